@@ -1,0 +1,75 @@
+"""Errors and warnings. Each message says what was wrong, where, the value, and what to do."""
+
+from __future__ import annotations
+
+
+class RwhecError(ValueError):
+    """Root of every error that bad input raises."""
+
+
+class PoseError(RwhecError):
+    """A pose that is not one: NaN, a rotation block that is no rotation, a zero quaternion, a wrong shape."""
+
+
+class CountError(RwhecError):
+    """Different numbers of A and B, or of weights, stamps and covariances for them; or none at all."""
+
+
+class NoiseError(RwhecError):
+    """A sigma or kappa that is not a positive, finite number; a covariance that is not positive definite."""
+
+
+class FrameError(RwhecError):
+    """A frame name that is unknown, empty, or used for both a target and a sensor."""
+
+
+class PriorError(RwhecError):
+    """Fixed frames or priors that contradict one another, or that the problem cannot hold."""
+
+
+class UnderdeterminedError(RwhecError):
+    """Fewer equations than unknowns: no method can answer."""
+
+
+class ScaleError(RwhecError):
+    """A scale that is not positive, in the input or at the optimum."""
+
+
+class OptionError(RwhecError):
+    """An option, a method or a starting point that cannot be used."""
+
+
+class MeasurementsNotKeptError(RwhecError):
+    """Raw measurements are asked for and the problem was told not to keep them."""
+
+
+class FileFormatError(RwhecError):
+    """A file that cannot be read as what it should be; the message has the file and the line or field."""
+
+
+class ResultVersionError(FileFormatError):
+    """A result file that another version of the format wrote."""
+
+
+class FetchError(RwhecError):
+    """A download that failed or whose content is not what was expected."""
+
+
+class RwhecWarning(UserWarning):
+    """Root of every warning."""
+
+
+class UnitsWarning(RwhecWarning):
+    """Numbers that look as if they had another unit."""
+
+
+class NotUniqueWarning(RwhecWarning):
+    """The measurements leave the answer free in some direction."""
+
+
+class NotCertifiedWarning(RwhecWarning):
+    """No proof of global optimality was found."""
+
+
+class RotationsProjectedWarning(RwhecWarning):
+    """Rotation blocks were slightly off and were projected to the nearest rotation."""

@@ -1,0 +1,225 @@
+"""What users give as poses, brought to one shape and checked.
+
+Accepted: arrays (N, 4, 4), sequences of ``gtsam.Pose3``, arrays (N, 7) of a quaternion and a translation with the
+order of the quaternion named. Checks run on blocks, so that memory beyond the input does not grow with N.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gtsam_rwhec.errors import PoseError
+
+Array = NDArray[np.float64]
+QuaternionOrder = Literal["wxyz", "xyzw"]
+PoseLike = ArrayLike | gtsam.Pose3
+PosesLike = ArrayLike | Sequence[gtsam.Pose3]
+
+#: A rotation block further than this from R'R = I (largest entry) is refused; a nearer one is projected.
+ROTATION_TOLERANCE = 1e-3
+#: Deviations below this are rounding and are left as they are.
+ROTATION_ROUNDING = 1e-13
+
+
+def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -> Array:
+    """Bring poses to an (N, 4, 4) array, without looking at the values of the matrices.
+
+    Parameters
+    ----------
+    poses : (N, 4, 4) array, sequence of N gtsam.Pose3, or (N, 7) array
+        Rows of 7 are quaternion then translation in metres.
+    order : "wxyz" or "xyzw" or None
+        Order of the quaternion's entries; needed for rows of 7 only.
+    where : str
+        Said in errors: which argument of which pair.
+
+    Returns
+    -------
+    (N, 4, 4) float64 array; the input itself where it has this form already.
+
+    Raises
+    ------
+    PoseError
+        For any other shape, a missing order, a zero or non-finite quaternion.
+    """
+    if isinstance(poses, gtsam.Pose3):
+        return poses.matrix()[None]
+    if not isinstance(poses, np.ndarray) and isinstance(poses, Sequence) and len(poses):
+        if isinstance(poses[0], gtsam.Pose3):
+            for index, pose in enumerate(poses):
+                if not isinstance(pose, gtsam.Pose3):
+                    raise PoseError(
+                        f"{where}: entry {index} is a {type(pose).__name__} in a list of gtsam.Pose3; "
+                        "give one kind of pose in a list"
+                    )
+            return np.array([pose.matrix() for pose in poses])
+    try:
+        array = np.asarray(poses, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise PoseError(
+            f"{where}: cannot be read as numbers ({error}); give (N,4,4), (N,7) or a list of gtsam.Pose3"
+        ) from error
+    if array.ndim == 2 and array.shape == (4, 4):
+        return array[None]
+    if array.ndim == 3 and array.shape[1:] == (4, 4):
+        if order is not None:
+            raise PoseError(f"{where}: order={order!r} names a quaternion's order, but the poses are 4x4 matrices")
+        return array
+    if array.ndim == 2 and array.shape[1] == 7:
+        return _from_quaternion_rows(array, order, where)
+    if array.size == 0:
+        return np.empty((0, 4, 4))
+    raise PoseError(
+        f"{where}: shape {array.shape} is not one of (N, 4, 4), (N, 7) and no list of gtsam.Pose3"
+    )
+
+
+def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str) -> Array:
+    if order not in ("wxyz", "xyzw"):
+        raise PoseError(
+            f"{where}: rows of 7 need the quaternion's order named, order='wxyz' or order='xyzw', got {order!r}"
+        )
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if bad.size:
+        raise PoseError(f"{where}: measurement {bad[0]} has an entry that is NaN or infinite: {rows[bad[0]]}")
+    w, x, y, z = rows[:, [0, 1, 2, 3] if order == "wxyz" else [3, 0, 1, 2]].T
+    norm_squared = w * w + x * x + y * y + z * z
+    off = np.flatnonzero(np.abs(np.sqrt(norm_squared) - 1.0) > 1e-2)
+    if off.size:
+        i = off[0]
+        raise PoseError(
+            f"{where}: the quaternion of measurement {i} has norm {np.sqrt(norm_squared[i]):.6g}, not 1 "
+            f"({rows[i, :4]}); normalise it, or check the columns and order={order!r}"
+        )
+    s = 2.0 / norm_squared
+    transforms = np.zeros((len(rows), 4, 4))
+    transforms[:, 0, 0] = 1.0 - s * (y * y + z * z)
+    transforms[:, 0, 1] = s * (x * y - w * z)
+    transforms[:, 0, 2] = s * (x * z + w * y)
+    transforms[:, 1, 0] = s * (x * y + w * z)
+    transforms[:, 1, 1] = 1.0 - s * (x * x + z * z)
+    transforms[:, 1, 2] = s * (y * z - w * x)
+    transforms[:, 2, 0] = s * (x * z - w * y)
+    transforms[:, 2, 1] = s * (y * z + w * x)
+    transforms[:, 2, 2] = 1.0 - s * (x * x + y * y)
+    transforms[:, :3, 3] = rows[:, 4:]
+    transforms[:, 3, 3] = 1.0
+    return transforms
+
+
+def checked_rows(block: Array, first: int, where: str) -> tuple[Array, int]:
+    """Check a block of transforms and lay it out for the moments.
+
+    Parameters
+    ----------
+    block : (b, 4, 4) array
+    first : int
+        Index of the block's first measurement, for messages.
+    where : str
+
+    Returns
+    -------
+    rows : (12, b) array
+        vec(R), column after column, then t: each entry a contiguous row.
+    projected : int
+        How many rotations were off by more than rounding and were projected to SO(3).
+
+    Raises
+    ------
+    PoseError
+        NaN or infinite entries, a last row other than 0 0 0 1, a block that is no rotation, a left-handed one.
+    """
+    rows = np.empty((12, len(block)))
+    rows.reshape(4, 3, -1)[...] = block[:, :3, :].transpose(2, 1, 0)
+    # A sum is finite only when all of its terms are, short of overflow, which is refused too.
+    if not np.isfinite(rows.sum()):
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=0))
+        index = int(bad[0]) if bad.size else 0
+        raise PoseError(
+            f"{where}: measurement {first + index} has an entry that is NaN, infinite or too large:\n{block[index]}"
+        )
+    last = block[:, 3, :] - (0.0, 0.0, 0.0, 1.0)
+    if np.abs(last).max() > 1e-9:
+        index = int(np.abs(last).max(axis=1).argmax())
+        raise PoseError(
+            f"{where}: the last row of measurement {first + index} is {block[index, 3]}, not 0 0 0 1; "
+            "are the matrices transposed?"
+        )
+    deviation = orthonormality(rows)
+    worst = float(deviation.max())
+    if worst > ROTATION_TOLERANCE:
+        index = int(deviation.argmax())
+        raise PoseError(
+            f"{where}: the rotation of measurement {first + index} is off by {deviation[index]:.3g} "
+            f"(largest entry of R'R - I; {ROTATION_TOLERANCE:g} is let through and projected):\n{block[index, :3, :3]}"
+        )
+    handed = determinant(rows)
+    if handed.min() < 0.0:
+        index = int(handed.argmin())
+        raise PoseError(
+            f"{where}: the rotation of measurement {first + index} is left-handed (determinant "
+            f"{handed[index]:.6f}): a mirrored axis; check the axis convention"
+        )
+    projected = 0
+    if worst > ROTATION_ROUNDING:
+        projected = int((deviation > ROTATION_ROUNDING).sum())
+        for _ in range(3):  # quadratic: 1e-3 becomes 1e-6, 1e-12, rounding
+            rows[:9] = polar_step(rows)
+    return rows, projected
+
+
+def orthonormality(rows: Array) -> Array:
+    """Largest entry of |R'R - I| of each column of ``rows`` (12 or 9, b)."""
+    c = rows[:9].reshape(3, 3, -1)
+    deviation = np.abs((c[0] * c[0]).sum(axis=0) - 1.0)
+    for i, j in ((1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+        np.maximum(deviation, np.abs((c[i] * c[j]).sum(axis=0) - (i == j)), out=deviation)
+    return deviation
+
+
+def determinant(rows: Array) -> Array:
+    """Determinant of each column of ``rows`` (12 or 9, b)."""
+    (a0, a1, a2), (b0, b1, b2), (c0, c1, c2) = rows[:9].reshape(3, 3, -1)
+    result: Array = a0 * (b1 * c2 - b2 * c1) + a1 * (b2 * c0 - b0 * c2) + a2 * (b0 * c1 - b1 * c0)
+    return result
+
+
+def polar_step(rows: Array) -> Array:
+    """One Newton-Schulz step R (3 I - R'R) / 2 toward the nearest rotation (Higham 2008, eq. 8.20)."""
+    c = rows[:9].reshape(3, 3, -1)  # c[j] is column j of R
+    gram = np.einsum("jib,kib->jkb", c, c)
+    step: Array = 1.5 * c - 0.5 * np.einsum("jib,jkb->kib", c, gram)
+    return step.reshape(9, -1)
+
+
+def one_transform(pose: PoseLike, where: str) -> Array:
+    """One pose as a checked (4, 4) array.
+
+    Raises
+    ------
+    PoseError
+        When it is no pose.
+    """
+    transforms = as_transforms([pose] if isinstance(pose, gtsam.Pose3) else np.asarray(pose), None, where)
+    if len(transforms) != 1:
+        raise PoseError(f"{where}: {len(transforms)} poses where one is expected")
+    rows, _ = checked_rows(transforms, 0, where)
+    return rows_to_transforms(rows)[0]
+
+
+def rows_to_transforms(rows: Array) -> Array:
+    """The inverse of the layout of ``checked_rows``: (12, b) to (b, 4, 4)."""
+    transforms = np.zeros((rows.shape[1], 4, 4))
+    transforms[:, :3, :] = rows.reshape(4, 3, -1).transpose(2, 1, 0)
+    transforms[:, 3, 3] = 1.0
+    return transforms
+
+
+def to_pose3(R: Array, t: Array) -> Any:
+    """A ``gtsam.Pose3`` of a rotation (3, 3) and a translation (3,)."""
+    return gtsam.Pose3(gtsam.Rot3(R), t)

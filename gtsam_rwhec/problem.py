@@ -1,0 +1,530 @@
+"""What the user states: targets, sensors, measurements, scale, known frames and priors; all validation of them."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gtsam_rwhec.errors import (
+    CountError,
+    FrameError,
+    MeasurementsNotKeptError,
+    NoiseError,
+    OptionError,
+    PriorError,
+    RotationsProjectedWarning,
+    ScaleError,
+    UnitsWarning,
+)
+from gtsam_rwhec.poses import (
+    ROTATION_TOLERANCE,
+    Array,
+    PoseLike,
+    PosesLike,
+    QuaternionOrder,
+    as_transforms,
+    one_transform,
+)
+from gtsam_rwhec.statistics import BLOCK, Gauge, Moments
+
+ScaleMode = Literal["known", "shared", "per_target"]
+Pair = tuple[str, str]
+
+#: Translations with a median beyond this are taken for millimetres (a camera sees no tag at 100 m).
+MILLIMETRES_M = 100.0
+#: Two priors on one frame contradict one another when they differ by more than this many standard deviations.
+CONTRADICTION_SIGMAS = 6.0
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Raw measurements of one edge: A, B (N, 4, 4), sigma (N,) in m, kappa (N,), stamps (N,) in ns, 6x6 covariances."""
+
+    A: Array
+    B: Array
+    sigma: Array
+    kappa: Array
+    stamps_ns: np.ndarray | None = None
+    covariances: Array | None = None
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A Gaussian belief: |t - t_0|^2 / sigma^2 and kappa |R - R_0|_F^2 (DESIGN fact 11). None: that part is free."""
+
+    transform: Array
+    sigma: float | None
+    kappa: float | None
+
+
+@dataclass
+class _Edge:
+    """One target seen by one sensor, or one sensor's motions."""
+
+    moments: Moments
+    batches: list[Measurements] = field(default_factory=list)
+    covariance_given: bool = False
+
+
+class Problem:
+    """A calibration problem: A_i X_j = Y_k B_i for targets j, sensors k and measurements i.
+
+    A = T_sensorcarrier_targetcarrier (known: kinematics, motion capture, SLAM), B = T_sensor_target (measured),
+    X = T_targetcarrier_target and Y = T_sensorcarrier_sensor (unknown). Translations in metres.
+
+    Parameters
+    ----------
+    scale : "known", "shared" or "per_target"
+        Whether lengths in B are true, or true times one unknown factor, or times one for each target
+        (t_B = scale * true length). With "per_target", ``fix_scale`` names targets of known size.
+    keep_measurements : bool
+        Whether raw pairs are kept beside the moments. Refinement under richer noise needs them; the certified
+        solution does not. Without them memory does not grow with the number of measurements.
+    """
+
+    def __init__(self, scale: ScaleMode = "known", *, keep_measurements: bool = True) -> None:
+        if scale not in get_args(ScaleMode):
+            raise OptionError(f"scale={scale!r} is not one of {', '.join(map(repr, get_args(ScaleMode)))}")
+        self.scale: ScaleMode = scale
+        self.keep_measurements = keep_measurements
+        self.is_relative = False
+        self.gauge: Gauge | None = None
+        self.fixed: dict[str, Array] = {}
+        self.priors: dict[str, list[Prior]] = {}
+        self.fixed_scales: dict[str, float] = {}
+        self._kind: dict[str, Literal["target", "sensor"]] = {}
+        self._edges: dict[Pair, _Edge] = {}
+        self._target_carrier_set = False
+
+    # -- what is in it ------------------------------------------------------------------------------------------
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the targets, in order of first appearance."""
+        return tuple(name for name, kind in self._kind.items() if kind == "target")
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors, in order of first appearance."""
+        return tuple(name for name, kind in self._kind.items() if kind == "sensor")
+
+    @property
+    def pairs(self) -> tuple[Pair, ...]:
+        """(target, sensor) of every edge; (sensor, sensor) for a sensor's own motions."""
+        return tuple(self._edges)
+
+    @property
+    def number_of_measurements(self) -> int:
+        """Measurements of all pairs together."""
+        return sum(edge.moments.count for edge in self._edges.values())
+
+    @property
+    def has_covariances(self) -> bool:
+        """Whether any measurement came with a full covariance (used in refinement only)."""
+        return any(edge.covariance_given for edge in self._edges.values())
+
+    def moments(self, target: str, sensor: str) -> Moments:
+        """Moments of a pair, about ``self.gauge``."""
+        return self._edge(target, sensor).moments
+
+    def measurements(self, target: str, sensor: str) -> Measurements:
+        """Raw measurements of a pair, in the order in which they were added.
+
+        Raises
+        ------
+        MeasurementsNotKeptError
+            When the problem was made with ``keep_measurements=False``.
+        """
+        edge = self._edge(target, sensor)
+        if sum(len(batch.A) for batch in edge.batches) != edge.moments.count:
+            raise MeasurementsNotKeptError(
+                f"the raw measurements of {target}-{sensor} were not kept (keep_measurements=False); "
+                "make the problem with keep_measurements=True"
+            )
+        batches = edge.batches
+        stamps = [b.stamps_ns for b in batches if b.stamps_ns is not None]
+        covariances = [b.covariances for b in batches if b.covariances is not None]
+        return Measurements(
+            np.concatenate([b.A for b in batches]),
+            np.concatenate([b.B for b in batches]),
+            np.concatenate([b.sigma for b in batches]),
+            np.concatenate([b.kappa for b in batches]),
+            np.concatenate(stamps) if len(stamps) == len(batches) else None,
+            np.concatenate(covariances) if len(covariances) == len(batches) else None,
+        )
+
+    def _edge(self, target: str, sensor: str) -> _Edge:
+        try:
+            return self._edges[target, sensor]
+        except KeyError:
+            raise FrameError(f"no measurements of the pair ({target!r}, {sensor!r}); there are {self.pairs}") from None
+
+    # -- measurements -------------------------------------------------------------------------------------------
+
+    def add(
+        self,
+        target: str,
+        sensor: str,
+        A: PosesLike,
+        B: PosesLike,
+        sigma: ArrayLike | None = None,
+        kappa: ArrayLike | None = None,
+        *,
+        order: QuaternionOrder | None = None,
+        stamps_ns: ArrayLike | None = None,
+        covariances: ArrayLike | None = None,
+        source: str | None = None,
+    ) -> None:
+        """Add measurements of a target by a sensor; any number of batches, in any order.
+
+        Parameters
+        ----------
+        target, sensor : str
+            Names, unique across targets and sensors.
+        A, B : (N, 4, 4) arrays, lists of gtsam.Pose3, or (N, 7) rows of quaternion and translation
+            A = T_sensorcarrier_targetcarrier, B = T_sensor_target; metres.
+        sigma : float or (N,), optional
+            Standard deviation of B's translation, each axis, in metres. Left out: 1, and costs are relative.
+        kappa : float or (N,), optional
+            Concentration of B's rotation; a standard deviation of s rad an axis is kappa = 1 / (2 s^2).
+        order : "wxyz" or "xyzw"
+            Order of the quaternions, for rows of 7.
+        stamps_ns : (N,) integers, optional
+            Nanoseconds; kept for refinement.
+        covariances : (N, 6, 6), optional
+            Of B, rotation first, right perturbation (GTSAM's order); kept for refinement.
+        source : str, optional
+            Where they came from (a file, a topic), said in errors.
+
+        Raises
+        ------
+        PoseError, CountError, NoiseError, FrameError
+            For bad input; nothing of the batch is added then.
+        """
+        if target == sensor:
+            raise FrameError(f"{target!r} is given as target and as sensor; names are unique across both")
+        self._add((target, sensor), A, B, sigma, kappa, order, stamps_ns, covariances, source)
+
+    def add_motion(
+        self,
+        sensor: str,
+        A: PosesLike,
+        B: PosesLike,
+        sigma: ArrayLike | None = None,
+        kappa: ArrayLike | None = None,
+        *,
+        order: QuaternionOrder | None = None,
+        stamps_ns: ArrayLike | None = None,
+        covariances: ArrayLike | None = None,
+        source: str | None = None,
+    ) -> None:
+        """Add motions seen by a sensor's own odometry: A Y = Y B (AX = XB), A the carrier's, B the sensor's.
+
+        Both are T_before_after. Arguments and errors as in ``add``.
+        """
+        self._add((sensor, sensor), A, B, sigma, kappa, order, stamps_ns, covariances, source)
+
+    def _add(
+        self,
+        pair: Pair,
+        A_poses: PosesLike,
+        B_poses: PosesLike,
+        sigma: ArrayLike | None,
+        kappa: ArrayLike | None,
+        order: QuaternionOrder | None,
+        stamps_ns: ArrayLike | None,
+        covariances: ArrayLike | None,
+        source: str | None,
+    ) -> None:
+        target, sensor = pair
+        motion = target == sensor
+        where = (f"the motions of {sensor}" if motion else f"{target}-{sensor}") + (f" ({source})" if source else "")
+        self._check_names(pair, where)
+        A = as_transforms(A_poses, order, f"A of {where}")
+        B = as_transforms(B_poses, order, f"B of {where}")
+        if len(A) != len(B):
+            raise CountError(f"{where}: {len(A)} poses in A and {len(B)} in B; they come in pairs")
+        if len(A) == 0:
+            raise CountError(f"{where}: no measurements; leave the pair out instead")
+        count = len(A)
+        sigmas = _weights(sigma, count, "sigma", where)
+        kappas = _weights(kappa, count, "kappa", where)
+        stamps = _stamps(stamps_ns, count, where)
+        covariance = _covariances(covariances, count, where)
+        gauge = self._gauge_for(A, motion, where)
+        moments = Moments.of(A, B, 1.0 / sigmas**2, kappas, gauge, motion, where)
+        if moments.projected:
+            warnings.warn(
+                f"{where}: {moments.projected} rotations were off R'R = I by rounding in the input (less than "
+                f"{ROTATION_TOLERANCE:g}) and were projected to the nearest rotation",
+                RotationsProjectedWarning,
+                stacklevel=3,
+            )
+        _warn_of_millimetres(A, B, where)
+        # Only now, with everything checked, does the problem change.
+        self.gauge = gauge
+        self._target_carrier_set = self._target_carrier_set or not motion
+        self.is_relative = self.is_relative or sigma is None or kappa is None
+        if not motion:
+            self._kind[target] = "target"
+        self._kind[sensor] = "sensor"
+        edge = self._edges.get(pair)
+        if edge is None:
+            edge = self._edges[pair] = _Edge(moments)
+        else:
+            edge.moments = edge.moments + moments
+        edge.covariance_given = edge.covariance_given or covariance is not None
+        if self.keep_measurements:
+            edge.batches.append(
+                Measurements(
+                    A.copy(),
+                    B.copy(),
+                    np.broadcast_to(sigmas, (count,)),
+                    np.broadcast_to(kappas, (count,)),
+                    stamps,
+                    covariance,
+                )
+            )
+
+    def _check_names(self, pair: Pair, where: str) -> None:
+        target, sensor = pair
+        for name, kind in ((target, "target"), (sensor, "sensor")):
+            if not isinstance(name, str) or not name:
+                raise FrameError(f"{where}: the {kind}'s name is {name!r}; give a string that is not empty")
+            if target != sensor and self._kind.get(name, kind) != kind:
+                raise FrameError(
+                    f"{where}: {name!r} is a {self._kind[name]} already and cannot be a {kind} too; "
+                    "names are unique across targets and sensors"
+                )
+        if target == sensor and self._kind.get(sensor) == "target":
+            raise FrameError(f"{where}: {sensor!r} is a target; only sensors have motions of their own")
+
+    def _gauge_for(self, A: Array, motion: bool, where: str) -> Gauge:
+        if self.gauge is not None and (motion or self._target_carrier_set):
+            return self.gauge
+        sample = A[:BLOCK]
+        if not np.isfinite(sample).all():
+            return self.gauge or Gauge()  # the moments' own check names the bad entry
+        return Gauge.of(sample, self.gauge, motion)
+
+    # -- what is known beforehand -------------------------------------------------------------------------------
+
+    def fix(self, name: str, T_carrier_frame: PoseLike) -> None:
+        """Say that a frame's pose on its carrier is known exactly.
+
+        Raises
+        ------
+        PriorError
+            When it is fixed at another pose already, or a prior contradicts it.
+        """
+        T = one_transform(T_carrier_frame, f"the pose at which {name} is fixed")
+        known = self.fixed.get(name)
+        if known is not None and np.abs(known - T).max() > 1e-9:
+            raise PriorError(
+                f"{name} is fixed already, at another pose ({_difference(known, T)}); remove one of the two"
+            )
+        for prior in self.priors.get(name, []):
+            _check_agreement(name, Prior(T, 0.0, np.inf), prior)
+        self.fixed[name] = T
+
+    def add_prior(
+        self, name: str, T_carrier_frame: PoseLike, sigma: float | None = None, kappa: float | None = None
+    ) -> None:
+        """Add a belief about a frame's pose on its carrier: a MAP estimate in place of a maximum-likelihood one.
+
+        Parameters
+        ----------
+        name : str
+        T_carrier_frame : pose
+        sigma : float, optional
+            Standard deviation of the translation, each axis, in metres; None leaves the translation free.
+        kappa : float, optional
+            Concentration of the rotation, 1 / (2 s^2) for s rad an axis; None leaves the rotation free.
+
+        Raises
+        ------
+        PriorError
+            When it contradicts what is known of the frame already, or says nothing.
+        """
+        T = one_transform(T_carrier_frame, f"the prior of {name}")
+        if sigma is None and kappa is None:
+            raise PriorError(f"the prior of {name} has neither sigma nor kappa and says nothing; give one of them")
+        where = f"the prior of {name}"
+        prior = Prior(
+            T,
+            None if sigma is None else float(_weights(sigma, 0, "sigma", where)),
+            None if kappa is None else float(_weights(kappa, 0, "kappa", where)),
+        )
+        if name in self.fixed:
+            _check_agreement(name, Prior(self.fixed[name], 0.0, np.inf), prior)
+        for other in self.priors.get(name, []):
+            _check_agreement(name, other, prior)
+        self.priors.setdefault(name, []).append(prior)
+
+    def fix_scale(self, name: str, scale: float = 1.0) -> None:
+        """Say that a target's size (or, for motions, a sensor's odometry scale) is known, with scale="per_target".
+
+        Raises
+        ------
+        ScaleError
+            When the scale is not positive, or the problem's scale is not "per_target".
+        """
+        if self.scale != "per_target":
+            raise ScaleError(f"fix_scale({name!r}) needs scale='per_target'; this problem has scale={self.scale!r}")
+        if not (np.isscalar(scale) and np.isfinite(scale) and scale > 0):
+            raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number (measured / true length)")
+        if self.fixed_scales.get(name, scale) != scale:
+            raise ScaleError(f"the scale of {name} is fixed at {self.fixed_scales[name]} already, and now at {scale}")
+        self.fixed_scales[name] = float(scale)
+
+    # -- joining ------------------------------------------------------------------------------------------------
+
+    def __add__(self, other: Problem) -> Problem:
+        """Both problems' measurements and knowledge in one: logs can be processed apart and joined."""
+        if not isinstance(other, Problem):
+            return NotImplemented
+        if self.scale != other.scale:
+            raise OptionError(f"a problem with scale={self.scale!r} cannot join one with scale={other.scale!r}")
+        merged = copy.copy(self)
+        merged.keep_measurements = self.keep_measurements and other.keep_measurements
+        merged.is_relative = self.is_relative or other.is_relative
+        merged.fixed, merged.fixed_scales = dict(self.fixed), dict(self.fixed_scales)
+        merged.priors = {name: list(priors) for name, priors in self.priors.items()}
+        merged._kind = dict(self._kind)
+        merged._edges = {
+            pair: _Edge(edge.moments, list(edge.batches), edge.covariance_given) for pair, edge in self._edges.items()
+        }
+        for name, kind in other._kind.items():
+            if merged._kind.setdefault(name, kind) != kind:
+                raise FrameError(f"{name!r} is a {kind} in one problem and a {merged._kind[name]} in the other")
+        if merged.gauge is None or not (self._target_carrier_set or not other._target_carrier_set):
+            merged.gauge, merged._target_carrier_set = other.gauge, other._target_carrier_set
+            merged._move_edges(self.gauge)
+        for pair, edge in other._edges.items():
+            moments = merged._at_own_gauge(pair, edge.moments, other.gauge)
+            known = merged._edges.get(pair)
+            if known is None:
+                merged._edges[pair] = _Edge(moments, list(edge.batches), edge.covariance_given)
+            else:
+                known.moments = known.moments + moments
+                known.batches.extend(edge.batches)
+                known.covariance_given = known.covariance_given or edge.covariance_given
+        for name, T in other.fixed.items():
+            merged.fix(name, T)
+        for name, priors in other.priors.items():
+            for prior in priors:
+                merged.add_prior(name, prior.transform, prior.sigma, prior.kappa)
+        for name, scale in other.fixed_scales.items():
+            merged.fix_scale(name, scale)
+        return merged
+
+    def _at_own_gauge(self, pair: Pair, moments: Moments, gauge: Gauge | None) -> Moments:
+        """Moments about ``gauge``, brought to this problem's own."""
+        if gauge is None or self.gauge is None or gauge is self.gauge:
+            return moments
+        a = self.gauge.sensor_carrier - gauge.sensor_carrier
+        c = a if pair[0] == pair[1] else self.gauge.target_carrier - gauge.target_carrier
+        return moments.shifted(a, c)
+
+    def _move_edges(self, gauge: Gauge | None) -> None:
+        for pair, edge in self._edges.items():
+            edge.moments = self._at_own_gauge(pair, edge.moments, gauge)
+
+    def __repr__(self) -> str:
+        return (
+            f"Problem({len(self.targets)} targets, {len(self.sensors)} sensors, {len(self._edges)} pairs, "
+            f"{self.number_of_measurements} measurements, scale={self.scale!r})"
+        )
+
+
+def _weights(value: ArrayLike | None, count: int, name: str, where: str) -> Array:
+    """sigma or kappa as a () or (count,) array of positive numbers; left out: 1."""
+    if value is None:
+        return np.array(1.0)
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise NoiseError(f"{where}: {name}={value!r} cannot be read as numbers") from error
+    if array.shape not in ((), (count,)):
+        raise CountError(f"{where}: {name} has shape {array.shape}; give one number or one for each of {count}")
+    bad = np.flatnonzero(~((array > 0.0) & np.isfinite(array)))
+    if bad.size:
+        index = f" of measurement {bad[0]}" if array.ndim else ""
+        raise NoiseError(f"{where}: {name}{index} is {array.flat[bad[0]]}; it must be positive and finite")
+    return array
+
+
+def _stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.ndarray | None:
+    if stamps_ns is None:
+        return None
+    stamps = np.asarray(stamps_ns)
+    if stamps.shape != (count,):
+        raise CountError(f"{where}: stamps_ns has shape {stamps.shape} for {count} measurements")
+    if not np.issubdtype(stamps.dtype, np.integer):
+        raise CountError(f"{where}: stamps_ns is of {stamps.dtype}; give integer nanoseconds")
+    return stamps.astype(np.int64)
+
+
+def _covariances(covariances: ArrayLike | None, count: int, where: str) -> Array | None:
+    if covariances is None:
+        return None
+    array = np.array(covariances, dtype=np.float64)
+    if array.shape == (6, 6):
+        array = np.broadcast_to(array, (count, 6, 6))
+    if array.shape != (count, 6, 6):
+        raise CountError(f"{where}: covariances has shape {array.shape}; give (6, 6) or ({count}, 6, 6)")
+    if not np.isfinite(array).all() or np.abs(array - array.transpose(0, 2, 1)).max() > 1e-9 * np.abs(array).max():
+        raise NoiseError(f"{where}: a covariance is not finite and symmetric")
+    smallest = np.linalg.eigvalsh(array)[:, 0]
+    if smallest.min() <= 0.0:
+        index = int(smallest.argmin())
+        raise NoiseError(
+            f"{where}: the covariance of measurement {index} is not positive definite (smallest eigenvalue "
+            f"{smallest[index]:.3g})"
+        )
+    return array
+
+
+def _warn_of_millimetres(A: Array, B: Array, where: str) -> None:
+    # Differences, so that a world origin far away is no millimetre; B is what a sensor sees, never far away.
+    spread_A = float(np.median(np.abs(A[:BLOCK, :3, 3] - A[0, :3, 3]).max(axis=1)))
+    size_B = float(np.median(np.abs(B[:BLOCK, :3, 3]).max(axis=1)))
+    for name, size in (("A", spread_A), ("B", size_B)):
+        if size > MILLIMETRES_M:
+            warnings.warn(
+                f"{where}: translations of {name} have a median size of {size:.4g}; that looks like millimetres. "
+                "This library takes metres; divide by 1000 if so",
+                UnitsWarning,
+                stacklevel=4,
+            )
+
+
+def _difference(T: Array, S: Array) -> str:
+    angle = np.degrees(2.0 * np.arcsin(min(1.0, np.linalg.norm(T[:3, :3] - S[:3, :3]) / np.sqrt(8.0))))
+    return f"{1e3 * np.linalg.norm(T[:3, 3] - S[:3, 3]):.4g} mm and {angle:.4g} deg apart"
+
+
+def _check_agreement(name: str, first: Prior, second: Prior) -> None:
+    """Refuse two beliefs on one frame that cannot both be true."""
+    apart = _difference(first.transform, second.transform)
+    if first.sigma is not None and second.sigma is not None:
+        distance = np.linalg.norm(first.transform[:3, 3] - second.transform[:3, 3])
+        if distance > 1e-9 + CONTRADICTION_SIGMAS * np.hypot(first.sigma, second.sigma):
+            raise PriorError(
+                f"what is said of {name} contradicts itself: {apart}, with standard deviations of "
+                f"{1e3 * first.sigma:.4g} mm and {1e3 * second.sigma:.4g} mm"
+            )
+    if first.kappa is not None and second.kappa is not None:
+        # kappa |R - R_0|_F^2: a standard deviation of 1 / sqrt(2 kappa) rad an axis, and |.|_F^2 = 2 theta^2.
+        distance = np.linalg.norm(first.transform[:3, :3] - second.transform[:3, :3])
+        spread = np.sqrt(1.0 / first.kappa + 1.0 / second.kappa)
+        if distance > 1e-9 + CONTRADICTION_SIGMAS * spread:
+            raise PriorError(
+                f"what is said of {name} contradicts itself: {apart}, with kappa of {first.kappa:.4g} and "
+                f"{second.kappa:.4g}"
+            )

@@ -1,0 +1,224 @@
+"""What the cost needs to know of an edge's measurements: a few moments, and the 25 x 25 form they make.
+
+Moments are sums over the measurements, so they add: batches, logs and machines may be merged, in any order. They are
+sums about a reference (``Gauge``): with the world's origin far away, products of uncentred translations would lose
+the digits that the answer is made of.
+
+One column of features per measurement, 25 of them::
+
+    f = [vec R_A (9), t_A (3), vec R_B (9), t_B (3), 1]          (vec stacks columns)
+
+``translation = sum f f' / sigma^2`` holds everything that eqs. 35-41 of the RWHEC paper need, for Problem 3 and for
+the equation turned round (one scale per target); ``rotation = sum kappa vec(R_A) vec(R_B)'`` all that L(G^rho) needs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gtsam_rwhec.poses import Array, checked_rows
+
+R_A, T_A, R_B, T_B, ONE = slice(0, 9), slice(9, 12), slice(12, 21), slice(21, 24), 24
+#: The features of the equation turned round, B X^-1 = Y^-1 A: A and B change places.
+SWAPPED = np.r_[12:24, 0:12, 24]
+#: Measurements handled at once: blocks of this many stay in the processor's cache.
+BLOCK = 2048
+I3 = np.eye(3)
+I9 = np.eye(9)
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """Origins to which translations are referred: A -> T(-sensor_carrier) A T(target_carrier), in metres.
+
+    X moves to T(-target_carrier) X and Y to T(-sensor_carrier) Y: the answer is shifted back exactly.
+    """
+
+    sensor_carrier: Array = field(default_factory=lambda: np.zeros(3))
+    target_carrier: Array = field(default_factory=lambda: np.zeros(3))
+
+    @staticmethod
+    def of(A: Array, current: Gauge | None, motion: bool) -> Gauge:
+        """The reference that makes the translations of ``A`` (N, 4, 4) small: min |R_A c + t_A - a|^2 over a, c.
+
+        For the motions of AX = XB both ends are the sensor's carrier: c = a. A component that the motions leave open
+        stays small (minimum norm). What ``current`` fixed already stays.
+        """
+        R, t = A[:, :3, :3], A[:, :3, 3]
+        eye = np.broadcast_to(I3, R.shape)
+        if motion:
+            a = _least_squares((eye - R).reshape(-1, 3), t.ravel())
+            return Gauge(a, np.zeros(3))
+        if current is not None:
+            c = np.einsum("nji,nj->ni", R, current.sensor_carrier - t).mean(axis=0)
+            return Gauge(current.sensor_carrier, c)
+        solution = _least_squares(np.concatenate([eye, -R], axis=2).reshape(-1, 6), t.ravel())
+        return Gauge(solution[:3], solution[3:])
+
+    def moved_by(self, a: Array, c: Array) -> Gauge:
+        """The gauge after a further shift."""
+        return Gauge(self.sensor_carrier + a, self.target_carrier + c)
+
+
+def _least_squares(matrix: Array, right: Array) -> Array:
+    solution: Array = np.linalg.lstsq(matrix, right, rcond=1e-9)[0]
+    return solution
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Sums over the measurements of one edge. Additive: ``a + b`` is the moments of both.
+
+    Attributes
+    ----------
+    count : int
+        Number of measurements.
+    kappa : float
+        Sum of the rotation weights.
+    translation : (25, 25) array
+        sum f f' / sigma^2.
+    rotation : (9, 9) array
+        sum kappa vec(R_A) vec(R_B)'.
+    projected : int
+        Measurements whose rotations were projected to SO(3).
+    """
+
+    count: int
+    kappa: float
+    translation: Array
+    rotation: Array
+    projected: int = 0
+
+    @staticmethod
+    def of(A: Array, B: Array, weight: Array, kappa: Array, gauge: Gauge, motion: bool, where: str) -> Moments:
+        """Moments of N measurements, block by block, checking every pose on the way (``poses.checked_rows``).
+
+        Parameters
+        ----------
+        A, B : (N, 4, 4) arrays
+        weight : () or (N,) array
+            1 / sigma^2, in 1/m^2.
+        kappa : () or (N,) array
+        gauge : Gauge
+        motion : bool
+            Whether both carriers are the sensor's (AX = XB).
+        where : str
+            For messages.
+        """
+        translation = np.zeros((25, 25))
+        rotation = np.zeros((9, 9))
+        projected = 0
+        a = gauge.sensor_carrier[:, None]
+        c = gauge.sensor_carrier if motion else gauge.target_carrier
+        features = np.empty((25, min(BLOCK, len(A))))
+        for first in range(0, len(A), BLOCK):
+            part = slice(first, first + BLOCK)
+            rows_A, projected_A = checked_rows(A[part], first, f"A of {where}")
+            rows_B, projected_B = checked_rows(B[part], first, f"B of {where}")
+            projected += projected_A + projected_B
+            f = features[:, : rows_A.shape[1]]
+            f[:12] = rows_A
+            f[T_A] += np.tensordot(c, rows_A[:9].reshape(3, 3, -1), axes=(0, 0)) - a
+            f[12:24] = rows_B
+            f[ONE] = 1.0
+            if weight.ndim == 0:
+                translation += weight * (f @ f.T)
+            else:
+                translation += (f * weight[part]) @ f.T
+            if kappa.ndim == 0:
+                rotation += kappa * (f[R_A] @ f[R_B].T)
+            else:
+                rotation += (f[R_A] * kappa[part]) @ f[R_B].T
+        total = float(kappa) * len(A) if kappa.ndim == 0 else float(kappa.sum())
+        return Moments(len(A), total, translation, rotation, projected)
+
+    def __add__(self, other: Moments) -> Moments:
+        return Moments(
+            self.count + other.count,
+            self.kappa + other.kappa,
+            self.translation + other.translation,
+            self.rotation + other.rotation,
+            self.projected + other.projected,
+        )
+
+    def shifted(self, a: Array, c: Array) -> Moments:
+        """The same measurements about a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
+        # t_A' = t_A + R_A c - a is linear in the features, so the moments change by a congruence.
+        shift = np.eye(25)
+        shift[T_A, R_A] = np.kron(c, I3)
+        shift[T_A, ONE] = -a
+        return Moments(self.count, self.kappa, shift @ self.translation @ shift.T, self.rotation, self.projected)
+
+
+def best_shift(moments: list[Moments], motion: list[bool]) -> tuple[Array, Array]:
+    """The shift (a, c) that centres all edges together: min sum |t_A + R_A c - a|^2 / sigma^2, minimum norm."""
+    normal = np.zeros((6, 6))
+    right = np.zeros(6)
+    for edge, is_motion in zip(moments, motion, strict=True):
+        G = edge.translation
+        # R_A' summed: entry (i, k) is R_A[k, i], which vec keeps at 3 i + k.
+        Rt = G[R_A, ONE].reshape(3, 3)
+        Rt_t = np.einsum("ikk->i", G[R_A, T_A].reshape(3, 3, 3))
+        W = G[ONE, ONE] * I3
+        if is_motion:  # c = a: residual t_A - (I - R_A) a
+            normal[:3, :3] += 2.0 * W - Rt - Rt.T
+            right[:3] += G[T_A, ONE] - Rt_t
+        else:
+            normal += np.block([[W, -Rt.T], [-Rt, W]])
+            right += np.r_[G[T_A, ONE], -Rt_t]
+    if not normal.any():
+        return np.zeros(3), np.zeros(3)
+    solution: Array = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+    return solution[:3], solution[3:]
+
+
+def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array, Array]:
+    """Quadratic forms of E edges over x = [t_X, t_Y, alpha, vec R_X, vec R_Y] (DESIGN fact 1; eqs. 24-33).
+
+    Parameters
+    ----------
+    translation : (E, 25, 25) array
+        Second moments of the features, about the gauge; permuted by ``SWAPPED`` for the equation turned round.
+    rotation : (E, 9, 9) array
+        sum kappa vec(R_A) vec(R_B)' (transposed for the equation turned round).
+    kappa : (E,) array
+
+    Returns
+    -------
+    translation_form, rotation_form : (E, 25, 25) arrays
+        x' form x is the edge's J_t and J_R (eq. 18), the 1/2 included.
+    """
+    G = translation
+    edges = len(G)
+    tX, tY, al, rX, rY = slice(0, 3), slice(3, 6), 6, slice(7, 16), slice(16, 25)
+    weight = G[:, ONE, ONE, None, None]
+    Rt = G[:, R_A, ONE].reshape(edges, 3, 3)  # sum w R_A'
+    Q = np.zeros((edges, 25, 25))
+    # M_t = [R_A, -I, t_A, 0, -t_B' (x) I] (eq. 30); the upper triangle of sum w M_t' M_t:
+    Q[:, tX, tX] = weight * I3
+    Q[:, tX, tY] = -Rt
+    Q[:, tX, al] = np.einsum("eikk->ei", G[:, R_A, T_A].reshape(edges, 3, 3, 3))
+    # -R_A' (t_B' (x) I): entry (i, 3 j + k) is -R_A[k, i] t_B[j]
+    Q[:, tX, rY] = -G[:, R_A, T_B].reshape(edges, 3, 3, 3).transpose(0, 1, 3, 2).reshape(edges, 3, 9)
+    Q[:, tY, tY] = weight * I3
+    Q[:, tY, al] = -G[:, T_A, ONE]
+    Q[:, tY, rY] = np.einsum("ej,ik->eijk", G[:, T_B, ONE], I3).reshape(edges, 3, 9)
+    Q[:, al, al] = np.einsum("ekk->e", G[:, T_A, T_A])
+    Q[:, al, rY] = -G[:, T_B, T_A].reshape(edges, 9)
+    Q[:, rY, rY] = np.einsum("ejl,ik->ejilk", G[:, T_B, T_B], I3).reshape(edges, 9, 9)
+    _mirror(Q)
+    P = np.zeros((edges, 25, 25))
+    # M_R = [I (x) R_A, -R_B' (x) I] (eq. 25); M_R' M_R has kappa I on the diagonal, -R_B' (x) R_A' beside it.
+    P[:, rX, rX] = kappa[:, None, None] * I9
+    P[:, rY, rY] = kappa[:, None, None] * I9
+    cross = rotation.reshape(edges, 3, 3, 3, 3)  # [i, k, p, q] = sum kappa R_A[k, i] R_B[q, p]
+    P[:, rX, rY] = -cross.transpose(0, 3, 1, 4, 2).reshape(edges, 9, 9)
+    _mirror(P)
+    return 0.5 * Q, 0.5 * P
+
+
+def _mirror(Q: Array) -> None:
+    upper = np.triu_indices(Q.shape[1], 1)
+    Q[:, upper[1], upper[0]] = Q[:, upper[0], upper[1]]
