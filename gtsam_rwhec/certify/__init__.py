@@ -1,0 +1,1 @@
+"""Global solution and certificate of the RWHEC paper's problem: quadratic form, starts, descent, duals, relaxation."""

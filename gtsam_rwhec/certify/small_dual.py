@@ -1,0 +1,127 @@
+"""The small dual (DESIGN fact 4a): better multipliers of all constraints at the same point.
+
+At a critical point x the multipliers of R'R = I are unique, those of all 20 independent constraints are not: each
+rotation has a family of combinations N with N x = 0, 14 of them. Adding them moves Z = Q' - Lambda without touching
+Z x = 0, and may make it positive semidefinite: maximise t subject to Z(y) >= t on the complement of x. A log-barrier
+Newton method on (y, t); it stops as soon as t is safely positive, since any such y proves the same.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+
+from gtsam_rwhec.certify.local_blocks import gram, scatter, traces
+from gtsam_rwhec.certify.reduced_form import ReducedForm
+from gtsam_rwhec.certify.rotations import CONSTRAINTS, vec
+from gtsam_rwhec.poses import Array
+
+
+def null_multipliers(R: Array) -> Array:
+    """(n, 14, 20): orthonormal combinations of the constraints whose matrix N has N x = 0 at x = [vec R, 1]."""
+    local = np.c_[vec(R), np.ones(len(R))]
+    # Column k is A_k x; its rank is 6, the normal space of SO(3) (Theorem 6). Rows of h follow from x'A_k x = 0.
+    columns = np.einsum("kpq,nq->npk", CONSTRAINTS, local)[:, :9]
+    _, _, Vt = np.linalg.svd(columns)
+    return Vt[:, 6:, :]
+
+
+def stationary_multipliers(form: ReducedForm, R: Array, multipliers: Array) -> Array:
+    """The multipliers (n, 20) nearest to the given ones with Z x = 0 at x = [vec R, 1], a critical point."""
+    local = np.c_[vec(R), np.ones(len(R))]
+    x = np.append(local[:, :9].ravel(), 1.0)
+    columns = np.einsum("kpq,nq->npk", CONSTRAINTS, local)[:, :9]
+    residual = form.apply(x)[:-1].reshape(-1, 9) - np.einsum("npk,nk->np", columns, multipliers)
+    correction = np.matmul(np.linalg.pinv(columns, rcond=1e-9), residual[:, :, None])[:, :, 0]
+    result: Array = multipliers + correction
+    return result
+
+
+def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int = 60) -> tuple[Array, float]:
+    """Maximise the smallest eigenvalue of Z on the complement of x over the multipliers' freedom.
+
+    Parameters
+    ----------
+    form : ReducedForm
+    R : (n, 3, 3) array
+        A critical point.
+    multipliers : (n, 20) array
+        With Z x = 0.
+
+    Returns
+    -------
+    multipliers : (n, 20) array
+        Still with Z x = 0.
+    eigenvalue : float
+        The smallest one of Z on the complement of x, reached by them.
+    """
+    n = len(R)
+    null = null_multipliers(R)
+    family = np.einsum("nmk,kpq->nmpq", null, CONSTRAINTS)
+    x = np.append(vec(R).ravel(), 1.0)
+    u = x / np.linalg.norm(x)
+    Z0 = form.dense() - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
+    Z0 = 0.5 * (Z0 + Z0.T)
+    Z0[-1, -1] -= float(x @ Z0 @ x)  # the multiplier of h^2 = 1: then Z x = 0 in h's row too
+    scale = float(np.abs(np.diagonal(Z0)).max())
+    Z0 /= scale
+    # A known positive eigenvalue along x takes it out of the question; t never gets near it.
+    Z0 += 10.0 * np.outer(u, u)
+    y = np.zeros(14 * n)
+    t = float(np.linalg.eigvalsh(Z0)[0])
+    t -= 0.1 * max(abs(t), 1e-3)
+    eye = np.eye(len(Z0))
+    weight = 1.0  # of the barrier
+    best = (multipliers, -np.inf)
+    enough = 1e-7
+    for _ in range(max_iterations):
+        Z = Z0 + scatter(np.einsum("nm,nmpq->npq", y.reshape(n, 14), family))
+        factor = scipy.linalg.cho_factor(Z - t * eye, lower=True, check_finite=False)
+        W = scipy.linalg.cho_solve(factor, eye, check_finite=False)
+        W = 0.5 * (W + W.T)
+        if t * scale > best[1]:
+            added = np.einsum("nm,nmk->nk", y.reshape(n, 14), null)
+            best = (multipliers - scale * added, t * scale)
+        if t > enough:
+            break
+        # Newton on -t - weight log det(Z(y) - t I).
+        W2 = W @ W
+        M = gram(family, W, W)
+        along = traces(family, W2).ravel()
+        gradient = np.r_[-weight * traces(family, W).ravel(), -1.0 + weight * np.trace(W)]
+        H = np.empty((14 * n + 1, 14 * n + 1))
+        H[:-1, :-1] = M
+        H[:-1, -1] = H[-1, :-1] = -along
+        H[-1, -1] = np.trace(W2)
+        H *= weight
+        H[np.diag_indices_from(H)] *= 1.0 + 1e-12
+        try:
+            step = -scipy.linalg.solve(H, gradient, assume_a="pos", check_finite=False)
+        except np.linalg.LinAlgError:
+            break
+        decrement = float(np.sqrt(max(-(gradient @ step), 0.0) / weight))
+        direction = scatter(np.einsum("nm,nmpq->npq", step[:-1].reshape(n, 14), family)) - step[-1] * eye
+        length = 1.0 if decrement < 0.25 else 1.0 / (1.0 + decrement)
+        length = _stay_inside(Z - t * eye, direction, 4.0 * length)
+        y = y + length * step[:-1]
+        t += length * step[-1]
+        if decrement < 0.5:
+            if weight * len(Z0) < 1e-9:
+                break
+            weight *= 0.1
+    return best
+
+
+def _stay_inside(S: Array, direction: Array, length: float) -> float:
+    """The largest length among length, 0.5 length, ... with S + length direction positive definite, a little shorter."""
+    while True:
+        try:
+            np.linalg.cholesky(S + length * direction)
+        except np.linalg.LinAlgError:
+            length *= 0.5
+            if length < 1e-12:
+                return 0.0
+        else:
+            return 0.9 * length
+
+
