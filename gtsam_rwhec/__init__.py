@@ -1,0 +1,37 @@
+"""Certifiably optimal robot-world and hand-eye calibration around GTSAM.
+
+State a ``Problem``, ``solve`` it: poses of every sensor and target, with a proof that no better answer exists and
+what the motion leaves undetermined.
+"""
+
+from gtsam_rwhec import errors, simulate
+from gtsam_rwhec.calibration import certify, solve
+from gtsam_rwhec.certify.certificate import Certificate, Status
+from gtsam_rwhec.certify.options import SolveOptions
+from gtsam_rwhec.csv_files import read_csv
+from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
+from gtsam_rwhec.problem import Measurements, Prior, Problem
+from gtsam_rwhec.result_file import read_solution
+from gtsam_rwhec.solution import Residual, Solution, SolvedPart
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Certificate",
+    "Identifiability",
+    "Measurements",
+    "PairIdentifiability",
+    "Prior",
+    "Problem",
+    "Residual",
+    "Solution",
+    "SolveOptions",
+    "SolvedPart",
+    "Status",
+    "certify",
+    "errors",
+    "read_csv",
+    "read_solution",
+    "simulate",
+    "solve",
+]

@@ -1,0 +1,297 @@
+"""``solve`` and ``certify``: a problem in, a proven calibration out."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+import warnings
+from collections.abc import Callable, Mapping
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec import identifiability
+from gtsam_rwhec.certify import certificate as certificates
+from gtsam_rwhec.certify.certificate import OBJECTIVES, Certificate, Status
+from gtsam_rwhec.certify.nonnegative import run_with_nonnegative_scale
+from gtsam_rwhec.certify.options import Method, SolveOptions, check_method
+from gtsam_rwhec.certify.parts import Part, connected_components, parts_of
+from gtsam_rwhec.certify.search import Forms, Found, Search
+from gtsam_rwhec.certify.variables import Answer, answer_of, as_variables, rotations_as_variables
+from gtsam_rwhec.errors import FrameError, NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError
+from gtsam_rwhec.identifiability import Identifiability, identify
+from gtsam_rwhec.poses import Array, PoseLike, one_transform, to_pose3
+from gtsam_rwhec.problem import Pair, Problem
+from gtsam_rwhec.solution import Residual, Solution, SolvedPart
+from gtsam_rwhec.statistics import ONE
+
+Poses = Mapping[str, PoseLike]
+Scale = float | Mapping[str, float]
+Progress = Callable[[str], None]
+
+
+def solve(
+    problem: Problem,
+    method: Method = "auto",
+    *,
+    initial: tuple[Poses, Poses, Scale] | None = None,
+    options: SolveOptions | None = None,
+    progress: Progress | None = None,
+) -> Solution:
+    """Calibrate: the globally optimal poses and scale, with a proof (RWHEC paper, Algorithm 1).
+
+    Parameters
+    ----------
+    problem : Problem
+    method : "auto", "sdp" or "local"
+        "auto" descends from a spectral start, certifies by duality, and looks further only where that does not
+        suffice; "sdp" always solves the semidefinite relaxation; "local" descends from ``initial``.
+    initial : (X, Y, scale), optional
+        Poses by name, for "local".
+    options : SolveOptions, optional
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+
+    Returns
+    -------
+    Solution
+        With a warning when the measurements leave something free (``NotUniqueWarning``) or optimality is not
+        proven (``NotCertifiedWarning``).
+
+    Raises
+    ------
+    CountError, FrameError, PriorError, UnderdeterminedError
+        For a problem that cannot be solved.
+    ScaleError
+        When the scale is not positive at the optimum.
+    """
+    check_method(method)
+    options = options or SolveOptions()
+    if method == "local" and initial is None:
+        raise OptionError("method='local' needs initial=(X, Y, scale): poses by name to descend from")
+    if method != "local" and initial is not None:
+        raise OptionError(f"initial= is for method='local'; method={method!r} makes its own start")
+    if options.nonnegative_scale and problem.scale != "shared":
+        raise OptionError(f"nonnegative_scale constrains a shared scale; this problem has scale={problem.scale!r}")
+    results = []
+    for part in parts_of(problem):
+        search = Search(part, options, progress)
+        if options.nonnegative_scale:
+            found = run_with_nonnegative_scale(search)
+        elif initial is not None:
+            given = _given_answer(part, *initial)
+            found = search.run(method, rotations_as_variables(part, given.R))
+        else:
+            found = search.run(method, None)
+        results.append(_finish(part, search, found))
+    return _merge(problem, results)
+
+
+def certify(
+    problem: Problem,
+    X: Poses,
+    Y: Poses,
+    scale: Scale = 1.0,
+    *,
+    options: SolveOptions | None = None,
+    progress: Progress | None = None,
+) -> Certificate:
+    """Certify anybody's answer: its cost against a rigorous bound on what any answer costs.
+
+    Parameters
+    ----------
+    problem : Problem
+    X, Y : dict of str to pose
+        T_targetcarrier_target and T_sensorcarrier_sensor.
+    scale : float or dict of str to float
+        One number, or one for each target with scale="per_target".
+    options : SolveOptions, optional
+    progress : callable, optional
+
+    Returns
+    -------
+    Certificate
+        Of the answer as given. "gap" says in ``reason`` whether a better answer was found.
+    """
+    options = options or SolveOptions()
+    parts = parts_of(problem)
+    results = []
+    for part in parts:
+        given = _given_answer(part, X, Y, scale)
+        search = Search(part, options, progress)
+        found = search.run("auto", rotations_as_variables(part, given.R))
+        cost = search.forms.full.value(*as_variables(part, given))
+        tolerance = search.tolerance(cost)
+        ours = _finish(part, search, found).certificate
+        gap = cost - found.lower
+        if gap <= tolerance:
+            status, reason = ours.status, f"proven globally optimal, as given; {ours.reason}"
+        elif cost - found.cost > tolerance:
+            status = Status.GAP
+            reason = f"a better answer exists: {found.cost:.8g} against {cost:.8g}"
+        else:
+            status, reason = Status.GAP, ours.reason
+        results.append(dataclasses.replace(ours, status=status, reason=reason, cost=cost, tolerance=tolerance))
+    return certificates.combined(results)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Result:
+    part: Part
+    answer: Answer
+    certificate: Certificate
+    identifiability: Identifiability
+    residuals: dict[Pair, Residual]
+
+
+def _finish(part: Part, search: Search, found: Found) -> _Result:
+    """Translations, residuals, identifiability and the certificate's words."""
+    start = time.perf_counter()
+    if search.progress is not None:
+        search.progress("identifiability")
+    answer = answer_of(part, search.form, found.R)
+    closed = found.cost - found.lower <= search.tolerance(found.cost)
+    _check_scale(part, answer, closed)
+    residuals, translation_cost, rotation_cost = _residuals(part, search.forms, answer)
+    known = identify(part, search.forms, answer, translation_cost, rotation_cost)
+    search.seconds["identifiability"] = time.perf_counter() - start
+    reason = found.reason
+    if not np.isfinite(found.lower):
+        status = Status.FAILED
+    elif not closed:
+        status = Status.GAP
+    elif known.is_unique:
+        status = Status.CERTIFIED
+    else:
+        status = Status.CERTIFIED_NOT_UNIQUE
+        reason += "; but the measurements leave the answer free: " + "; ".join(known.free_directions[:3])
+    certificate = Certificate(
+        status=status,
+        reason=reason,
+        objective=OBJECTIVES[part.kind] + (", and the priors" if part.priors else ""),
+        path=found.path,
+        cost=found.cost,
+        lower_bound=found.lower,
+        float_bound=found.value if found.definite else found.lower,
+        min_eigenvalue=found.eigenvalue if not found.definite else -max(found.cost - found.lower, 0.0),
+        tolerance=search.tolerance(found.cost),
+        is_relative=part.is_relative,
+        seconds=dict(search.seconds),
+    )
+    return _Result(part, answer, certificate, known, residuals)
+
+
+def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
+    scales = {"the scale": answer.scale} if part.scale == "shared" else {}
+    for name, value in zip(part.free, answer.own_scale, strict=True):
+        if name in part.scale_owners:
+            scales[f"the scale of {name}"] = float(value)
+    for what, value in scales.items():
+        if not (np.isfinite(value) and value > 0.0):
+            raise ScaleError(
+                f"{what} is {value:.6g} at the {'optimum' if proven else 'best point found'}, which no real target "
+                "has: the rotations or translations contradict the frame convention (is B = T_sensor_target? is A "
+                "inverted?), or the noise drowns the scale"
+            )
+
+
+def _residuals(part: Part, forms: Forms, answer: Answer) -> tuple[dict[Pair, Residual], float, float]:
+    """Per-pair root mean squares from the edges' forms, and J_t and J_R of all."""
+    leaf, center, tail = as_variables(part, answer)
+    numbers = np.concatenate([leaf, center, np.zeros((1, 13))])
+    place = {name: i for i, name in enumerate(part.free)}
+    L = len(leaf)
+    x = np.zeros((len(part.pairs), 28))
+    x[:, 26:] = tail
+    for e, pair in enumerate(part.pairs):
+        for name in pair:
+            i = place.get(name, len(numbers) - 1)
+            if name in place:
+                x[e, slice(0, 13) if i < L else slice(13, 26)] = numbers[i]
+    y = np.einsum("eij,ej->ei", forms.substitution, x)
+    J_t = np.maximum(np.einsum("ei,eij,ej->e", y, forms.edges_translation, y), 0.0)
+    J_R = np.maximum(np.einsum("ei,eij,ej->e", y, forms.edges_rotation, y), 0.0)
+    in_metres = answer.scale if part.kind == "direct" else 1.0
+    residuals = {}
+    for e, (pair, moments) in enumerate(zip(part.pairs, part.moments, strict=True)):
+        rms = float(np.sqrt(2.0 * J_t[e] / moments.translation[ONE, ONE])) / abs(in_metres)
+        chord = float(np.sqrt(2.0 * J_R[e] / moments.kappa))  # |R_A R_X - R_Y R_B|_F = sqrt(8) sin(angle / 2)
+        residuals[pair] = Residual(moments.count, rms, 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0)))))
+    return residuals, float(J_t.sum()), float(J_R.sum())
+
+
+def _merge(problem: Problem, results: list[_Result]) -> Solution:
+    X: dict[str, gtsam.Pose3] = {}
+    Y: dict[str, gtsam.Pose3] = {}
+    scales: dict[str, float] = {}
+    residuals: dict[Pair, Residual] = {}
+    for result in results:
+        part = result.part
+        poses = {
+            name: to_pose3(R, t + part.frame_shift(name))
+            for name, R, t in zip(part.free, result.answer.R, result.answer.t, strict=True)
+        }
+        for name in part.fixed:
+            T = problem.fixed[name]
+            poses[name] = to_pose3(T[:3, :3], T[:3, 3])
+        X |= {name: poses[name] for name in part.targets}
+        Y |= {name: poses[name] for name in part.sensors}
+        if problem.scale == "per_target":
+            scales |= part.fixed_scales
+            own = dict(zip(part.free, result.answer.own_scale, strict=True))
+            scales |= {name: float(own[name]) for name in part.scale_owners}
+        residuals |= result.residuals
+    certificate = certificates.combined([result.certificate for result in results])
+    components = tuple(tuple(component) for component in connected_components(problem.pairs))
+    known = identifiability.combined([result.identifiability for result in results], components)
+    if not known.is_unique:
+        warnings.warn(
+            "the measurements do not determine the answer: " + "; ".join(known.free_directions),
+            NotUniqueWarning,
+            stacklevel=3,
+        )
+    if not certificate.is_optimal:
+        warnings.warn(f"not proven optimal: {certificate.reason}", NotCertifiedWarning, stacklevel=3)
+    scale: float | dict[str, float] = 1.0
+    if problem.scale == "per_target":
+        scale = {name: scales[name] for name in dict.fromkeys(t for t, _ in problem.pairs)}
+    elif problem.scale == "shared":
+        scale = results[0].answer.scale
+    return Solution(
+        X={name: X[name] for name in problem.targets},
+        Y={name: Y[name] for name in problem.sensors},
+        scale=scale,
+        scale_mode=problem.scale,
+        cost=certificate.cost,
+        is_relative=problem.is_relative,
+        certificate=certificate,
+        identifiability=known,
+        residuals={pair: residuals[pair] for pair in problem.pairs},
+        parts=tuple(SolvedPart(result.part.names, result.certificate) for result in results),
+    )
+
+
+def _given_answer(part: Part, X: Poses, Y: Poses, scale: Scale) -> Answer:
+    """The user's poses about the part's gauge."""
+    transforms = []
+    for name in part.free:
+        poses, what = (X, "X") if name in part.targets else (Y, "Y")
+        if name not in poses:
+            raise FrameError(f"{what} has no pose of {name!r}; it has {', '.join(map(repr, poses)) or 'none'}")
+        transforms.append(one_transform(poses[name], f"{what}[{name!r}]"))
+    stacked = np.array(transforms).reshape(-1, 4, 4)
+    shift = np.array([part.frame_shift(name) for name in part.free]).reshape(-1, 3)
+    own = np.full(len(part.free), np.nan)
+    for i, name in enumerate(part.free):
+        if name in part.scale_owners:
+            own[i] = _positive(scale[name] if isinstance(scale, Mapping) and name in scale else scale, name)
+    shared = _positive(scale, "all targets") if part.scale == "shared" else 1.0
+    return Answer(np.ascontiguousarray(stacked[:, :3, :3]), stacked[:, :3, 3] - shift, own, shared)
+
+
+def _positive(scale: Scale, name: str) -> float:
+    if isinstance(scale, Mapping) or not (np.isfinite(scale) and scale > 0.0):
+        raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number")
+    return float(scale)
+
+

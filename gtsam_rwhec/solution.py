@@ -1,0 +1,87 @@
+"""What solving returns: poses, scale, cost, certificate, identifiability, residuals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import gtsam
+
+from gtsam_rwhec.certify.certificate import Certificate, Status
+from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
+from gtsam_rwhec.problem import Pair, ScaleMode
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Root mean squares of a pair's residuals, weighted as the cost weighs them.
+
+    translation_rms_m is of |R_A t_X + t_A - t_Y - R_Y t_B / scale| in true metres, rotation_rms_rad of the angle of
+    R_A R_X against R_Y R_B.
+    """
+
+    number_of_measurements: int
+    translation_rms_m: float
+    rotation_rms_rad: float
+
+
+@dataclass(frozen=True)
+class SolvedPart:
+    """The frames of one unconnected part and its own certificate."""
+
+    names: tuple[str, ...]
+    certificate: Certificate
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A calibration.
+
+    Attributes
+    ----------
+    X : dict of str to gtsam.Pose3
+        T_targetcarrier_target of each target, metres.
+    Y : dict of str to gtsam.Pose3
+        T_sensorcarrier_sensor of each sensor, metres.
+    scale : float or dict of str to float
+        t_B = scale * true length: 1 when known, one number when shared, one for each target otherwise (and for
+        each sensor with motions of its own).
+    scale_mode : "known", "shared" or "per_target"
+    cost : float
+        J; half a chi-square when the weights are true.
+    is_relative : bool
+        Whether unit weights were used, which makes costs (and covariances) relative.
+    certificate : Certificate
+    identifiability : Identifiability
+    residuals : dict of (target, sensor) to Residual
+    parts : tuple of SolvedPart
+        The unconnected parts that were solved apart; one when all is connected.
+    """
+
+    X: dict[str, gtsam.Pose3]
+    Y: dict[str, gtsam.Pose3]
+    scale: float | dict[str, float]
+    scale_mode: ScaleMode
+    cost: float
+    is_relative: bool
+    certificate: Certificate
+    identifiability: Identifiability
+    residuals: dict[Pair, Residual]
+    parts: tuple[SolvedPart, ...]
+
+    def write_json(self, path: str | Path) -> None:
+        """Write the documented JSON file (``gtsam_rwhec.result_file``)."""
+        from gtsam_rwhec.result_file import write_solution  # the file format imports this module
+
+        write_solution(self, path)
+
+
+__all__ = [
+    "Certificate",
+    "Identifiability",
+    "PairIdentifiability",
+    "Residual",
+    "Solution",
+    "SolvedPart",
+    "Status",
+]
