@@ -20,7 +20,7 @@ from gtsam_rwhec.certify.search import Forms, Found, Search
 from gtsam_rwhec.certify.variables import Answer, answer_of, as_variables, rotations_as_variables
 from gtsam_rwhec.errors import FrameError, NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError
 from gtsam_rwhec.identifiability import Identifiability, identify
-from gtsam_rwhec.poses import Array, PoseLike, one_transform, to_pose3
+from gtsam_rwhec.poses import PoseLike, one_transform, to_pose3
 from gtsam_rwhec.problem import Pair, Problem
 from gtsam_rwhec.solution import Residual, Solution, SolvedPart
 from gtsam_rwhec.statistics import ONE
@@ -293,5 +293,3 @@ def _positive(scale: Scale, name: str) -> float:
     if isinstance(scale, Mapping) or not (np.isfinite(scale) and scale > 0.0):
         raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number")
     return float(scale)
-
-

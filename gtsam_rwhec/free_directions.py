@@ -18,9 +18,7 @@ _REASONS = {
 }
 
 
-def describe(
-    names: tuple[str, ...], basis: Array, length_m: float, axes: dict[str, int], scale_mode: str
-) -> list[str]:
+def describe(names: tuple[str, ...], basis: Array, length_m: float, axes: dict[str, int], scale_mode: str) -> list[str]:
     """One sentence for each frame, and for each scale, that the directions move.
 
     Parameters

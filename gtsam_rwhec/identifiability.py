@@ -150,7 +150,10 @@ def identify(
     if weak.free.any():
         frames_noise = np.concatenate([noise_frames.ravel(), [noise_scale]])
         basis = weak.vectors[:, weak.free] / np.sqrt(np.where(frames_noise > 0.0, frames_noise, 1.0))[:, None]
-        seen = {name: max((a for a, pair in zip(axes, part.pairs, strict=True) if name in pair), default=0) for name in index}
+        seen = {
+            name: max((a for a, pair in zip(axes, part.pairs, strict=True) if name in pair), default=0)
+            for name in index
+        }
         free = describe(part.free, basis, length, seen, part.scale)
     pairs = _pairs(part, forms, P, ends, own, noise, axes, length)
     return Identifiability(
@@ -230,7 +233,7 @@ def _weakest(info: Information, leaf_noise: Array, border_noise: Array, counts: 
     squares = 1.0 / np.maximum((share**2 / (2.0 * counts[:, None])).sum(axis=0), 1e-300)
     thresholds = _threshold(squares, redundancy)
     order = np.argsort(values / thresholds)
-    assert L * 7 <= len(used)
+    assert len(used) >= L * 7
     return _Weak(values[order], vectors[:, order], thresholds[order])
 
 
@@ -308,8 +311,8 @@ def _pairs(
         if free.any():
             names = tuple(dict.fromkeys(name for name in sorted(pair, key=lambda x: index.get(x, -1)) if name in index))
             basis = vectors[e][:, free] / np.sqrt(np.where(used[e], noise_diagonal[e], 1.0))[:, None]
-            rows = [7 * (0 if index[name] < L else 1) + k for name in names for k in range(7)] + [14]
-            sentences = describe(names, basis[rows], length, dict.fromkeys(names, axes[e]), part.scale)
+            kept = [7 * (0 if index[name] < L else 1) + k for name in names for k in range(7)] + [14]
+            sentences = describe(names, basis[kept], length, dict.fromkeys(names, axes[e]), part.scale)
         result[pair] = PairIdentifiability(
             not free.any(), sentences, axes[e], int(counts[e]), float(values[e, 0]), float(threshold[e])
         )

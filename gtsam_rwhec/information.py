@@ -14,7 +14,6 @@ import numpy as np
 from gtsam_rwhec.certify.full_form import FullForm
 from gtsam_rwhec.certify.parts import Part
 from gtsam_rwhec.certify.rotations import tangent_basis, vec
-from gtsam_rwhec.certify.search import Forms
 from gtsam_rwhec.certify.variables import Answer, as_variables
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.statistics import ONE

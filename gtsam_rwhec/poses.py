@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from gtsam_rwhec.errors import PoseError
 
-Array = NDArray[np.float64]
+#: Arrays of real numbers; double precision unless said otherwise.
+Array = NDArray[np.floating[Any]]
 QuaternionOrder = Literal["wxyz", "xyzw"]
 PoseLike = ArrayLike | gtsam.Pose3
 PosesLike = ArrayLike | Sequence[gtsam.Pose3]
@@ -49,15 +50,14 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
     """
     if isinstance(poses, gtsam.Pose3):
         return poses.matrix()[None]
-    if not isinstance(poses, np.ndarray) and isinstance(poses, Sequence) and len(poses):
-        if isinstance(poses[0], gtsam.Pose3):
-            for index, pose in enumerate(poses):
-                if not isinstance(pose, gtsam.Pose3):
-                    raise PoseError(
-                        f"{where}: entry {index} is a {type(pose).__name__} in a list of gtsam.Pose3; "
-                        "give one kind of pose in a list"
-                    )
-            return np.array([pose.matrix() for pose in poses])
+    if isinstance(poses, (list, tuple)) and poses and isinstance(poses[0], gtsam.Pose3):
+        for index, pose in enumerate(poses):
+            if not isinstance(pose, gtsam.Pose3):
+                raise PoseError(
+                    f"{where}: entry {index} is a {type(pose).__name__} in a list of gtsam.Pose3; "
+                    "give one kind of pose in a list"
+                )
+        return np.array([pose.matrix() for pose in poses])
     try:
         array = np.asarray(poses, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -74,9 +74,7 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
         return _from_quaternion_rows(array, order, where)
     if array.size == 0:
         return np.empty((0, 4, 4))
-    raise PoseError(
-        f"{where}: shape {array.shape} is not one of (N, 4, 4), (N, 7) and no list of gtsam.Pose3"
-    )
+    raise PoseError(f"{where}: shape {array.shape} is not one of (N, 4, 4), (N, 7) and no list of gtsam.Pose3")
 
 
 def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str) -> Array:
@@ -176,7 +174,7 @@ def checked_rows(block: Array, first: int, where: str) -> tuple[Array, int]:
 def orthonormality(rows: Array) -> Array:
     """Largest entry of |R'R - I| of each column of ``rows`` (12 or 9, b)."""
     c = rows[:9].reshape(3, 3, -1)
-    deviation = np.abs((c[0] * c[0]).sum(axis=0) - 1.0)
+    deviation: Array = np.abs((c[0] * c[0]).sum(axis=0) - 1.0)
     for i, j in ((1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
         np.maximum(deviation, np.abs((c[i] * c[j]).sum(axis=0) - (i == j)), out=deviation)
     return deviation
@@ -209,7 +207,8 @@ def one_transform(pose: PoseLike, where: str) -> Array:
     if len(transforms) != 1:
         raise PoseError(f"{where}: {len(transforms)} poses where one is expected")
     rows, _ = checked_rows(transforms, 0, where)
-    return rows_to_transforms(rows)[0]
+    transform: Array = rows_to_transforms(rows)[0]
+    return transform
 
 
 def rows_to_transforms(rows: Array) -> Array:

@@ -376,7 +376,7 @@ class Problem:
         """
         if self.scale != "per_target":
             raise ScaleError(f"fix_scale({name!r}) needs scale='per_target'; this problem has scale={self.scale!r}")
-        if not (np.isscalar(scale) and np.isfinite(scale) and scale > 0):
+        if not (isinstance(scale, (int, float)) and np.isfinite(scale) and scale > 0):
             raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number (measured / true length)")
         if self.fixed_scales.get(name, scale) != scale:
             raise ScaleError(f"the scale of {name} is fixed at {self.fixed_scales[name]} already, and now at {scale}")

@@ -20,6 +20,7 @@ is a true one on the optimum of the stored D, C, E, G of ``ReducedForm``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -121,7 +122,9 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
             return Bound(-np.inf, float(value), False, False, -np.inf, direction)
     slack = np.r_[slack_leaf.ravel(), slack_border].reshape(n, 9)
     # |z_i|_F <= 2 sqrt(3) for each rotation.
-    loss = float(12.0 * slack.max(axis=1).sum() + 2.0 * np.sqrt(12.0) * np.linalg.norm(reach.reshape(n, 9), axis=1).sum())
+    loss = float(
+        12.0 * slack.max(axis=1).sum() + 2.0 * np.sqrt(12.0) * np.linalg.norm(reach.reshape(n, 9), axis=1).sum()
+    )
     lower = _round_down(value - Wide(value_error) - Wide(loss * (1.0 + 1e-10)))
     return Bound(lower, float(value), False, semidefinite, -float(slack.max()), None if semidefinite else direction)
 
@@ -138,18 +141,19 @@ def exact_value(form: ReducedForm, x: Array) -> tuple[float, float]:
     return float(value), error + UNIT * abs(float(value))
 
 
-def _round_down(value: np.longdouble) -> float:
+def _round_down(value: Any) -> float:
     return float(np.nextafter(float(value), -np.inf))
 
 
-def _lagrangian(form: ReducedForm, multipliers: Array, r: Array) -> tuple[np.longdouble, np.ndarray, float, Array]:
+def _lagrangian(form: ReducedForm, multipliers: Array, r: Array) -> tuple[Any, Array, float, Array]:
     """x'Zx and (Zx)_r for x = [r, 1] in extended precision, each with a bound on its rounding error."""
     n, split = form.rotations, 9 * form.leaves
     x = np.append(r, 1.0)
     wide_x = x.astype(Wide)
 
-    def evaluate(y: np.ndarray, D: np.ndarray, C: np.ndarray, E: np.ndarray, G: np.ndarray, Lambda: np.ndarray, minus: int) -> np.ndarray:
+    def evaluate(y: Array, stored: tuple[Array, ...], Lambda: Array, minus: int) -> Array:
         """(D, C, E) y - G'(G y) - Lambda y; with absolute values and minus = -1, what bounds the rounding."""
+        D, C, E, G = stored
         leaf, border = y[:split], y[split:]
         local = np.empty((n, 10), dtype=y.dtype)
         local[:, :9], local[:, 9] = y[:-1].reshape(n, 9), y[-1]
@@ -164,9 +168,9 @@ def _lagrangian(form: ReducedForm, multipliers: Array, r: Array) -> tuple[np.lon
 
     stored = (form.D, form.wide, form.E, form.G)
     Lambda = (multipliers.astype(Wide) @ CONSTRAINTS_FLAT.astype(Wide)).reshape(n, 10, 10)
-    z = evaluate(wide_x, *(m.astype(Wide) for m in stored), Lambda, 1)
+    z = evaluate(wide_x, tuple(m.astype(Wide) for m in stored), Lambda, 1)
     size_Lambda = (np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)).reshape(n, 10, 10)
-    size = evaluate(np.abs(x), *(np.abs(m) for m in stored), size_Lambda, -1)
+    size = evaluate(np.abs(x), tuple(np.abs(m) for m in stored), size_Lambda, -1)
     # No entry of z is made by more operations than this; sums within sums add their counts.
     unit = gamma(2 * form.size + len(form.G) + 60, WIDE_UNIT)
     z_error = unit * size * (1.0 + gamma(4 * form.size))
@@ -216,5 +220,5 @@ def _smallest_eigenpair(D: Array, C: Array, E: Array, form: ReducedForm) -> tupl
         return float(values[0]), vectors[:, 0]
     except ArpackNoConvergence as stopped:
         if len(stopped.eigenvalues):
-            return float(stopped.eigenvalues[0]), stopped.eigenvectors[:, 0]
+            return float(stopped.eigenvalues[0]), np.real(stopped.eigenvectors[:, 0])
         return -form.magnitude, start / np.linalg.norm(start)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -54,73 +55,113 @@ class Relaxation:
 def solve_by_blocks(
     Q: Array, tolerance: float, max_iterations: int, progress: Callable[[str], None] | None = None
 ) -> Relaxation:
-    """Solve the relaxation of Q' (9 n + 1 square, symmetric) to a relative gap of ``tolerance``."""
+    """Solve the relaxation of Q' (9 n + 1 square, symmetric) to a relative gap of ``tolerance``.
+
+    Stops earlier where double precision ends; the gap between ``primal`` and ``dual`` says how far it came.
+    """
     size = len(Q)
-    n = (size - 1) // 9
     scale = float(np.abs(Q).max()) or 1.0
     C = Q / scale
-    family = np.broadcast_to(CONSTRAINTS, (n, 20, 10, 10))
-    eye = np.eye(size)
+    point = _strictly_feasible(C)
+    iteration = 0
+    for iteration in range(1, max_iterations + 1):
+        primal, gap = float(np.vdot(C, point.X)), float(np.vdot(point.X, point.Z))
+        if progress is not None and iteration % 5 == 1:
+            progress(f"semidefinite relaxation, iteration {iteration}, gap {gap / (1e-12 + abs(primal)):.1e}")
+        if gap <= tolerance * max(abs(primal), 1e-12):
+            break
+        try:
+            system = _Newton.at(point)
+        except np.linalg.LinAlgError:
+            break  # the end of what double precision gives
+        # Mehrotra: how far the pure Newton step gets tells how much centring the real one needs.
+        affine = system.direction(0.0, None)
+        a_primal, a_dual = _step_length(point.X, affine.X, 1.0), _step_length(point.Z, affine.Z, 1.0)
+        after = float(np.vdot(point.X + a_primal * affine.X, point.Z + a_dual * affine.Z)) / gap
+        sigma = min(1.0, max(1e-4, after**2 if after < 0.3 else after))
+        step = system.direction(sigma * gap / size, affine.X @ affine.Z)
+        a_primal, a_dual = _step_length(point.X, step.X, 0.95), _step_length(point.Z, step.Z, 0.95)
+        if max(a_primal, a_dual) < 1e-6:
+            break
+        point = _Point(
+            point.X + a_primal * step.X,
+            point.multipliers + a_dual * step.multipliers,
+            point.gamma + a_dual * step.gamma,
+            point.Z + a_dual * step.Z,
+        )
+    X = point.X / point.X[-1, -1]
+    return Relaxation(
+        X,
+        scale * point.multipliers,
+        0.0,
+        scale * float(np.vdot(C, X)),
+        scale * point.gamma,
+        iteration,
+        "interior point (blocks)",
+    )
 
-    # Strictly feasible: the mean of SO(3) with a spread, and S = -c I with gamma low enough.
-    X = np.diag(np.r_[np.full(9 * n, 1.0 / 3.0), 1.0])
-    c = float(np.abs(C).sum(axis=1).max())
+
+@dataclass(frozen=True)
+class _Point:
+    """An iterate, or a step from one: X, lambda (n, 20), gamma, Z."""
+
+    X: Array
+    multipliers: Array
+    gamma: float
+    Z: Array
+
+
+def _strictly_feasible(C: Array) -> _Point:
+    """The mean of SO(3) with its spread; and lambda on R'R = I so negative that Z is dominated by its diagonal."""
+    n = (len(C) - 1) // 9
+    c = 1.1 * float(np.abs(C).sum(axis=1).max())
     multipliers = np.zeros((n, 20))
     multipliers[:, :3] = -c
     gamma = float(C[-1, -1]) - 3.0 * n * c - c
+    Z = C - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
+    Z[-1, -1] -= gamma
+    return _Point(np.diag(np.r_[np.full(9 * n, 1.0 / 3.0), 1.0]), multipliers, gamma, Z)
 
-    def slack(multipliers: Array, gamma: float) -> Array:
-        Z = C - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
-        Z[-1, -1] -= gamma
-        return Z
 
-    Z = slack(multipliers, gamma)
-    iteration = 0
-    for iteration in range(1, max_iterations + 1):
-        primal, gap = float(np.vdot(C, X)), float(np.vdot(X, Z))
-        if progress is not None and iteration % 5 == 1:
-            progress(f"semidefinite relaxation, iteration {iteration}, gap {gap / (1e-12 + abs(primal)):.1e}")
-        if gap <= tolerance * max(abs(primal), 1e-9 * c) and _infeasibility(family, X) < 1e-9:
-            break
-        factor = scipy.linalg.cho_factor(Z, lower=True, check_finite=False)
-        W = scipy.linalg.cho_solve(factor, eye, check_finite=False)
-        W = 0.5 * (W + W.T)
-        M = _schur(family, X, W)
-        try:
-            M_factor = scipy.linalg.cho_factor(M, lower=True, check_finite=False)
-        except np.linalg.LinAlgError:
-            break  # the end of what double precision gives
-        mu = gap / size
+@dataclass(frozen=True)
+class _Newton:
+    """The linear system of X Z = target I at a point, factored once for predictor and corrector."""
 
-        def direction(
-            target: float, correction: Array | None, X: Array = X, Z: Array = Z, W: Array = W, M_factor: Array = M_factor
-        ) -> tuple[Array, float, Array, Array]:
-            """Solve for (dlambda, dgamma, dX, dZ) of X Z = target I."""
-            base = target * W if correction is None else target * W - _symmetric(correction @ W)
-            right = -np.r_[traces(family, base).ravel(), base[-1, -1] - 1.0]
-            step = scipy.linalg.cho_solve(M_factor, right, check_finite=False)
-            d_multipliers, d_gamma = step[:-1].reshape(n, 20), float(step[-1])
-            dZ = -scatter(np.einsum("nk,kpq->npq", d_multipliers, CONSTRAINTS))
-            dZ[-1, -1] -= d_gamma
-            dX = base - X - _symmetric(X @ dZ @ W)
-            return d_multipliers, d_gamma, dX, dZ
+    point: _Point
+    W: Array
+    family: Array
+    factor: Any
 
-        _, _, dX, dZ = direction(0.0, None)
-        a_primal, a_dual = _step_length(X, dX, 1.0), _step_length(Z, dZ, 1.0)
-        after = float(np.vdot(X + a_primal * dX, Z + a_dual * dZ)) / gap
-        sigma = min(1.0, max(1e-6, after) ** 3)
-        d_multipliers, d_gamma, dX, dZ = direction(sigma * mu, dX @ dZ)
-        a_primal, a_dual = _step_length(X, dX, 0.98), _step_length(Z, dZ, 0.98)
-        if max(a_primal, a_dual) < 1e-6:
-            break
-        X = X + a_primal * dX
-        multipliers = multipliers + a_dual * d_multipliers
-        gamma += a_dual * d_gamma
-        Z = slack(multipliers, gamma)
-    X = X / X[-1, -1]
-    return Relaxation(
-        X, scale * multipliers, 0.0, scale * float(np.vdot(C, X)), scale * gamma, iteration, "interior point (blocks)"
-    )
+    @staticmethod
+    def at(point: _Point) -> _Newton:
+        n = len(point.multipliers)
+        family = np.broadcast_to(CONSTRAINTS, (n, 20, 10, 10))
+        lower = scipy.linalg.cho_factor(point.Z, lower=True, check_finite=False)
+        W = _symmetric(scipy.linalg.cho_solve(lower, np.eye(len(point.Z)), check_finite=False))
+        M = _schur(family, point.X, W)
+        # X tends to rank one and M to a singular matrix: what rounding took from its diagonal is given back, no more
+        # than needed. The next step mends what that leaves of infeasibility.
+        diagonal = np.diagonal(M).copy()
+        for relative in (0.0, 1e-14, 1e-12, 1e-10):
+            M[np.diag_indices_from(M)] = diagonal * (1.0 + relative)
+            try:
+                return _Newton(point, W, family, scipy.linalg.cho_factor(M, lower=True, check_finite=False))
+            except np.linalg.LinAlgError:
+                continue
+        raise np.linalg.LinAlgError("the Schur complement is numerically singular")
+
+    def direction(self, target: float, correction: Array | None) -> _Point:
+        """The HKM direction: dX = target W - X - sym(X dZ W) - sym(correction W), with X's constraints kept."""
+        n = len(self.point.multipliers)
+        base = target * self.W
+        if correction is not None:
+            base = base - _symmetric(correction @ self.W)
+        right = -np.r_[traces(self.family, base).ravel(), base[-1, -1] - 1.0]
+        solved = scipy.linalg.cho_solve(self.factor, right, check_finite=False)
+        multipliers, gamma = solved[:-1].reshape(n, 20), float(solved[-1])
+        dZ = -scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
+        dZ[-1, -1] -= gamma
+        return _Point(base - self.point.X - _symmetric(self.point.X @ dZ @ self.W), multipliers, gamma, dZ)
 
 
 def _schur(family: Array, X: Array, W: Array) -> Array:
@@ -138,10 +179,6 @@ def _schur(family: Array, X: Array, W: Array) -> Array:
 def _symmetric(M: Array) -> Array:
     result: Array = 0.5 * (M + M.T)
     return result
-
-
-def _infeasibility(family: Array, X: Array) -> float:
-    return float(np.abs(traces(family, X)).max(initial=0.0))
 
 
 def _step_length(S: Array, dS: Array, fraction: float) -> float:

@@ -14,7 +14,7 @@ from gtsam_rwhec.poses import Array
 
 def local_indices(n: int) -> np.ndarray:
     """(n, 10): rows [9 i, ..., 9 i + 8, 9 n] of each rotation."""
-    return np.c_[np.arange(9 * n).reshape(n, 9), np.full(n, 9 * n)]
+    return np.concatenate([np.arange(9 * n).reshape(n, 9), np.full((n, 1), 9 * n)], axis=1)
 
 
 def scatter(blocks: Array) -> Array:

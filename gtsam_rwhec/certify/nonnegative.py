@@ -71,7 +71,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
         nu = max(relaxation.scale_multiplier, 0.0)
         point = relaxation.X[:-1, -1] / relaxation.X[-1, -1]
         bound = lower_bound(with_scale_multiplier(form, nu), relaxation.multipliers, point)
-    if not positive or min(end.cost for end in positive) > bound.lower + 1e-3 * max(abs(bound.lower), 1.0) and nu > 0:
+    if not positive or (min(end.cost for end in positive) > bound.lower + 1e-3 * max(abs(bound.lower), 1.0) and nu > 0):
         raise ScaleError(
             f"with alpha >= 0 as a constraint the optimum is at scale zero (cost at least {bound.lower:.6g}; the "
             f"unconstrained optimum, {found.cost:.6g}, has a negative scale): the noise drowns the scale"
@@ -88,4 +88,3 @@ def run_with_nonnegative_scale(search: Search) -> Found:
         "relaxation with alpha >= 0",
         "the unconstrained optimum has a negative scale; bounded by the relaxation with alpha >= 0",
     )
-

@@ -46,9 +46,7 @@ def solve_relaxation(
     return solve_by_blocks(Q, tolerance, max_iterations, progress)
 
 
-def solve_by_clarabel(
-    Q: Array, tolerance: float, max_iterations: int, scale_row: Array | None = None
-) -> Relaxation:
+def solve_by_clarabel(Q: Array, tolerance: float, max_iterations: int, scale_row: Array | None = None) -> Relaxation:
     """The dual, max gamma s.t. Z(lambda) >= 0, as Clarabel's problem; its cone's dual variable is X."""
     size = len(Q)
     n = (size - 1) // 9
@@ -101,7 +99,7 @@ def _constraint_columns(n: int, size: int) -> scipy.sparse.csc_matrix:
     values = CONSTRAINTS[k, p, q]
     upper = p <= q  # h is the last of the ten and of the whole
     k, p, q, values = k[upper], p[upper], q[upper], values[upper]
-    rows = [q_global * (q_global + 1) // 2 + p_global for p_global, q_global in ((index[:, p], index[:, q]),)][0]
+    rows = index[:, q] * (index[:, q] + 1) // 2 + index[:, p]
     cols = 20 * np.arange(n)[:, None] + k
     data = np.broadcast_to(np.where(p == q, values, np.sqrt(2.0) * values), rows.shape)
     last = size * (size + 1) // 2

@@ -55,7 +55,8 @@ def vec(R: Array) -> Array:
 
 def unvec(r: Array) -> Array:
     """(n, 9) or (9 n,) to (n, 3, 3)."""
-    return r.reshape(-1, 3, 3).transpose(0, 2, 1)
+    stack: Array = r.reshape(-1, 3, 3).transpose(0, 2, 1)
+    return stack
 
 
 def tangent_basis(R: Array) -> Array:
@@ -79,7 +80,8 @@ def retract(R: Array, w: Array) -> Array:
     first = np.sinc(theta / np.pi)
     second = 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
     S = R @ (np.eye(3) + first * W + second * (W @ W))
-    return 1.5 * S - 0.5 * S @ (S.transpose(0, 2, 1) @ S)
+    result: Array = 1.5 * S - 0.5 * S @ (S.transpose(0, 2, 1) @ S)
+    return result
 
 
 def project(M: Array) -> Array:

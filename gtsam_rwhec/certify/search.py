@@ -13,10 +13,11 @@ from gtsam_rwhec.certify import small_dual
 from gtsam_rwhec.certify.bound import Bound, exact_value, lower_bound
 from gtsam_rwhec.certify.descent import Descent, descend, homogeneous
 from gtsam_rwhec.certify.full_form import FullForm, add_priors, assemble, edge_slots, forms_of_edges
+from gtsam_rwhec.certify.interior_point import Relaxation
 from gtsam_rwhec.certify.options import Method, SolveOptions
 from gtsam_rwhec.certify.parts import Part
 from gtsam_rwhec.certify.reduced_form import ReducedForm, reduce
-from gtsam_rwhec.certify.relaxation import Relaxation, round_to_rotations, solve_relaxation
+from gtsam_rwhec.certify.relaxation import round_to_rotations, solve_relaxation
 from gtsam_rwhec.certify.rotations import kkt_multipliers, project, random_rotations, unvec, vec
 from gtsam_rwhec.certify.start import spectral_start, unconstrained_start
 from gtsam_rwhec.poses import Array
@@ -188,7 +189,8 @@ class Search:
 
     def _better_starts(self) -> bool:
         """Look for a lower critical point: along the negative curvature of Z, from Q' as a whole, at random."""
-        assert self.best is not None and self.bound is not None
+        assert self.best is not None
+        assert self.bound is not None
         starts = []
         if self.bound.direction is not None:
             direction = self.bound.direction * np.sqrt(3.0 * self.form.rotations)
@@ -210,7 +212,8 @@ class Search:
             )
 
     def _found(self, reason: str) -> Found:
-        assert self.best is not None and self.bound is not None
+        assert self.best is not None
+        assert self.bound is not None
         closed = self._is_closed()
         if not closed and not reason:
             reason = (

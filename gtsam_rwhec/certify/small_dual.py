@@ -113,7 +113,7 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
 
 
 def _stay_inside(S: Array, direction: Array, length: float) -> float:
-    """The largest length among length, 0.5 length, ... with S + length direction positive definite, a little shorter."""
+    """The first of length, length / 2, ... that keeps S + length * direction positive definite, a little shorter."""
     while True:
         try:
             np.linalg.cholesky(S + length * direction)
@@ -123,5 +123,3 @@ def _stay_inside(S: Array, direction: Array, length: float) -> float:
                 return 0.0
         else:
             return 0.9 * length
-
-

@@ -43,7 +43,7 @@ def spectral_start(part: Part, rotation_form: FullForm) -> list[Array]:
         # Parts that only the shared scale joins have an eigenvector, and a sign, each.
         for block in _center_blocks(part):
             at = (9 * block[:, None] + np.arange(9)).ravel()
-            values, vectors = scipy.linalg.eigh(
+            _, vectors = scipy.linalg.eigh(
                 S[at[:, None], at], subset_by_index=[0, 0], check_finite=False, overwrite_a=True
             )
             r = vectors[:, 0]
@@ -77,9 +77,7 @@ def unconstrained_start(form: ReducedForm) -> list[Array]:
     """
     C, E = form.C[:, :, :-1], form.E[:-1, :-1]
     shift = 1e-12 * form.magnitude
-    border, square = arrow.with_low_rank(
-        C, E + shift * np.eye(len(E)), form.G_leaf, form.G_border[:, :-1]
-    )
+    border, square = arrow.with_low_rank(C, E + shift * np.eye(len(E)), form.G_leaf, form.G_border[:, :-1])
     factor = arrow.cholesky(form.D + shift * np.eye(9), border, square)
     if factor is None:
         return []
@@ -96,7 +94,7 @@ def unconstrained_start(form: ReducedForm) -> list[Array]:
     candidates = []
     if np.abs(linear).max(initial=0.0) > 0.0:
         candidates.append(solve(-linear))
-    v = np.ones(form.size - 1)
+    v: Array = np.ones(form.size - 1)
     for _ in range(8):
         v = solve(v)
         v /= np.linalg.norm(v)
