@@ -1,0 +1,157 @@
+"""The subcommands of ``gtsam-rwhec`` and their options."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import warnings
+from enum import StrEnum
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gtsam_rwhec import __version__
+from gtsam_rwhec.calibration import solve
+from gtsam_rwhec.cli.demo_data import KAPPA, SIGMA_M, demo_folder
+from gtsam_rwhec.cli.exit_status import HELP, ExitStatus, exit_status
+from gtsam_rwhec.cli.failures import failures_in_words
+from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.csv_files import read_csv
+from gtsam_rwhec.errors import FileFormatError, NotCertifiedWarning, NotUniqueWarning
+from gtsam_rwhec.fetch import UTIAS_URL, fetch_utias
+from gtsam_rwhec.report import print_solution, report_console
+from gtsam_rwhec.result_file import read_solution, write_solution
+
+app = typer.Typer(
+    name="gtsam-rwhec",
+    help="Calibrate sensors against their carriers and targets, with a proof that no answer is better.",
+    epilog=HELP,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+fetch_app = typer.Typer(help="Download public measurements.", no_args_is_help=True)
+app.add_typer(fetch_app, name="fetch")
+
+
+class Scale(StrEnum):
+    """What is known about the scale of the measured translations."""
+
+    known = "known"
+    shared = "shared"
+    per_target = "per_target"
+
+
+class Method(StrEnum):
+    """How to solve."""
+
+    auto = "auto"
+    sdp = "sdp"
+    local = "local"
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"gtsam-rwhec {__version__} (gtsam {version('gtsam')})")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Options of the command itself; what it does is in the subcommands."""
+
+
+@app.command(epilog=HELP)
+def calibrate(
+    folder: Annotated[Path, typer.Argument(help="Folder of <targets>_<id>_<sensors>_<id>_{A,B}.csv files.")],
+    scale: Annotated[Scale, typer.Option(help="Is the targets' size known, wrong by one factor, or by one each?")] = (
+        Scale.known
+    ),
+    sigma: Annotated[
+        float | None, typer.Option(help="Standard deviation of a measured translation along each axis, m.")
+    ] = None,
+    kappa: Annotated[
+        float | None,
+        typer.Option(help="Concentration of a measured rotation: 1/(2 s^2) for a deviation of s rad about each axis."),
+    ] = None,
+    method: Annotated[
+        Method, typer.Option(help="Fastest proof; always the semidefinite relaxation; from --initial only.")
+    ] = Method.auto,
+    targets: Annotated[str, typer.Option(help="The file names' word for targets.")] = "tag",
+    sensors: Annotated[str, typer.Option(help="The file names' word for sensors.")] = "cam",
+    initial: Annotated[
+        Path | None, typer.Option(help="Result of an earlier calibration (JSON) to start from; for --method local.")
+    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the result here as JSON.")] = None,
+) -> None:
+    """Calibrate from a folder of CSV files, and print poses, residuals and the certificate."""
+    if (initial is not None) != (method is Method.local):
+        raise typer.BadParameter("--method local and --initial FILE go together")
+    with failures_in_words():
+        if output is not None and not output.absolute().parent.is_dir():
+            raise FileFormatError(f"{output} cannot be written: there is no folder {output.parent}.")
+        with StageDisplay() as stage, warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotUniqueWarning)  # the report says it, with the directions
+            warnings.simplefilter("ignore", NotCertifiedWarning)
+            stage(f"reading {folder}")
+            problem = read_csv(folder, scale.value, sigma, kappa, targets, sensors, keep_measurements=False)
+            start = None
+            if initial is not None:
+                earlier = read_solution(initial)
+                start = (earlier.X, earlier.Y, earlier.scale)
+            solution = solve(problem, method=method.value, initial=start, progress=stage)
+        try:
+            if output is not None:
+                write_solution(solution, output)
+                typer.echo(f"Written to {output}.", err=True)
+        finally:  # a result that cannot be written is shown all the same
+            print_solution(solution)
+        raise typer.Exit(exit_status(solution))
+
+
+@app.command(epilog=HELP)
+def demo() -> None:
+    """Calibrate three simulated cameras that saw four tags; the measurements come with this package."""
+    folder = demo_folder()
+    command = f"gtsam-rwhec calibrate {shlex.quote(str(folder))} --sigma {SIGMA_M:g} --kappa {KAPPA:.4f}"
+    report_console().print(f"The same as: {command}\n", markup=False, soft_wrap=True)
+    calibrate(folder, sigma=SIGMA_M, kappa=KAPPA)
+
+
+@fetch_app.command(epilog=HELP)
+def utias(
+    destination: Annotated[Path, typer.Argument(help="Folder to write to; made if it is not there.")] = Path("utias"),
+    base_url: Annotated[
+        str, typer.Option(help="Where the files are, for a mirror.", show_default="the authors' repository on GitHub")
+    ] = UTIAS_URL,
+) -> None:
+    """Download the real dataset of the RWHEC paper: 16 tags, 8 cameras, 3230 measurements, 1.4 MB.
+
+    Call it again to go on with an interrupted download; files that are there are verified and kept.
+    """
+    with failures_in_words():
+        with StageDisplay() as stage:
+            fetched = fetch_utias(
+                destination,
+                base_url,
+                lambda done, total, name: stage(f"downloading file {done + 1} of {total}: {name}"),
+            )
+        typer.echo(
+            f"{len(fetched.downloaded)} files downloaded to {fetched.folder}, {len(fetched.already_there)} were there; "
+            "all verified."
+        )
+        typer.echo(f"Next: gtsam-rwhec calibrate {shlex.quote(str(fetched.folder))} --scale shared")
+
+
+def main() -> None:
+    """Entry point of the command ``gtsam-rwhec``."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        sys.exit(ExitStatus.INTERRUPTED)

@@ -1,0 +1,39 @@
+"""What the command's exit status means; scripts may rely on these numbers."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from gtsam_rwhec.solution import Solution, Status
+
+
+class ExitStatus(IntEnum):
+    """Exit statuses of every subcommand."""
+
+    CERTIFIED = 0
+    """Done; a calibration is certified and determined by the measurements."""
+    BAD_INPUT = 2
+    """An argument, a file or a measurement cannot be used; the message says which."""
+    NOT_UNIQUE = 3
+    """No answer is better, but the measurements leave some frames free: do not use those."""
+    NOT_CERTIFIED = 4
+    """An answer without a proof that there is no better one."""
+    DOWNLOAD_FAILED = 5
+    """No network, or not the expected files; what was downloaded stays."""
+    INTERRUPTED = 130
+    """Ctrl-C."""
+
+
+HELP = (
+    "Exit status: 0 certified (or done); 2 bad input; 3 certified, but the measurements do not determine every frame; "
+    "4 not certified; 5 download failed; 130 interrupted."
+)
+
+
+def exit_status(solution: Solution) -> ExitStatus:
+    """The exit status that a solution leads to."""
+    if solution.certificate.status is Status.CERTIFIED_NOT_UNIQUE:
+        return ExitStatus.NOT_UNIQUE
+    if not solution.certificate.is_certified:
+        return ExitStatus.NOT_CERTIFIED
+    return ExitStatus.CERTIFIED if solution.identifiability.is_unique else ExitStatus.NOT_UNIQUE

@@ -1,0 +1,54 @@
+"""How errors and warnings reach a person: one message each, no traceback."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.errors import FetchError, RwhecError, RwhecWarning
+
+
+@contextmanager
+def failures_in_words() -> Iterator[None]:
+    """Turn this package's errors into a message and an exit status, and its warnings into messages.
+
+    Raises
+    ------
+    typer.Exit
+        With the status of `ExitStatus`. Errors of any other kind are faults of the program and pass with a traceback.
+    """
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RwhecWarning)
+        in_python = warnings.showwarning
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, RwhecWarning):
+                console.print(Text("Warning: ", style="bold yellow").append(str(message), style="not bold default"))
+            else:
+                in_python(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = show
+        try:
+            yield
+        except RwhecError as error:
+            console.print(Text("Error: ", style="bold red").append(str(error), style="not bold default"))
+            status = ExitStatus.DOWNLOAD_FAILED if isinstance(error, FetchError) else ExitStatus.BAD_INPUT
+            raise typer.Exit(status) from error
+        except KeyboardInterrupt as error:
+            console.print("Interrupted.")
+            raise typer.Exit(ExitStatus.INTERRUPTED) from error

@@ -1,0 +1,65 @@
+"""What the user sees of a calculation that takes more than a second: its stage and the time, on standard error."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+INTERVAL_S = 1.0
+"""Nothing is shown before this, and lines in a log come no faster."""
+
+
+class StageDisplay:
+    """A context in which stages can be announced: a spinner on a terminal, a line a stage in a log.
+
+    Examples
+    --------
+    >>> with StageDisplay() as stage:
+    ...     stage("reading")
+    """
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = Console(stderr=True, highlight=False) if console is None else console
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            TimeElapsedColumn(),
+            console=self._console,
+            transient=True,
+        )
+        self._task = self._progress.add_task("")
+        self._stage = ""
+        self._finished = threading.Event()
+        self._ticker = threading.Thread(target=self._tick, daemon=True)
+        self._begun_s = time.monotonic()
+
+    def __enter__(self) -> Self:
+        self._ticker.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._finished.set()
+        self._ticker.join()
+        if self._console.is_interactive:
+            self._progress.stop()
+
+    def __call__(self, stage: str) -> None:
+        """Announce what begins now."""
+        self._stage = stage
+        self._progress.update(self._task, description=stage)
+
+    def _tick(self) -> None:
+        shown = ""
+        while not self._finished.wait(INTERVAL_S):
+            if self._console.is_interactive:
+                self._progress.start()  # does nothing when it runs already
+            elif self._stage != shown:
+                shown = self._stage
+                self._console.print(f"[{time.monotonic() - self._begun_s:.0f} s] {shown}", markup=False)

@@ -1,0 +1,114 @@
+"""Tables of calibrated frames: where each one is, and how well its measurements agree with that."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from rich import box
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+from rich.text import Text
+
+from gtsam_rwhec.csv_files import natural_key
+from gtsam_rwhec.solution import Residual, Solution
+
+POSE_LEGEND = (
+    "Translations in metres; rotations as roll, pitch, yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll). Residuals: root "
+    "mean square over the n measurements of a frame, in millimetres and degrees."
+)
+
+POSE_HEADINGS = ("x m", "y m", "z m", "roll°", "pitch°", "yaw°")
+RESIDUAL_HEADINGS = ("rms mm", "rms°", "n")
+
+
+@dataclass(frozen=True)
+class FrameTable:
+    """Frames with numbers under headings; prints itself to any width without cutting a number or a name.
+
+    One table where it fits, poses and residuals apart where that fits, and else a paragraph for each frame.
+    """
+
+    title: str
+    kind: str
+    headings: tuple[str, ...]
+    rows: Mapping[str, tuple[str, ...]]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Choose the widest layout that fits."""
+        split = len(POSE_HEADINGS)
+        for cuts in (((0, None),), ((0, split), (split, None))):
+            tables = [self._table(slice(*cut)) for cut in cuts]
+            unlimited = options.update(max_width=10_000)
+            if all(console.measure(table, options=unlimited).maximum <= options.max_width for table in tables):
+                yield from tables
+                return
+        yield Text(self.title, style="italic")
+        for name, cells in self.rows.items():
+            numbers = ", ".join(f"{heading} {cell}" for heading, cell in zip(self.headings, cells, strict=True))
+            yield Text(f"{name}: {numbers}")
+        yield Text()
+
+    def _table(self, columns: slice) -> Table:
+        # One space between columns and none outside: with short names the whole fits 80 columns.
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+        table.title, table.title_justify = self.title, "left"
+        table.add_column(self.kind, no_wrap=True)
+        for heading in self.headings[columns]:
+            table.add_column(heading, justify="right", no_wrap=True)
+        for name, cells in self.rows.items():
+            table.add_row(Text(name), *cells[columns])
+        return table
+
+
+def sensor_table(solution: Solution) -> FrameTable:
+    """The poses Y = T_sensorcarrier_sensor, one line for each sensor."""
+    return _frame_table("Sensors in the frame that carries them", "sensor", solution.Y, solution)
+
+
+def target_table(solution: Solution) -> FrameTable:
+    """The poses X = T_targetcarrier_target, one line for each target."""
+    return _frame_table("Targets in the frame that carries them", "target", solution.X, solution)
+
+
+def _frame_table(title: str, kind: str, poses: Mapping[str, gtsam.Pose3], solution: Solution) -> FrameTable:
+    scales = solution.scale if isinstance(solution.scale, Mapping) else {}
+    own_scales = any(name in scales for name in poses)
+    rows = {}
+    for name in sorted(poses, key=natural_key):
+        pooled = pooled_residual(residual for pair, residual in solution.residuals.items() if name in pair)
+        scale = (f"{scales[name]:.5f}" if name in scales else "-",) if own_scales else ()
+        rows[name] = (*_pose_cells(poses[name]), *_residual_cells(pooled), *scale)
+    return FrameTable(title, kind, (*POSE_HEADINGS, *RESIDUAL_HEADINGS, *(("scale",) if own_scales else ())), rows)
+
+
+def pooled_residual(residuals: Iterable[Residual]) -> Residual:
+    """The root mean square over all measurements of several pairs."""
+    residuals = tuple(residuals)
+    number = sum(residual.number_of_measurements for residual in residuals)
+    if number == 0:
+        return Residual(0, math.nan, math.nan)
+
+    def pool(rms: Iterable[float]) -> float:
+        squares = (r.number_of_measurements * value**2 for r, value in zip(residuals, rms, strict=True))
+        return math.sqrt(sum(squares) / number)
+
+    return Residual(number, pool(r.translation_rms_m for r in residuals), pool(r.rotation_rms_rad for r in residuals))
+
+
+def _pose_cells(pose: gtsam.Pose3) -> tuple[str, ...]:
+    translation = (f"{value:z.4f}" for value in pose.translation())
+    return *translation, *(f"{value:z.2f}" for value in np.degrees(pose.rotation().rpy()))
+
+
+def _residual_cells(residual: Residual) -> tuple[str, ...]:
+    if residual.number_of_measurements == 0:
+        return "-", "-", "0"
+    return (
+        f"{1e3 * residual.translation_rms_m:.1f}",
+        f"{math.degrees(residual.rotation_rms_rad):.2f}",
+        str(residual.number_of_measurements),
+    )

@@ -1,0 +1,271 @@
+"""The command as people type it: a process of its own, its output and its exit status."""
+
+from __future__ import annotations
+
+import dataclasses
+import http.server
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.simulate import Noise, general
+
+DEMO = Path(__file__).resolve().parents[2] / "data" / "demo"
+NOISE = Noise(sigma_m=0.005, kappa=6000.0)
+COMMAND = (sys.executable, "-m", "gtsam_rwhec.cli")
+
+
+def run(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end."""
+    environment = {**os.environ, "NO_PROXY": "127.0.0.1", "PYTHONIOENCODING": "utf-8"}
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, encoding="utf-8", cwd=cwd, env=environment
+    )
+
+
+def write_csv(problem: rw.Problem, folder: Path) -> Path:
+    """Write a simulated problem in the real dataset's format; target0 and sensor0 become tag_0 and cam_0."""
+    for target, sensor in problem.pairs:
+        measurements = problem.measurements(target, sensor)
+        name = f"tag_{target.removeprefix('target')}_cam_{sensor.removeprefix('sensor')}"
+        for side, poses in (("A", measurements.A), ("B", measurements.B)):
+            rows = []
+            for matrix in poses:
+                q = gtsam.Rot3(matrix[:3, :3]).toQuaternion()
+                rows.append([q.w(), q.x(), q.y(), q.z(), *matrix[:3, 3]])
+            np.savetxt(folder / f"{name}_{side}.csv", rows, delimiter=",")
+    return folder
+
+
+@pytest.fixture
+def serve(utias_folder: Path) -> Iterator[str]:
+    """Address of a server on this machine that serves the real dataset."""
+    handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(utias_folder))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_address[1]}"
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+class SlowServer:
+    """Answers every request after some seconds, with 404."""
+
+    def __init__(self, seconds: float) -> None:
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                time.sleep(seconds)
+                self.send_error(404)
+
+            def log_message(self, format: str, *args: object) -> None:
+                pass
+
+        self._server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.address = f"http://127.0.0.1:{self._server.server_address[1]}"
+        self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.01})
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+@pytest.fixture
+def slow_address() -> Iterator[str]:
+    """Address of a server that takes more than a second for anything."""
+    server = SlowServer(seconds=2.5)
+    yield server.address
+    server.stop()
+
+
+def test_demo_needs_no_arguments(tmp_path: Path) -> None:
+    done = run("demo", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    for words in ("4 targets, 3 sensors, 11 pairs", " cam_2 ", " tag_3 ", "Certified globally optimal", "Time: "):
+        assert words in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_demo_says_how_to_do_the_same() -> None:
+    arguments = run("demo").stdout.splitlines()[0].removeprefix("The same as: gtsam-rwhec ").split()
+    demo, same = run("demo").stdout.splitlines(), run(*arguments).stdout.splitlines()
+    assert [line for line in demo[2:] if "Time:" not in line] == [line for line in same if "Time:" not in line]
+
+
+def test_the_real_dataset_and_its_result_file(utias_folder: Path, tmp_path: Path) -> None:
+    result = tmp_path / "result.json"
+    done = run("calibrate", utias_folder, "--sigma", 1, "--kappa", 1, "-o", result)
+    assert done.returncode == 0, done.stderr
+    assert "16 targets, 8 sensors, 73 pairs, 3230 measurements" in done.stdout
+    assert "this answer costs 8.281245" in done.stdout
+    assert f"Written to {result}." in done.stderr
+    solution = rw.read_solution(result)
+    assert solution.certificate.is_certified
+    assert solution.cost == pytest.approx(8.2812454, abs=1e-7)
+
+
+def test_scale_and_method(utias_folder: Path) -> None:
+    done = run("calibrate", utias_folder, "--scale", "shared", "--sigma", "1", "--kappa", "1")
+    assert done.returncode == 0, done.stderr
+    assert "Scale: 1.025" in done.stdout
+
+
+def test_local_from_an_earlier_result(tmp_path: Path) -> None:
+    assert run("calibrate", DEMO, "-o", tmp_path / "first.json").returncode == 0
+    done = run("calibrate", DEMO, "--method", "local", "--initial", tmp_path / "first.json")
+    assert done.returncode == 0, done.stderr
+    assert "given start" in done.stdout
+
+
+def test_the_relaxation() -> None:
+    done = run("calibrate", DEMO, "--method", "sdp", "--sigma", 0.005, "--kappa", 6565)
+    assert done.returncode == 0, done.stderr
+    assert "relaxation" in done.stdout
+
+
+def test_unit_weights_are_called_relative() -> None:
+    assert "costs and covariances are relative" in run("calibrate", DEMO).stdout
+
+
+def test_words_of_file_names(tmp_path: Path) -> None:
+    for path in DEMO.iterdir():
+        shutil.copy(path, tmp_path / path.name.replace("tag_", "board_").replace("cam_", "lidar_"))
+    done = run("calibrate", tmp_path, "--targets", "board", "--sensors", "lidar")
+    assert done.returncode == 0, done.stderr
+    assert " board_3 " in done.stdout
+    assert " lidar_2 " in done.stdout
+
+
+def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(DEMO, tmp_path / "demo"))
+    with open(folder / "tag_0_cam_1_B.csv", "a", encoding="utf-8") as stream:
+        stream.write("1,0,0,0,oops,0,0\n")
+    done = run("calibrate", folder)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == f"Error: {folder}/tag_0_cam_1_B.csv, line 17: not a finite number: tx is 'oops'.\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["calibrate", "/nowhere"], "/nowhere does not exist"),
+        (["calibrate", DEMO, "--sigma", "-1"], "sigma is -1.0"),
+        (["calibrate", DEMO, "--scale", "unknown"], "unknown"),
+        (["calibrate", DEMO, "--method", "local"], "--initial"),
+        (["calibrate", DEMO, "--initial", "x.json"], "--method local"),
+        (["calibrate", DEMO, "-o", "/nowhere/result.json"], "there is no folder /nowhere"),
+        (["calibrate"], "folder"),
+        (["fetch", "other"], "other"),
+        (["guess"], "guess"),
+    ],
+)
+def test_what_cannot_be_done_is_status_2(arguments: list[object], said: str) -> None:
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_files_that_are_not_read_are_warned_of(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(DEMO, tmp_path / "demo"))
+    (folder / "README.txt").touch()
+    done = run("calibrate", folder)
+    assert done.returncode == 0
+    assert done.stderr.startswith("Warning: ")
+    assert "README.txt" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_not_unique_is_status_3(tmp_path: Path) -> None:
+    folder = write_csv(general(2, 2, seed=5, motion="planar", noise=NOISE).problem, tmp_path)
+    done = run("calibrate", folder, "--sigma", 0.005, "--kappa", 6000, "-o", tmp_path / "result.json")
+    assert done.returncode == 3
+    assert "Certified, but not unique" in done.stdout
+    assert "do not use these numbers" in done.stdout
+    assert rw.read_solution(tmp_path / "result.json").certificate.status is rw.Status.CERTIFIED_NOT_UNIQUE
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
+def test_not_certified_is_status_4(tmp_path: Path) -> None:
+    """Few and very noisy measurements: from some starts the descent ends in a local minimum, and must not hide it."""
+    start = ({"target0": gtsam.Pose3()}, {"sensor0": gtsam.Pose3()}, 1.0)
+    problems = (
+        general(1, 1, seed=seed, number_of_measurements=5, noise=Noise(sigma_m=1.0, kappa=1.0)).problem
+        for seed in range(100)
+    )
+    problem = next(p for p in problems if rw.solve(p, "local", initial=start).certificate.status is rw.Status.GAP)
+    (tmp_path / "csv").mkdir()
+    folder = write_csv(problem, tmp_path / "csv")
+    earlier = rw.solve(rw.read_csv(folder))
+    elsewhere = dataclasses.replace(earlier, X={"tag_0": gtsam.Pose3()}, Y={"cam_0": gtsam.Pose3()})
+    elsewhere.write_json(tmp_path / "start.json")
+    done = run(
+        "calibrate", folder, "--sigma", 1, "--kappa", 1, "--method", "local", "--initial", tmp_path / "start.json"
+    )
+    assert done.returncode == 4, done.stderr
+    assert "Not certified: this answer costs" in done.stdout
+    assert done.stderr == ""
+
+
+def test_a_log_gets_a_line_for_what_takes_long(slow_address: str, tmp_path: Path) -> None:
+    done = run("fetch", "utias", tmp_path / "utias", "--base-url", slow_address)
+    assert done.stderr.startswith("[1 s] downloading file 1 of 146: tag_0_cam_0_A.csv\nError: ")
+
+
+def test_fetch_then_calibrate(serve: str, tmp_path: Path) -> None:
+    first = run("fetch", "utias", "--base-url", serve, cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert "146 files downloaded to utias, 0 were there; all verified." in first.stdout
+    again = run("fetch", "utias", "utias", "--base-url", serve, cwd=tmp_path)
+    assert "0 files downloaded to utias, 146 were there" in again.stdout
+    next_command = again.stdout.splitlines()[-1].removeprefix("Next: gtsam-rwhec ").split()
+    assert run(*next_command, cwd=tmp_path).returncode == 0
+
+
+def test_a_failed_download_is_status_5(serve: str, tmp_path: Path) -> None:
+    done = run("fetch", "utias", tmp_path / "utias", "--base-url", f"{serve}/elsewhere")
+    assert done.returncode == 5
+    assert "not found (404)" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_ctrl_c_is_status_130(slow_address: str, tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, "fetch", "utias", str(tmp_path / "utias"), "--base-url", slow_address],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "NO_PROXY": "127.0.0.1"},
+    )
+    assert process.stderr is not None
+    first = process.stderr.readline()  # after a second: by now it waits for the server
+    process.send_signal(signal.SIGINT)
+    status = process.wait(timeout=30)
+    rest = process.stderr.read()
+    process.stderr.close()
+    assert "downloading file 1" in first
+    assert status == 130
+    assert rest == "Interrupted.\n"
+
+
+def test_version_and_help() -> None:
+    assert run("--version").stdout == f"gtsam-rwhec {rw.__version__} (gtsam {version('gtsam')})\n"
+    assert "3 certified, but the" in run("--help").stdout
+    assert "--kappa" in run("calibrate", "--help").stdout
