@@ -10,7 +10,9 @@ from gtsam_rwhec.certify.certificate import Certificate, Status
 from gtsam_rwhec.certify.options import SolveOptions
 from gtsam_rwhec.csv_files import read_csv
 from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
-from gtsam_rwhec.problem import Measurements, Prior, Problem
+from gtsam_rwhec.measurements import Measurements
+from gtsam_rwhec.priors import Prior
+from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.result_file import read_solution
 from gtsam_rwhec.solution import Residual, Solution, SolvedPart
 

@@ -153,7 +153,7 @@ def _finish(part: Part, search: Search, found: Found) -> _Result:
     closed = found.cost - found.lower <= search.tolerance(found.cost)
     _check_scale(part, answer, closed)
     residuals, translation_cost, rotation_cost = _residuals(part, search.forms, answer)
-    known = identify(part, search.forms, answer, translation_cost, rotation_cost)
+    known = identify(part, answer, translation_cost, rotation_cost)
     search.seconds["identifiability"] = time.perf_counter() - start
     reason = found.reason
     if not np.isfinite(found.lower):

@@ -1,11 +1,14 @@
 """What the motion can and cannot determine (RWHEC paper Section 6, DESIGN fact 8).
 
 Noise excites every direction a little, so rank says nothing on real data. A direction is called *free* when the
-information that the measurements have of it is no more than the noise of A and B alone would create there if the true
-motions left it open. In units of that noise information (``information.noise_information``) a free direction has a
-ratio of mean 1: a sum of about m = 2 N squares of noise over a noise variance estimated with nu degrees of freedom, an
-F variate. The threshold is its 99.9 % quantile F(m, nu): a free direction is called determined once in a thousand.
-Three measurements with six degrees to spare ask for a ratio of 20, a hundred for 1.4.
+information that the motions give of it is no more than the noise alone would feign there if the true motions left it
+open (``information.pair_information``). In units of that noise a free direction has a ratio of mean 1: a sum of about
+m = 2 N squares of noise over a noise variance estimated with nu degrees of freedom, an F variate. The threshold is its
+99.9 % quantile F(m, nu): a free direction is called determined once in a thousand. Three measurements with six degrees
+to spare ask for a ratio of 20, a hundred for 1.4.
+
+Rotation residuals know rotations only, so they are asked first; where they determine every rotation, the rest is about
+translations and scales at those rotations, and where not, everything is asked of all residuals together.
 
 Corollaries 2 and 4 are the same test on one pair: rotations about two distinct axes leave nothing free. Theorems 1 and
 3 (one determined pair determines all that is connected) and endnote 9 (pairs that only together determine) need no
@@ -22,17 +25,15 @@ from scipy.special import fdtri
 
 from gtsam_rwhec.certify import arrow
 from gtsam_rwhec.certify.parts import Part
-from gtsam_rwhec.certify.search import Forms
 from gtsam_rwhec.certify.variables import Answer
 from gtsam_rwhec.free_directions import describe
 from gtsam_rwhec.information import (
-    Derivative,
     Information,
-    NoiseLevel,
-    derivative,
+    PairInformation,
     information,
-    noise_information,
     noise_level,
+    pair_information,
+    prior_information,
 )
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.problem import Pair
@@ -101,69 +102,81 @@ class Identifiability:
 
 @dataclass(frozen=True)
 class _Weak:
-    """Directions in ascending order of information: values (k,), vectors (d, k) in noise units, thresholds (k,)."""
+    """Directions in ascending order of information over threshold: values (k,), thresholds (k,), directions (d, k)."""
 
     values: Array
-    vectors: Array
     thresholds: Array
+    directions: Array
 
     @property
     def free(self) -> np.ndarray:
-        return self.values <= self.thresholds
+        free: np.ndarray = self.values <= self.thresholds
+        return free
+
+    @property
+    def ratio(self) -> float:
+        return float(self.values[0] / self.thresholds[0]) if len(self.values) else np.inf
 
 
-def identify(
-    part: Part, forms: Forms, answer: Answer, translation_cost: float, rotation_cost: float
-) -> Identifiability:
+_IS_ROTATION = np.zeros(15, dtype=bool)
+_IS_ROTATION[[0, 1, 2, 7, 8, 9]] = True
+
+
+def identify(part: Part, answer: Answer, translation_cost: float, rotation_cost: float) -> Identifiability:
     """Test every direction of a part, and of each of its pairs alone, at its answer.
 
     Parameters
     ----------
     part : Part
-    forms : Forms
     answer : Answer
     translation_cost, rotation_cost : float
         J_t and J_R at the answer: they tell the noise.
     """
-    P = derivative(part, answer)
     noise = noise_level(part, translation_cost, rotation_cost)
-    ends, own, _ = noise_information(part, noise, answer.scale)
-    index = {name: i for i, name in enumerate(part.free)}
-    n, L = len(part.free), len(part.leaves)
-    noise_frames, counts, noise_scale = np.zeros((n, 7)), np.zeros(n), 0.0
-    for e, pair in enumerate(part.pairs):
-        for end, name in enumerate(pair):
-            if name in index:
-                noise_frames[index[name], :6] += ends[e, end]
-                counts[index[name]] += part.moments[e].count
-        if pair[0] in index:
-            noise_frames[index[pair[0]], 6] += own[e]
-        noise_scale += own[e]
-    total = part.number_of_measurements
+    pairs = pair_information(part, answer, noise)
     length = _typical_length(part)
-    axes = [_rotation_axes(part, e, noise) for e in range(len(part.pairs))]
+    axes = _rotation_axes(part, pairs.carrier_noise, noise.redundancy)
+    of_each = _pairs(part, pairs, noise.redundancy, axes, length)
 
-    info = information(part, forms.full, P)
-    border_noise = np.r_[noise_frames[L:].ravel(), noise_scale]
-    weak = _weakest(info, noise_frames[:L], border_noise, np.r_[counts, total], noise.redundancy)
+    index = {name: i for i, name in enumerate(part.free)}
+    counts = np.zeros(len(index) + 1)
+    for pair, moments in zip(part.pairs, part.moments, strict=True):
+        for name in set(pair) & index.keys():
+            counts[index[name]] += moments.count
+    counts[-1] = part.number_of_measurements
+    rotation_prior, translation_prior = prior_information(part)
+    rotation_only = pairs.used & _IS_ROTATION
+    turning = information(part, pairs.rotation, pairs.noise_rotation, rotation_only, rotation_prior)
+    tests = [_weakest(turning, counts, noise.redundancy)]
+    if tests[0].free.any():
+        everything = information(
+            part,
+            pairs.rotation + pairs.translation,
+            pairs.noise_rotation + pairs.noise_translation,
+            pairs.used,
+            rotation_prior + translation_prior,
+        )
+        tests = [_weakest(everything, counts, noise.redundancy)]
+    else:
+        rest = pairs.used & ~_IS_ROTATION
+        moving = information(part, pairs.translation, pairs.noise_translation, rest, translation_prior)
+        tests.append(_weakest(moving, counts, noise.redundancy))
+    weak = min(tests, key=lambda test: test.ratio)
     free: list[str] = []
     if weak.free.any():
-        frames_noise = np.concatenate([noise_frames.ravel(), [noise_scale]])
-        basis = weak.vectors[:, weak.free] / np.sqrt(np.where(frames_noise > 0.0, frames_noise, 1.0))[:, None]
         seen = {
             name: max((a for a, pair in zip(axes, part.pairs, strict=True) if name in pair), default=0)
             for name in index
         }
-        free = describe(part.free, basis, length, seen, part.scale)
-    pairs = _pairs(part, forms, P, ends, own, noise, axes, length)
+        free = describe(part.free, weak.directions[:, weak.free], length, seen, part.scale)
     return Identifiability(
         is_unique=not free,
         free_directions=free,
         weakest=float(weak.values[0]) if len(weak.values) else np.inf,
         threshold=float(weak.thresholds[0]) if len(weak.values) else 0.0,
-        pairs=pairs,
+        pairs=of_each,
         parts=(part.names,),
-        explanation=_explanation(pairs, not free),
+        explanation=_explanation(of_each, not free),
     )
 
 
@@ -193,35 +206,33 @@ def _threshold(squares: Array | float, redundancy: int) -> Array:
     return result
 
 
-def _rotation_axes(part: Part, e: int, noise: NoiseLevel) -> int:
-    """About how many axes a pair's A turned (Corollary 2, tested as noise would have it): 0, 1 or 2.
+def _rotation_axes(part: Part, noise: Array, redundancy: int) -> list[int]:
+    """About how many axes each pair's A turned (Corollary 2, tested against A's noise, (E,) rad^2): 0, 1 or 2.
 
     The mean of R_A shortens every direction but a common axis: 1 - s^2 of its singular values is the mean square
-    sine of the turning that leaves that direction.
+    sine of the turning that leaves that direction; noise alone makes it 2 q^2.
     """
-    moments = part.moments[e]
-    mean = moments.translation[R_A, ONE].reshape(3, 3) / moments.translation[ONE, ONE]
-    s = np.linalg.svd(mean, compute_uv=False)
-    ratio = (1.0 - s**2) * moments.kappa / moments.count / noise.rotation
-    excited = int((ratio > _threshold(2.0 * moments.count, noise.redundancy)).sum())
-    return {0: 0, 1: 1, 2: 1, 3: 2}[excited]
+    means = np.array([m.translation[R_A, ONE].reshape(3, 3) / m.translation[ONE, ONE] for m in part.moments])
+    counts = np.array([m.count for m in part.moments])
+    s = np.linalg.svd(means, compute_uv=False)
+    ratio = (1.0 - s**2) / (2.0 * noise[:, None])
+    excited = (ratio > _threshold(2.0 * counts, redundancy)[:, None]).sum(axis=1)
+    return [(0, 1, 1, 2)[k] for k in excited]
 
 
-def _weakest(info: Information, leaf_noise: Array, border_noise: Array, counts: Array, redundancy: int) -> _Weak:
-    """The directions with the least information in units of noise information; all that are free among them."""
-    L = len(leaf_noise)
-    leaf_scale = np.where(info.used_leaf, 1.0 / np.sqrt(np.where(leaf_noise > 0.0, leaf_noise, 1.0)), 0.0)
-    border_scale = np.where(info.used_border, 1.0 / np.sqrt(np.where(border_noise > 0.0, border_noise, 1.0)), 0.0)
-    D = info.leaf * leaf_scale[:, :, None] * leaf_scale[:, None, :]
-    C = info.coupling * leaf_scale[:, :, None] * border_scale
-    E = info.border * border_scale[:, None] * border_scale
+def _weakest(info: Information, counts: Array, redundancy: int) -> _Weak:
+    """The directions with the least information in units of noise; all that are free are among them."""
+    leaf_unit = _unit(info.leaf_noise, info.used_leaf)
+    border_unit = _unit(info.border_noise, info.used_border)
+    D = info.leaf * leaf_unit[:, :, None] * leaf_unit[:, None, :]
+    C = info.coupling * leaf_unit[:, :, None] * border_unit
+    E = info.border * border_unit[:, None] * border_unit
     used = np.r_[info.used_leaf.ravel(), info.used_border]
     size = int(used.sum())
     if size == 0:
-        return _Weak(np.zeros(0), np.zeros((len(used), 0)), np.zeros(0))
+        return _Weak(np.zeros(0), np.zeros(0), np.zeros((len(used), 0)))
     if size <= DENSE_PARAMETERS:
-        matrix = arrow.dense(D, C, E)[used][:, used]
-        values, reduced = np.linalg.eigh(matrix)
+        values, reduced = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])
     else:
         values, reduced = _weakest_by_lanczos(D, C, E, used)
     vectors = np.zeros((len(used), len(values)))
@@ -233,8 +244,14 @@ def _weakest(info: Information, leaf_noise: Array, border_noise: Array, counts: 
     squares = 1.0 / np.maximum((share**2 / (2.0 * counts[:, None])).sum(axis=0), 1e-300)
     thresholds = _threshold(squares, redundancy)
     order = np.argsort(values / thresholds)
-    assert len(used) >= L * 7
-    return _Weak(values[order], vectors[:, order], thresholds[order])
+    unit = np.r_[leaf_unit.ravel(), border_unit]
+    return _Weak(values[order], thresholds[order], vectors[:, order] * unit[:, None])
+
+
+def _unit(noise: Array, used: np.ndarray) -> Array:
+    """What brings a parameter to units of its noise; 0 where it is not asked."""
+    result: Array = np.where(used, 1.0 / np.sqrt(np.where(used, noise, 1.0)), 0.0)
+    return result
 
 
 def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray) -> tuple[Array, Array]:
@@ -261,62 +278,48 @@ def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray) -> tuple
 
 
 def _pairs(
-    part: Part,
-    forms: Forms,
-    P: Derivative,
-    ends: Array,
-    own: Array,
-    noise: NoiseLevel,
-    axes: list[int],
-    length: float,
+    part: Part, pairs: PairInformation, redundancy: int, axes: list[int], length: float
 ) -> dict[Pair, PairIdentifiability]:
-    """Every pair on its own, all in one stack of 15 x 15 problems: two frames' seven parameters, and the scale."""
-    index = {name: i for i, name in enumerate(part.free)}
-    L, E = len(part.leaves), len(part.pairs)
-    S = forms.substitution
-    Q = S.transpose(0, 2, 1) @ (forms.edges_translation + forms.edges_rotation) @ S
-    tangent = np.zeros((E, 28, 15))
-    noise_diagonal = np.zeros((E, 15))
-    used = np.zeros((E, 15), dtype=bool)
-    owners = set(part.scale_owners)
-    for e, pair in enumerate(part.pairs):
-        for end, name in enumerate(pair):
-            if name not in index:
-                continue
-            i = index[name]
-            slot = 0 if i < L else 1
-            rows, columns = slice(13 * slot, 13 * slot + 13), slice(7 * slot, 7 * slot + 7)
-            tangent[e, rows, columns] = P.frames[i]
-            tangent[e, rows, 14] = P.by_scale[i]
-            noise_diagonal[e, 7 * slot : 7 * slot + 6] += ends[e, end]
-            used[e, 7 * slot : 7 * slot + 6] = True
-            if end == 0 and name in owners:
-                noise_diagonal[e, 7 * slot + 6] = own[e]
-                used[e, 7 * slot + 6] = True
-        tangent[e, 26:, 14] = P.tail
-        noise_diagonal[e, 14] = own[e]
-        used[e, 14] = part.scale == "shared"
-    scaled = tangent * np.where(used, 1.0 / np.sqrt(np.where(used, noise_diagonal, 1.0)), 0.0)[:, None, :]
-    matrix = 2.0 * scaled.transpose(0, 2, 1) @ Q @ scaled
-    diagonal = np.einsum("eii->ei", matrix)  # a view
-    # What a pair does not have is not free; no larger than the rest, or the small eigenvalues lose their digits.
-    diagonal[...] = np.where(used, diagonal, 1.0 + diagonal.max(axis=1, keepdims=True))
-    values, vectors = np.linalg.eigh(matrix)
+    """Every pair on its own, all in one stack of 15 x 15 problems, asked as the whole is."""
     counts = np.array([m.count for m in part.moments])
-    threshold = _threshold(2.0 * counts, noise.redundancy)
+    threshold = _threshold(2.0 * counts, redundancy)
+    rotations = pairs.used & _IS_ROTATION
+    turning, _ = _weakest_of_each(pairs.rotation, pairs.noise_rotation, rotations)
+    settled = np.all(turning > threshold[:, None], axis=1, keepdims=False)
+    asked = pairs.used & ~(_IS_ROTATION & settled[:, None])
+    rest, directions = _weakest_of_each(
+        pairs.translation + np.where(settled, 0.0, 1.0)[:, None, None] * pairs.rotation,
+        pairs.noise_translation + np.where(settled, 0.0, 1.0)[:, None] * pairs.noise_rotation,
+        asked,
+    )
     result = {}
     for e, pair in enumerate(part.pairs):
-        free = values[e] <= threshold[e]
+        free = np.less_equal(rest[e], threshold[e])
+        ends = {name: 7 * end for end, name in enumerate(pair) if name not in part.fixed}
+        if not free.any() and axes[e] < 2 and len(ends) == 2:
+            free[0] = True  # Corollary 4: about one axis a pair alone leaves a direction open
         sentences: list[str] = []
         if free.any():
-            names = tuple(dict.fromkeys(name for name in sorted(pair, key=lambda x: index.get(x, -1)) if name in index))
-            basis = vectors[e][:, free] / np.sqrt(np.where(used[e], noise_diagonal[e], 1.0))[:, None]
-            kept = [7 * (0 if index[name] < L else 1) + k for name in names for k in range(7)] + [14]
-            sentences = describe(names, basis[kept], length, dict.fromkeys(names, axes[e]), part.scale)
+            rows = [first + k for first in ends.values() for k in range(7)] + [14]
+            sentences = describe(
+                tuple(ends), directions[e][rows][:, free], length, dict.fromkeys(ends, axes[e]), part.scale
+            )
+        weakest = float(min(rest[e, 0], turning[e, 0])) if settled[e] else float(rest[e, 0])
         result[pair] = PairIdentifiability(
-            not free.any(), sentences, axes[e], int(counts[e]), float(values[e, 0]), float(threshold[e])
+            not free.any(), sentences, axes[e], int(counts[e]), weakest, float(threshold[e])
         )
     return result
+
+
+def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array, Array]:
+    """Eigenvalues (E, 15) in units of noise and directions (E, 15, 15); what a pair does not have is large."""
+    unit = _unit(noise, used)
+    matrix = info * unit[:, :, None] * unit[:, None, :]
+    diagonal = np.einsum("eii->ei", matrix)  # a view
+    # No larger than needed, or the small eigenvalues lose their digits.
+    diagonal[...] = np.where(used, diagonal, 1e3 + 2.0 * diagonal.max(axis=1, keepdims=True))
+    values, vectors = np.linalg.eigh(matrix)
+    return values, vectors * unit[:, :, None]
 
 
 def _explanation(pairs: dict[Pair, PairIdentifiability], unique: bool) -> str:

@@ -1,8 +1,12 @@
-"""The Fisher information of a part's measurements about poses and scales, and what noise alone would create.
+"""The Fisher information that a part's motions give about poses and scales, and what A's noise alone would create.
 
 Parameters are what users perturb: for each free frame [omega, v], a right perturbation T Expmap(xi) in GTSAM's order
-(rad, m), and the logarithm of each unknown scale. The residuals are linear in the form's variables, so with P their
-derivative by the parameters the Gauss-Newton information is 2 P' Q P.
+(rad, m), and the logarithm of each unknown scale. The information is the *expected* one: B enters by its prediction
+Y^-1 A X at the answer, not by its noisy measurement, so that only A can feign excitation. It comes from the moments of
+A alone. With c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carrier's frame):
+
+- rotation residual, weight 2 kappa:        omega_X - (R_Y' R_A R_X)' omega_Y
+- translation residual, weight alpha^2/s^2: R_A R_X v_X - R_Y v_Y + c^ R_Y omega_Y + c dlog alpha
 """
 
 from __future__ import annotations
@@ -11,114 +15,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.certify.full_form import FullForm
 from gtsam_rwhec.certify.parts import Part
-from gtsam_rwhec.certify.rotations import tangent_basis, vec
-from gtsam_rwhec.certify.variables import Answer, as_variables
+from gtsam_rwhec.certify.variables import Answer
 from gtsam_rwhec.poses import Array
-from gtsam_rwhec.statistics import ONE
+from gtsam_rwhec.statistics import ONE, R_A, T_A
 
 #: Below a nanoradian and a nanometre nothing is noise: exact data.
 FLOOR_RAD = 1e-9
 FLOOR_M = 1e-9
-#: Columns of a frame's parameters: rotation, translation, logarithm of its own scale.
-OMEGA, V, OWN = slice(0, 3), slice(3, 6), 6
-
-
-@dataclass(frozen=True)
-class Derivative:
-    """How the form's variables move: frames (n, 13, 7) by their own parameters, (n, 13) and tail by log scale."""
-
-    frames: Array
-    by_scale: Array
-    tail: Array
-
-
-def derivative(part: Part, answer: Answer) -> Derivative:
-    """P, frame by frame, at an answer."""
-    n = len(answer.R)
-    frames = np.zeros((n, 13, 7))
-    by_scale = np.zeros((n, 13))
-    leaf, center, _ = as_variables(part, answer)
-    numbers = np.concatenate([leaf, center])
-    shared = 1.0 if part.scale == "shared" else 0.0
-    if part.kind == "direct":  # t = alpha t_X, r = vec R
-        alpha = answer.scale if part.scale == "shared" else 1.0
-        frames[:, 4:, OMEGA] = tangent_basis(answer.R)
-        frames[:, :3, V] = alpha * answer.R
-        by_scale[:, :3] = shared * numbers[:, :3]
-        tail = np.array([shared * answer.scale, 0.0])
-    else:  # (T exp(xi))^-1 = exp(-xi) T^-1: dR' = -omega^ R', dt' = -omega x t' - v; the scale enters as 1/alpha
-        for k in range(3):
-            E = np.zeros((3, 3))
-            E[(k + 2) % 3, (k + 1) % 3], E[(k + 1) % 3, (k + 2) % 3] = 1.0, -1.0
-            frames[:, 4:, k] = -vec(E @ answer.R.transpose(0, 2, 1))
-            frames[:, :3, k] = -numbers[:, :3] @ E.T
-        frames[:, :3, V] = -np.eye(3)
-        frames[:, 3, OWN] = -numbers[:, 3]
-        tail = np.array([-shared / answer.scale, 0.0])
-    return Derivative(frames, by_scale, tail)
-
-
-@dataclass(frozen=True)
-class Information:
-    """Arrow-shaped information: leaf (L, 7, 7), coupling (L, 7, 7 P + 1), border (7 P + 1 square).
-
-    Order of the border: the centers' seven, then the logarithm of the shared scale. ``used_leaf`` and ``used_border``
-    mark the parameters that exist.
-    """
-
-    leaf: Array
-    coupling: Array
-    border: Array
-    used_leaf: np.ndarray
-    used_border: np.ndarray
-
-
-def information(part: Part, full: FullForm, P: Derivative) -> Information:
-    """2 P' Q P in blocks."""
-    L, C = full.leaves, full.centers
-    leaf_P, center_P = P.frames[:L], P.frames[L:]
-    leaf_s, center_s = P.by_scale[:L], P.by_scale[L:]
-    leaf_Pt, center_Pt = leaf_P.transpose(0, 2, 1), center_P.transpose(0, 2, 1)
-    leaf = leaf_Pt @ full.leaf @ leaf_P
-    center = center_Pt @ full.center @ center_P
-    coupling = np.zeros((L, 7, 7 * C + 1))
-    border = np.zeros((7 * C + 1, 7 * C + 1))
-    rows = np.matmul(leaf_Pt[:, None], full.leaf_center)  # (L, C, 7, 13)
-    coupling[:, :, :-1] = np.matmul(rows, center_P[None]).transpose(0, 2, 1, 3).reshape(L, 7, 7 * C)
-    # The shared scale moves every translation and alpha: its column of Q P, frame by frame.
-    leaf_column = (
-        np.einsum("lij,lj->li", full.leaf, leaf_s)
-        + np.einsum("lcij,cj->li", full.leaf_center, center_s)
-        + full.leaf_tail @ P.tail
-    )
-    center_column = (
-        np.einsum("cij,cj->ci", full.center, center_s)
-        + np.einsum("lcij,li->cj", full.leaf_center, leaf_s)
-        + full.center_tail @ P.tail
-    )
-    tail_column = (
-        np.einsum("lit,li->t", full.leaf_tail, leaf_s)
-        + np.einsum("cit,ci->t", full.center_tail, center_s)
-        + full.tail @ P.tail
-    )
-    coupling[:, :, -1] = np.einsum("lij,li->lj", leaf_P, leaf_column)
-    for c in range(C):
-        at = slice(7 * c, 7 * c + 7)
-        border[at, at] = center[c]
-        border[at, -1] = border[-1, at] = center_P[c].T @ center_column[c]
-    border[-1, -1] = (leaf_s * leaf_column).sum() + (center_s * center_column).sum() + P.tail @ tail_column
-    owners = set(part.scale_owners)
-    used = np.ones((L + C, 7), dtype=bool)
-    used[:, OWN] = [name in owners for name in part.free]
-    return Information(
-        2.0 * leaf,
-        2.0 * coupling,
-        2.0 * border,
-        used[:L],
-        np.r_[used[L:].ravel(), part.scale == "shared"],
-    )
+#: A pair's 15 parameters: the target's seven, the sensor's seven, the shared scale. A frame's seven: rotation,
+#: translation, logarithm of its own scale.
+OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
 
 
 @dataclass(frozen=True)
@@ -138,46 +45,202 @@ def noise_level(part: Part, translation_cost: float, rotation_cost: float) -> No
     """
     N = part.number_of_measurements
     redundancy = 6 * N - part.number_of_unknowns
-    correction = 6.0 * N / redundancy if redundancy > 0 else 1.0
-    W = sum(float(m.translation[ONE, ONE]) for m in part.moments)
-    K = sum(m.kappa for m in part.moments)
-    floor_t = W / N * FLOOR_M**2
-    floor_R = 2.0 * K / N * FLOOR_RAD**2
     if redundancy <= 0:  # nothing tells the noise but the weights
         return NoiseLevel(1.0, 1.0, redundancy)
+    correction = 6.0 * N / redundancy
+    W = sum(float(m.translation[ONE, ONE]) for m in part.moments)
+    K = sum(m.kappa for m in part.moments)
     return NoiseLevel(
-        max(correction * 2.0 * translation_cost / (3.0 * N), floor_t),
-        max(correction * 2.0 * rotation_cost / (3.0 * N), floor_R),
+        max(correction * 2.0 * translation_cost / (3.0 * N), W / N * FLOOR_M**2),
+        max(correction * 2.0 * rotation_cost / (3.0 * N), 2.0 * K / N * FLOOR_RAD**2),
         redundancy,
     )
 
 
-def noise_information(part: Part, noise: NoiseLevel, scale: float) -> tuple[Array, Array, float]:
-    """Information that the noise of A and B alone creates in a direction that the true motions leave free.
+@dataclass(frozen=True)
+class PairInformation:
+    """Of every pair: rotation residuals' and translation residuals' information, and what noise alone would create.
 
-    Let the true Jacobian of measurement i vanish along a direction. With noise it is what the noise makes of it:
-
-    - rotation, residual omega_X - R_B' omega_Y: noise eps (variance s^2 an axis) leaves eps x omega, whose square is
-      expected at 2 s^2 |omega|^2; times the weight 2 kappa with s^2 = f_R / (2 kappa): 2 f_R |omega|^2;
-    - translation, the lever arm R_Y t_B^ omega_Y: 2 f_t |omega_Y|^2; R_A t_X under noise of R_A: 2 s^2 |v|^2 / sigma^2;
-    - a scale's, t_B d log alpha: 3 f_t.
-
-    X and Y move together along a free direction, so each end takes half.
-
-    Returns
-    -------
-    per_edge_ends : (E, 2, 6) array
-        Diagonal for [omega, v] of the target's and the sensor's end of each edge.
-    per_edge_scale : (E,) array
+    rotation, translation (E, 15, 15); noise_rotation, noise_translation (E, 15), diagonal; used (E, 15): the
+    parameters that exist; carrier_noise (E,) in rad^2, the largest variance an axis that A's rotations may have.
     """
-    ends = np.zeros((len(part.pairs), 2, 6))
-    own = np.zeros(len(part.pairs))
-    alpha = scale if part.kind == "direct" and part.scale == "shared" else 1.0
-    for e, moments in enumerate(part.moments):
-        n, W = moments.count, float(moments.translation[ONE, ONE])
-        variance = noise.rotation * n / (2.0 * moments.kappa)  # s^2, rad^2
-        lever = alpha**2 * W * variance
-        ends[e, :, :3] = n * (noise.rotation + noise.translation)
-        ends[e, :, 3:] = max(lever, 1e-18 * W)
-        own[e] = 3.0 * n * noise.translation
-    return ends, own, float(own.sum())
+
+    rotation: Array
+    translation: Array
+    noise_rotation: Array
+    noise_translation: Array
+    used: np.ndarray
+    carrier_noise: Array
+
+
+def pair_information(part: Part, answer: Answer, noise: NoiseLevel) -> PairInformation:
+    """The information of every pair and its noise, all pairs at once.
+
+    Noise in a direction that the true motions leave free: with A's rotation off by eps (variance q^2 an axis), what
+    was zero becomes eps x omega or eps x v, expected at 2 q^2 |.|^2; both ends move together along a free direction,
+    so each takes half. The residuals do not tell A's noise from B's, but they bound it: rotation residuals hold all
+    of it, so q^2 <= f_R / (2 kappa); translation residuals hold it at the end of the lever arm t_X, so
+    2 q^2 |t_X|^2 <= 3 f_t sigma^2. A's translation noise is at most f_t sigma^2 an axis: 2 f_t |omega_Y|^2, and
+    3 f_t for a scale.
+    """
+    E = len(part.pairs)
+    index = {name: i for i, name in enumerate(part.free)}
+    poses = [[_pose(part, answer, index, name) for name in pair] for pair in part.pairs]
+    R_X, R_Y = (np.array([pose[end][0] for pose in poses]) for end in (0, 1))
+    t_X, t_Y = (np.array([pose[end][1] for pose in poses]) for end in (0, 1))
+    own_scale = dict(zip(part.free, answer.own_scale, strict=True))
+    owners = frozenset(part.scale_owners)
+    alpha = np.array([_scale(part, answer, own_scale, target) for target, _ in part.pairs])
+    G = np.array([m.translation for m in part.moments])
+    K, n = np.array([m.kappa for m in part.moments]), np.array([m.count for m in part.moments])
+    W = G[:, ONE, ONE]
+
+    # Moments of c = R_A t_X + t_A - t_Y, linear in A's features: c = [t_X' (x) I, I, -t_Y] f.
+    linear = np.zeros((E, 3, 25))
+    linear[:, :, R_A] = np.einsum("ej,ik->eijk", t_X, np.eye(3)).reshape(E, 3, 9)
+    linear[:, :, T_A] = np.eye(3)
+    linear[:, :, ONE] = -t_Y
+    Gc = G @ linear.transpose(0, 2, 1)  # sum w f c'
+    cc = linear @ Gc
+    c = Gc[:, ONE]
+    Rt = G[:, R_A, ONE].reshape(E, 3, 3)  # sum w R_A'
+    Rt_c = Gc[:, R_A].reshape(E, 3, 3, 3)  # [i, k, m]: sum w R_A[k, i] c[m]
+
+    R_Xt, R_Yt = R_X.transpose(0, 2, 1), R_Y.transpose(0, 2, 1)
+    turned = R_Xt @ Rt @ R_Y  # sum w (R_Y' R_A R_X)'
+    eye = np.eye(3)
+    rotation = np.zeros((E, 15, 15))
+    rotation[:, OMEGA_X, OMEGA_X] = rotation[:, OMEGA_Y, OMEGA_Y] = 2.0 * K[:, None, None] * eye
+    rotation[:, OMEGA_X, OMEGA_Y] = -2.0 * (K / W)[:, None, None] * turned
+    translation = np.zeros((E, 15, 15))
+    translation[:, V_X, V_X] = translation[:, V_Y, V_Y] = W[:, None, None] * eye
+    translation[:, V_X, V_Y] = -turned
+    # (c^)_{kj} = -eps_{kjm} c_m, so sum w (R_A' c^)_{ij} = -sum w R_A[k, i] eps_{kjm} c_m.
+    Rt_skew = -np.einsum("eikm,kjm->eij", Rt_c, _LEVI_CIVITA)
+    translation[:, V_X, OMEGA_Y] = R_Xt @ Rt_skew @ R_Y
+    skew = -np.einsum("em,kjm->ekj", c, _LEVI_CIVITA)  # sum w c^
+    translation[:, OMEGA_Y, V_Y] = -(R_Yt @ skew @ R_Y).transpose(0, 2, 1)
+    square = np.einsum("eii->e", cc)
+    translation[:, OMEGA_Y, OMEGA_Y] = R_Yt @ (square[:, None, None] * eye - cc) @ R_Y
+    translation[:, V_X, SHARED] = np.einsum("eij,ej->ei", R_Xt, np.einsum("eikk->ei", Rt_c))
+    translation[:, V_Y, SHARED] = -np.einsum("eij,ej->ei", R_Yt, c)
+    translation[:, SHARED, SHARED] = square  # c^ c = 0: nothing with omega_Y
+    upper = np.triu_indices(15, 1)
+    for full in (rotation, translation):
+        full[:, upper[1], upper[0]] = full[:, upper[0], upper[1]]
+    translation *= (alpha**2)[:, None, None]
+
+    by_arm = 1.5 * noise.translation * n / np.maximum(alpha**2 * W * (t_X**2).sum(axis=1), 1e-300)
+    q2 = np.maximum(np.minimum(noise.rotation * n / (2.0 * K), by_arm), FLOOR_RAD**2)
+    noise_rotation, noise_translation = np.zeros((E, 15)), np.zeros((E, 15))
+    for omega, v in ((OMEGA_X, V_X), (OMEGA_Y, V_Y)):
+        noise_rotation[:, omega] = (2.0 * K * q2)[:, None]
+        noise_translation[:, omega] = noise.translation * n[:, None]
+        noise_translation[:, v] = (alpha**2 * W * q2)[:, None]
+    noise_translation[:, SHARED] = 3.0 * noise.translation * n
+
+    used = np.zeros((E, 15), dtype=bool)
+    for e, (target, sensor) in enumerate(part.pairs):
+        if target == sensor:  # both ends are one frame: fold the first onto the second
+            for full in (rotation[e], translation[e]):
+                full[7:14] += full[:7]
+                full[:, 7:14] += full[:, :7]
+                full[:7] = full[:, :7] = 0.0
+            noise_rotation[e, 7:14] += noise_rotation[e, :7]
+            noise_translation[e, 7:14] += noise_translation[e, :7]
+            noise_rotation[e, :7] = noise_translation[e, :7] = 0.0
+        used[e, :6] = target in index and target != sensor
+        used[e, 7:13] = sensor in index
+        used[e, SHARED] = part.scale == "shared"
+        if target in owners:
+            at = OWN_X if target != sensor else 13
+            for full in (translation[e], translation[e].T):
+                full[at] += full[SHARED]
+            translation[e, at, at] = alpha[e] ** 2 * square[e]
+            noise_translation[e, at] = noise_translation[e, SHARED]
+            used[e, at] = True
+    return PairInformation(rotation, translation, noise_rotation, noise_translation, used, q2)
+
+
+_LEVI_CIVITA = np.zeros((3, 3, 3))
+for _i in range(3):
+    _LEVI_CIVITA[_i, (_i + 1) % 3, (_i + 2) % 3] = 1.0
+    _LEVI_CIVITA[_i, (_i + 2) % 3, (_i + 1) % 3] = -1.0
+
+
+def _pose(part: Part, answer: Answer, index: dict[str, int], name: str) -> tuple[Array, Array]:
+    if name in index:
+        return answer.R[index[name]], answer.t[index[name]]
+    return part.fixed[name][:3, :3], part.fixed[name][:3, 3]
+
+
+def _scale(part: Part, answer: Answer, own_scale: dict[str, float], target: str) -> float:
+    if part.scale == "shared":
+        return answer.scale
+    own = own_scale.get(target, np.nan)
+    return float(own) if np.isfinite(own) else part.fixed_scales.get(target, 1.0)
+
+
+@dataclass(frozen=True)
+class Information:
+    """Arrow-shaped: leaf (L, 7, 7), coupling (L, 7, 7 P + 1), border (7 P + 1 square), and the noise's diagonal.
+
+    Order of the border: the centers' seven, then the logarithm of the shared scale.
+    """
+
+    leaf: Array
+    coupling: Array
+    border: Array
+    leaf_noise: Array
+    border_noise: Array
+    used_leaf: np.ndarray
+    used_border: np.ndarray
+
+
+def information(part: Part, by_pair: Array, noise: Array, used: np.ndarray, priors: Array) -> Information:
+    """Add up pairs' information (E, 15, 15) and noise (E, 15), and the priors' (n, 7) diagonal, along the graph."""
+    L, P = len(part.leaves), len(part.centers)
+    place = {name: i for i, name in enumerate(part.free)}
+    leaf, coupling = np.zeros((L, 7, 7)), np.zeros((L, 7, 7 * P + 1))
+    border = np.zeros((7 * P + 1, 7 * P + 1))
+    frame_noise, frame_used = np.zeros((L + P, 7)), np.zeros((L + P, 7), dtype=bool)
+    for e, pair in enumerate(part.pairs):
+        ends = [(place[name], slice(7 * end, 7 * end + 7)) for end, name in enumerate(pair) if name in place]
+        for i, at in ends:
+            frame_noise[i] += noise[e, at]
+            frame_used[i] |= used[e, at]
+            if i < L:
+                leaf[i] += by_pair[e, at, at]
+                coupling[i, :, -1] += by_pair[e, at, 14]
+            else:
+                own = slice(7 * (i - L), 7 * (i - L) + 7)
+                border[own, own] += by_pair[e, at, at]
+                border[own, -1] += by_pair[e, at, 14]
+        if len(ends) == 2 and pair[0] != pair[1]:
+            (i, at_i), (j, at_j) = sorted(ends)
+            coupling[i, :, 7 * (j - L) : 7 * (j - L) + 7] += by_pair[e, at_i, at_j]
+    border[-1, :-1] = border[:-1, -1]
+    border[-1, -1] = by_pair[:, 14, 14].sum()
+    np.einsum("lii->li", leaf)[...] += priors[:L]
+    np.einsum("ii->i", border)[:-1] += priors[L:].ravel()
+    return Information(
+        leaf,
+        coupling,
+        border,
+        frame_noise[:L],
+        np.r_[frame_noise[L:].ravel(), noise[:, 14].sum()],
+        frame_used[:L],
+        np.r_[frame_used[L:].ravel(), used[:, 14].any()],
+    )
+
+
+def prior_information(part: Part) -> tuple[Array, Array]:
+    """The priors' information, diagonal, for rotations and translations apart: (n, 7) each."""
+    rotation, translation = np.zeros((len(part.free), 7)), np.zeros((len(part.free), 7))
+    for i, name in enumerate(part.free):
+        for prior in part.priors.get(name, []):
+            if prior.kappa is not None:
+                rotation[i, :3] += 2.0 * prior.kappa
+            if prior.sigma is not None:
+                translation[i, 3:6] += 1.0 / prior.sigma**2
+    return rotation, translation

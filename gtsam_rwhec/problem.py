@@ -14,12 +14,17 @@ from gtsam_rwhec.errors import (
     CountError,
     FrameError,
     MeasurementsNotKeptError,
-    NoiseError,
     OptionError,
     PriorError,
     RotationsProjectedWarning,
     ScaleError,
-    UnitsWarning,
+)
+from gtsam_rwhec.measurements import (
+    Measurements,
+    checked_covariances,
+    checked_stamps,
+    positive_weights,
+    warn_of_millimetres,
 )
 from gtsam_rwhec.poses import (
     ROTATION_TOLERANCE,
@@ -30,36 +35,11 @@ from gtsam_rwhec.poses import (
     as_transforms,
     one_transform,
 )
+from gtsam_rwhec.priors import Prior, check_agreement, difference
 from gtsam_rwhec.statistics import BLOCK, Gauge, Moments
 
 ScaleMode = Literal["known", "shared", "per_target"]
 Pair = tuple[str, str]
-
-#: Translations with a median beyond this are taken for millimetres (a camera sees no tag at 100 m).
-MILLIMETRES_M = 100.0
-#: Two priors on one frame contradict one another when they differ by more than this many standard deviations.
-CONTRADICTION_SIGMAS = 6.0
-
-
-@dataclass(frozen=True)
-class Measurements:
-    """Raw measurements of one edge: A, B (N, 4, 4), sigma (N,) in m, kappa (N,), stamps (N,) in ns, 6x6 covariances."""
-
-    A: Array
-    B: Array
-    sigma: Array
-    kappa: Array
-    stamps_ns: np.ndarray | None = None
-    covariances: Array | None = None
-
-
-@dataclass(frozen=True)
-class Prior:
-    """A Gaussian belief: |t - t_0|^2 / sigma^2 and kappa |R - R_0|_F^2 (DESIGN fact 11). None: that part is free."""
-
-    transform: Array
-    sigma: float | None
-    kappa: float | None
 
 
 @dataclass
@@ -252,10 +232,10 @@ class Problem:
         if len(A) == 0:
             raise CountError(f"{where}: no measurements; leave the pair out instead")
         count = len(A)
-        sigmas = _weights(sigma, count, "sigma", where)
-        kappas = _weights(kappa, count, "kappa", where)
-        stamps = _stamps(stamps_ns, count, where)
-        covariance = _covariances(covariances, count, where)
+        sigmas = positive_weights(sigma, count, "sigma", where)
+        kappas = positive_weights(kappa, count, "kappa", where)
+        stamps = checked_stamps(stamps_ns, count, where)
+        covariance = checked_covariances(covariances, count, where)
         gauge = self._gauge_for(A, motion, where)
         moments = Moments.of(A, B, 1.0 / sigmas**2, kappas, gauge, motion, where)
         if moments.projected:
@@ -265,7 +245,7 @@ class Problem:
                 RotationsProjectedWarning,
                 stacklevel=3,
             )
-        _warn_of_millimetres(A, B, where)
+        warn_of_millimetres(A, B, where)
         # Only now, with everything checked, does the problem change.
         self.gauge = gauge
         self._target_carrier_set = self._target_carrier_set or not motion
@@ -326,10 +306,10 @@ class Problem:
         known = self.fixed.get(name)
         if known is not None and np.abs(known - T).max() > 1e-9:
             raise PriorError(
-                f"{name} is fixed already, at another pose ({_difference(known, T)}); remove one of the two"
+                f"{name} is fixed already, at another pose ({difference(known, T)}); remove one of the two"
             )
         for prior in self.priors.get(name, []):
-            _check_agreement(name, Prior(T, 0.0, np.inf), prior)
+            check_agreement(name, Prior(T, 0.0, np.inf), prior)
         self.fixed[name] = T
 
     def add_prior(
@@ -357,13 +337,13 @@ class Problem:
         where = f"the prior of {name}"
         prior = Prior(
             T,
-            None if sigma is None else float(_weights(sigma, 0, "sigma", where)),
-            None if kappa is None else float(_weights(kappa, 0, "kappa", where)),
+            None if sigma is None else float(positive_weights(sigma, 0, "sigma", where)),
+            None if kappa is None else float(positive_weights(kappa, 0, "kappa", where)),
         )
         if name in self.fixed:
-            _check_agreement(name, Prior(self.fixed[name], 0.0, np.inf), prior)
+            check_agreement(name, Prior(self.fixed[name], 0.0, np.inf), prior)
         for other in self.priors.get(name, []):
-            _check_agreement(name, other, prior)
+            check_agreement(name, other, prior)
         self.priors.setdefault(name, []).append(prior)
 
     def fix_scale(self, name: str, scale: float = 1.0) -> None:
@@ -440,91 +420,3 @@ class Problem:
             f"Problem({len(self.targets)} targets, {len(self.sensors)} sensors, {len(self._edges)} pairs, "
             f"{self.number_of_measurements} measurements, scale={self.scale!r})"
         )
-
-
-def _weights(value: ArrayLike | None, count: int, name: str, where: str) -> Array:
-    """sigma or kappa as a () or (count,) array of positive numbers; left out: 1."""
-    if value is None:
-        return np.array(1.0)
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise NoiseError(f"{where}: {name}={value!r} cannot be read as numbers") from error
-    if array.shape not in ((), (count,)):
-        raise CountError(f"{where}: {name} has shape {array.shape}; give one number or one for each of {count}")
-    bad = np.flatnonzero(~((array > 0.0) & np.isfinite(array)))
-    if bad.size:
-        index = f" of measurement {bad[0]}" if array.ndim else ""
-        raise NoiseError(f"{where}: {name}{index} is {array.flat[bad[0]]}; it must be positive and finite")
-    return array
-
-
-def _stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.ndarray | None:
-    if stamps_ns is None:
-        return None
-    stamps = np.asarray(stamps_ns)
-    if stamps.shape != (count,):
-        raise CountError(f"{where}: stamps_ns has shape {stamps.shape} for {count} measurements")
-    if not np.issubdtype(stamps.dtype, np.integer):
-        raise CountError(f"{where}: stamps_ns is of {stamps.dtype}; give integer nanoseconds")
-    return stamps.astype(np.int64)
-
-
-def _covariances(covariances: ArrayLike | None, count: int, where: str) -> Array | None:
-    if covariances is None:
-        return None
-    array = np.array(covariances, dtype=np.float64)
-    if array.shape == (6, 6):
-        array = np.broadcast_to(array, (count, 6, 6))
-    if array.shape != (count, 6, 6):
-        raise CountError(f"{where}: covariances has shape {array.shape}; give (6, 6) or ({count}, 6, 6)")
-    if not np.isfinite(array).all() or np.abs(array - array.transpose(0, 2, 1)).max() > 1e-9 * np.abs(array).max():
-        raise NoiseError(f"{where}: a covariance is not finite and symmetric")
-    smallest = np.linalg.eigvalsh(array)[:, 0]
-    if smallest.min() <= 0.0:
-        index = int(smallest.argmin())
-        raise NoiseError(
-            f"{where}: the covariance of measurement {index} is not positive definite (smallest eigenvalue "
-            f"{smallest[index]:.3g})"
-        )
-    return array
-
-
-def _warn_of_millimetres(A: Array, B: Array, where: str) -> None:
-    # Differences, so that a world origin far away is no millimetre; B is what a sensor sees, never far away.
-    spread_A = float(np.median(np.abs(A[:BLOCK, :3, 3] - A[0, :3, 3]).max(axis=1)))
-    size_B = float(np.median(np.abs(B[:BLOCK, :3, 3]).max(axis=1)))
-    for name, size in (("A", spread_A), ("B", size_B)):
-        if size > MILLIMETRES_M:
-            warnings.warn(
-                f"{where}: translations of {name} have a median size of {size:.4g}; that looks like millimetres. "
-                "This library takes metres; divide by 1000 if so",
-                UnitsWarning,
-                stacklevel=4,
-            )
-
-
-def _difference(T: Array, S: Array) -> str:
-    angle = np.degrees(2.0 * np.arcsin(min(1.0, np.linalg.norm(T[:3, :3] - S[:3, :3]) / np.sqrt(8.0))))
-    return f"{1e3 * np.linalg.norm(T[:3, 3] - S[:3, 3]):.4g} mm and {angle:.4g} deg apart"
-
-
-def _check_agreement(name: str, first: Prior, second: Prior) -> None:
-    """Refuse two beliefs on one frame that cannot both be true."""
-    apart = _difference(first.transform, second.transform)
-    if first.sigma is not None and second.sigma is not None:
-        distance = np.linalg.norm(first.transform[:3, 3] - second.transform[:3, 3])
-        if distance > 1e-9 + CONTRADICTION_SIGMAS * np.hypot(first.sigma, second.sigma):
-            raise PriorError(
-                f"what is said of {name} contradicts itself: {apart}, with standard deviations of "
-                f"{1e3 * first.sigma:.4g} mm and {1e3 * second.sigma:.4g} mm"
-            )
-    if first.kappa is not None and second.kappa is not None:
-        # kappa |R - R_0|_F^2: a standard deviation of 1 / sqrt(2 kappa) rad an axis, and |.|_F^2 = 2 theta^2.
-        distance = np.linalg.norm(first.transform[:3, :3] - second.transform[:3, :3])
-        spread = np.sqrt(1.0 / first.kappa + 1.0 / second.kappa)
-        if distance > 1e-9 + CONTRADICTION_SIGMAS * spread:
-            raise PriorError(
-                f"what is said of {name} contradicts itself: {apart}, with kappa of {first.kappa:.4g} and "
-                f"{second.kappa:.4g}"
-            )

@@ -9,7 +9,8 @@ import numpy as np
 
 from gtsam_rwhec.errors import CountError, FrameError, PriorError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Pair, Prior, Problem, ScaleMode
+from gtsam_rwhec.priors import Prior
+from gtsam_rwhec.problem import Pair, Problem, ScaleMode
 from gtsam_rwhec.statistics import Gauge, Moments, best_shift
 
 #: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" the equation turned round, B X^-1 = Y^-1 A, which

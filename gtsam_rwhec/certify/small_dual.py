@@ -96,7 +96,7 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
         H *= weight
         H[np.diag_indices_from(H)] *= 1.0 + 1e-12
         try:
-            step = -scipy.linalg.solve(H, gradient, assume_a="pos", check_finite=False)
+            step = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(H, check_finite=False), gradient, check_finite=False)
         except np.linalg.LinAlgError:
             break
         decrement = float(np.sqrt(max(-(gradient @ step), 0.0) / weight))
