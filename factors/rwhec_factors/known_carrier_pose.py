@@ -45,7 +45,7 @@ def robot_world_hand_eye_factor(
     B_inverse = B.inverse()
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Any] | None) -> np.ndarray:
-        X, Y = (values.atPose3(key) for key in factor.keys())
+        X, Y = (values.atPose3(key) for key in list(factor.keys()))
         predicted = Y.inverse().compose(A.compose(X))  # B as the extrinsics would have it
         residual: np.ndarray = gtsam.Pose3.Logmap(B_inverse.compose(predicted))
         if jacobians is not None:

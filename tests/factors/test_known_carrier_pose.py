@@ -40,7 +40,7 @@ def test_jacobians_are_the_numeric_ones(seed: int, size: float) -> None:
     values.insert(Y(0), T_sensor)
     linear = factor.linearize(values)
     whitened = linear.jacobian()[0] * 0.1
-    expected = np.hstack([numeric_jacobian(factor, values, key) for key in factor.keys()])
+    expected = np.hstack([numeric_jacobian(factor, values, key) for key in list(factor.keys())])
     np.testing.assert_allclose(whitened, expected, atol=1e-7)
 
 
