@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec import identifiability
+from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify import certificate as certificates
 from gtsam_rwhec.certify.certificate import OBJECTIVES, Certificate, Status
 from gtsam_rwhec.certify.nonnegative import run_with_nonnegative_scale
@@ -21,9 +22,8 @@ from gtsam_rwhec.certify.variables import Answer, answer_of, as_variables, rotat
 from gtsam_rwhec.errors import FrameError, NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError
 from gtsam_rwhec.identifiability import Identifiability, identify
 from gtsam_rwhec.poses import PoseLike, one_transform, to_pose3
-from gtsam_rwhec.problem import Pair, Problem
+from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.solution import Residual, Solution, SolvedPart
-from gtsam_rwhec.statistics import ONE
 
 Poses = Mapping[str, PoseLike]
 Scale = float | Mapping[str, float]
@@ -190,8 +190,9 @@ def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
         if not (np.isfinite(value) and value > 0.0):
             raise ScaleError(
                 f"{what} is {value:.6g} at the {'optimum' if proven else 'best point found'}, which no real target "
-                "has: the rotations or translations contradict the frame convention (is B = T_sensor_target? is A "
-                "inverted?), or the noise drowns the scale"
+                "has. Either the poses contradict the frame convention (is B = T_sensor_target? is A inverted?), or "
+                "the motion turned about one axis only, where a mirror image fits too (turn about a second one), or "
+                "the noise drowns the scale (SolveOptions(nonnegative_scale=True) constrains a shared one)"
             )
 
 
@@ -212,11 +213,12 @@ def _residuals(part: Part, forms: Forms, answer: Answer) -> tuple[dict[Pair, Res
     J_t = np.maximum(np.einsum("ei,eij,ej->e", y, forms.edges_translation, y), 0.0)
     J_R = np.maximum(np.einsum("ei,eij,ej->e", y, forms.edges_rotation, y), 0.0)
     in_metres = answer.scale if part.kind == "direct" else 1.0
-    residuals = {}
-    for e, (pair, moments) in enumerate(zip(part.pairs, part.moments, strict=True)):
-        rms = float(np.sqrt(2.0 * J_t[e] / moments.translation[ONE, ONE])) / abs(in_metres)
-        chord = float(np.sqrt(2.0 * J_R[e] / moments.kappa))  # |R_A R_X - R_Y R_B|_F = sqrt(8) sin(angle / 2)
-        residuals[pair] = Residual(moments.count, rms, 2.0 * float(np.arcsin(min(1.0, chord / np.sqrt(8.0)))))
+    rms = np.sqrt(2.0 * J_t / part.moments.weight) / abs(in_metres)
+    chord = np.sqrt(2.0 * J_R / part.moments.kappa)  # |R_A R_X - R_Y R_B|_F = sqrt(8) sin(angle / 2)
+    angle = 2.0 * np.arcsin(np.minimum(1.0, chord / np.sqrt(8.0)))
+    residuals = {
+        pair: Residual(int(part.moments.count[e]), float(rms[e]), float(angle[e])) for e, pair in enumerate(part.pairs)
+    }
     return residuals, float(J_t.sum()), float(J_R.sum())
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.special import fdtri
 
+from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify import arrow
 from gtsam_rwhec.certify.parts import Part
 from gtsam_rwhec.certify.variables import Answer
@@ -36,7 +37,6 @@ from gtsam_rwhec.information import (
     prior_information,
 )
 from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Pair
 from gtsam_rwhec.statistics import ONE, R_A, T_B
 
 #: A free direction passes for determined with this probability.
@@ -140,9 +140,9 @@ def identify(part: Part, answer: Answer, translation_cost: float, rotation_cost:
 
     index = {name: i for i, name in enumerate(part.free)}
     counts = np.zeros(len(index) + 1)
-    for pair, moments in zip(part.pairs, part.moments, strict=True):
+    for pair, count in zip(part.pairs, part.moments.count, strict=True):
         for name in set(pair) & index.keys():
-            counts[index[name]] += moments.count
+            counts[index[name]] += count
     counts[-1] = part.number_of_measurements
     rotation_prior, translation_prior = prior_information(part)
     rotation_only = pairs.used & _IS_ROTATION
@@ -196,9 +196,8 @@ def combined(results: list[Identifiability], components: tuple[tuple[str, ...], 
 
 def _typical_length(part: Part) -> float:
     """Root mean square of |t_B|, in metres: weighs radians against metres in words."""
-    W = sum(float(m.translation[ONE, ONE]) for m in part.moments)
-    square = sum(float(np.trace(m.translation[T_B, T_B])) for m in part.moments)
-    return float(np.sqrt(max(square / W, 1e-12)))
+    square = float(np.einsum("ekk->", part.moments.translation[:, T_B, T_B]))
+    return float(np.sqrt(max(square / float(part.moments.weight.sum()), 1e-12)))
 
 
 def _threshold(squares: Array | float, redundancy: int) -> Array:
@@ -212,8 +211,8 @@ def _rotation_axes(part: Part, noise: Array, redundancy: int) -> list[int]:
     The mean of R_A shortens every direction but a common axis: 1 - s^2 of its singular values is the mean square
     sine of the turning that leaves that direction; noise alone makes it 2 q^2.
     """
-    means = np.array([m.translation[R_A, ONE].reshape(3, 3) / m.translation[ONE, ONE] for m in part.moments])
-    counts = np.array([m.count for m in part.moments])
+    means = part.moments.translation[:, R_A, ONE].reshape(-1, 3, 3) / part.moments.weight[:, None, None]
+    counts = part.moments.count
     s = np.linalg.svd(means, compute_uv=False)
     ratio = (1.0 - s**2) / (2.0 * noise[:, None])
     excited = (ratio > _threshold(2.0 * counts, redundancy)[:, None]).sum(axis=1)
@@ -281,7 +280,7 @@ def _pairs(
     part: Part, pairs: PairInformation, redundancy: int, axes: list[int], length: float
 ) -> dict[Pair, PairIdentifiability]:
     """Every pair on its own, all in one stack of 15 x 15 problems, asked as the whole is."""
-    counts = np.array([m.count for m in part.moments])
+    counts = part.moments.count
     threshold = _threshold(2.0 * counts, redundancy)
     rotations = pairs.used & _IS_ROTATION
     turning, _ = _weakest_of_each(pairs.rotation, pairs.noise_rotation, rotations)

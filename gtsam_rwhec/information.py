@@ -48,8 +48,7 @@ def noise_level(part: Part, translation_cost: float, rotation_cost: float) -> No
     if redundancy <= 0:  # nothing tells the noise but the weights
         return NoiseLevel(1.0, 1.0, redundancy)
     correction = 6.0 * N / redundancy
-    W = sum(float(m.translation[ONE, ONE]) for m in part.moments)
-    K = sum(m.kappa for m in part.moments)
+    W, K = float(part.moments.weight.sum()), float(part.moments.kappa.sum())
     return NoiseLevel(
         max(correction * 2.0 * translation_cost / (3.0 * N), W / N * FLOOR_M**2),
         max(correction * 2.0 * rotation_cost / (3.0 * N), 2.0 * K / N * FLOOR_RAD**2),
@@ -91,9 +90,8 @@ def pair_information(part: Part, answer: Answer, noise: NoiseLevel) -> PairInfor
     own_scale = dict(zip(part.free, answer.own_scale, strict=True))
     owners = frozenset(part.scale_owners)
     alpha = np.array([_scale(part, answer, own_scale, target) for target, _ in part.pairs])
-    G = np.array([m.translation for m in part.moments])
-    K, n = np.array([m.kappa for m in part.moments]), np.array([m.count for m in part.moments])
-    W = G[:, ONE, ONE]
+    G, W = part.moments.translation, part.moments.weight
+    K, n = part.moments.kappa, part.moments.count
 
     # Moments of c = R_A t_X + t_A - t_Y, linear in A's features: c = [t_X' (x) I, I, -t_Y] f.
     linear = np.zeros((E, 3, 25))

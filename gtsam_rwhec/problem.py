@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gtsam_rwhec.accumulation import Accumulator, Batch, Pair
 from gtsam_rwhec.errors import (
     CountError,
     FrameError,
@@ -36,17 +37,15 @@ from gtsam_rwhec.poses import (
     one_transform,
 )
 from gtsam_rwhec.priors import Prior, check_agreement, difference
-from gtsam_rwhec.statistics import BLOCK, Gauge, Moments
+from gtsam_rwhec.statistics import Gauge, Moments
 
 ScaleMode = Literal["known", "shared", "per_target"]
-Pair = tuple[str, str]
 
 
 @dataclass
 class _Edge:
-    """One target seen by one sensor, or one sensor's motions."""
+    """Raw measurements of one target by one sensor, or of one sensor's motions, as far as they are kept."""
 
-    moments: Moments
     batches: list[Measurements] = field(default_factory=list)
     covariance_given: bool = False
 
@@ -73,13 +72,12 @@ class Problem:
         self.scale: ScaleMode = scale
         self.keep_measurements = keep_measurements
         self.is_relative = False
-        self.gauge: Gauge | None = None
         self.fixed: dict[str, Array] = {}
         self.priors: dict[str, list[Prior]] = {}
         self.fixed_scales: dict[str, float] = {}
         self._kind: dict[str, Literal["target", "sensor"]] = {}
         self._edges: dict[Pair, _Edge] = {}
-        self._target_carrier_set = False
+        self._accumulator = Accumulator()
 
     # -- what is in it ------------------------------------------------------------------------------------------
 
@@ -101,16 +99,28 @@ class Problem:
     @property
     def number_of_measurements(self) -> int:
         """Measurements of all pairs together."""
-        return sum(edge.moments.count for edge in self._edges.values())
+        return sum(moments.count for moments in self._accumulator.moments.values())
 
     @property
     def has_covariances(self) -> bool:
         """Whether any measurement came with a full covariance (used in refinement only)."""
         return any(edge.covariance_given for edge in self._edges.values())
 
+    @property
+    def has_measurements(self) -> bool:
+        """Whether every raw measurement is still here."""
+        kept = sum(len(batch.A) for edge in self._edges.values() for batch in edge.batches)
+        return kept == self.number_of_measurements
+
+    @property
+    def gauge(self) -> Gauge:
+        """The origins that moments are about."""
+        return self._accumulator.gauge
+
     def moments(self, target: str, sensor: str) -> Moments:
-        """Moments of a pair, about ``self.gauge``."""
-        return self._edge(target, sensor).moments
+        """Moments of a pair, about ``gauge``."""
+        self._edge(target, sensor)
+        return self._accumulator.moments[target, sensor]
 
     def measurements(self, target: str, sensor: str) -> Measurements:
         """Raw measurements of a pair, in the order in which they were added.
@@ -121,7 +131,7 @@ class Problem:
             When the problem was made with ``keep_measurements=False``.
         """
         edge = self._edge(target, sensor)
-        if sum(len(batch.A) for batch in edge.batches) != edge.moments.count:
+        if sum(len(batch.A) for batch in edge.batches) != self.moments(target, sensor).count:
             raise MeasurementsNotKeptError(
                 f"the raw measurements of {target}-{sensor} were not kept (keep_measurements=False); "
                 "make the problem with keep_measurements=True"
@@ -236,28 +246,21 @@ class Problem:
         kappas = positive_weights(kappa, count, "kappa", where)
         stamps = checked_stamps(stamps_ns, count, where)
         covariance = checked_covariances(covariances, count, where)
-        gauge = self._gauge_for(A, motion, where)
-        moments = Moments.of(A, B, 1.0 / sigmas**2, kappas, gauge, motion, where)
-        if moments.projected:
+        # The one step that can still fail, and that changes nothing then.
+        projected = self._accumulator.add(Batch(pair, A, B, 1.0 / sigmas**2, kappas, where))
+        if projected:
             warnings.warn(
-                f"{where}: {moments.projected} rotations were off R'R = I by rounding in the input (less than "
+                f"{where}: {projected} rotations were off R'R = I by rounding in the input (less than "
                 f"{ROTATION_TOLERANCE:g}) and were projected to the nearest rotation",
                 RotationsProjectedWarning,
                 stacklevel=3,
             )
         warn_of_millimetres(A, B, where)
-        # Only now, with everything checked, does the problem change.
-        self.gauge = gauge
-        self._target_carrier_set = self._target_carrier_set or not motion
         self.is_relative = self.is_relative or sigma is None or kappa is None
         if not motion:
             self._kind[target] = "target"
         self._kind[sensor] = "sensor"
-        edge = self._edges.get(pair)
-        if edge is None:
-            edge = self._edges[pair] = _Edge(moments)
-        else:
-            edge.moments = edge.moments + moments
+        edge = self._edges.setdefault(pair, _Edge())
         edge.covariance_given = edge.covariance_given or covariance is not None
         if self.keep_measurements:
             edge.batches.append(
@@ -283,14 +286,6 @@ class Problem:
                 )
         if target == sensor and self._kind.get(sensor) == "target":
             raise FrameError(f"{where}: {sensor!r} is a target; only sensors have motions of their own")
-
-    def _gauge_for(self, A: Array, motion: bool, where: str) -> Gauge:
-        if self.gauge is not None and (motion or self._target_carrier_set):
-            return self.gauge
-        sample = A[:BLOCK]
-        if not np.isfinite(sample).all():
-            return self.gauge or Gauge()  # the moments' own check names the bad entry
-        return Gauge.of(sample, self.gauge, motion)
 
     # -- what is known beforehand -------------------------------------------------------------------------------
 
@@ -376,24 +371,15 @@ class Problem:
         merged.fixed, merged.fixed_scales = dict(self.fixed), dict(self.fixed_scales)
         merged.priors = {name: list(priors) for name, priors in self.priors.items()}
         merged._kind = dict(self._kind)
-        merged._edges = {
-            pair: _Edge(edge.moments, list(edge.batches), edge.covariance_given) for pair, edge in self._edges.items()
-        }
+        merged._edges = {pair: _Edge(list(edge.batches), edge.covariance_given) for pair, edge in self._edges.items()}
         for name, kind in other._kind.items():
             if merged._kind.setdefault(name, kind) != kind:
                 raise FrameError(f"{name!r} is a {kind} in one problem and a {merged._kind[name]} in the other")
-        if merged.gauge is None or not (self._target_carrier_set or not other._target_carrier_set):
-            merged.gauge, merged._target_carrier_set = other.gauge, other._target_carrier_set
-            merged._move_edges(self.gauge)
+        merged._accumulator = self._accumulator.merged(other._accumulator)
         for pair, edge in other._edges.items():
-            moments = merged._at_own_gauge(pair, edge.moments, other.gauge)
-            known = merged._edges.get(pair)
-            if known is None:
-                merged._edges[pair] = _Edge(moments, list(edge.batches), edge.covariance_given)
-            else:
-                known.moments = known.moments + moments
-                known.batches.extend(edge.batches)
-                known.covariance_given = known.covariance_given or edge.covariance_given
+            known = merged._edges.setdefault(pair, _Edge())
+            known.batches.extend(edge.batches)
+            known.covariance_given = known.covariance_given or edge.covariance_given
         for name, T in other.fixed.items():
             merged.fix(name, T)
         for name, priors in other.priors.items():
@@ -402,18 +388,6 @@ class Problem:
         for name, scale in other.fixed_scales.items():
             merged.fix_scale(name, scale)
         return merged
-
-    def _at_own_gauge(self, pair: Pair, moments: Moments, gauge: Gauge | None) -> Moments:
-        """Moments about ``gauge``, brought to this problem's own."""
-        if gauge is None or self.gauge is None or gauge is self.gauge:
-            return moments
-        a = self.gauge.sensor_carrier - gauge.sensor_carrier
-        c = a if pair[0] == pair[1] else self.gauge.target_carrier - gauge.target_carrier
-        return moments.shifted(a, c)
-
-    def _move_edges(self, gauge: Gauge | None) -> None:
-        for pair, edge in self._edges.items():
-            edge.moments = self._at_own_gauge(pair, edge.moments, gauge)
 
     def __repr__(self) -> str:
         return (

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import gtsam
 
+from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify.certificate import Certificate, Status
 from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
-from gtsam_rwhec.problem import Pair, ScaleMode
+from gtsam_rwhec.problem import ScaleMode
 
 
 @dataclass(frozen=True)

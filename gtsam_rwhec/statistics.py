@@ -40,31 +40,32 @@ class Gauge:
     target_carrier: Array = field(default_factory=lambda: np.zeros(3))
 
     @staticmethod
-    def of(A: Array, current: Gauge | None, motion: bool) -> Gauge:
+    def of(A: Array, motion: np.ndarray) -> Gauge:
         """The reference that makes the translations of ``A`` (N, 4, 4) small: min |R_A c + t_A - a|^2 over a, c.
 
-        For the motions of AX = XB both ends are the sensor's carrier: c = a. A component that the motions leave open
-        stays small (minimum norm). What ``current`` fixed already stays.
+        Where ``motion`` (N,) says so, both ends are the sensor's carrier (AX = XB): c = a. A component that the
+        motions leave open stays small (minimum norm). Poses that are none give the zero gauge; the check is elsewhere.
         """
+        if not np.isfinite(A).all():
+            return Gauge()
         R, t = A[:, :3, :3], A[:, :3, 3]
-        eye = np.broadcast_to(I3, R.shape)
-        if motion:
-            a = _least_squares((eye - R).reshape(-1, 3), t.ravel())
-            return Gauge(a, np.zeros(3))
-        if current is not None:
-            c = np.einsum("nji,nj->ni", R, current.sensor_carrier - t).mean(axis=0)
-            return Gauge(current.sensor_carrier, c)
-        solution = _least_squares(np.concatenate([eye, -R], axis=2).reshape(-1, 6), t.ravel())
+        rows = np.zeros((len(A), 3, 6))
+        rows[:, :, :3] = I3 - np.where(motion[:, None, None], R, 0.0)
+        rows[:, :, 3:] = -np.where(motion[:, None, None], 0.0, R)
+        solution = np.linalg.lstsq(rows.reshape(-1, 6), t.ravel(), rcond=1e-9)[0]
         return Gauge(solution[:3], solution[3:])
+
+    @staticmethod
+    def target_origin(A: Array, sensor_carrier: Array) -> Array:
+        """The best target carrier's origin (3,) when the sensor carrier's is settled."""
+        if not np.isfinite(A).all():
+            return np.zeros(3)
+        origin: Array = np.einsum("nji,nj->ni", A[:, :3, :3], sensor_carrier - A[:, :3, 3]).mean(axis=0)
+        return origin
 
     def moved_by(self, a: Array, c: Array) -> Gauge:
         """The gauge after a further shift."""
         return Gauge(self.sensor_carrier + a, self.target_carrier + c)
-
-
-def _least_squares(matrix: Array, right: Array) -> Array:
-    solution: Array = np.linalg.lstsq(matrix, right, rcond=1e-9)[0]
-    return solution
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,11 @@ class Moments:
         total = float(kappa) * len(A) if kappa.ndim == 0 else float(kappa.sum())
         return Moments(len(A), total, translation, rotation, projected)
 
+    @staticmethod
+    def none() -> Moments:
+        """Of no measurement."""
+        return Moments(0, 0.0, np.zeros((25, 25)), np.zeros((9, 9)))
+
     def __add__(self, other: Moments) -> Moments:
         return Moments(
             self.count + other.count,
@@ -145,33 +151,74 @@ class Moments:
 
     def shifted(self, a: Array, c: Array) -> Moments:
         """The same measurements about a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
-        # t_A' = t_A + R_A c - a is linear in the features, so the moments change by a congruence.
-        shift = np.eye(25)
-        shift[T_A, R_A] = np.kron(c, I3)
-        shift[T_A, ONE] = -a
+        shift = _shift(a, c)
         return Moments(self.count, self.kappa, shift @ self.translation @ shift.T, self.rotation, self.projected)
 
 
-def best_shift(moments: list[Moments], motion: list[bool]) -> tuple[Array, Array]:
-    """The shift (a, c) that centres all edges together: min sum |t_A + R_A c - a|^2 / sigma^2, minimum norm."""
-    normal = np.zeros((6, 6))
-    right = np.zeros(6)
-    for edge, is_motion in zip(moments, motion, strict=True):
-        G = edge.translation
+def _shift(a: Array, c: Array) -> Array:
+    """t_A' = t_A + R_A c - a is linear in the features, so that moments change by a congruence with this."""
+    shift = np.eye(25)
+    for i in range(3):
+        shift[T_A, R_A][:, 3 * i : 3 * i + 3] = c[i] * I3
+    shift[T_A, ONE] = -a
+    return shift
+
+
+@dataclass(frozen=True)
+class MomentStack:
+    """Moments of E edges: count (E,), kappa (E,), translation (E, 25, 25), rotation (E, 9, 9); motion (E,) booleans."""
+
+    count: np.ndarray
+    kappa: Array
+    translation: Array
+    rotation: Array
+    motion: np.ndarray
+
+    @staticmethod
+    def of(moments: list[Moments], motion: list[bool]) -> MomentStack:
+        """Stack them."""
+        return MomentStack(
+            np.array([edge.count for edge in moments]),
+            np.array([edge.kappa for edge in moments]),
+            np.array([edge.translation for edge in moments]),
+            np.array([edge.rotation for edge in moments]),
+            np.array(motion),
+        )
+
+    @property
+    def weight(self) -> Array:
+        """(E,) sums of 1 / sigma^2."""
+        return self.translation[:, ONE, ONE]
+
+    def best_shift(self) -> tuple[Array, Array]:
+        """The shift (a, c) that centres all edges together: min sum |t_A + R_A c - a|^2 / sigma^2, minimum norm."""
+        G, still = self.translation, ~self.motion
         # R_A' summed: entry (i, k) is R_A[k, i], which vec keeps at 3 i + k.
-        Rt = G[R_A, ONE].reshape(3, 3)
-        Rt_t = np.einsum("ikk->i", G[R_A, T_A].reshape(3, 3, 3))
-        W = G[ONE, ONE] * I3
-        if is_motion:  # c = a: residual t_A - (I - R_A) a
-            normal[:3, :3] += 2.0 * W - Rt - Rt.T
-            right[:3] += G[T_A, ONE] - Rt_t
-        else:
-            normal += np.block([[W, -Rt.T], [-Rt, W]])
-            right += np.r_[G[T_A, ONE], -Rt_t]
-    if not normal.any():
-        return np.zeros(3), np.zeros(3)
-    solution: Array = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-    return solution[:3], solution[3:]
+        Rt = G[:, R_A, ONE].reshape(-1, 3, 3)
+        Rt_t = np.einsum("eikk->ei", G[:, R_A, T_A].reshape(-1, 3, 3, 3))
+        t = G[:, T_A, ONE]
+        normal, right = np.zeros((6, 6)), np.zeros(6)
+        normal[:3, :3] = normal[3:, 3:] = self.weight[still].sum() * I3
+        normal[3:, :3] = -Rt[still].sum(axis=0)
+        normal[:3, 3:] = normal[3:, :3].T
+        right[:3], right[3:] = t[still].sum(axis=0), -Rt_t[still].sum(axis=0)
+        if self.motion.any():  # c = a: residual t_A - (I - R_A) a
+            turned = Rt[self.motion].sum(axis=0)
+            normal[:3, :3] += 2.0 * self.weight[self.motion].sum() * I3 - turned - turned.T
+            right[:3] += (t - Rt_t)[self.motion].sum(axis=0)
+        solution: Array = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+        return solution[:3], solution[3:]
+
+    def shifted(self, a: Array, c: Array) -> MomentStack:
+        """About a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
+        shift = np.where(self.motion[:, None, None], _shift(a, a), _shift(a, c))
+        moved = shift @ self.translation @ shift.transpose(0, 2, 1)
+        return MomentStack(self.count, self.kappa, moved, self.rotation, self.motion)
+
+    def spread(self) -> float:
+        """Root mean square of t_A about the gauge, in metres."""
+        square = np.einsum("ekk->", self.translation[:, T_A, T_A])
+        return float(np.sqrt(max(square, 0.0) / self.weight.sum()))
 
 
 def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array, Array]:

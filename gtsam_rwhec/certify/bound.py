@@ -105,7 +105,7 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
             # y'Zy = constant + a^2 (r'Z_rr r) + ..., and the constant is the last entry of Z x.
             negative = max(0.0, float(constant - value) + value_error + loss)
             lower = constant - Wide(value_error) - Wide(negative * reach_of_a * (1.0 + 1e-10))
-        return Bound(_round_down(lower), float(value), True, True, float(room.min()), None)
+        return Bound(_round_down(lower), float(value), True, True, float(room.min(initial=np.inf)), None)
 
     smallest, direction = 0.0, None
     slack_leaf, slack_border = leaf_unit, border_unit

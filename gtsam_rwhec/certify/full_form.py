@@ -112,13 +112,11 @@ def _as_variable(T: Array, part: Part) -> Array:
 
 def forms_of_edges(part: Part) -> tuple[Array, Array]:
     """Translation and rotation forms (E, 25, 25) of all edges of a part."""
-    translation = np.array([edge.translation for edge in part.moments])
-    rotation = np.array([edge.rotation for edge in part.moments])
-    kappa = np.array([edge.kappa for edge in part.moments])
+    translation, rotation = part.moments.translation, part.moments.rotation
     if part.kind == "inverse":
         translation = translation[:, SWAPPED[:, None], SWAPPED]
         rotation = rotation.transpose(0, 2, 1)
-    return edge_forms(translation, rotation, kappa)
+    return edge_forms(translation, rotation, part.moments.kappa)
 
 
 def assemble(part: Part, slots: EdgeSlots, edge_form: Array) -> FullForm:

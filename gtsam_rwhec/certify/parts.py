@@ -7,15 +7,18 @@ from typing import Literal
 
 import numpy as np
 
+from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.errors import CountError, FrameError, PriorError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.priors import Prior
-from gtsam_rwhec.problem import Pair, Problem, ScaleMode
-from gtsam_rwhec.statistics import Gauge, Moments, best_shift
+from gtsam_rwhec.problem import Problem, ScaleMode
+from gtsam_rwhec.statistics import Gauge, Moments, MomentStack
 
 #: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" the equation turned round, B X^-1 = Y^-1 A, which
 #: a scale for each target needs (DESIGN fact 7).
 Kind = Literal["direct", "inverse"]
+#: Beyond this many times the translations' spread, moving the gauge costs digits (its square, of sixteen).
+FAR = 100.0
 
 
 @dataclass(frozen=True)
@@ -30,8 +33,8 @@ class Part:
         All frames of the part, fixed ones too.
     pairs : tuple of (str, str)
         Its edges; (sensor, sensor) for motions.
-    moments : tuple of Moments
-        Of each pair, about ``gauge``.
+    moments : MomentStack
+        Of the pairs in their order, about ``gauge``.
     fixed : dict of str to (4, 4) array
         Known poses, about ``gauge``.
     priors : dict of str to list of Prior
@@ -43,7 +46,7 @@ class Part:
     targets: tuple[str, ...]
     sensors: tuple[str, ...]
     pairs: tuple[Pair, ...]
-    moments: tuple[Moments, ...]
+    moments: MomentStack
     fixed: dict[str, Array]
     priors: dict[str, list[Prior]]
     fixed_scales: dict[str, float]
@@ -65,7 +68,7 @@ class Part:
     @property
     def number_of_measurements(self) -> int:
         """Of all pairs."""
-        return sum(edge.count for edge in self.moments)
+        return int(self.moments.count.sum())
 
     @property
     def scale_owners(self) -> tuple[str, ...]:
@@ -137,13 +140,7 @@ def _part(problem: Problem, members: frozenset[str]) -> Part:
     pairs = tuple(pair for pair in problem.pairs if pair[1] in members)
     targets = tuple(name for name in problem.targets if name in members)
     sensors = tuple(name for name in problem.sensors if name in members)
-    moments = [problem.moments(*pair) for pair in pairs]
-    motion = [target == sensor for target, sensor in pairs]
-    a, c = best_shift(moments, motion)
-    assert problem.gauge is not None
-    gauge = problem.gauge.moved_by(a, c)
-    moments = [edge.shifted(a, a if m else c) for edge, m in zip(moments, motion, strict=True)]
-
+    gauge, moments = _centred(problem, pairs)
     priors = {name: problem.priors[name] for name in problem.priors if name in members}
     turned_round = problem.scale == "per_target" or (
         problem.scale == "shared" and any(p.sigma is not None for beliefs in priors.values() for p in beliefs)
@@ -156,7 +153,7 @@ def _part(problem: Problem, members: frozenset[str]) -> Part:
         targets=targets,
         sensors=sensors,
         pairs=pairs,
-        moments=tuple(moments),
+        moments=moments,
         fixed={name: _moved(T, shift[name]) for name, T in problem.fixed.items() if name in members},
         priors={
             name: [Prior(_moved(p.transform, shift[name]), p.sigma, p.kappa) for p in beliefs]
@@ -170,6 +167,27 @@ def _part(problem: Problem, members: frozenset[str]) -> Part:
     )
     _check(part)
     return part
+
+
+def _centred(problem: Problem, pairs: tuple[Pair, ...]) -> tuple[Gauge, MomentStack]:
+    """A part's moments about its own gauge (DESIGN fact 9).
+
+    Moving moments is exact in formula, but a move far beyond the spread of the translations cancels digits, as when
+    the first measurements were all but one pose. Then the raw measurements, where kept, are summed anew.
+    """
+    motion = [target == sensor for target, sensor in pairs]
+    moments = MomentStack.of([problem.moments(*pair) for pair in pairs], motion)
+    a, c = moments.best_shift()
+    gauge, centred = problem.gauge.moved_by(a, c), moments.shifted(a, c)
+    far = float(np.hypot(np.linalg.norm(a), np.linalg.norm(c)))
+    if far > FAR * centred.spread() and problem.has_measurements:
+        fresh = []
+        for pair, is_motion in zip(pairs, motion, strict=True):
+            raw = problem.measurements(*pair)
+            where = "-".join(dict.fromkeys(pair))
+            fresh.append(Moments.of(raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, gauge, is_motion, where))
+        centred = MomentStack.of(fresh, motion)
+    return gauge, centred
 
 
 def _moved(T: Array, origin: Array) -> Array:
@@ -210,5 +228,5 @@ def _check(part: Part) -> None:
     for name in part.fixed_scales:
         if name not in {target for target, _ in part.pairs}:
             raise ScaleError(f"the scale of {name} is fixed, but nothing measures {name}'s size")
-    if part.scale != "known" and not np.isfinite(part.moments[0].translation).all():
+    if part.scale != "known" and not np.isfinite(part.moments.translation).all():
         raise ScaleError("the translations overflow; are they in metres?")
