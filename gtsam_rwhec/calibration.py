@@ -17,13 +17,14 @@ from gtsam_rwhec.certify.certificate import OBJECTIVES, Certificate, Status
 from gtsam_rwhec.certify.nonnegative import run_with_nonnegative_scale
 from gtsam_rwhec.certify.options import Method, SolveOptions, check_method
 from gtsam_rwhec.certify.parts import Part, connected_components, parts_of
-from gtsam_rwhec.certify.search import Forms, Found, Search
+from gtsam_rwhec.certify.search import Found, Search
 from gtsam_rwhec.certify.variables import Answer, answer_of, as_variables, rotations_as_variables
 from gtsam_rwhec.errors import FrameError, NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError
 from gtsam_rwhec.identifiability import Identifiability, identify
 from gtsam_rwhec.poses import PoseLike, one_transform, to_pose3
 from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.solution import Residual, Solution, SolvedPart
+from gtsam_rwhec.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
+from gtsam_rwhec.solution import Solution, SolvedPart
 
 Poses = Mapping[str, PoseLike]
 Scale = float | Mapping[str, float]
@@ -152,8 +153,9 @@ def _finish(part: Part, search: Search, found: Found) -> _Result:
     answer = answer_of(part, search.form, found.R)
     closed = found.cost - found.lower <= search.tolerance(found.cost)
     _check_scale(part, answer, closed)
-    residuals, translation_cost, rotation_cost = _residuals(part, search.forms, answer)
-    known = identify(part, answer, translation_cost, rotation_cost)
+    poses = PairPoses.of(part, answer)
+    J_t, J_R = costs_of_pairs(part, poses)
+    known = identify(part, poses, J_t, J_R)
     search.seconds["identifiability"] = time.perf_counter() - start
     reason = found.reason
     if not np.isfinite(found.lower):
@@ -178,7 +180,7 @@ def _finish(part: Part, search: Search, found: Found) -> _Result:
         is_relative=part.is_relative,
         seconds=dict(search.seconds),
     )
-    return _Result(part, answer, certificate, known, residuals)
+    return _Result(part, answer, certificate, known, residuals_of_pairs(part, poses, J_t, J_R))
 
 
 def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
@@ -194,32 +196,6 @@ def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
                 "the motion turned about one axis only, where a mirror image fits too (turn about a second one), or "
                 "the noise drowns the scale (SolveOptions(nonnegative_scale=True) constrains a shared one)"
             )
-
-
-def _residuals(part: Part, forms: Forms, answer: Answer) -> tuple[dict[Pair, Residual], float, float]:
-    """Per-pair root mean squares from the edges' forms, and J_t and J_R of all."""
-    leaf, center, tail = as_variables(part, answer)
-    numbers = np.concatenate([leaf, center, np.zeros((1, 13))])
-    place = {name: i for i, name in enumerate(part.free)}
-    L = len(leaf)
-    x = np.zeros((len(part.pairs), 28))
-    x[:, 26:] = tail
-    for e, pair in enumerate(part.pairs):
-        for name in pair:
-            i = place.get(name, len(numbers) - 1)
-            if name in place:
-                x[e, slice(0, 13) if i < L else slice(13, 26)] = numbers[i]
-    y = np.einsum("eij,ej->ei", forms.substitution, x)
-    J_t = np.maximum(np.einsum("ei,eij,ej->e", y, forms.edges_translation, y), 0.0)
-    J_R = np.maximum(np.einsum("ei,eij,ej->e", y, forms.edges_rotation, y), 0.0)
-    in_metres = answer.scale if part.kind == "direct" else 1.0
-    rms = np.sqrt(2.0 * J_t / part.moments.weight) / abs(in_metres)
-    chord = np.sqrt(2.0 * J_R / part.moments.kappa)  # |R_A R_X - R_Y R_B|_F = sqrt(8) sin(angle / 2)
-    angle = 2.0 * np.arcsin(np.minimum(1.0, chord / np.sqrt(8.0)))
-    residuals = {
-        pair: Residual(int(part.moments.count[e]), float(rms[e]), float(angle[e])) for e, pair in enumerate(part.pairs)
-    }
-    return residuals, float(J_t.sum()), float(J_R.sum())
 
 
 def _merge(problem: Problem, results: list[_Result]) -> Solution:

@@ -26,7 +26,6 @@ from scipy.special import fdtri
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify import arrow
 from gtsam_rwhec.certify.parts import Part
-from gtsam_rwhec.certify.variables import Answer
 from gtsam_rwhec.free_directions import describe
 from gtsam_rwhec.information import (
     Information,
@@ -37,6 +36,7 @@ from gtsam_rwhec.information import (
     prior_information,
 )
 from gtsam_rwhec.poses import Array
+from gtsam_rwhec.residuals import PairPoses
 from gtsam_rwhec.statistics import ONE, R_A, T_B
 
 #: A free direction passes for determined with this probability.
@@ -122,18 +122,19 @@ _IS_ROTATION = np.zeros(15, dtype=bool)
 _IS_ROTATION[[0, 1, 2, 7, 8, 9]] = True
 
 
-def identify(part: Part, answer: Answer, translation_cost: float, rotation_cost: float) -> Identifiability:
+def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiability:
     """Test every direction of a part, and of each of its pairs alone, at its answer.
 
     Parameters
     ----------
     part : Part
-    answer : Answer
-    translation_cost, rotation_cost : float
-        J_t and J_R at the answer: they tell the noise.
+    poses : PairPoses
+        The answer.
+    J_t, J_R : (E,) arrays
+        Costs of the pairs at the answer, in the physical model: they tell the noise.
     """
-    noise = noise_level(part, translation_cost, rotation_cost)
-    pairs = pair_information(part, answer, noise)
+    noise = noise_level(part, J_t, J_R)
+    pairs = pair_information(part, poses, noise)
     length = _typical_length(part)
     axes = _rotation_axes(part, pairs.carrier_noise, noise.redundancy)
     of_each = _pairs(part, pairs, noise.redundancy, axes, length)

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.certify.parts import Part
-from gtsam_rwhec.certify.variables import Answer
 from gtsam_rwhec.poses import Array
+from gtsam_rwhec.residuals import PairPoses
 from gtsam_rwhec.statistics import ONE, R_A, T_A
 
 #: Below a nanoradian and a nanometre nothing is noise: exact data.
@@ -30,30 +30,41 @@ OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """Variance factors of the residuals: 1 when the weights are true. ``redundancy`` is equations minus unknowns."""
+    """Variance factors of each pair's residuals, (E,): 1 where the weights are true.
 
-    translation: float
-    rotation: float
+    ``redundancy`` is equations minus unknowns of the whole part.
+    """
+
+    translation: Array
+    rotation: Array
     redundancy: int
 
 
-def noise_level(part: Part, translation_cost: float, rotation_cost: float) -> NoiseLevel:
-    """Variance factors from the residuals at the optimum, corrected for the unknowns that were fitted.
+def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
+    """Variance factors from the residuals at the optimum: the part's, or a pair's own where that is larger.
 
     J_t is sum |r|^2 / (2 sigma^2), expected 3 N / 2; J_R is sum kappa |dR|_F^2 / 2 = sum kappa theta^2, expected
-    3 N / 2 too, as each axis has variance 1 / (2 kappa).
+    3 N / 2 too, as each axis has variance 1 / (2 kappa). The part's are corrected for the unknowns that were fitted.
+
+    Parameters
+    ----------
+    part : Part
+    J_t, J_R : (E,) arrays
+        Of each pair, in the physical model.
     """
-    N = part.number_of_measurements
+    counts, N = part.moments.count, part.number_of_measurements
     redundancy = 6 * N - part.number_of_unknowns
     if redundancy <= 0:  # nothing tells the noise but the weights
-        return NoiseLevel(1.0, 1.0, redundancy)
+        return NoiseLevel(np.ones(len(counts)), np.ones(len(counts)), redundancy)
     correction = 6.0 * N / redundancy
-    W, K = float(part.moments.weight.sum()), float(part.moments.kappa.sum())
-    return NoiseLevel(
-        max(correction * 2.0 * translation_cost / (3.0 * N), W / N * FLOOR_M**2),
-        max(correction * 2.0 * rotation_cost / (3.0 * N), 2.0 * K / N * FLOOR_RAD**2),
-        redundancy,
-    )
+    factors = []
+    for J, floor in (
+        (J_t, part.moments.weight * FLOOR_M**2 / counts),
+        (J_R, 2.0 * part.moments.kappa * FLOOR_RAD**2 / counts),
+    ):
+        of_part = correction * float(J.sum()) / (1.5 * N)
+        factors.append(np.maximum(np.maximum(J / (1.5 * counts), of_part), floor))
+    return NoiseLevel(factors[0], factors[1], redundancy)
 
 
 @dataclass(frozen=True)
@@ -72,7 +83,7 @@ class PairInformation:
     carrier_noise: Array
 
 
-def pair_information(part: Part, answer: Answer, noise: NoiseLevel) -> PairInformation:
+def pair_information(part: Part, poses: PairPoses, noise: NoiseLevel) -> PairInformation:
     """The information of every pair and its noise, all pairs at once.
 
     Noise in a direction that the true motions leave free: with A's rotation off by eps (variance q^2 an axis), what
@@ -83,13 +94,8 @@ def pair_information(part: Part, answer: Answer, noise: NoiseLevel) -> PairInfor
     3 f_t for a scale.
     """
     E = len(part.pairs)
-    index = {name: i for i, name in enumerate(part.free)}
-    poses = [[_pose(part, answer, index, name) for name in pair] for pair in part.pairs]
-    R_X, R_Y = (np.array([pose[end][0] for pose in poses]) for end in (0, 1))
-    t_X, t_Y = (np.array([pose[end][1] for pose in poses]) for end in (0, 1))
-    own_scale = dict(zip(part.free, answer.own_scale, strict=True))
-    owners = frozenset(part.scale_owners)
-    alpha = np.array([_scale(part, answer, own_scale, target) for target, _ in part.pairs])
+    R_X, t_X, R_Y, t_Y, alpha = poses.R_X, poses.t_X, poses.R_Y, poses.t_Y, poses.alpha
+    free, owners = frozenset(part.free), frozenset(part.scale_owners)
     G, W = part.moments.translation, part.moments.weight
     K, n = part.moments.kappa, part.moments.count
 
@@ -133,7 +139,7 @@ def pair_information(part: Part, answer: Answer, noise: NoiseLevel) -> PairInfor
     noise_rotation, noise_translation = np.zeros((E, 15)), np.zeros((E, 15))
     for omega, v in ((OMEGA_X, V_X), (OMEGA_Y, V_Y)):
         noise_rotation[:, omega] = (2.0 * K * q2)[:, None]
-        noise_translation[:, omega] = noise.translation * n[:, None]
+        noise_translation[:, omega] = (noise.translation * n)[:, None]
         noise_translation[:, v] = (alpha**2 * W * q2)[:, None]
     noise_translation[:, SHARED] = 3.0 * noise.translation * n
 
@@ -147,8 +153,8 @@ def pair_information(part: Part, answer: Answer, noise: NoiseLevel) -> PairInfor
             noise_rotation[e, 7:14] += noise_rotation[e, :7]
             noise_translation[e, 7:14] += noise_translation[e, :7]
             noise_rotation[e, :7] = noise_translation[e, :7] = 0.0
-        used[e, :6] = target in index and target != sensor
-        used[e, 7:13] = sensor in index
+        used[e, :6] = target in free and target != sensor
+        used[e, 7:13] = sensor in free
         used[e, SHARED] = part.scale == "shared"
         if target in owners:
             at = OWN_X if target != sensor else 13
@@ -164,19 +170,6 @@ _LEVI_CIVITA = np.zeros((3, 3, 3))
 for _i in range(3):
     _LEVI_CIVITA[_i, (_i + 1) % 3, (_i + 2) % 3] = 1.0
     _LEVI_CIVITA[_i, (_i + 2) % 3, (_i + 1) % 3] = -1.0
-
-
-def _pose(part: Part, answer: Answer, index: dict[str, int], name: str) -> tuple[Array, Array]:
-    if name in index:
-        return answer.R[index[name]], answer.t[index[name]]
-    return part.fixed[name][:3, :3], part.fixed[name][:3, 3]
-
-
-def _scale(part: Part, answer: Answer, own_scale: dict[str, float], target: str) -> float:
-    if part.scale == "shared":
-        return answer.scale
-    own = own_scale.get(target, np.nan)
-    return float(own) if np.isfinite(own) else part.fixed_scales.get(target, 1.0)
 
 
 @dataclass(frozen=True)

@@ -11,19 +11,7 @@ from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify.certificate import Certificate, Status
 from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
 from gtsam_rwhec.problem import ScaleMode
-
-
-@dataclass(frozen=True)
-class Residual:
-    """Root mean squares of a pair's residuals, weighted as the cost weighs them.
-
-    translation_rms_m is of |R_A t_X + t_A - t_Y - R_Y t_B / scale| in true metres, rotation_rms_rad of the angle of
-    R_A R_X against R_Y R_B.
-    """
-
-    number_of_measurements: int
-    translation_rms_m: float
-    rotation_rms_rad: float
+from gtsam_rwhec.residuals import Residual
 
 
 @dataclass(frozen=True)
