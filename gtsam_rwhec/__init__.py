@@ -4,7 +4,9 @@ State a ``Problem``, ``solve`` it: poses of every sensor and target, with a proo
 what the motion leaves undetermined.
 """
 
-from gtsam_rwhec import errors, simulate
+from typing import TYPE_CHECKING, Any
+
+from gtsam_rwhec import errors
 from gtsam_rwhec.calibration import certify, solve
 from gtsam_rwhec.certify.certificate import Certificate, Status
 from gtsam_rwhec.certify.options import SolveOptions
@@ -15,6 +17,9 @@ from gtsam_rwhec.priors import Prior
 from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.result_file import read_solution
 from gtsam_rwhec.solution import Residual, Solution, SolvedPart
+
+if TYPE_CHECKING:
+    from gtsam_rwhec import simulate
 
 __version__ = "0.1.0"
 
@@ -37,3 +42,12 @@ __all__ = [
     "simulate",
     "solve",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # The simulators bring in more of SciPy than the rest together: only who simulates waits for it.
+    if name == "simulate":
+        import gtsam_rwhec.simulate
+
+        return gtsam_rwhec.simulate
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

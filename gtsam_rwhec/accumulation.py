@@ -38,15 +38,15 @@ class Batch:
 
 
 class Accumulator:
-    """Moments by pair. Adding a batch either succeeds or changes nothing."""
+    """Moments by pair. Nothing in it changes: what is added makes another."""
 
-    def __init__(self) -> None:
-        self.gauge = Gauge()
-        self.moments: dict[Pair, Moments] = {}
-        self._opening: list[Batch] | None = []
+    def __init__(self, gauge: Gauge | None = None, moments: dict[Pair, Moments] | None = None) -> None:
+        self.gauge = gauge or Gauge()
+        self.moments = moments or {}
+        self._opening: list[Batch] | None = [] if gauge is None else None
 
-    def add(self, batch: Batch) -> int:
-        """Add a batch; the number of its rotations that had to be projected to SO(3).
+    def added(self, batch: Batch) -> tuple[Accumulator, int]:
+        """This and a batch; and how many of its rotations had to be projected to SO(3).
 
         Raises
         ------
@@ -58,9 +58,8 @@ class Accumulator:
             if not batch.is_motion and not self._has_targets():
                 gauge = replace(gauge, target_carrier=Gauge.target_origin(batch.A[:BLOCK], gauge.sensor_carrier))
             fresh = batch.moments(gauge)
-            self.gauge = gauge
-            self.moments[batch.pair] = self.moments[batch.pair] + fresh if batch.pair in self.moments else fresh
-            return fresh.projected
+            known = self.moments.get(batch.pair)
+            return Accumulator(gauge, {**self.moments, batch.pair: known + fresh if known else fresh}), fresh.projected
         batches = [*self._opening, batch]
         gauge = Gauge.of(
             np.concatenate([b.A[:BLOCK] for b in batches]),
@@ -71,38 +70,30 @@ class Accumulator:
         for b in batches:
             fresh = b.moments(gauge)
             moments[b.pair] = moments[b.pair] + fresh if b.pair in moments else fresh
-        self.gauge, self.moments = gauge, moments
-        if sum(len(b.A) for b in batches) >= OPENING:
-            self._opening = None
-        else:  # kept for a while: the caller's arrays may change meanwhile
-            self._opening.append(replace(batch, A=batch.A.copy(), B=batch.B.copy()))
-        return fresh.projected
+        result = Accumulator(gauge, moments)
+        if sum(len(b.A) for b in batches) < OPENING:
+            # Kept for a while: the caller's arrays may change meanwhile.
+            result._opening = [*self._opening, replace(batch, A=batch.A.copy(), B=batch.B.copy())]
+        return result, fresh.projected
 
     def _has_targets(self) -> bool:
         return any(target != sensor for target, sensor in self.moments)
 
-    def copy(self) -> Accumulator:
-        """An independent one; moments themselves never change."""
-        other = Accumulator()
-        other.gauge, other.moments = self.gauge, dict(self.moments)
-        other._opening = None if self._opening is None else list(self._opening)
-        return other
-
     def merged(self, other: Accumulator) -> Accumulator:
         """Both together, about the gauge of the one that has settled."""
         settled, rest = (self, other) if self._opening is None or other._opening is not None else (other, self)
-        result = settled.copy()
         if rest._opening is not None:
+            result = settled
             for batch in rest._opening:
-                result.add(batch)
+                result, _ = result.added(batch)
             return result
-        if not result._has_targets():
-            result.gauge = replace(result.gauge, target_carrier=rest.gauge.target_carrier)
-        a = result.gauge.sensor_carrier - rest.gauge.sensor_carrier
-        c = result.gauge.target_carrier - rest.gauge.target_carrier
-        if not rest._has_targets():
-            c = np.zeros(3)
-        for pair, moments in rest.moments.items():
-            moved = moments.shifted(a, a if pair[0] == pair[1] else c)
-            result.moments[pair] = result.moments[pair] + moved if pair in result.moments else moved
-        return result
+        gauge = settled.gauge
+        if not settled._has_targets():
+            gauge = replace(gauge, target_carrier=rest.gauge.target_carrier)
+        a = gauge.sensor_carrier - rest.gauge.sensor_carrier
+        c = gauge.target_carrier - rest.gauge.target_carrier if rest._has_targets() else np.zeros(3)
+        moments = dict(settled.moments)
+        for pair, edge in rest.moments.items():
+            moved = edge.shifted(a, a if pair[0] == pair[1] else c)
+            moments[pair] = moments[pair] + moved if pair in moments else moved
+        return Accumulator(gauge, moments)

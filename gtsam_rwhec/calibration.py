@@ -19,9 +19,17 @@ from gtsam_rwhec.certify.options import Method, SolveOptions, check_method
 from gtsam_rwhec.certify.parts import Part, connected_components, parts_of
 from gtsam_rwhec.certify.search import Found, Search
 from gtsam_rwhec.certify.variables import Answer, answer_of, as_variables, rotations_as_variables
-from gtsam_rwhec.errors import FrameError, NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError
+from gtsam_rwhec.errors import (
+    FrameError,
+    NotCertifiedWarning,
+    NotUniqueWarning,
+    OptionError,
+    PriorError,
+    ScaleError,
+)
 from gtsam_rwhec.identifiability import Identifiability, identify
 from gtsam_rwhec.poses import PoseLike, one_transform, to_pose3
+from gtsam_rwhec.priors import difference
 from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
 from gtsam_rwhec.solution import Solution, SolvedPart
@@ -29,6 +37,9 @@ from gtsam_rwhec.solution import Solution, SolvedPart
 Poses = Mapping[str, PoseLike]
 Scale = float | Mapping[str, float]
 Progress = Callable[[str], None]
+
+#: An answer's known frames and scales may differ from the problem's by this much: rounding on the way through a file.
+SAME = 1e-9
 
 
 def solve(
@@ -113,9 +124,17 @@ def certify(
     -------
     Certificate
         Of the answer as given. "gap" says in ``reason`` whether a better answer was found.
+
+    Raises
+    ------
+    FrameError, PoseError, ScaleError
+        For an answer that lacks a frame, has something that is no pose, or a scale that is none.
+    PriorError, ScaleError
+        For an answer that contradicts a fixed frame or a known scale.
     """
     options = options or SolveOptions()
     parts = parts_of(problem)
+    _check_against_knowledge(problem, X, Y, scale)
     results = []
     for part in parts:
         given = _given_answer(part, X, Y, scale)
@@ -265,6 +284,27 @@ def _given_answer(part: Part, X: Poses, Y: Poses, scale: Scale) -> Answer:
             own[i] = _positive(scale[name] if isinstance(scale, Mapping) and name in scale else scale, name)
     shared = _positive(scale, "all targets") if part.scale == "shared" else 1.0
     return Answer(np.ascontiguousarray(stacked[:, :3, :3]), stacked[:, :3, 3] - shift, own, shared)
+
+
+def _check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) -> None:
+    """Refuse an answer that is another than the problem says is known: its cost would not be that of the answer."""
+    if problem.scale == "known" and scale != 1.0:
+        raise ScaleError(
+            f"the answer's scale is {scale!r}, but this problem has scale='known', which is 1; leave it out"
+        )
+    if isinstance(scale, Mapping):
+        for name, known in problem.fixed_scales.items():
+            if name in scale and not np.isclose(scale[name], known, rtol=SAME, atol=0.0):
+                raise ScaleError(f"the answer's scale of {name} is {scale[name]!r}, but it is fixed at {known!r}")
+    for name, T in problem.fixed.items():
+        poses, what = (X, "X") if name in problem.targets else (Y, "Y")
+        if name in poses:
+            given = one_transform(poses[name], f"{what}[{name!r}]")
+            if not np.allclose(given, T, rtol=SAME, atol=SAME):
+                raise PriorError(
+                    f"{what}[{name!r}] is not the pose at which {name} is fixed: {difference(given, T)}; leave it out, "
+                    "or do not fix the frame"
+                )
 
 
 def _positive(scale: Scale, name: str) -> float:

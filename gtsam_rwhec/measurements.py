@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CountError, NoiseError, UnitsWarning
 from gtsam_rwhec.poses import Array
-from gtsam_rwhec.statistics import BLOCK
+from gtsam_rwhec.statistics import BLOCK, Gauge
 
 #: Translations with a median beyond this are taken for millimetres (a camera sees no tag at 100 m).
 MILLIMETRES_M = 100.0
@@ -35,9 +35,10 @@ def positive_weights(value: ArrayLike | None, count: int, name: str, where: str)
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise NoiseError(f"{where}: {name}={value!r} cannot be read as numbers") from error
-    if array.shape not in ((), (count,)):
-        raise CountError(f"{where}: {name} has shape {array.shape}; give one number or one for each of {count}")
+        raise NoiseError(f"{where}: {name}={value!r} cannot be read as numbers; give a number") from error
+    if array.shape not in ((), (count,)) or count == 0 != array.ndim:
+        many = f" or one for each of {count}" if count else ""
+        raise CountError(f"{where}: {name} has shape {array.shape}; give one number{many}")
     bad = np.flatnonzero(~((array > 0.0) & np.isfinite(array)))
     if bad.size:
         index = f" of measurement {bad[0]}" if array.ndim else ""
@@ -78,22 +79,30 @@ def checked_covariances(covariances: ArrayLike | None, count: int, where: str) -
         array = np.broadcast_to(array, (count, 6, 6))
     if array.shape != (count, 6, 6):
         raise CountError(f"{where}: covariances has shape {array.shape}; give (6, 6) or ({count}, 6, 6)")
-    if not np.isfinite(array).all() or np.abs(array - array.transpose(0, 2, 1)).max() > 1e-9 * np.abs(array).max():
-        raise NoiseError(f"{where}: a covariance is not finite and symmetric")
+    with np.errstate(invalid="ignore"):
+        asymmetry = np.abs(array - array.transpose(0, 2, 1)).max(axis=(1, 2))
+        bad = np.flatnonzero(~(asymmetry <= 1e-9 * np.abs(array).max(axis=(1, 2))))
+    if bad.size:
+        raise NoiseError(
+            f"{where}: the covariance of measurement {bad[0]} is not finite and symmetric; give 6 x 6 matrices in the "
+            f"order of rotation, translation:\n{array[bad[0]]}"
+        )
     smallest = np.linalg.eigvalsh(array)[:, 0]
     if smallest.min() <= 0.0:
         index = int(smallest.argmin())
         raise NoiseError(
             f"{where}: the covariance of measurement {index} is not positive definite (smallest eigenvalue "
-            f"{smallest[index]:.3g})"
+            f"{smallest[index]:.3g}); give variances that are positive in every direction"
         )
     return array
 
 
-def warn_of_millimetres(A: Array, B: Array, where: str) -> None:
+def warn_of_millimetres(A: Array, B: Array, gauge: Gauge, motion: bool, where: str) -> None:
     """Warn where translations look as if they were in millimetres."""
-    # Differences, so that a world origin far away is no millimetre; B is what a sensor sees, never far away.
-    spread_A = float(np.median(np.abs(A[:BLOCK, :3, 3] - A[0, :3, 3]).max(axis=1)))
+    # About the gauge, so that a world origin far away is no millimetre; B is what a sensor sees, never far away.
+    c = gauge.sensor_carrier if motion else gauge.target_carrier
+    centred_A = A[:BLOCK, :3, 3] + A[:BLOCK, :3, :3] @ c - gauge.sensor_carrier
+    spread_A = float(np.median(np.abs(centred_A).max(axis=1)))
     size_B = float(np.median(np.abs(B[:BLOCK, :3, 3]).max(axis=1)))
     for name, size in (("A", spread_A), ("B", size_B)):
         if size > MILLIMETRES_M:

@@ -68,7 +68,9 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
         return array[None]
     if array.ndim == 3 and array.shape[1:] == (4, 4):
         if order is not None:
-            raise PoseError(f"{where}: order={order!r} names a quaternion's order, but the poses are 4x4 matrices")
+            raise PoseError(
+                f"{where}: order={order!r} names a quaternion's order, but the poses are 4x4 matrices; leave order out"
+            )
         return array
     if array.ndim == 2 and array.shape[1] == 7:
         return _from_quaternion_rows(array, order, where)
@@ -84,7 +86,10 @@ def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str
         )
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if bad.size:
-        raise PoseError(f"{where}: measurement {bad[0]} has an entry that is NaN or infinite: {rows[bad[0]]}")
+        raise PoseError(
+            f"{where}: measurement {bad[0]} has an entry that is NaN or infinite: {rows[bad[0]]}; "
+            "leave the measurement out"
+        )
     w, x, y, z = rows[:, [0, 1, 2, 3] if order == "wxyz" else [3, 0, 1, 2]].T
     norm_squared = w * w + x * x + y * y + z * z
     off = np.flatnonzero(np.abs(np.sqrt(norm_squared) - 1.0) > 1e-2)
@@ -139,7 +144,8 @@ def checked_rows(block: Array, first: int, where: str) -> tuple[Array, int]:
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=0))
         index = int(bad[0]) if bad.size else 0
         raise PoseError(
-            f"{where}: measurement {first + index} has an entry that is NaN, infinite or too large:\n{block[index]}"
+            f"{where}: measurement {first + index} has an entry that is NaN, infinite or too large; "
+            f"leave the measurement out:\n{block[index]}"
         )
     last = block[:, 3, :] - (0.0, 0.0, 0.0, 1.0)
     if np.abs(last).max() > 1e-9:
@@ -154,7 +160,8 @@ def checked_rows(block: Array, first: int, where: str) -> tuple[Array, int]:
         index = int(deviation.argmax())
         raise PoseError(
             f"{where}: the rotation of measurement {first + index} is off by {deviation[index]:.3g} "
-            f"(largest entry of R'R - I; {ROTATION_TOLERANCE:g} is let through and projected):\n{block[index, :3, :3]}"
+            f"(largest entry of R'R - I; up to {ROTATION_TOLERANCE:g} is let through and projected); check the layout "
+            f"of the matrices, or give quaternions:\n{block[index, :3, :3]}"
         )
     handed = determinant(rows)
     if handed.min() < 0.0:
@@ -205,7 +212,7 @@ def one_transform(pose: PoseLike, where: str) -> Array:
     """
     transforms = as_transforms([pose] if isinstance(pose, gtsam.Pose3) else np.asarray(pose), None, where)
     if len(transforms) != 1:
-        raise PoseError(f"{where}: {len(transforms)} poses where one is expected")
+        raise PoseError(f"{where}: {len(transforms)} poses where one is expected; give one")
     rows, _ = checked_rows(transforms, 0, where)
     transform: Array = rows_to_transforms(rows)[0]
     return transform

@@ -36,7 +36,7 @@ def check_agreement(name: str, first: Prior, second: Prior) -> None:
         if distance > 1e-9 + CONTRADICTION_SIGMAS * np.hypot(first.sigma, second.sigma):
             raise PriorError(
                 f"what is said of {name} contradicts itself: {apart}, with standard deviations of "
-                f"{1e3 * first.sigma:.4g} mm and {1e3 * second.sigma:.4g} mm"
+                f"{1e3 * first.sigma:.4g} mm and {1e3 * second.sigma:.4g} mm; remove one of the two, or widen it"
             )
     if first.kappa is not None and second.kappa is not None:
         # kappa |R - R_0|_F^2: a standard deviation of 1 / sqrt(2 kappa) rad an axis, and |.|_F^2 = 2 theta^2.
@@ -45,5 +45,5 @@ def check_agreement(name: str, first: Prior, second: Prior) -> None:
         if distance > 1e-9 + CONTRADICTION_SIGMAS * spread:
             raise PriorError(
                 f"what is said of {name} contradicts itself: {apart}, with kappa of {first.kappa:.4g} and "
-                f"{second.kappa:.4g}"
+                f"{second.kappa:.4g}; remove one of the two, or widen it"
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Literal, get_args
 
 import numpy as np
@@ -246,8 +247,7 @@ class Problem:
         kappas = positive_weights(kappa, count, "kappa", where)
         stamps = checked_stamps(stamps_ns, count, where)
         covariance = checked_covariances(covariances, count, where)
-        # The one step that can still fail, and that changes nothing then.
-        projected = self._accumulator.add(Batch(pair, A, B, 1.0 / sigmas**2, kappas, where))
+        accumulator, projected = self._accumulator.added(Batch(pair, A, B, 1.0 / sigmas**2, kappas, where))
         if projected:
             warnings.warn(
                 f"{where}: {projected} rotations were off R'R = I by rounding in the input (less than "
@@ -255,7 +255,9 @@ class Problem:
                 RotationsProjectedWarning,
                 stacklevel=3,
             )
-        warn_of_millimetres(A, B, where)
+        warn_of_millimetres(A, B, accumulator.gauge, motion, where)
+        # Only now, with everything checked and warned of (warnings may be errors), does the problem change.
+        self._accumulator = accumulator
         self.is_relative = self.is_relative or sigma is None or kappa is None
         if not motion:
             self._kind[target] = "target"
@@ -351,7 +353,7 @@ class Problem:
         """
         if self.scale != "per_target":
             raise ScaleError(f"fix_scale({name!r}) needs scale='per_target'; this problem has scale={self.scale!r}")
-        if not (isinstance(scale, (int, float)) and np.isfinite(scale) and scale > 0):
+        if not (isinstance(scale, Real) and np.isfinite(scale) and scale > 0):
             raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number (measured / true length)")
         if self.fixed_scales.get(name, scale) != scale:
             raise ScaleError(f"the scale of {name} is fixed at {self.fixed_scales[name]} already, and now at {scale}")
@@ -374,7 +376,9 @@ class Problem:
         merged._edges = {pair: _Edge(list(edge.batches), edge.covariance_given) for pair, edge in self._edges.items()}
         for name, kind in other._kind.items():
             if merged._kind.setdefault(name, kind) != kind:
-                raise FrameError(f"{name!r} is a {kind} in one problem and a {merged._kind[name]} in the other")
+                raise FrameError(
+                    f"{name!r} is a {kind} in one problem and a {merged._kind[name]} in the other; rename one of them"
+                )
         merged._accumulator = self._accumulator.merged(other._accumulator)
         for pair, edge in other._edges.items():
             known = merged._edges.setdefault(pair, _Edge())
