@@ -32,6 +32,11 @@ class Batch:
         """Whether both ends are one sensor (AX = XB)."""
         return self.pair[0] == self.pair[1]
 
+    @property
+    def sample(self) -> Array:
+        """At most a block of A, from all over the batch: logs begin at rest, which tells no centre."""
+        return self.A[:: -(-len(self.A) // BLOCK)]
+
     def moments(self, gauge: Gauge) -> Moments:
         """Checked and summed about a gauge."""
         return Moments.of(self.A, self.B, self.weight, self.kappa, gauge, self.is_motion, self.where)
@@ -56,14 +61,14 @@ class Accumulator:
         if self._opening is None:
             gauge = self.gauge
             if not batch.is_motion and not self._has_targets():
-                gauge = replace(gauge, target_carrier=Gauge.target_origin(batch.A[:BLOCK], gauge.sensor_carrier))
+                gauge = replace(gauge, target_carrier=Gauge.target_origin(batch.sample, gauge.sensor_carrier))
             fresh = batch.moments(gauge)
             known = self.moments.get(batch.pair)
             return Accumulator(gauge, {**self.moments, batch.pair: known + fresh if known else fresh}), fresh.projected
         batches = [*self._opening, batch]
         gauge = Gauge.of(
-            np.concatenate([b.A[:BLOCK] for b in batches]),
-            np.concatenate([np.full(len(b.A[:BLOCK]), b.is_motion) for b in batches]),
+            np.concatenate([b.sample for b in batches]),
+            np.concatenate([np.full(len(b.sample), b.is_motion) for b in batches]),
         )
         moments: dict[Pair, Moments] = {}
         fresh = Moments.none()

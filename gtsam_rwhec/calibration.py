@@ -94,7 +94,7 @@ def solve(
             given = _given_answer(part, *initial)
             found = search.run(method, rotations_as_variables(part, given.R))
         else:
-            found = search.run(method, None)
+            found = search.with_positive_scale(search.run(method, None))
         results.append(_finish(part, search, found))
     return _merge(problem, results)
 

@@ -36,9 +36,9 @@ def describe(names: tuple[str, ...], basis: Array, length_m: float, axes: dict[s
     n = len(names)
     metric = np.r_[np.tile(np.r_[np.full(3, length_m), np.ones(3), length_m], n), length_m]
     weighed, _ = np.linalg.qr(basis * metric[:, None])
-    frames = weighed[:-1].reshape(n, 7, -1)
+    frames = weighed[:-1].reshape(n, 7, basis.shape[1])
     # Directions that turn nothing come apart from those that do: the right singular vectors of the rotations' rows.
-    turning = frames[:, :3].reshape(3 * n, -1)
+    turning = frames[:, :3].reshape(3 * n, basis.shape[1])
     _, s, Vt = np.linalg.svd(turning, full_matrices=True)
     turns = np.zeros(len(Vt), dtype=bool)
     turns[: len(s)] = s > SHARE

@@ -312,14 +312,15 @@ def _pairs(
 
 
 def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array, Array]:
-    """Eigenvalues (E, 15) in units of noise and directions (E, 15, 15); what a pair does not have is large."""
+    """Eigenvalues (E, 15) in units of noise and directions (E, 15, 15); infinite for what a pair does not have."""
     unit = _unit(noise, used)
     matrix = info * unit[:, :, None] * unit[:, None, :]
     diagonal = np.einsum("eii->ei", matrix)  # a view
     # No larger than needed, or the small eigenvalues lose their digits.
     diagonal[...] = np.where(used, diagonal, 1e3 + 2.0 * diagonal.max(axis=1, keepdims=True))
     values, vectors = np.linalg.eigh(matrix)
-    return values, vectors * unit[:, :, None]
+    foreign = (vectors**2 * ~used[:, :, None]).sum(axis=1) > 0.5
+    return np.where(foreign, np.inf, values), vectors * unit[:, :, None]
 
 
 def _explanation(pairs: dict[Pair, PairIdentifiability], unique: bool) -> str:

@@ -62,13 +62,16 @@ def with_low_rank(C: Array, E: Array, G_leaf: Array, G_border: Array) -> tuple[A
 
 
 def cholesky(D: Array, C: Array, E: Array) -> ArrowFactor | None:
-    """Factor the arrow matrix; None when a pivot is not positive."""
+    """Factor the arrow matrix; None when a pivot is not a positive, finite number."""
     try:
         leaves = np.linalg.cholesky(D)
         coupling = forward_substitution(leaves, C)
         wide = flat(coupling)
         border = np.linalg.cholesky(E - wide.T @ wide)
     except np.linalg.LinAlgError:
+        return None
+    # LAPACK may let NaN and infinity pass as pivots; whatever holds one ends up on the diagonal.
+    if not (np.isfinite(np.einsum("lii->li", leaves)).all() and np.isfinite(np.diagonal(border)).all()):
         return None
     return ArrowFactor(leaves, coupling, border)
 

@@ -7,8 +7,7 @@ constraint is zero at y. Write y = x + [z, 0] for any x whose last entry is 1::
 
 If Z_rr >= diag(m) with m > 0, the right side is at least x' Z x - sum g^2 / m; this is the dual certificate of DESIGN
 fact 3 with the null vector taken out beforehand, so that the test of definiteness has room. If only Z_rr >= -diag(m)
-can be shown (free directions, or no certificate), |z| <= 2 sqrt(3) for each rotation of two feasible points bounds the
-loss.
+can be shown (free directions, or no certificate), |z_i| <= sqrt(3) + |r_i| for each rotation bounds the loss.
 
 With an unknown scale nothing couples to h: (R, alpha) and (-R, -alpha) cost the same and Z_rr has the null vector r
 itself. Then an entry j of r takes the part of h: y_r = a r + z with z_j = 0 and a = y_j / r_j, |a| <= 1 / |r_j|.
@@ -37,6 +36,8 @@ Wide = np.longdouble
 WIDE_UNIT = float(np.finfo(Wide).eps) / 2.0
 #: Above this size the eigenvalues of a failed certificate are found by Lanczos, not densely.
 DENSE_EIGEN_SIZE = 700
+#: Factor between one margin of definiteness and the next that is tried; a power of two, so that it does not round.
+MORE_ROOM = 16.0
 
 
 @dataclass(frozen=True)
@@ -99,17 +100,24 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
     if proven(leaf_unit, border_unit, pin):
         room = np.r_[leaf_unit.ravel(), border_unit]
         loss = float((reach**2 / room).sum()) * (1.0 + 1e-10)
+        # Each try costs a factorisation: more room is asked for only where g is so large that it matters.
+        more = MORE_ROOM
+        while loss > 1e-9 * abs(float(value)) + 1e-17 * size * form.magnitude:
+            if not proven(more * leaf_unit, more * border_unit, pin):
+                break
+            room, loss, more = MORE_ROOM * room, loss / MORE_ROOM, MORE_ROOM * more
         if pin is None:
             lower = value - Wide(value_error) - Wide(loss)
         else:
             # y'Zy = constant + a^2 (r'Z_rr r) + ..., and the constant is the last entry of Z x.
-            negative = max(0.0, float(constant - value) + value_error + loss)
+            negative = max(0.0, float(constant - value + Wide(value_error) + Wide(loss)))
             lower = constant - Wide(value_error) - Wide(negative * reach_of_a * (1.0 + 1e-10))
         return Bound(_round_down(lower), float(value), True, True, float(room.min(initial=np.inf)), None)
 
     smallest, direction = 0.0, None
-    slack_leaf, slack_border = leaf_unit, border_unit
-    semidefinite = proven(-leaf_unit, -border_unit)
+    # Half of this is what the factorisation itself asks for.
+    slack_leaf, slack_border = 2.0 * leaf_unit, 2.0 * border_unit
+    semidefinite = proven(-slack_leaf, -slack_border)
     if not semidefinite:
         smallest, direction = _smallest_eigenpair(D, C, E, form)
         extra = 1.01 * max(-smallest, 0.0)
@@ -121,10 +129,10 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
         else:  # an estimate of the eigenvalue that is off by 1.5^60: nothing is claimed
             return Bound(-np.inf, float(value), False, False, -np.inf, direction)
     slack = np.r_[slack_leaf.ravel(), slack_border].reshape(n, 9)
-    # |z_i|_F <= 2 sqrt(3) for each rotation.
-    loss = float(
-        12.0 * slack.max(axis=1).sum() + 2.0 * np.sqrt(12.0) * np.linalg.norm(reach.reshape(n, 9), axis=1).sum()
-    )
+    # z_i = vec R_i - r_i of a rotation R_i, so |z_i| <= sqrt(3) + |r_i|.
+    size_z = np.sqrt(3.0) + np.linalg.norm(r.reshape(n, 9), axis=1)
+    of_g = np.linalg.norm(reach.reshape(n, 9), axis=1)
+    loss = float((slack.max(axis=1) * size_z**2 + 2.0 * of_g * size_z).sum())
     lower = _round_down(value - Wide(value_error) - Wide(loss * (1.0 + 1e-10)))
     return Bound(lower, float(value), False, semidefinite, -float(slack.max()), None if semidefinite else direction)
 

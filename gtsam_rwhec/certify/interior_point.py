@@ -72,15 +72,15 @@ def solve_by_blocks(
             break
         try:
             system = _Newton.at(point)
+            # Mehrotra: how far the pure Newton step gets tells how much centring the real one needs.
+            affine = system.direction(0.0, None)
+            a_primal, a_dual = _step_length(point.X, affine.X, 1.0), _step_length(point.Z, affine.Z, 1.0)
+            after = float(np.vdot(point.X + a_primal * affine.X, point.Z + a_dual * affine.Z)) / gap
+            sigma = min(1.0, max(1e-4, after**2 if after < 0.3 else after))
+            step = system.direction(sigma * gap / size, affine.X @ affine.Z)
+            a_primal, a_dual = _step_length(point.X, step.X, 0.95), _step_length(point.Z, step.Z, 0.95)
         except np.linalg.LinAlgError:
             break  # the end of what double precision gives
-        # Mehrotra: how far the pure Newton step gets tells how much centring the real one needs.
-        affine = system.direction(0.0, None)
-        a_primal, a_dual = _step_length(point.X, affine.X, 1.0), _step_length(point.Z, affine.Z, 1.0)
-        after = float(np.vdot(point.X + a_primal * affine.X, point.Z + a_dual * affine.Z)) / gap
-        sigma = min(1.0, max(1e-4, after**2 if after < 0.3 else after))
-        step = system.direction(sigma * gap / size, affine.X @ affine.Z)
-        a_primal, a_dual = _step_length(point.X, step.X, 0.95), _step_length(point.Z, step.Z, 0.95)
         if max(a_primal, a_dual) < 1e-6:
             break
         point = _Point(

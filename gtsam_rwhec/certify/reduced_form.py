@@ -25,8 +25,8 @@ RANK_TOLERANCE = 1e-12
 class ReducedForm:
     """Q' = arrow(D, C, E) - G'G over x = [leaves (9 L), centers (9 P), h (1)], and the way back to translations.
 
-    D (L, 9, 9), C (L, 9, 9 P + 1), E (9 P + 1, 9 P + 1), G (k, 9 L + 9 P + 1). The factors lead back to what was
-    eliminated; the null vectors are the translations and scales that no measurement determines, whatever the rotations.
+    D (L, 9, 9) and E (9 P + 1, 9 P + 1), exactly symmetric, C (L, 9, 9 P + 1), G (k, 9 L + 9 P + 1). The factors lead
+    back to what was eliminated; the null vectors are the translations and scales that no measurement determines, whatever the rotations.
     """
 
     D: Array
@@ -146,7 +146,9 @@ def reduce(form: FullForm) -> ReducedForm:
     G = np.empty((factor.shape[1], 9 * L + b - w))
     G[:, : 9 * L] = np.matmul(C[:, :, :w], factor).reshape(9 * L, factor.shape[1]).T
     G[:, 9 * L :] = factor.T @ E[:w, w:]
+    # Exactly symmetric: a factorisation reads one triangle, and what it proves is to be of the form that is evaluated.
     symmetric = 0.5 * (E[w:, w:] + E[w:, w:].T)
+    D = 0.5 * (D + D.transpose(0, 2, 1))
     return ReducedForm(D, np.ascontiguousarray(C[:, :, w:]), symmetric, G, factor, leaf_factor, rows, null, leaf_null)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,15 +14,20 @@ from gtsam_rwhec.certify.bound import Bound, exact_value, lower_bound
 from gtsam_rwhec.certify.descent import Descent, descend, homogeneous
 from gtsam_rwhec.certify.full_form import FullForm, add_priors, assemble, edge_slots, forms_of_edges
 from gtsam_rwhec.certify.interior_point import Relaxation
+from gtsam_rwhec.certify.mirror import mirrored
 from gtsam_rwhec.certify.options import Method, SolveOptions
 from gtsam_rwhec.certify.parts import Part
 from gtsam_rwhec.certify.reduced_form import ReducedForm, reduce
 from gtsam_rwhec.certify.relaxation import round_to_rotations, solve_relaxation
 from gtsam_rwhec.certify.rotations import kkt_multipliers, project, random_rotations, unvec, vec
 from gtsam_rwhec.certify.start import spectral_start, unconstrained_start
+from gtsam_rwhec.certify.variables import answer_of
 from gtsam_rwhec.poses import Array
 
 Progress = Callable[[str], None]
+
+#: A mirror image may cost this much more, relatively, and still be what the data mean; more is another answer.
+MIRROR_COST = 0.01
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,12 @@ class Found:
     reason: str
 
 
+def _has_positive_scales(part: Part, form: ReducedForm, R: Array) -> bool:
+    answer = answer_of(part, form, R)
+    own = answer.own_scale[np.isfinite(answer.own_scale)]
+    return answer.scale > 0.0 and bool((own > 0.0).all())
+
+
 @dataclass
 class Search:
     """One part's search. ``run`` does it; ``seconds`` holds the stages' times."""
@@ -84,9 +95,15 @@ class Search:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def tolerance(self, cost: float) -> float:
-        """The absolute gap that counts as none (DESIGN fact 10), rounding of the form's own entries included."""
+        """The absolute gap that counts as none (DESIGN fact 10), or what rounding leaves of it.
+
+        With Z proven definite that is rounding of the form's own entries; otherwise the bound has given away what the
+        proof of semidefiniteness needs, which is much more.
+        """
         unit = 0.0 if self.part.is_relative else 1.0
-        return max(self.options.relative_tolerance * max(cost, unit), 1e-11 * self.form.magnitude)
+        definite = self.bound is not None and self.bound.definite
+        rounding = 1e-16 * self.form.size if definite else 1e-11
+        return max(self.options.relative_tolerance * max(cost, unit), rounding * self.form.magnitude)
 
     def run(self, method: Method, initial: Array | None) -> Found:
         """Search with a method; ``initial`` (n, 3, 3) is the start of "local" (and of ``certify``)."""
@@ -110,7 +127,7 @@ class Search:
                 starts = spectral_start(self.part, self.forms.rotation)
             self._descend(starts, "spectral start")
             label = "spectral start"
-        if self._certify(label) or method == "local":
+        if self._certify(label) or method == "local" or self._is_closed_but_for_rounding():
             return self._found("")
         if self._better_starts() and self._certify("better start"):
             return self._found("the first start led to a local minimum")
@@ -130,6 +147,29 @@ class Search:
         return self._found(
             f"the relaxation is not tight: its own optimum is {relaxation.dual:.8g}, {gap:.3g} below the best answer"
         )
+
+    def with_positive_scale(self, found: Found) -> Found:
+        """The answer as found, or its mirror image where only that has positive scales and it costs as little.
+
+        Motion about one axis leaves the sign of a scale open (``mirror``). With noise in A the two costs differ a
+        little, and the image may cost more than the bound allows: then it is returned with that gap.
+        """
+        if _has_positive_scales(self.part, self.form, found.R):
+            return found
+        with self.stage("descent"):
+            end = descend(self.form, mirrored(self.part, found.R), self.options.max_descent_iterations)
+        likely = end.cost - found.cost <= max(self.tolerance(found.cost), MIRROR_COST * found.cost)
+        if not (likely and _has_positive_scales(self.part, self.form, end.R)):
+            return found
+        cost, _ = exact_value(self.form, homogeneous(end.R))
+        reason = found.reason
+        if cost - found.lower > self.tolerance(cost):
+            reason = (
+                f"its mirror image, with a negative scale, costs {found.cost:.8g}, less than this answer's {cost:.8g}: "
+                "motion about one axis leaves the sign of the scale to the noise"
+            )
+        path = f"{found.path}, mirrored"
+        return replace(found, R=end.R, cost=cost, lower=min(found.lower, cost), reason=reason, path=path)
 
     @property
     def _cost(self) -> float:
@@ -187,6 +227,11 @@ class Search:
     def _is_closed(self) -> bool:
         return self.bound is not None and self._cost - self.bound.lower <= self.tolerance(self._cost)
 
+    def _is_closed_but_for_rounding(self) -> bool:
+        """Whether Z is positive semidefinite as far as can be told, and no other point or multiplier can do better."""
+        assert self.bound is not None
+        return self.bound.semidefinite and self._cost - self.bound.value <= self.tolerance(self._cost)
+
     def _better_starts(self) -> bool:
         """Look for a lower critical point: along the negative curvature of Z, from Q' as a whole, at random."""
         assert self.best is not None
@@ -215,7 +260,12 @@ class Search:
         assert self.best is not None
         assert self.bound is not None
         closed = self._is_closed()
-        if not closed and not reason:
+        if not closed and self._is_closed_but_for_rounding():
+            reason = (
+                "without the allowance for rounding the bound reaches the cost; answers that are as good (free "
+                "directions, a mirror image) leave the verified test no room"
+            )
+        elif not closed and not reason:
             reason = (
                 "the point may be a local minimum, or redundant constraints' multipliers are needed; "
                 "method='auto' looks further"

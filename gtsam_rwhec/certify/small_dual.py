@@ -2,8 +2,11 @@
 
 At a critical point x the multipliers of R'R = I are unique, those of all 20 independent constraints are not: each
 rotation has a family of combinations N with N x = 0, 14 of them. Adding them moves Z = Q' - Lambda without touching
-Z x = 0, and may make it positive semidefinite: maximise t subject to Z(y) >= t on the complement of x. A log-barrier
-Newton method on (y, t); it stops as soon as t is safely positive, since any such y proves the same.
+Z x = 0, and may make it positive semidefinite: maximise t subject to Z(y) >= t P across x. A log-barrier Newton method
+on (y, t); it stops as soon as t is safely positive, since any such y proves the same.
+
+P sets the measure: Q' itself, a little more on its diagonal. Weights of translations and rotations differ by powers of
+ten, and the directions in question are those in which Q' is smallest; against the identity they would drown.
 """
 
 from __future__ import annotations
@@ -15,6 +18,9 @@ from gtsam_rwhec.certify.local_blocks import gram, scatter, traces
 from gtsam_rwhec.certify.reduced_form import ReducedForm
 from gtsam_rwhec.certify.rotations import CONSTRAINTS, vec
 from gtsam_rwhec.poses import Array
+
+#: With Z above this much of P the verified test has room, whatever the rounding.
+ENOUGH = 1e-2
 
 
 def null_multipliers(R: Array) -> Array:
@@ -38,7 +44,7 @@ def stationary_multipliers(form: ReducedForm, R: Array, multipliers: Array) -> A
 
 
 def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int = 60) -> tuple[Array, float]:
-    """Maximise the smallest eigenvalue of Z on the complement of x over the multipliers' freedom.
+    """Maximise t with Z >= t P across x over the multipliers' freedom.
 
     Parameters
     ----------
@@ -52,47 +58,53 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
     -------
     multipliers : (n, 20) array
         Still with Z x = 0.
-    eigenvalue : float
-        The smallest one of Z on the complement of x, reached by them.
+    t : float
+        What they reach: Z - t P is positive definite across x. Positive: they prove x optimal.
     """
     n = len(R)
     null = null_multipliers(R)
     family = np.einsum("nmk,kpq->nmpq", null, CONSTRAINTS)
     x = np.append(vec(R).ravel(), 1.0)
-    u = x / np.linalg.norm(x)
-    Z0 = form.dense() - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
+    Q = form.dense()
+    Z0 = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
     Z0 = 0.5 * (Z0 + Z0.T)
     Z0[-1, -1] -= float(x @ Z0 @ x)  # the multiplier of h^2 = 1: then Z x = 0 in h's row too
     scale = float(np.abs(np.diagonal(Z0)).max())
     Z0 /= scale
-    # A known positive eigenvalue along x takes it out of the question; t never gets near it.
-    Z0 += 10.0 * np.outer(u, u)
-    y = np.zeros(14 * n)
-    t = float(np.linalg.eigvalsh(Z0)[0])
+    P = Q / scale
+    P[np.diag_indices_from(P)] += 1e-9 * np.abs(np.diagonal(P)) + 1e-12
+    # Added along P x it takes x out of the question and leaves what is across x, z'P x = 0, as it is.
+    along_x = P @ x / np.sqrt(float(x @ P @ x))
+    t = float(scipy.linalg.eigh(Z0, P, eigvals_only=True, subset_by_index=[0, 0], check_finite=False)[0])
     t -= 0.1 * max(abs(t), 1e-3)
-    eye = np.eye(len(Z0))
-    weight = 1.0  # of the barrier
+    Z0 += 10.0 * max(abs(t), 1.0) * np.outer(along_x, along_x)
+    y = np.zeros(14 * n)
+    weight = 0.0  # of the barrier
     best = (multipliers, -np.inf)
-    enough = 1e-7
     for _ in range(max_iterations):
         Z = Z0 + scatter(np.einsum("nm,nmpq->npq", y.reshape(n, 14), family))
-        factor = scipy.linalg.cho_factor(Z - t * eye, lower=True, check_finite=False)
-        W = scipy.linalg.cho_solve(factor, eye, check_finite=False)
-        W = 0.5 * (W + W.T)
-        if t * scale > best[1]:
-            added = np.einsum("nm,nmk->nk", y.reshape(n, 14), null)
-            best = (multipliers - scale * added, t * scale)
-        if t > enough:
+        try:
+            factor = scipy.linalg.cho_factor(Z - t * P, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
             break
-        # Newton on -t - weight log det(Z(y) - t I).
-        W2 = W @ W
+        W = scipy.linalg.cho_solve(factor, np.eye(len(Z)), check_finite=False)
+        W = 0.5 * (W + W.T)
+        if t > best[1]:
+            added = np.einsum("nm,nmk->nk", y.reshape(n, 14), null)
+            best = (multipliers - scale * added, t)
+        if t > ENOUGH:
+            break
+        # Newton on -t - weight log det(Z(y) - t P).
+        WP = W @ P
+        weight = weight or 1.0 / float(np.trace(WP))  # so that at first the barrier holds t where it is
+        W2 = WP @ W
         M = gram(family, W, W)
         along = traces(family, W2).ravel()
-        gradient = np.r_[-weight * traces(family, W).ravel(), -1.0 + weight * np.trace(W)]
+        gradient = np.r_[-weight * traces(family, W).ravel(), -1.0 + weight * np.trace(WP)]
         H = np.empty((14 * n + 1, 14 * n + 1))
         H[:-1, :-1] = M
         H[:-1, -1] = H[-1, :-1] = -along
-        H[-1, -1] = np.trace(W2)
+        H[-1, -1] = float(np.vdot(WP, WP.T))
         H *= weight
         H[np.diag_indices_from(H)] *= 1.0 + 1e-12
         try:
@@ -100,15 +112,16 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
         except np.linalg.LinAlgError:
             break
         decrement = float(np.sqrt(max(-(gradient @ step), 0.0) / weight))
-        direction = scatter(np.einsum("nm,nmpq->npq", step[:-1].reshape(n, 14), family)) - step[-1] * eye
-        length = 1.0 if decrement < 0.25 else 1.0 / (1.0 + decrement)
-        length = _stay_inside(Z - t * eye, direction, 4.0 * length)
+        direction = scatter(np.einsum("nm,nmpq->npq", step[:-1].reshape(n, 14), family)) - step[-1] * P
+        # The damped step is safe and short; four times it mostly stays inside too.
+        length = 1.0 if decrement < 0.25 else 4.0 / (1.0 + decrement)
+        length = _stay_inside(Z - t * P, direction, length)
         y = y + length * step[:-1]
         t += length * step[-1]
         if decrement < 0.5:
             if weight * len(Z0) < 1e-9:
                 break
-            weight *= 0.1
+            weight *= 0.2
     return best
 
 
@@ -122,4 +135,4 @@ def _stay_inside(S: Array, direction: Array, length: float) -> float:
             if length < 1e-12:
                 return 0.0
         else:
-            return 0.9 * length
+            return length if length == 1.0 else 0.9 * length
