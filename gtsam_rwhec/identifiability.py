@@ -297,14 +297,14 @@ def _pairs(
         free = np.less_equal(rest[e], threshold[e])
         ends = {name: 7 * end for end, name in enumerate(pair) if name not in part.fixed}
         if not free.any() and axes[e] < 2 and len(ends) == 2:
-            free[0] = True  # Corollary 4: about one axis a pair alone leaves a direction open
+            free[rest[e].argmin()] = True  # Corollary 4: about one axis a pair alone leaves a direction open
         sentences: list[str] = []
         if free.any():
             rows = [first + k for first in ends.values() for k in range(7)] + [14]
             sentences = describe(
                 tuple(ends), directions[e][rows][:, free], length, dict.fromkeys(ends, axes[e]), part.scale
             )
-        weakest = float(min(rest[e, 0], turning[e, 0])) if settled[e] else float(rest[e, 0])
+        weakest = float(min(rest[e].min(), turning[e].min())) if settled[e] else float(rest[e].min())
         result[pair] = PairIdentifiability(
             not free.any(), sentences, axes[e], int(counts[e]), weakest, float(threshold[e])
         )
