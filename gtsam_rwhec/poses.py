@@ -115,7 +115,7 @@ def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str
     return transforms
 
 
-def checked_rows(block: Array, first: int, where: str) -> tuple[Array, int]:
+def checked_rows(block: Array, first: int, where: str, out: Array | None = None) -> tuple[Array, int]:
     """Check a block of transforms and lay it out for the moments.
 
     Parameters
@@ -124,6 +124,8 @@ def checked_rows(block: Array, first: int, where: str) -> tuple[Array, int]:
     first : int
         Index of the block's first measurement, for messages.
     where : str
+    out : (12, b) array, optional
+        Where the rows go; given, nothing is copied twice.
 
     Returns
     -------
@@ -137,8 +139,9 @@ def checked_rows(block: Array, first: int, where: str) -> tuple[Array, int]:
     PoseError
         NaN or infinite entries, a last row other than 0 0 0 1, a block that is no rotation, a left-handed one.
     """
-    rows = np.empty((12, len(block)))
-    rows.reshape(4, 3, -1)[...] = block[:, :3, :].transpose(2, 1, 0)
+    rows = np.empty((12, len(block))) if out is None else out
+    for column in range(4):
+        rows[3 * column : 3 * column + 3] = block[:, :3, column].T
     # A sum is finite only when all of its terms are, short of overflow, which is refused too.
     if not np.isfinite(rows.sum()):
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=0))
@@ -147,9 +150,11 @@ def checked_rows(block: Array, first: int, where: str) -> tuple[Array, int]:
             f"{where}: measurement {first + index} has an entry that is NaN, infinite or too large; "
             f"leave the measurement out:\n{block[index]}"
         )
-    last = block[:, 3, :] - (0.0, 0.0, 0.0, 1.0)
-    if np.abs(last).max() > 1e-9:
-        index = int(np.abs(last).max(axis=1).argmax())
+    # Almost always exact; asked entry by entry, which takes half the time of one pass over a strided block.
+    exact = not (block[:, 3, 0].any() or block[:, 3, 1].any() or block[:, 3, 2].any() or (block[:, 3, 3] != 1.0).any())
+    last = 0.0 if exact else np.abs(block[:, 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=1)
+    if not np.max(last) <= 1e-9:  # NaN is refused too
+        index = int(np.argmax(last))
         raise PoseError(
             f"{where}: the last row of measurement {first + index} is {block[index, 3]}, not 0 0 0 1; "
             "are the matrices transposed?"

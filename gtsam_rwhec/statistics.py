@@ -27,6 +27,7 @@ SWAPPED = np.r_[12:24, 0:12, 24]
 BLOCK = 2048
 I3 = np.eye(3)
 I9 = np.eye(9)
+_UPPER = np.triu_indices(25, 1)
 
 
 @dataclass(frozen=True)
@@ -116,13 +117,11 @@ class Moments:
         features = np.empty((25, min(BLOCK, len(A))))
         for first in range(0, len(A), BLOCK):
             part = slice(first, first + BLOCK)
-            rows_A, projected_A = checked_rows(A[part], first, f"A of {where}")
-            rows_B, projected_B = checked_rows(B[part], first, f"B of {where}")
+            f = features[:, : min(BLOCK, len(A) - first)]
+            _, projected_A = checked_rows(A[part], first, f"A of {where}", f[:12])
+            _, projected_B = checked_rows(B[part], first, f"B of {where}", f[12:24])
             projected += projected_A + projected_B
-            f = features[:, : rows_A.shape[1]]
-            f[:12] = rows_A
-            f[T_A] += np.tensordot(c, rows_A[:9].reshape(3, 3, -1), axes=(0, 0)) - a
-            f[12:24] = rows_B
+            f[T_A] += c[0] * f[0:3] + c[1] * f[3:6] + c[2] * f[6:9] - a
             f[ONE] = 1.0
             if weight.ndim == 0:
                 translation += weight * (f @ f.T)
@@ -267,5 +266,4 @@ def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array
 
 
 def _mirror(Q: Array) -> None:
-    upper = np.triu_indices(Q.shape[1], 1)
-    Q[:, upper[1], upper[0]] = Q[:, upper[0], upper[1]]
+    Q[:, _UPPER[1], _UPPER[0]] = Q[:, _UPPER[0], _UPPER[1]]

@@ -26,7 +26,8 @@ class ReducedForm:
     """Q' = arrow(D, C, E) - G'G over x = [leaves (9 L), centers (9 P), h (1)], and the way back to translations.
 
     D (L, 9, 9) and E (9 P + 1, 9 P + 1), exactly symmetric, C (L, 9, 9 P + 1), G (k, 9 L + 9 P + 1). The factors lead
-    back to what was eliminated; the null vectors are the translations and scales that no measurement determines, whatever the rotations.
+    back to what was eliminated; the null vectors are the translations and scales that no measurement determines,
+    whatever the rotations.
     """
 
     D: Array

@@ -28,7 +28,9 @@ def spectral_start(part: Part, rotation_form: FullForm) -> list[Array]:
     C = np.empty((L, 9, 9 * P + 1))
     C[:, :, :-1] = rotation_form.leaf_center[..., 4:, 4:].transpose(0, 2, 1, 3).reshape(L, 9, 9 * P)
     C[:, :, -1] = rotation_form.leaf_tail[:, 4:, 1]
-    E = scipy.linalg.block_diag(*rotation_form.center[:, 4:, 4:], rotation_form.tail[1:, 1:])
+    E = np.zeros((9 * P + 1, 9 * P + 1))
+    np.einsum("papb->pab", E[:-1, :-1].reshape(P, 9, P, 9))[...] = rotation_form.center[:, 4:, 4:]
+    E[-1, -1] = rotation_form.tail[1, 1]
     E[:-1, -1] = E[-1, :-1] = rotation_form.center_tail[:, 4:, 1].ravel()
     to_border = np.linalg.solve(D, C)
     S = E - arrow.flat(C).T @ arrow.flat(to_border)
@@ -37,24 +39,28 @@ def spectral_start(part: Part, rotation_form: FullForm) -> list[Array]:
     anchored = bool(np.abs(E[-1, :-1]).max(initial=0.0) > 0.0 or np.abs(C[:, :, -1]).max(initial=0.0) > 0.0)
     border = np.zeros(9 * P + 1)
     if anchored:
-        _, vectors = scipy.linalg.eigh(S, subset_by_index=[0, 0], check_finite=False)
-        border[:] = vectors[:, 0]
+        border[:] = _smallest_eigenvector(S)
     else:
         # Parts that only the shared scale joins have an eigenvector, and a sign, each.
         for block in _center_blocks(part):
             at = (9 * block[:, None] + np.arange(9)).ravel()
-            _, vectors = scipy.linalg.eigh(
-                S[at[:, None], at], subset_by_index=[0, 0], check_finite=False, overwrite_a=True
-            )
-            r = vectors[:, 0]
+            r = _smallest_eigenvector(S[at[:, None], at])
             border[at] = r * _handedness(r)
     starts = []
     for sign in (1.0, -1.0) if anchored else (1.0,):
         centers = project(unvec(sign * border[:-1]))
-        known = np.r_[vec(centers).ravel(), 1.0 if anchored else 0.0]
+        known = np.append(vec(centers), 1.0 if anchored else 0.0)
         leaves = project(unvec(-(to_border @ known))) if L else np.empty((0, 3, 3))
         starts.append(np.concatenate([leaves, centers]))
     return starts
+
+
+def _smallest_eigenvector(S: Array) -> Array:
+    """Of a symmetric matrix; a small one has all of its eigenvectors before a subset's driver is set up."""
+    if len(S) <= 64:
+        return np.linalg.eigh(S)[1][:, 0]
+    vectors: Array = scipy.linalg.eigh(S, subset_by_index=[0, 0], check_finite=False)[1]
+    return vectors[:, 0]
 
 
 def _handedness(r: Array) -> float:
