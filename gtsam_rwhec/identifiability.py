@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
-from scipy.special import fdtri
+from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify import arrow
@@ -202,7 +202,10 @@ def _typical_length(part: Part) -> float:
 
 
 def _threshold(squares: Array | float, redundancy: int) -> Array:
-    result: Array = np.asarray(fdtri(np.asarray(squares), float(max(redundancy, 1)), 1.0 - SIGNIFICANCE))
+    if redundancy <= 0:  # the weights tell the noise, and nothing else does
+        known: Array = np.asarray(chdtri(squares, SIGNIFICANCE) / squares)
+        return known
+    result: Array = np.asarray(fdtri(squares, float(redundancy), 1.0 - SIGNIFICANCE))
     return result
 
 
@@ -239,7 +242,7 @@ def _weakest(info: Information, counts: Array, redundancy: int) -> _Weak:
     vectors[used] = reduced
     # Satterthwaite: a direction spread over frames sums as many squares as its shares of their measurements tell.
     share = np.empty((len(counts), len(values)))
-    share[:-1] = (vectors[:-1] ** 2).reshape(len(counts) - 1, 7, -1).sum(axis=1)
+    share[:-1] = (vectors[:-1] ** 2).reshape(len(counts) - 1, 7, len(values)).sum(axis=1)
     share[-1] = vectors[-1] ** 2
     squares = 1.0 / np.maximum((share**2 / (2.0 * counts[:, None])).sum(axis=0), 1e-300)
     thresholds = _threshold(squares, redundancy)

@@ -20,12 +20,14 @@ from gtsam_rwhec.poses import Array
 from gtsam_rwhec.residuals import PairPoses
 from gtsam_rwhec.statistics import ONE, R_A, T_A
 
-#: Below a nanoradian and a nanometre nothing is noise: exact data.
-FLOOR_RAD = 1e-9
-FLOOR_M = 1e-9
+#: Below a tenth of a microradian and of a micrometre nothing is noise: exact data, and the eigenvalues' own rounding.
+FLOOR_RAD = 1e-7
+FLOOR_M = 1e-7
 #: A pair's 15 parameters: the target's seven, the sensor's seven, the shared scale. A frame's seven: rotation,
 #: translation, logarithm of its own scale.
 OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
+
+_UPPER = np.triu_indices(15, 1)
 
 
 @dataclass(frozen=True)
@@ -89,9 +91,10 @@ def pair_information(part: Part, poses: PairPoses, noise: NoiseLevel) -> PairInf
     Noise in a direction that the true motions leave free: with A's rotation off by eps (variance q^2 an axis), what
     was zero becomes eps x omega or eps x v, expected at 2 q^2 |.|^2; both ends move together along a free direction,
     so each takes half. The residuals do not tell A's noise from B's, but they bound it: rotation residuals hold all
-    of it, so q^2 <= f_R / (2 kappa); translation residuals hold it at the end of the lever arm t_X, so
-    2 q^2 |t_X|^2 <= 3 f_t sigma^2. A's translation noise is at most f_t sigma^2 an axis: 2 f_t |omega_Y|^2, and
-    3 f_t for a scale.
+    of it, so q^2 <= f_R / (2 kappa); translation residuals hold it at the end of a lever arm a, so
+    2 q^2 |a|^2 <= 3 f_t sigma^2. Where A turns wrongly about its target carrier's origin, as given, the arm is t_X;
+    about its sensor carrier's, it is c: the shorter one is safe. A's translation noise is at most f_t sigma^2 an axis:
+    2 f_t |omega_Y|^2, and 3 f_t for a scale.
     """
     E = len(part.pairs)
     R_X, t_X, R_Y, t_Y, alpha = poses.R_X, poses.t_X, poses.R_Y, poses.t_Y, poses.alpha
@@ -129,12 +132,13 @@ def pair_information(part: Part, poses: PairPoses, noise: NoiseLevel) -> PairInf
     translation[:, V_X, SHARED] = np.einsum("eij,ej->ei", R_Xt, np.einsum("eikk->ei", Rt_c))
     translation[:, V_Y, SHARED] = -np.einsum("eij,ej->ei", R_Yt, c)
     translation[:, SHARED, SHARED] = square  # c^ c = 0: nothing with omega_Y
-    upper = np.triu_indices(15, 1)
     for full in (rotation, translation):
-        full[:, upper[1], upper[0]] = full[:, upper[0], upper[1]]
+        full[:, _UPPER[1], _UPPER[0]] = full[:, _UPPER[0], _UPPER[1]]
     translation *= (alpha**2)[:, None, None]
 
-    by_arm = 1.5 * noise.translation * n / np.maximum(alpha**2 * W * (t_X**2).sum(axis=1), 1e-300)
+    given_t_X = t_X + np.array([part.frame_shift(target) for target, _ in part.pairs])
+    arm = np.minimum((given_t_X**2).sum(axis=1), square / W)
+    by_arm = 1.5 * noise.translation * n / np.maximum(alpha**2 * W * arm, 1e-300)
     q2 = np.maximum(np.minimum(noise.rotation * n / (2.0 * K), by_arm), FLOOR_RAD**2)
     noise_rotation, noise_translation = np.zeros((E, 15)), np.zeros((E, 15))
     for omega, v in ((OMEGA_X, V_X), (OMEGA_Y, V_Y)):

@@ -12,6 +12,9 @@ can be shown (free directions, or no certificate), |z_i| <= sqrt(3) + |r_i| for 
 With an unknown scale nothing couples to h: (R, alpha) and (-R, -alpha) cost the same and Z_rr has the null vector r
 itself. Then an entry j of r takes the part of h: y_r = a r + z with z_j = 0 and a = y_j / r_j, |a| <= 1 / |r_j|.
 
+Where Z_rr is singular, because an answer is free or has a twin, that loss is that of the verified test on the whole of
+Z_rr; ``deflation`` takes the null directions out first and loses next to nothing.
+
 x'Zx and g are evaluated in extended precision with their rounding bounded, the test is ``verified``'s: the bound
 is a true one on the optimum of the stored D, C, E, G of ``ReducedForm``.
 """
@@ -26,14 +29,13 @@ import scipy.linalg
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from gtsam_rwhec.certify import arrow
+from gtsam_rwhec.certify.deflation import deflated_eigenvalue
+from gtsam_rwhec.certify.lagrangian import Wide, lagrangian
 from gtsam_rwhec.certify.reduced_form import ReducedForm
 from gtsam_rwhec.certify.rotations import CONSTRAINTS_FLAT
 from gtsam_rwhec.certify.verified import UNIT, arrow_is_positive_definite, cholesky_allowance, gamma
 from gtsam_rwhec.poses import Array
 
-#: numpy's widest real number: 80 bits on x86, 128 on aarch64 Linux, plain double elsewhere (the bound then is looser).
-Wide = np.longdouble
-WIDE_UNIT = float(np.finfo(Wide).eps) / 2.0
 #: Above this size the eigenvalues of a failed certificate are found by Lanczos, not densely.
 DENSE_EIGEN_SIZE = 700
 #: Factor between one margin of definiteness and the next that is tried; a power of two, so that it does not round.
@@ -70,8 +72,10 @@ class Bound:
 
 def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
     """The bound that multipliers (n, 20) and a point r (9 n,) give; any will do, optimal ones give a tight one."""
+    if not (np.isfinite(multipliers).all() and np.isfinite(r).all()):  # of a solver that failed
+        return Bound(-np.inf, -np.inf, False, False, -np.inf, None)
     L, n = form.leaves, form.rotations
-    value, z, value_error, z_error = _lagrangian(form, multipliers, r)
+    value, z, value_error, z_error = lagrangian(form, multipliers, np.append(r, 1.0))
     g, g_error, constant = z[:-1], z_error[:-1], z[-1]
     reach = np.abs(g.astype(float)) * (1.0 + 4.0 * UNIT) + g_error  # |g|, entry by entry, rounded up
 
@@ -132,7 +136,11 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
     # z_i = vec R_i - r_i of a rotation R_i, so |z_i| <= sqrt(3) + |r_i|.
     size_z = np.sqrt(3.0) + np.linalg.norm(r.reshape(n, 9), axis=1)
     of_g = np.linalg.norm(reach.reshape(n, 9), axis=1)
-    loss = float((slack.max(axis=1) * size_z**2 + 2.0 * of_g * size_z).sum())
+    loss = float((slack.max(axis=1) * size_z**2).sum())
+    if semidefinite and 9 * n <= DENSE_EIGEN_SIZE:
+        below = deflated_eigenvalue(form, multipliers, arrow.dense(D, C, E), rounded, slack)
+        loss = min(loss, max(-below, 0.0) * float((size_z**2).sum()))
+    loss += float((2.0 * of_g * size_z).sum())
     lower = _round_down(value - Wide(value_error) - Wide(loss * (1.0 + 1e-10)))
     return Bound(lower, float(value), False, semidefinite, -float(slack.max()), None if semidefinite else direction)
 
@@ -145,46 +153,12 @@ def _is_homogeneous(form: ReducedForm, multipliers: Array) -> bool:
 
 def exact_value(form: ReducedForm, x: Array) -> tuple[float, float]:
     """x' Q' x in extended precision, and a bound on its rounding error."""
-    value, _, error, _ = _lagrangian(form, np.zeros((form.rotations, 20)), x[:-1])
+    value, _, error, _ = lagrangian(form, np.zeros((form.rotations, 20)), x)
     return float(value), error + UNIT * abs(float(value))
 
 
 def _round_down(value: Any) -> float:
     return float(np.nextafter(float(value), -np.inf))
-
-
-def _lagrangian(form: ReducedForm, multipliers: Array, r: Array) -> tuple[Any, Array, float, Array]:
-    """x'Zx and (Zx)_r for x = [r, 1] in extended precision, each with a bound on its rounding error."""
-    n, split = form.rotations, 9 * form.leaves
-    x = np.append(r, 1.0)
-    wide_x = x.astype(Wide)
-
-    def evaluate(y: Array, stored: tuple[Array, ...], Lambda: Array, minus: int) -> Array:
-        """(D, C, E) y - G'(G y) - Lambda y; with absolute values and minus = -1, what bounds the rounding."""
-        D, C, E, G = stored
-        leaf, border = y[:split], y[split:]
-        local = np.empty((n, 10), dtype=y.dtype)
-        local[:, :9], local[:, 9] = y[:-1].reshape(n, 9), y[-1]
-        product = np.einsum("nij,nj->ni", Lambda, local)
-        result = np.empty_like(y)
-        result[:split] = np.einsum("lij,lj->li", D, leaf.reshape(-1, 9)).ravel() + C @ border
-        result[split:] = C.T @ leaf + E @ border
-        result -= minus * (G.T @ (G @ y))
-        result[:-1] -= minus * product[:, :9].ravel()
-        result[-1] -= minus * product[:, 9].sum()
-        return result
-
-    stored = (form.D, form.wide, form.E, form.G)
-    Lambda = (multipliers.astype(Wide) @ CONSTRAINTS_FLAT.astype(Wide)).reshape(n, 10, 10)
-    z = evaluate(wide_x, tuple(m.astype(Wide) for m in stored), Lambda, 1)
-    size_Lambda = (np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)).reshape(n, 10, 10)
-    size = evaluate(np.abs(x), tuple(np.abs(m) for m in stored), size_Lambda, -1)
-    # No entry of z is made by more operations than this; sums within sums add their counts.
-    unit = gamma(2 * form.size + len(form.G) + 60, WIDE_UNIT)
-    z_error = unit * size * (1.0 + gamma(4 * form.size))
-    value = wide_x @ z
-    value_error = float(np.abs(x) @ (z_error + unit * size)) * (1.0 + gamma(2 * form.size))
-    return value, z, value_error, z_error
 
 
 def _curvature(form: ReducedForm, multipliers: Array) -> tuple[Array, Array, Array, Array]:

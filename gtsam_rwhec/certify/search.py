@@ -97,13 +97,12 @@ class Search:
     def tolerance(self, cost: float) -> float:
         """The absolute gap that counts as none (DESIGN fact 10), or what rounding leaves of it.
 
-        With Z proven definite that is rounding of the form's own entries; otherwise the bound has given away what the
-        proof of semidefiniteness needs, which is much more.
+        With unit weights 1 means nothing, and with exact data the cost is zero too: then there is only the rounding of
+        the form's own entries to compare with.
         """
         unit = 0.0 if self.part.is_relative else 1.0
-        definite = self.bound is not None and self.bound.definite
-        rounding = 1e-16 * self.form.size if definite else 1e-11
-        return max(self.options.relative_tolerance * max(cost, unit), rounding * self.form.magnitude)
+        rounding = 1e-15 * self.form.size * self.form.magnitude
+        return max(self.options.relative_tolerance * max(cost, unit), rounding)
 
     def run(self, method: Method, initial: Array | None) -> Found:
         """Search with a method; ``initial`` (n, 3, 3) is the start of "local" (and of ``certify``)."""
