@@ -26,6 +26,7 @@ from gtsam_rwhec.errors import (
     OptionError,
     PriorError,
     ScaleError,
+    WeightsWarning,
 )
 from gtsam_rwhec.identifiability import Identifiability, identify
 from gtsam_rwhec.poses import PoseLike, one_transform, to_pose3
@@ -78,6 +79,7 @@ def solve(
         When the scale is not positive at the optimum.
     """
     check_method(method)
+    _check_types(problem, options)
     options = options or SolveOptions()
     if method == "local" and initial is None:
         raise OptionError("method='local' needs initial=(X, Y, scale): poses by name to descend from")
@@ -85,6 +87,12 @@ def solve(
         raise OptionError(f"initial= is for method='local'; method={method!r} makes its own start")
     if options.nonnegative_scale and problem.scale != "shared":
         raise OptionError(f"nonnegative_scale constrains a shared scale; this problem has scale={problem.scale!r}")
+    if initial is not None:
+        if not (isinstance(initial, tuple) and len(initial) == 3):
+            raise OptionError(
+                "initial is (X, Y, scale): poses of targets and of sensors by name, and a scale (1.0 if known)"
+            )
+        _check_against_knowledge(problem, *initial)
     results = []
     for part in parts_of(problem):
         search = Search(part, options, progress)
@@ -132,6 +140,7 @@ def certify(
     PriorError, ScaleError
         For an answer that contradicts a fixed frame or a known scale.
     """
+    _check_types(problem, options)
     options = options or SolveOptions()
     parts = parts_of(problem)
     _check_against_knowledge(problem, X, Y, scale)
@@ -145,7 +154,7 @@ def certify(
         ours = _finish(part, search, found).certificate
         gap = cost - found.lower
         if gap <= tolerance:
-            status, reason = ours.status, f"proven globally optimal, as given; {ours.reason}"
+            status, reason = ours.status, ours.reason.replace("optimal", "optimal, as given", 1)
         elif cost - found.cost > tolerance:
             status = Status.GAP
             reason = f"a better answer exists: {found.cost:.8g} against {cost:.8g}"
@@ -162,6 +171,7 @@ class _Result:
     certificate: Certificate
     identifiability: Identifiability
     residuals: dict[Pair, Residual]
+    residual_cost: float
 
 
 def _finish(part: Part, search: Search, found: Found) -> _Result:
@@ -185,7 +195,9 @@ def _finish(part: Part, search: Search, found: Found) -> _Result:
         status = Status.CERTIFIED
     else:
         status = Status.CERTIFIED_NOT_UNIQUE
+        more = len(known.free_directions) - 3
         reason += "; but the measurements leave the answer free: " + "; ".join(known.free_directions[:3])
+        reason += f"; and {more} more (identifiability.free_directions)" if more > 0 else ""
     certificate = Certificate(
         status=status,
         reason=reason,
@@ -199,7 +211,8 @@ def _finish(part: Part, search: Search, found: Found) -> _Result:
         is_relative=part.is_relative,
         seconds=dict(search.seconds),
     )
-    return _Result(part, answer, certificate, known, residuals_of_pairs(part, poses, J_t, J_R))
+    residuals = residuals_of_pairs(part, poses, J_t, J_R)
+    return _Result(part, answer, certificate, known, residuals, float(J_t.sum() + J_R.sum()))
 
 
 def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
@@ -239,6 +252,7 @@ def _merge(problem: Problem, results: list[_Result]) -> Solution:
             scales |= {name: float(own[name]) for name in part.scale_owners}
         residuals |= result.residuals
     certificate = certificates.combined([result.certificate for result in results])
+    _warn_of_weights(problem, results)
     components = tuple(tuple(component) for component in connected_components(problem.pairs))
     known = identifiability.combined([result.identifiability for result in results], components)
     if not known.is_unique:
@@ -268,13 +282,31 @@ def _merge(problem: Problem, results: list[_Result]) -> Solution:
     )
 
 
+#: A cost this many times what the weights predict is told: weights too small, outliers, or another convention.
+UNLIKELY = 4.0
+
+
+def _warn_of_weights(problem: Problem, results: list[_Result]) -> None:
+    """Compare the residuals with what the weights predict: half the degrees of freedom."""
+    if problem.is_relative:
+        return
+    cost = sum(result.residual_cost for result in results)
+    freedom = sum(6 * r.part.number_of_measurements - r.part.number_of_unknowns for r in results)
+    if freedom > 0 and cost > UNLIKELY * 0.5 * freedom:
+        warnings.warn(
+            f"the residuals cost {cost:.4g}, {cost / (0.5 * freedom):.3g} times what sigma and kappa predict "
+            f"({0.5 * freedom:.4g}): the noise is larger than they say, some measurements are wrong, or A or B is "
+            "inverted",
+            WeightsWarning,
+            stacklevel=4,
+        )
+
+
 def _given_answer(part: Part, X: Poses, Y: Poses, scale: Scale) -> Answer:
     """The user's poses about the part's gauge."""
     transforms = []
     for name in part.free:
         poses, what = (X, "X") if name in part.targets else (Y, "Y")
-        if name not in poses:
-            raise FrameError(f"{what} has no pose of {name!r}; it has {', '.join(map(repr, poses)) or 'none'}")
         transforms.append(one_transform(poses[name], f"{what}[{name!r}]"))
     stacked = np.array(transforms).reshape(-1, 4, 4)
     shift = np.array([part.frame_shift(name) for name in part.free]).reshape(-1, 3)
@@ -286,8 +318,24 @@ def _given_answer(part: Part, X: Poses, Y: Poses, scale: Scale) -> Answer:
     return Answer(np.ascontiguousarray(stacked[:, :3, :3]), stacked[:, :3, 3] - shift, own, shared)
 
 
+def _check_types(problem: Problem, options: SolveOptions | None) -> None:
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    if options is not None and not isinstance(options, SolveOptions):
+        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.SolveOptions")
+
+
 def _check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) -> None:
     """Refuse an answer that is another than the problem says is known: its cost would not be that of the answer."""
+    for what, poses, names in (("X", X, problem.targets), ("Y", Y, problem.sensors)):
+        if not isinstance(poses, Mapping):
+            raise OptionError(f"{what} is a {type(poses).__name__}; give poses by name: {{name: pose}}")
+        missing = [name for name in names if name not in poses and name not in problem.fixed]
+        if missing:
+            raise FrameError(f"{what} has no pose of {missing[0]!r}; it has {', '.join(map(repr, poses)) or 'none'}")
+        unknown = [name for name in poses if name not in names]
+        if unknown:
+            raise FrameError(f"{what} has {unknown[0]!r}, which the problem does not; it has {', '.join(names)}")
     if problem.scale == "known" and scale != 1.0:
         raise ScaleError(
             f"the answer's scale is {scale!r}, but this problem has scale='known', which is 1; leave it out"

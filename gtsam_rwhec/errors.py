@@ -71,5 +71,9 @@ class NotCertifiedWarning(RwhecWarning):
     """No proof of global optimality was found."""
 
 
+class WeightsWarning(RwhecWarning):
+    """Residuals far beyond what the stated weights predict."""
+
+
 class RotationsProjectedWarning(RwhecWarning):
     """Rotation blocks were slightly off and were projected to the nearest rotation."""

@@ -11,14 +11,37 @@ SHARE = 0.05
 #: An axis within this angle of a coordinate axis is called by its name.
 AXIS_COSINE = np.cos(np.radians(8.0))
 
-_REASONS = {
-    0: "the motion did not turn",
-    1: "the motion turned about one axis only",
-    2: "the measurements say no more about it than their noise would",
-}
+#: A motion that turned by this much (rms) and is still lost in the noise did turn: it is the residuals that are large.
+TURNED_RAD = np.radians(3.0)
 
 
-def describe(names: tuple[str, ...], basis: Array, length_m: float, axes: dict[str, int], scale_mode: str) -> list[str]:
+def reason_for(axes: int, turned_rad: float, residual_rad: float) -> str:
+    """Why something of a pair is free, in words.
+
+    Parameters
+    ----------
+    axes : int
+        About how many axes its motion turned, beyond the noise: 0, 1, or 2 for two and more.
+    turned_rad : float
+        Root mean square of its turning, noise or not.
+    residual_rad : float
+        Root mean square of its rotation residuals.
+    """
+    if axes < 2 and turned_rad > TURNED_RAD and residual_rad > 0.5 * turned_rad:
+        return (
+            f"the residuals ({np.degrees(residual_rad):.0f} deg) are as large as the motion: is A or B inverted, "
+            "is the quaternions' order right?"
+        )
+    if axes == 0:
+        return "the motion did not turn"
+    if axes == 1:
+        return "the motion turned about one axis only"
+    return "the measurements say no more about it than their noise would"
+
+
+def describe(
+    names: tuple[str, ...], basis: Array, length_m: float, reasons: dict[str, str], scale_mode: str
+) -> list[str]:
     """One sentence for each frame, and for each scale, that the directions move.
 
     Parameters
@@ -29,8 +52,8 @@ def describe(names: tuple[str, ...], basis: Array, length_m: float, axes: dict[s
         Free directions: [omega (rad), v (m), log own scale] for each frame, then the shared scale's logarithm.
     length_m : float
         How many metres count as much as a radian.
-    axes : dict of str to int
-        About how many axes the motions seen with each frame turned.
+    reasons : dict of str to str
+        Why, for each frame (``reason_for``).
     scale_mode : str
     """
     n = len(names)
@@ -56,10 +79,10 @@ def describe(names: tuple[str, ...], basis: Array, length_m: float, axes: dict[s
             words.append(f"translation along {axis}")
         own = bool(np.abs(weighed[rows][6]).max(initial=0.0) > SHARE)
         if own:
-            words.append("scale")
+            words.append("its scale")
         if words:
             of_frame = " of its own frame" if axis or "rotation" in words[0] else ""
-            sentences.append(f"{name}: {' and '.join(words)}{of_frame}; {_REASONS[axes.get(name, 2)]}")
+            sentences.append(f"{name}: {' and '.join(words)}{of_frame}; {reasons[name]}")
     if scale_mode == "shared" and np.abs(weighed[-1]).max(initial=0.0) > SHARE:
         sentences.append("scale: a change of it is made up for by the frames' translations on these motions")
     if not sentences:

@@ -4,8 +4,9 @@ Noise excites every direction a little, so rank says nothing on real data. A dir
 information that the motions give of it is no more than the noise alone would feign there if the true motions left it
 open (``information.pair_information``). In units of that noise a free direction has a ratio of mean 1: a sum of about
 m = 2 N squares of noise over a noise variance estimated with nu degrees of freedom, an F variate. The threshold is its
-99.9 % quantile F(m, nu): a free direction is called determined once in a thousand. Three measurements with six degrees
-to spare ask for a ratio of 20, a hundred for 1.4.
+99.9 % quantile F(m, nu): a free direction is called determined once in a thousand. The noise of rotations
+and that of translations are estimated apart, each from about half of the equations to spare: three measurements with
+six to spare ask for a ratio of 130, a hundred for 1.5.
 
 Rotation residuals know rotations only, so they are asked first; where they determine every rotation, the rest is about
 translations and scales at those rotations, and where not, everything is asked of all residuals together.
@@ -26,7 +27,7 @@ from scipy.special import chdtri, fdtri
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify import arrow
 from gtsam_rwhec.certify.parts import Part
-from gtsam_rwhec.free_directions import describe
+from gtsam_rwhec.free_directions import describe, reason_for
 from gtsam_rwhec.information import (
     Information,
     PairInformation,
@@ -136,8 +137,10 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
     noise = noise_level(part, J_t, J_R)
     pairs = pair_information(part, poses, noise)
     length = _typical_length(part)
-    axes = _rotation_axes(part, pairs.carrier_noise, noise.redundancy)
-    of_each = _pairs(part, pairs, noise.redundancy, axes, length)
+    axes, turned = _rotation_axes(part, pairs.carrier_noise, noise.redundancy)
+    residual = np.sqrt(J_R / part.moments.kappa)  # J_R is sum kappa theta^2
+    reasons = [reason_for(*of_pair) for of_pair in zip(axes, turned, residual, strict=True)]
+    of_each = _pairs(part, pairs, noise.redundancy, axes, reasons, length)
 
     index = {name: i for i, name in enumerate(part.free)}
     counts = np.zeros(len(index) + 1)
@@ -165,10 +168,12 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
     weak = min(tests, key=lambda test: test.ratio)
     free: list[str] = []
     if weak.free.any():
-        seen = {
-            name: max((a for a, pair in zip(axes, part.pairs, strict=True) if name in pair), default=0)
-            for name in index
+        # The pair that turned most speaks for a frame.
+        speaks = {
+            name: max((a, e) for e, (a, pair) in enumerate(zip(axes, part.pairs, strict=True)) if name in pair)
+            for name in part.free
         }
+        seen = {name: reasons[e] for name, (_, e) in speaks.items()}
         free = describe(part.free, weak.directions[:, weak.free], length, seen, part.scale)
     return Identifiability(
         is_unique=not free,
@@ -205,12 +210,13 @@ def _threshold(squares: Array | float, redundancy: int) -> Array:
     if redundancy <= 0:  # the weights tell the noise, and nothing else does
         known: Array = np.asarray(chdtri(squares, SIGNIFICANCE) / squares)
         return known
-    result: Array = np.asarray(fdtri(squares, float(redundancy), 1.0 - SIGNIFICANCE))
+    result: Array = np.asarray(fdtri(squares, 0.5 * redundancy, 1.0 - SIGNIFICANCE))
     return result
 
 
-def _rotation_axes(part: Part, noise: Array, redundancy: int) -> list[int]:
-    """About how many axes each pair's A turned (Corollary 2, tested against A's noise, (E,) rad^2): 0, 1 or 2.
+def _rotation_axes(part: Part, noise: Array, redundancy: int) -> tuple[list[int], Array]:
+    """About how many axes each pair's A turned (Corollary 2, tested against A's noise, (E,) rad^2): 0, 1 or 2;
+    and by how much, root mean square, in rad.
 
     The mean of R_A shortens every direction but a common axis: 1 - s^2 of its singular values is the mean square
     sine of the turning that leaves that direction; noise alone makes it 2 q^2.
@@ -220,7 +226,7 @@ def _rotation_axes(part: Part, noise: Array, redundancy: int) -> list[int]:
     s = np.linalg.svd(means, compute_uv=False)
     ratio = (1.0 - s**2) / (2.0 * noise[:, None])
     excited = (ratio > _threshold(2.0 * counts, redundancy)[:, None]).sum(axis=1)
-    return [(0, 1, 1, 2)[k] for k in excited]
+    return [(0, 1, 1, 2)[k] for k in excited], np.sqrt(np.maximum(1.0 - s[:, -1] ** 2, 0.0))
 
 
 def _weakest(info: Information, counts: Array, redundancy: int) -> _Weak:
@@ -281,7 +287,7 @@ def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray) -> tuple
 
 
 def _pairs(
-    part: Part, pairs: PairInformation, redundancy: int, axes: list[int], length: float
+    part: Part, pairs: PairInformation, redundancy: int, axes: list[int], reasons: list[str], length: float
 ) -> dict[Pair, PairIdentifiability]:
     """Every pair on its own, all in one stack of 15 x 15 problems, asked as the whole is."""
     counts = part.moments.count
@@ -305,7 +311,7 @@ def _pairs(
         if free.any():
             rows = [first + k for first in ends.values() for k in range(7)] + [14]
             sentences = describe(
-                tuple(ends), directions[e][rows][:, free], length, dict.fromkeys(ends, axes[e]), part.scale
+                tuple(ends), directions[e][rows][:, free], length, dict.fromkeys(ends, reasons[e]), part.scale
             )
         weakest = float(min(rest[e].min(), turning[e].min())) if settled[e] else float(rest[e].min())
         result[pair] = PairIdentifiability(

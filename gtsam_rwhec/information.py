@@ -18,11 +18,11 @@ import numpy as np
 from gtsam_rwhec.certify.parts import Part
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.residuals import PairPoses
-from gtsam_rwhec.statistics import ONE, R_A, T_A
+from gtsam_rwhec.statistics import ONE, R_A, T_A, T_B
 
-#: Below a tenth of a microradian and of a micrometre nothing is noise: exact data, and the eigenvalues' own rounding.
-FLOOR_RAD = 1e-7
-FLOOR_M = 1e-7
+#: No data are taken for more exact than this, in radians and as a part of the measured lengths: where the noise is
+#: zero, the eigenvalues' own rounding (1e-16 / floor^2) must not pass for information.
+FLOOR = 1e-7
 #: A pair's 15 parameters: the target's seven, the sensor's seven, the shared scale. A frame's seven: rotation,
 #: translation, logarithm of its own scale.
 OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
@@ -59,10 +59,11 @@ def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
     if redundancy <= 0:  # nothing tells the noise but the weights
         return NoiseLevel(np.ones(len(counts)), np.ones(len(counts)), redundancy)
     correction = 6.0 * N / redundancy
+    lengths = np.einsum("eii->e", part.moments.translation[:, T_B, T_B])
     factors = []
     for J, floor in (
-        (J_t, part.moments.weight * FLOOR_M**2 / counts),
-        (J_R, 2.0 * part.moments.kappa * FLOOR_RAD**2 / counts),
+        (J_t, (lengths + 1e-4 * part.moments.weight) * FLOOR**2 / counts),  # at least a centimetre's part
+        (J_R, 2.0 * part.moments.kappa * FLOOR**2 / counts),
     ):
         of_part = correction * float(J.sum()) / (1.5 * N)
         factors.append(np.maximum(np.maximum(J / (1.5 * counts), of_part), floor))
@@ -139,7 +140,7 @@ def pair_information(part: Part, poses: PairPoses, noise: NoiseLevel) -> PairInf
     given_t_X = t_X + np.array([part.frame_shift(target) for target, _ in part.pairs])
     arm = np.minimum((given_t_X**2).sum(axis=1), square / W)
     by_arm = 1.5 * noise.translation * n / np.maximum(alpha**2 * W * arm, 1e-300)
-    q2 = np.maximum(np.minimum(noise.rotation * n / (2.0 * K), by_arm), FLOOR_RAD**2)
+    q2 = np.maximum(np.minimum(noise.rotation * n / (2.0 * K), by_arm), FLOOR**2)
     noise_rotation, noise_translation = np.zeros((E, 15)), np.zeros((E, 15))
     for omega, v in ((OMEGA_X, V_X), (OMEGA_Y, V_Y)):
         noise_rotation[:, omega] = (2.0 * K * q2)[:, None]

@@ -12,6 +12,8 @@ from gtsam_rwhec.errors import CountError, NoiseError, UnitsWarning
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.statistics import BLOCK, Gauge
 
+#: sigma and kappa below this, or above its inverse, lose everything else in rounding.
+SMALLEST_WEIGHT = 1e-15
 #: Translations with a median beyond this are taken for millimetres (a camera sees no tag at 100 m).
 MILLIMETRES_M = 100.0
 
@@ -43,6 +45,13 @@ def positive_weights(value: ArrayLike | None, count: int, name: str, where: str)
     if bad.size:
         index = f" of measurement {bad[0]}" if array.ndim else ""
         raise NoiseError(f"{where}: {name}{index} is {array.flat[bad[0]]}; it must be positive and finite")
+    unlikely = np.flatnonzero((array < SMALLEST_WEIGHT) | (array > 1.0 / SMALLEST_WEIGHT))
+    if unlikely.size:
+        value_there = array.flat[unlikely[0]]
+        raise NoiseError(
+            f"{where}: {name} is {value_there:.3g}; beyond {SMALLEST_WEIGHT:g} to {1.0 / SMALLEST_WEIGHT:g} no double "
+            "precision sum holds it. sigma is in metres, kappa is 1 / (2 s^2) for s in radians"
+        )
     return array
 
 

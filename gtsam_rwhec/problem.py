@@ -393,6 +393,10 @@ class Problem:
             merged.fix_scale(name, scale)
         return merged
 
+    def __radd__(self, other: object) -> Problem:
+        """0 + problem, so that ``sum(problems)`` joins them."""
+        return self if other == 0 else NotImplemented
+
     def __repr__(self) -> str:
         return (
             f"Problem({len(self.targets)} targets, {len(self.sensors)} sensors, {len(self._edges)} pairs, "

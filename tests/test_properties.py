@@ -36,7 +36,9 @@ def matrices(poses: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def scales(solution: Any) -> np.ndarray:
-    return np.array([s for _, s in sorted(solution.scale.items())] if isinstance(solution.scale, dict) else solution.scale)
+    return np.array(
+        [s for _, s in sorted(solution.scale.items())] if isinstance(solution.scale, dict) else solution.scale
+    )
 
 
 def assert_same(first: rw.Solution, second: rw.Solution, tolerance_m: float, relative_cost: float) -> None:
@@ -63,7 +65,9 @@ def put(problem: rw.Problem, pair: tuple[str, str], data: Any, part: Any = slice
         problem.add(*pair, *arguments)
 
 
-def moved(problem: rw.Problem, left: np.ndarray, right: np.ndarray, batch: int | None = None, **options: Any) -> rw.Problem:
+def moved(
+    problem: rw.Problem, left: np.ndarray, right: np.ndarray, batch: int | None = None, **options: Any
+) -> rw.Problem:
     """The problem with other carrier frames: A becomes left A right, and a motion's A left A left^-1."""
     result = rw.Problem(problem.scale, **options)
     for pair, data in batches_of(problem):
@@ -205,7 +209,10 @@ def test_the_bound_is_below_the_cost_of_every_answer(mode: str, seed: int) -> No
     (part,) = parts_of(problem)
     generator = np.random.default_rng(seed)
     size = len(solution.X) + len(solution.Y)
-    near = [T @ N for T, N in zip(matrices({**solution.X, **solution.Y}).values(), small_poses(size, generator), strict=True)]
+    near = [
+        T @ N
+        for T, N in zip(matrices({**solution.X, **solution.Y}).values(), small_poses(size, generator), strict=True)
+    ]
     truth = list({**simulation.X, **simulation.Y}.values())
     for poses in (near, truth, list(random_poses(size, 2.0, generator))):
         X = dict(zip(solution.X, poses, strict=False))

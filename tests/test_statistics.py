@@ -44,9 +44,7 @@ def cost_from_moments(
     T = np.array([{**X, **Y}[name] for name in part.free]).reshape(-1, 4, 4)
     shift = np.array([part.frame_shift(name) for name in part.free]).reshape(-1, 3)
     own = [scale[name] if isinstance(scale, dict) and name in part.scale_owners else np.nan for name in part.free]
-    answer = Answer(
-        T[:, :3, :3], T[:, :3, 3] - shift, np.array(own), scale if isinstance(scale, float) else 1.0
-    )
+    answer = Answer(T[:, :3, :3], T[:, :3, 3] - shift, np.array(own), scale if isinstance(scale, float) else 1.0)
     return Forms.of(part).full.value(*as_variables(part, answer))
 
 
@@ -93,7 +91,9 @@ def test_cost_from_moments_is_the_cost_of_the_measurements(case: str, known: str
         scale |= problem.fixed_scales
     parts = parts_of(problem)
     kind = parts[0].kind
-    assert kind == ("inverse" if problem.scale == "per_target" or (known, problem.scale) == ("priors", "shared") else "direct")
+    assert kind == (
+        "inverse" if problem.scale == "per_target" or (known, problem.scale) == ("priors", "shared") else "direct"
+    )
     got = sum(cost_from_moments(part, X, Y, scale) for part in parts)
     expected = naive_cost(problem, X, Y, scale, kind, parts[0].gauge)
     assert got == pytest.approx(expected, rel=1e-12)
@@ -128,7 +128,9 @@ def naive_edge_form(A: np.ndarray, B: np.ndarray, sigma: np.ndarray, kappa: np.n
     return form
 
 
-def moments_of(A: np.ndarray, B: np.ndarray, sigma: np.ndarray, kappa: np.ndarray, gauge: Gauge | None = None) -> Moments:
+def moments_of(
+    A: np.ndarray, B: np.ndarray, sigma: np.ndarray, kappa: np.ndarray, gauge: Gauge | None = None
+) -> Moments:
     return Moments.of(A, B, 1.0 / sigma**2, kappa, gauge or Gauge(), False, "test")
 
 
@@ -221,9 +223,10 @@ def eliminated_by_pinv(part: Part, Q: np.ndarray) -> np.ndarray:
     rotations = np.array([13 * i + 4 + k for i in range(len(part.free)) for k in range(9)])
     kept = np.r_[rotations, len(Q) - 1]
     gone = np.setdiff1d(np.arange(len(Q)), kept)
-    return Q[np.ix_(kept, kept)] - Q[np.ix_(kept, gone)] @ np.linalg.pinv(Q[np.ix_(gone, gone)], rcond=1e-12) @ Q[
-        np.ix_(gone, kept)
-    ]
+    return (
+        Q[np.ix_(kept, kept)]
+        - Q[np.ix_(kept, gone)] @ np.linalg.pinv(Q[np.ix_(gone, gone)], rcond=1e-12) @ Q[np.ix_(gone, kept)]
+    )
 
 
 @pytest.mark.parametrize("graph", GRAPHS)

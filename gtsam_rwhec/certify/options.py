@@ -50,8 +50,16 @@ class SolveOptions:
         for option in fields(self):
             value = getattr(self, option.name)
             if option.name == "nonnegative_scale":
+                if not isinstance(value, bool):
+                    raise OptionError(f"SolveOptions.nonnegative_scale={value!r}; it is True or False")
                 continue
-            if not np.isfinite(value) or value < 0 or (value == 0 and option.name not in ("random_starts", "seed")):
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if (
+                not number
+                or not np.isfinite(value)
+                or value < 0
+                or (value == 0 and option.name not in ("random_starts", "seed"))
+            ):
                 raise OptionError(f"SolveOptions.{option.name}={value!r}; it must be positive and finite")
 
 

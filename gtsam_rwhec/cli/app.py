@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shlex
 import sys
 import warnings
@@ -151,6 +152,9 @@ def utias(
 
 def main() -> None:
     """Entry point of the command ``gtsam-rwhec``."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal or pipe that lacks a sign gets a question mark
+            stream.reconfigure(errors="replace")
     try:
         app()
     except KeyboardInterrupt:

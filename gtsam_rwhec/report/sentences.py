@@ -72,10 +72,9 @@ def scale_sentence(solution: Solution) -> str:
 def weights_sentence(solution: Solution) -> str:
     """What the cost may be compared with."""
     if solution.is_relative:
-        return (
-            "Weights: sigma and kappa were not given, so all measurements weigh the same (sigma = 1 m, kappa = 1), and "
-            "costs and covariances are relative."
-        )
+        return "Weights: sigma or kappa was not given; 1 (m) stood in for it, and costs and covariances are relative."
+    if solution.certificate.objective.startswith("the equation turned round"):
+        return "Weights: as given; the cost is of the equation turned round, and no chi-square."
     return "Weights: as given; if they are true, the cost is half a chi-square."
 
 

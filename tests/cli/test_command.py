@@ -269,3 +269,12 @@ def test_version_and_help() -> None:
     assert run("--version").stdout == f"gtsam-rwhec {rw.__version__} (gtsam {version('gtsam')})\n"
     assert "3 certified, but the" in run("--help").stdout
     assert "--kappa" in run("calibrate", "--help").stdout
+
+
+def test_a_terminal_without_our_signs_gets_others() -> None:
+    environment = {**os.environ, "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(
+        [sys.executable, "-m", "gtsam_rwhec.cli", "demo"], capture_output=True, env=environment, check=False, timeout=60
+    )
+    assert done.returncode == 0
+    assert b"Certified globally optimal" in done.stdout
