@@ -160,7 +160,18 @@ def certify(
             reason = f"a better answer exists: {found.cost:.8g} against {cost:.8g}"
         else:
             status, reason = Status.GAP, ours.reason
-        results.append(dataclasses.replace(ours, status=status, reason=reason, cost=cost, tolerance=tolerance))
+        # The bound is exact to the stored form's last digits; the cost of the answer as given rounds on its way there.
+        results.append(
+            dataclasses.replace(
+                ours,
+                status=status,
+                reason=reason,
+                cost=cost,
+                lower_bound=min(ours.lower_bound, cost),
+                float_bound=min(ours.float_bound, cost),
+                tolerance=tolerance,
+            )
+        )
     return certificates.combined(results)
 
 
@@ -225,7 +236,7 @@ def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
             raise ScaleError(
                 f"{what} is {value:.6g} at the {'optimum' if proven else 'best point found'}, which no real target "
                 "has. Either the poses contradict the frame convention (is B = T_sensor_target? is A inverted?), or "
-                "the motion turned about one axis only, where a mirror image fits too (turn about a second one), or "
+                "the motion was planar, where a mirror image fits too (turn about a second axis), or "
                 "the noise drowns the scale (SolveOptions(nonnegative_scale=True) constrains a shared one)"
             )
 

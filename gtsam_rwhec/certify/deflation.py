@@ -73,8 +73,9 @@ def deflated_eigenvalue(
     of_ZV = np.abs(ZV).astype(float) * _SAFETY
     H_error = (of_V_rows.T @ errors) * _SAFETY + gamma(N + 2, WIDE_UNIT) * (of_V_rows.T @ of_ZV)
     size_H = np.abs(H).astype(float) * _SAFETY + H_error
-    diagonal = np.diagonal(H).astype(float) - np.diagonal(H_error)
-    radius = size_H.sum(axis=1) - np.diagonal(size_H)
+    diagonal = np.diagonal(H).astype(float)
+    diagonal = diagonal - 4.0 * gamma(1) * np.abs(diagonal) - np.diagonal(H_error)
+    radius = (size_H - np.diag(np.diagonal(size_H))).sum(axis=1) * _SAFETY
     nu = max(0.0, float((radius + np.diagonal(H_error) - diagonal).max()))
     residual = np.abs(ZV - wide_V * of_V).astype(float) * _SAFETY + errors
     residual += gamma(3, WIDE_UNIT) * (of_ZV + of_V_rows * np.abs(of_V))

@@ -150,7 +150,7 @@ class Search:
     def with_positive_scale(self, found: Found) -> Found:
         """The answer as found, or its mirror image where only that has positive scales and it costs as little.
 
-        Motion about one axis leaves the sign of a scale open (``mirror``). With noise in A the two costs differ a
+        Planar motion leaves the sign of a scale open (``mirror``). With noise in A the two costs differ a
         little, and the image may cost more than the bound allows: then it is returned with that gap.
         """
         if _has_positive_scales(self.part, self.form, found.R):
@@ -165,7 +165,7 @@ class Search:
         if cost - found.lower > self.tolerance(cost):
             reason = (
                 f"its mirror image, with a negative scale, costs {found.cost:.8g}, less than this answer's {cost:.8g}: "
-                "motion about one axis leaves the sign of the scale to the noise"
+                "planar motion leaves the sign of the scale to the noise"
             )
         path = f"{found.path}, mirrored"
         return replace(found, R=end.R, cost=cost, lower=min(found.lower, cost), reason=reason, path=path)

@@ -59,7 +59,8 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
     multipliers : (n, 20) array
         Still with Z x = 0.
     t : float
-        What they reach: Z - t P is positive definite across x. Positive: they prove x optimal.
+        What they reach: Z - t P is positive definite across x. Positive: they prove x optimal. Minus infinity, with
+        the multipliers as given, where rounding has left Q' with a negative eigenvalue.
     """
     n = len(R)
     null = null_multipliers(R)
@@ -73,6 +74,10 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
     Z0 /= scale
     P = Q / scale
     P[np.diag_indices_from(P)] += 1e-9 * np.abs(np.diagonal(P)) + 1e-12
+    try:
+        np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:  # an ill-conditioned reduction has rounded Q' below zero: there is no measure
+        return multipliers, -np.inf
     # Added along P x it takes x out of the question and leaves what is across x, z'P x = 0, as it is.
     along_x = P @ x / np.sqrt(float(x @ P @ x))
     t = float(scipy.linalg.eigh(Z0, P, eigvals_only=True, subset_by_index=[0, 0], check_finite=False)[0])
