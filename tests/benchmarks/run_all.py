@@ -1,0 +1,60 @@
+"""Every benchmark in one table.
+
+    python tests/benchmarks/run_all.py [--no-scs] [--plot FOLDER] [--tables-runs 1000]
+
+Takes some minutes: SCS one, the paper's tables (in processes of their own, with their own table) most of the rest;
+``--tables-runs 0`` leaves those out. The noise sweep is examples/noise_sweep.py. Exits with 1 if a bar is missed.
+Needs opencv-python-headless<5, scs and matplotlib.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import many_frames
+import million_measurements
+import one_pair
+import real_dataset
+import single_pairs
+import world_origin
+from bars import Row, print_rows
+
+
+def main() -> int:
+    """Run them one after the other."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--no-scs", action="store_true", help="leave out the rows that need SCS")
+    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write time_against_frames.png there")
+    parser.add_argument("--tables-runs", type=int, default=1000, help="of each experiment of Tables 2-5; 0: none")
+    arguments = parser.parse_args()
+    parts = {
+        "answers on the real dataset": real_dataset.answers,
+        "real dataset against SCS": lambda: [] if arguments.no_scs else real_dataset.speed(repetitions=15),
+        "the pairs alone": lambda: single_pairs.rows_of("known", 100) + single_pairs.rows_of("shared", 100),
+        "one X, one Y, against OpenCV": lambda: one_pair.rows(repetitions=51),
+        "a million measurements": lambda: million_measurements.rows(1_000_000, repetitions=9),
+        "many frames": lambda: many_frames.rows(repetitions=7),
+        "world origin": world_origin.rows,
+    }
+    rows: list[Row] = []
+    for name, make in parts.items():
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        start = time.perf_counter()
+        rows += make()
+        print(f"    {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
+    status = print_rows("What the certified core must reach", rows)
+    if arguments.plot is not None:
+        print(f"Written to {many_frames.plot(arguments.plot, repetitions=5)}.")
+    if arguments.tables_runs:
+        script = Path(__file__).with_name("tables_2_to_5.py")
+        command = [sys.executable, str(script), "--runs", str(arguments.tables_runs)]
+        status = max(status, subprocess.run(command, check=False).returncode)
+    return status
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,53 @@
+"""Every example runs, says what it found and leaves a picture; at reduced sizes, so that none rots."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+#: Arguments that make it quick, and what must be in its output.
+RUNS = {
+    "certify_a_rig": ([], "Certified globally optimal"),
+    "noise_sweep": (["--runs", "2", "--degrees", "2", "60"], r"shared\s+20\s+2\s+100"),
+    "tightness_neighbourhood": (["--problems", "2", "--step", "45"], "all constraints: the first loss at"),
+    "sparsity": (["--leaves", "2", "4"], r"8 X: ([\d.]+)% of Q' filled before, \1% after"),
+    "certify_other_solver": (["--runs", "4"], "After local descent: certified"),
+}
+
+
+def run(name: str, arguments: list[str], folder: Path) -> str:
+    """Run an example as a user does; its output."""
+    command = [sys.executable, str(EXAMPLES / f"{name}.py"), "--save", str(folder), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, timeout=120)
+    assert done.returncode == 0, f"{name}: {done.stderr}"
+    assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    return done.stdout
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_an_example_runs(name: str, tmp_path: Path) -> None:
+    arguments, expected = RUNS[name]
+    output = run(name, arguments, tmp_path)
+    assert re.search(expected, output), output
+
+
+def test_the_grid_of_figure_8(utias_folder: Path, tmp_path: Path) -> None:
+    output = run("figure_8_grid", [str(utias_folder)], tmp_path)
+    assert "certified: cost 8.2812454" in output
+    assert "The whole is determined." in output
+
+
+def test_no_example_is_left_out() -> None:
+    scripts = {path.stem for path in EXAMPLES.glob("*.py")} - {"figures"}
+    assert scripts == set(RUNS) | {"figure_8_grid"}
+
+
+def test_committed_pictures_are_small_and_made_by_an_example() -> None:
+    for picture in (EXAMPLES / "pictures").glob("*.png"):
+        assert (EXAMPLES / f"{picture.stem}.py").is_file(), f"{picture.name}: nothing makes it"
+        assert picture.stat().st_size < 150_000, f"{picture.name} is larger than 150 kB"
