@@ -241,9 +241,10 @@ def _weakest(info: Information, counts: Array, redundancy: int) -> _Weak:
     if size == 0:
         return _Weak(np.zeros(0), np.zeros(0), np.zeros((len(used), 0)))
     if size <= DENSE_PARAMETERS:
-        values, reduced = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])
+        values, reduced = _all(D, C, E, used)
     else:
-        values, reduced = _weakest_by_lanczos(D, C, E, used)
+        # No direction sums fewer than two squares, and the fewer, the higher its threshold.
+        values, reduced = _weakest_by_lanczos(D, C, E, used, float(_threshold(2.0, redundancy)))
     vectors = np.zeros((len(used), len(values)))
     vectors[used] = reduced
     # Satterthwaite: a direction spread over frames sums as many squares as its shares of their measurements tell.
@@ -263,10 +264,11 @@ def _unit(noise: Array, used: np.ndarray) -> Array:
     return result
 
 
-def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray) -> tuple[Array, Array]:
-    """The smallest eigenpairs by inverse iteration with one arrow factorisation, linear in the leaves."""
+def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray, enough: float) -> tuple[Array, Array]:
+    """The smallest eigenpairs, up to one above ``enough``, by Lanczos on the inverse, linear in the leaves."""
     L, m = D.shape[:2]
-    shift = 1e-6
+    largest = max(np.einsum("lii->li", D).max(initial=0.0), np.diagonal(E).max(initial=0.0))
+    shift = max(1e-6, 1e-13 * float(largest))  # above the factorisation's rounding, far below any threshold
     unused = (~used).astype(float)
     leaf_diagonal = unused[: L * m].reshape(L, m) * 1e30 + shift
     border_diagonal = unused[L * m :] * 1e30 + shift
@@ -279,11 +281,22 @@ def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray) -> tuple
         return np.concatenate([leaf.ravel(), border.ravel()])
 
     size = len(used)
-    count = 12
     operator = LinearOperator((size, size), matvec=solve, dtype=np.float64)
-    inverse, vectors = eigsh(operator, k=count, which="LA", v0=np.random.default_rng(0).standard_normal(size) * used)
-    values = np.maximum(1.0 / inverse - shift, 0.0)
-    return values, vectors[used]
+    start = np.random.default_rng(0).standard_normal(size) * used
+    count = 12
+    while 4 * count < size:
+        inverse, vectors = eigsh(operator, k=count, which="LA", v0=start)
+        values = np.maximum(1.0 / inverse - shift, 0.0)
+        if values.max() > enough:
+            return values, vectors[used]
+        count *= 4
+    return _all(D, C, E, used)  # so many are free that Lanczos is no gain
+
+
+def _all(D: Array, C: Array, E: Array, used: np.ndarray) -> tuple[Array, Array]:
+    """All eigenpairs, densely."""
+    values, vectors = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])
+    return values, vectors
 
 
 def _pairs(

@@ -23,6 +23,8 @@ PosesLike = ArrayLike | Sequence[gtsam.Pose3]
 
 #: A rotation block further than this from R'R = I (largest entry) is refused; a nearer one is projected.
 ROTATION_TOLERANCE = 1e-3
+#: Translations beyond this are no poses: their squares would drown everything.
+LARGEST_M = 1e15
 #: Deviations below this are rounding and are left as they are.
 ROTATION_ROUNDING = 1e-13
 
@@ -58,6 +60,8 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
                     "give one kind of pose in a list"
                 )
         return np.array([pose.matrix() for pose in poses])
+    if isinstance(poses, np.ma.MaskedArray) or getattr(poses, "dtype", None) in (np.complex64, np.complex128):
+        raise PoseError(f"{where}: a masked or complex array; leave masked measurements out, and give real numbers")
     try:
         array = np.asarray(poses, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -142,9 +146,8 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
     rows = np.empty((12, len(block))) if out is None else out
     for column in range(4):
         rows[3 * column : 3 * column + 3] = block[:, :3, column].T
-    # A sum is finite only when all of its terms are, short of overflow, which is refused too.
-    if not np.isfinite(rows.sum()):
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=0))
+    if not np.abs(rows[9:]).max() <= LARGEST_M or not np.isfinite(rows.sum()):
+        bad = np.flatnonzero(~(np.abs(rows) <= LARGEST_M).all(axis=0))
         index = int(bad[0]) if bad.size else 0
         raise PoseError(
             f"{where}: measurement {first + index} has an entry that is NaN, infinite or too large; "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -358,7 +359,7 @@ def test_scales_of_known_size_are_any_number(scale: Any) -> None:
         problem.fix_scale("tag0", 3.0)
 
 
-# -- what only the whole problem shows ----------------------------------------------------------------------------------
+# -- what only the whole problem shows --------------------------------------------------------------
 
 
 def of_one(count: int, scale: Any = "known") -> rw.Problem:
@@ -424,17 +425,25 @@ WHOLE: dict[str, tuple[Callable[[], rw.Problem], type[Exception], list[str]]] = 
 
 
 @pytest.mark.parametrize("case", WHOLE)
-@pytest.mark.parametrize("call", ["solve", "certify"])
-def test_a_problem_that_cannot_be_solved_is_refused(case: str, call: str) -> None:
+@pytest.mark.parametrize(
+    "call", [rw.solve, partial(rw.certify, X={"tag0": EYE}, Y={"cam0": EYE})], ids=["solve", "certify"]
+)
+def test_a_problem_that_cannot_be_solved_is_refused(case: str, call: Callable[[rw.Problem], Any]) -> None:
     make, error, said = WHOLE[case]
     problem = make()
     with pytest.raises(error) as caught:
-        if call == "solve":
-            rw.solve(problem)
-        else:
-            rw.certify(problem, X={"tag0": EYE, "tag1": EYE}, Y={"cam0": EYE, "cam1": EYE})
+        call(problem)
     for words in said:
         assert words in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::gtsam_rwhec.errors.UnitsWarning")
+@pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
+def test_translations_whose_squares_overflow_are_refused(scale: Any) -> None:
+    problem = rw.Problem(scale)
+    problem.add("tag0", "cam0", spoilt(A, (slice(None), 0, 3), 1e200), B, 0.01, 100.0)
+    with pytest.raises(errors.PoseError, match=r"translations of tag0-cam0 are so large .* are they in metres\?"):
+        rw.solve(problem)
 
 
 @pytest.mark.parametrize("scale", ["shared", "per_target"])

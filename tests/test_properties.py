@@ -103,7 +103,7 @@ def simulated(seed: int, mode: str, **options: Any) -> Simulation:
     return general(2, 2, seed=seed, **{**defaults, **MODES[mode], **options})
 
 
-# -- gauges ---------------------------------------------------------------------------------------------------------------
+# -- gauges -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -138,7 +138,7 @@ def test_known_frames_and_priors_move_along(mode: str) -> None:
         np.testing.assert_allclose({**X, **Y}[name], T, rtol=0.0, atol=2e-8)
 
 
-# -- order, batches, merging ----------------------------------------------------------------------------------------------
+# -- order, batches, merging ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -190,10 +190,10 @@ def test_merging_is_adding(mode: str, count: int, seed: int) -> None:
     assert_same(rw.solve(merged), rw.solve(problem), 1e-8, 1e-9)
 
 
-# -- bounds ---------------------------------------------------------------------------------------------------------------
+# -- bounds -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.NotUniqueWarning")  # so much noise
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")  # so much noise
 @pytest.mark.parametrize("mode", MODES)
 @given(SEEDS)
 @few
@@ -246,7 +246,7 @@ def test_any_multipliers_bound_the_cost_at_any_rotations(mode: str, seed: int, s
         assert bound.lower <= x @ form.apply(x)
 
 
-# -- exact data -----------------------------------------------------------------------------------------------------------
+# -- exact data -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -289,7 +289,7 @@ def test_without_noise_odometry_alone_gives_the_truth(scale: Any, seed: int) -> 
     assert error.Y["sensor0"].rotation_rad < 1e-8
 
 
-# -- a world far away -----------------------------------------------------------------------------------------------------
+# -- a world far away -------------------------------------------------------------------------------
 
 FAR = {"1 km": (1e3, 1e-9), "1,000 km": (1e6, 1e-6)}
 BATCHES: dict[str, dict[str, Any]] = {

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -256,7 +259,7 @@ def test_free_translations_take_the_pseudo_inverse(scale: str) -> None:
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
-def test_forms_of_the_real_dataset(utias_folder, scale: str) -> None:  # noqa: ANN001
+def test_forms_of_the_real_dataset(utias_folder: Path, scale: Any) -> None:
     problem = rw.read_csv(utias_folder, scale=scale, sigma=1.0, kappa=1.0)
     (part,) = parts_of(problem)
     Q = naive_form(problem, part)

@@ -101,15 +101,20 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
         pin = int(np.abs(r[9 * L :]).argmax())
         # Rotations have entries of at most 1.
         reach_of_a = float(1.0 / r[9 * L + pin] ** 2) * (1.0 + 1e-10)
+    # z_i = vec R_i - r_i of a rotation R_i, so |z_i| <= sqrt(3) + |r_i|.
+    size_z = np.sqrt(3.0) + np.linalg.norm(r.reshape(n, 9), axis=1)
+    of_g = float((2.0 * np.linalg.norm(reach.reshape(n, 9), axis=1) * size_z).sum()) * (1.0 + 1e-10)
     if proven(leaf_unit, border_unit, pin):
         room = np.r_[leaf_unit.ravel(), border_unit]
-        loss = float((reach**2 / room).sum()) * (1.0 + 1e-10)
+        by_room = float((reach**2 / room).sum()) * (1.0 + 1e-10)
+        by_size = of_g if pin is None else np.inf  # with a large g and little room, z'Z_rr z >= 0 is worth more
         # Each try costs a factorisation: more room is asked for only where g is so large that it matters.
         more = MORE_ROOM
-        while loss > 1e-9 * abs(float(value)) + 1e-17 * size * form.magnitude:
+        while min(by_room, by_size) > 1e-9 * abs(float(value)) + 1e-17 * size * form.magnitude:
             if not proven(more * leaf_unit, more * border_unit, pin):
                 break
-            room, loss, more = MORE_ROOM * room, loss / MORE_ROOM, MORE_ROOM * more
+            room, by_room, more = MORE_ROOM * room, by_room / MORE_ROOM, MORE_ROOM * more
+        loss = min(by_room, by_size)
         if pin is None:
             lower = value - Wide(value_error) - Wide(loss)
         else:
@@ -133,15 +138,12 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
         else:  # an estimate of the eigenvalue that is off by 1.5^60: nothing is claimed
             return Bound(-np.inf, float(value), False, False, -np.inf, direction)
     slack = np.r_[slack_leaf.ravel(), slack_border].reshape(n, 9)
-    # z_i = vec R_i - r_i of a rotation R_i, so |z_i| <= sqrt(3) + |r_i|.
-    size_z = np.sqrt(3.0) + np.linalg.norm(r.reshape(n, 9), axis=1)
-    of_g = np.linalg.norm(reach.reshape(n, 9), axis=1)
     loss = float((slack.max(axis=1) * size_z**2).sum())
     if semidefinite and 9 * n <= DENSE_EIGEN_SIZE:
         below = deflated_eigenvalue(form, multipliers, arrow.dense(D, C, E), rounded, slack)
         loss = min(loss, max(-below, 0.0) * float((size_z**2).sum()))
-    loss += float((2.0 * of_g * size_z).sum())
-    lower = _round_down(value - Wide(value_error) - Wide(loss * (1.0 + 1e-10)))
+    loss = (loss + of_g) * (1.0 + 1e-10)
+    lower = _round_down(value - Wide(value_error) - Wide(loss))
     return Bound(lower, float(value), False, semidefinite, -float(slack.max()), None if semidefinite else direction)
 
 

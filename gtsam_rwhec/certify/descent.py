@@ -47,7 +47,7 @@ def descend(form: ReducedForm, R: Array, max_iterations: int) -> Descent:
     q = form.apply(x)
     cost = float(x @ q)
     rounding = 1e-15 * max(form.magnitude, 1e-300)
-    floor = 1e-9 * form.magnitude / max(form.size, 1)
+    floor = max(1e-9 * form.magnitude / form.size, 1e-290)  # a form of motions at rest is zero
     damping = 0.0
     gradient = np.zeros(0)
     for iteration in range(max_iterations):
@@ -77,7 +77,7 @@ def descend(form: ReducedForm, R: Array, max_iterations: int) -> Descent:
                     if cost_new <= cost + max(rounding, 1e-14 * abs(cost)) or length < 1e-7:
                         break
             damping = max(4.0 * damping, floor)
-            if damping > 1e6 * form.magnitude:
+            if not damping <= 1e6 * form.magnitude:
                 return Descent(R, cost, float(np.linalg.norm(gradient)), iteration, converged=False)
         R, x, q, cost = candidate, x_new, q_new, cost_new
         damping = 0.0 if damping <= floor else damping / 8.0

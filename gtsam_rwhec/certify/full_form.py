@@ -48,11 +48,13 @@ class FullForm:
         return len(self.center)
 
     def value(self, leaf: Array, center: Array, tail: Array) -> float:
-        """x' Q x for leaf (L, 13), center (P, 13), tail (2,)."""
-        coupled = np.einsum("li,lpij,pj->", leaf, self.leaf_center, center)
-        coupled += np.einsum("li,lij,j->", leaf, self.leaf_tail, tail)
-        coupled += np.einsum("pi,pij,j->", center, self.center_tail, tail)
-        own = np.einsum("li,lij,lj->", leaf, self.leaf, leaf) + np.einsum("pi,pij,pj->", center, self.center, center)
+        """x' Q x for leaf (L, 13), center (P, 13), tail (2,); in extended precision, as large terms cancel."""
+        leaf, center, tail = (x.astype(np.longdouble) for x in (leaf, center, tail))
+        of_leaf = np.einsum("lpij,pj->li", self.leaf_center, center) + self.leaf_tail @ tail
+        of_center = self.center_tail @ tail
+        own = (leaf * np.einsum("lij,lj->li", self.leaf, leaf)).sum()
+        own += (center * np.einsum("pij,pj->pi", self.center, center)).sum()
+        coupled = (leaf * of_leaf).sum() + (center * of_center).sum()
         return float(own + 2.0 * coupled + tail @ self.tail @ tail)
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.errors import CountError, FrameError, PriorError, ScaleError, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, FrameError, PoseError, PriorError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.priors import Prior
 from gtsam_rwhec.problem import Problem, ScaleMode
@@ -228,5 +228,9 @@ def _check(part: Part) -> None:
     for name in part.fixed_scales:
         if name not in {target for target, _ in part.pairs}:
             raise ScaleError(f"the scale of {name} is fixed, but nothing measures {name}'s size")
-    if part.scale != "known" and not np.isfinite(part.moments.translation).all():
-        raise ScaleError("the translations overflow; are they in metres?")
+    bad = np.flatnonzero(~np.isfinite(part.moments.translation).all(axis=(1, 2)))
+    if bad.size:
+        raise PoseError(
+            f"the translations of {'-'.join(part.pairs[bad[0]])} are so large that their squares overflow; "
+            "are they in metres?"
+        )

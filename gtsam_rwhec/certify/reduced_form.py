@@ -19,6 +19,9 @@ from gtsam_rwhec.poses import Array
 #: Directions of translation and scale whose pivot is smaller than this, after scaling to a unit diagonal, are
 #: rounding: eq. 48's pseudo-inverse leaves them out.
 RANK_TOLERANCE = 1e-12
+#: A variable whose diagonal is this small beside the largest is not there: the square of what rounding leaves of a
+#: zero, and far below any ratio of weights.
+ABSENT = 1e-26
 
 
 @dataclass(frozen=True)
@@ -162,7 +165,7 @@ def generalised_inverse_factor(M: Array) -> tuple[Array, Array]:
     """
     diagonal = np.einsum("sii->si", M)
     largest = diagonal.max(axis=1, keepdims=True, initial=0.0)
-    used = diagonal > 1e-14 * largest
+    used = diagonal > ABSENT * largest
     d = np.where(used, 1.0 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
     scaled = M * d[:, :, None] * d[:, None, :]
     np.einsum("sii->si", scaled)[...] = 1.0

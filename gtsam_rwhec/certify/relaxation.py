@@ -1,7 +1,7 @@
 """The semidefinite relaxation of Problem 6 with all 21 constraints a rotation (eqs. 19, 50, 70-73).
 
 Clarabel solves it where its cone fits, the block method of ``interior_point`` elsewhere. Clarabel also takes the
-variant with alpha >= 0 (Section 4.3): h alpha is quadratic in x, so alpha >= 0 is one more linear inequality on X.
+variant with alpha >= 0 (Section 4.3): with alpha as a variable of its own, h alpha is an entry of X, to be nonnegative.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ def solve_relaxation(
     Q: Array,
     tolerance: float,
     max_iterations: int,
-    scale_row: Array | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Relaxation:
     """Solve the relaxation of Q' (9 n + 1 square).
@@ -36,33 +35,68 @@ def solve_relaxation(
     tolerance : float
         Relative gap at which to stop.
     max_iterations : int
-    scale_row : (9 n,) array, optional
-        alpha = scale_row . r; given, alpha >= 0 is a constraint.
     progress : callable, optional
         Told what it does.
     """
-    if len(Q) <= CLARABEL_SIZE or scale_row is not None:
-        return solve_by_clarabel(Q, tolerance, max_iterations, scale_row)
+    if len(Q) <= CLARABEL_SIZE:
+        return solve_by_clarabel(Q, tolerance, max_iterations)
     return solve_by_blocks(Q, tolerance, max_iterations, progress)
 
 
-def solve_by_clarabel(Q: Array, tolerance: float, max_iterations: int, scale_row: Array | None = None) -> Relaxation:
+def solve_by_clarabel(Q: Array, tolerance: float, max_iterations: int) -> Relaxation:
     """The dual, max gamma s.t. Z(lambda) >= 0, as Clarabel's problem; its cone's dual variable is X."""
-    size = len(Q)
-    n = (size - 1) // 9
     scale = float(np.abs(Q).max()) or 1.0
-    columns = _constraint_columns(n, size)
-    blocks = [columns]
+    X, y, iterations = _clarabel(Q / scale, (len(Q) - 1) // 9, tolerance, max_iterations)
+    return _relaxation(Q, X, y, scale, 0.0, iterations)
+
+
+def solve_with_scale(Q: Array, row: Array, spread: float, tolerance: float, max_iterations: int) -> Relaxation:
+    """With alpha >= 0: of x'Q'x + (alpha - row . r)^2 / spread, the cost before the scale is eliminated.
+
+    Parameters
+    ----------
+    Q : (9 n + 1, 9 n + 1) array
+    row : (9 n,) array
+        The best scale of rotations r is row . r (eq. 47).
+    spread : float
+        How weakly the cost holds the scale there.
+    tolerance, max_iterations
+        As in ``solve_relaxation``.
+    """
+    size = len(Q)
+    scale = float(np.abs(Q).max()) or 1.0
+    unit = np.sqrt(spread * scale)  # of alpha, so that its entries compare with the others
+    apart = np.r_[-row / unit, 0.0, 1.0]
+    lifted = np.outer(apart, apart)
+    lifted[:size, :size] += Q / scale
+    X, y, iterations = _clarabel(lifted, (size - 1) // 9, tolerance, max_iterations)
+    return _relaxation(Q, X[:size, :size], y, scale, scale * float(y[-1]) / unit, iterations)
+
+
+def _relaxation(Q: Array, X: Array, y: Array, scale: float, nu: float, iterations: int) -> Relaxation:
+    n = (len(Q) - 1) // 9
+    return Relaxation(
+        X,
+        scale * y[: 20 * n].reshape(n, 20),
+        nu,
+        float(np.vdot(Q, X)),
+        scale * float(y[20 * n]),
+        iterations,
+        "Clarabel",
+    )
+
+
+def _clarabel(C: Array, n: int, tolerance: float, max_iterations: int) -> tuple[Array, Array, int]:
+    """X, multipliers and iterations; C is over [r, h], or over [r, h, alpha]: then X's entry h alpha is nonnegative."""
+    size = len(C)
     upper_j, upper_i = np.tril_indices(size)  # Clarabel stacks the upper triangle, column after column
     root = np.where(upper_i == upper_j, 1.0, np.sqrt(2.0))
-    if scale_row is not None:
-        B = np.zeros((size, size))
-        B[:-1, -1] = B[-1, :-1] = 0.5 * scale_row / max(np.abs(scale_row).max(), 1e-300)
-        blocks.append(scipy.sparse.csc_matrix((B[upper_i, upper_j] * root)[:, None]))
-    A = scipy.sparse.hstack(blocks, format="csc")
-    b = (Q / scale)[upper_i, upper_j] * root
+    A = _constraint_columns(n, size)
+    b = C[upper_i, upper_j] * root
     cones = [clarabel.PSDTriangleConeT(size)]
-    if scale_row is not None:  # nu >= 0
+    if size == 9 * n + 2:  # nu >= 0, the multiplier of h alpha
+        entry = (upper_i == 9 * n) & (upper_j == 9 * n + 1)
+        A = scipy.sparse.hstack([A, scipy.sparse.csc_matrix((entry * 0.5 * root)[:, None])], format="csc")
         A = scipy.sparse.vstack([A, scipy.sparse.csc_matrix(([-1.0], ([0], [A.shape[1] - 1])), (1, A.shape[1]))], "csc")
         b = np.r_[b, 0.0]
         cones.append(clarabel.NonnegativeConeT(1))
@@ -74,22 +108,11 @@ def solve_by_clarabel(Q: Array, tolerance: float, max_iterations: int, scale_row
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     zero = scipy.sparse.csc_matrix((A.shape[1], A.shape[1]))
     solution = clarabel.DefaultSolver(zero, q, A, b, cones, settings).solve()
-    y, z = np.array(solution.x), np.array(solution.z)[: len(upper_i)]
+    z = np.array(solution.z)[: len(upper_i)]
     X = np.zeros((size, size))
     X[upper_i, upper_j] = z / root
     X = X + X.T - np.diag(np.diagonal(X))
-    nu = 0.0
-    if scale_row is not None:
-        nu = scale * float(y[-1]) / max(float(np.abs(scale_row).max()), 1e-300)
-    return Relaxation(
-        X,
-        scale * y[: 20 * n].reshape(n, 20),
-        nu,
-        float(np.vdot(Q, X)),
-        scale * float(y[20 * n]),
-        int(solution.iterations),
-        "Clarabel",
-    )
+    return X, np.array(solution.x), int(solution.iterations)
 
 
 def _constraint_columns(n: int, size: int) -> scipy.sparse.csc_matrix:
@@ -102,9 +125,10 @@ def _constraint_columns(n: int, size: int) -> scipy.sparse.csc_matrix:
     rows = index[:, q] * (index[:, q] + 1) // 2 + index[:, p]
     cols = 20 * np.arange(n)[:, None] + k
     data = np.broadcast_to(np.where(p == q, values, np.sqrt(2.0) * values), rows.shape)
-    last = size * (size + 1) // 2
+    of_h = 9 * n * (9 * n + 1) // 2 + 9 * n
     return scipy.sparse.csc_matrix(
-        (np.r_[data.ravel(), 1.0], (np.r_[rows.ravel(), last - 1], np.r_[cols.ravel(), 20 * n])), (last, 20 * n + 1)
+        (np.r_[data.ravel(), 1.0], (np.r_[rows.ravel(), of_h], np.r_[cols.ravel(), 20 * n])),
+        (size * (size + 1) // 2, 20 * n + 1),
     )
 
 

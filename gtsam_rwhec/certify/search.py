@@ -28,6 +28,8 @@ Progress = Callable[[str], None]
 
 #: A mirror image may cost this much more, relatively, and still be what the data mean; more is another answer.
 MIRROR_COST = 0.01
+#: Entries of rotations that differ by this much are another answer.
+TWIN_DISTANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class Search:
         the form's own entries to compare with.
         """
         unit = 0.0 if self.part.is_relative else 1.0
-        rounding = 1e-15 * self.form.size * self.form.magnitude
+        rounding = 1e-15 * self.form.size * self.form.magnitude + 1e-250
         return max(self.options.relative_tolerance * max(cost, unit), rounding)
 
     def run(self, method: Method, initial: Array | None) -> Found:
@@ -169,6 +171,24 @@ class Search:
             )
         path = f"{found.path}, mirrored"
         return replace(found, R=end.R, cost=cost, lower=min(found.lower, cost), reason=reason, path=path)
+
+    def has_twin(self, found: Found) -> bool:
+        """Whether descents from elsewhere find another answer of the same cost.
+
+        Information is about the answer's neighbourhood; twins far away show in a Z that is not definite, which is
+        when this is asked.
+        """
+        if self.form.rotations > self.options.max_dense_frames:
+            return False
+        generator = np.random.default_rng(self.options.seed)
+        with self.stage("twins"):
+            for _ in range(2 * self.options.random_starts):
+                start = random_rotations(self.form.rotations, generator)
+                end = descend(self.form, start, self.options.max_descent_iterations)
+                elsewhere = float(np.abs(end.R - found.R).max(initial=0.0)) > TWIN_DISTANCE
+                if elsewhere and end.cost <= found.cost + self.tolerance(found.cost):
+                    return _has_positive_scales(self.part, self.form, end.R)
+        return False
 
     @property
     def _cost(self) -> float:

@@ -70,7 +70,7 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
     Z0 = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
     Z0 = 0.5 * (Z0 + Z0.T)
     Z0[-1, -1] -= float(x @ Z0 @ x)  # the multiplier of h^2 = 1: then Z x = 0 in h's row too
-    scale = float(np.abs(np.diagonal(Z0)).max())
+    scale = float(np.abs(np.diagonal(Z0)).max()) or 1.0
     Z0 /= scale
     P = Q / scale
     P[np.diag_indices_from(P)] += 1e-9 * np.abs(np.diagonal(P)) + 1e-12
@@ -80,7 +80,10 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
         return multipliers, -np.inf
     # Added along P x it takes x out of the question and leaves what is across x, z'P x = 0, as it is.
     along_x = P @ x / np.sqrt(float(x @ P @ x))
-    t = float(scipy.linalg.eigh(Z0, P, eigvals_only=True, subset_by_index=[0, 0], check_finite=False)[0])
+    try:
+        t = float(scipy.linalg.eigh(Z0, P, eigvals_only=True, subset_by_index=[0, 0], check_finite=False)[0])
+    except np.linalg.LinAlgError:  # P is no measure: Q' is zero, or its entries differ by all of double precision
+        return multipliers, -np.inf
     t -= 0.1 * max(abs(t), 1e-3)
     Z0 += 10.0 * max(abs(t), 1.0) * np.outer(along_x, along_x)
     y = np.zeros(14 * n)

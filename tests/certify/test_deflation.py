@@ -1,71 +1,100 @@
-"""Bounds on singular matrices: true, and far tighter than a verified test of the whole."""
+"""The eigenvalue that deflation proves, and Z x in extended precision, against exact arithmetic."""
 
 from __future__ import annotations
 
-import mpmath
+import dataclasses
+from fractions import Fraction
+
+import exact_arithmetic as exact
 import numpy as np
 import pytest
+from small_problems import flat, multipliers_at, optimum, reduced, simulated
 
-import gtsam_rwhec as rw
 from gtsam_rwhec.certify import arrow
-from gtsam_rwhec.certify.bound import _curvature, lower_bound
+from gtsam_rwhec.certify.bound import lower_bound
 from gtsam_rwhec.certify.deflation import deflated_eigenvalue
-from gtsam_rwhec.certify.descent import homogeneous
-from gtsam_rwhec.certify.parts import parts_of
-from gtsam_rwhec.certify.rotations import CONSTRAINTS, kkt_multipliers, vec
-from gtsam_rwhec.certify.search import Search
-from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.certify.lagrangian import lagrangian
+from gtsam_rwhec.certify.local_blocks import scatter
+from gtsam_rwhec.certify.reduced_form import ReducedForm
+from gtsam_rwhec.certify.rotations import CONSTRAINTS, random_rotations
+from gtsam_rwhec.certify.verified import cholesky_allowance
+from gtsam_rwhec.problem import ScaleMode
+from gtsam_rwhec.simulate import Motion, Noise
 
 
-def at_the_optimum(seed: int, scale: str, sigma: float) -> tuple:
-    simulated = general(2, 2, seed=seed, motion="planar", scale=scale, noise=Noise(sigma, 1e5))
-    (part,) = parts_of(simulated.problem)
-    search = Search(part, rw.SolveOptions())
-    found = search.run("auto", None)
-    kkt = kkt_multipliers(found.R, search.form.apply(homogeneous(found.R))[:-1].reshape(-1, 9))
-    return search.form, kkt, found
+def proven(form: ReducedForm) -> float:
+    """What it proves of Q' itself, whose forming rounds nothing: all multipliers zero."""
+    arrow_part = arrow.dense(form.D, form.C, form.E)[:-1, :-1]
+    slack = 2.0 * cholesky_allowance(np.diagonal(arrow_part), len(arrow_part) + len(form.G)).reshape(-1, 9)
+    multipliers = np.zeros((form.rotations, 20))
+    return deflated_eigenvalue(form, multipliers, arrow_part, np.zeros(len(arrow_part)), slack)
 
 
-def exact_eigenvalue(form, multipliers: np.ndarray) -> float:
-    """Smallest eigenvalue of Z_rr with 50 digits, from the stored numbers."""
-    mpmath.mp.dps = 50
-    n = form.rotations
-    A = arrow.dense(form.D, form.C[:, :, :-1], form.E[:-1, :-1])
-    G = mpmath.matrix(form.G[:, :-1].tolist())
-    Z = mpmath.matrix(A.tolist()) - G.T * G
-    for i in range(n):
-        for k in np.flatnonzero(multipliers[i]):
-            for p, q in zip(*np.nonzero(CONSTRAINTS[k, :9, :9]), strict=True):
-                Z[9 * i + int(p), 9 * i + int(q)] -= mpmath.mpf(multipliers[i, k]) * int(CONSTRAINTS[k, p, q])
-    return min(mpmath.eigsy(Z, eigvals_only=True))
+def is_exactly_above(form: ReducedForm, eigenvalue: float) -> bool:
+    """Whether Q'_rr - eigenvalue I is positive definite, in fractions."""
+    Q = exact.stored_matrix(form)[:-1, :-1]
+    shift = np.array([[Fraction(eigenvalue) if i == j else Fraction(0) for j in range(len(Q))] for i in range(len(Q))])
+    return exact.is_positive_definite(Q - shift)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("kind", "scale"),
+    [("planar", "known"), ("planar", "shared"), ("none", "shared"), ("general", "shared"), ("single_axis", "shared")],
+)
+def test_no_eigenvalue_is_below(kind: str, scale: ScaleMode, seed: int) -> None:
+    """Forms of exact data with one zero eigenvalue or two; and tight: a thousandth of the plain test's slack."""
+    form = reduced(simulated(1, 1, seed, motion=kind, noise=None, scale=scale).problem)
+    below = proven(form)
+    assert -1e-16 * form.magnitude < below <= 0.0
+    assert is_exactly_above(form, below - 1e-30 * form.magnitude)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("depth", [1e-15, 1e-14, 1e-13])
+def test_a_negative_eigenvalue_is_not_hidden(depth: float, seed: int) -> None:
+    """The smallest eigenvalue moved below zero by less than the verified test can tell from zero."""
+    form = reduced(simulated(1, 1, seed, motion="planar", noise=None).problem)
+    shift = depth * form.magnitude
+    form = dataclasses.replace(form, D=form.D - shift * np.eye(9), E=form.E - shift * np.eye(10))
+    below = proven(form)
+    assert below <= -0.9 * shift
+    assert below == -np.inf or is_exactly_above(form, below)
+
+
+def test_nothing_small_to_take_out_is_nothing_proven() -> None:
+    """It is asked only where Z is singular."""
+    form = reduced(simulated(1, 1, motion=Motion("general"), noise=Noise(0.1, 100.0)).problem)
+    assert proven(form) == -np.inf
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
-@pytest.mark.parametrize("sigma", [0.01, 1e-4])
 @pytest.mark.parametrize("seed", range(3))
-def test_it_is_below_the_smallest_eigenvalue_and_close_to_it(scale: str, sigma: float, seed: int) -> None:
-    form, kkt, _ = at_the_optimum(seed, scale, sigma)
-    D, C, E, rounded = _curvature(form, kkt)
-    slack = np.full((form.rotations, 9), 1e-11 * form.magnitude)
-    proven = deflated_eigenvalue(form, kkt, arrow.dense(D, C, E), rounded, slack)
-    exact = exact_eigenvalue(form, kkt)
-    assert mpmath.mpf(proven) <= exact
-    assert float(exact) - proven < 1e-14 * form.magnitude
-
-
-@pytest.mark.parametrize("sigma", [0.01, 1e-4])
-def test_free_answers_have_bounds_as_tight_as_others(sigma: float) -> None:
-    form, kkt, found = at_the_optimum(1, "shared", sigma)
-    bound = lower_bound(form, kkt, vec(found.R).ravel())
+def test_free_answers_lose_next_to_nothing(seed: int, scale: str) -> None:
+    problem = simulated(4, 3, seed, motion="planar", scale=scale).problem
+    form, end = reduced(problem), optimum(problem)
+    bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
+    assert bound.semidefinite
     assert not bound.definite
-    assert bound.lower <= found.cost
-    assert found.cost - bound.lower < 1e-6 * max(found.cost, 1.0)
+    assert end.cost - bound.lower <= 1e-14 * form.magnitude
 
 
-def test_nothing_is_claimed_of_an_indefinite_matrix() -> None:
-    form, kkt, _ = at_the_optimum(0, "known", 0.01)
-    worse = kkt.copy()
-    worse[:, :3] += 0.01 * form.magnitude  # Z loses that much on its diagonal
-    D, C, E, rounded = _curvature(form, worse)
-    proven = deflated_eigenvalue(form, worse, arrow.dense(D, C, E), rounded, np.full((form.rotations, 9), 1e-9))
-    assert mpmath.mpf(proven) <= exact_eigenvalue(form, worse)
+@pytest.mark.parametrize("last", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_extended_precision_keeps_within_its_stated_rounding(seed: int, last: float) -> None:
+    form = reduced(simulated(2, 1, seed, odometry=4, noise=Noise(0.01, 1e4)).problem)
+    generator = np.random.default_rng(seed)
+    multipliers = form.magnitude * generator.standard_normal((3, 20))
+    for r in (flat(random_rotations(3, generator)), 10.0 ** generator.uniform(-8, 8, 27)):
+        x = np.append(r, last)
+        value, Zx, value_error, Zx_error = lagrangian(form, multipliers, x)
+        Lambda = np.einsum("nk,kpq->npq", exact.fractions(multipliers), exact.fractions(CONSTRAINTS))
+        full = np.full((28, 28), Fraction(0), dtype=object)
+        for i, block in enumerate(Lambda):
+            at = np.r_[9 * i : 9 * i + 9, 27]
+            full[np.ix_(at, at)] += block
+        assert np.abs(full.astype(float) - scatter(Lambda.astype(float))).max() < 1e-9 * form.magnitude
+        product = (exact.stored_matrix(form) - full) @ exact.fractions(x)
+        for ours, error, true in zip(Zx, Zx_error, product, strict=True):
+            assert abs(Fraction(float(ours)) + Fraction(float(ours - np.longdouble(float(ours)))) - true) <= error
+        assert abs(Fraction(float(value)) - exact.fractions(x) @ product) <= value_error + 2.0**-53 * abs(float(value))
