@@ -319,7 +319,8 @@ UNLIKELY = 4.0
 
 def _warn_of_weights(problem: Problem, results: list[_Result]) -> None:
     """Compare the residuals with what the weights predict: half the degrees of freedom."""
-    if problem.is_relative:
+    # The form turned round weighs otherwise than the physical model: its answer is no minimum of these residuals.
+    if problem.is_relative or any(result.part.kind == "inverse" for result in results):
         return
     cost = sum(result.residual_cost for result in results)
     freedom = sum(6 * r.part.number_of_measurements - r.part.number_of_unknowns for r in results)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gtsam_rwhec.poses import Array, checked_rows
+from gtsam_rwhec.poses import LARGEST_M, Array, checked_rows
 
 R_A, T_A, R_B, T_B, ONE = slice(0, 9), slice(9, 12), slice(12, 21), slice(21, 24), 24
 #: The features of the equation turned round, B X^-1 = Y^-1 A: A and B change places.
@@ -47,7 +47,7 @@ class Gauge:
         Where ``motion`` (N,) says so, both ends are the sensor's carrier (AX = XB): c = a. A component that the
         motions leave open stays small (minimum norm). Poses that are none give the zero gauge; the check is elsewhere.
         """
-        if not np.isfinite(A).all():
+        if not np.abs(A).max() <= LARGEST_M:
             return Gauge()
         R, t = A[:, :3, :3], A[:, :3, 3]
         rows = np.zeros((len(A), 3, 6))
@@ -59,7 +59,7 @@ class Gauge:
     @staticmethod
     def target_origin(A: Array, sensor_carrier: Array) -> Array:
         """The best target carrier's origin (3,) when the sensor carrier's is settled."""
-        if not np.isfinite(A).all():
+        if not np.abs(A).max() <= LARGEST_M:
             return np.zeros(3)
         origin: Array = np.einsum("nji,nj->ni", A[:, :3, :3], sensor_carrier - A[:, :3, 3]).mean(axis=0)
         return origin

@@ -325,7 +325,7 @@ def test_true_weights_raise_no_alarm(mode: str) -> None:
             rw.solve(simulated(mode, seed=seed).problem)
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "per_target"])  # its cost is no chi-square
 def test_weights_far_from_the_residuals_do(mode: str) -> None:
     data, problem = simulated(mode).problem, rw.Problem(MODES[mode]["scale"])
     for pair in data.pairs:

@@ -97,7 +97,7 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
         )
 
     pin, reach_of_a = None, 1.0
-    if _is_homogeneous(form, multipliers) and b:
+    if _is_homogeneous(form, multipliers) and r[9 * L :].any():
         pin = int(np.abs(r[9 * L :]).argmax())
         # Rotations have entries of at most 1.
         reach_of_a = float(1.0 / r[9 * L + pin] ** 2) * (1.0 + 1e-10)

@@ -111,6 +111,7 @@ def test_any_multipliers_at_any_point_bound_the_optimum(name: str, seed: int) ->
             flat(end.R),
             flat(random_rotations(n, generator)),
             generator.standard_normal(9 * n) * 10.0 ** generator.uniform(-3, 3),
+            np.zeros(9 * n),
         )
         for multipliers in (random, kkt + random, kkt + orthogonality, kkt + shift, kkt - shift, np.zeros((n, 20))):
             for point in points:

@@ -16,6 +16,7 @@ from gtsam_rwhec.certify.relaxation import solve_by_clarabel
 from gtsam_rwhec.certify.rotations import CONSTRAINTS
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.problem import ScaleMode
+from gtsam_rwhec.simulate import Motion, Noise
 
 SIDES = {1: (1, 1), 2: (1, 1), 3: (2, 1), 4: (2, 2), 5: (3, 2)}
 
@@ -100,16 +101,21 @@ def test_data_without_noise_end_at_zero(frames: int) -> None:
     assert abs(relaxation.dual) < 1e-8 * form.magnitude
 
 
-@pytest.mark.parametrize("seed", [609, 438])
-def test_the_end_of_double_precision_is_no_error(seed: int) -> None:
-    """Two measurements a pair, hardly any rotation, a scale each: X or Z loses its definiteness on the way."""
-    simulation = simulated(
-        4, 3, seed, graph="star", motion=rw.simulate.Motion(max_angle_rad=0.05), number_of_measurements=2,
-        scale="per_target", noise=rw.simulate.Noise(0.0126, 66000.0),
-    )  # fmt: skip
-    relaxation = solve_by_blocks(reduced(simulation.problem).dense(), 0.0, 300)
-    assert relaxation.iterations < 300
-    assert np.isfinite(relaxation.multipliers).all()
+def test_the_end_of_double_precision_is_no_error() -> None:
+    """Two measurements a pair, hardly any turning, a scale each: X or Z loses its definiteness on the way."""
+    for seed in range(600, 620):
+        simulation = simulated(
+            *(4, 3),
+            seed,
+            graph="star",
+            motion=Motion(max_angle_rad=0.05),
+            number_of_measurements=2,
+            scale="per_target",
+            noise=Noise(0.0126, 66000.0),
+        )
+        relaxation = solve_by_blocks(reduced(simulation.problem).dense(), 0.0, 300)
+        assert relaxation.iterations < 300
+        assert np.isfinite(relaxation.multipliers).all()
 
 
 def test_it_reports_as_it_goes() -> None:

