@@ -340,6 +340,24 @@ def test_a_free_direction_is_practically_never_called_determined(
     assert sum(pairs) <= 2
 
 
+@pytest.mark.parametrize("count", [10, 40])
+@pytest.mark.parametrize(
+    ("of_B", "of_A"), [(Noise(0.001, 5e5), Noise(0.005, 2500.0)), (Noise(0.002, 1e5), Noise(0.007, 1800.0))]
+)
+def test_weights_too_modest_for_the_sensor_do_not_excuse_the_carrier(of_B: Noise, of_A: Noise, count: int) -> None:
+    """The residuals are about what sigma and kappa say, but it is A that is off: nothing shows which of the two."""
+    verdicts = []
+    for seed in range(RUNS // 2):
+        simulation = general(
+            1, 1, seed=seed, motion="planar", noise=of_B, noise_in_A=of_A, number_of_measurements=count
+        )
+        data = simulation.problem.measurements("target0", "sensor0")
+        problem = rw.Problem()
+        problem.add("tag", "cam", data.A, data.B, NOISE.sigma_m, NOISE.kappa)
+        verdicts.append(identify(problem).is_unique)
+    assert sum(verdicts) <= 1
+
+
 @pytest.mark.parametrize(
     ("count", "scale", "noise_in_A"),
     [(5, "known", None), (5, "known", MOCAP), (10, "shared", MOCAP), (10, "per_target", MOCAP), (30, "known", NOISE)],

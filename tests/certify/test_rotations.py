@@ -97,6 +97,9 @@ def test_twenty_of_the_21_constraints_are_independent() -> None:
     every = fractions(ALL_CONSTRAINTS.reshape(21, 100))
     assert rank(every) == rank(every[:20]) == 20
     np.testing.assert_array_equal(CONSTRAINTS, ALL_CONSTRAINTS[:20])
+    # The one left out completes R R' = I, whose trace is that of R'R = I.
+    np.testing.assert_array_equal(ALL_CONSTRAINTS[:3].sum(axis=0), ALL_CONSTRAINTS[[9, 10, 20]].sum(axis=0))
+    assert len(np.unique(ALL_CONSTRAINTS, axis=0)) == 21
 
 
 def test_appendix_a_spans_the_same_matrices() -> None:
