@@ -34,20 +34,12 @@ _UPPER = np.triu_indices(15, 1)
 class NoiseLevel:
     """Variance factors of each pair's residuals, (E,): 1 where the weights are true.
 
-    ``redundancy`` is equations minus unknowns of the whole part; ``carrier_share`` the share of the rotation variance
-    that A's noise may have.
+    ``redundancy`` is equations minus unknowns of the whole part.
     """
 
     translation: Array
     rotation: Array
     redundancy: int
-    carrier_share: float = 1.0
-
-
-#: Where the residuals' rotation variance is this near to what kappa states, kappa is believed.
-BELIEVED = (0.3, 3.0)
-#: ... but for this share, which A's noise may always have.
-LEAST_SHARE = 0.05
 
 
 def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
@@ -75,12 +67,7 @@ def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
     ):
         of_part = correction * float(J.sum()) / (1.5 * N)
         factors.append(np.maximum(np.maximum(J / (1.5 * counts), of_part), floor))
-    # kappa states B's noise. Where it is borne out, A is left what the residuals hold beyond it, by three sigmas.
-    share, stated = 1.0, correction * float(J_R.sum()) / (1.5 * N)
-    if not part.is_relative and BELIEVED[0] < stated < BELIEVED[1]:
-        above = stated * (1.0 + 3.0 * np.sqrt(4.0 / redundancy))
-        share = float(np.clip((above - 1.0) / stated, LEAST_SHARE, 1.0))
-    return NoiseLevel(factors[0], factors[1], redundancy, share)
+    return NoiseLevel(factors[0], factors[1], redundancy)
 
 
 @dataclass(frozen=True)
@@ -153,7 +140,7 @@ def pair_information(part: Part, poses: PairPoses, noise: NoiseLevel) -> PairInf
     given_t_X = t_X + np.array([part.frame_shift(target) for target, _ in part.pairs])
     arm = np.minimum((given_t_X**2).sum(axis=1), square / W)
     by_arm = 1.5 * noise.translation * n / np.maximum(alpha**2 * W * arm, 1e-300)
-    q2 = np.maximum(np.minimum(noise.carrier_share * noise.rotation * n / (2.0 * K), by_arm), FLOOR**2)
+    q2 = np.maximum(np.minimum(noise.rotation * n / (2.0 * K), by_arm), FLOOR**2)
     noise_rotation, noise_translation = np.zeros((E, 15)), np.zeros((E, 15))
     for omega, v in ((OMEGA_X, V_X), (OMEGA_Y, V_Y)):
         noise_rotation[:, omega] = (2.0 * K * q2)[:, None]
