@@ -18,7 +18,7 @@ from gtsam_rwhec.certify.nonnegative import run_with_nonnegative_scale
 from gtsam_rwhec.certify.options import Method, SolveOptions, check_method
 from gtsam_rwhec.certify.parts import Part, connected_components, parts_of
 from gtsam_rwhec.certify.search import Found, Search
-from gtsam_rwhec.certify.variables import Answer, answer_of, as_variables, rotations_as_variables
+from gtsam_rwhec.certify.variables import Answer, answer_of, as_variables, given_answer, rotations_as_variables
 from gtsam_rwhec.errors import (
     FrameError,
     NotCertifiedWarning,
@@ -99,7 +99,7 @@ def solve(
         if options.nonnegative_scale:
             found = run_with_nonnegative_scale(search)
         elif initial is not None:
-            given = _given_answer(part, *initial)
+            given = given_answer(part, *initial)
             found = search.run(method, rotations_as_variables(part, given.R))
         else:
             found = search.with_positive_scale(search.run(method, None))
@@ -146,7 +146,7 @@ def certify(
     _check_against_knowledge(problem, X, Y, scale)
     results = []
     for part in parts:
-        given = _given_answer(part, X, Y, scale)
+        given = given_answer(part, X, Y, scale)
         search = Search(part, options, progress)
         found = search.run("auto", rotations_as_variables(part, given.R))
         cost = search.forms.full.value(*as_variables(part, given))
@@ -334,22 +334,6 @@ def _warn_of_weights(problem: Problem, results: list[_Result]) -> None:
         )
 
 
-def _given_answer(part: Part, X: Poses, Y: Poses, scale: Scale) -> Answer:
-    """The user's poses about the part's gauge."""
-    transforms = []
-    for name in part.free:
-        poses, what = (X, "X") if name in part.targets else (Y, "Y")
-        transforms.append(one_transform(poses[name], f"{what}[{name!r}]"))
-    stacked = np.array(transforms).reshape(-1, 4, 4)
-    shift = np.array([part.frame_shift(name) for name in part.free]).reshape(-1, 3)
-    own = np.full(len(part.free), np.nan)
-    for i, name in enumerate(part.free):
-        if name in part.scale_owners:
-            own[i] = _positive(scale[name] if isinstance(scale, Mapping) and name in scale else scale, name)
-    shared = _positive(scale, "all targets") if part.scale == "shared" else 1.0
-    return Answer(np.ascontiguousarray(stacked[:, :3, :3]), stacked[:, :3, 3] - shift, own, shared)
-
-
 def _check_types(problem: Problem, options: SolveOptions | None) -> None:
     if not isinstance(problem, Problem):
         raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
@@ -385,9 +369,3 @@ def _check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale)
                     f"{what}[{name!r}] is not the pose at which {name} is fixed: {difference(given, T)}; leave it out, "
                     "or do not fix the frame"
                 )
-
-
-def _positive(scale: Scale, name: str) -> float:
-    if isinstance(scale, Mapping) or not (np.isfinite(scale) and scale > 0.0):
-        raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number")
-    return float(scale)

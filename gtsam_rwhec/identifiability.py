@@ -136,36 +136,12 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
     """
     noise = noise_level(part, J_t, J_R)
     pairs = pair_information(part, poses, noise)
-    length = _typical_length(part)
+    length = typical_length(part)
     axes, turned = _rotation_axes(part, pairs.carrier_noise, noise.redundancy)
     residual = np.sqrt(J_R / part.moments.kappa)  # J_R is sum kappa theta^2
     reasons = [reason_for(*of_pair) for of_pair in zip(axes, turned, residual, strict=True)]
     of_each = _pairs(part, pairs, noise.redundancy, axes, reasons, length)
-
-    index = {name: i for i, name in enumerate(part.free)}
-    counts = np.zeros(len(index) + 1)
-    for pair, count in zip(part.pairs, part.moments.count, strict=True):
-        for name in set(pair) & index.keys():
-            counts[index[name]] += count
-    counts[-1] = part.number_of_measurements
-    rotation_prior, translation_prior = prior_information(part)
-    rotation_only = pairs.used & _IS_ROTATION
-    turning = information(part, pairs.rotation, pairs.noise_rotation, rotation_only, rotation_prior)
-    tests = [_weakest(turning, counts, noise.redundancy)]
-    if tests[0].free.any():
-        everything = information(
-            part,
-            pairs.rotation + pairs.translation,
-            pairs.noise_rotation + pairs.noise_translation,
-            pairs.used,
-            rotation_prior + translation_prior,
-        )
-        tests = [_weakest(everything, counts, noise.redundancy)]
-    else:
-        rest = pairs.used & ~_IS_ROTATION
-        moving = information(part, pairs.translation, pairs.noise_translation, rest, translation_prior)
-        tests.append(_weakest(moving, counts, noise.redundancy))
-    weak = min(tests, key=lambda test: test.ratio)
+    weak = _weakest_of_part(part, pairs, noise.redundancy)
     free: list[str] = []
     if weak.free.any():
         # The pair that turned most speaks for a frame.
@@ -186,6 +162,45 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
     )
 
 
+def free_directions_of(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Array:
+    """What ``identify`` puts in words, as numbers: a basis (7 n + 1, k) of the directions that are free at an answer.
+
+    [omega (rad), v (m), log own scale] for each of ``part.free``, then the shared scale's logarithm.
+    """
+    noise = noise_level(part, J_t, J_R)
+    weak = _weakest_of_part(part, pair_information(part, poses, noise), noise.redundancy)
+    directions: Array = weak.directions[:, weak.free]
+    return directions
+
+
+def _weakest_of_part(part: Part, pairs: PairInformation, redundancy: int) -> _Weak:
+    """Rotations first; where they are all determined, the rest at those rotations, and else everything together."""
+    index = {name: i for i, name in enumerate(part.free)}
+    counts = np.zeros(len(index) + 1)
+    for pair, count in zip(part.pairs, part.moments.count, strict=True):
+        for name in set(pair) & index.keys():
+            counts[index[name]] += count
+    counts[-1] = part.number_of_measurements
+    rotation_prior, translation_prior = prior_information(part)
+    rotation_only = pairs.used & _IS_ROTATION
+    turning = information(part, pairs.rotation, pairs.noise_rotation, rotation_only, rotation_prior)
+    tests = [_weakest(turning, counts, redundancy)]
+    if tests[0].free.any():
+        everything = information(
+            part,
+            pairs.rotation + pairs.translation,
+            pairs.noise_rotation + pairs.noise_translation,
+            pairs.used,
+            rotation_prior + translation_prior,
+        )
+        tests = [_weakest(everything, counts, redundancy)]
+    else:
+        rest = pairs.used & ~_IS_ROTATION
+        moving = information(part, pairs.translation, pairs.noise_translation, rest, translation_prior)
+        tests.append(_weakest(moving, counts, redundancy))
+    return min(tests, key=lambda test: test.ratio)
+
+
 def combined(results: list[Identifiability], components: tuple[tuple[str, ...], ...]) -> Identifiability:
     """One result for parts that were solved apart."""
     weakest = min(results, key=lambda r: r.weakest / max(r.threshold, 1e-300))
@@ -200,7 +215,7 @@ def combined(results: list[Identifiability], components: tuple[tuple[str, ...], 
     )
 
 
-def _typical_length(part: Part) -> float:
+def typical_length(part: Part) -> float:
     """Root mean square of |t_B|, in metres: weighs radians against metres in words."""
     square = float(np.einsum("ekk->", part.moments.translation[:, T_B, T_B]))
     return float(np.sqrt(max(square / float(part.moments.weight.sum()), 1e-12)))

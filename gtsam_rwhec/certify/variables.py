@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,8 @@ from gtsam_rwhec.certify.descent import homogeneous
 from gtsam_rwhec.certify.parts import Part
 from gtsam_rwhec.certify.reduced_form import ReducedForm
 from gtsam_rwhec.certify.rotations import vec
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.errors import ScaleError
+from gtsam_rwhec.poses import Array, PoseLike, one_transform
 
 
 @dataclass(frozen=True)
@@ -67,3 +69,27 @@ def as_variables(part: Part, answer: Answer) -> tuple[Array, Array, Array]:
 def rotations_as_variables(part: Part, R: Array) -> Array:
     """Rotations of frames as the form's: transposed where frames are inverted."""
     return R if part.kind == "direct" else np.ascontiguousarray(R.transpose(0, 2, 1))
+
+
+def given_answer(
+    part: Part, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float]
+) -> Answer:
+    """The user's poses about the part's gauge."""
+    transforms = []
+    for name in part.free:
+        poses, what = (X, "X") if name in part.targets else (Y, "Y")
+        transforms.append(one_transform(poses[name], f"{what}[{name!r}]"))
+    stacked = np.array(transforms).reshape(-1, 4, 4)
+    shift = np.array([part.frame_shift(name) for name in part.free]).reshape(-1, 3)
+    own = np.full(len(part.free), np.nan)
+    for i, name in enumerate(part.free):
+        if name in part.scale_owners:
+            own[i] = _positive(scale[name] if isinstance(scale, Mapping) and name in scale else scale, name)
+    shared = _positive(scale, "all targets") if part.scale == "shared" else 1.0
+    return Answer(np.ascontiguousarray(stacked[:, :3, :3]), stacked[:, :3, 3] - shift, own, shared)
+
+
+def _positive(scale: float | Mapping[str, float], name: str) -> float:
+    if isinstance(scale, Mapping) or not (np.isfinite(scale) and scale > 0.0):
+        raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number")
+    return float(scale)

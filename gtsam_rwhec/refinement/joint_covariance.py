@@ -1,0 +1,147 @@
+"""From an information matrix with free directions to covariances that are infinite along them.
+
+With F the free directions (``FreeSpace``), a prior of variance tau along them has, for tau to infinity, the covariance
+
+    tau F F' + Q (Q' Lambda Q)^-1 Q'          (Q spans F's orthogonal complement)
+
+so that whatever F does not touch has a finite covariance, and everything else an infinite one. GTSAM's Marginals throw
+there, or return 1e18.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.poses import Array
+
+#: A linear function whose share along the free directions is below this is called determined (the share below which a
+#: free direction's sentence leaves a frame out).
+SHARE = 0.05
+#: Below this, of the largest, an equilibrated information's eigenvalue is rounding.
+ROUNDING = 1e-13
+
+
+@dataclass(frozen=True)
+class JointCovariance:
+    """Of all unknowns together: dense, d x d.
+
+    Attributes
+    ----------
+    slots : dict of str to slice
+        Rows of each name.
+    information : (d, d) array
+        As the graph has it.
+    finite : (d, d) array
+        Q (Q' Lambda Q)^-1 Q'.
+    free : (d, k) array
+        Directions of infinite variance, orthonormal in units of ``unit``.
+    unit : (d,) array
+        What counts as one: 1 rad, the typical length, ...
+    """
+
+    slots: dict[str, slice]
+    information: Array
+    finite: Array
+    free: Array
+    unit: Array
+
+    @staticmethod
+    def of(dimensions: dict[str, int], information: Array, free: Array, unit: Array) -> JointCovariance:
+        """Invert.
+
+        Parameters
+        ----------
+        dimensions : dict of str to int
+            Of each name, in order.
+        information : (d, d) array
+        free : (d, k) array
+            Directions that the measurements leave free, in the parameters' own units; k may be 0.
+        unit : (d,) array
+        """
+        slots, first = {}, 0
+        for name, dimension in dimensions.items():
+            slots[name] = slice(first, first + dimension)
+            first += dimension
+        scaled = information * unit[:, None] * unit
+        scaled = 0.5 * (scaled + scaled.T)
+        basis = _orthonormal(free / unit[:, None])
+        Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if basis.shape[1] else np.eye(first)
+        inside = Q.T @ scaled @ Q
+        # Equilibrated, so that rounding is judged by each parameter's own information.
+        size = np.sqrt(np.maximum(np.diagonal(inside), 1e-300))
+        values, vectors = np.linalg.eigh(inside / size[:, None] / size)
+        lost = values <= ROUNDING * values.max(initial=0.0)
+        if lost.any():  # no measurement speaks of these at all
+            more = Q @ (vectors[:, lost] / size[:, None])
+            return JointCovariance.of(dimensions, information, np.hstack([free, more * unit[:, None]]), unit)
+        root = Q @ (vectors / np.sqrt(values) / size[:, None])
+        finite = (root @ root.T) * unit[:, None] * unit
+        return JointCovariance(slots, information, finite, basis, unit)
+
+    def rows(self, names: tuple[str, ...]) -> Array:
+        """Indices of names, in the order given.
+
+        Raises
+        ------
+        FrameError
+            For a name that is not among the unknowns.
+        """
+        for name in names:
+            if name not in self.slots:
+                raise FrameError(f"there is no {name!r} among the unknowns; there are {', '.join(self.slots)}")
+        indices: Array = np.concatenate([np.arange(self.slots[n].start, self.slots[n].stop) for n in names])
+        return indices
+
+    def selector(self, names: tuple[str, ...]) -> Array:
+        """(m, d): picks the names' rows."""
+        selected: Array = np.eye(len(self.unit))[self.rows(names)]
+        return selected
+
+    def free_shares(self, G: Array) -> Array:
+        """(m, k): how far each row of G reaches along each free direction; 0 where next to nothing."""
+        if self.free.shape[1] == 0:
+            return np.zeros((len(G), 0))
+        scaled = G * self.unit
+        length = np.linalg.norm(scaled, axis=1, keepdims=True)
+        # In units of the parameter that moves most: many frames that move together share one direction's length.
+        largest = np.linalg.norm(self.free, axis=1).max()
+        shares = (scaled @ self.free) / np.where(length > 0.0, length, 1.0) / largest
+        touched = np.linalg.norm(shares, axis=1, keepdims=True) > SHARE
+        result: Array = np.where(touched, shares, 0.0)
+        return result
+
+    def covariance_of(self, G: Array) -> Array:
+        """(m, m) covariance of the linear functions G (m, d) of the unknowns.
+
+        Infinite in every row that a free direction reaches, and between two such rows of one direction (with the sign
+        of their correlation); finite elsewhere.
+        """
+        covariance: Array = G @ self.finite @ G.T
+        shares = self.free_shares(G)
+        along = shares @ shares.T
+        reached = np.abs(along) > SHARE**2 * 1e-3
+        covariance[reached] = np.inf * np.sign(along[reached])
+        return covariance
+
+    def information_of(self, names: tuple[str, ...]) -> Array:
+        """(m, m) marginal information: the inverse of the covariance where it is finite, 0 along free directions."""
+        chosen = self.selector(names)
+        unit = self.unit[self.rows(names)]
+        finite = (chosen @ self.finite @ chosen.T) / unit[:, None] / unit
+        basis = _orthonormal(self.free_shares(chosen))
+        Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if basis.shape[1] else np.eye(len(unit))
+        inside: Array = Q @ np.linalg.inv(Q.T @ finite @ Q) @ Q.T
+        marginal: Array = inside / unit[:, None] / unit
+        return marginal
+
+
+def _orthonormal(basis: Array) -> Array:
+    """An orthonormal basis of the columns' span."""
+    if basis.shape[1] == 0:
+        return basis
+    U, s, _ = np.linalg.svd(basis / np.maximum(np.linalg.norm(basis, axis=0), 1e-300), full_matrices=False)
+    span: Array = U[:, s > 1e-9 * max(s[0], 1e-300)]
+    return span
