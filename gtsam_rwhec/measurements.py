@@ -29,6 +29,20 @@ class Measurements:
     stamps_ns: np.ndarray | None = None
     covariances: Array | None = None
 
+    def covariance_of_B(self) -> Array:
+        """(N, 6, 6), rotation first: as given, or 1 / (2 kappa) and sigma^2 an axis."""
+        if self.covariances is not None:
+            return self.covariances
+        variances = np.repeat(np.column_stack([0.5 / self.kappa, self.sigma**2]), 3, axis=1)
+        covariance: Array = variances[:, :, None] * np.eye(6)
+        return covariance
+
+
+def weights_of(covariances: Array) -> tuple[Array, Array]:
+    """sigma (N,) in m and kappa (N,) with the mean variance of each block of covariances (N, 6, 6)."""
+    variances = np.einsum("nii->ni", covariances)
+    return np.sqrt(variances[:, 3:].mean(axis=1)), 0.5 / variances[:, :3].mean(axis=1)
+
 
 def positive_weights(value: ArrayLike | None, count: int, name: str, where: str) -> Array:
     """sigma or kappa as a () or (count,) array of positive numbers; left out: 1."""

@@ -16,6 +16,7 @@ from gtsam_rwhec.errors import (
     CountError,
     FrameError,
     MeasurementsNotKeptError,
+    NoiseError,
     OptionError,
     PriorError,
     RotationsProjectedWarning,
@@ -27,6 +28,7 @@ from gtsam_rwhec.measurements import (
     checked_stamps,
     positive_weights,
     warn_of_millimetres,
+    weights_of,
 )
 from gtsam_rwhec.poses import (
     ROTATION_TOLERANCE,
@@ -139,14 +141,13 @@ class Problem:
             )
         batches = edge.batches
         stamps = [b.stamps_ns for b in batches if b.stamps_ns is not None]
-        covariances = [b.covariances for b in batches if b.covariances is not None]
         return Measurements(
             np.concatenate([b.A for b in batches]),
             np.concatenate([b.B for b in batches]),
             np.concatenate([b.sigma for b in batches]),
             np.concatenate([b.kappa for b in batches]),
             np.concatenate(stamps) if len(stamps) == len(batches) else None,
-            np.concatenate(covariances) if len(covariances) == len(batches) else None,
+            np.concatenate([b.covariance_of_B() for b in batches]) if edge.covariance_given else None,
         )
 
     def _edge(self, target: str, sensor: str) -> _Edge:
@@ -188,7 +189,8 @@ class Problem:
         stamps_ns : (N,) integers, optional
             Nanoseconds; kept for refinement.
         covariances : (N, 6, 6), optional
-            Of B, rotation first, right perturbation (GTSAM's order); kept for refinement.
+            Of B, rotation first, right perturbation (GTSAM's order), in place of sigma and kappa: refinement takes them
+            whole, the certified solution the mean variance of each block.
         source : str, optional
             Where they came from (a file, a topic), said in errors.
 
@@ -243,10 +245,18 @@ class Problem:
         if len(A) == 0:
             raise CountError(f"{where}: no measurements; leave the pair out instead")
         count = len(A)
-        sigmas = positive_weights(sigma, count, "sigma", where)
-        kappas = positive_weights(kappa, count, "kappa", where)
         stamps = checked_stamps(stamps_ns, count, where)
         covariance = checked_covariances(covariances, count, where)
+        if covariance is not None:
+            if sigma is not None or kappa is not None:
+                raise NoiseError(
+                    f"{where}: covariances and {'sigma' if sigma is not None else 'kappa'} are given, which may "
+                    "contradict one another; give the one or the other (of covariances, the certified solution takes "
+                    "the mean variance of each block)"
+                )
+            sigma, kappa = weights_of(covariance)
+        sigmas = positive_weights(sigma, count, "sigma", where)
+        kappas = positive_weights(kappa, count, "kappa", where)
         accumulator, projected = self._accumulator.added(Batch(pair, A, B, 1.0 / sigmas**2, kappas, where))
         if projected:
             warnings.warn(

@@ -153,9 +153,9 @@ def test_weights_left_out_are_one_and_relative(weights: dict[str, float], relati
 
 def test_measurements_are_kept_as_they_came() -> None:
     problem = rw.Problem()
-    stamps, covariances = np.arange(12) * 10**9, np.tile(np.diag(np.arange(1.0, 7.0)), (12, 1, 1))
-    problem.add("t", "s", A[:5], B[:5], 0.1, np.arange(1.0, 6.0), stamps_ns=stamps[:5], covariances=covariances[:5])
-    problem.add("t", "s", A[5:], B[5:], 0.2, 7.0, stamps_ns=stamps[5:], covariances=covariances[0])
+    stamps = np.arange(12) * 10**9
+    problem.add("t", "s", A[:5], B[:5], 0.1, np.arange(1.0, 6.0), stamps_ns=stamps[:5])
+    problem.add("t", "s", A[5:], B[5:], 0.2, 7.0, stamps_ns=stamps[5:])
     kept = problem.measurements("t", "s")
     np.testing.assert_array_equal(kept.A, A)
     np.testing.assert_array_equal(kept.B, B)
@@ -164,8 +164,33 @@ def test_measurements_are_kept_as_they_came() -> None:
     np.testing.assert_array_equal(kept.stamps_ns, stamps)
     assert kept.stamps_ns is not None
     assert kept.stamps_ns.dtype == np.int64
-    np.testing.assert_array_equal(kept.covariances, covariances)
+    assert kept.covariances is None
+    assert not problem.has_covariances
+
+
+def test_covariances_are_kept_and_weigh_the_certified_form_by_their_means() -> None:
+    full = np.diag(np.arange(1.0, 7.0)) + 0.1
+    problem, same = rw.Problem(), rw.Problem()
+    problem.add("t", "s", A[:5], B[:5], covariances=np.tile(full, (5, 1, 1)))
+    sigma, kappa = np.sqrt(5.0 + 0.1), 0.5 / (2.0 + 0.1)
+    same.add("t", "s", A[:5], B[:5], sigma, kappa)
     assert problem.has_covariances
+    assert not problem.is_relative
+    assert_same_moments(problem, same)
+    # A batch with sigma and kappa beside it has a covariance too, the diagonal one.
+    problem.add("t", "s", A[5:], B[5:], 0.2, 7.0)
+    kept = problem.measurements("t", "s").covariances
+    assert kept is not None
+    np.testing.assert_array_equal(kept[:5], np.tile(full, (5, 1, 1)))
+    np.testing.assert_allclose(kept[5:], np.tile(np.diag([1 / 14] * 3 + [0.04] * 3), (7, 1, 1)), rtol=1e-15)
+
+
+@pytest.mark.parametrize("weights", [{"sigma": 0.1}, {"kappa": 3.0}])
+def test_covariances_and_weights_at_once_are_refused(weights: dict[str, float]) -> None:
+    problem = rw.Problem()
+    with pytest.raises(rw.errors.NoiseError, match=f"t-s: covariances and {next(iter(weights))} are given"):
+        problem.add("t", "s", A, B, covariances=np.eye(6), **weights)
+    assert problem.pairs == ()
 
 
 def test_what_is_kept_does_not_change_with_the_callers_arrays() -> None:

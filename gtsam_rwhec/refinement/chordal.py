@@ -1,0 +1,82 @@
+"""Refinement with the certified cost's own residual: from moments alone, so that its optimum is the certified one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.certify.parts import Part
+from gtsam_rwhec.refinement.graph import add_summary, summary_of
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.optimisation import information_of
+from gtsam_rwhec.refinement.options import NoiseGroups
+from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.refinement.variance_components import VarianceComponents, from_moments
+from gtsam_rwhec.refinement.weighting import COMPONENTS, VarianceFactors
+
+
+@dataclass(frozen=True)
+class ChordalModel:
+    """One edge summary a pair."""
+
+    parts: list[Part]
+    variables: Variables
+
+    @property
+    def reweighs(self) -> bool:
+        """The weights do not depend on the estimate."""
+        return False
+
+    @property
+    def given_noise(self) -> dict[Pair, tuple[float, float]]:
+        """Standard deviations as given, of all measurements of a pair together: rad and (measured) metres an axis."""
+        return {
+            pair: (
+                float(np.sqrt(0.5 * part.moments.count[e] / part.moments.kappa[e])),
+                float(np.sqrt(part.moments.count[e] / part.moments.weight[e])),
+            )
+            for part in self.parts
+            for e, pair in enumerate(part.pairs)
+        }
+
+    def graph(self, state: State, factors: VarianceFactors) -> gtsam.NonlinearFactorGraph:
+        """The measurements' factors."""
+        graph = gtsam.NonlinearFactorGraph()
+        for part in self.parts:
+            for e, pair in enumerate(part.pairs):
+                add_summary(graph, self.variables, pair, summary_of(part, e, factors.of[pair]))
+        return graph
+
+    def values(self, state: State) -> gtsam.Values:
+        """An estimate as GTSAM's."""
+        return self.variables.values(state)
+
+    def information_graph(self, state: State, factors: VarianceFactors) -> gtsam.NonlinearFactorGraph:
+        """The graph itself: there is no loss in it."""
+        return self.graph(state, factors)
+
+    def inefficiency(self, state: State, factors: VarianceFactors) -> float:
+        """None: least squares."""
+        return 1.0
+
+    def next_factors(
+        self, state: State, joint: JointCovariance, factors: VarianceFactors, groups: NoiseGroups
+    ) -> VarianceComponents:
+        """Variance factors from the residuals at an estimate."""
+        values = self.variables.values(state)
+        costs: dict[Pair, tuple[float, float]] = {}
+        fitted: dict[Pair, tuple[float, float]] = {}
+        for part in self.parts:
+            for e, pair in enumerate(part.pairs):
+                cost, used = [], []
+                for i, component in enumerate(COMPONENTS):
+                    alone = gtsam.NonlinearFactorGraph()
+                    add_summary(alone, self.variables, pair, summary_of(part, e, (1.0, 1.0), component))
+                    cost.append(alone.error(values))
+                    information = information_of(alone, values, self.variables)
+                    used.append(float(np.sum(joint.finite * information)) / factors.of[pair][i])
+                costs[pair], fitted[pair] = (cost[0], cost[1]), (used[0], used[1])
+        return from_moments(self.parts, costs, fitted, groups)

@@ -1,0 +1,61 @@
+"""Directions that the measurements leave free at a refined answer, as columns over the refinement's unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.certify.parts import Part
+from gtsam_rwhec.certify.variables import given_answer
+from gtsam_rwhec.identifiability import free_directions_of, identify, typical_length
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.residuals import PairPoses, costs_of_pairs
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """Free directions: basis (d, k) over ``Variables.unknown``; sentences; unit (d,): what counts as one of each."""
+
+    basis: Array
+    sentences: list[str]
+    unit: Array
+
+
+def free_space_of(parts: list[Part], variables: Variables, state: State) -> FreeSpace:
+    """Tested as the certified solution's are (``identifiability``), at the refined answer."""
+    unknown = variables.unknown
+    place = dict(zip(unknown, np.cumsum([0, *unknown.values()])[:-1], strict=True))
+    size = sum(unknown.values())
+    unit = np.ones(size)
+    columns, sentences = [], []
+    for part in parts:
+        scale = _scales_of(part, state)
+        answer = given_answer(part, state.X, state.Y, scale)
+        poses = PairPoses.of(part, answer)
+        J_t, J_R = costs_of_pairs(part, poses)
+        length = typical_length(part)
+        basis = free_directions_of(part, poses, J_t, J_R)
+        mapped = np.zeros((size, basis.shape[1]))
+        for i, name in enumerate(part.free):
+            rows = slice(place[name], place[name] + 6)
+            mapped[rows] = basis[7 * i : 7 * i + 6]
+            unit[rows] = np.r_[np.full(3, 1.0 / length), np.ones(3)]
+            own = f"scale:{name}"
+            if own in place:  # d alpha = alpha d log alpha
+                mapped[place[own]] = state.scales[own] * basis[7 * i + 6]
+                unit[place[own]] = state.scales[own] / length
+        if "scale" in place:
+            mapped[place["scale"]] = state.scales["scale"] * basis[-1]
+            unit[place["scale"]] = state.scales["scale"] / length
+        columns.append(mapped)
+        if basis.shape[1]:
+            sentences += identify(part, poses, J_t, J_R).free_directions
+    return FreeSpace(np.hstack(columns) if columns else np.zeros((size, 0)), sentences, unit)
+
+
+def _scales_of(part: Part, state: State) -> float | dict[str, float]:
+    if part.scale == "per_target":
+        return {name: state.scales[f"scale:{name}"] for name in part.scale_owners}
+    return state.scales.get("scale", 1.0)

@@ -1,0 +1,184 @@
+"""Refinement with the geodesic residual: any covariance of B, noise in A, robust losses, time offsets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from rwhec_factors.batch import Linearization
+from scipy.stats import chi2
+
+from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.poses import Array, to_pose3
+from gtsam_rwhec.refinement import graph as graphs
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.options import NoiseGroups, RefineOptions, Robust
+from gtsam_rwhec.refinement.pair_data import PairData
+from gtsam_rwhec.refinement.variables import State, Variables, carrier_key
+from gtsam_rwhec.refinement.variance_components import SMALLEST, VarianceComponents, from_measurements
+from gtsam_rwhec.refinement.weighting import (
+    COMPONENTS,
+    VarianceFactors,
+    group_of,
+    residual_covariance,
+    square_root_information,
+)
+
+
+@dataclass(frozen=True)
+class GeodesicModel:
+    """The raw measurements of every pair; ``carriers`` where carrier poses are variables.
+
+    inlier_share is the share of its variance that a squared residual keeps when those beyond the inlier threshold are
+    left out.
+    """
+
+    data: list[PairData]
+    variables: Variables
+    options: RefineOptions
+    carriers: graphs.CarrierVariables | None
+    inlier_share: float
+
+    @staticmethod
+    def of(data: list[PairData], variables: Variables, options: RefineOptions) -> GeodesicModel:
+        """Decide whether carrier poses are variables."""
+        carriers = None
+        if options.carrier_noise is not None and options.carrier_model != "propagated" and not options.time_offsets:
+            candidates = graphs.CarrierVariables.of(data)
+            if options.carrier_model == "variables" or candidates.is_shared:
+                carriers = candidates
+        share = 1.0
+        if options.robust == "gnc":  # of a chi-square with 6 degrees of freedom, cut at its quantile
+            cut = chi2.ppf(options.inlier_confidence, 6)
+            share = float(chi2.cdf(cut, 8) / options.inlier_confidence)
+        return GeodesicModel(data, variables, options, carriers, share)
+
+    @property
+    def is_m_estimate(self) -> bool:
+        """Whether one of GTSAM's losses weighs each measurement."""
+        return self.options.robust in graphs.LOSSES
+
+    @property
+    def reweighs(self) -> bool:
+        """Whether the weights depend on the estimate: A's noise is carried into the residual at it."""
+        return self.options.carrier_noise is not None and self.carriers is None
+
+    @property
+    def given_noise(self) -> dict[Pair, tuple[float, float]]:
+        """Standard deviations as given, root mean square over measurements and axes: rad and metres."""
+        result = {}
+        for item in self.data:
+            variances = np.einsum("nii->i", item.covariance) / item.count
+            result[item.pair] = (float(np.sqrt(variances[:3].mean())), float(np.sqrt(variances[3:].mean())))
+        return result
+
+    def linearize(self, state: State) -> dict[Pair, Linearization]:
+        """Residuals and Jacobians of every pair at an estimate."""
+        frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
+        result = {}
+        for item in self.data:
+            scale = self.variables.scale_of_pair.get(item.pair)
+            result[item.pair] = item.residuals.linearize(
+                frames[item.pair[0]],
+                frames[item.pair[1]],
+                1.0 if scale is None else state.scales[scale],
+                state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0),
+            )
+        return result
+
+    def covariances(self, state: State, factors: VarianceFactors) -> dict[Pair, Array]:
+        """(N, 6, 6) of every pair's residuals at an estimate."""
+        at = self.linearize(state)
+        return {i.pair: residual_covariance(i, at[i.pair], factors.of[i.pair], propagated=True) for i in self.data}
+
+    def graph(self, state: State, factors: VarianceFactors, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
+        """The measurements' factors, weighed as of an estimate; in another loss than the options', if told."""
+        loss = self.options.robust if robust is None else robust
+        graph = gtsam.NonlinearFactorGraph()
+        rest = self.data
+        if self.carriers is not None:
+            graphs.add_with_carriers(graph, self.variables, self.data, self.carriers, factors, loss)
+            rest = [item for item in self.data if item.pair not in self.carriers.index]
+        covariances = self.covariances(state, factors) if rest else {}
+        if loss in graphs.LOSSES:
+            graphs.add_single(graph, self.variables, rest, covariances, loss)
+        else:
+            roots = {item.pair: square_root_information(covariances[item.pair]) for item in rest}
+            graphs.add_batches(graph, self.variables, rest, roots)
+        return graph
+
+    def values(self, state: State) -> gtsam.Values:
+        """An estimate with the carrier poses as measured, where they are variables."""
+        values = self.variables.values(state)
+        if self.carriers is not None:
+            for i, A in enumerate(self.carriers.A):
+                values.insert(carrier_key(i), to_pose3(A[:3, :3], A[:3, 3]))
+        return values
+
+    def information_graph(self, state: State, factors: VarianceFactors) -> gtsam.NonlinearFactorGraph:
+        """The measurements' factors without a loss: what the information is of, up to ``inefficiency``."""
+        return self.graph(state, factors, "none")
+
+    def inefficiency(self, state: State, factors: VarianceFactors) -> float:
+        """By what a loss widens the covariance of least squares: Huber's E psi^2 / (E psi')^2, for 6 dimensions.
+
+        (Huber and Ronchetti, Robust Statistics, eq. 7.87, whose psi' is here the divergence of w(|u|) u over 6.)
+        """
+        if not self.is_m_estimate:
+            return 1.0
+        loss = graphs.loss_of(self.options.robust)
+        lengths = np.concatenate([np.linalg.norm(u, axis=1) for u in self._whitened(state, factors).values()])
+        weight = np.array([loss.weight(d) for d in lengths])
+        step = 1e-5
+        slope = np.array([(loss.weight(d + step) - loss.weight(max(d - step, 0.0))) for d in lengths]) / (
+            step + np.minimum(lengths, step)
+        )
+        unknowns = sum(self.variables.unknown.values())
+        spare = max(6 * len(lengths) - unknowns, 1)
+        square = float(np.sum((weight * lengths) ** 2)) / spare
+        return square / float(np.mean(weight + slope * lengths / 6.0)) ** 2
+
+    def next_factors(
+        self, state: State, joint: JointCovariance, factors: VarianceFactors, groups: NoiseGroups
+    ) -> VarianceComponents:
+        """Variance factors from the residuals at an estimate."""
+        at = self.linearize(state)
+        components = from_measurements(
+            self.data, at, self.variables, joint, factors, groups, consistency=self.inlier_share
+        )
+        if not self.is_m_estimate:
+            return components
+        return VarianceComponents(self._median_factors(state, factors, groups, components), components.redundancy)
+
+    def _whitened(self, state: State, factors: VarianceFactors) -> dict[Pair, Array]:
+        at = self.linearize(state)
+        result = {}
+        for item in self.data:
+            covariance = residual_covariance(item, at[item.pair], factors.of[item.pair], propagated=True)
+            result[item.pair] = np.einsum("nij,nj->ni", square_root_information(covariance), at[item.pair].residual)
+        return result
+
+    def _median_factors(
+        self, state: State, factors: VarianceFactors, groups: NoiseGroups, components: VarianceComponents
+    ) -> VarianceFactors:
+        """Where outliers are expected: medians of squared residuals against a chi-square's, 3 dimensions each."""
+        at = self.linearize(state)
+        squares: dict[tuple[str, int], list[Array]] = {}
+        for item in self.data:
+            covariance = residual_covariance(item, at[item.pair], factors.of[item.pair], propagated=True)
+            for i, block in enumerate((slice(0, 3), slice(3, 6))):
+                r = at[item.pair].residual[:, block]
+                square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(covariance[:, block, block]), r)
+                squares.setdefault((group_of(item.pair, groups), i), []).append(square)
+        ratios = {}
+        for (group, i), values in squares.items():
+            all_squares = np.concatenate(values)
+            spare = components.redundancy[group, COMPONENTS[i]] / (3.0 * len(all_squares))
+            ratios[group, i] = max(float(np.median(all_squares)) / float(chi2.ppf(0.5, 3)) / spare, SMALLEST)
+        return VarianceFactors(
+            {
+                pair: (old[0] * ratios[group_of(pair, groups), 0], old[1] * ratios[group_of(pair, groups), 1])
+                for pair, old in factors.of.items()
+            }
+        )

@@ -1,0 +1,226 @@
+"""The factor graph of a refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from rwhec_factors.batch import robot_world_hand_eye_batch_factor
+from rwhec_factors.carrier_pose_variables import pose_robot_world_hand_eye_factor
+from rwhec_factors.edge_summary import EdgeSummary, edge_summary_factor, hand_eye_summary_factor
+from rwhec_factors.known_carrier_pose import robot_world_hand_eye_factor, scaled_robot_world_hand_eye_factor
+from rwhec_factors.priors import position_prior_factor, rotation_prior_factor
+
+from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.certify.parts import Part
+from gtsam_rwhec.poses import Array, to_pose3
+from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.refinement.options import ResidualKind, Robust
+from gtsam_rwhec.refinement.pair_data import PairData
+from gtsam_rwhec.refinement.variables import Variables, carrier_key
+from gtsam_rwhec.refinement.weighting import (
+    Component,
+    VarianceFactors,
+    measurement_covariance,
+)
+from gtsam_rwhec.statistics import edge_forms
+
+#: Tuning constants with 95 % efficiency at one-dimensional Gaussian noise, as GTSAM's own defaults.
+LOSSES = {
+    "huber": (gtsam.noiseModel.mEstimator.Huber, 1.345),
+    "cauchy": (gtsam.noiseModel.mEstimator.Cauchy, 2.3849),
+    "tukey": (gtsam.noiseModel.mEstimator.Tukey, 4.6851),
+    "geman_mcclure": (gtsam.noiseModel.mEstimator.GemanMcClure, 1.0),
+}
+
+
+@dataclass(frozen=True)
+class CarrierVariables:
+    """Carrier poses that are variables: one for each distinct (stamp, A) of the problem.
+
+    index (dict of pair to (N,) integers) tells which one a measurement saw; A (M, 4, 4) are the poses as given, and
+    covariance (M, 6, 6) their noise.
+    """
+
+    index: dict[Pair, np.ndarray]
+    A: Array
+    covariance: Array
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether two measurements saw one carrier pose."""
+        return sum(len(index) for index in self.index.values()) > len(self.A)
+
+    @staticmethod
+    def of(data: list[PairData]) -> CarrierVariables:
+        """Measurements of one stamp and one A, and where there are no stamps those of one A, share a variable."""
+        place: dict[tuple[int, bytes], int] = {}
+        index: dict[Pair, np.ndarray] = {}
+        A, covariance = [], []
+        for item in data:
+            if item.carrier is None or item.pair[0] == item.pair[1]:
+                continue
+            of_pair = np.empty(item.count, dtype=np.int64)
+            for i, pose in enumerate(item.residuals.A):
+                stamp = -1 if item.stamps_ns is None else int(item.stamps_ns[i])
+                # Rounded well below any noise: the same pose may come out of two interpolations.
+                key = (stamp, np.round(pose[:3], 9).tobytes())
+                if key not in place:
+                    place[key] = len(A)
+                    A.append(pose)
+                    covariance.append(item.carrier[i])
+                of_pair[i] = place[key]
+            index[item.pair] = of_pair
+        return CarrierVariables(index, np.array(A), np.array(covariance))
+
+
+def summary_of(
+    part: Part, pair_index: int, factors: tuple[float, float], component: Component | None = None
+) -> EdgeSummary:
+    """A pair's moments as one summary, its variances multiplied by the factors; or of one component alone."""
+    moments = part.moments
+    one = slice(pair_index, pair_index + 1)
+    translation, rotation = edge_forms(moments.translation[one], moments.rotation[one], moments.kappa[one])
+    form = np.zeros((25, 25))
+    if component != "translation":
+        form += rotation[0] / factors[0]
+    if component != "rotation":
+        form += translation[0] / factors[1]
+    target, sensor = part.pairs[pair_index]
+    scale = part.fixed_scales.get(target, 1.0)
+    if scale != 1.0:  # the form's variables are measured lengths, the factor's true ones
+        unit = np.r_[np.full(7, scale), np.ones(18)]
+        form = form * unit[:, None] * unit
+    return EdgeSummary(
+        form=form,
+        count=int(moments.count[pair_index]),
+        target_origin=part.frame_shift(target),
+        sensor_origin=part.frame_shift(sensor),
+    )
+
+
+def add_summary(graph: gtsam.NonlinearFactorGraph, variables: Variables, pair: Pair, summary: EdgeSummary) -> None:
+    """One chordal factor for all measurements of a pair, from moments (DESIGN fact 2)."""
+    target, sensor = variables.ends(pair)
+    scale_key = variables.scale_key(pair)
+    if target == sensor:
+        graph.add(hand_eye_summary_factor(sensor, summary, scale_key=scale_key))
+    else:
+        graph.add(edge_summary_factor(target, sensor, summary, scale_key=scale_key))
+
+
+def add_batches(
+    graph: gtsam.NonlinearFactorGraph,
+    variables: Variables,
+    data: list[PairData],
+    roots: dict[Pair, Array],
+) -> None:
+    """One geodesic factor for each pair, with every measurement in it under its own weight."""
+    for item in data:
+        target, sensor = variables.ends(item.pair)
+        graph.add(
+            robot_world_hand_eye_batch_factor(
+                target,
+                sensor,
+                item.residuals.A,
+                item.residuals.B,
+                roots[item.pair],
+                scale_key=variables.scale_key(item.pair),
+                time_offset_key=variables.offset_key(item.pair),
+                twists=item.residuals.twists,
+            )
+        )
+
+
+def robust_noise(covariance: Array, robust: Robust) -> gtsam.noiseModel.Base:
+    """A Gaussian (6, 6) in one of GTSAM's losses."""
+    gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    return gtsam.noiseModel.Robust.Create(loss_of(robust), gaussian) if robust in LOSSES else gaussian
+
+
+def loss_of(robust: Robust) -> gtsam.noiseModel.mEstimator.Base:
+    """One of GTSAM's losses, by name."""
+    loss, constant = LOSSES[robust]
+    return loss.Create(constant)
+
+
+def add_single(
+    graph: gtsam.NonlinearFactorGraph,
+    variables: Variables,
+    data: list[PairData],
+    covariances: dict[Pair, Array],
+    robust: Robust,
+) -> None:
+    """One geodesic factor for each measurement, so that GTSAM's losses weigh each on its own."""
+    for item in data:
+        target, sensor = variables.ends(item.pair)
+        scale_key, offset_key = variables.scale_key(item.pair), variables.offset_key(item.pair)
+        twists = item.residuals.twists
+        for i, (A, B) in enumerate(zip(item.residuals.A, item.residuals.B, strict=True)):
+            poses = (to_pose3(A[:3, :3], A[:3, 3]), to_pose3(B[:3, :3], B[:3, 3]))
+            noise = robust_noise(covariances[item.pair][i], robust)
+            offset = {"time_offset_key": offset_key, "twist": None if twists is None else twists[i]}
+            if scale_key is None:
+                graph.add(robot_world_hand_eye_factor(target, sensor, *poses, noise, **offset))
+            else:
+                graph.add(scaled_robot_world_hand_eye_factor(target, sensor, scale_key, *poses, noise, **offset))
+
+
+def add_with_carriers(
+    graph: gtsam.NonlinearFactorGraph,
+    variables: Variables,
+    data: list[PairData],
+    carriers: CarrierVariables,
+    factors: VarianceFactors,
+    robust: Robust,
+) -> None:
+    """Carrier poses as variables, each with a prior at what was measured; one factor for each measurement."""
+    for i, (A, covariance) in enumerate(zip(carriers.A, carriers.covariance, strict=True)):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        graph.add(gtsam.PriorFactorPose3(carrier_key(i), to_pose3(A[:3, :3], A[:3, 3]), noise))
+    for item in data:
+        if item.pair not in carriers.index:
+            continue
+        target, sensor = variables.ends(item.pair)
+        covariance = measurement_covariance(item, factors.of[item.pair])
+        for i, B in enumerate(item.residuals.B):
+            graph.add(
+                pose_robot_world_hand_eye_factor(
+                    carrier_key(int(carriers.index[item.pair][i])),
+                    target,
+                    sensor,
+                    to_pose3(B[:3, :3], B[:3, 3]),
+                    robust_noise(covariance[i], robust),
+                    scale_key=variables.scale_key(item.pair),
+                    pose="targetcarrier_in_sensorcarrier",
+                )
+            )
+
+
+def add_fixed(graph: gtsam.NonlinearFactorGraph, variables: Variables, problem: Problem) -> None:
+    """Known frames as hard constraints."""
+    for name, T in problem.fixed.items():
+        graph.add(gtsam.NonlinearEqualityPose3(variables.frames[name], to_pose3(T[:3, :3], T[:3, 3])))
+
+
+def add_priors(
+    graph: gtsam.NonlinearFactorGraph, variables: Variables, problem: Problem, residual: ResidualKind
+) -> None:
+    """Beliefs: |t - t_0|^2 / sigma_0^2, and kappa_0 |R - R_0|_F^2 (DESIGN fact 11) or its angle's 2 kappa_0 theta^2."""
+    for name, priors in problem.priors.items():
+        if name in problem.fixed:
+            continue
+        for prior in priors:
+            pose = to_pose3(prior.transform[:3, :3], prior.transform[:3, 3])
+            key = variables.frames[name]
+            if prior.kappa is not None:
+                noise = isotropic(np.sqrt(0.5 / prior.kappa))
+                graph.add(rotation_prior_factor(key, pose.rotation(), noise, residual=residual))
+            if prior.sigma is not None:
+                graph.add(position_prior_factor(key, pose.translation(), isotropic(prior.sigma)))
+
+
+def isotropic(sigma: float) -> gtsam.noiseModel.Isotropic:
+    """Three equal standard deviations."""
+    return gtsam.noiseModel.Isotropic.Sigma(3, sigma)

@@ -1,0 +1,287 @@
+"""``refine``: from the certified solution to poses under the noise that there is, with covariances."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.calibration import check_against_knowledge
+from gtsam_rwhec.certify.parts import Part, parts_of
+from gtsam_rwhec.errors import (
+    FrameError,
+    MeasurementsNotKeptError,
+    NotUniqueWarning,
+    OptionError,
+    ScaleError,
+    WeightsWarning,
+)
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.refinement import graph as graphs
+from gtsam_rwhec.refinement.chordal import ChordalModel
+from gtsam_rwhec.refinement.free_space import free_space_of
+from gtsam_rwhec.refinement.geodesic import GeodesicModel
+from gtsam_rwhec.refinement.graduated import graduated
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.optimisation import Optimum, information_of, optimise
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.pair_data import PairData
+from gtsam_rwhec.refinement.refined import Movement, PairNoise, Refined
+from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.refinement.weighting import VarianceFactors, group_of
+from gtsam_rwhec.selection import selected
+from gtsam_rwhec.solution import Solution
+
+Progress = Callable[[str], None]
+Model = GeodesicModel | ChordalModel
+
+#: Rounds of re-estimating the noise, and of carrying A's noise into the residuals anew; two to five are usual.
+MAX_ROUNDS = 30
+#: Variance factors are settled when none changes by more than this, of itself.
+SETTLED = 1e-4
+
+
+def refine(
+    problem: Problem,
+    solution: Solution,
+    options: RefineOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Refined:
+    """Refine a certified solution in GTSAM under the noise that there is, and say how well everything is known.
+
+    Parameters
+    ----------
+    problem : Problem
+        With the raw measurements, unless ``residual="chordal"`` and ``robust="none"``.
+    solution : Solution
+        What ``solve`` returned for it; the start.
+    options : RefineOptions, optional
+    progress : callable, optional
+        Told each stage's name.
+
+    Returns
+    -------
+    Refined
+
+    Raises
+    ------
+    FrameError, ScaleError, PriorError
+        For a solution of another problem.
+    MeasurementsNotKeptError
+        Where raw measurements are needed and were not kept.
+    NoiseError, OptionError, CountError
+        For noise that cannot be estimated or honoured, or options that do not go together.
+
+    Warns
+    -----
+    NotUniqueWarning
+        Where the measurements leave something free, by name; variances are infinite there.
+    """
+    options = RefineOptions() if options is None else options
+    tell = progress if progress is not None else _silent
+    _check(problem, solution, options)
+    estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)
+    inliers: dict[Pair, np.ndarray] = {}
+    start = solution
+    if options.robust == "gnc":
+        tell("rejecting outliers")
+        found = graduated(
+            problem,
+            confidence=options.inlier_confidence,
+            noise_scale="estimate" if estimates else "given",
+            progress=progress,
+        )
+        problem, start, inliers = selected(problem, found.inliers), found.solution, found.inliers
+    variables = Variables.of(problem, _sensors_with_offset(problem, options))
+    parts = parts_of(problem)
+    model = _model(problem, parts, variables, options)
+    tell("refining")
+    fit = _fit(problem, model, variables, variables.start(start), options, estimates)
+    state = variables.state(fit.optimum.values)
+    tell("covariances")
+    space = free_space_of(parts, variables, state)
+    if space.sentences:
+        warnings.warn(
+            "the measurements do not determine everything; variances are infinite along: " + "; ".join(space.sentences),
+            NotUniqueWarning,
+            stacklevel=2,
+        )
+    joint = JointCovariance.of(variables.unknown, fit.information, space.basis, space.unit)
+    return Refined(
+        X=state.X,
+        Y=state.Y,
+        scale=_scale(problem, state),
+        scale_mode=problem.scale,
+        time_offsets_s={name.partition(":")[2]: value for name, value in state.offsets_s.items()},
+        graph=fit.graph,
+        values=fit.optimum.values,
+        keys=variables.keys,
+        noise_source="estimated" if estimates else "given",
+        noise=_noise(model, fit, options, estimates),
+        cost=fit.optimum.cost,
+        initial_cost=fit.initial_cost,
+        iterations=fit.iterations,
+        moved=_moved(start, state),
+        inliers=inliers,
+        free_directions=space.sentences,
+        solution=start,
+        options=options,
+        joint=joint,
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    graph: gtsam.NonlinearFactorGraph
+    optimum: Optimum
+    information: Array
+    factors: VarianceFactors
+    redundancy: dict[tuple[str, str], float]
+    initial_cost: float
+    iterations: int
+
+
+def _fit(
+    problem: Problem, model: Model, variables: Variables, start: State, options: RefineOptions, estimates: bool
+) -> _Fit:
+    """Optimise, and where weights depend on the answer or on the residuals, again until they are settled."""
+    factors = VarianceFactors.ones(problem.pairs)
+    redundancy: dict[tuple[str, str], float] = {}
+    state, values = start, model.values(start)
+    iterations = 0
+    for round_number in range(MAX_ROUNDS):
+        graph = model.graph(state, factors)
+        graphs.add_priors(graph, variables, problem, options.residual)
+        graphs.add_fixed(graph, variables, problem)
+        optimum = optimise(graph, values, options.max_iterations)
+        iterations += optimum.iterations
+        state, values = variables.state(optimum.values), optimum.values
+        information = _information(problem, model, variables, options, state, factors, values)
+        settled = not model.reweighs or round_number > 0
+        if estimates:
+            size = len(information)
+            joint = JointCovariance.of(variables.unknown, information, np.zeros((size, 0)), np.ones(size))
+            components = model.next_factors(state, joint, factors, options.noise_groups)
+            change = components.factors.distance(factors)
+            settled = settled and change < SETTLED
+            redundancy = components.redundancy
+            if not settled:
+                factors = components.factors
+        if settled:
+            break
+    else:
+        warnings.warn(
+            f"the estimated noise did not settle in {MAX_ROUNDS} rounds: a part of it goes to zero, as where the noise "
+            "given for A already explains the residuals; give B's noise (noise='given'), or less for A",
+            WeightsWarning,
+            stacklevel=3,
+        )
+    return _Fit(graph, optimum, information, factors, redundancy, graph.error(model.values(start)), iterations)
+
+
+def _information(
+    problem: Problem,
+    model: Model,
+    variables: Variables,
+    options: RefineOptions,
+    state: State,
+    factors: VarianceFactors,
+    values: gtsam.Values,
+) -> Array:
+    graph = model.information_graph(state, factors)
+    graphs.add_priors(graph, variables, problem, options.residual)
+    return information_of(graph, values, variables) / model.inefficiency(state, factors)
+
+
+def _model(problem: Problem, parts: list[Part], variables: Variables, options: RefineOptions) -> Model:
+    if options.residual == "chordal":
+        if problem.has_covariances:
+            raise OptionError(
+                "some measurements came with full covariances, which the chordal residual cannot hold; take "
+                "residual='geodesic', or add them with sigma and kappa"
+            )
+        return ChordalModel(parts, variables)
+    if not problem.has_measurements:
+        raise MeasurementsNotKeptError(
+            "the geodesic residual needs the raw measurements, and they were not kept (keep_measurements=False); make "
+            "the problem with keep_measurements=True, or refine with RefineOptions(residual='chordal')"
+        )
+    data = [PairData.of(problem, p, options, variables.offset_key(p) is not None) for p in problem.pairs]
+    return GeodesicModel.of(data, variables, options)
+
+
+def _check(problem: Problem, solution: Solution, options: RefineOptions) -> None:
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    if not isinstance(solution, Solution):
+        raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
+    if not isinstance(options, RefineOptions):
+        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.RefineOptions")
+    if solution.scale_mode != problem.scale:
+        raise ScaleError(
+            f"the solution is of a problem with scale={solution.scale_mode!r}, this one has scale={problem.scale!r}; "
+            "solve this problem first"
+        )
+    check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
+    if options.noise == "given" and problem.is_relative:
+        raise OptionError(
+            "noise='given', but some measurements were added without sigma or kappa, so that no noise was given; "
+            "take noise='estimate'"
+        )
+    if options.robust == "gnc" and not problem.has_measurements:
+        raise MeasurementsNotKeptError(
+            "robust='gnc' weighs each measurement, and they were not kept (keep_measurements=False); make the problem "
+            "with keep_measurements=True"
+        )
+
+
+def _sensors_with_offset(problem: Problem, options: RefineOptions) -> tuple[str, ...]:
+    if isinstance(options.time_offsets, bool):
+        return problem.sensors if options.time_offsets else ()
+    for name in options.time_offsets:
+        if name not in problem.sensors:
+            raise FrameError(
+                f"RefineOptions.time_offsets names {name!r}, which is no sensor; there are {', '.join(problem.sensors)}"
+            )
+    return tuple(options.time_offsets)
+
+
+def _scale(problem: Problem, state: State) -> float | dict[str, float]:
+    if problem.scale == "shared":
+        return state.scales["scale"]
+    if problem.scale == "known":
+        return 1.0
+    names = dict.fromkeys(target for target, _ in problem.pairs)
+    return {n: problem.fixed_scales[n] if n in problem.fixed_scales else state.scales[f"scale:{n}"] for n in names}
+
+
+def _noise(model: Model, fit: _Fit, options: RefineOptions, estimates: bool) -> dict[Pair, PairNoise]:
+    result = {}
+    for pair, (rotation, translation) in model.given_noise.items():
+        factors = fit.factors.of[pair]
+        spare = (np.inf, np.inf)
+        if estimates:
+            group = group_of(pair, options.noise_groups)
+            spare = (fit.redundancy[group, "rotation"], fit.redundancy[group, "translation"])
+        result[pair] = PairNoise(rotation * np.sqrt(factors[0]), translation * np.sqrt(factors[1]), spare)
+    return result
+
+
+def _moved(start: Solution, state: State) -> dict[str, Movement]:
+    moved = {}
+    for before, after in ((start.X, state.X), (start.Y, state.Y)):
+        for name, pose in after.items():
+            difference = before[name].between(pose)
+            angle = float(np.linalg.norm(gtsam.Rot3.Logmap(difference.rotation())))
+            moved[name] = Movement(1e3 * float(np.linalg.norm(difference.translation())), float(np.degrees(angle)))
+    return moved
+
+
+def _silent(stage: str) -> None:
+    """Nobody wants to know."""

@@ -1,0 +1,205 @@
+"""What refining returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+
+from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.pose_covariances import relative_jacobian, standard_deviations
+from gtsam_rwhec.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.problem import ScaleMode
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.solution import Solution
+
+
+@dataclass(frozen=True)
+class Movement:
+    """How far a frame moved from the certified solution."""
+
+    translation_mm: float
+    rotation_deg: float
+
+
+@dataclass(frozen=True)
+class PairNoise:
+    """The noise of a pair's B that the covariances rest on, root mean square an axis, and how well it is known.
+
+    ``redundancy`` is equations to spare, (rotation, translation): infinite where the noise was given.
+    """
+
+    rotation_rad: float
+    translation_m: float
+    redundancy: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A refined calibration, with covariances.
+
+    Covariances are of right perturbations, T Expmap(xi), xi = [omega (rad), v (m)], in the frame's own axes (GTSAM's
+    convention; ``gtsam_rwhec.pose_covariances`` turns them into others). They are infinite along directions that the
+    measurements leave free.
+
+    Attributes
+    ----------
+    X, Y : dict of str to gtsam.Pose3
+        T_targetcarrier_target and T_sensorcarrier_sensor, metres.
+    scale : float or dict of str to float
+    scale_mode : "known", "shared" or "per_target"
+    time_offsets_s : dict of str to float
+        Of each sensor for which it was estimated: its stamp t is the carriers' t + offset.
+    graph, values : gtsam.NonlinearFactorGraph, gtsam.Values
+        To go on with.
+    keys : dict of str to int
+        The variables' keys in them, by name: frames, "scale" ("scale:NAME" for each with scale="per_target"),
+        "time_offset:SENSOR".
+    noise_source : "given" or "estimated"
+    noise : dict of (target, sensor) to PairNoise
+    cost, initial_cost : float
+        Of the graph, at the end and at the certified solution.
+    iterations : int
+        Levenberg-Marquardt steps, of all rounds of re-weighting together.
+    moved : dict of str to Movement
+    inliers : dict of (target, sensor) to (N,) booleans
+        With robust="gnc"; else empty.
+    free_directions : list of str
+        In words; empty where everything is determined.
+    solution : Solution
+        The certified solution that was refined (with robust="gnc": of the inliers).
+    options : RefineOptions
+    """
+
+    X: dict[str, gtsam.Pose3]
+    Y: dict[str, gtsam.Pose3]
+    scale: float | dict[str, float]
+    scale_mode: ScaleMode
+    time_offsets_s: dict[str, float]
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    keys: dict[str, int]
+    noise_source: str
+    noise: dict[Pair, PairNoise]
+    cost: float
+    initial_cost: float
+    iterations: int
+    moved: dict[str, Movement]
+    inliers: dict[Pair, np.ndarray]
+    free_directions: list[str]
+    solution: Solution
+    options: RefineOptions
+    joint: JointCovariance = field(repr=False)
+
+    def covariance(self, *names: str) -> Array:
+        """Joint covariance of frames, scales and time offsets, in the order given.
+
+        Parameters
+        ----------
+        names : str
+            Frames (six rows each), "scale" or "scale:NAME", "time_offset:SENSOR" (one row each). None: everything
+            that was unknown, in the order of ``names``.
+
+        Returns
+        -------
+        (m, m) array
+            Zero for what is fixed; infinite in the rows that a free direction reaches.
+
+        Raises
+        ------
+        FrameError
+            For a name that there is not.
+        """
+        rows = [self._rows_of(name) for name in (names or self.names)]
+        return self.joint.covariance_of(np.concatenate(rows))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Everything that was unknown."""
+        return tuple(self.joint.slots)
+
+    def information(self, *names: str) -> Array:
+        """Marginal information (m, m) of unknowns: the covariance's inverse, and zero along free directions.
+
+        Unlike the covariance it holds everything that is known where a free direction is oblique to the axes.
+
+        Raises
+        ------
+        FrameError
+            For a name that is not among the unknowns.
+        """
+        return self.joint.information_of(names or self.names)
+
+    def relative(self, first: str, second: str) -> tuple[gtsam.Pose3, Array]:
+        """T_first_second of two frames on one carrier, and the covariance (6, 6) of its right perturbation.
+
+        What two cameras of a rig have between them; often far better known than either on its carrier.
+
+        Raises
+        ------
+        FrameError
+            For names that there are not, or on two carriers.
+        """
+        poses = next((p for p in (self.X, self.Y) if first in p and second in p), None)
+        if poses is None:
+            for name in (first, second):
+                self._rows_of(name)
+            raise FrameError(
+                f"{first!r} and {second!r} are on two carriers, which move against one another: they have no relative "
+                "pose; ask for two sensors or two targets"
+            )
+        if first == second:
+            raise FrameError(f"{first!r} has no pose relative to itself; ask for two frames")
+        J = relative_jacobian(poses[first], poses[second])
+        G = J @ np.concatenate([self._rows_of(first), self._rows_of(second)])
+        return poses[first].between(poses[second]), self.joint.covariance_of(G)
+
+    def standard_deviations(self, name: str) -> tuple[Array, Array]:
+        """A frame's (3,) in degrees about, and (3,) in millimetres along, its own x, y, z."""
+        return standard_deviations(self.covariance(name))
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Equations that the estimated noise rests on, the fewest of any group; infinite where it was given."""
+        return min((min(noise.redundancy) for noise in self.noise.values()), default=np.inf)
+
+    def squared_radius(self, dimension: int, confidence: float = 0.95) -> float:
+        """Up to which xi' covariance^-1 xi is inside the confidence ellipsoid.
+
+        A chi-square quantile where the noise was given; where it was estimated, dimension times an F quantile.
+        """
+        if not 0.0 < confidence < 1.0:
+            raise OptionError(f"confidence={confidence!r}; give one between 0 and 1")
+        if np.isinf(self.degrees_of_freedom):
+            return float(chi2.ppf(confidence, dimension))
+        return float(dimension * f_distribution.ppf(confidence, dimension, self.degrees_of_freedom))
+
+    def contains(self, name: str, T_carrier_frame: PoseLike, confidence: float = 0.95) -> bool:
+        """Whether a pose is inside a frame's confidence ellipsoid.
+
+        Raises
+        ------
+        FrameError, PoseError
+            For a name or a pose that is none.
+        """
+        poses = self.X | self.Y
+        if name not in poses:
+            raise FrameError(f"there is no frame {name!r}; there are {', '.join(poses)}")
+        T = one_transform(T_carrier_frame, f"the pose of {name}")
+        xi = gtsam.Pose3.Logmap(poses[name].inverse().compose(gtsam.Pose3(T)))
+        if name not in self.joint.slots:
+            return bool(np.abs(xi).max() < 1e-9)
+        return bool(xi @ self.information(name) @ xi <= self.squared_radius(6, confidence))
+
+    def _rows_of(self, name: str) -> Array:
+        """(m, d): a name's rows of the unknowns; zero for a fixed frame."""
+        if name in self.keys and name not in self.joint.slots:
+            return np.zeros((6, len(self.joint.unit)))
+        if name not in self.joint.slots:
+            raise FrameError(f"there is no {name!r}; there are {', '.join(self.keys)}")
+        return self.joint.selector((name,))
