@@ -92,7 +92,7 @@ def solve(
             raise OptionError(
                 "initial is (X, Y, scale): poses of targets and of sensors by name, and a scale (1.0 if known)"
             )
-        _check_against_knowledge(problem, *initial)
+        check_against_knowledge(problem, *initial)
     results = []
     for part in parts_of(problem):
         search = Search(part, options, progress)
@@ -143,7 +143,7 @@ def certify(
     _check_types(problem, options)
     options = options or SolveOptions()
     parts = parts_of(problem)
-    _check_against_knowledge(problem, X, Y, scale)
+    check_against_knowledge(problem, X, Y, scale)
     results = []
     for part in parts:
         given = given_answer(part, X, Y, scale)
@@ -341,7 +341,7 @@ def _check_types(problem: Problem, options: SolveOptions | None) -> None:
         raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.SolveOptions")
 
 
-def _check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) -> None:
+def check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) -> None:
     """Refuse an answer that is another than the problem says is known: its cost would not be that of the answer."""
     for what, poses, names in (("X", X, problem.targets), ("Y", Y, problem.sensors)):
         if not isinstance(poses, Mapping):
