@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.poses import Array, PoseLike, one_transform
 
 #: [omega, v] to [v, omega] and back.
 SWAP = np.r_[3:6, 0:3]
@@ -66,6 +66,19 @@ def right_of_ros(T_a_b: gtsam.Pose3, covariance: ArrayLike) -> Array:
     axes = np.zeros((6, 6))
     axes[:3, :3] = axes[3:, 3:] = Rt
     return _turned(axes, checked(covariance)[np.ix_(SWAP, SWAP)])
+
+
+def error_of(estimate: gtsam.Pose3, T_a_b: PoseLike) -> Array:
+    """xi (6,) with T_a_b = estimate Expmap(xi): what a covariance of the estimate is the covariance of.
+
+    Raises
+    ------
+    PoseError
+        When T_a_b is no pose.
+    """
+    truth = gtsam.Pose3(one_transform(T_a_b, "the pose to compare with"))
+    xi: Array = gtsam.Pose3.Logmap(estimate.inverse().compose(truth))
+    return xi
 
 
 def standard_deviations(covariance: ArrayLike) -> tuple[Array, Array]:

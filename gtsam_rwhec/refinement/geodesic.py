@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from rwhec_factors.batch import Linearization
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.poses import Array, to_pose3
@@ -50,8 +50,8 @@ class GeodesicModel:
                 carriers = candidates
         share = 1.0
         if options.robust == "gnc":  # of a chi-square with 6 degrees of freedom, cut at its quantile
-            cut = chi2.ppf(options.inlier_confidence, 6)
-            share = float(chi2.cdf(cut, 8) / options.inlier_confidence)
+            cut = chdtri(6, 1.0 - options.inlier_confidence)
+            share = float(chdtr(8, cut) / options.inlier_confidence)
         return GeodesicModel(data, variables, options, carriers, share)
 
     @property
@@ -175,7 +175,7 @@ class GeodesicModel:
         for (group, i), values in squares.items():
             all_squares = np.concatenate(values)
             spare = components.redundancy[group, COMPONENTS[i]] / (3.0 * len(all_squares))
-            ratios[group, i] = max(float(np.median(all_squares)) / float(chi2.ppf(0.5, 3)) / spare, SMALLEST)
+            ratios[group, i] = max(float(np.median(all_squares)) / float(chdtri(3, 0.5)) / spare, SMALLEST)
         return VarianceFactors(
             {
                 pair: (old[0] * ratios[group_of(pair, groups), 0], old[1] * ratios[group_of(pair, groups), 1])

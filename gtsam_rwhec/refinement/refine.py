@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -269,7 +270,7 @@ def _noise(model: Model, fit: _Fit, options: RefineOptions, estimates: bool) -> 
         if estimates:
             group = group_of(pair, options.noise_groups)
             spare = (fit.redundancy[group, "rotation"], fit.redundancy[group, "translation"])
-        result[pair] = PairNoise(rotation * np.sqrt(factors[0]), translation * np.sqrt(factors[1]), spare)
+        result[pair] = PairNoise(rotation * math.sqrt(factors[0]), translation * math.sqrt(factors[1]), spare)
     return result
 
 

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
+from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.errors import FrameError, OptionError
-from gtsam_rwhec.pose_covariances import relative_jacobian, standard_deviations
-from gtsam_rwhec.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.pose_covariances import error_of, relative_jacobian, standard_deviations
+from gtsam_rwhec.poses import Array, PoseLike
 from gtsam_rwhec.problem import ScaleMode
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
@@ -176,8 +175,8 @@ class Refined:
         if not 0.0 < confidence < 1.0:
             raise OptionError(f"confidence={confidence!r}; give one between 0 and 1")
         if np.isinf(self.degrees_of_freedom):
-            return float(chi2.ppf(confidence, dimension))
-        return float(dimension * f_distribution.ppf(confidence, dimension, self.degrees_of_freedom))
+            return float(chdtri(dimension, 1.0 - confidence))
+        return float(dimension * fdtri(dimension, self.degrees_of_freedom, confidence))
 
     def contains(self, name: str, T_carrier_frame: PoseLike, confidence: float = 0.95) -> bool:
         """Whether a pose is inside a frame's confidence ellipsoid.
@@ -190,8 +189,7 @@ class Refined:
         poses = self.X | self.Y
         if name not in poses:
             raise FrameError(f"there is no frame {name!r}; there are {', '.join(poses)}")
-        T = one_transform(T_carrier_frame, f"the pose of {name}")
-        xi = gtsam.Pose3.Logmap(poses[name].inverse().compose(gtsam.Pose3(T)))
+        xi = error_of(poses[name], T_carrier_frame)
         if name not in self.joint.slots:
             return bool(np.abs(xi).max() < 1e-9)
         return bool(xi @ self.information(name) @ xi <= self.squared_radius(6, confidence))

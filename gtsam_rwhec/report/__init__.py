@@ -5,4 +5,12 @@ from gtsam_rwhec.report.pose_table import sensor_table, target_table
 from gtsam_rwhec.report.sentences import certificate_sentence
 from gtsam_rwhec.report.solution_report import print_solution, report_console
 
-__all__ = ["PairGrid", "certificate_sentence", "print_solution", "report_console", "sensor_table", "target_table"]
+__all__ = [
+    "PairGrid",
+    "certificate_sentence",
+    "print_refined",
+    "print_solution",
+    "report_console",
+    "sensor_table",
+    "target_table",
+]

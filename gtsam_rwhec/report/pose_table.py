@@ -81,7 +81,7 @@ def _frame_table(title: str, kind: str, poses: Mapping[str, gtsam.Pose3], soluti
     for name in sorted(poses, key=natural_key):
         pooled = pooled_residual(residual for pair, residual in solution.residuals.items() if name in pair)
         scale = (f"{scales[name]:.5f}" if name in scales else "-",) if own_scales else ()
-        rows[name] = (*_pose_cells(poses[name]), *_residual_cells(pooled), *scale)
+        rows[name] = (*pose_cells(poses[name]), *_residual_cells(pooled), *scale)
     return FrameTable(title, kind, (*POSE_HEADINGS, *RESIDUAL_HEADINGS, *(("scale",) if own_scales else ())), rows)
 
 
@@ -99,7 +99,8 @@ def pooled_residual(residuals: Iterable[Residual]) -> Residual:
     return Residual(number, pool(r.translation_rms_m for r in residuals), pool(r.rotation_rms_rad for r in residuals))
 
 
-def _pose_cells(pose: gtsam.Pose3) -> tuple[str, ...]:
+def pose_cells(pose: gtsam.Pose3) -> tuple[str, ...]:
+    """x, y, z in metres; roll, pitch, yaw in degrees."""
     translation = (f"{value:z.4f}" for value in pose.translation())
     return *translation, *(f"{value:z.2f}" for value in np.degrees(pose.rotation().rpy()))
 

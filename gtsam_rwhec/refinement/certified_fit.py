@@ -1,0 +1,77 @@
+"""The certified optimum of re-weighted measurements, without what only a final answer needs (identifiability, words)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.certify.options import SolveOptions
+from gtsam_rwhec.certify.parts import Part, parts_of
+from gtsam_rwhec.certify.search import Found, Search
+from gtsam_rwhec.certify.variables import Answer, answer_of, rotations_as_variables
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.problem import Problem
+
+#: Above this many free frames a gap is left open on the way: the semidefinite relaxation would take most of the time,
+#: and only the last, full solution's certificate is claimed.
+FRAMES_RELAXED = 12
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Poses (4, 4) of the frames that had a measurement, metres, and alpha by pair; whether every part was certified.
+
+    A scale is as it was found, negative too: outliers may do that on the way.
+    """
+
+    poses: dict[str, Array]
+    alpha: dict[Pair, float]
+    certified: bool
+
+
+def certified_fit(problem: Problem, previous: Fit | None) -> Fit:
+    """The global optimum; from the previous poses where they lead to it, which the certificate tells.
+
+    Raises
+    ------
+    UnderdeterminedError
+        When the measurements that are left are too few.
+    """
+    poses: dict[str, Array] = {}
+    alpha: dict[Pair, float] = {}
+    certified = True
+    for part in parts_of(problem):
+        answer, closed = _solve(part, previous)
+        certified = certified and closed
+        for name, R, t in zip(part.free, answer.R, answer.t, strict=True):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = R, t + part.frame_shift(name)
+            poses[name] = T
+        poses |= {name: problem.fixed[name] for name in part.fixed}
+        own = dict(zip(part.free, answer.own_scale, strict=True))
+        for pair in part.pairs:
+            if part.scale == "per_target":
+                alpha[pair] = part.fixed_scales.get(pair[0], float(own.get(pair[0], np.nan)))
+            else:
+                alpha[pair] = answer.scale
+    return Fit(poses, alpha, certified)
+
+
+def _solve(part: Part, previous: Fit | None) -> tuple[Answer, bool]:
+    search = Search(part, SolveOptions(max_dense_frames=FRAMES_RELAXED))
+    found: Found | None = None
+    if previous is not None and all(name in previous.poses for name in part.free):
+        start = np.array([previous.poses[name][:3, :3] for name in part.free]).reshape(-1, 3, 3)
+        found = search.run("local", rotations_as_variables(part, start))
+    if found is None or not _is_closed(search, found):
+        again = search.run("auto", None)
+        if found is None or again.cost < found.cost:
+            found = again
+    found = search.with_positive_scale(found)
+    return answer_of(part, search.form, found.R), _is_closed(search, found)
+
+
+def _is_closed(search: Search, found: Found) -> bool:
+    return found.cost - found.lower <= search.tolerance(found.cost)

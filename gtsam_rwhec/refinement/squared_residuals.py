@@ -1,0 +1,140 @@
+"""Squared residuals of every raw measurement, in units of its noise: what tells inliers from outliers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.refinement.certified_fit import Fit
+
+
+class NoiseFactors(NamedTuple):
+    """Variances of the noise over those that the measurements state."""
+
+    rotation: float
+    translation: float
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Whitened squared residuals of N measurements: about chi-square with 3 degrees of freedom each, at the truth.
+
+    Attributes
+    ----------
+    rotation : (N,) array
+        kappa |R_A R_X - R_Y R_B|_F^2, which is 2 kappa theta^2 for a small angle; of full covariances, the rotation
+        block's. Infinite where a frame has no pose.
+    translation : (N,) array
+        |alpha (R_A t_X + t_A - t_Y) - R_Y t_B|^2 / sigma^2; or the block's.
+    error : (N, 6) array or None
+        [omega, v] of the residual in B's frame, where full covariances were given.
+    """
+
+    rotation: Array
+    translation: Array
+    error: Array | None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """All raw measurements of a problem, one after the other, pair by pair.
+
+    Attributes
+    ----------
+    pairs : tuple of (str, str)
+    rows : tuple of slice
+        Of each pair.
+    A, B : (N, 4, 4) arrays
+    sigma, kappa : (N,) arrays
+    whitening : (N, 6, 6) array or None
+        Inverse Cholesky factors of B's covariances, where full ones were given.
+    """
+
+    pairs: tuple[Pair, ...]
+    rows: tuple[slice, ...]
+    A: Array
+    B: Array
+    sigma: Array
+    kappa: Array
+    whitening: Array | None
+
+    @staticmethod
+    def of(problem: Problem) -> Measured:
+        """From a problem that kept its measurements."""
+        raw = [problem.measurements(*pair) for pair in problem.pairs]
+        ends = np.cumsum([0] + [len(one.A) for one in raw])
+        whitening = None
+        if problem.has_covariances:
+            covariances = np.concatenate([one.covariance_of_B() for one in raw])
+            whitening = np.linalg.inv(np.linalg.cholesky(covariances))
+        return Measured(
+            problem.pairs,
+            tuple(slice(int(first), int(end)) for first, end in zip(ends[:-1], ends[1:], strict=True)),
+            np.concatenate([one.A for one in raw]),
+            np.concatenate([one.B for one in raw]),
+            np.concatenate([one.sigma for one in raw]),
+            np.concatenate([one.kappa for one in raw]),
+            whitening,
+        )
+
+    def by_pair(self, values: np.ndarray) -> dict[Pair, np.ndarray]:
+        """(N,) values, pair by pair."""
+        return {pair: values[rows] for pair, rows in zip(self.pairs, self.rows, strict=True)}
+
+    def squares(self, fit: Fit) -> Squares:
+        """At an answer."""
+        R = np.empty((len(self.A), 3, 3))
+        t = np.empty((len(self.A), 3))
+        R_Y = np.empty((len(self.A), 3, 3))
+        known = np.ones(len(self.A), dtype=bool)
+        for (target, sensor), rows in zip(self.pairs, self.rows, strict=True):
+            if target not in fit.poses or sensor not in fit.poses:
+                known[rows] = False
+                R[rows] = R_Y[rows] = np.eye(3)
+                t[rows] = 0.0
+                continue
+            X, Y = fit.poses[target], fit.poses[sensor]
+            A, B = self.A[rows], self.B[rows]
+            R[rows] = A[:, :3, :3] @ X[:3, :3]
+            R_Y[rows] = Y[:3, :3]
+            t[rows] = fit.alpha[target, sensor] * (A[:, :3, :3] @ X[:3, 3] + A[:, :3, 3] - Y[:3, 3])
+            t[rows] -= B[:, :3, 3] @ Y[:3, :3].T
+        if self.whitening is None:
+            chord = R - R_Y @ self.B[:, :3, :3]
+            rotation = self.kappa * np.einsum("nij,nij->n", chord, chord)
+            translation = np.einsum("ni,ni->n", t, t) / self.sigma**2
+            error = None
+        else:
+            seen = self.B[:, :3, :3].transpose(0, 2, 1) @ R_Y.transpose(0, 2, 1)  # to the axes of the measured target
+            error = np.concatenate(
+                [Rotation.from_matrix(seen @ R).as_rotvec(), np.einsum("nij,nj->ni", seen, t)], axis=1
+            )
+            rotation = _block_square(self.whitening, error, slice(0, 3))
+            translation = _block_square(self.whitening, error, slice(3, 6))
+            error[~known] = np.inf
+        return Squares(np.where(known, rotation, np.inf), np.where(known, translation, np.inf), error)
+
+    def together(self, squares: Squares, factors: NoiseFactors) -> Array:
+        """(N,) both together, about chi-square with 6 degrees of freedom at the truth."""
+        if squares.error is None or self.whitening is None:
+            return squares.rotation / factors.rotation + squares.translation / factors.translation
+        known = np.isfinite(squares.rotation)
+        scaled = squares.error[known] / np.sqrt(np.repeat(factors, 3))
+        result = np.full(len(known), np.inf)
+        white = np.einsum("nij,nj->ni", self.whitening[known], scaled)
+        result[known] = np.einsum("ni,ni->n", white, white)
+        return result
+
+
+def _block_square(whitening: Array, error: Array, block: slice) -> Array:
+    """e' C^-1 e of one block of the covariance alone: C = (L^-1)^-1 (L^-1)^-T."""
+    root = np.linalg.inv(whitening)[:, block]
+    covariance = root @ root.transpose(0, 2, 1)
+    square: Array = np.einsum("ni,ni->n", error[:, block], np.linalg.solve(covariance, error[:, block, None])[..., 0])
+    return square
