@@ -43,6 +43,10 @@ class MeasurementsNotKeptError(RwhecError):
     """Raw measurements are asked for and the problem was told not to keep them."""
 
 
+class OutlierError(RwhecError):
+    """Too few measurements agree with one another for any answer."""
+
+
 class FileFormatError(RwhecError):
     """A file that cannot be read as what it should be; the message has the file and the line or field."""
 
@@ -73,6 +77,10 @@ class NotCertifiedWarning(RwhecWarning):
 
 class WeightsWarning(RwhecWarning):
     """Residuals far beyond what the stated weights predict."""
+
+
+class OutliersWarning(RwhecWarning):
+    """Less than half of a frame's measurements, or of all, agree with the rest."""
 
 
 class RotationsProjectedWarning(RwhecWarning):

@@ -1,4 +1,4 @@
-"""The certified optimum of re-weighted measurements, without what only a final answer needs (identifiability, words)."""
+"""The certified optimum of re-weighted measurements, without what only a final answer needs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify.options import SolveOptions
 from gtsam_rwhec.certify.parts import Part, parts_of
 from gtsam_rwhec.certify.search import Found, Search
@@ -21,13 +20,13 @@ FRAMES_RELAXED = 12
 
 @dataclass(frozen=True)
 class Fit:
-    """Poses (4, 4) of the frames that had a measurement, metres, and alpha by pair; whether every part was certified.
+    """Poses (4, 4) of the frames that had a measurement, metres; alpha by target (or mover); whether all was certified.
 
     A scale is as it was found, negative too: outliers may do that on the way.
     """
 
     poses: dict[str, Array]
-    alpha: dict[Pair, float]
+    alpha: dict[str, float]
     certified: bool
 
 
@@ -40,7 +39,7 @@ def certified_fit(problem: Problem, previous: Fit | None) -> Fit:
         When the measurements that are left are too few.
     """
     poses: dict[str, Array] = {}
-    alpha: dict[Pair, float] = {}
+    alpha: dict[str, float] = {}
     certified = True
     for part in parts_of(problem):
         answer, closed = _solve(part, previous)
@@ -50,12 +49,9 @@ def certified_fit(problem: Problem, previous: Fit | None) -> Fit:
             T[:3, :3], T[:3, 3] = R, t + part.frame_shift(name)
             poses[name] = T
         poses |= {name: problem.fixed[name] for name in part.fixed}
+        alpha |= dict.fromkeys(part.names, answer.scale if part.scale != "per_target" else 1.0)
         own = dict(zip(part.free, answer.own_scale, strict=True))
-        for pair in part.pairs:
-            if part.scale == "per_target":
-                alpha[pair] = part.fixed_scales.get(pair[0], float(own.get(pair[0], np.nan)))
-            else:
-                alpha[pair] = answer.scale
+        alpha |= part.fixed_scales | {name: float(own[name]) for name in part.scale_owners}
     return Fit(poses, alpha, certified)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +55,8 @@ class Measured:
     sigma, kappa : (N,) arrays
     whitening : (N, 6, 6) array or None
         Inverse Cholesky factors of B's covariances, where full ones were given.
+    whitening_of_translation : (N, 3, 3) array or None
+        The same of the translation's block alone.
     """
 
     pairs: tuple[Pair, ...]
@@ -63,25 +66,48 @@ class Measured:
     sigma: Array
     kappa: Array
     whitening: Array | None
+    whitening_of_translation: Array | None
 
     @staticmethod
     def of(problem: Problem) -> Measured:
         """From a problem that kept its measurements."""
         raw = [problem.measurements(*pair) for pair in problem.pairs]
         ends = np.cumsum([0] + [len(one.A) for one in raw])
-        whitening = None
+        whitening = whitening_of_translation = None
         if problem.has_covariances:
             covariances = np.concatenate([one.covariance_of_B() for one in raw])
             whitening = np.linalg.inv(np.linalg.cholesky(covariances))
+            whitening_of_translation = np.linalg.inv(np.linalg.cholesky(covariances[:, 3:, 3:]))
         return Measured(
             problem.pairs,
-            tuple(slice(int(first), int(end)) for first, end in zip(ends[:-1], ends[1:], strict=True)),
+            tuple(slice(int(first), int(end)) for first, end in pairwise(ends)),
             np.concatenate([one.A for one in raw]),
             np.concatenate([one.B for one in raw]),
             np.concatenate([one.sigma for one in raw]),
             np.concatenate([one.kappa for one in raw]),
             whitening,
+            whitening_of_translation,
         )
+
+    def of_pairs(self, pairs: list[Pair]) -> Measured:
+        """Those of some pairs alone, in their order."""
+        rows = [self.rows[self.pairs.index(pair)] for pair in pairs]
+        index = np.concatenate([np.arange(one.start, one.stop) for one in rows]) if rows else np.zeros(0, dtype=int)
+        ends = np.cumsum([0] + [one.stop - one.start for one in rows])
+        return Measured(
+            tuple(pairs),
+            tuple(slice(int(first), int(end)) for first, end in pairwise(ends)),
+            self.A[index],
+            self.B[index],
+            self.sigma[index],
+            self.kappa[index],
+            None if self.whitening is None else self.whitening[index],
+            None if self.whitening_of_translation is None else self.whitening_of_translation[index],
+        )
+
+    def pair_of(self, index: int) -> Pair:
+        """The pair of a measurement."""
+        return next(pair for pair, rows in zip(self.pairs, self.rows, strict=True) if index < rows.stop)
 
     def by_pair(self, values: np.ndarray) -> dict[Pair, np.ndarray]:
         """(N,) values, pair by pair."""
@@ -103,9 +129,9 @@ class Measured:
             A, B = self.A[rows], self.B[rows]
             R[rows] = A[:, :3, :3] @ X[:3, :3]
             R_Y[rows] = Y[:3, :3]
-            t[rows] = fit.alpha[target, sensor] * (A[:, :3, :3] @ X[:3, 3] + A[:, :3, 3] - Y[:3, 3])
+            t[rows] = fit.alpha[target] * (A[:, :3, :3] @ X[:3, 3] + A[:, :3, 3] - Y[:3, 3])
             t[rows] -= B[:, :3, 3] @ Y[:3, :3].T
-        if self.whitening is None:
+        if self.whitening is None or self.whitening_of_translation is None:
             chord = R - R_Y @ self.B[:, :3, :3]
             rotation = self.kappa * np.einsum("nij,nij->n", chord, chord)
             translation = np.einsum("ni,ni->n", t, t) / self.sigma**2
@@ -115,8 +141,8 @@ class Measured:
             error = np.concatenate(
                 [Rotation.from_matrix(seen @ R).as_rotvec(), np.einsum("nij,nj->ni", seen, t)], axis=1
             )
-            rotation = _block_square(self.whitening, error, slice(0, 3))
-            translation = _block_square(self.whitening, error, slice(3, 6))
+            rotation = _norms(self.whitening[:, :3, :3], error[:, :3])  # L is lower triangular: the block's own
+            translation = _norms(self.whitening_of_translation, error[:, 3:])
             error[~known] = np.inf
         return Squares(np.where(known, rotation, np.inf), np.where(known, translation, np.inf), error)
 
@@ -127,14 +153,11 @@ class Measured:
         known = np.isfinite(squares.rotation)
         scaled = squares.error[known] / np.sqrt(np.repeat(factors, 3))
         result = np.full(len(known), np.inf)
-        white = np.einsum("nij,nj->ni", self.whitening[known], scaled)
-        result[known] = np.einsum("ni,ni->n", white, white)
+        result[known] = _norms(self.whitening[known], scaled)
         return result
 
 
-def _block_square(whitening: Array, error: Array, block: slice) -> Array:
-    """e' C^-1 e of one block of the covariance alone: C = (L^-1)^-1 (L^-1)^-T."""
-    root = np.linalg.inv(whitening)[:, block]
-    covariance = root @ root.transpose(0, 2, 1)
-    square: Array = np.einsum("ni,ni->n", error[:, block], np.linalg.solve(covariance, error[:, block, None])[..., 0])
+def _norms(whitening: Array, error: Array) -> Array:
+    white = np.einsum("nij,nj->ni", whitening, error)
+    square: Array = np.einsum("ni,ni->n", white, white)
     return square
