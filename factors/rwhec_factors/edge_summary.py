@@ -1,0 +1,237 @@
+"""All measurements of a pair in one factor of at most 25 rows, exactly: the certified cost as it is (DESIGN fact 2).
+
+Over x = [s (t_X - c), s (t_Y - a), s, vec R_X, vec R_Y] (scale s; origins c of the target's and a of the sensor's
+carrier; vec stacks columns) the chordal cost of any number of measurements is one quadratic form x' Q x (RWHEC paper,
+eqs. 24-42). With 2 Q = L' L, the residual L x has the same cost 1/2 |L x|^2, gradient and Gauss-Newton Hessian as all
+of them together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rwhec_factors.se3 import Array, hat
+from rwhec_factors.values import number_of, pose_of
+
+#: Measurements summed at once.
+BLOCK = 4096
+#: Eigenvalues of Q below this, of the largest after scaling, are its rounding: they make no row.
+ROUNDING = 1e-15
+
+T_X, T_Y, SCALE, R_X, R_Y = slice(0, 3), slice(3, 6), 6, slice(7, 16), slice(16, 25)
+
+
+@dataclass(frozen=True)
+class EdgeSummary:
+    """A pair's measurements as one quadratic form. Additive: ``a + b`` holds both, about one origin.
+
+    Attributes
+    ----------
+    form : (25, 25) array
+        Q: x' Q x is the cost 1/2 sum (kappa |R_A R_X - R_Y R_B|_F^2
+        + |s (R_A t_X + t_A - t_Y) - R_Y t_B|^2 / sigma^2).
+    count : int
+        Number of measurements.
+    target_origin, sensor_origin : (3,) arrays
+        c and a, in metres: t_X and t_Y are referred to them, or a world far away would take the form's digits.
+    """
+
+    form: Array
+    count: int
+    target_origin: Array = field(default_factory=lambda: np.zeros(3))
+    sensor_origin: Array = field(default_factory=lambda: np.zeros(3))
+
+    @staticmethod
+    def of(
+        A: ArrayLike,
+        B: ArrayLike,
+        sigma: ArrayLike,
+        kappa: ArrayLike,
+        *,
+        target_origin: ArrayLike = (0.0, 0.0, 0.0),
+        sensor_origin: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> EdgeSummary:
+        """Summarise measurements A X = Y B.
+
+        Parameters
+        ----------
+        A, B : (N, 4, 4) arrays
+            T_sensorcarrier_targetcarrier and T_sensor_target; metres (B's times the scale).
+        sigma, kappa : float or (N,)
+            Standard deviation of B's translation, m an axis; concentration of its rotation, 1 / (2 s^2) for s rad an
+            axis.
+        target_origin, sensor_origin : (3,), optional
+            A point in each carrier near which the poses are.
+
+        Raises
+        ------
+        ValueError
+            For arrays that do not go together, or weights that are not positive and finite.
+        """
+        A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
+        if A.ndim != 3 or A.shape[1:] != (4, 4) or A.shape != B.shape or len(A) == 0:
+            raise ValueError(f"A has shape {A.shape} and B {B.shape}; both must be (N, 4, 4) with one N of at least 1")
+        if not (np.isfinite(A).all() and np.isfinite(B).all()):
+            raise ValueError("A or B has entries that are NaN or infinite; leave these measurements out")
+        weights = []
+        for name, value in (("sigma", sigma), ("kappa", kappa)):
+            weight = np.asarray(value, dtype=np.float64)
+            if weight.shape not in ((), (len(A),)):
+                raise ValueError(f"{name} has shape {weight.shape}; give one number, or one for each of {len(A)}")
+            if not (np.isfinite(weight).all() and (weight > 0.0).all()):
+                raise ValueError(f"{name} is {value!r}; it must be positive and finite")
+            weights.append(np.broadcast_to(weight, len(A)))
+        c, a = np.asarray(target_origin, dtype=np.float64), np.asarray(sensor_origin, dtype=np.float64)
+        form = np.zeros((25, 25))
+        for first in range(0, len(A), BLOCK):
+            part = slice(first, first + BLOCK)
+            rows = _rows(A[part], B[part], 1.0 / weights[0][part], np.sqrt(weights[1][part]), c, a)
+            form += 0.5 * rows.T @ rows
+        return EdgeSummary(form, len(A), c, a)
+
+    def about(self, target_origin: Array, sensor_origin: Array) -> EdgeSummary:
+        """The same about other origins, exactly in formula (far ones cost digits)."""
+        shift = np.eye(25)
+        shift[T_X, SCALE] = target_origin - self.target_origin
+        shift[T_Y, SCALE] = sensor_origin - self.sensor_origin
+        return EdgeSummary(shift.T @ self.form @ shift, self.count, target_origin, sensor_origin)
+
+    def __add__(self, other: EdgeSummary) -> EdgeSummary:
+        if not isinstance(other, EdgeSummary):
+            return NotImplemented
+        moved = other.about(self.target_origin, self.sensor_origin)
+        return EdgeSummary(
+            self.form + moved.form, self.count + other.count, self.target_origin, self.sensor_origin
+        )
+
+
+def _rows(A: Array, B: Array, root_weight: Array, root_kappa: Array, c: Array, a: Array) -> Array:
+    """(12 N, 25) whitened rows: M_R (eq. 25) and M_t (eq. 30), about the origins."""
+    count = len(A)
+    R_A, R_B, t_B = A[:, :3, :3], B[:, :3, :3], B[:, :3, 3]
+    t_A = A[:, :3, 3] + R_A @ c - a
+    I3 = np.eye(3)
+    M = np.zeros((count, 4, 3, 25))  # three columns of the rotation residual, then the translation residual
+    for j in range(3):  # column j: R_A R_X e_j - R_Y R_B e_j
+        M[:, j, :, 7 + 3 * j : 10 + 3 * j] = R_A
+        M[:, j, :, R_Y] = -np.einsum("nk,il->nikl", R_B[:, :, j], I3).reshape(count, 3, 9)
+    M[:, :3] *= root_kappa[:, None, None, None]
+    M[:, 3, :, T_X], M[:, 3, :, T_Y], M[:, 3, :, SCALE] = R_A, -I3, t_A
+    M[:, 3, :, R_Y] = -np.einsum("nk,il->nikl", t_B, I3).reshape(count, 3, 9)
+    M[:, 3] *= root_weight[:, None, None]
+    return M.reshape(12 * count, 25)
+
+
+def square_root(form: Array) -> Array:
+    """L (r, 25), r <= 25, with L' L = 2 Q.
+
+    Scaled to a unit diagonal first: translations' and rotations' weights may be orders of magnitude apart.
+
+    Raises
+    ------
+    ValueError
+        For a form that is not finite, or not positive semidefinite but for rounding.
+    """
+    form = np.asarray(form, dtype=np.float64)
+    if form.shape != (25, 25) or not np.isfinite(form).all():
+        raise ValueError(f"the form has shape {form.shape}, or entries that are no numbers; it is 25 x 25 and finite")
+    doubled = form + form.T
+    diagonal = np.diagonal(doubled)
+    size = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(doubled / size[:, None] / size)
+    largest = values[-1]
+    if values[0] < -1e-9 * max(largest, 1e-300):
+        raise ValueError(f"the form is not positive semidefinite (eigenvalue {values[0]:.3g} after scaling)")
+    kept = values > ROUNDING * largest
+    root: Array = (np.sqrt(values[kept]) * vectors[:, kept]).T * size
+    return root
+
+
+def edge_summary_factor(
+    target_key: int, sensor_key: int, summary: EdgeSummary, *, scale_key: int | None = None
+) -> gtsam.CustomFactor:
+    """All measurements of a target by a sensor as one factor, with the chordal residual of the certified cost.
+
+    Parameters
+    ----------
+    target_key, sensor_key : int
+        Keys of X = T_targetcarrier_target and Y = T_sensorcarrier_sensor, Pose3, true metres.
+    summary : EdgeSummary
+    scale_key : int, optional
+        Key of a 1-vector: t_B = scale * (true length); 1 when left out.
+
+    Returns
+    -------
+    gtsam.CustomFactor
+        At most 25 rows, unit noise; its weights are in the summary. Robust losses weigh measurements, so they cannot
+        be put on it: take single factors, or re-weight and summarise anew.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For equal keys, or what is no summary.
+    """
+    if target_key == sensor_key:
+        raise ValueError(
+            f"target and sensor have one key, {gtsam.DefaultKeyFormatter(target_key)}; for A Y = Y B of one sensor's "
+            "motions take hand_eye_summary_factor"
+        )
+    return _summary_factor([target_key, sensor_key], summary, scale_key)
+
+
+def hand_eye_summary_factor(
+    sensor_key: int, summary: EdgeSummary, *, scale_key: int | None = None
+) -> gtsam.CustomFactor:
+    """All motions of one sensor, A Y = Y B (AX = XB), as one factor; A and B both T_before_after.
+
+    Parameters, result and errors as of ``edge_summary_factor``, with Y in both places; the summary's origins are equal.
+    """
+    if isinstance(summary, EdgeSummary) and not np.array_equal(summary.target_origin, summary.sensor_origin):
+        summary = summary.about(summary.sensor_origin, summary.sensor_origin)
+    return _summary_factor([sensor_key], summary, scale_key)
+
+
+def _summary_factor(ends: list[int], summary: EdgeSummary, scale_key: int | None) -> gtsam.CustomFactor:
+    if not isinstance(summary, EdgeSummary):
+        raise TypeError(f"the summary is a {type(summary).__name__}; give EdgeSummary.of(A, B, sigma, kappa)")
+    keys = ends + ([] if scale_key is None else [scale_key])
+    if len(set(keys)) != len(keys):
+        raise ValueError(f"the scale has a pose's key, {gtsam.DefaultKeyFormatter(keys[-1])}; give it one of its own")
+    L = square_root(summary.form)
+    origins = (summary.target_origin, summary.sensor_origin)
+    names = ("X = T_targetcarrier_target", "Y = T_sensorcarrier_sensor")
+    first_of = ((T_X, R_X), (T_Y, R_Y))
+    if len(ends) == 1:
+        names = (names[1], names[1])
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Any] | None) -> Array:
+        poses = [pose_of(values, key, name) for key, name in zip((ends[0], ends[-1]), names, strict=True)]
+        scale = 1.0 if scale_key is None else number_of(values, scale_key, "the scale")
+        x = np.empty(25)
+        x[SCALE] = scale
+        for pose, origin, (t, R) in zip(poses, origins, first_of, strict=True):
+            x[t] = scale * (pose.translation() - origin)
+            x[R] = pose.rotation().matrix().ravel(order="F")
+        if jacobians is not None:
+            blocks = []
+            for pose, (t, R) in zip(poses, first_of, strict=True):
+                R_pose = pose.rotation().matrix()
+                columns = L[:, R].reshape(-1, 3, 3)  # [row, j]: what multiplies column j of R
+                turned = np.einsum("rji,jik->rk", columns, -R_pose @ hat(np.eye(3)))  # d (R e_j) = -R hat(e_j) omega
+                blocks.append(np.hstack([turned, scale * L[:, t] @ R_pose]))
+            if len(ends) == 1:
+                blocks = [blocks[0] + blocks[1]]
+            for i, block in enumerate(blocks):
+                jacobians[i] = np.asfortranarray(block)
+            if scale_key is not None:  # x's first seven entries are scale times something
+                metres = np.r_[poses[0].translation() - origins[0], poses[1].translation() - origins[1], 1.0]
+                jacobians[len(blocks)] = np.asfortranarray((L[:, :7] @ metres)[:, None])
+        residual: Array = L @ x
+        return residual
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(L)), keys, error)

@@ -1,0 +1,146 @@
+"""SE(3) for many poses at once: what GTSAM's Pose3 does for one. Poses (N, 4, 4); tangents (N, 6), [omega, v].
+
+Equations: Barfoot, State Estimation for Robotics (2024), Chapter 8; its rotation-second order turned into GTSAM's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Below this angle (rad) series are taken in place of quotients whose numerators cancel.
+SMALL = 1e-2
+#: Above this one the rotation's axis is taken from its symmetric part: the antisymmetric one vanishes at pi.
+LARGE = 3.0
+
+
+def hat(v: Array) -> Array:
+    """(N, 3, 3) with hat(v) w = v x w."""
+    x, y, z = np.moveaxis(v, -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3)
+
+
+def inverse(T: Array) -> Array:
+    """T_b_a from T_a_b."""
+    Rt = T[:, :3, :3].transpose(0, 2, 1)
+    result = np.zeros_like(T)
+    result[:, :3, :3] = Rt
+    result[:, :3, 3] = -np.einsum("nij,nj->ni", Rt, T[:, :3, 3])
+    result[:, 3, 3] = 1.0
+    return result
+
+
+def adjoint(T: Array) -> Array:
+    """(N, 6, 6): T Expmap(xi) T^-1 = Expmap(adjoint(T) xi)."""
+    result = np.zeros((len(T), 6, 6))
+    R = T[:, :3, :3]
+    result[:, :3, :3] = result[:, 3:, 3:] = R
+    result[:, 3:, :3] = hat(T[:, :3, 3]) @ R
+    return result
+
+
+def so3_logmap(R: Array) -> Array:
+    """(N, 3) rotation vectors of (N, 3, 3) rotations, angles in [0, pi], accurate near 0 and near pi."""
+    half = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=-1)
+    sine = np.linalg.norm(half, axis=1)
+    cosine = 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0)
+    angle = np.arctan2(sine, cosine)
+    small = sine < 1e-7
+    scale = np.where(small, 1.0 + angle**2 / 6.0, angle / np.where(small, 1.0, sine))
+    omega: Array = scale[:, None] * half
+    for n in np.flatnonzero(angle > LARGE):
+        # R + R' = 2 cos I + 2 (1 - cos) a a': the axis from the largest column, its sign from the sine's side.
+        outer = 0.5 * (R[n] + R[n].T) - np.cos(angle[n]) * np.eye(3)
+        axis = outer[:, int(np.argmax(np.diagonal(outer)))]
+        axis = axis / np.linalg.norm(axis)
+        omega[n] = angle[n] * (axis if axis @ half[n] >= 0.0 else -axis)
+    return omega
+
+
+def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
+    """(1 - cos) / angle^2, (angle - sin) / angle^3, and the square's coefficient of the left Jacobian's inverse."""
+    small = angle < SMALL
+    t = np.where(small, 1.0, angle)
+    t2 = angle * angle
+    b = np.where(small, 0.5 - t2 / 24.0 + t2 * t2 / 720.0, (1.0 - np.cos(t)) / t**2)
+    c = np.where(small, 1.0 / 6.0 - t2 / 120.0 + t2 * t2 / 5040.0, (t - np.sin(t)) / t**3)
+    cot = (1.0 - 0.5 * t * np.cos(0.5 * t) / np.sin(0.5 * t)) / t**2
+    d = np.where(small, 1.0 / 12.0 + t2 / 720.0 + t2 * t2 / 30240.0, cot)
+    return b, c, d
+
+
+def so3_left_jacobian_inverse(omega: Array) -> Array:
+    """(N, 3, 3): I - hat/2 + d hat^2."""
+    W = hat(omega)
+    _, _, d = _coefficients(np.linalg.norm(omega, axis=1))
+    result: Array = np.eye(3) - 0.5 * W + d[:, None, None] * (W @ W)
+    return result
+
+
+def expmap(xi: Array) -> Array:
+    """(N, 4, 4) poses of tangents (N, 6)."""
+    omega = xi[:, :3]
+    W = hat(omega)
+    W2 = W @ W
+    angle = np.linalg.norm(omega, axis=1)
+    b, c, _ = _coefficients(angle)
+    a = np.sinc(angle / np.pi)
+    result = np.zeros((len(xi), 4, 4))
+    result[:, :3, :3] = np.eye(3) + a[:, None, None] * W + b[:, None, None] * W2
+    left_jacobian = np.eye(3) + b[:, None, None] * W + c[:, None, None] * W2
+    result[:, :3, 3] = np.einsum("nij,nj->ni", left_jacobian, xi[:, 3:])
+    result[:, 3, 3] = 1.0
+    return result
+
+
+def logmap(T: Array) -> Array:
+    """(N, 6) tangents of poses (N, 4, 4): T = Expmap(xi), angles in [0, pi]."""
+    omega = so3_logmap(T[:, :3, :3])
+    v = np.einsum("nij,nj->ni", so3_left_jacobian_inverse(omega), T[:, :3, 3])
+    return np.concatenate([omega, v], axis=1)
+
+
+def right_jacobian_inverse(xi: Array) -> Array:
+    """(N, 6, 6): Log(Expmap(xi) Expmap(d)) = xi + result d to first order in d.
+
+    The right Jacobian is the left one at -xi; its inverse is [[J, 0], [-J Q J, J]] with J the SO(3) left Jacobian's
+    inverse at -omega and Q the coupling of translation with rotation (Barfoot eq. 8.91, in GTSAM's order).
+    """
+    omega, v = -xi[:, :3], -xi[:, 3:]
+    J = so3_left_jacobian_inverse(omega)
+    result = np.zeros((len(xi), 6, 6))
+    result[:, :3, :3] = result[:, 3:, 3:] = J
+    result[:, 3:, :3] = -J @ _coupling(omega, v) @ J
+    return result
+
+
+def _coupling(omega: Array, v: Array) -> Array:
+    """Q(omega, v) of the SE(3) left Jacobian (Barfoot eq. 8.91b), (N, 3, 3)."""
+    W, V = hat(omega), hat(v)
+    WV, VW = W @ V, V @ W
+    WVW = WV @ W
+    t = np.linalg.norm(omega, axis=1)
+    small = t < 0.1  # fourth-order differences cancel earlier
+    s = np.where(small, 1.0, t)
+    t2 = t * t
+    q1 = np.where(
+        small, 1.0 / 6.0 - t2 / 120.0 * (1.0 - t2 / 42.0 * (1.0 - t2 / 72.0)), (s - np.sin(s)) / s**3
+    )
+    q2 = np.where(
+        small,
+        1.0 / 24.0 - t2 / 720.0 * (1.0 - t2 / 56.0 * (1.0 - t2 / 90.0)),
+        (s**2 + 2.0 * np.cos(s) - 2.0) / (2.0 * s**4),
+    )
+    q3 = np.where(
+        small,
+        1.0 / 120.0 - t2 / 2520.0 * (1.0 - t2 / 48.0 * (1.0 - t2 / 82.5)),
+        (2.0 * s - 3.0 * np.sin(s) + s * np.cos(s)) / (2.0 * s**5),
+    )
+    c1, c2, c3 = (q[:, None, None] for q in (q1, q2, q3))
+    result: Array = (
+        0.5 * V + c1 * (WV + VW + WVW) + c2 * (W @ WV + VW @ W - 3.0 * WVW) + c3 * (WVW @ W + W @ WVW)
+    )
+    return result
