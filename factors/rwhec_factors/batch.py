@@ -67,9 +67,7 @@ class BatchResiduals:
         if self.residual == "chordal":  # Y stands outside the prediction too: the residual is turned by R_Y
             sensor = sensor + self._chordal_turning(value, Y)
         carrier = by_predicted @ by_carrier
-        offset = (
-            np.zeros_like(value) if self.twists is None else np.einsum("nmi,ni->nm", carrier, self.twists)
-        )
+        offset = np.zeros_like(value) if self.twists is None else np.einsum("nmi,ni->nm", carrier, self.twists)
         return Linearization(value, target, sensor, by_scale, offset, carrier)
 
     def residuals(self, X: Array, Y: Array, scale: float = 1.0, offset_s: float = 0.0) -> Array:

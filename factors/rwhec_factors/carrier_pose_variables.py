@@ -71,7 +71,7 @@ def pose_robot_world_hand_eye_factor(
         if not wanted:
             return Prediction(predicted, Y, [])
         by_sensor = -predicted.inverse().AdjointMap()
-        # P Expmap(d) moves the prediction by Ad(X^-1) d; its inverse by what Y does, seen from P: -Ad(predicted^-1 Y^-1) d.
+        # A Expmap(d) moves the prediction by Ad(X^-1) d; P = A^-1 moves it as Y does, seen from P.
         by_pose = by_sensor @ Y.inverse().AdjointMap() if inverted else X.inverse().AdjointMap()
         return Prediction(predicted, Y, [by_pose, np.eye(6), by_sensor])
 

@@ -105,9 +105,7 @@ class EdgeSummary:
         if not isinstance(other, EdgeSummary):
             return NotImplemented
         moved = other.about(self.target_origin, self.sensor_origin)
-        return EdgeSummary(
-            self.form + moved.form, self.count + other.count, self.target_origin, self.sensor_origin
-        )
+        return EdgeSummary(self.form + moved.form, self.count + other.count, self.target_origin, self.sensor_origin)
 
 
 def _rows(A: Array, B: Array, root_weight: Array, root_kappa: Array, c: Array, a: Array) -> Array:

@@ -64,7 +64,7 @@ def pose_hand_eye_factor(
     scale_key: int | None = None,
     residual: Residual = "geodesic",
 ) -> gtsam.CustomFactor:
-    """A sensor's motion between two poses of its carrier that are variables: odometry of a sensor off the robot's frame.
+    """A sensor's motion between two poses of its carrier that are variables: odometry of a sensor off its frame.
 
     P_i = T_world_carrier before and P_j after: A = P_i^-1 P_j; the residual is that of ``hand_eye_factor`` at A.
 

@@ -44,7 +44,7 @@ def robot_world_hand_eye_factor(
         T_sensor_target, measured; metres.
     noise : gtsam.noiseModel.Base
         Of B's right perturbation, dimension 6, rotation (rad) first; robust ones too. For the chordal residual
-        isotropic in rotation and in translation: Diagonal.Sigmas of [r, r, r, t, t, t] is kappa = 1 / (2 r^2), sigma = t.
+        isotropic in each: Diagonal.Sigmas of [r, r, r, t, t, t] is kappa = 1 / (2 r^2), sigma = t.
     residual : "geodesic" or "chordal"
     time_offset_key : int, optional
         Key of a 1-vector d in seconds, the last key: B's stamp t is the carriers' t + d, A(t + d) = A Expmap(d twist).

@@ -126,9 +126,7 @@ def _coupling(omega: Array, v: Array) -> Array:
     small = t < 0.1  # fourth-order differences cancel earlier
     s = np.where(small, 1.0, t)
     t2 = t * t
-    q1 = np.where(
-        small, 1.0 / 6.0 - t2 / 120.0 * (1.0 - t2 / 42.0 * (1.0 - t2 / 72.0)), (s - np.sin(s)) / s**3
-    )
+    q1 = np.where(small, 1.0 / 6.0 - t2 / 120.0 * (1.0 - t2 / 42.0 * (1.0 - t2 / 72.0)), (s - np.sin(s)) / s**3)
     q2 = np.where(
         small,
         1.0 / 24.0 - t2 / 720.0 * (1.0 - t2 / 56.0 * (1.0 - t2 / 90.0)),
@@ -140,7 +138,5 @@ def _coupling(omega: Array, v: Array) -> Array:
         (2.0 * s - 3.0 * np.sin(s) + s * np.cos(s)) / (2.0 * s**5),
     )
     c1, c2, c3 = (q[:, None, None] for q in (q1, q2, q3))
-    result: Array = (
-        0.5 * V + c1 * (WV + VW + WVW) + c2 * (W @ WV + VW @ W - 3.0 * WVW) + c3 * (WVW @ W + W @ WVW)
-    )
+    result: Array = 0.5 * V + c1 * (WV + VW + WVW) + c2 * (W @ WV + VW @ W - 3.0 * WVW) + c3 * (WVW @ W + W @ WVW)
     return result

@@ -14,7 +14,7 @@ from gtsam_rwhec.poses import Array, to_pose3
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import NoiseGroups, RefineOptions, Robust
-from gtsam_rwhec.refinement.pair_data import PairData
+from gtsam_rwhec.refinement.pair_data import PairData, check_carriers
 from gtsam_rwhec.refinement.variables import State, Variables, carrier_key
 from gtsam_rwhec.refinement.variance_components import SMALLEST, VarianceComponents, from_measurements
 from gtsam_rwhec.refinement.weighting import (
@@ -43,6 +43,7 @@ class GeodesicModel:
     @staticmethod
     def of(data: list[PairData], variables: Variables, options: RefineOptions) -> GeodesicModel:
         """Decide whether carrier poses are variables."""
+        check_carriers(data, options)
         carriers = None
         if options.carrier_noise is not None and options.carrier_model != "propagated" and not options.time_offsets:
             candidates = graphs.CarrierVariables.of(data)

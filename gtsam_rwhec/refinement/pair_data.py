@@ -108,7 +108,7 @@ def carrier_covariances(noise: CarrierNoise, pair: Pair, A: Array) -> Array:
     return turned
 
 
-def check_carrier_is_still(data: list[PairData], options: RefineOptions) -> None:
+def check_carriers(data: list[PairData], options: RefineOptions) -> None:
     """Motions' A's are differences of poses, whose noise is not that of one pose: refused as variables.
 
     Raises

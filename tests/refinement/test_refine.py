@@ -1,0 +1,283 @@
+"""refine: against the certified solution, against the truth, and against itself in other words."""
+
+from __future__ import annotations
+
+import warnings
+
+import gtsam
+import numpy as np
+import pytest
+from refinement_problems import KAPPA, SIGMA_M, SIGMA_RAD, copied, distance, refined, rig
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.simulate import Noise, general
+
+
+@pytest.mark.parametrize("scale", ["known", "shared"])
+def test_chordal_optimum_is_the_certified_one(scale: str) -> None:
+    simulation = rig(3, 2, scale=scale)
+    solution = rw.solve(simulation.problem)
+    r = rw.refine(simulation.problem, solution, rw.RefineOptions(residual="chordal"))
+    assert distance(r, solution) < 1e-8
+    assert r.cost == pytest.approx(solution.cost, rel=1e-9)
+    assert r.initial_cost == pytest.approx(r.cost, rel=1e-9)
+    assert all(moved.translation_mm < 1e-4 for moved in r.moved.values())
+    np.testing.assert_allclose(r.scale, solution.scale, rtol=1e-9)
+
+
+def test_chordal_needs_no_measurements() -> None:
+    kept, left = rig(seed=1), rig(seed=1, keep_measurements=False)
+    options = rw.RefineOptions(residual="chordal")
+    first = rw.refine(kept.problem, rw.solve(kept.problem), options)
+    second = rw.refine(left.problem, rw.solve(left.problem), options)
+    np.testing.assert_allclose(first.covariance(), second.covariance(), rtol=1e-9)
+
+
+def test_both_residuals_agree_to_first_order() -> None:
+    simulation = rig(noise=Noise(0.001, 0.5 / np.radians(0.1) ** 2))
+    chordal, geodesic = (refined(simulation.problem, residual=r) for r in ("chordal", "geodesic"))
+    assert distance(chordal, geodesic) < 1e-4
+    np.testing.assert_allclose(
+        chordal.covariance() / np.sqrt(np.outer(*[np.diag(chordal.covariance())] * 2)),
+        geodesic.covariance() / np.sqrt(np.outer(*[np.diag(geodesic.covariance())] * 2)),
+        atol=0.01,
+    )
+
+
+@pytest.mark.parametrize("residual", ["chordal", "geodesic"])
+def test_covariance_is_gtsams_marginal(residual: str) -> None:
+    """Where nothing is free, they are GTSAM's own."""
+    r = refined(rig(scale="shared").problem, residual=residual)
+    marginals = gtsam.Marginals(r.graph, r.values)
+    for name in ("target1", "sensor0", "scale"):
+        np.testing.assert_allclose(r.covariance(name), marginals.marginalCovariance(r.keys[name]), rtol=1e-6)
+    # GTSAM sorts joint marginals by key; symbols "s" < "x" < "y".
+    joint = marginals.jointMarginalCovariance([r.keys["scale"], r.keys["target0"]]).fullMatrix()
+    np.testing.assert_allclose(r.covariance("scale", "target0"), joint, rtol=1e-6, atol=1e-15)
+
+
+def test_joint_covariance_has_the_order_asked_for() -> None:
+    r = refined(rig().problem)
+    there, back = r.covariance("sensor0", "target1"), r.covariance("target1", "sensor0")
+    assert there.shape == (12, 12)
+    np.testing.assert_array_equal(there[:6, 6:], back[6:, :6])
+    np.testing.assert_array_equal(there[:6, :6], r.covariance("sensor0"))
+    assert r.covariance().shape == (24, 24)
+
+
+def test_relative_pose_and_its_covariance() -> None:
+    r = refined(rig(2, 3, seed=4).problem)
+    pose, covariance = r.relative("sensor0", "sensor2")
+    assert pose.equals(r.Y["sensor0"].inverse().compose(r.Y["sensor2"]), 1e-12)
+    joint = r.covariance("sensor0", "sensor2")
+    J = rw.pose_covariances.relative_jacobian(r.Y["sensor0"], r.Y["sensor2"])
+    np.testing.assert_allclose(covariance, J @ joint @ J.T, rtol=1e-8, atol=1e-16)
+    back, of_back = r.relative("sensor2", "sensor0")
+    np.testing.assert_allclose(of_back, rw.pose_covariances.of_inverse(pose, covariance), rtol=1e-8, atol=1e-15)
+    assert back.equals(pose.inverse(), 1e-12)
+    with pytest.raises(rw.errors.FrameError, match="two carriers"):
+        r.relative("sensor0", "target0")
+    with pytest.raises(rw.errors.FrameError, match="no 'sensor9'"):
+        r.relative("sensor0", "sensor9")
+    with pytest.raises(rw.errors.FrameError, match="itself"):
+        r.relative("sensor0", "sensor0")
+
+
+def test_the_order_of_samples_does_not_matter() -> None:
+    problem = rig(seed=6).problem
+    turned = copied(
+        problem,
+        A=lambda pair, raw: raw.A[::-1],
+        B=lambda pair, raw: raw.B[::-1],
+        stamps_ns=lambda pair, raw: raw.stamps_ns[::-1],
+    )
+    first, second = refined(problem, noise="estimate"), refined(turned, noise="estimate")
+    assert distance(first, second) < 1e-9
+    np.testing.assert_allclose(first.covariance(), second.covariance(), rtol=1e-6, atol=1e-14)
+
+
+@pytest.mark.parametrize("residual", ["chordal", "geodesic"])
+def test_estimated_noise_does_not_depend_on_what_was_given(residual: str) -> None:
+    problem = rig(seed=7).problem
+    wrong = copied(problem, sigma=lambda pair, raw: 7.0 * raw.sigma, kappa=lambda pair, raw: 0.01 * raw.kappa)
+    unit = rw.Problem()
+    for pair in problem.pairs:
+        raw = problem.measurements(*pair)
+        unit.add(*pair, raw.A, raw.B)
+    results = [refined(p, noise="estimate", residual=residual) for p in (problem, wrong)]
+    results.append(refined(unit, residual=residual))  # "auto" estimates where nothing was given
+    assert [r.noise_source for r in results] == ["estimated"] * 3
+    for r in results:
+        np.testing.assert_allclose(r.covariance(), results[0].covariance(), rtol=2e-3, atol=1e-11)
+        noise = next(iter(r.noise.values()))
+        assert noise.rotation_rad == pytest.approx(SIGMA_RAD, rel=0.15)
+        assert noise.translation_m == pytest.approx(SIGMA_M, rel=0.15)
+        assert sum(noise.redundancy) == pytest.approx(6 * 80 - 24, abs=0.5)
+
+
+def test_noise_by_sensor_and_by_pair() -> None:
+    noises = {
+        (f"target{j}", f"sensor{k}"): Noise(0.002 if k else 0.02, 0.5 / np.radians(0.2 if k else 2.0) ** 2)
+        for j in range(2)
+        for k in range(2)
+    }
+    exact = general(2, 2, seed=8, noise=noises, number_of_measurements=100)
+    flat = copied(exact.problem, sigma=lambda p, raw: 0.01 + 0 * raw.sigma, kappa=lambda p, raw: 1000.0 + 0 * raw.kappa)
+    for groups in ("sensor", "pair"):
+        r = refined(flat, noise="estimate", noise_groups=groups)
+        for pair, noise in noises.items():
+            assert r.noise[pair].translation_m == pytest.approx(noise.sigma_m, rel=0.15)
+            assert r.noise[pair].rotation_rad == pytest.approx(np.sqrt(0.5 / noise.kappa), rel=0.15)
+    one = refined(flat, noise="estimate")
+    assert len({noise.translation_m for noise in one.noise.values()}) == 1
+
+
+def test_full_covariances_are_honoured() -> None:
+    """Noise of B along its x only: an estimator that knows it does better, and says by how much."""
+    exact = general(1, 1, seed=9, number_of_measurements=60)
+    sigma = np.r_[np.full(3, np.radians(0.1)), 0.05, 0.001, 0.001]
+    squares: dict[str, list[float]] = {"whole": [], "mean": []}
+    raw = exact.problem.measurements("target0", "sensor0")
+    for seed in range(12):
+        xi = np.random.default_rng(seed).normal(size=(60, 6)) * sigma
+        B = [gtsam.Pose3(b).retract(x) for b, x in zip(raw.B, xi, strict=True)]
+        whole, mean = rw.Problem(), rw.Problem()
+        whole.add("target0", "sensor0", raw.A, B, covariances=np.diag(sigma**2))
+        mean.add("target0", "sensor0", raw.A, B, np.sqrt(np.mean(sigma[3:] ** 2)), 0.5 / sigma[0] ** 2)
+        for name, problem in (("whole", whole), ("mean", mean)):
+            r = refined(problem)
+            error = rw.pose_covariances.error_of(r.Y["sensor0"], exact.Y["sensor0"])
+            squares[name].append(float(error[3:] @ error[3:]))
+            if name == "whole":
+                assert r.contains("sensor0", exact.Y["sensor0"], 0.9999)
+    assert np.mean(squares["whole"]) < 0.05 * np.mean(squares["mean"])
+    with pytest.raises(rw.errors.OptionError, match="full covariances, which the chordal residual cannot hold"):
+        refined(whole, residual="chordal")
+
+
+@pytest.mark.parametrize("residual", ["chordal", "geodesic"])
+def test_planar_motion_has_infinite_variance_along_what_is_free(residual: str) -> None:
+    simulation = rig(1, 2, seed=2, motion="planar", number_of_measurements=40)
+    solution = None
+    with pytest.warns(rw.errors.NotUniqueWarning):
+        solution = rw.solve(simulation.problem)
+    with pytest.warns(rw.errors.NotUniqueWarning, match="variances are infinite along: .*translation along"):
+        r = rw.refine(simulation.problem, solution, rw.RefineOptions(residual=residual))
+    assert r.free_directions
+    assert np.isinf(np.diag(r.covariance("target0"))).any()
+    # The world's z is free for all together: the target along the plane's normal, in its own axes.
+    information = r.information("target0")
+    normal = r.X["target0"].rotation().matrix().T @ np.array([0.0, 0.0, 1.0])
+    assert np.abs(information[3:, 3:] @ normal).max() < 0.02 * np.abs(information[3:, 3:]).max()
+    # Sensor to sensor nothing is free: both move along together.
+    _, covariance = r.relative("sensor0", "sensor1")
+    assert np.isfinite(covariance).all()
+    assert np.sqrt(np.diag(covariance)).max() < 0.1
+    assert r.contains("target0", simulation.X["target0"], 0.999)
+
+
+def test_no_rotation_at_all() -> None:
+    simulation = rig(1, 1, seed=3, motion="none", number_of_measurements=40)
+    r = refined(simulation.problem)
+    assert np.isinf(np.diag(r.covariance("sensor0"))).all() or r.free_directions
+    assert np.isinf(np.diag(r.covariance("sensor0"))[3:]).all()
+
+
+def test_a_prior_makes_the_free_direction_finite() -> None:
+    simulation = rig(1, 1, seed=2, motion="planar", number_of_measurements=40)
+    simulation.problem.add_prior("target0", simulation.X["target0"], sigma=0.01)
+    for residual in ("chordal", "geodesic"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", rw.errors.NotUniqueWarning)
+            r = rw.refine(simulation.problem, rw.solve(simulation.problem), rw.RefineOptions(residual=residual))
+        deviations = r.standard_deviations("target0")[1]
+        assert deviations.max() < 10.1  # no wider than the prior, in mm
+        assert r.contains("target0", simulation.X["target0"], 0.999)
+
+
+@pytest.mark.parametrize("scale", ["known", "shared"])
+def test_map_estimate_with_priors_is_the_certified_one(scale: str) -> None:
+    simulation = rig(2, 2, seed=5, scale=scale)
+    off = gtsam.Pose3(simulation.X["target0"]).retract(np.r_[0.02, -0.01, 0.0, 0.01, 0.0, 0.02])
+    simulation.problem.add_prior("target0", off, kappa=1000.0, sigma=0.02 if scale == "known" else None)
+    solution = rw.solve(simulation.problem)
+    r = rw.refine(simulation.problem, solution, rw.RefineOptions(residual="chordal"))
+    assert distance(r, solution) < 1e-7
+    assert r.cost == pytest.approx(solution.cost, rel=1e-8)
+
+
+def test_fixed_frames_stay_and_have_no_variance() -> None:
+    simulation = rig(2, 2, seed=5)
+    simulation.problem.fix("sensor0", simulation.Y["sensor0"])
+    for residual in ("chordal", "geodesic"):
+        r = refined(simulation.problem, residual=residual)
+        np.testing.assert_allclose(r.Y["sensor0"].matrix(), simulation.Y["sensor0"], atol=1e-9)
+        np.testing.assert_array_equal(r.covariance("sensor0"), np.zeros((6, 6)))
+        assert "sensor0" not in r.names
+        pose, covariance = r.relative("sensor0", "sensor1")
+        np.testing.assert_allclose(covariance, r.covariance("sensor1"), rtol=1e-9)
+        assert pose.equals(r.Y["sensor0"].between(r.Y["sensor1"]), 1e-12)
+        assert r.contains("sensor0", simulation.Y["sensor0"])
+
+
+@pytest.mark.parametrize("residual", ["geodesic", "chordal"])
+def test_per_target_scales_under_the_exact_model(residual: str) -> None:
+    """The certified form's scale is 5 % off at 5 degrees of noise; refined it is where its variance says (fact 7)."""
+    certified, scores = [], []
+    for seed in range(8):
+        simulation = rig(
+            2,
+            2,
+            seed=seed,
+            scale="per_target",
+            known_sizes=("target1",),
+            noise=Noise(0.01, 0.5 / np.radians(5.0) ** 2),
+            number_of_measurements=30,
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+            solution = rw.solve(simulation.problem)
+            r = rw.refine(simulation.problem, solution, rw.RefineOptions(residual=residual))
+        truth = simulation.scale["target0"]
+        assert r.scale["target1"] == 1.0
+        certified.append(solution.scale["target0"] / truth - 1.0)
+        scores.append((r.scale["target0"] - truth) / np.sqrt(r.covariance("scale:target0")[0, 0]))
+    assert np.mean(np.abs(certified)) > 0.02
+    assert 0.4 < np.mean(np.square(scores)) < 2.5  # a chi-square of 8 degrees of freedom, over 8
+
+
+def test_motions_and_mixed_problems() -> None:
+    simulation = general(
+        1, 2, seed=3, noise=Noise(SIGMA_M, KAPPA), odometry=15, odometry_noise=Noise(SIGMA_M, KAPPA), scale="shared"
+    )
+    for residual in ("chordal", "geodesic"):
+        r = refined(simulation.problem, residual=residual)
+        for name, T in (simulation.X | simulation.Y).items():
+            assert r.contains(name, T, 0.9999)
+    alone = general(0, 2, seed=3, odometry=30, odometry_noise=Noise(SIGMA_M, KAPPA))
+    for residual in ("chordal", "geodesic"):
+        r = refined(alone.problem, residual=residual)
+        assert not r.free_directions
+        assert r.contains("sensor1", alone.Y["sensor1"], 0.9999)
+
+
+def test_a_world_far_away_changes_nothing() -> None:
+    problem = rig(seed=2).problem
+    shift = np.eye(4)
+    shift[:3, 3] = (4e5, -7e5, 2e5)
+    far = copied(problem, A=lambda pair, raw: raw.A @ np.linalg.inv(shift))
+    near, away = refined(problem, residual="chordal"), refined(far, residual="chordal")
+    for name in ("sensor0", "sensor1"):
+        np.testing.assert_allclose(near.Y[name].matrix(), away.Y[name].matrix(), atol=1e-6)
+        np.testing.assert_allclose(near.covariance(name), away.covariance(name), rtol=1e-3, atol=1e-12)
+
+
+def test_the_graph_goes_on() -> None:
+    """A user adds a factor of her own to the graph and optimises again."""
+    r = refined(rig(seed=1).problem)
+    graph = r.graph
+    before = r.values.atPose3(r.keys["sensor0"])
+    moved = before.retract(np.r_[0, 0, 0, 0.05, 0, 0])
+    graph.add(gtsam.PriorFactorPose3(r.keys["sensor0"], moved, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    after = gtsam.LevenbergMarquardtOptimizer(graph, r.values).optimize().atPose3(r.keys["sensor0"])
+    assert after.equals(moved, 1e-4)
