@@ -12,6 +12,7 @@ from gtsam_rwhec.certify.search import Found, Search
 from gtsam_rwhec.certify.variables import Answer, answer_of, rotations_as_variables
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.refinement.exact_scales import with_exact_scales
 
 #: Above this many free frames a gap is left open on the way: the semidefinite relaxation would take most of the time,
 #: and only the last, full solution's certificate is claimed.
@@ -66,7 +67,7 @@ def _solve(part: Part, previous: Fit | None) -> tuple[Answer, bool]:
         if found is None or again.cost < found.cost:
             found = again
     found = search.with_positive_scale(found)
-    return answer_of(part, search.form, found.R), _is_closed(search, found)
+    return with_exact_scales(part, answer_of(part, search.form, found.R)), _is_closed(search, found)
 
 
 def _is_closed(search: Search, found: Found) -> bool:

@@ -41,8 +41,10 @@ GRADUATION = 1.4
 LAST_MU = 10.0
 #: Frames of which fewer measurements agree than this are put to the vote.
 VOTED = 0.9
-#: A frame of which fewer measurements agree is named.
+#: A frame or pair of which a smaller share of measurements agrees is named in a warning.
 SUSPECT = 0.5
+#: So many of them at most.
+NAMED = 5
 #: Residuals are not taken for quieter than this (m and rad): exact data would leave nothing to divide by.
 QUIETEST = 1e-8
 #: A vote pays when the truncated cost goes down by more than this, relatively.
@@ -95,6 +97,8 @@ class Graduated:
         Frames of which no measurement agrees; the solution lacks them.
     suspect : dict of str to (int, int)
         Frames of which less than half agrees: how many do, of how many.
+    suspect_pairs : dict of (target, sensor) to (int, int)
+        The same of pairs, where neither of the two frames is suspect as a whole.
     iterations : int
         Re-weighted solutions, of all starts together.
     history : tuple of Iteration
@@ -108,6 +112,7 @@ class Graduated:
     truncated_cost: float
     left_out: tuple[str, ...]
     suspect: dict[str, tuple[int, int]]
+    suspect_pairs: dict[Pair, tuple[int, int]]
     iterations: int
     history: tuple[Iteration, ...]
 
@@ -183,7 +188,12 @@ def graduated(
     counts = {name: _count(name, inliers) for name in problem.targets + problem.sensors}
     left_out = tuple(name for name, (good, _) in counts.items() if good == 0)
     suspect = {name: (good, total) for name, (good, total) in counts.items() if good < SUSPECT * total}
-    _warn(problem, keep, suspect, left_out, work.threshold, noise_scale)
+    suspect_pairs = {
+        pair: (int(mask.sum()), len(mask))
+        for pair, mask in inliers.items()
+        if mask.sum() < SUSPECT * len(mask) and not any(name in suspect for name in pair)
+    }
+    _warn(keep, suspect, suspect_pairs, left_out, work.threshold, noise_scale)
     return Graduated(
         solution=solution,
         weights=weights,
@@ -193,6 +203,7 @@ def graduated(
         truncated_cost=0.5 * work.truncated(work.distances(fit)),
         left_out=left_out,
         suspect=suspect,
+        suspect_pairs=suspect_pairs,
         iterations=len(work.history),
         history=tuple(work.history),
     )
@@ -399,14 +410,19 @@ def _count(name: str, inliers: dict[Pair, np.ndarray]) -> tuple[int, int]:
 
 
 def _warn(
-    problem: Problem,
     keep: np.ndarray,
     suspect: dict[str, tuple[int, int]],
+    suspect_pairs: dict[Pair, tuple[int, int]],
     left_out: tuple[str, ...],
     threshold: float,
     noise_scale: NoiseScale,
 ) -> None:
-    message = ""
+    """Say where less than half agrees: of all, or of some frames and pairs."""
+    named = [
+        f"{name} ({good} of {total}{': left out' if name in left_out else ''})"
+        for name, (good, total) in sorted(suspect.items(), key=lambda item: item[1][0] / item[1][1])
+    ]
+    named += [f"{'-'.join(dict.fromkeys(pair))} ({good} of {total})" for pair, (good, total) in suspect_pairs.items()]
     if keep.sum() < SUSPECT * len(keep):
         message = (
             f"only {int(keep.sum())} of {len(keep)} measurements agree to within {np.sqrt(threshold):.3g} standard "
@@ -416,14 +432,15 @@ def _warn(
             message += "sigma and kappa may claim too much (noise_scale='estimate'), or the frames may be confused"
         else:
             message += "check the frame convention, the stamps, and the names of targets"
-    elif suspect:
-        message = "of some frames less than half of the measurements agree with the rest: " + ", ".join(
-            f"{name} ({good} of {total}{': left out' if name in left_out else ''})"
-            for name, (good, total) in suspect.items()
+    elif named:
+        more = f" and {len(named) - NAMED} more (suspect, suspect_pairs)" if len(named) > NAMED else ""
+        message = (
+            f"less than half of the measurements agree of {', '.join(named[:NAMED])}{more}: moved, or confused with "
+            "another? Its pose rests on those that do; the others' poses do not rest on what was rejected"
         )
-        message += "; was it moved, or confused with another? The others' poses do not rest on what was rejected"
-    if message:
-        warnings.warn(message, OutliersWarning, stacklevel=3)
+    else:
+        return
+    warnings.warn(message, OutliersWarning, stacklevel=3)
 
 
 def _check_options(confidence: float, noise_scale: str, max_iterations: int) -> None:

@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from rwhec_factors import se3
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.poses import Array
@@ -34,7 +34,7 @@ class Squares:
     translation : (N,) array
         |alpha (R_A t_X + t_A - t_Y) - R_Y t_B|^2 / sigma^2; or the block's.
     error : (N, 6) array or None
-        [omega, v] of the residual in B's frame, where full covariances were given.
+        Log(B^-1 Y^-1 A X), lengths as B has them, where full covariances were given.
     """
 
     rotation: Array
@@ -138,9 +138,11 @@ class Measured:
             error = None
         else:
             seen = self.B[:, :3, :3].transpose(0, 2, 1) @ R_Y.transpose(0, 2, 1)  # to the axes of the measured target
-            error = np.concatenate(
-                [Rotation.from_matrix(seen @ R).as_rotvec(), np.einsum("nij,nj->ni", seen, t)], axis=1
-            )
+            difference = np.zeros((len(self.B), 4, 4))  # B^-1 Y^-1 A X, lengths as B has them
+            difference[:, :3, :3] = seen @ R
+            difference[:, :3, 3] = np.einsum("nij,nj->ni", seen, t)
+            difference[:, 3, 3] = 1.0
+            error = se3.logmap(difference)
             rotation = _norms(self.whitening[:, :3, :3], error[:, :3])  # L is lower triangular: the block's own
             translation = _norms(self.whitening_of_translation, error[:, 3:])
             error[~known] = np.inf

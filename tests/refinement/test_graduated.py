@@ -1,0 +1,226 @@
+"""Outliers rejected around the certified solver, whatever the scale mode, the noise, and the order of samples."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from outlier_problems import Pair, corrupted
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError, OutlierError, OutliersWarning
+from gtsam_rwhec.refinement.graduated import Graduated, graduated, truncated_weights
+from gtsam_rwhec.selection import selected
+from gtsam_rwhec.simulate import Noise, Simulation, general
+from gtsam_rwhec.simulate.transforms import random_poses
+
+NOISE = Noise(sigma_m=0.01, kappa=500.0)
+
+
+def wrongly_classed(found: Graduated, good: dict[Pair, np.ndarray]) -> tuple[int, int]:
+    """Outliers kept, inliers lost."""
+    kept = sum(int((found.inliers[pair] & ~good[pair]).sum()) for pair in good)
+    return kept, sum(int((~found.inliers[pair] & good[pair]).sum()) for pair in good)
+
+
+def largest_error_m(simulation: Simulation, solution: rw.Solution) -> float:
+    errors = simulation.errors(solution)
+    return max(error.translation_m for error in (errors.X | errors.Y).values())
+
+
+@pytest.mark.parametrize("kind", ["random", "structured"])
+@pytest.mark.parametrize(
+    ("frames", "options"),
+    [
+        ((1, 1), {}),
+        ((3, 2), {}),
+        ((1, 1), {"scale": "shared"}),
+        ((2, 2), {"scale": "per_target", "known_sizes": ["target1"]}),
+        ((2, 1), {"odometry": 25, "odometry_noise": NOISE}),
+        ((0, 1), {"odometry": 40, "odometry_noise": NOISE}),
+    ],
+    ids=["one pair", "3 x 2", "shared scale", "own scales", "with odometry", "AX = XB"],
+)
+@pytest.mark.parametrize("noise_scale", ["given", "estimate"])
+def test_forty_percent_of_outliers_are_found(
+    kind: Any, frames: tuple[int, int], options: dict[str, Any], noise_scale: Any
+) -> None:
+    simulation = general(*frames, seed=3, number_of_measurements=25, noise=NOISE, **options)
+    weights = "given" if noise_scale == "given" else "unit"
+    problem, good = corrupted(simulation, 0.4, kind, 7, NOISE, weights=weights)
+    found = graduated(problem, noise_scale=noise_scale)
+    kept, lost = wrongly_classed(found, good)
+    assert kept == 0
+    assert lost <= 0.02 * problem.number_of_measurements + 1
+    assert found.solution.certificate.is_optimal
+    clean = rw.solve(selected(simulation.problem, good))
+    # One inlier more or less moves the answer by a part of its error.
+    assert largest_error_m(simulation, found.solution) < 1.3 * largest_error_m(simulation, clean) + 1e-4
+    assert found.iterations == len(found.history)
+    for pair, mask in found.inliers.items():
+        np.testing.assert_array_equal(found.weights[pair], mask.astype(float))
+    if noise_scale == "given":
+        assert found.noise_factors == (1.0, 1.0)
+    else:
+        rotation, translation = found.noise_factors
+        assert rotation == pytest.approx(1.0 / NOISE.kappa, rel=0.5)
+        assert translation == pytest.approx(NOISE.sigma_m**2, rel=0.5)
+
+
+def test_without_outliers_it_is_solve() -> None:
+    problem = general(2, 2, seed=1, number_of_measurements=15, noise=NOISE).problem
+    found = graduated(problem, confidence=1.0 - 1e-9)
+    assert all(mask.all() for mask in found.inliers.values())
+    plain = rw.solve(problem)
+    assert found.solution.cost == pytest.approx(plain.cost, rel=1e-9)
+    assert found.truncated_cost == pytest.approx(plain.cost, rel=1e-6)
+    assert not found.suspect
+    assert not found.left_out
+
+
+def test_noise_that_claims_three_times_too_much_is_estimated() -> None:
+    simulation = general(3, 2, seed=5, number_of_measurements=30, noise=NOISE)
+    problem, good = corrupted(simulation, 0.3, "random", 5, NOISE, weights="three_times_too_small")
+    found = graduated(problem, noise_scale="estimate")
+    assert wrongly_classed(found, good)[0] == 0
+    assert np.sqrt(found.noise_factors) == pytest.approx([3.0, 3.0], rel=0.15)
+    with pytest.warns(OutliersWarning, match="noise_scale='estimate'"):
+        graduated(problem)
+
+
+def test_the_order_of_samples_does_not_matter() -> None:
+    simulation = general(2, 2, seed=11, number_of_measurements=20, noise=NOISE)
+    problem, good = corrupted(simulation, 0.4, "structured", 11, NOISE)
+    shuffled = rw.Problem()
+    generator = np.random.default_rng(0)
+    order = {pair: generator.permutation(len(mask)) for pair, mask in good.items()}
+    for pair in reversed(problem.pairs):
+        raw, index = problem.measurements(*pair), order[pair]
+        shuffled.add(*pair, raw.A[index], raw.B[index], raw.sigma[index], raw.kappa[index])
+    for noise_scale in ("given", "estimate"):
+        one, other = graduated(problem, noise_scale=noise_scale), graduated(shuffled, noise_scale=noise_scale)
+        assert other.truncated_cost == pytest.approx(one.truncated_cost, rel=1e-6)
+        for pair, index in order.items():
+            np.testing.assert_array_equal(other.inliers[pair], one.inliers[pair][index])
+
+
+def test_one_bad_tag_among_others_is_named_and_does_no_harm() -> None:
+    simulation = general(4, 2, seed=2, number_of_measurements=20, noise=NOISE)
+    bad = (("target1", "sensor0"), ("target1", "sensor1"))
+    problem, good = corrupted(simulation, 1.0, "random", 2, NOISE, pairs=bad)
+    with pytest.warns(OutliersWarning, match=r"target1 \(\d of 40\)"):
+        found = graduated(problem)
+    assert set(found.suspect) == {"target1"}
+    clean = rw.solve(selected(simulation.problem, good))
+    for name in ("target0", "target2", "target3"):
+        difference = found.solution.X[name].translation() - clean.X[name].translation()
+        assert np.linalg.norm(difference) < 0.005
+
+
+def test_labels_that_one_camera_swaps_are_told_by_pair() -> None:
+    problem, swap = rw.Problem(), {"target0": "target1", "target1": "target0"}
+    simulation = general(5, 3, seed=4, number_of_measurements=10, noise=NOISE)
+    for target, sensor in simulation.problem.pairs:
+        seen = swap.get(target, target) if sensor == "sensor0" else target
+        raw = simulation.problem.measurements(seen, sensor)
+        problem.add(target, sensor, raw.A, raw.B, raw.sigma, raw.kappa)
+    with pytest.warns(OutliersWarning, match="target0-sensor0"):
+        found = graduated(problem)
+    assert set(found.suspect_pairs) == {("target0", "sensor0"), ("target1", "sensor0")}
+    assert largest_error_m(simulation, found.solution) < 0.02
+
+
+def test_a_fixed_frame_that_nothing_agrees_with_is_left_out_by_name() -> None:
+    simulation = general(3, 2, seed=6, number_of_measurements=15, noise=NOISE)
+    problem = simulation.problem
+    wrong = simulation.X["target2"].copy()
+    wrong[:3, 3] += 1.0
+    problem.fix("target2", wrong)
+    with pytest.warns(OutliersWarning, match=r"target2 \(0 of 30: left out\)"):
+        found = graduated(problem)
+    assert found.left_out == ("target2",)
+    assert "target2" not in found.solution.X
+    assert not selected(problem, found.inliers).fixed
+
+
+def test_priors_decide_between_two_targets_that_are_seen_as_often() -> None:
+    simulation = general(1, 1, seed=8, number_of_measurements=40, noise=NOISE)
+    problem, good = corrupted(simulation, 0.5, "structured", 8, NOISE)
+    for mask, wanted in ((good, True), ({pair: ~m for pair, m in good.items()}, False)):
+        answer = rw.solve(selected(problem, mask))
+        told = selected(problem, {})
+        told.add_prior("target0", answer.X["target0"], sigma=0.002, kappa=1e5)
+        told.add_prior("sensor0", answer.Y["sensor0"], sigma=0.002, kappa=1e5)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", OutliersWarning)
+            found = graduated(told)
+        agreeing = found.inliers["target0", "sensor0"] == good["target0", "sensor0"]
+        assert agreeing.mean() > 0.95 if wanted else agreeing.mean() < 0.05
+
+
+def test_exact_data_has_nothing_to_estimate_and_still_finds_outliers() -> None:
+    simulation = general(2, 1, seed=9, number_of_measurements=12)
+    problem, good = corrupted(simulation, 0.3, "random", 9, NOISE, weights="unit")
+    found = graduated(problem, noise_scale="estimate")
+    assert wrongly_classed(found, good) == (0, 0)
+    assert largest_error_m(simulation, found.solution) < 1e-7
+
+
+def test_nothing_agrees_with_anything() -> None:
+    generator = np.random.default_rng(1)
+    problem = rw.Problem()
+    problem.add("target0", "sensor0", random_poses(6, 1.0, generator), random_poses(6, 1.0, generator), 1e-4, 1e8)
+    with pytest.raises(OutlierError, match=r"too few of the 6 measurements agree.*noise_scale='estimate'"):
+        graduated(problem)
+
+
+def test_bad_options_and_missing_measurements_are_refused() -> None:
+    problem = general(1, 1, seed=0, noise=NOISE).problem
+    for options in ({"confidence": 1.0}, {"confidence": 95}, {"noise_scale": "guess"}, {"max_iterations": 0}):
+        with pytest.raises(OptionError, match=next(iter(options))):
+            graduated(problem, **options)  # type: ignore[arg-type]
+    with pytest.raises(MeasurementsNotKeptError, match="keep_measurements=True"):
+        graduated(general(1, 1, seed=0, noise=NOISE, keep_measurements=False).problem)
+
+
+def test_progress_is_told_and_the_problem_stays_as_it_was() -> None:
+    problem, _ = corrupted(general(1, 1, seed=0, noise=NOISE), 0.2, "random", 0, NOISE)
+    before = problem.moments("target0", "sensor0")
+    told: list[str] = []
+    graduated(problem, progress=told.append)
+    assert any("agree" in line for line in told)
+    assert problem.moments("target0", "sensor0") is before
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(1e-4, 1e3), st.floats(1.0, 100.0))
+def test_weights_go_from_one_to_zero_without_a_step(mu: float, c2: float) -> None:
+    first, last = mu / (mu + 1.0) * c2, (mu + 1.0) / mu * c2
+    d2 = np.concatenate([[0.0, first, last, 2.0 * last, np.inf], np.linspace(first, last, 50)])
+    w = truncated_weights(d2, mu, c2)
+    np.testing.assert_allclose(w[:5], [1.0, 1.0, 0.0, 0.0, 0.0], atol=1e-9)
+    assert w[5] == pytest.approx(1.0)
+    assert w[-1] == pytest.approx(0.0, abs=1e-9)
+    assert (np.diff(w[5:]) <= 1e-12).all()
+
+
+def test_the_real_dataset_with_thirty_percent_corrupted(utias_folder: object) -> None:
+    problem = rw.read_csv(str(utias_folder))
+    generator = np.random.default_rng(0)
+    spoilt, bad = rw.Problem(), {}
+    for pair in problem.pairs:
+        raw = problem.measurements(*pair)
+        bad[pair] = generator.random(len(raw.B)) < 0.3
+        wrong = random_poses(len(raw.B), 2.0, generator)
+        spoilt.add(*pair, raw.A, np.where(bad[pair][:, None, None], wrong, raw.B))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OutliersWarning)
+        found = graduated(spoilt, noise_scale="estimate")
+        clean = graduated(selected(spoilt, {pair: ~mask for pair, mask in bad.items()}), noise_scale="estimate")
+    assert sum(int((found.inliers[pair] & bad[pair]).sum()) for pair in bad) == 0
+    for name, pose in clean.solution.Y.items():
+        np.testing.assert_allclose(found.solution.Y[name].matrix(), pose.matrix(), atol=1e-4)
