@@ -10,18 +10,19 @@ from gtsam_rwhec import errors, pose_covariances
 from gtsam_rwhec.calibration import certify, solve
 from gtsam_rwhec.certify.certificate import Certificate, Status
 from gtsam_rwhec.certify.options import SolveOptions
+from gtsam_rwhec.cross_validation import CrossValidation, cross_validate
 from gtsam_rwhec.csv_files import read_csv
 from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
 from gtsam_rwhec.measurements import Measurements
 from gtsam_rwhec.priors import Prior
 from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
+from gtsam_rwhec.refinement.refine import refine
+from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.result_file import read_solution
 from gtsam_rwhec.solution import Residual, Solution, SolvedPart
 
 if TYPE_CHECKING:
-    from gtsam_rwhec.refinement.refine import refine
-    from gtsam_rwhec.refinement.refined import Refined
     from gtsam_rwhec import simulate
 
 __version__ = "0.1.0"
@@ -29,6 +30,7 @@ __version__ = "0.1.0"
 __all__ = [
     "CarrierNoise",
     "Certificate",
+    "CrossValidation",
     "Identifiability",
     "Measurements",
     "PairIdentifiability",
@@ -42,6 +44,7 @@ __all__ = [
     "SolvedPart",
     "Status",
     "certify",
+    "cross_validate",
     "errors",
     "pose_covariances",
     "read_csv",
@@ -58,12 +61,4 @@ def __getattr__(name: str) -> Any:
         import gtsam_rwhec.simulate
 
         return gtsam_rwhec.simulate
-    if name == "refine":
-        from gtsam_rwhec.refinement.refine import refine
-
-        return refine
-    if name == "Refined":
-        from gtsam_rwhec.refinement.refined import Refined
-
-        return Refined
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -120,7 +120,7 @@ def _factor(
         X = pose_of(values, target_key, "X = T_targetcarrier_target")
         Y = pose_of(values, sensor_key, "Y = T_sensorcarrier_sensor")
         A_now = A
-        if time_offset_key is not None:
+        if time_offset_key is not None and velocity is not None:
             offset = number_of(values, time_offset_key, "the time offset in seconds")
             A_now = A.compose(gtsam.Pose3.Expmap(offset * velocity))
         P = Y.inverse().compose(A_now.compose(X))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
 import numpy as np
 
@@ -44,14 +46,15 @@ def checked(noise: object, dimension: int, what: str) -> Noise:
     return noise
 
 
-def without_loss(noise: Noise) -> Noise:
+def without_loss(noise: Noise) -> Any:
     """The Gaussian inside a robust model; itself where there is no loss."""
     while isinstance(noise, gtsam.noiseModel.Robust):
         noise = noise.noise()
-    return noise
+    gaussian: Any = noise  # GTSAM has no third kind
+    return gaussian
 
 
-def information_of(gaussian: Noise) -> Array:
+def information_of(gaussian: Any) -> Array:
     """W' W of a Gaussian noise model, (n, n)."""
     with np.errstate(invalid="ignore"):
         R = np.asarray(gaussian.R(), dtype=np.float64)

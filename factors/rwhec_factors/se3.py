@@ -5,10 +5,12 @@ Equations: Barfoot, State Estimation for Robotics (2024), Chapter 8; its rotatio
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 #: Below this angle (rad) series are taken in place of quotients whose numerators cancel.
 SMALL = 1e-2

@@ -10,6 +10,7 @@ from rwhec_factors.batch import Linearization
 from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.poses import Array, to_pose3
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
@@ -109,6 +110,11 @@ class GeodesicModel:
             graphs.add_batches(graph, self.variables, rest, roots)
         return graph
 
+    @property
+    def first_loss(self) -> Robust | None:
+        """A loss without local minima to start under, for those that let go of what is far away."""
+        return "huber" if self.is_m_estimate and self.options.robust != "huber" else None
+
     def values(self, state: State) -> gtsam.Values:
         """An estimate with the carrier poses as measured, where they are variables."""
         values = self.variables.values(state)
@@ -138,7 +144,15 @@ class GeodesicModel:
         unknowns = sum(self.variables.unknown.values())
         spare = max(6 * len(lengths) - unknowns, 1)
         square = float(np.sum((weight * lengths) ** 2)) / spare
-        return square / float(np.mean(weight + slope * lengths / 6.0)) ** 2
+        gain = float(np.mean(weight + slope * lengths / 6.0))
+        if not gain > 0.05:
+            raise NoiseError(
+                f"robust={self.options.robust!r} leaves next to nothing of the measurements (mean weight "
+                f"{weight.mean():.2g}): half of the residuals are beyond {np.median(lengths):.3g} standard "
+                "deviations, so either the noise is larger than given (noise='estimate') or outliers have pulled the "
+                "start away (robust='gnc' needs none)"
+            )
+        return square / gain**2
 
     def next_factors(
         self, state: State, joint: JointCovariance, factors: VarianceFactors, groups: NoiseGroups

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -26,12 +27,13 @@ from gtsam_rwhec.refinement.weighting import (
 )
 from gtsam_rwhec.statistics import edge_forms
 
-#: Tuning constants with 95 % efficiency at one-dimensional Gaussian noise, as GTSAM's own defaults.
-LOSSES = {
-    "huber": (gtsam.noiseModel.mEstimator.Huber, 1.345),
-    "cauchy": (gtsam.noiseModel.mEstimator.Cauchy, 2.3849),
-    "tukey": (gtsam.noiseModel.mEstimator.Tukey, 4.6851),
-    "geman_mcclure": (gtsam.noiseModel.mEstimator.GemanMcClure, 1.0),
+#: Tuning constants: 95 % efficient where the noise is Gaussian in six dimensions. (GTSAM weighs a factor by the length
+#: of its whitened residual; its defaults have that efficiency in one dimension, and 40 to 93 % in six.)
+LOSSES: dict[str, tuple[Any, float]] = {
+    "huber": (gtsam.noiseModel.mEstimator.Huber, 1.869),
+    "cauchy": (gtsam.noiseModel.mEstimator.Cauchy, 2.862),
+    "tukey": (gtsam.noiseModel.mEstimator.Tukey, 6.356),
+    "geman_mcclure": (gtsam.noiseModel.mEstimator.GemanMcClure, 4.846),
 }
 
 
@@ -57,7 +59,8 @@ class CarrierVariables:
         """Measurements of one stamp and one A, and where there are no stamps those of one A, share a variable."""
         place: dict[tuple[int, bytes], int] = {}
         index: dict[Pair, np.ndarray] = {}
-        A, covariance = [], []
+        A: list[Array] = []
+        covariance: list[Array] = []
         for item in data:
             if item.carrier is None or item.pair[0] == item.pair[1]:
                 continue
@@ -139,7 +142,7 @@ def robust_noise(covariance: Array, robust: Robust) -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Robust.Create(loss_of(robust), gaussian) if robust in LOSSES else gaussian
 
 
-def loss_of(robust: Robust) -> gtsam.noiseModel.mEstimator.Base:
+def loss_of(robust: Robust) -> Any:  # GTSAM's stubs leave out the base class's methods
     """One of GTSAM's losses, by name."""
     loss, constant = LOSSES[robust]
     return loss.Create(constant)
@@ -160,11 +163,17 @@ def add_single(
         for i, (A, B) in enumerate(zip(item.residuals.A, item.residuals.B, strict=True)):
             poses = (to_pose3(A[:3, :3], A[:3, 3]), to_pose3(B[:3, :3], B[:3, 3]))
             noise = robust_noise(covariances[item.pair][i], robust)
-            offset = {"time_offset_key": offset_key, "twist": None if twists is None else twists[i]}
+            twist = None if twists is None else twists[i]
             if scale_key is None:
-                graph.add(robot_world_hand_eye_factor(target, sensor, *poses, noise, **offset))
+                graph.add(
+                    robot_world_hand_eye_factor(target, sensor, *poses, noise, time_offset_key=offset_key, twist=twist)
+                )
             else:
-                graph.add(scaled_robot_world_hand_eye_factor(target, sensor, scale_key, *poses, noise, **offset))
+                graph.add(
+                    scaled_robot_world_hand_eye_factor(
+                        target, sensor, scale_key, *poses, noise, time_offset_key=offset_key, twist=twist
+                    )
+                )
 
 
 def add_with_carriers(

@@ -52,7 +52,8 @@ def information_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, vari
     unknown = variables.unknown
     place = dict(zip(unknown, np.cumsum([0, *unknown.values()])[:-1], strict=True))
     information = np.zeros((sum(unknown.values()),) * 2)
-    rows, columns = [], []
+    rows: list[int] = []
+    columns: list[int] = []
     first = 0
     for name in names:
         dimension = 6 if name in variables.frames else 1

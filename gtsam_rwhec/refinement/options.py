@@ -76,8 +76,9 @@ class RefineOptions:
         Log(B^-1 Y^-1 A X) with any 6 x 6 covariance, from the raw measurements; or the certified cost's own, from
         moments alone, with which GTSAM's optimum is the certified one.
     robust : "none", "huber", "cauchy", "tukey", "geman_mcclure" or "gnc"
-        GTSAM's losses (at their usual 95 % efficiency); or graduated truncated least squares around the certified
-        solver, which needs no good start, and after which outliers are left out.
+        GTSAM's losses (95 % efficient at Gaussian noise; from the certified solution, by way of "huber", which many
+        gross outliers have pulled away); or graduated truncated least squares around the certified solver, which needs
+        no good start, and after which outliers are left out.
     inlier_confidence : float
         With "gnc": probability that a good measurement is kept.
     carrier_noise : CarrierNoise, optional

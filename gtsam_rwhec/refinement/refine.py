@@ -156,10 +156,13 @@ def _fit(
     redundancy: dict[tuple[str, str], float] = {}
     state, values = start, model.values(start)
     iterations = 0
+    if isinstance(model, GeodesicModel) and model.first_loss is not None:
+        graph = _with_knowledge(model.graph(state, factors, model.first_loss), problem, variables, options)
+        optimum = optimise(graph, values, options.max_iterations)
+        iterations += optimum.iterations
+        state, values = variables.state(optimum.values), optimum.values
     for round_number in range(MAX_ROUNDS):
-        graph = model.graph(state, factors)
-        graphs.add_priors(graph, variables, problem, options.residual)
-        graphs.add_fixed(graph, variables, problem)
+        graph = _with_knowledge(model.graph(state, factors), problem, variables, options)
         optimum = optimise(graph, values, options.max_iterations)
         iterations += optimum.iterations
         state, values = variables.state(optimum.values), optimum.values
@@ -184,6 +187,14 @@ def _fit(
             stacklevel=3,
         )
     return _Fit(graph, optimum, information, factors, redundancy, graph.error(model.values(start)), iterations)
+
+
+def _with_knowledge(
+    graph: gtsam.NonlinearFactorGraph, problem: Problem, variables: Variables, options: RefineOptions
+) -> gtsam.NonlinearFactorGraph:
+    graphs.add_priors(graph, variables, problem, options.residual)
+    graphs.add_fixed(graph, variables, problem)
+    return graph
 
 
 def _information(

@@ -1,5 +1,6 @@
 """What people look at: tables, the grid of Figure 8, and sentences."""
 
+from gtsam_rwhec.report.covariance_report import print_refined
 from gtsam_rwhec.report.pair_grid import PairGrid
 from gtsam_rwhec.report.pose_table import sensor_table, target_table
 from gtsam_rwhec.report.sentences import certificate_sentence

@@ -1,0 +1,123 @@
+"""What refine refuses: with the place, the value and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from refinement_problems import KAPPA, SIGMA_M, refined, rig
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.refinement.options import RefineOptions
+
+PROBLEM = rig(seed=1).problem
+SOLUTION = rw.solve(PROBLEM)
+MOMENTS_ONLY = rig(seed=1, keep_measurements=False).problem
+
+
+def unit_weights() -> rw.Problem:
+    problem = rw.Problem()
+    for pair in PROBLEM.pairs:
+        raw = PROBLEM.measurements(*pair)
+        problem.add(*pair, raw.A, raw.B)
+    return problem
+
+
+def few() -> rw.Problem:
+    """As many equations as unknowns."""
+    problem = rw.Problem()
+    raw = PROBLEM.measurements("target0", "sensor0")
+    problem.add("target0", "sensor0", raw.A[:2], raw.B[:2], SIGMA_M, KAPPA)
+    return problem
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: rw.refine("no", SOLUTION), rw.errors.OptionError, "the problem is a str"),
+        (lambda: rw.refine(PROBLEM, PROBLEM), rw.errors.OptionError, "the solution is a Problem; give what"),
+        (lambda: rw.refine(PROBLEM, SOLUTION, {}), rw.errors.OptionError, "options is a dict"),
+        (
+            lambda: rw.refine(rig(3, 2, seed=1).problem, SOLUTION),
+            rw.errors.FrameError,
+            "X has no pose of 'target2'; it has 'target0', 'target1'",
+        ),
+        (
+            lambda: rw.refine(rig(1, 2, seed=1).problem, SOLUTION),
+            rw.errors.FrameError,
+            "X has 'target1', which the problem does not",
+        ),
+        (
+            lambda: rw.refine(rig(seed=1, scale="shared").problem, SOLUTION),
+            rw.errors.ScaleError,
+            "scale='known', this one has scale='shared'",
+        ),
+        (
+            lambda: rw.refine(MOMENTS_ONLY, SOLUTION),
+            rw.errors.MeasurementsNotKeptError,
+            r"geodesic residual needs the raw .*keep_measurements=True, or refine with .*chordal",
+        ),
+        (
+            lambda: rw.refine(MOMENTS_ONLY, SOLUTION, RefineOptions(residual="chordal", robust="gnc")),
+            rw.errors.MeasurementsNotKeptError,
+            "robust='gnc' weighs each measurement",
+        ),
+        (
+            lambda: rw.refine(unit_weights(), SOLUTION, RefineOptions(noise="given")),
+            rw.errors.OptionError,
+            "without sigma or kappa.*noise='estimate'",
+        ),
+        (
+            lambda: refined(few(), noise="estimate"),
+            rw.errors.NoiseError,
+            "noise of the measurements cannot be estimated: .*equations to spare",
+        ),
+        (lambda: RefineOptions(noise="guess"), rw.errors.OptionError, "noise='guess' is not one of 'auto'"),
+        (lambda: RefineOptions(robust="l1"), rw.errors.OptionError, "robust='l1' is not one of"),
+        (lambda: RefineOptions(residual="quaternion"), rw.errors.OptionError, "residual='quaternion'"),
+        (lambda: RefineOptions(noise_groups="tag"), rw.errors.OptionError, "noise_groups='tag'"),
+        (lambda: RefineOptions(carrier_model="exact"), rw.errors.OptionError, "carrier_model='exact'"),
+        (lambda: RefineOptions(carrier_noise=0.1), rw.errors.OptionError, "carrier_noise is a float"),
+        (lambda: RefineOptions(inlier_confidence=1.5), rw.errors.OptionError, "inlier_confidence=1.5"),
+        (lambda: RefineOptions(max_iterations=0), rw.errors.OptionError, "max_iterations=0"),
+        (
+            lambda: RefineOptions(residual="chordal", robust="huber"),
+            rw.errors.OptionError,
+            "robust='huber' needs residual='geodesic'",
+        ),
+        (
+            lambda: RefineOptions(residual="chordal", time_offsets=True),
+            rw.errors.OptionError,
+            "time_offsets=True needs residual='geodesic'",
+        ),
+        (
+            lambda: RefineOptions(carrier_model="variables", time_offsets=True),
+            rw.errors.OptionError,
+            "carrier_model='propagated'",
+        ),
+    ],
+)
+def test_refused(call: Callable[[], Any], error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda r: r.covariance("cam"), "there is no 'cam'; there are target0"),
+        (lambda r: r.covariance("scale"), "there is no 'scale'"),
+        (lambda r: r.information("cam"), "no 'cam' among the unknowns"),
+        (lambda r: r.contains("cam", np.eye(4)), "there is no frame 'cam'"),
+    ],
+)
+def test_unknown_names(ask: Callable[[rw.Refined], Any], words: str) -> None:
+    with pytest.raises(rw.errors.FrameError, match=words):
+        ask(rw.refine(PROBLEM, SOLUTION))
+
+
+def test_bad_confidence() -> None:
+    with pytest.raises(rw.errors.OptionError, match="confidence=95"):
+        rw.refine(PROBLEM, SOLUTION).squared_radius(6, 95)
