@@ -1,0 +1,89 @@
+"""Hold-out errors as tables: overall, of each sensor and target, and where asked for of each pair."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.text import Text
+
+from gtsam_rwhec.cross_validation import Comparison, CrossValidation
+from gtsam_rwhec.csv_files import natural_key
+from gtsam_rwhec.report.pose_table import FrameTable
+from gtsam_rwhec.report.solution_report import report_console
+
+HEADINGS = ("rms mm", "median", "95%", "rms°", "median", "95%", "seen mm", "seen°", "n")
+LEGEND = (
+    "Predicted against measured poses of targets, held out of the calibration that predicts them: translation in true "
+    "millimetres, angle in degrees; root mean square, median, 95th percentile. seen: root mean square of the same "
+    "measurements when none is held out. n: measurements predicted (of those there are)."
+)
+SPLITS = {
+    "time": "{folds} blocks, contiguous in {time}, each predicted from the others",
+    "pair": "each pair predicted from all other pairs",
+    "sensor": "each half in {time} of a sensor's measurements predicted from all others",
+}
+
+
+def cross_validation_tables(result: CrossValidation, *, pairs: bool = False) -> list[FrameTable]:
+    """Tables of the whole and the sensors, of the targets, and with ``pairs`` of the pairs."""
+    tables = [
+        FrameTable(
+            "Hold-out error by sensor", "sensor", HEADINGS, {"all": _cells(result.overall), **_rows(result.sensors)}
+        )
+    ]
+    if result.targets:
+        tables.append(FrameTable("Hold-out error by target", "target", HEADINGS, _rows(result.targets)))
+    if pairs:
+        by_name = {"-".join(dict.fromkeys(pair)): comparison for pair, comparison in result.pairs.items()}
+        tables.append(FrameTable("Hold-out error by pair", "pair", HEADINGS, _rows(by_name)))
+    return tables
+
+
+def print_cross_validation(result: CrossValidation, console: Console | None = None, *, pairs: bool = False) -> None:
+    """Print the tables and what they are of.
+
+    Parameters
+    ----------
+    result : CrossValidation
+    console : rich.console.Console, optional
+        Standard output if left out.
+    pairs : bool
+        Whether every pair has a line too.
+    """
+    console = report_console() if console is None else console
+    wrap = not console.is_terminal
+    console.print(Text(f"Hold-out error: {split_sentence(result)}", style="bold"), soft_wrap=wrap)
+    console.print()
+    for table in cross_validation_tables(result, pairs=pairs):
+        console.print(table)
+    console.print(Text(LEGEND, style="dim"), soft_wrap=wrap)
+    for note in result.notes:
+        console.print(Text(f"  - {note}", style="yellow"), soft_wrap=wrap)
+
+
+def split_sentence(result: CrossValidation) -> str:
+    """What was held out."""
+    time = "time, by their stamps" if result.ordered_by == "stamps" else "the order in which they were added"
+    return SPLITS[result.by].format(folds=result.number_of_folds, time=time)
+
+
+def _rows(comparisons: Mapping[str, Comparison]) -> dict[str, tuple[str, ...]]:
+    return {name: _cells(comparisons[name]) for name in sorted(comparisons, key=natural_key)}
+
+
+def _cells(comparison: Comparison) -> tuple[str, ...]:
+    held, seen = comparison.held_out, comparison.training
+    total = held.count + comparison.not_predicted
+    return (
+        *(_number(value, 1) for value in (held.translation_rms_mm, held.translation_median_mm, held.translation_95_mm)),
+        *(_number(value, 2) for value in (held.rotation_rms_deg, held.rotation_median_deg, held.rotation_95_deg)),
+        _number(seen.translation_rms_mm, 1),
+        _number(seen.rotation_rms_deg, 2),
+        str(held.count) if comparison.not_predicted == 0 else f"{held.count} of {total}",
+    )
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
