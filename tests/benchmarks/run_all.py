@@ -15,6 +15,7 @@ import sys
 import time
 from pathlib import Path
 
+import edge_summaries
 import many_frames
 import million_measurements
 import one_pair
@@ -39,6 +40,7 @@ def main() -> int:
         "a million measurements": lambda: million_measurements.rows(1_000_000, repetitions=9),
         "many frames": lambda: many_frames.rows(repetitions=7),
         "world origin": world_origin.rows,
+        "edge summaries in GTSAM": lambda: edge_summaries.rows(repetitions=5),
     }
     rows: list[Row] = []
     for name, make in parts.items():
