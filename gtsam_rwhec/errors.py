@@ -83,5 +83,9 @@ class OutliersWarning(RwhecWarning):
     """Less than half of a frame's measurements, or of all, agree with the rest."""
 
 
+class NotConvergedWarning(RwhecWarning):
+    """An iteration that stopped at its limit."""
+
+
 class RotationsProjectedWarning(RwhecWarning):
     """Rotation blocks were slightly off and were projected to the nearest rotation."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import gtsam
@@ -10,7 +11,7 @@ from rwhec_factors.batch import Linearization
 from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.errors import NoiseError
+from gtsam_rwhec.errors import NoiseError, WeightsWarning
 from gtsam_rwhec.poses import Array, to_pose3
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
@@ -50,6 +51,14 @@ class GeodesicModel:
             candidates = graphs.CarrierVariables.of(data)
             if options.carrier_model == "variables" or candidates.is_shared:
                 carriers = candidates
+        elif options.carrier_noise is not None and graphs.CarrierVariables.of(data).is_shared:
+            warnings.warn(
+                "some measurements share a carrier pose, whose error does not average out between them, but its "
+                "noise is propagated to each on its own: standard deviations are too small; take carrier_model='variables'"
+                + (", without time offsets" if options.time_offsets else ""),
+                WeightsWarning,
+                stacklevel=4,
+            )
         share = 1.0
         if options.robust == "gnc":  # of a chi-square with 6 degrees of freedom, cut at its quantile
             cut = chdtri(6, 1.0 - options.inlier_confidence)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from scipy.special import chdtrc
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.calibration import check_against_knowledge
@@ -16,6 +17,7 @@ from gtsam_rwhec.certify.parts import Part, parts_of
 from gtsam_rwhec.errors import (
     FrameError,
     MeasurementsNotKeptError,
+    NotConvergedWarning,
     NotUniqueWarning,
     OptionError,
     ScaleError,
@@ -78,11 +80,17 @@ def refine(
         Where raw measurements are needed and were not kept.
     NoiseError, OptionError, CountError
         For noise that cannot be estimated or honoured, or options that do not go together.
+    OutlierError
+        With robust="gnc", where hardly any measurement agrees with another.
 
     Warns
     -----
     NotUniqueWarning
         Where the measurements leave something free, by name; variances are infinite there.
+    WeightsWarning
+        Where the residuals say that the noise as given is too small, or A's noise is shared and is not treated so.
+    NotConvergedWarning
+        Where iterations ended at their limit.
     """
     options = RefineOptions() if options is None else options
     tell = progress if progress is not None else _silent
@@ -113,6 +121,8 @@ def refine(
             NotUniqueWarning,
             stacklevel=2,
         )
+    if not estimates:
+        _warn_of_weights(problem, variables, fit, options)
     joint = JointCovariance.of(variables.unknown, fit.information, space.basis, space.unit)
     return Refined(
         X=state.X,
@@ -183,7 +193,14 @@ def _fit(
         warnings.warn(
             f"the estimated noise did not settle in {MAX_ROUNDS} rounds: a part of it goes to zero, as where the noise "
             "given for A already explains the residuals; give B's noise (noise='given'), or less for A",
-            WeightsWarning,
+            NotConvergedWarning,
+            stacklevel=3,
+        )
+    if optimum.iterations >= options.max_iterations:
+        warnings.warn(
+            f"GTSAM stopped after {optimum.iterations} iterations without converging; raise "
+            "RefineOptions.max_iterations",
+            NotConvergedWarning,
             stacklevel=3,
         )
     return _Fit(graph, optimum, information, factors, redundancy, graph.error(model.values(start)), iterations)
@@ -209,6 +226,31 @@ def _information(
     graph = model.information_graph(state, factors)
     graphs.add_priors(graph, variables, problem, options.residual)
     return information_of(graph, values, variables) / model.inefficiency(state, factors)
+
+
+#: A cost this many times what the given noise predicts makes covariances too small by its root, and is told.
+UNLIKELY = 2.0
+
+
+def _warn_of_weights(problem: Problem, variables: Variables, fit: _Fit, options: RefineOptions) -> None:
+    """Compare the residuals with what the noise as given predicts: half the equations to spare."""
+    if options.robust not in ("none", "gnc"):  # a loss makes another cost
+        return
+    beliefs = [p for name, priors in problem.priors.items() if name not in problem.fixed for p in priors]
+    equations = 6 * problem.number_of_measurements + sum(
+        3 * (p.sigma is not None) + 3 * (p.kappa is not None) for p in beliefs
+    )
+    spare = equations - sum(variables.unknown.values())
+    # Beyond doubt, too: a chi-square of few degrees of freedom may well be twice its mean.
+    if fit.optimum.cost > UNLIKELY * 0.5 * spare and chdtrc(spare, 2.0 * fit.optimum.cost) < 1e-3:
+        ratio = fit.optimum.cost / (0.5 * spare)
+        warnings.warn(
+            f"the residuals cost {fit.optimum.cost:.4g}, {ratio:.3g} times what the given noise predicts "
+            f"({0.5 * spare:.4g}): standard deviations are too small by about {math.sqrt(ratio):.2g}; take "
+            "noise='estimate', robust='gnc' if some measurements are wrong, or carrier_noise if A is not exact",
+            WeightsWarning,
+            stacklevel=3,
+        )
 
 
 def _model(problem: Problem, parts: list[Part], variables: Variables, options: RefineOptions) -> Model:

@@ -42,6 +42,14 @@ def test_shared_carriers_become_variables_and_widen_the_covariance() -> None:
     assert relative[1] < relative[0]
 
 
+def test_shared_carriers_that_are_not_treated_so_are_told() -> None:
+    problem = rig(1, 2, seed=4).problem
+    solution = rw.solve(problem)
+    options = rw.RefineOptions(carrier_noise=CARRIER, carrier_model="propagated")
+    with pytest.warns(rw.errors.WeightsWarning, match="share a carrier pose.*carrier_model='variables'"):
+        rw.refine(problem, solution, options)
+
+
 def test_stamps_tell_which_measurements_share_a_pose() -> None:
     simulation = rig(1, 2, seed=5, number_of_measurements=8, noise=None)
     options = rw.RefineOptions(carrier_noise=CARRIER)

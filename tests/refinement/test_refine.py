@@ -281,3 +281,34 @@ def test_the_graph_goes_on() -> None:
     graph.add(gtsam.PriorFactorPose3(r.keys["sensor0"], moved, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
     after = gtsam.LevenbergMarquardtOptimizer(graph, r.values).optimize().atPose3(r.keys["sensor0"])
     assert after.equals(moved, 1e-4)
+
+
+def test_a_known_size_other_than_one() -> None:
+    """A tag known to be measured 1.5 times too long beside one of unknown size, in both residuals."""
+    simulation = rig(
+        2, 2, seed=3, scale="per_target", known_sizes=("target1",), true_scale={"target0": 0.7, "target1": 1.5}
+    )
+    for residual in ("geodesic", "chordal"):
+        r = refined(simulation.problem, residual=residual)
+        assert r.scale["target1"] == 1.5
+        assert r.scale["target0"] == pytest.approx(0.7, abs=4 * np.sqrt(r.covariance("scale:target0")[0, 0]))
+        for name, T in (simulation.X | simulation.Y).items():
+            assert r.contains(name, T, 0.9999), name
+
+
+def test_noise_given_too_small_is_told_and_estimated_is_not() -> None:
+    problem = copied(rig(seed=4).problem, sigma=lambda pair, raw: 0.3 * raw.sigma)
+    solution = rw.solve(problem)
+    with pytest.warns(rw.errors.WeightsWarning, match=r"standard deviations are too small by about \d"):
+        rw.refine(problem, solution, rw.RefineOptions(noise="given"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rw.refine(problem, solution, rw.RefineOptions(noise="estimate"))
+        rw.refine(rig(seed=4).problem, rw.solve(rig(seed=4).problem))
+
+
+def test_a_limit_of_iterations_is_told() -> None:
+    simulation = rig(seed=4, noise=Noise(0.05, 50.0))
+    solution = rw.solve(simulation.problem)
+    with pytest.warns(rw.errors.NotConvergedWarning, match="after 1 iterations"):
+        rw.refine(simulation.problem, solution, rw.RefineOptions(max_iterations=1))
