@@ -54,8 +54,8 @@ class GeodesicModel:
         elif options.carrier_noise is not None and graphs.CarrierVariables.of(data).is_shared:
             warnings.warn(
                 "some measurements share a carrier pose, whose error does not average out between them, but its "
-                "noise is propagated to each on its own: standard deviations are too small; take carrier_model='variables'"
-                + (", without time offsets" if options.time_offsets else ""),
+                "noise is propagated to each on its own: standard deviations are too small; take "
+                "carrier_model='variables'" + (", without time offsets" if options.time_offsets else ""),
                 WeightsWarning,
                 stacklevel=4,
             )

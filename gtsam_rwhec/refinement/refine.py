@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -17,36 +16,27 @@ from gtsam_rwhec.certify.parts import Part, parts_of
 from gtsam_rwhec.errors import (
     FrameError,
     MeasurementsNotKeptError,
-    NotConvergedWarning,
     NotUniqueWarning,
     OptionError,
     ScaleError,
     WeightsWarning,
 )
-from gtsam_rwhec.poses import Array
 from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.chordal import ChordalModel
+from gtsam_rwhec.refinement.fit import Fit, Model, fit
 from gtsam_rwhec.refinement.free_space import free_space_of
 from gtsam_rwhec.refinement.geodesic import GeodesicModel
 from gtsam_rwhec.refinement.graduated import graduated
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
-from gtsam_rwhec.refinement.optimisation import Optimum, information_of, optimise
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.refined import Movement, PairNoise, Refined
 from gtsam_rwhec.refinement.variables import State, Variables
-from gtsam_rwhec.refinement.weighting import VarianceFactors, group_of
+from gtsam_rwhec.refinement.weighting import group_of
 from gtsam_rwhec.selection import selected
 from gtsam_rwhec.solution import Solution
 
 Progress = Callable[[str], None]
-Model = GeodesicModel | ChordalModel
-
-#: Rounds of re-estimating the noise, and of carrying A's noise into the residuals anew; two to five are usual.
-MAX_ROUNDS = 30
-#: Variance factors are settled when none changes by more than this, of itself.
-SETTLED = 1e-4
 
 
 def refine(
@@ -111,8 +101,8 @@ def refine(
     parts = parts_of(problem)
     model = _model(problem, parts, variables, options)
     tell("refining")
-    fit = _fit(problem, model, variables, variables.start(start), options, estimates)
-    state = variables.state(fit.optimum.values)
+    settled = fit(problem, model, variables, variables.start(start), options, estimates)
+    state = variables.state(settled.optimum.values)
     tell("covariances")
     space = free_space_of(parts, variables, state)
     if space.sentences:
@@ -122,22 +112,22 @@ def refine(
             stacklevel=2,
         )
     if not estimates:
-        _warn_of_weights(problem, variables, fit, options)
-    joint = JointCovariance.of(variables.unknown, fit.information, space.basis, space.unit)
+        _warn_of_weights(problem, variables, settled, options)
+    joint = JointCovariance.of(variables.unknown, settled.information, space.basis, space.unit)
     return Refined(
         X=state.X,
         Y=state.Y,
         scale=_scale(problem, state),
         scale_mode=problem.scale,
         time_offsets_s={name.partition(":")[2]: value for name, value in state.offsets_s.items()},
-        graph=fit.graph,
-        values=fit.optimum.values,
+        graph=settled.graph,
+        values=settled.optimum.values,
         keys=variables.keys,
         noise_source="estimated" if estimates else "given",
-        noise=_noise(model, fit, options, estimates),
-        cost=fit.optimum.cost,
-        initial_cost=fit.initial_cost,
-        iterations=fit.iterations,
+        noise=_noise(model, settled, options, estimates),
+        cost=settled.optimum.cost,
+        initial_cost=settled.initial_cost,
+        iterations=settled.iterations,
         moved=_moved(start, state),
         inliers=inliers,
         free_directions=space.sentences,
@@ -147,92 +137,11 @@ def refine(
     )
 
 
-@dataclass(frozen=True)
-class _Fit:
-    graph: gtsam.NonlinearFactorGraph
-    optimum: Optimum
-    information: Array
-    factors: VarianceFactors
-    redundancy: dict[tuple[str, str], float]
-    initial_cost: float
-    iterations: int
-
-
-def _fit(
-    problem: Problem, model: Model, variables: Variables, start: State, options: RefineOptions, estimates: bool
-) -> _Fit:
-    """Optimise, and where weights depend on the answer or on the residuals, again until they are settled."""
-    factors = VarianceFactors.ones(problem.pairs)
-    redundancy: dict[tuple[str, str], float] = {}
-    state, values = start, model.values(start)
-    iterations = 0
-    if isinstance(model, GeodesicModel) and model.first_loss is not None:
-        graph = _with_knowledge(model.graph(state, factors, model.first_loss), problem, variables, options)
-        optimum = optimise(graph, values, options.max_iterations)
-        iterations += optimum.iterations
-        state, values = variables.state(optimum.values), optimum.values
-    for round_number in range(MAX_ROUNDS):
-        graph = _with_knowledge(model.graph(state, factors), problem, variables, options)
-        optimum = optimise(graph, values, options.max_iterations)
-        iterations += optimum.iterations
-        state, values = variables.state(optimum.values), optimum.values
-        information = _information(problem, model, variables, options, state, factors, values)
-        settled = not model.reweighs or round_number > 0
-        if estimates:
-            size = len(information)
-            joint = JointCovariance.of(variables.unknown, information, np.zeros((size, 0)), np.ones(size))
-            components = model.next_factors(state, joint, factors, options.noise_groups)
-            change = components.factors.distance(factors)
-            settled = settled and change < SETTLED
-            redundancy = components.redundancy
-            if not settled:
-                factors = components.factors
-        if settled:
-            break
-    else:
-        warnings.warn(
-            f"the estimated noise did not settle in {MAX_ROUNDS} rounds: a part of it goes to zero, as where the noise "
-            "given for A already explains the residuals; give B's noise (noise='given'), or less for A",
-            NotConvergedWarning,
-            stacklevel=3,
-        )
-    if optimum.iterations >= options.max_iterations:
-        warnings.warn(
-            f"GTSAM stopped after {optimum.iterations} iterations without converging; raise "
-            "RefineOptions.max_iterations",
-            NotConvergedWarning,
-            stacklevel=3,
-        )
-    return _Fit(graph, optimum, information, factors, redundancy, graph.error(model.values(start)), iterations)
-
-
-def _with_knowledge(
-    graph: gtsam.NonlinearFactorGraph, problem: Problem, variables: Variables, options: RefineOptions
-) -> gtsam.NonlinearFactorGraph:
-    graphs.add_priors(graph, variables, problem, options.residual)
-    graphs.add_fixed(graph, variables, problem)
-    return graph
-
-
-def _information(
-    problem: Problem,
-    model: Model,
-    variables: Variables,
-    options: RefineOptions,
-    state: State,
-    factors: VarianceFactors,
-    values: gtsam.Values,
-) -> Array:
-    graph = model.information_graph(state, factors)
-    graphs.add_priors(graph, variables, problem, options.residual)
-    return information_of(graph, values, variables) / model.inefficiency(state, factors)
-
-
 #: A cost this many times what the given noise predicts makes covariances too small by its root, and is told.
 UNLIKELY = 2.0
 
 
-def _warn_of_weights(problem: Problem, variables: Variables, fit: _Fit, options: RefineOptions) -> None:
+def _warn_of_weights(problem: Problem, variables: Variables, settled: Fit, options: RefineOptions) -> None:
     """Compare the residuals with what the noise as given predicts: half the equations to spare."""
     if options.robust not in ("none", "gnc"):  # a loss makes another cost
         return
@@ -242,10 +151,10 @@ def _warn_of_weights(problem: Problem, variables: Variables, fit: _Fit, options:
     )
     spare = equations - sum(variables.unknown.values())
     # Beyond doubt, too: a chi-square of few degrees of freedom may well be twice its mean.
-    if fit.optimum.cost > UNLIKELY * 0.5 * spare and chdtrc(spare, 2.0 * fit.optimum.cost) < 1e-3:
-        ratio = fit.optimum.cost / (0.5 * spare)
+    if settled.optimum.cost > UNLIKELY * 0.5 * spare and chdtrc(spare, 2.0 * settled.optimum.cost) < 1e-3:
+        ratio = settled.optimum.cost / (0.5 * spare)
         warnings.warn(
-            f"the residuals cost {fit.optimum.cost:.4g}, {ratio:.3g} times what the given noise predicts "
+            f"the residuals cost {settled.optimum.cost:.4g}, {ratio:.3g} times what the given noise predicts "
             f"({0.5 * spare:.4g}): standard deviations are too small by about {math.sqrt(ratio):.2g}; take "
             "noise='estimate', robust='gnc' if some measurements are wrong, or carrier_noise if A is not exact",
             WeightsWarning,
@@ -315,14 +224,14 @@ def _scale(problem: Problem, state: State) -> float | dict[str, float]:
     return {n: problem.fixed_scales[n] if n in problem.fixed_scales else state.scales[f"scale:{n}"] for n in names}
 
 
-def _noise(model: Model, fit: _Fit, options: RefineOptions, estimates: bool) -> dict[Pair, PairNoise]:
+def _noise(model: Model, settled: Fit, options: RefineOptions, estimates: bool) -> dict[Pair, PairNoise]:
     result = {}
     for pair, (rotation, translation) in model.given_noise.items():
-        factors = fit.factors.of[pair]
+        factors = settled.factors.of[pair]
         spare = (np.inf, np.inf)
         if estimates:
             group = group_of(pair, options.noise_groups)
-            spare = (fit.redundancy[group, "rotation"], fit.redundancy[group, "translation"])
+            spare = (settled.redundancy[group, "rotation"], settled.redundancy[group, "translation"])
         result[pair] = PairNoise(rotation * math.sqrt(factors[0]), translation * math.sqrt(factors[1]), spare)
     return result
 

@@ -1,0 +1,111 @@
+"""Optimising until the weights are settled, where they depend on the answer or on the residuals."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.errors import NotConvergedWarning
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.refinement import graph as graphs
+from gtsam_rwhec.refinement.chordal import ChordalModel
+from gtsam_rwhec.refinement.geodesic import GeodesicModel
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.optimisation import Optimum, information_of, optimise
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.refinement.weighting import VarianceFactors
+
+Model = GeodesicModel | ChordalModel
+
+#: Rounds of re-estimating the noise, and of carrying A's noise into the residuals anew; two to five are usual.
+MAX_ROUNDS = 30
+#: Variance factors are settled when none changes by more than this, of itself.
+SETTLED = 1e-4
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The settled optimum: the graph, the information of the unknowns, and what the noise came to."""
+
+    graph: gtsam.NonlinearFactorGraph
+    optimum: Optimum
+    information: Array
+    factors: VarianceFactors
+    redundancy: dict[tuple[str, str], float]
+    initial_cost: float
+    iterations: int
+
+
+def fit(
+    problem: Problem, model: Model, variables: Variables, start: State, options: RefineOptions, estimates: bool
+) -> Fit:
+    """Optimise, and where weights depend on the answer or on the residuals, again until they are settled."""
+    factors = VarianceFactors.ones(problem.pairs)
+    redundancy: dict[tuple[str, str], float] = {}
+    state, values = start, model.values(start)
+    iterations = 0
+    if isinstance(model, GeodesicModel) and model.first_loss is not None:
+        graph = _with_knowledge(model.graph(state, factors, model.first_loss), problem, variables, options)
+        optimum = optimise(graph, values, options.max_iterations)
+        iterations += optimum.iterations
+        state, values = variables.state(optimum.values), optimum.values
+    for round_number in range(MAX_ROUNDS):
+        graph = _with_knowledge(model.graph(state, factors), problem, variables, options)
+        optimum = optimise(graph, values, options.max_iterations)
+        iterations += optimum.iterations
+        state, values = variables.state(optimum.values), optimum.values
+        information = _information(problem, model, variables, options, state, factors, values)
+        settled = not model.reweighs or round_number > 0
+        if estimates:
+            size = len(information)
+            joint = JointCovariance.of(variables.unknown, information, np.zeros((size, 0)), np.ones(size))
+            components = model.next_factors(state, joint, factors, options.noise_groups)
+            change = components.factors.distance(factors)
+            settled = settled and change < SETTLED
+            redundancy = components.redundancy
+            if not settled:
+                factors = components.factors
+        if settled:
+            break
+    else:
+        warnings.warn(
+            f"the estimated noise did not settle in {MAX_ROUNDS} rounds: a part of it goes to zero, as where the noise "
+            "given for A already explains the residuals; give B's noise (noise='given'), or less for A",
+            NotConvergedWarning,
+            stacklevel=3,
+        )
+    if optimum.iterations >= options.max_iterations:
+        warnings.warn(
+            f"GTSAM stopped after {optimum.iterations} iterations without converging; raise "
+            "RefineOptions.max_iterations",
+            NotConvergedWarning,
+            stacklevel=3,
+        )
+    return Fit(graph, optimum, information, factors, redundancy, graph.error(model.values(start)), iterations)
+
+
+def _with_knowledge(
+    graph: gtsam.NonlinearFactorGraph, problem: Problem, variables: Variables, options: RefineOptions
+) -> gtsam.NonlinearFactorGraph:
+    graphs.add_priors(graph, variables, problem, options.residual)
+    graphs.add_fixed(graph, variables, problem)
+    return graph
+
+
+def _information(
+    problem: Problem,
+    model: Model,
+    variables: Variables,
+    options: RefineOptions,
+    state: State,
+    factors: VarianceFactors,
+    values: gtsam.Values,
+) -> Array:
+    graph = model.information_graph(state, factors)
+    graphs.add_priors(graph, variables, problem, options.residual)
+    return information_of(graph, values, variables) / model.inefficiency(state, factors)
