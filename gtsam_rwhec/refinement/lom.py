@@ -203,7 +203,7 @@ def lom_factor(
     weight = np.concatenate([np.repeat(1.0 / sigma_R[:, None], 3, 1), np.repeat(1.0 / sigma_t[:, None], 3, 1)], 1)
     keys = [X.rotation, X.translation, Y.rotation, Y.translation]
 
-    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Any] | None) -> Array:
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Any] | None) -> se3.Array:
         R_X, R_Y = values.atRot3(X.rotation).matrix(), values.atRot3(Y.rotation).matrix()
         alpha = 1.0 if scale_key is None else values.atVector(scale_key)[0]
         e_R = se3.so3_logmap((R_A @ R_X).transpose(0, 2, 1) @ R_Y @ R_B)
@@ -212,16 +212,14 @@ def lom_factor(
             J_left_inverse = se3.so3_left_jacobian_inverse(e_R)
             # log(Expmap(-w) E): -J_l^-1; log(E Expmap(R_B' w)): J_r^-1 R_B', and J_r^-1 is J_l^-1 transposed
             by_R_X = _stacked(-J_left_inverse, np.zeros_like(R_A), weight)
-            by_R_Y = _stacked(
-                J_left_inverse.transpose(0, 2, 1) @ R_B.transpose(0, 2, 1), R_Y @ se3.hat(t_B), weight
-            )
+            by_R_Y = _stacked(J_left_inverse.transpose(0, 2, 1) @ R_B.transpose(0, 2, 1), R_Y @ se3.hat(t_B), weight)
             jacobians[0] = by_R_X
             jacobians[1] = _stacked(np.zeros_like(R_A), R_A, weight)
             jacobians[2] = by_R_Y
             jacobians[3] = _stacked(np.zeros_like(R_A), np.broadcast_to(-np.eye(3), R_A.shape), weight)
             if scale_key is not None:
                 jacobians[4] = _stacked(np.zeros((*t_A.shape, 1)), t_A[:, :, None], weight)
-        residual: Array = (weight * np.concatenate([e_R, e_t], axis=1)).ravel()
+        residual: se3.Array = (weight * np.concatenate([e_R, e_t], axis=1)).ravel()
         return residual
 
     return gtsam.CustomFactor(
