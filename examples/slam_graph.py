@@ -4,8 +4,8 @@
 
 A drone flies two laps through a room. Its graph has odometry and loop closures; two cameras see tags on the walls.
 Where the cameras are on the drone, and where the tags are, is known to some ten degrees and decimetres at first:
-``pose_robot_world_hand_eye_factor`` ties drone, tag and camera by one sighting, under a full covariance in the camera's
-frame. Only gtsam and numpy are needed; the picture is drawn where matplotlib is there.
+``pose_robot_world_hand_eye_factor`` ties drone, tag and camera by one sighting, under a covariance of its own. Only
+gtsam and numpy are needed; the picture is drawn where matplotlib is there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rwhec_factors import pose_robot_world_hand_eye_factor
 POSES, LAPS = 72, 2
 ODOMETRY = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.01, 0.02], 3))  # rad, m
 CLOSURE = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.02, 0.03], 3))
-# A tag's tilt and its distance are what a camera sees worst.
+# Along the tag's axes, z towards the camera: tilt and distance are what a camera sees worst.
 SIGHTING = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.02, 0.02, 0.005, 0.004, 0.004, 0.015]))
 START = gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
 MOUNTED_ABOUT_THERE = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.3, 0.2], 3))

@@ -47,8 +47,8 @@ def robot_world_hand_eye_factor(
         isotropic in each: Diagonal.Sigmas of [r, r, r, t, t, t] is kappa = 1 / (2 r^2), sigma = t.
     residual : "geodesic" or "chordal"
     time_offset_key : int, optional
-        Key of a 1-vector d in seconds, the last key: B's stamp t is the carriers' t + d, A(t + d) = A Expmap(d twist).
-        Needs ``twist``.
+        Key of a 1-vector d in seconds, the factor's third key: B's stamp t is the carriers' t + d, A(t + d) =
+        A Expmap(d twist). Needs ``twist``.
     twist : (6,), optional
         The carriers' velocity at the stamp, [omega (rad/s), v (m/s)], in the target carrier's frame as A's right
         perturbations are: Log(A(t)^-1 A(t + h)) / h for small h.
@@ -88,7 +88,7 @@ def scaled_robot_world_hand_eye_factor(
         Keys of X and Y, Pose3, in true metres.
     scale_key : int
         Key of s, a 1-vector (``numpy.array([1.0])``; a float in Values cannot be pickled): t_B = s * (true length). The
-        last key but for a time offset.
+        factor's last key.
     A, B, noise, residual, time_offset_key, twist
         As there; B and its noise in measured lengths.
 

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
+import rwhec_factors
 from gtsam.symbol_shorthand import S, Y
-from rwhec_factors import direction_prior_factor, hand_eye_factor, pose_prior_factor, position_prior_factor
+from rwhec_factors import (
+    direction_prior_factor,
+    hand_eye_factor,
+    pose_prior_factor,
+    position_prior_factor,
+    rotation_prior_factor,
+)
 
 NOISE = gtsam.noiseModel.Isotropic.Sigma(6, 0.01)
 MOUNTING = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, -0.2, 1.0), np.array([0.1, -0.05, 0.4]))
@@ -114,6 +122,10 @@ def test_marginals_raise_when_singular_and_the_hessian_names_the_direction() -> 
     graph.add(position_prior_factor(Y(0), MOUNTING.translation(), gtsam.noiseModel.Isotropic.Sigma(3, 0.01)))
     with pytest.raises(RuntimeError, match="Indeterminate"):
         gtsam.Marginals(graph, values)
+    weak = gtsam.NonlinearFactorGraph(graph)
+    weak.add(rotation_prior_factor(Y(0), MOUNTING.rotation(), gtsam.noiseModel.Isotropic.Sigma(3, 1e4)))
+    with pytest.raises(RuntimeError, match="Indeterminate"):  # determined by now, to 1e4 rad
+        gtsam.Marginals(weak, values)
     eigenvalues, eigenvectors = np.linalg.eigh(graph.linearize(values).hessian()[0])
     assert eigenvalues[0] < 1e-9 * eigenvalues[1]
     np.testing.assert_allclose(np.abs(eigenvectors[:, 0]), np.abs(np.r_[axis, 0.0, 0.0, 0.0]), atol=1e-6)
@@ -128,3 +140,9 @@ def test_an_error_of_a_factor_comes_out_of_the_optimiser_as_it_is() -> None:
         empty.insert(Y(0), np.zeros(1))
         with pytest.raises(TypeError, match=r"y0 should be .*Pose3"):
             optimiser(graph, empty).optimize()
+
+
+def test_the_readme_lists_every_factor() -> None:
+    text = (Path(__file__).resolve().parents[2] / "factors" / "README.md").read_text(encoding="utf-8")
+    listed = {name for name in rwhec_factors.__all__ if f"`{name}(" in text}
+    assert listed == {name for name in rwhec_factors.__all__ if name.endswith("_factor")}
