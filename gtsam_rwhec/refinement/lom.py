@@ -211,12 +211,11 @@ def lom_factor(
         if jacobians is not None:
             J_left_inverse = se3.so3_left_jacobian_inverse(e_R)
             # log(Expmap(-w) E): -J_l^-1; log(E Expmap(R_B' w)): J_r^-1 R_B', and J_r^-1 is J_l^-1 transposed
-            by_R_X = _stacked(-J_left_inverse, np.zeros_like(R_A), weight)
-            by_R_Y = _stacked(J_left_inverse.transpose(0, 2, 1) @ R_B.transpose(0, 2, 1), R_Y @ se3.hat(t_B), weight)
-            jacobians[0] = by_R_X
-            jacobians[1] = _stacked(np.zeros_like(R_A), R_A, weight)
-            jacobians[2] = by_R_Y
-            jacobians[3] = _stacked(np.zeros_like(R_A), np.broadcast_to(-np.eye(3), R_A.shape), weight)
+            zero = np.zeros_like(R_A)
+            jacobians[0] = _stacked(-J_left_inverse, zero, weight)
+            jacobians[1] = _stacked(zero, R_A, weight)
+            jacobians[2] = _stacked((R_B @ J_left_inverse).transpose(0, 2, 1), R_Y @ se3.hat(t_B), weight)
+            jacobians[3] = _stacked(zero, np.broadcast_to(-np.eye(3), R_A.shape), weight)
             if scale_key is not None:
                 jacobians[4] = _stacked(np.zeros((*t_A.shape, 1)), t_A[:, :, None], weight)
         residual: se3.Array = (weight * np.concatenate([e_R, e_t], axis=1)).ravel()

@@ -1,10 +1,10 @@
 """Every benchmark in one table.
 
-    python tests/benchmarks/run_all.py [--no-scs] [--plot FOLDER] [--tables-runs 1000]
+    python tests/benchmarks/run_all.py [--no-scs] [--plot FOLDER] [--tables-runs 1000] [--lom-runs 300]
 
-Takes some minutes: SCS one, the paper's tables (in processes of their own, with their own table) most of the rest;
-``--tables-runs 0`` leaves those out. The noise sweep is examples/noise_sweep.py. Exits with 1 if a bar is missed.
-Needs opencv-python-headless<5, scs and matplotlib.
+Takes some minutes: SCS one, the paper's tables (in processes of their own, with their own tables) most of the rest;
+``--tables-runs 0`` and ``--lom-runs 0`` leave those out. The noise sweep is examples/noise_sweep.py. Exits
+with 1 if a bar is missed. Needs opencv-python-headless<5, scs and matplotlib.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ def main() -> int:
     parser.add_argument("--no-scs", action="store_true", help="leave out the rows that need SCS")
     parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write time_against_frames.png there")
     parser.add_argument("--tables-runs", type=int, default=1000, help="of each experiment of Tables 2-5; 0: none")
+    parser.add_argument("--lom-runs", type=int, default=300, help="of each row LOM of Tables 2-5; 0: none")
     arguments = parser.parse_args()
     parts = {
         "answers on the real dataset": real_dataset.answers,
@@ -51,10 +52,10 @@ def main() -> int:
     status = print_rows("What the certified core must reach", rows)
     if arguments.plot is not None:
         print(f"Written to {many_frames.plot(arguments.plot, repetitions=5)}.")
-    if arguments.tables_runs:
-        script = Path(__file__).with_name("tables_2_to_5.py")
-        command = [sys.executable, str(script), "--runs", str(arguments.tables_runs)]
-        status = max(status, subprocess.run(command, check=False).returncode)
+    for name, runs in (("tables_2_to_5.py", arguments.tables_runs), ("lom_tables.py", arguments.lom_runs)):
+        if runs:
+            command = [sys.executable, str(Path(__file__).with_name(name)), "--runs", str(runs)]
+            status = max(status, subprocess.run(command, check=False).returncode)
     return status
 
 
