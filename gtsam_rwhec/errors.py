@@ -15,6 +15,10 @@ class CountError(RwhecError):
     """Different numbers of A and B, or of weights, stamps and covariances for them; or none at all."""
 
 
+class StampError(RwhecError):
+    """Stamps that are all zero, out of order, of another clock, or do not tell what is asked of them."""
+
+
 class NoiseError(RwhecError):
     """A sigma or kappa that is not a positive, finite number; a covariance that is not positive definite."""
 

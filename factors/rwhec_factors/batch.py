@@ -156,7 +156,7 @@ def robot_world_hand_eye_batch_factor(
     Returns
     -------
     gtsam.CustomFactor
-        Of N times 6 (or 12) whitened rows with unit noise; keys in the order target, sensor, scale, time offset.
+        Of N times 6 (or 12) whitened rows with unit noise; keys in the order target, sensor, time offset, scale.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def robot_world_hand_eye_batch_factor(
     whitening = _whitening(np.asarray(sqrt_information, dtype=np.float64), count, residual)
     batch = BatchResiduals(A, B, residual, None if twists is None else np.asarray(twists, dtype=np.float64))
     ends = [target_key] if target_key == sensor_key else [target_key, sensor_key]
-    keys = ends + [key for key in (scale_key, time_offset_key) if key is not None]
+    keys = ends + [key for key in (time_offset_key, scale_key) if key is not None]
     if len(set(keys)) != len(keys):
         raise ValueError(f"keys {[gtsam.DefaultKeyFormatter(key) for key in keys]} are not all different")
     rows = whitening.shape[-2] * count
@@ -189,10 +189,10 @@ def robot_world_hand_eye_batch_factor(
             return plain
         at = batch.linearize(X, Y, scale, offset)
         blocks = [at.target + at.sensor] if len(ends) == 1 else [at.target, at.sensor]
-        if scale_key is not None:
-            blocks.append(at.scale[:, :, None])
         if time_offset_key is not None:
             blocks.append(at.offset[:, :, None])
+        if scale_key is not None:
+            blocks.append(at.scale[:, :, None])
         for i, block in enumerate(blocks):
             jacobians[i] = np.asfortranarray((whitening @ block).reshape(rows, -1))
         whitened: Array = np.einsum("nij,nj->ni", whitening, at.residual).ravel()

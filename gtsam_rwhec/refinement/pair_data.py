@@ -14,7 +14,7 @@ from gtsam_rwhec.measurements import checked_covariances
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
-from gtsam_rwhec.refinement.twists import carrier_twists
+from gtsam_rwhec.twists import carrier_twists
 
 
 @dataclass(frozen=True)
