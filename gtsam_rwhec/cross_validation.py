@@ -32,9 +32,9 @@ from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refine import refine
 from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.twists import carrier_twists
 from gtsam_rwhec.selection import selected
 from gtsam_rwhec.solution import Solution
+from gtsam_rwhec.twists import carrier_twists
 
 Split = Literal["time", "pair", "sensor"]
 Progress = Callable[[str], None]
