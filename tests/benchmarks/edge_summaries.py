@@ -33,7 +33,7 @@ SAME_OPTIMUM = 1e-8
 SAME_FORM = 1e-9
 FASTER = 20.0
 OFF = 0.05
-#: Of B: 7 mrad and 10 mm an axis, near the median residuals (8 mrad, 9.5 mm; outliers make the rms 26 mrad, 20 mm).
+#: Of B: 7 mrad and 10 mm an axis, near the median residuals (8 mrad, 9.5 mm; their rms is 26 mrad, 20 mm).
 KAPPA, SIGMA_M = 1e4, 0.01
 
 
