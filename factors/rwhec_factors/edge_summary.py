@@ -125,6 +125,10 @@ def _rows(A: Array, B: Array, root_weight: Array, root_kappa: Array, c: Array, a
     return M.reshape(12 * count, 25)
 
 
+#: d (R e_j) = -R hat(e_j) omega, for a right perturbation omega.
+_COLUMNS = -hat(np.eye(3))
+
+
 def square_root(form: Array) -> Array:
     """L (r, 25), r <= 25, with L' L = 2 Q.
 
@@ -204,6 +208,7 @@ def _summary_factor(ends: list[int], summary: EdgeSummary, scale_key: int | None
     origins = (summary.target_origin, summary.sensor_origin)
     names = ("X = T_targetcarrier_target", "Y = T_sensorcarrier_sensor")
     first_of = ((T_X, R_X), (T_Y, R_Y))
+    parts = [(np.ascontiguousarray(L[:, t]), np.ascontiguousarray(L[:, R])) for t, R in first_of]
     if len(ends) == 1:
         names = (names[1], names[1])
 
@@ -217,15 +222,16 @@ def _summary_factor(ends: list[int], summary: EdgeSummary, scale_key: int | None
             x[R] = pose.rotation().matrix().ravel(order="F")
         if jacobians is not None:
             blocks = []
-            for pose, (t, R) in zip(poses, first_of, strict=True):
+            for pose, (L_t, L_R) in zip(poses, parts, strict=True):
                 R_pose = pose.rotation().matrix()
-                columns = L[:, R].reshape(-1, 3, 3)  # [row, j]: what multiplies column j of R
-                turned = np.einsum("rji,jik->rk", columns, -R_pose @ hat(np.eye(3)))  # d (R e_j) = -R hat(e_j) omega
-                blocks.append(np.hstack([turned, scale * L[:, t] @ R_pose]))
+                block = np.empty((len(L), 6), order="F")
+                block[:, :3] = L_R @ (R_pose @ _COLUMNS).reshape(9, 3)
+                block[:, 3:] = L_t @ (scale * R_pose)
+                blocks.append(block)
             if len(ends) == 1:
                 blocks = [blocks[0] + blocks[1]]
             for i, block in enumerate(blocks):
-                jacobians[i] = np.asfortranarray(block)
+                jacobians[i] = block
             if scale_key is not None:  # x's first seven entries are scale times something
                 metres = np.r_[poses[0].translation() - origins[0], poses[1].translation() - origins[1], 1.0]
                 jacobians[len(blocks)] = np.asfortranarray((L[:, :7] @ metres)[:, None])
