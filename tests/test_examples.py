@@ -43,9 +43,19 @@ def test_the_grid_of_figure_8(utias_folder: Path, tmp_path: Path) -> None:
     assert "The whole is determined." in output
 
 
+def test_certified_start_then_refinement_is_short_and_goes_on(tmp_path: Path) -> None:
+    path = EXAMPLES / "certified_init_then_refine.py"
+    assert len(path.read_text(encoding="utf-8").splitlines()) < 30
+    done = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "certified: cost 368.6" in done.stdout
+    assert done.stdout.endswith(" 126.5 mm with the ruler.\n")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_no_example_is_left_out() -> None:
     scripts = {path.stem for path in EXAMPLES.glob("*.py")} - {"figures"}
-    assert scripts == set(RUNS) | {"figure_8_grid"}
+    assert scripts == set(RUNS) | {"figure_8_grid", "certified_init_then_refine"}
 
 
 def test_committed_pictures_are_small_and_made_by_an_example() -> None:
