@@ -4,8 +4,8 @@
 
 Close starts stand 10 cm and 10 degrees, at the most, from the truth, with a scale of 1; random ones have rotations
 uniform on SO(3), translations uniform in [-1, 1]^3 and a scale of 1. In Tables 2 and 4 the paper starts LOM from Wang's
-closed form in place of close; both lead to the same minimum. The runs are those of tables_2_to_5.py.
-Most of the time goes into random starts in Table 5: 7 minutes on two free cores.
+closed form; these rows start close here, too (no close start ended in a wrong minimum). The runs are those of
+tables_2_to_5.py. Takes 20 minutes on two busy cores, most of it for random starts.
 
 Some of the paper's rows are not what its text says. They are printed twice: as the text has them, without a bar, and as
 they seem to have been run, which was found by trying. The bar for the latter, and for the close rows of Tables 2 and 3
@@ -15,10 +15,10 @@ as the text has them: every mean within four combined standard errors.
   translation errors of the row below it and twice its rotation errors; and wrong minima are half turns, of which 66 %
   make a mean of 237 degrees and a deviation of 171 (the paper: 237 +- 163) if each counts as 360.
 - Random: one pair of weights served all four noise levels of a table, not each its own. With their own, Table 3
-  (kappa 125, 5 cm) has a wrong minimum in 1 % of our runs, and Table 2 in 10 to 50 %; the paper's four rows of
-  Table 3 have as many as one another, about 65 %, and its 400 runs of Table 2 none. Table 2 takes kappa sigma^2 of 0.4 or more for
-  that, and its errors fit 0.3 to 1: unit weights, say, which the paper has in Section 9. Tables 3-5 take 0.0125 (kappa
-  125, 1 cm) or less; what exactly, the numbers do not tell.
+  (kappa 125, 5 cm) has a wrong minimum in 1 % of our runs, and Table 2 in 10 to 50 %; the paper's four rows of Table 3
+  have as many as one another, about 65 %, and its 400 runs of Table 2 none. Table 2 takes kappa sigma^2 of 0.4 or more
+  for that, and its errors fit 0.3 to 1: unit weights, say, which the paper has in Section 9. Tables 3-5 take 0.0125
+  (kappa 125, 1 cm) or less; what exactly, the numbers do not tell.
 - Random, monocular: translations are divided by the scale, and a scale of -1/2 in place of 1/2, where nearly half of
   Table 3's runs end, is an error of 2.
 - Close, Tables 4 and 5: r_y is that of a rotation weight of 2 to 3 kappa, not Appendix C's kappa: larger than that of
