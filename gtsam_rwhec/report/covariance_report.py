@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.csv_files import natural_key
 from gtsam_rwhec.pose_covariances import standard_deviations
 from gtsam_rwhec.poses import Array
-from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
 from gtsam_rwhec.report.solution_report import report_console
 
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
 LEGEND = (
     "Poses: metres; roll, pitch, yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation along, and "
-    "about, the x, y, z of the frame itself; 'free': the measurements say nothing of it. Moved: from the certified "
-    "solution."
+    "about, the x, y, z of the frame itself; free: infinite, as a direction that the measurements leave free reaches "
+    "this axis. Moved: from the certified solution."
 )
 
 
@@ -46,6 +47,9 @@ def print_refined(refined: Refined, console: Console | None = None) -> None:
             console.print(table)
     console.print(Text(LEGEND, style="dim"), soft_wrap=not console.is_terminal)
     console.print()
+    noise = noise_table(refined)
+    if len(noise.rows) > 1:
+        console.print(noise)
     for sentence in refined_sentences(refined):
         console.print(Text(sentence), soft_wrap=not console.is_terminal)
     for sentence in refined.free_directions:
@@ -70,32 +74,78 @@ def refined_sentences(refined: Refined) -> list[str]:
                 f"Time offset of {owner}: {offset:+.3f} ± {_cell(1e3 * deviation, 3)} ms (the carriers' time is its "
                 "stamps' plus this)."
             )
-    sentences += _noise_sentences(refined)
+    sentences += [_noise_sentence(refined), _carrier_noise_sentence(refined)]
+    loss = "" if refined.options.robust in ("none", "gnc") else f", {refined.options.robust} loss"
+    steps = f"{refined.iterations} iteration{'' if refined.iterations == 1 else 's'}"
     sentences.append(
-        f"Cost: {refined.cost:.6g} after {refined.iterations} iterations, {refined.initial_cost:.6g} at the certified "
-        f"solution ({refined.options.residual} residual)."
+        f"Cost: {refined.cost:.6g} after {steps}, {refined.initial_cost:.6g} at the certified solution "
+        f"({refined.options.residual} residual{loss})."
     )
-    for pair, kept in refined.inliers.items():
-        if not kept.all():
-            sentences.append(
-                f"Outliers of {'-'.join(dict.fromkeys(pair))}: {int((~kept).sum())} of {len(kept)} left out."
-            )
+    if refined.inliers:
+        sentences.append(_outlier_sentence(refined.inliers))
     return sentences
 
 
-def _noise_sentences(refined: Refined) -> list[str]:
-    """One sentence where all pairs have the same noise, else one for each."""
-    groups: dict[str, list[str]] = {}
-    for pair, noise in refined.noise.items():
-        how = f"{math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm an axis"
-        if refined.noise_source == "estimated":
-            how += f", estimated with {noise.redundancy[0]:.0f} and {noise.redundancy[1]:.0f} equations to spare"
-        else:
-            how += ", as given"
-        groups.setdefault(how, []).append("-".join(dict.fromkeys(pair)))
-    if len(groups) == 1:
-        return [f"Noise of B: {next(iter(groups))}."]
-    return [f"Noise of B, {', '.join(pairs)}: {how}." for how, pairs in groups.items()]
+def _noise_sentence(refined: Refined) -> str:
+    """Where the noise comes from; its size too where it is the same for all pairs, which else the table has."""
+    source = "estimated from the residuals" if refined.noise_source == "estimated" else "as given"
+    rows = noise_table(refined).rows
+    if len(rows) != 1:
+        return f"Noise of B: {source}; in the table."
+    rotation, translation, *spare = next(iter(rows.values()))
+    backing = f", with {spare[0]} and {spare[1]} equations to spare" if spare else ""
+    return f"Noise of B: {rotation}° and {translation} mm an axis, {source}{backing}."
+
+
+def _carrier_noise_sentence(refined: Refined) -> str:
+    noise = refined.options.carrier_noise
+    if noise is None:
+        return "Noise of A: none; if the carriers' poses are not exact, these standard deviations are too small."
+    if noise.covariances is not None:
+        return "Noise of A: the covariances given for each measurement."
+    return (
+        f"Noise of A: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm an axis of the "
+        f"{noise.about.removesuffix('carrier')} carrier, as given."
+    )
+
+
+def _outlier_sentence(inliers: Mapping[Pair, np.ndarray]) -> str:
+    """How many measurements were left out, and of which pairs."""
+    total = sum(len(kept) for kept in inliers.values())
+    out = {pair: int((~kept).sum()) for pair, kept in inliers.items() if not kept.all()}
+    if not out:
+        return f"Outliers: none of {total} measurements."
+    pairs = ", ".join(f"{_pair_name(pair)} {count} of {len(inliers[pair])}" for pair, count in out.items())
+    return f"Outliers: {sum(out.values())} of {total} measurements left out: {pairs}."
+
+
+def noise_table(refined: Refined) -> FrameTable:
+    """The noise of B: a line for all pairs, for each sensor, or for each pair, as few as tell all."""
+    noises = {pair: _noise_cells(noise) for pair, noise in refined.noise.items()}
+    kinds: tuple[tuple[str, Callable[[Pair], str]], ...] = (
+        ("", lambda pair: "all"),
+        ("sensor", lambda pair: pair[1]),
+        ("pair", _pair_name),
+    )
+    kind, label = next(
+        (kind, label)
+        for kind, label in kinds
+        if label is _pair_name
+        or len({(label(pair), cells) for pair, cells in noises.items()}) == len({label(pair) for pair in noises})
+    )
+    rows = {label(pair): cells for pair, cells in noises.items()}
+    headings = ("±°", "±mm") if refined.noise_source == "given" else ("±°", "±mm", "spare (°)", "spare (mm)")
+    title = "Noise of B an axis" + ("" if refined.noise_source == "given" else ", and equations to spare")
+    return FrameTable(title, kind, headings, {name: rows[name] for name in sorted(rows, key=natural_key)})
+
+
+def _noise_cells(noise: PairNoise) -> tuple[str, ...]:
+    size = (f"{math.degrees(noise.rotation_rad):.3g}", f"{1e3 * noise.translation_m:.3g}")
+    return size + tuple(f"{spare:.0f}" for spare in noise.redundancy if np.isfinite(spare))
+
+
+def _pair_name(pair: Pair) -> str:
+    return "-".join(dict.fromkeys(pair))
 
 
 def _frame_table(title: str, kind: str, poses: Mapping[str, object], refined: Refined) -> FrameTable:
@@ -104,7 +154,7 @@ def _frame_table(title: str, kind: str, poses: Mapping[str, object], refined: Re
         moved = refined.moved[name]
         rows[name] = (
             *pose_cells(refined.X[name] if name in refined.X else refined.Y[name]),
-            *deviation_cells(refined.covariance(name)),
+            *(deviation_cells(refined.covariance(name)) if name in refined.names else ("fixed",) * 6),
             f"{moved.translation_mm:.2f}",
             f"{moved.rotation_deg:.3f}",
         )

@@ -23,13 +23,16 @@ POSE_LEGEND = (
 
 POSE_HEADINGS = ("x m", "y m", "z m", "roll°", "pitch°", "yaw°")
 RESIDUAL_HEADINGS = ("rms mm", "rms°", "n")
+SPLIT = len(POSE_HEADINGS)
+"""Columns of a narrower table."""
 
 
 @dataclass(frozen=True)
 class FrameTable:
     """Frames with numbers under headings; prints itself to any width without cutting a number or a name.
 
-    One table where it fits, poses and residuals apart where that fits, and else a paragraph for each frame.
+    One table where it fits, else poses and what follows them apart, six columns each, where that fits, and else a
+    paragraph for each frame.
     """
 
     title: str
@@ -39,29 +42,45 @@ class FrameTable:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Choose the widest layout that fits."""
-        split = len(POSE_HEADINGS)
-        for cuts in (((0, None),), ((0, split), (split, None))):
-            tables = [self._table(slice(*cut)) for cut in cuts]
+        layouts = (
+            [slice(0, None)],
+            [slice(0, SPLIT), slice(SPLIT, None)],
+            [slice(0, SPLIT), slice(SPLIT, 2 * SPLIT), slice(2 * SPLIT, None)],
+        )
+        for cuts in layouts:
+            tables = [self._table(cut, self.title if cut.start == 0 else None) for cut in cuts if self.headings[cut]]
             unlimited = options.update(max_width=10_000)
             if all(console.measure(table, options=unlimited).maximum <= options.max_width for table in tables):
                 yield from tables
                 return
         yield Text(self.title, style="italic")
         for name, cells in self.rows.items():
-            numbers = ", ".join(f"{heading} {cell}" for heading, cell in zip(self.headings, cells, strict=True))
-            yield Text(f"{name}: {numbers}")
+            numbers = [f"{heading} {cell}" for heading, cell in zip(self.headings, cells, strict=True)]
+            yield Text("\n".join(_filled(f"{name}:", numbers, options.max_width)))
         yield Text()
 
-    def _table(self, columns: slice) -> Table:
+    def _table(self, columns: slice, title: str | None) -> Table:
         # One space between columns and none outside: with short names the whole fits 80 columns.
         table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-        table.title, table.title_justify = self.title, "left"
+        table.title, table.title_justify = title, "left"
         table.add_column(self.kind, no_wrap=True)
         for heading in self.headings[columns]:
             table.add_column(heading, justify="right", no_wrap=True)
         for name, cells in self.rows.items():
             table.add_row(Text(name), *cells[columns])
         return table
+
+
+def _filled(start: str, numbers: Iterable[str], width: int) -> list[str]:
+    """Lines up to a width; a number stays with its heading."""
+    lines = [start]
+    for piece in numbers:
+        if len(lines[-1]) + 1 + len(piece) + 1 <= width:
+            lines[-1] += f" {piece},"
+        else:
+            lines.append(f"  {piece},")
+    lines[-1] = lines[-1].removesuffix(",")
+    return lines
 
 
 def sensor_table(solution: Solution) -> FrameTable:
