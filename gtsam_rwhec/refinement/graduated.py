@@ -5,9 +5,12 @@
 (Yang, Antonante, Tzoumas, Carlone: Graduated non-convexity for robust spatial perception, 2020, Section III; c^2 is
 a quantile of the chi-square distribution with 6 degrees of freedom, which d^2 has at the truth.) For given weights the
 problem is a calibration problem again, solved to its global optimum from moments of the re-weighted measurements; so
-the scheme has no start to depend on. Graduating is a heuristic all the same: outliers that agree with each other can
-draw it to the wrong side. Hence a second start, least trimmed squares, which keeps half of each pair; of both ends the
-one of smaller truncated cost is taken.
+the scheme has no start to depend on. Graduating is a heuristic all the same: afterwards, frames with outliers are put
+to the vote of their own measurements (``consensus``).
+
+With noise unknown, d^2 has no unit to begin with: the worst of all measurements would make everything an inlier. Least
+trimmed squares, which keep the better half of each pair, give a first one, the inliers the next. With more than half
+outliers that noise is theirs, and nothing tells.
 """
 
 from __future__ import annotations
@@ -231,8 +234,8 @@ class _Work:
         """The best answer and its inliers (N,)."""
         everything = self.fit(np.ones(len(self.measured.A)), None)
         if noise_scale == "given":
-            return self.best([lambda: self.graduate(everything), lambda: self.trim(everything)])
-        halves = self.trim(everything, estimates=True)
+            return self.best([lambda: self.graduate(everything)])
+        halves = self.trim(everything)
         fit, _ = self.settle(halves, estimates=True)
         fit, _ = self.best([lambda: self.graduate(everything), lambda: fit])
         return self.settle(fit, estimates=True)
@@ -324,13 +327,12 @@ class _Work:
                 break
         return fit
 
-    def trim(self, fit: Fit, *, estimates: bool = False) -> Fit:
-        """Least trimmed squares: the better half of each pair, again and again until it stays the same."""
+    def trim(self, fit: Fit) -> Fit:
+        """Least trimmed squares: the better half of each pair, by the noise of the median, until it stays the same."""
         keep = np.zeros(len(self.measured.A), dtype=bool)
         for _ in range(self.max_iterations):
             squares = self.measured.squares(fit)
-            if estimates:
-                self.factors = self._from_median(squares)
+            self.factors = self._from_median(squares)
             d = self.measured.together(squares, self.factors)
             half = np.zeros_like(keep)
             for rows in self.measured.rows:

@@ -1,10 +1,11 @@
 """Every benchmark in one table.
 
-    python tests/benchmarks/run_all.py [--no-scs] [--plot FOLDER] [--tables-runs 1000] [--lom-runs 300]
+    python tests/benchmarks/run_all.py [--no-scs] [--plot FOLDER] [--outlier-seeds 40] [--tables-runs 1000]
+                                       [--lom-runs 300]
 
-Takes some minutes: SCS one, the paper's tables (in processes of their own, with their own tables) most of the rest;
-``--tables-runs 0`` and ``--lom-runs 0`` leave those out. The noise sweep is examples/noise_sweep.py. Exits
-with 1 if a bar is missed. Needs opencv-python-headless<5, scs and matplotlib.
+Takes a while: SCS a minute, outliers ten or more, the paper's tables (in processes of their own, with their own tables)
+most of the rest; ``--outlier-seeds 0``, ``--tables-runs 0`` and ``--lom-runs 0`` leave those out. The noise sweep is
+examples/noise_sweep.py. Exits with 1 if a bar is missed. Needs opencv-python-headless<5, scs and matplotlib.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import edge_summaries
 import many_frames
 import million_measurements
 import one_pair
+import outliers
 import real_dataset
 import single_pairs
 import world_origin
@@ -29,7 +31,8 @@ def main() -> int:
     """Run them one after the other."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--no-scs", action="store_true", help="leave out the rows that need SCS")
-    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write time_against_frames.png there")
+    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write the benchmarks' plots there")
+    parser.add_argument("--outlier-seeds", type=int, default=40, help="of each kind of outliers; 0: none")
     parser.add_argument("--tables-runs", type=int, default=1000, help="of each experiment of Tables 2-5; 0: none")
     parser.add_argument("--lom-runs", type=int, default=300, help="of each row LOM of Tables 2-5; 0: none")
     arguments = parser.parse_args()
@@ -41,6 +44,7 @@ def main() -> int:
         "a million measurements": lambda: million_measurements.rows(1_000_000, repetitions=9),
         "many frames": lambda: many_frames.rows(repetitions=7),
         "world origin": world_origin.rows,
+        "outliers": lambda: outliers.rows(arguments.outlier_seeds, arguments.plot) if arguments.outlier_seeds else [],
         "edge summaries in GTSAM": lambda: edge_summaries.rows(repetitions=5),
     }
     rows: list[Row] = []
