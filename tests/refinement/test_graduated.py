@@ -34,18 +34,28 @@ def largest_error_m(simulation: Simulation, solution: rw.Solution) -> float:
 
 @pytest.mark.parametrize("kind", ["random", "structured"])
 @pytest.mark.parametrize(
-    ("frames", "options"),
+    ("frames", "options", "noise_scale"),
     [
-        ((1, 1), {}),
-        ((3, 2), {}),
-        ((1, 1), {"scale": "shared"}),
-        ((2, 2), {"scale": "per_target", "known_sizes": ["target1"]}),
-        ((2, 1), {"odometry": 25, "odometry_noise": NOISE}),
-        ((0, 1), {"odometry": 40, "odometry_noise": NOISE}),
+        ((1, 1), {}, "given"),
+        ((1, 1), {}, "estimate"),
+        ((3, 2), {}, "given"),
+        ((3, 2), {}, "estimate"),
+        ((1, 1), {"scale": "shared"}, "estimate"),
+        ((2, 2), {"scale": "per_target", "known_sizes": ["target1"]}, "given"),
+        ((2, 1), {"odometry": 25, "odometry_noise": NOISE}, "estimate"),
+        ((0, 1), {"odometry": 40, "odometry_noise": NOISE}, "given"),
     ],
-    ids=["one pair", "3 x 2", "shared scale", "own scales", "with odometry", "AX = XB"],
+    ids=[
+        "one pair",
+        "one pair, noise unknown",
+        "3 x 2",
+        "3 x 2, noise unknown",
+        "shared scale, noise unknown",
+        "own scales",
+        "with odometry, noise unknown",
+        "AX = XB",
+    ],
 )
-@pytest.mark.parametrize("noise_scale", ["given", "estimate"])
 def test_forty_percent_of_outliers_are_found(
     kind: Any, frames: tuple[int, int], options: dict[str, Any], noise_scale: Any
 ) -> None:
