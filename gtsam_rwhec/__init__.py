@@ -16,9 +16,10 @@ from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
 from gtsam_rwhec.measurements import Measurements
 from gtsam_rwhec.priors import Prior
 from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.refined_file import read_refined
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
 from gtsam_rwhec.refinement.refine import refine
-from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.result_file import read_solution
 from gtsam_rwhec.solution import Residual, Solution, SolvedPart
 
@@ -38,6 +39,7 @@ __all__ = [
     "Problem",
     "RefineOptions",
     "Refined",
+    "RefinedPoses",
     "Residual",
     "Solution",
     "SolveOptions",
@@ -48,6 +50,7 @@ __all__ = [
     "errors",
     "pose_covariances",
     "read_csv",
+    "read_refined",
     "read_solution",
     "refine",
     "simulate",

@@ -6,7 +6,7 @@ every file. Poses carry the rotation twice: as a matrix, which is read back, and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,10 +17,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from gtsam_rwhec.atomic_write import write_atomically
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
+from gtsam_rwhec.problem import ScaleMode
 from gtsam_rwhec.result_schema import (
     CONVENTIONS,
     FORMAT,
     FORMAT_VERSION,
+    UNREFINED_VERSION,
     CertificateFields,
     IdentifiabilityFields,
     PairFields,
@@ -57,10 +59,22 @@ def write_solution(solution: Solution, path: str | Path) -> None:
     FileFormatError
         The file cannot be written (the message says why), or a number of the solution is NaN.
     """
+    write_result(path, lambda: fields_of(solution))
+
+
+def write_result(path: str | Path, make: Callable[[], ResultFile]) -> None:
+    """Write the fields that ``make`` returns.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written (the message says why), or ``make`` meets a number that is none.
+    """
     try:
-        content = _to_file(solution).model_dump_json(indent=2) + "\n"
+        result = make()
     except ValidationError as error:
         raise FileFormatError(f"{path} was not written, the solution is not sound: {_in_words(error)}") from error
+    content = result.model_dump_json(indent=2, exclude=None if result.refined is not None else {"refined"}) + "\n"
     try:
         write_atomically(Path(path), content.encode("utf-8"))
     except OSError as error:
@@ -70,6 +84,8 @@ def write_solution(solution: Solution, path: str | Path) -> None:
 def read_solution(path: str | Path) -> Solution:
     """Read what `write_solution` wrote: every number is the same double as before.
 
+    Of a refined calibration's file, the certified solution that was refined (`gtsam_rwhec.read_refined`: the rest).
+
     Raises
     ------
     ResultVersionError
@@ -78,6 +94,11 @@ def read_solution(path: str | Path) -> Solution:
         The file cannot be read, is not JSON, is not a result, or a field is missing, unknown or not what it should be;
         the message gives its JSON path.
     """
+    return _from_file(read_result(path))
+
+
+def read_result(path: str | Path) -> ResultFile:
+    """Read a file's fields; raises as `read_solution` does."""
     try:
         content = Path(path).read_bytes()
     except OSError as error:
@@ -90,7 +111,7 @@ def read_solution(path: str | Path) -> Solution:
         raise FileFormatError(
             f"{path}: $.format is {header.format!r}, expected {FORMAT!r}: this is another kind of file."
         )
-    if header.format_version != FORMAT_VERSION:
+    if header.format_version not in (UNREFINED_VERSION, FORMAT_VERSION):
         remedy = (
             "install a newer gtsam-rwhec"
             if header.format_version > FORMAT_VERSION
@@ -98,10 +119,10 @@ def read_solution(path: str | Path) -> Solution:
         )
         raise ResultVersionError(
             f"{path} has version {header.format_version} of the result format (written by {header.written_by}); this "
-            f"gtsam-rwhec reads version {FORMAT_VERSION}: {remedy}."
+            f"gtsam-rwhec reads versions {UNREFINED_VERSION} and {FORMAT_VERSION}: {remedy}."
         )
     try:
-        return _from_file(ResultFile.model_validate_json(content))
+        return ResultFile.model_validate_json(content)
     except ValidationError as error:
         raise FileFormatError(f"{path} is not a sound result: {_in_words(error)}") from error
 
@@ -118,22 +139,19 @@ def _in_words(error: ValidationError) -> str:
     return "; ".join(faults[:3]) + rest + "."
 
 
-def _to_file(solution: Solution) -> ResultFile:
+def fields_of(solution: Solution) -> ResultFile:
+    """A solution's fields."""
     from gtsam_rwhec import __version__  # the package imports this module
 
-    scale, identifiability = solution.scale, solution.identifiability
+    identifiability = solution.identifiability
     return ResultFile(
         format=FORMAT,
-        format_version=FORMAT_VERSION,
+        format_version=UNREFINED_VERSION,
         written_by=f"gtsam-rwhec {__version__}",
         conventions=CONVENTIONS,
-        targets=tuple(_pose_to_file("targetcarrier", name, pose) for name, pose in solution.X.items()),
-        sensors=tuple(_pose_to_file("sensorcarrier", name, pose) for name, pose in solution.Y.items()),
-        scale=Scale(
-            mode=solution.scale_mode,
-            value=None if isinstance(scale, Mapping) else scale,
-            by_frame=dict(scale) if isinstance(scale, Mapping) else None,
-        ),
+        targets=tuple(pose_to_file("targetcarrier", name, pose) for name, pose in solution.X.items()),
+        sensors=tuple(pose_to_file("sensorcarrier", name, pose) for name, pose in solution.Y.items()),
+        scale=scale_to_file(solution.scale_mode, solution.scale),
         cost=solution.cost,
         is_relative=solution.is_relative,
         certificate=_certificate_to_file(solution.certificate),
@@ -186,12 +204,10 @@ def _from_file(file: ResultFile) -> Solution:
         parts=file.identifiability.parts,
         explanation=file.identifiability.explanation,
     )
-    # Scale's own check has seen to it that one of the two is there.
-    scale = file.scale.value if file.scale.value is not None else dict(file.scale.by_frame or {})
     return Solution(
-        X={pose.child: _pose_from_file(pose) for pose in file.targets},
-        Y={pose.child: _pose_from_file(pose) for pose in file.sensors},
-        scale=scale,
+        X={pose.child: pose_from_file(pose) for pose in file.targets},
+        Y={pose.child: pose_from_file(pose) for pose in file.sensors},
+        scale=scale_from_file(file.scale),
         scale_mode=file.scale.mode,
         cost=file.cost,
         is_relative=file.is_relative,
@@ -207,7 +223,20 @@ def _from_file(file: ResultFile) -> Solution:
     )
 
 
-def _pose_to_file(parent: Literal["targetcarrier", "sensorcarrier"], child: str, pose: gtsam.Pose3) -> Pose:
+def scale_to_file(mode: ScaleMode, scale: float | Mapping[str, float]) -> Scale:
+    """A scale's fields."""
+    if isinstance(scale, Mapping):
+        return Scale(mode=mode, value=None, by_frame=dict(scale))
+    return Scale(mode=mode, value=scale, by_frame=None)
+
+
+def scale_from_file(fields: Scale) -> float | dict[str, float]:
+    """One scale, or each one's own; Scale's own check has seen to it that one of the two is there."""
+    return fields.value if fields.value is not None else dict(fields.by_frame or {})
+
+
+def pose_to_file(parent: Literal["targetcarrier", "sensorcarrier"], child: str, pose: gtsam.Pose3) -> Pose:
+    """A pose's fields."""
     q: Any = pose.rotation().toQuaternion()  # Eigen's quaternion, of which gtsam's stubs say nothing
     first, second, third = pose.rotation().matrix().tolist()
     return Pose(
@@ -219,7 +248,8 @@ def _pose_to_file(parent: Literal["targetcarrier", "sensorcarrier"], child: str,
     )
 
 
-def _pose_from_file(pose: Pose) -> gtsam.Pose3:
+def pose_from_file(pose: Pose) -> gtsam.Pose3:
+    """The pose that the fields are of."""
     return gtsam.Pose3(gtsam.Rot3(np.array(pose.rotation_matrix)), np.array(pose.translation_m))
 
 

@@ -16,8 +16,10 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from gtsam_rwhec.certify.certificate import Status
 
 FORMAT: Final = "gtsam-rwhec result"
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
 """Raised whenever a reader of the last version would misread or refuse the file."""
+UNREFINED_VERSION: Final = 1
+"""Still written where nothing is refined, for such readers."""
 
 CONVENTIONS = {
     "pose": (
@@ -30,6 +32,10 @@ CONVENTIONS = {
     ),
     "scale": "length of the measured translation of T_sensor_target = scale * true length",
     "units": "m, rad, s; sigma in m, kappa in 1/rad^2 (1/(2 s^2) for a standard deviation of s about each axis)",
+    "covariance": (
+        "of xi in T_parent_child Expmap(xi), xi = [omega (rad), v (m)], rotation first, in the axes and about the "
+        "origin of child (GTSAM's right perturbation)"
+    ),
     "infinity": "null stands for a number that is infinite; which infinity is said in the field's description",
 }
 
@@ -55,6 +61,15 @@ InfinityIfNull = Annotated[float, *_finite_or(math.inf)]
 MinusInfinityIfNull = Annotated[float, *_finite_or(-math.inf)]
 Positive = Annotated[FiniteFloat, Field(gt=0.0)]
 Count = Annotated[int, Field(ge=0)]
+Deviations = tuple[InfinityIfNull, InfinityIfNull, InfinityIfNull]
+Row = tuple[
+    FiniteFloat | None,
+    FiniteFloat | None,
+    FiniteFloat | None,
+    FiniteFloat | None,
+    FiniteFloat | None,
+    FiniteFloat | None,
+]
 Name = Annotated[str, Field(min_length=1)]
 
 
@@ -157,11 +172,97 @@ class IdentifiabilityFields(_Model):
     parts: tuple[tuple[Name, ...], ...] = Field(description="the frames of each unconnected part")
 
 
+class RefinedFrame(_Model):
+    """How well a refined frame is known, and how far refining moved it."""
+
+    name: Name = Field(description="as in targets or sensors")
+    standard_deviations_deg: Deviations = Field(description="about the frame's own x, y, z; null: infinite, free")
+    standard_deviations_mm: Deviations = Field(description="along the frame's own x, y, z; null: infinite, free")
+    covariance: tuple[Row, Row, Row, Row, Row, Row] = Field(
+        description="6 x 6, rows [omega (rad), v (m)]; zero for a fixed frame; null: infinite, of either sign"
+    )
+    moved_mm: FiniteFloat = Field(description="from the certified solution")
+    moved_deg: FiniteFloat = Field(description="from the certified solution")
+
+
+class RefinedPair(_Model):
+    """The noise of a pair's T_sensor_target that the covariances rest on, and its inliers."""
+
+    target: Name = Field(description="its name, as in targets; or the sensor's")
+    sensor: Name = Field(description="its name, as in sensors")
+    noise_rad: FiniteFloat = Field(description="of the rotation, root mean square an axis")
+    noise_m: FiniteFloat = Field(description="of the translation, root mean square an axis")
+    redundancy: tuple[InfinityIfNull, InfinityIfNull] = Field(
+        description="equations to spare behind the two; null: infinitely many, the noise was given"
+    )
+    inliers: tuple[Count, Count] | None = Field(
+        description="measurements kept, and all of them; null: outliers were not looked for"
+    )
+
+
+class Unknown(_Model):
+    """Some rows of the joint covariance."""
+
+    name: Name = Field(description="a frame, scale, scale:TARGET or time_offset:SENSOR")
+    rows: Literal[1, 6] = Field(description="how many rows it has; 6 for a frame, [omega (rad), v (m)]")
+
+
+class Joint(_Model):
+    """Covariance of everything that was unknown: finite, and infinite along the columns of free."""
+
+    unknowns: tuple[Unknown, ...] = Field(description="what the rows are of, in this order")
+    units: tuple[Positive, ...] = Field(description="what counts as one of each row, in rad, m, s")
+    finite: tuple[tuple[FiniteFloat, ...], ...] = Field(description="lower triangle, row by row, with the diagonal")
+    free: tuple[tuple[FiniteFloat, ...], ...] = Field(
+        description="orthonormal directions of infinite variance, each with a number for each row, in the units above"
+    )
+
+    @model_validator(mode="after")
+    def _sizes_fit(self) -> Joint:
+        size = sum(unknown.rows for unknown in self.unknowns)
+        if len(self.units) != size or [len(row) for row in self.finite] != list(range(1, size + 1)):
+            raise ValueError(f"unknowns have {size} rows, units {len(self.units)} and finite {len(self.finite)}")
+        if any(len(direction) != size for direction in self.free):
+            raise ValueError(f"a direction in free has not {size} numbers")
+        return self
+
+
+class RefinedFields(_Model):
+    """The calibration refined under the noise that there is, and how well it is known."""
+
+    targets: tuple[Pose, ...] = Field(description="X: T_targetcarrier_target of each target")
+    sensors: tuple[Pose, ...] = Field(description="Y: T_sensorcarrier_sensor of each sensor")
+    scale: Scale
+    time_offsets_s: dict[Name, FiniteFloat] = Field(description="by sensor: its stamp t is the carriers' t + offset")
+    noise_source: Literal["given", "estimated"] = Field(description="where the noise of pairs comes from")
+    residual: str = Field(description="geodesic or chordal")
+    robust: str = Field(description="the loss; gnc: outliers were left out; or none")
+    cost: FiniteFloat = Field(description="of the refined graph, at the end")
+    initial_cost: FiniteFloat = Field(description="of the refined graph, at the certified solution")
+    iterations: Count = Field(description="Levenberg-Marquardt steps")
+    free_directions: tuple[str, ...] = Field(description="in words; none where everything is determined")
+    frames: tuple[RefinedFrame, ...] = Field(description="every target and sensor, for people; joint is read back")
+    pairs: tuple[RefinedPair, ...] = Field(description="every pair whose measurements were used")
+    joint: Joint
+
+    @model_validator(mode="after")
+    def _names_fit_together(self) -> RefinedFields:
+        names = {pose.child for pose in (*self.targets, *self.sensors)}
+        if {frame.name for frame in self.frames} != names:
+            raise ValueError(f"frames are not the targets and sensors {', '.join(sorted(names))}")
+        offsets = {f"time_offset:{name}" for name in self.time_offsets_s}
+        scales = {"scale", *(f"scale:{name}" for name in self.scale.by_frame or {})}
+        unknown = {unknown.name for unknown in self.joint.unknowns} - names - offsets - scales
+        if unknown:
+            raise ValueError(f"unknowns that have no value: {', '.join(sorted(unknown))}")
+        return self
+
+
 class ResultFile(_Model):
     """A calibration and everything that is known about it."""
 
     format: Literal["gtsam-rwhec result"] = Field(description="what kind of file this is")
-    format_version: Literal[1] = Field(description="the version of these fields")
+    format_version: Literal[1, 2] = Field(description="the version of these fields: 2 with refined, 1 without")
     written_by: str = Field(description="the library and its version")
     conventions: dict[str, str] = Field(description="what poses, scale and units mean, for people; not read back")
     targets: tuple[Pose, ...] = Field(description="X: T_targetcarrier_target of each target")
@@ -173,9 +274,12 @@ class ResultFile(_Model):
     identifiability: IdentifiabilityFields
     pairs: tuple[PairFields, ...] = Field(description="every pair that was measured")
     parts: tuple[Part, ...] = Field(description="the unconnected parts; one when all is connected")
+    refined: RefinedFields | None = Field(default=None, description="left out where nothing was refined")
 
     @model_validator(mode="after")
     def _names_fit_together(self) -> ResultFile:
+        if (self.refined is not None) != (self.format_version == FORMAT_VERSION):
+            raise ValueError(f"a file of version {self.format_version} with refined: {self.refined is not None}")
         names = [pose.child for pose in (*self.targets, *self.sensors)]
         twice = {name for name in names if names.count(name) > 1}
         if twice:

@@ -32,8 +32,6 @@ class JointCovariance:
     ----------
     slots : dict of str to slice
         Rows of each name.
-    information : (d, d) array
-        As the graph has it.
     finite : (d, d) array
         Q (Q' Lambda Q)^-1 Q'.
     free : (d, k) array
@@ -43,7 +41,6 @@ class JointCovariance:
     """
 
     slots: dict[str, slice]
-    information: Array
     finite: Array
     free: Array
     unit: Array
@@ -78,8 +75,8 @@ class JointCovariance:
             more = Q @ (vectors[:, lost] / size[:, None])
             return JointCovariance.of(dimensions, information, np.hstack([free, more * unit[:, None]]), unit)
         root = Q @ (vectors / np.sqrt(values) / size[:, None])
-        finite = (root @ root.T) * unit[:, None] * unit
-        return JointCovariance(slots, information, finite, basis, unit)
+        finite = (root @ root.T) * np.outer(unit, unit)
+        return JointCovariance(slots, finite, basis, unit)
 
     def rows(self, names: tuple[str, ...]) -> Array:
         """Indices of names, in the order given.

@@ -129,6 +129,7 @@ def refine(
         initial_cost=settled.initial_cost,
         iterations=settled.iterations,
         moved=_moved(start, state),
+        inlier_counts={pair: (int(kept.sum()), len(kept)) for pair, kept in inliers.items()},
         inliers=inliers,
         free_directions=space.sentences,
         solution=start,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -39,8 +41,8 @@ class PairNoise:
 
 
 @dataclass(frozen=True)
-class Refined:
-    """A refined calibration, with covariances.
+class RefinedPoses:
+    """Refined poses and how well they are known: what a result file keeps of a `Refined`.
 
     Covariances are of right perturbations, T Expmap(xi), xi = [omega (rad), v (m)], in the frame's own axes (GTSAM's
     convention; ``gtsam_rwhec.pose_covariances`` turns them into others). They are infinite along directions that the
@@ -54,11 +56,6 @@ class Refined:
     scale_mode : "known", "shared" or "per_target"
     time_offsets_s : dict of str to float
         Of each sensor for which it was estimated: its stamp t is the carriers' t + offset.
-    graph, values : gtsam.NonlinearFactorGraph, gtsam.Values
-        To go on with.
-    keys : dict of str to int
-        The variables' keys in them, by name: frames, "scale" ("scale:NAME" for each with scale="per_target"),
-        "time_offset:SENSOR".
     noise_source : "given" or "estimated"
     noise : dict of (target, sensor) to PairNoise
     cost, initial_cost : float
@@ -66,13 +63,10 @@ class Refined:
     iterations : int
         Levenberg-Marquardt steps, of all rounds of re-weighting together.
     moved : dict of str to Movement
-    inliers : dict of (target, sensor) to (N,) booleans
-        With robust="gnc"; else empty.
+    inlier_counts : dict of (target, sensor) to (int, int)
+        Inliers, and measurements, with robust="gnc"; else empty.
     free_directions : list of str
         In words; empty where everything is determined.
-    solution : Solution
-        The certified solution that was refined (with robust="gnc": of the inliers).
-    options : RefineOptions
     """
 
     X: dict[str, gtsam.Pose3]
@@ -80,19 +74,14 @@ class Refined:
     scale: float | dict[str, float]
     scale_mode: ScaleMode
     time_offsets_s: dict[str, float]
-    graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
-    keys: dict[str, int]
-    noise_source: str
+    noise_source: Literal["given", "estimated"]
     noise: dict[Pair, PairNoise]
     cost: float
     initial_cost: float
     iterations: int
     moved: dict[str, Movement]
-    inliers: dict[Pair, np.ndarray]
+    inlier_counts: dict[Pair, tuple[int, int]]
     free_directions: list[str]
-    solution: Solution
-    options: RefineOptions
     joint: JointCovariance = field(repr=False)
 
     def covariance(self, *names: str) -> Array:
@@ -196,8 +185,43 @@ class Refined:
 
     def _rows_of(self, name: str) -> Array:
         """(m, d): a name's rows of the unknowns; zero for a fixed frame."""
-        if name in self.keys and name not in self.joint.slots:
-            return np.zeros((6, len(self.joint.unit)))
         if name not in self.joint.slots:
-            raise FrameError(f"there is no {name!r}; there are {', '.join(self.keys)}")
+            known = dict.fromkeys((*self.X, *self.Y, *self.joint.slots))
+            if name not in known:
+                raise FrameError(f"there is no {name!r}; there are {', '.join(known)}")
+            return np.zeros((6, len(self.joint.unit)))
         return self.joint.selector((name,))
+
+
+@dataclass(frozen=True)
+class Refined(RefinedPoses):
+    """A refined calibration, with covariances, and the graph to go on with.
+
+    Attributes
+    ----------
+    graph, values : gtsam.NonlinearFactorGraph, gtsam.Values
+        To go on with.
+    keys : dict of str to int
+        The variables' keys in them, by name: frames, "scale" ("scale:NAME" for each with scale="per_target"),
+        "time_offset:SENSOR".
+    inliers : dict of (target, sensor) to (N,) booleans
+        With robust="gnc"; else empty.
+    solution : Solution
+        The certified solution that was refined (with robust="gnc": of the inliers).
+    options : RefineOptions
+
+    And everything that `RefinedPoses` has.
+    """
+
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    keys: dict[str, int]
+    inliers: dict[Pair, np.ndarray]
+    solution: Solution
+    options: RefineOptions
+
+    def write_json(self, path: str | Path) -> None:
+        """Write the certified solution and everything refined, but the graph (``gtsam_rwhec.read_refined``)."""
+        from gtsam_rwhec.refined_file import write_refined  # the file format imports this module
+
+        write_refined(self, path)

@@ -81,8 +81,8 @@ def refined_sentences(refined: Refined) -> list[str]:
         f"Cost: {refined.cost:.6g} after {steps}, {refined.initial_cost:.6g} at the certified solution "
         f"({refined.options.residual} residual{loss})."
     )
-    if refined.inliers:
-        sentences.append(_outlier_sentence(refined.inliers))
+    if refined.inlier_counts:
+        sentences.append(_outlier_sentence(refined.inlier_counts))
     return sentences
 
 
@@ -109,13 +109,13 @@ def _carrier_noise_sentence(refined: Refined) -> str:
     )
 
 
-def _outlier_sentence(inliers: Mapping[Pair, np.ndarray]) -> str:
+def _outlier_sentence(counts: Mapping[Pair, tuple[int, int]]) -> str:
     """How many measurements were left out, and of which pairs."""
-    total = sum(len(kept) for kept in inliers.values())
-    out = {pair: int((~kept).sum()) for pair, kept in inliers.items() if not kept.all()}
+    total = sum(number for _, number in counts.values())
+    out = {pair: number - kept for pair, (kept, number) in counts.items() if kept < number}
     if not out:
         return f"Outliers: none of {total} measurements."
-    pairs = ", ".join(f"{_pair_name(pair)} {count} of {len(inliers[pair])}" for pair, count in out.items())
+    pairs = ", ".join(f"{_pair_name(pair)} {count} of {counts[pair][1]}" for pair, count in out.items())
     return f"Outliers: {sum(out.values())} of {total} measurements left out: {pairs}."
 
 

@@ -195,13 +195,12 @@ def test_it_says_whether_the_carriers_are_taken_for_exact(rig: rw.Refined) -> No
 
 
 def test_outliers_are_counted(rig: rw.Refined) -> None:
-    inliers = {pair: np.ones(20, dtype=bool) for pair in rig.noise}
-    assert "Outliers: none of 120 measurements." in refined_sentences(dataclasses.replace(rig, inliers=inliers))
-    inliers["target1", "sensor0"][[3, 5]] = False
-    inliers["target2", "sensor1"][0] = False
+    counts = dict.fromkeys(rig.noise, (20, 20))
+    assert "Outliers: none of 120 measurements." in refined_sentences(dataclasses.replace(rig, inlier_counts=counts))
+    counts |= {("target1", "sensor0"): (18, 20), ("target2", "sensor1"): (19, 20)}
     assert (
         "Outliers: 3 of 120 measurements left out: target1-sensor0 2 of 20, target2-sensor1 1 of 20."
-    ) in refined_sentences(dataclasses.replace(rig, inliers=inliers))
+    ) in refined_sentences(dataclasses.replace(rig, inlier_counts=counts))
     assert not any("Outliers" in sentence for sentence in refined_sentences(rig))
 
 
@@ -230,5 +229,5 @@ def test_a_file_gets_one_line_for_each_sentence(rig: rw.Refined, planar: rw.Refi
 
 def test_frame_names_are_not_taken_for_markup(rig: rw.Refined) -> None:
     odd = dataclasses.replace(rig, noise={("[bold]t[/]", "[red]s[/]"): PairNoise(0.01, 0.01, (math.inf, math.inf))})
-    inliers = {("[bold]t[/]", "[red]s[/]"): np.array([True, False])}
-    assert "[bold]t[/]-[red]s[/] 1 of 2." in printed(dataclasses.replace(odd, inliers=inliers))
+    counts = {("[bold]t[/]", "[red]s[/]"): (1, 2)}
+    assert "[bold]t[/]-[red]s[/] 1 of 2." in printed(dataclasses.replace(odd, inlier_counts=counts))

@@ -1,0 +1,159 @@
+"""Files of refined calibrations: the same poses and covariances come back, infinite ones too; damage is refused."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.simulate import Motion, Noise, general
+
+NOISE = Noise(sigma_m=0.005, kappa=0.5 / np.radians(0.5) ** 2)
+
+
+def refined_of(problem: rw.Problem, **options: Any) -> rw.Refined:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+        return rw.refine(problem, rw.solve(problem), rw.RefineOptions(**options))
+
+
+def with_outliers() -> rw.Problem:
+    """A quarter of one pair's measurements wrong; a shared scale."""
+    clean = general(2, 2, seed=5, noise=NOISE, scale="shared", number_of_measurements=30).problem
+    problem = rw.Problem(scale="shared")
+    for pair in clean.pairs:
+        raw = clean.measurements(*pair)
+        B = raw.B.copy()
+        if pair == ("target1", "sensor0"):
+            B[::4] = B[::4] @ gtsam.Pose3.Expmap(np.full(6, 0.8)).matrix()
+        problem.add(*pair, raw.A, B, NOISE.sigma_m, NOISE.kappa)
+    return problem
+
+
+def fixed() -> rw.Problem:
+    simulation = general(2, 2, seed=5, noise=NOISE)
+    simulation.problem.fix("target0", simulation.X["target0"])
+    return simulation.problem
+
+
+KINDS: dict[str, Callable[[], rw.Refined]] = {
+    "known scale": lambda: refined_of(general(2, 2, seed=5, noise=NOISE).problem),
+    "scales of targets": lambda: refined_of(
+        general(3, 2, seed=5, noise=NOISE, scale="per_target", known_sizes=["target0"]).problem, noise="estimate"
+    ),
+    "outliers": lambda: refined_of(with_outliers(), noise="estimate", robust="gnc"),
+    "something free": lambda: refined_of(general(2, 2, seed=5, noise=NOISE, motion=Motion("planar")).problem),
+    "fixed frame": lambda: refined_of(fixed()),
+    "time offsets": lambda: refined_of(
+        general(1, 2, seed=5, noise=NOISE, motion=Motion(wobble_m=0.1)).problem, time_offsets=True
+    ),
+    "motions": lambda: refined_of(general(0, 2, seed=5, odometry=20, odometry_noise=NOISE).problem),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_poses_and_covariances_come_back(kind: str, tmp_path: Path) -> None:
+    refined = KINDS[kind]()
+    refined.write_json(tmp_path / "refined.json")
+    back = rw.read_refined(tmp_path / "refined.json")
+    for poses, others in ((refined.X, back.X), (refined.Y, back.Y)):
+        assert list(poses) == list(others)
+        for name, pose in poses.items():
+            np.testing.assert_array_equal(others[name].matrix(), pose.matrix())
+            np.testing.assert_allclose(back.covariance(name), refined.covariance(name), rtol=1e-12)
+    np.testing.assert_allclose(back.covariance(), refined.covariance(), rtol=1e-9, atol=1e-20)
+    np.testing.assert_array_equal(back.joint.finite, refined.joint.finite)
+    np.testing.assert_array_equal(back.joint.free, refined.joint.free)
+    for name in [
+        "scale",
+        "scale_mode",
+        "time_offsets_s",
+        "noise_source",
+        "noise",
+        "cost",
+        "initial_cost",
+        "iterations",
+        "moved",
+        "inlier_counts",
+        "free_directions",
+        "names",
+        "degrees_of_freedom",
+    ]:
+        assert getattr(back, name) == getattr(refined, name), name
+    if len(refined.Y) > 1:
+        pose, covariance = back.relative("sensor0", "sensor1")
+        assert pose.equals(refined.relative("sensor0", "sensor1")[0], 1e-15)
+        np.testing.assert_allclose(covariance, refined.relative("sensor0", "sensor1")[1], rtol=1e-9, atol=1e-20)
+    assert back.contains("sensor0", refined.Y["sensor0"])
+
+
+def test_the_certified_solution_is_in_the_same_file(tmp_path: Path) -> None:
+    refined = KINDS["outliers"]()
+    refined.write_json(tmp_path / "refined.json")
+    refined.solution.write_json(tmp_path / "solution.json")
+    back = rw.read_solution(tmp_path / "refined.json")
+    back.write_json(tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "solution.json").read_bytes()
+    assert json.loads((tmp_path / "refined.json").read_bytes())["format_version"] == 2
+    assert refined.inlier_counts["target1", "sensor0"] == (22, 30)
+
+
+def test_infinite_is_null(tmp_path: Path) -> None:
+    refined = KINDS["something free"]()
+    refined.write_json(tmp_path / "refined.json")
+    text = (tmp_path / "refined.json").read_text(encoding="utf-8")
+    assert "Infinity" not in text
+    assert "NaN" not in text
+    for frame in json.loads(text)["refined"]["frames"]:
+        degrees, millimetres = refined.standard_deviations(frame["name"])
+        for written, known in (
+            (frame["standard_deviations_deg"], degrees),
+            (frame["standard_deviations_mm"], millimetres),
+            (np.array(frame["covariance"], dtype=object).ravel(), refined.covariance(frame["name"]).ravel()),
+        ):
+            assert [value is None for value in written] == np.isinf(known).tolist()
+        assert None in frame["standard_deviations_mm"]
+
+
+def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
+    rw.solve(general(1, 1, seed=5, noise=NOISE).problem).write_json(tmp_path / "solution.json")
+    with pytest.raises(FileFormatError, match=r"was not refined; read it with read_solution, or refine"):
+        rw.read_refined(tmp_path / "solution.json")
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda raw: raw.update(format_version=1), "version 1 with refined"),
+        (lambda raw: raw.pop("refined"), "version 2 with refined: False"),
+        (lambda raw: raw["refined"]["joint"]["finite"].pop(), "rows, units 24 and finite 23"),
+        (lambda raw: raw["refined"]["joint"]["units"].__setitem__(3, 0.0), "$.refined.joint.units[3]"),
+        (lambda raw: raw["refined"]["joint"]["free"].append([1.0]), "has not 24 numbers"),
+        (lambda raw: raw["refined"]["joint"]["unknowns"][0].update(name="moon"), "have no value: moon"),
+        (lambda raw: raw["refined"]["frames"].pop(), "frames are not the targets and sensors"),
+        (lambda raw: raw["refined"]["sensors"][0].pop("translation_m"), "$.refined.sensors[0].translation_m"),
+        (lambda raw: raw["refined"].update(speed=1), "$.refined.speed"),
+    ],
+)
+def test_damage_is_refused_with_its_place(damage: Callable[[Any], object], said: str, tmp_path: Path) -> None:
+    path = tmp_path / "refined.json"
+    KINDS["known scale"]().write_json(path)
+    raw = json.loads(path.read_text(encoding="utf-8"))
+    damage(raw)
+    path.write_text(json.dumps(raw), encoding="utf-8")
+    with pytest.raises(FileFormatError) as caught:
+        rw.read_refined(path)
+    assert said in str(caught.value)
+
+
+def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="cannot be written"):
+        KINDS["known scale"]().write_json(tmp_path / "nowhere" / "refined.json")
