@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import shlex
 import sys
 import warnings
@@ -22,8 +23,10 @@ from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.csv_files import read_csv
 from gtsam_rwhec.errors import FileFormatError, NotCertifiedWarning, NotUniqueWarning
 from gtsam_rwhec.fetch import UTIAS_URL, fetch_utias
-from gtsam_rwhec.report import print_solution, report_console
-from gtsam_rwhec.result_file import read_solution, write_solution
+from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
+from gtsam_rwhec.refinement.refine import refine
+from gtsam_rwhec.report import print_refined, print_solution, report_console
+from gtsam_rwhec.result_file import read_solution
 
 app = typer.Typer(
     name="gtsam-rwhec",
@@ -43,6 +46,24 @@ class Scale(StrEnum):
     known = "known"
     shared = "shared"
     per_target = "per_target"
+
+
+class Refine(StrEnum):
+    """Whose noise the refinement takes."""
+
+    given = "given"
+    estimate = "estimate"
+
+
+class Robust(StrEnum):
+    """What the refinement does about measurements that are wrong."""
+
+    none = "none"
+    gnc = "gnc"
+    huber = "huber"
+    cauchy = "cauchy"
+    tukey = "tukey"
+    geman_mcclure = "geman_mcclure"
 
 
 class Method(StrEnum):
@@ -89,11 +110,30 @@ def calibrate(
     initial: Annotated[
         Path | None, typer.Option(help="Result of an earlier calibration (JSON) to start from; for --method local.")
     ] = None,
+    refine_with: Annotated[
+        Refine | None,
+        typer.Option("--refine", help="Refine the certified answer; noise as given, or estimated; report covariances."),
+    ] = None,
+    robust: Annotated[
+        Robust,
+        typer.Option(help="With --refine: gnc leaves outliers out, certified; the others are losses of GTSAM."),
+    ] = Robust.none,
+    carrier_noise_deg: Annotated[
+        float | None, typer.Option(help="With --refine: noise of the carriers' poses A about each axis, degrees.")
+    ] = None,
+    carrier_noise_mm: Annotated[
+        float | None, typer.Option(help="With --refine: noise of the carriers' poses A along each axis, mm.")
+    ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the result here as JSON.")] = None,
 ) -> None:
     """Calibrate from a folder of CSV files, and print poses, residuals and the certificate."""
     if (initial is not None) != (method is Method.local):
         raise typer.BadParameter("--method local and --initial FILE go together")
+    carrier_noises = {carrier_noise_deg is None, carrier_noise_mm is None}
+    if refine_with is None and (robust is not Robust.none or False in carrier_noises):
+        raise typer.BadParameter("without --refine, --robust and --carrier-noise-deg, --carrier-noise-mm say nothing")
+    if len(carrier_noises) > 1:
+        raise typer.BadParameter("--carrier-noise-deg and --carrier-noise-mm go together")
     with failures_in_words():
         if output is not None and not output.absolute().parent.is_dir():
             raise FileFormatError(f"{output} cannot be written: there is no folder {output.parent}.")
@@ -101,28 +141,50 @@ def calibrate(
             warnings.simplefilter("ignore", NotUniqueWarning)  # the report says it, with the directions
             warnings.simplefilter("ignore", NotCertifiedWarning)
             stage(f"reading {folder}")
-            problem = read_csv(folder, scale.value, sigma, kappa, targets, sensors, keep_measurements=False)
+            keep = refine_with is not None
+            problem = read_csv(folder, scale.value, sigma, kappa, targets, sensors, keep_measurements=keep)
             start = None
             if initial is not None:
                 earlier = read_solution(initial)
                 start = (earlier.X, earlier.Y, earlier.scale)
             solution = solve(problem, method=method.value, initial=start, progress=stage)
+            refined = None
+            if refine_with is not None:
+                options = RefineOptions(
+                    noise=refine_with.value,
+                    robust=robust.value,
+                    carrier_noise=_carrier_noise(carrier_noise_deg, carrier_noise_mm),
+                )
+                refined = refine(problem, solution, options, progress=stage)
+                solution = refined.solution  # that of the inliers, where outliers were left out
         try:
             if output is not None:
-                write_solution(solution, output)
+                (solution if refined is None else refined).write_json(output)
                 typer.echo(f"Written to {output}.", err=True)
         finally:  # a result that cannot be written is shown all the same
             print_solution(solution)
-        raise typer.Exit(exit_status(solution))
+            if refined is not None:
+                report_console().print()
+                print_refined(refined)
+        status = exit_status(solution)
+        if refined is not None and refined.free_directions and status is ExitStatus.CERTIFIED:
+            status = ExitStatus.NOT_UNIQUE
+        raise typer.Exit(status)
+
+
+def _carrier_noise(deg: float | None, mm: float | None) -> CarrierNoise | None:
+    return None if deg is None or mm is None else CarrierNoise(math.radians(deg), 1e-3 * mm)
 
 
 @app.command(epilog=HELP)
 def demo() -> None:
     """Calibrate three simulated cameras that saw four tags; the measurements come with this package."""
     folder = demo_folder()
-    command = f"gtsam-rwhec calibrate {shlex.quote(str(folder))} --sigma {SIGMA_M:g} --kappa {KAPPA:.4f}"
+    command = (
+        f"gtsam-rwhec calibrate {shlex.quote(str(folder))} --sigma {SIGMA_M:g} --kappa {KAPPA:.4f} --refine estimate"
+    )
     report_console().print(f"The same as: {command}\n", markup=False, soft_wrap=True)
-    calibrate(folder, sigma=SIGMA_M, kappa=KAPPA)
+    calibrate(folder, sigma=SIGMA_M, kappa=KAPPA, refine_with=Refine.estimate)
 
 
 @fetch_app.command(epilog=HELP)

@@ -100,7 +100,7 @@ def _noise_sentence(refined: Refined) -> str:
 def _carrier_noise_sentence(refined: Refined) -> str:
     noise = refined.options.carrier_noise
     if noise is None:
-        return "Noise of A: none; if the carriers' poses are not exact, these standard deviations are too small."
+        return "Noise of A: left out; where the carriers' poses are not exact, these standard deviations are too small."
     if noise.covariances is not None:
         return "Noise of A: the covariances given for each measurement."
     return (

@@ -98,7 +98,15 @@ def test_demo_needs_no_arguments(tmp_path: Path) -> None:
     done = run("demo", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    for words in ("4 targets, 3 sensors, 11 pairs", " cam_2 ", " tag_3 ", "Certified globally optimal", "Time: "):
+    for words in (
+        "4 targets, 3 sensors, 11 pairs",
+        " cam_2 ",
+        " tag_3 ",
+        "Certified globally optimal",
+        "Time: ",
+        " ±x mm ",
+        "estimated",
+    ):
         assert words in done.stdout
     assert list(tmp_path.iterdir()) == []
 
@@ -172,6 +180,9 @@ def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
         (["calibrate", DEMO, "--method", "local"], "--initial"),
         (["calibrate", DEMO, "--initial", "x.json"], "--method local"),
         (["calibrate", DEMO, "-o", "/nowhere/result.json"], "there is no folder /nowhere"),
+        (["calibrate", DEMO, "--robust", "gnc"], "without --refine"),
+        (["calibrate", DEMO, "--refine", "estimate", "--carrier-noise-mm", "2"], "go together"),
+        (["calibrate", DEMO, "--refine", "given"], "noise='estimate'"),
         (["calibrate"], "folder"),
         (["fetch", "other"], "other"),
         (["guess"], "guess"),
@@ -201,6 +212,54 @@ def test_not_unique_is_status_3(tmp_path: Path) -> None:
     assert "Certified, but not unique" in done.stdout
     assert "do not use these numbers" in done.stdout
     assert rw.read_solution(tmp_path / "result.json").certificate.status is rw.Status.CERTIFIED_NOT_UNIQUE
+
+
+def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
+    result = tmp_path / "refined.json"
+    given = ("calibrate", DEMO, "--sigma", 0.005, "--kappa", 6565, "--refine", "given")
+    done = run(*given, "-o", result)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.index("Certified globally optimal") < done.stdout.index("Refined calibration")
+    assert "Noise of B: 0.5° and 5 mm an axis, as given." in done.stdout
+    refined = rw.read_refined(result)
+    for name in refined.Y:
+        (_, row, *_) = [line for line in done.stdout.splitlines() if line.startswith(f" {name} ")]
+        np.testing.assert_allclose(
+            [float(cell) for cell in row.split()[7:10]], refined.standard_deviations(name)[1], atol=0.0051
+        )
+    noisier = run(*given, "--carrier-noise-deg", 0.3, "--carrier-noise-mm", 2, "-o", tmp_path / "noisier.json")
+    assert "Noise of A: 0.3° and 2 mm an axis of the target carrier, as given." in noisier.stdout
+    wider = rw.read_refined(tmp_path / "noisier.json")
+    assert (wider.standard_deviations("cam_0")[1] > refined.standard_deviations("cam_0")[1]).all()
+    again = run("calibrate", DEMO, "--method", "local", "--initial", result)  # the certified part of the file
+    assert again.returncode == 0, again.stderr
+
+
+def test_outliers_are_left_out(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(DEMO, tmp_path / "demo"))
+    path = folder / "tag_0_cam_1_B.csv"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for i in (-1, -2, -3):
+        *rotation, x, y, z = lines[i].split(",")
+        lines[i] = ",".join([*rotation, str(float(x) + 0.7), y, z])
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    weights = ("--sigma", 0.005, "--kappa", 6565, "--refine", "given")
+    done = run("calibrate", folder, *weights, "--robust", "gnc", "-o", tmp_path / "result.json")
+    assert done.returncode == 0, done.stderr
+    kept, number = rw.read_refined(tmp_path / "result.json").inlier_counts["tag_0", "cam_1"]
+    assert kept == number - 3
+    assert f"tag_0-cam_1 3 of {number}" in done.stdout
+    assert "cauchy loss" in run("calibrate", folder, *weights, "--robust", "cauchy").stdout
+
+
+def test_refined_and_free_is_status_3(tmp_path: Path) -> None:
+    folder = write_csv(general(2, 2, seed=5, motion="planar", noise=NOISE).problem, tmp_path)
+    done = run("calibrate", folder, "--sigma", 0.005, "--kappa", 6000, "--refine", "given", "-o", tmp_path / "r.json")
+    assert done.returncode == 3
+    assert done.stderr == f"Written to {tmp_path / 'r.json'}.\n"
+    assert " free " in done.stdout
+    assert done.stdout.count("Not determined: ") == 4
+    assert np.isinf(rw.read_refined(tmp_path / "r.json").covariance("cam_0")).any()
 
 
 @pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
