@@ -298,7 +298,8 @@ def test_a_known_size_other_than_one() -> None:
 
 def test_noise_given_too_small_is_told_and_estimated_is_not() -> None:
     problem = copied(rig(seed=4).problem, sigma=lambda pair, raw: 0.3 * raw.sigma)
-    solution = rw.solve(problem)
+    with pytest.warns(rw.errors.WeightsWarning, match="sigma and kappa predict"):
+        solution = rw.solve(problem)
     with pytest.warns(rw.errors.WeightsWarning, match=r"standard deviations are too small by about \d"):
         rw.refine(problem, solution, rw.RefineOptions(noise="given"))
     with warnings.catch_warnings():

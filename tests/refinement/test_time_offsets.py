@@ -9,8 +9,8 @@ from refinement_problems import KAPPA, SIGMA_M, refined
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.twists import carrier_twists
 from gtsam_rwhec.simulate import Noise, perturb
+from gtsam_rwhec.twists import carrier_twists
 
 X = gtsam.Pose3.Expmap(np.array([0.3, 0.1, -0.4, 1.0, 0.5, 0.2])).matrix()
 Y = {
