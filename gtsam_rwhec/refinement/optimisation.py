@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.refinement.variables import Variables
 
@@ -43,7 +44,14 @@ def information_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, vari
     present = set(linear.keyVector())
     others = present - set(keys.values())
     if others:  # carrier poses
-        linear = linear.marginal([key for key in keys.values() if key in present])
+        try:
+            linear = linear.marginal([key for key in keys.values() if key in present])
+        except RuntimeError as error:  # GTSAM's IndeterminateSystemException
+            raise NoiseError(
+                "the carrier poses cannot be told apart from rounding: A's noise, turned about the origin that it is "
+                "given about, moves what is far from it by far more than it says. Give it about the other carrier "
+                "(CarrierNoise.about), or refer the world to an origin nearby"
+            ) from error
     names = [name for name, key in keys.items() if key in present]
     ordering = gtsam.Ordering()
     for name in names:

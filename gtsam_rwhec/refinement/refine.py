@@ -151,6 +151,8 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: Fit, optio
         3 * (p.sigma is not None) + 3 * (p.kappa is not None) for p in beliefs
     )
     spare = equations - sum(variables.unknown.values())
+    if spare <= 0:
+        return
     # Beyond doubt, too: a chi-square of few degrees of freedom may well be twice its mean.
     if settled.optimum.cost > UNLIKELY * 0.5 * spare and chdtrc(spare, 2.0 * settled.optimum.cost) < 1e-3:
         ratio = settled.optimum.cost / (0.5 * spare)

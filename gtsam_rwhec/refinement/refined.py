@@ -103,6 +103,8 @@ class RefinedPoses:
         FrameError
             For a name that there is not.
         """
+        if not (names or self.names):  # everything is fixed
+            return np.zeros((0, 0))
         rows = [self._rows_of(name) for name in (names or self.names)]
         return self.joint.covariance_of(np.concatenate(rows))
 

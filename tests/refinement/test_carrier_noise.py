@@ -119,3 +119,11 @@ def test_bad_carrier_noise(noise: object, error: type[Exception], words: str) ->
     problem = rig(1, 1).problem
     with pytest.raises(error, match=words):
         refined(problem, carrier_noise=noise())
+
+
+def test_noise_about_an_origin_a_thousand_kilometres_away_is_refused() -> None:
+    far = np.eye(4)
+    far[:3, 3] = (1e6, -1e6, 1e6)
+    problem = copied(rig(2, 2, seed=3).problem, A=lambda pair, raw: raw.A @ np.linalg.inv(far))
+    with pytest.raises(rw.errors.NoiseError, match="about the other carrier"):
+        refined(problem, carrier_noise=rw.CarrierNoise(rotation_rad=1e-3, translation_m=1e-3))

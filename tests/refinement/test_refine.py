@@ -313,3 +313,22 @@ def test_a_limit_of_iterations_is_told() -> None:
     solution = rw.solve(simulation.problem)
     with pytest.warns(rw.errors.NotConvergedWarning, match="after 1 iterations"):
         rw.refine(simulation.problem, solution, rw.RefineOptions(max_iterations=1))
+
+
+def test_two_measurements() -> None:
+    """No equation to spare, one turn only: nothing estimates the noise, and no pose is determined."""
+    problem = rig(1, 1, seed=5, number_of_measurements=2).problem
+    r = refined(problem)
+    assert len(r.free_directions) == 2
+    assert np.isinf(np.diag(r.covariance("sensor0"))).all()
+    assert np.linalg.matrix_rank(r.information("sensor0")) == 4
+
+
+def test_everything_fixed() -> None:
+    simulation = rig(1, 1, seed=3)
+    simulation.problem.fix("target0", simulation.X["target0"])
+    simulation.problem.fix("sensor0", simulation.Y["sensor0"])
+    for residual in ("chordal", "geodesic"):
+        r = refined(simulation.problem, residual=residual)
+        assert r.covariance().shape == (0, 0)
+        assert r.covariance("sensor0").max() == 0.0
