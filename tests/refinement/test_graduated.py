@@ -13,7 +13,8 @@ from outlier_problems import Pair, corrupted
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError, OutlierError, OutliersWarning
-from gtsam_rwhec.refinement.graduated import Graduated, graduated, truncated_weights
+from gtsam_rwhec.refinement.graduated import Graduated, graduated
+from gtsam_rwhec.refinement.truncated_least_squares import truncated_weights
 from gtsam_rwhec.selection import selected
 from gtsam_rwhec.simulate import Noise, Simulation, general
 from gtsam_rwhec.simulate.transforms import random_poses
@@ -98,7 +99,7 @@ def test_noise_that_claims_three_times_too_much_is_estimated() -> None:
     found = graduated(problem, noise_scale="estimate")
     assert wrongly_classed(found, good)[0] == 0
     assert np.sqrt(found.noise_factors) == pytest.approx([3.0, 3.0], rel=0.15)
-    with pytest.warns(OutliersWarning, match="noise_scale='estimate'"):
+    with pytest.warns(OutliersWarning, match="noise='estimate'"):
         graduated(problem)
 
 
