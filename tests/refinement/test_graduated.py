@@ -185,7 +185,7 @@ def test_nothing_agrees_with_anything() -> None:
     generator = np.random.default_rng(1)
     problem = rw.Problem()
     problem.add("target0", "sensor0", random_poses(6, 1.0, generator), random_poses(6, 1.0, generator), 1e-4, 1e8)
-    with pytest.raises(OutlierError, match=r"too few of the 6 measurements agree.*noise_scale='estimate'"):
+    with pytest.raises(OutlierError, match=r"too few of the 6 measurements agree.*noise='estimate'"):
         graduated(problem)
 
 
