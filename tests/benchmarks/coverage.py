@@ -264,7 +264,8 @@ def plot(results: dict[Case, Outcome], folder: Path) -> Path:
         axis.set_title(f"noise {'given' if noise == 'given' else 'estimated from the residuals'}")
         axis.set_xlabel("case (row of the table)")
     axes[0].set_ylabel("runs whose 95 % ellipsoid holds the truth, %")
-    axes[0].legend(loc="lower left", ncols=2)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5)
     path = folder / "coverage.png"
     figure.savefig(path, dpi=130)
     return path
