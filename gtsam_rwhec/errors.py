@@ -55,6 +55,18 @@ class FileFormatError(RwhecError):
     """A file that cannot be read as what it should be; the message has the file and the line or field."""
 
 
+class LogError(FileFormatError):
+    """A log that cannot be read, or lacks what is asked of it; or one that could not be written."""
+
+
+class MessageError(LogError):
+    """A message of a log that cannot be read as its schema says, or whose content makes no sense."""
+
+
+class TransformError(RwhecError):
+    """Frames that no chain of transforms joins, or that go round in a loop; the message has the chain."""
+
+
 class ResultVersionError(FileFormatError):
     """A result file that another version of the format wrote."""
 
@@ -65,6 +77,10 @@ class FetchError(RwhecError):
 
 class RwhecWarning(UserWarning):
     """Root of every warning."""
+
+
+class LogWarning(RwhecWarning):
+    """Parts of a log that could not be read: what, how much, why."""
 
 
 class UnitsWarning(RwhecWarning):

@@ -1,0 +1,16 @@
+"""Logs of robots and rigs: MCAP files with ROS 2 or Foxglove messages, read as checked records."""
+
+from gtsam_rwhec.logs.mcap_reader import Log, PoseSeries, Topic, open_log
+from gtsam_rwhec.logs.records import DetectionRecord, ImageRecord, IntrinsicsRecord, PoseRecord, Record
+
+__all__ = [
+    "DetectionRecord",
+    "ImageRecord",
+    "IntrinsicsRecord",
+    "Log",
+    "PoseRecord",
+    "PoseSeries",
+    "Record",
+    "Topic",
+    "open_log",
+]

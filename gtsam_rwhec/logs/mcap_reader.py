@@ -1,0 +1,316 @@
+"""Logs in MCAP: what is in them, and their messages as records in the order of time.
+
+log = open_log("run.mcap")
+for topic in log.topics():
+    print(topic.name, topic.schema, topic.count)
+for record in log.records(["/tf", "/detections"]):
+    ...
+"""
+
+from __future__ import annotations
+
+import heapq
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+
+import numpy as np
+from mcap.records import Channel, Schema
+
+from gtsam_rwhec.errors import LogError, LogWarning, MessageError
+from gtsam_rwhec.logs import foxglove_schemas, protobuf_messages, ros2_schemas
+from gtsam_rwhec.logs.mcap_blocks import Block, McapFile
+from gtsam_rwhec.logs.records import Array, PoseRecord, Record
+
+OnBad = Literal["warn", "raise"]
+#: Messages that are decoded together.
+SLICE = 4096
+#: Opened blocks that overlap in time are held together, up to this many bytes.
+MOST_OPEN_BYTES = 1 << 30
+
+_Decoder = Callable[[str, Sequence[bytes | memoryview], list[int]], list[foxglove_schemas.Read]]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a log; first and last are log times, of the chunks that have it where the file is indexed.
+
+    `unreadable` is empty where its messages become records, else why they do not.
+    """
+
+    name: str
+    schema: str
+    encoding: str
+    count: int
+    first_ns: int | None
+    last_ns: int | None
+    unreadable: str
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSeries:
+    """All poses of one pair of frames, by stamp: stamps_ns (N,), T_parent_child (N, 4, 4)."""
+
+    stamps_ns: np.ndarray
+    T: Array
+    parent: str
+    child: str
+
+
+def open_log(path: str | Path | Iterable[str | Path]) -> Log:
+    """Open a log.
+
+    Parameters
+    ----------
+    path
+        An MCAP file, several (a bag that was split), or a folder of them (a ROS 2 bag).
+
+    Raises
+    ------
+    LogError
+        A file cannot be read or is not MCAP, or there is none.
+    """
+    given = [path] if isinstance(path, str | Path) else list(path)
+    paths: list[Path] = []
+    for each in map(Path, given):
+        paths += sorted(each.glob("*.mcap")) if each.is_dir() else [each]
+    if not paths:
+        raise LogError(f"{', '.join(map(str, given)) or 'an empty list'}: no MCAP files there.")
+    files: list[McapFile] = []
+    try:
+        files += map(McapFile, paths)
+    except LogError:
+        for file in files:
+            file.close()
+        raise
+    return Log(files)
+
+
+class Log:
+    """One or more MCAP files read as one; made by `open_log`. A context manager, which closes the files."""
+
+    def __init__(self, files: list[McapFile]) -> None:
+        self.files = files
+        self._decoders: dict[tuple[int, int], _Decoder | str] = {}
+        self.losses = [loss for file in files for loss in file.losses]
+        if self.losses:
+            warnings.warn("; ".join(self.losses), LogWarning, stacklevel=3)
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for file in self.files:
+            file.close()
+
+    def topics(self) -> tuple[Topic, ...]:
+        """Every topic, by name; one that has several schemas or encodings is there as often."""
+        found: dict[tuple[str, str, str], Topic] = {}
+        for number, file in enumerate(self.files):
+            for channel in file.channels.values():
+                schema = file.schemas.get(channel.schema_id)
+                key = channel.topic, schema.name if schema else "", channel.message_encoding
+                decoder = self._decoder(number, channel.id)
+                seen, before = file.seen.get(channel.id), found.get(key)
+                spans = [(s.first_ns, s.last_ns) for s in (seen, before) if s is not None]
+                firsts = [first for first, _ in spans if first is not None]
+                lasts = [last for _, last in spans if last is not None]
+                count = (seen.count if seen else 0) + (before.count if before else 0)
+                unreadable = decoder if isinstance(decoder, str) else ""
+                found[key] = Topic(*key, count, min(firsts, default=None), max(lasts, default=None), unreadable)
+        return tuple(found[key] for key in sorted(found))
+
+    def records(self, topics: Iterable[str] | None = None, on_bad: OnBad = "warn") -> Iterator[Record]:
+        """Go through the log in the order of log time.
+
+        Memory is bounded: only blocks of messages that overlap in time are open together.
+
+        Parameters
+        ----------
+        topics
+            None for all that can be read.
+        on_bad
+            What to do with messages that cannot be read and blocks that are damaged: ``"warn"`` leaves them out and
+            says how many of which topic, and why the first, in one `LogWarning` at the end; ``"raise"`` stops.
+
+        Raises
+        ------
+        LogError
+            A topic that is not in the log (the message has those that are) or that cannot be read; blocks that overlap
+            in time beyond `MOST_OPEN_BYTES`.
+        MessageError
+            With ``on_bad="raise"``.
+        """
+        wanted = self._checked_topics(topics)
+        bad = _Bad(on_bad)
+        waiting = sorted(
+            ((block.start_ns, number, block) for number, file in enumerate(self.files) for block in file.blocks),
+            key=lambda entry: entry[:2],
+            reverse=True,
+        )
+        # The heap holds, for each open block, its next record's time; the number breaks ties.
+        heap: list[tuple[int, int, Record, Iterator[Record], int]] = []
+        order = open_bytes = 0
+        while waiting or heap:
+            if waiting and (not heap or waiting[-1][0] <= heap[0][0]):
+                _, number, block = waiting.pop()
+                records = self._records_of(number, block, wanted, bad)
+                first = next(records, None)
+                if first is not None:
+                    heapq.heappush(heap, (first.logged_ns, order, first, records, block.length))
+                    order += 1
+                    open_bytes += block.length
+                    if len(heap) > 1 and open_bytes > MOST_OPEN_BYTES:
+                        raise LogError(
+                            f"{self.files[number].path}: {len(heap)} chunks of {open_bytes} bytes overlap in time; "
+                            "sort the log first (mcap sort)."
+                        )
+                continue
+            _, tie, record, records, size = heapq.heappop(heap)
+            limit = min(heap[0][0] if heap else 1 << 64, waiting[-1][0] if waiting else 1 << 64)
+            yield record
+            for record in records:
+                if record.logged_ns >= limit:
+                    heapq.heappush(heap, (record.logged_ns, tie, record, records, size))
+                    break
+                yield record
+            else:
+                open_bytes -= size
+        bad.say()
+
+    def poses(self, topic: str, parent: str | None = None, child: str | None = None) -> PoseSeries:
+        """All poses of a topic (and of one pair of frames of it), sorted by their own stamps.
+
+        Raises
+        ------
+        LogError
+            As `records`; or there are none, or of several pairs of frames (the message has them).
+        """
+        stamps: list[int] = []
+        blocks: list[Array] = []
+        pending: list[Array] = []
+        pairs: dict[tuple[str, str], None] = {}
+        for record in self.records([topic]):
+            if not isinstance(record, PoseRecord):
+                raise LogError(f"topic {topic} has no poses but {type(record).__name__}s")
+            if parent not in (None, record.parent) or child not in (None, record.child):
+                continue
+            pairs[record.parent, record.child] = None
+            stamps.append(record.stamp_ns)
+            pending.append(record.T)
+            if len(pending) == SLICE:
+                blocks.append(np.stack(pending))
+                pending = []
+        if len(pairs) != 1:
+            of = "; ".join(f"{a or '?'} to {b or '?'}" for a, b in list(pairs)[:20])
+            raise LogError(f"topic {topic} has poses of {len(pairs)} pairs of frames ({of}); name parent and child")
+        if pending:
+            blocks.append(np.stack(pending))
+        ((parent, child),) = pairs
+        order = np.argsort(np.array(stamps, dtype=np.int64), kind="stable")
+        return PoseSeries(np.array(stamps, dtype=np.int64)[order], np.concatenate(blocks)[order], parent, child)
+
+    def _checked_topics(self, topics: Iterable[str] | None) -> set[str] | None:
+        if topics is None:
+            return None
+        wanted = {topics} if isinstance(topics, str) else set(topics)
+        known = self.topics()
+        for name in sorted(wanted - {topic.name for topic in known}):
+            there = ", ".join(f"{topic.name} ({topic.schema})" for topic in known) or "none"
+            raise LogError(f"{self.files[0].path} has no topic {name}; it has: {there}.")
+        for topic in known:
+            if topic.name in wanted and topic.unreadable:
+                raise LogError(f"{self.files[0].path}, topic {topic.name}: {topic.unreadable}.")
+        return wanted
+
+    def _decoder(self, number: int, channel_id: int) -> _Decoder | str:
+        """The function for a channel's messages, or why there is none."""
+        key = number, channel_id
+        if key not in self._decoders:
+            file = self.files[number]
+            channel = file.channels.get(channel_id)
+            if channel is None:
+                self._decoders[key] = f"channel {channel_id} is not described in the file"
+            else:
+                try:
+                    self._decoders[key] = _decoder_for(channel, file.schemas.get(channel.schema_id))
+                except MessageError as error:
+                    self._decoders[key] = str(error)
+        return self._decoders[key]
+
+    def _records_of(self, number: int, block: Block, wanted: set[str] | None, bad: _Bad) -> Iterator[Record]:
+        """Records of one block, in the order of log time; decoded a slice at a time."""
+        file = self.files[number]
+        try:
+            messages = file.open(block)
+        except LogError as error:
+            bad.add(f"{file.path}", error)
+            return
+        log_time = np.array(messages.log_time, dtype=np.uint64)
+        order = np.argsort(log_time, kind="stable")
+        data = memoryview(messages.data)
+        for start in range(0, len(order), SLICE):
+            places = order[start : start + SLICE].tolist()
+            by_channel: dict[int, list[int]] = {}
+            for i in places:
+                by_channel.setdefault(messages.channel[i], []).append(i)
+            read: dict[int, Sequence[Record]] = {}
+            for channel_id, members in by_channel.items():
+                decoder = self._decoder(number, channel_id)
+                if isinstance(decoder, str):
+                    if channel_id not in file.channels:
+                        bad.add(f"{file.path}", MessageError(decoder), len(members))
+                    continue
+                topic = file.channels[channel_id].topic
+                if wanted is not None and topic not in wanted:
+                    continue
+                cut = [data[messages.start[i] : messages.end[i]] for i in members]
+                results = decoder(topic, cut, [messages.log_time[i] for i in members])
+                for i, result in zip(members, results, strict=True):
+                    if isinstance(result, str):
+                        bad.add(f"topic {topic}", MessageError(f"{file.path}, topic {topic}: {result}"))
+                    else:
+                        read[i] = result
+            for i in places:
+                yield from read.pop(i, ())
+
+
+class _Bad:
+    """What could not be read while going through a log."""
+
+    def __init__(self, on_bad: OnBad) -> None:
+        self._on_bad = on_bad
+        self._first: dict[str, LogError] = {}
+        self._counts: dict[str, int] = {}
+
+    def add(self, where: str, error: LogError, count: int = 1) -> None:
+        if self._on_bad == "raise":
+            raise error
+        self._first.setdefault(where, error)
+        self._counts[where] = self._counts.get(where, 0) + count
+
+    def say(self) -> None:
+        if self._first:
+            parts = [f"{where}: {self._counts[where]} left out, the first: {e}" for where, e in self._first.items()]
+            warnings.warn("; ".join(parts), LogWarning, stacklevel=3)
+
+
+def _decoder_for(channel: Channel, schema: Schema | None) -> _Decoder:
+    if schema is None:
+        raise MessageError("it has no schema")
+    name, encoding = schema.name, channel.message_encoding
+    if encoding == "cdr" and schema.encoding == "ros2msg" and name.replace("/msg/", "/") in ros2_schemas.SCHEMAS:
+        try:
+            return ros2_schemas.decoder(name, schema.data.decode())
+        except UnicodeDecodeError as error:
+            raise MessageError(f"the definition of {name} is not UTF-8") from error
+    if encoding == "json" and name in foxglove_schemas.SCHEMAS:
+        return foxglove_schemas.decoder(name, foxglove_schemas.parse_json, foxglove_schemas.JSON)
+    if encoding == "protobuf" and name in foxglove_schemas.SCHEMAS:
+        return foxglove_schemas.decoder(name, protobuf_messages.parser(schema), foxglove_schemas.PROTOBUF)
+    raise MessageError(f"schema {name!r} ({schema.encoding}) in {encoding!r} is not read by this library")

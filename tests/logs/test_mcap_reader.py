@@ -1,0 +1,344 @@
+"""Logs of every kind that the library reads, and what strangers' files can have in them."""
+
+from __future__ import annotations
+
+import base64
+import struct
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from log_files import POSE, TRANSFORM, foxglove_protobuf, header, json_log, ros2_log, xyz
+from mcap.writer import CompressionType, IndexType
+from mcap.writer import Writer as McapWriter
+from mcap_protobuf.writer import Writer as ProtobufWriter
+
+from gtsam_rwhec.errors import LogError, LogWarning, MessageError, RwhecError
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, PoseRecord, mcap_blocks, open_log
+
+T0 = 1_700_000_000_000_000_000
+#: of POSE and TRANSFORM: about z, cos = 0.8^2 - 0.6^2
+T_EXPECTED = np.array([[0.28, -0.96, 0, 1], [0.96, 0.28, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+LOOSE = {"use_chunking": False}
+BARE = {
+    "index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False,
+    "repeat_channels": False, "repeat_schemas": False,
+}  # fmt: skip
+
+
+def read(path: Path, **options: Any) -> list[Any]:
+    with open_log(path) as log:
+        return list(log.records(**options))
+
+
+def test_ros2_poses_of_every_kind(tmp_path: Path) -> None:
+    covariance = np.diag([1.0, 4, 9, 0.01, 0.04, 0.09])
+    with_covariance = {"pose": POSE, "covariance": covariance.ravel().tolist()}
+    zero = {"twist": {"linear": xyz(0, 0, 0), "angular": xyz(0, 0, 0)}, "covariance": [0.0] * 36}
+    stamped = {"header": header(T0, "/base"), "child_frame_id": "hand", "transform": TRANSFORM}
+    other = {"header": header(T0 + 1, "hand"), "child_frame_id": "cam", "transform": TRANSFORM}
+    odometry = {"header": header(T0), "child_frame_id": "b", "pose": with_covariance, "twist": zero}
+    records = read(
+        ros2_log(
+            tmp_path / "a.mcap",
+            [
+                ("/a", "geometry_msgs/PoseStamped", {"header": header(T0 + 7), "pose": POSE}, T0),
+                (
+                    "/b",
+                    "geometry_msgs/PoseWithCovarianceStamped",
+                    {"header": header(T0), "pose": with_covariance},
+                    T0 + 1,
+                ),
+                ("/c", "geometry_msgs/TransformStamped", stamped, T0 + 2),
+                ("/tf_static", "tf2_msgs/TFMessage", {"transforms": [stamped, other]}, T0 + 3),
+                ("/e", "nav_msgs/Odometry", odometry, T0 + 4),
+            ],
+        )
+    )
+    assert [(r.topic, r.parent, r.child) for r in records] == [
+        ("/a", "world", ""), ("/b", "world", ""), ("/c", "base", "hand"), ("/tf_static", "base", "hand"),
+        ("/tf_static", "hand", "cam"), ("/e", "world", "b"),
+    ]  # fmt: skip
+    for record in records:
+        np.testing.assert_allclose(record.T, T_EXPECTED, atol=1e-15)
+    assert (records[0].stamp_ns, records[0].logged_ns) == (T0 + 7, T0)
+    assert [r.is_static for r in records] == [False] * 3 + [True] * 2 + [False]
+    # A turn of 2 atan(0.75) about z: what is x in the world is seen along R' x in the body.
+    R = T_EXPECTED[:3, :3]
+    expected = np.zeros((6, 6))
+    expected[:3, :3] = R.T @ np.diag([0.01, 0.04, 0.09]) @ R
+    expected[3:, 3:] = R.T @ np.diag([1.0, 4, 9]) @ R
+    for record in (records[1], records[5]):
+        np.testing.assert_allclose(record.covariance, expected, atol=1e-15)
+    assert records[0].covariance is None
+
+
+def test_ros2_images_intrinsics_and_detections(tmp_path: Path) -> None:
+    K = [500.0, 0, 320, 0, 510, 240, 0, 0, 1]
+    info = {
+        "header": header(T0, "cam"), "height": 480, "width": 640, "distortion_model": "plumb_bob",
+        "d": [0.1, 0.2, 0.0, 0.0, 0.3], "k": K, "r": np.eye(3).ravel().tolist(),
+        "p": np.c_[np.reshape(K, (3, 3)), np.zeros(3)].ravel().tolist(), "binning_x": 0, "binning_y": 0,
+        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
+    }  # fmt: skip
+    image = {
+        "header": header(T0, "cam"), "height": 2, "width": 3, "encoding": "mono8", "is_bigendian": 0, "step": 3,
+        "data": b"abcdef",
+    }  # fmt: skip
+    tag = {
+        "family": "36h11", "id": 7, "hamming": 0, "goodness": 0.0, "decision_margin": 50.0, "centre": xyz(1, 1),
+        "corners": [xyz(0, 0), xyz(2, 0), xyz(2, 2), xyz(0, 2)], "homography": [0.0] * 9,
+    }  # fmt: skip
+    jpeg = {"header": header(T0, "cam"), "format": "jpeg", "data": b"\xff\xd8"}
+    tags = {"header": header(T0, "cam"), "detections": [tag, {**tag, "id": 8}]}
+    markers = {"header": header(T0, "cam"), "marker_ids": [3, 4], "poses": [POSE, POSE]}
+    info_, image_, jpeg_, seven, eight, three, four = read(
+        ros2_log(
+            tmp_path / "a.mcap",
+            [
+                ("/info", "sensor_msgs/CameraInfo", info, T0),
+                ("/image", "sensor_msgs/Image", image, T0 + 1),
+                ("/jpeg", "sensor_msgs/CompressedImage", jpeg, T0 + 2),
+                ("/tags", "apriltag_msgs/AprilTagDetectionArray", tags, T0 + 3),
+                ("/markers", "ros2_aruco_interfaces/ArucoMarkers", markers, T0 + 4),
+            ],
+        )
+    )
+    assert isinstance(info_, IntrinsicsRecord)
+    np.testing.assert_array_equal(info_.K, np.reshape(K, (3, 3)))
+    assert (info_.width, info_.height, info_.model, info_.D.tolist()) == (640, 480, "plumb_bob", info["d"])
+    assert isinstance(image_, ImageRecord)
+    assert (image_.data, image_.width, image_.height, image_.is_compressed) == (b"abcdef", 3, 2, False)
+    assert (jpeg_.encoding, jpeg_.data, jpeg_.is_compressed) == ("jpeg", b"\xff\xd8", True)
+    assert isinstance(seven, DetectionRecord)
+    assert (seven.family, seven.id, eight.id, three.id, four.id) == ("36h11", "7", "8", "3", "4")
+    np.testing.assert_array_equal(seven.corners_px, [[0, 0], [2, 0], [2, 2], [0, 2]])
+    np.testing.assert_allclose(four.T_camera_tag, T_EXPECTED, atol=1e-15)
+
+
+def test_foxglove_json(tmp_path: Path) -> None:
+    time = {"sec": T0 // 10**9, "nsec": 5}
+    transform = {"timestamp": time, "parent_frame_id": "base", "child_frame_id": "hand", **TRANSFORM}
+    pixels = base64.b64encode(b"abcdef").decode()
+    raw = {"timestamp": time, "frame_id": "c", "width": 3, "height": 2, "encoding": "mono8", "step": 3, "data": pixels}
+    calibration = {
+        "timestamp": time, "frame_id": "c", "width": 4, "height": 3, "distortion_model": "kannala_brandt",
+        "D": [0, 0, 0, 0], "K": [1, 0, 2, 0, 1, 2, 0, 0, 1], "R": [], "P": [],
+    }  # fmt: skip
+    records = read(
+        json_log(
+            tmp_path / "a.mcap",
+            [
+                ("/a", "foxglove.FrameTransform", transform, 1),
+                ("/b", "foxglove.FrameTransforms", {"transforms": [transform, transform]}, 2),
+                ("/c", "foxglove.PoseInFrame", {"timestamp": time, "frame_id": "base", "pose": POSE}, 3),
+                ("/d", "foxglove.PosesInFrame", {"timestamp": time, "frame_id": "base", "poses": [POSE, POSE]}, 4),
+                ("/e", "foxglove.RawImage", raw, 5),
+                (
+                    "/f", "foxglove.CompressedImage",
+                    {"timestamp": time, "frame_id": "c", "format": "png", "data": pixels}, 6,
+                ),
+                ("/g", "foxglove.CameraCalibration", calibration, 7),
+            ],
+        )
+    )  # fmt: skip
+    assert [r.topic for r in records] == ["/a", "/b", "/b", "/c", "/d", "/d", "/e", "/f", "/g"]
+    for record in records[:6]:
+        np.testing.assert_allclose(record.T, T_EXPECTED, atol=1e-15)
+        assert (record.parent, record.stamp_ns) == ("base", T0 + 5)
+    assert (records[6].data, records[7].data, records[8].model) == (b"abcdef", b"abcdef", "kannala_brandt")
+    np.testing.assert_array_equal(records[8].P, [[1, 0, 2, 0], [0, 1, 2, 0], [0, 0, 1, 0]])
+
+
+def test_foxglove_protobuf(tmp_path: Path) -> None:
+    classes = foxglove_protobuf()
+    message = classes["FrameTransform"](parent_frame_id="base", child_frame_id="hand")
+    message.timestamp.FromNanoseconds(T0 + 5)
+    message.translation.x, message.translation.y, message.translation.z = 1, 2, 3
+    message.rotation.z, message.rotation.w = 0.6, 0.8
+    path = tmp_path / "a.mcap"
+    with open(path, "wb") as stream, ProtobufWriter(stream) as writer:
+        writer.write_message("/tf", message, log_time=T0, publish_time=T0)
+    (record,) = read(path)
+    np.testing.assert_allclose(record.T, T_EXPECTED, atol=1e-15)
+    assert (record.parent, record.child, record.stamp_ns) == ("base", "hand", T0 + 5)
+
+
+def pose_messages(count: int) -> list[Any]:
+    """Poses along x, with frame names and so lengths that change."""
+    return [
+        (
+            f"/{i % 3}", "geometry_msgs/PoseStamped",
+            {"header": header(T0 + i, "w" * (1 + i % 5)), "pose": {**POSE, "position": xyz(i, 0, 0)}}, T0 + i,
+        )
+        for i in range(count)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_messages_of_many_shapes_come_in_order(tmp_path: Path, compression: CompressionType) -> None:
+    path = ros2_log(tmp_path / "a.mcap", pose_messages(5000), compression, chunk_size=20_000)
+    records = read(path)
+    assert [r.T[0, 3] for r in records] == list(range(5000))
+    assert [len(r.parent) for r in records[:5]] == [1, 2, 3, 4, 5]
+    with open_log(path) as log:
+        assert [(t.name, t.count) for t in log.topics()] == [("/0", 1667), ("/1", 1667), ("/2", 1666)]
+        assert len(list(log.records(["/1"]))) == 1667
+
+
+def test_order_across_chunks_and_files_that_overlap(tmp_path: Path) -> None:
+    messages = pose_messages(600)
+    rng = np.random.default_rng(0)
+    for name, part in (("a", messages[::2]), ("b", messages[1::2])):
+        ros2_log(tmp_path / f"{name}.mcap", [part[i] for i in rng.permutation(300)], chunk_size=3000)
+    assert [r.logged_ns for r in read(tmp_path)] == [T0 + i for i in range(600)]
+
+
+def json_poses(count: int) -> list[Any]:
+    time = {"sec": 1, "nsec": 0}
+    message = {"timestamp": time, "frame_id": "w", "pose": POSE}
+    return [("/pose", "foxglove.PoseInFrame", message, i) for i in range(count)]
+
+
+@pytest.mark.parametrize("options", [LOOSE, BARE, {**LOOSE, **BARE}])
+def test_files_without_index(tmp_path: Path, options: dict[str, Any]) -> None:
+    path = json_log(tmp_path / "a.mcap", json_poses(100), **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(read(path)) == 100
+    with open_log(path) as log:
+        (topic,) = log.topics()
+    assert (topic.name, topic.count, topic.first_ns, topic.last_ns) == ("/pose", 100, 0, 99)
+
+
+@pytest.mark.parametrize("options", [{"chunk_size": 2000}, LOOSE])
+def test_truncated_file_is_read_as_far_as_it_goes(tmp_path: Path, options: dict[str, Any]) -> None:
+    path = json_log(tmp_path / "a.mcap", json_poses(200), **options)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.warns(LogWarning, match=r"a\.mcap ends too early.*bytes .* are lost"):
+        log = open_log(path)
+    with log:
+        assert 50 < len(list(log.records())) < 150
+
+
+def test_damaged_chunk_costs_its_own_messages(tmp_path: Path) -> None:
+    path = ros2_log(tmp_path / "a.mcap", pose_messages(300), CompressionType.NONE, chunk_size=10_000)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 255
+    path.write_bytes(content)
+    with pytest.warns(LogWarning, match="wrong checksum"):
+        records = read(path)
+    assert 150 < len(records) < 300
+    with pytest.raises(LogError, match="wrong checksum"):
+        read(path, on_bad="raise")
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_decompression_is_bounded(tmp_path: Path, compression: str) -> None:
+    bomb = getattr(CompressionType, compression.upper())
+    path = tmp_path / "a.mcap"
+    with open(path, "wb") as stream:
+        writer = McapWriter(stream, compression=bomb, chunk_size=1 << 30)
+        writer.start()
+        channel = writer.register_channel(
+            "/x", "json", writer.register_schema("foxglove.PoseInFrame", "jsonschema", b"")
+        )
+        writer.add_message(channel, 0, bytes(1 << 24), 0)
+        writer.finish()
+    content = path.read_bytes()
+    with open_log(path) as log:
+        (block,) = log.files[0].blocks
+    at = block.offset + 9 + 16  # the chunk's stated size follows its record's head and two stamps
+    for claim, words in ((1000, "other than the 1000 bytes"), (mcap_blocks.LARGEST_CHUNK + 1, "beyond the limit")):
+        path.write_bytes(content[:at] + struct.pack("<Q", claim) + content[at + 8 :])
+        with pytest.warns(LogWarning, match=words):
+            assert read(path) == []
+
+
+def test_bad_messages_are_left_out_and_said(tmp_path: Path) -> None:
+    bad = {"header": header(T0), "pose": {**POSE, "orientation": xyz(0, 0, 0, 0)}}
+    nan = {"header": header(T0), "pose": {**POSE, "position": xyz(np.nan, 0, 0)}}
+    messages = [*pose_messages(3), *[("/0", "geometry_msgs/PoseStamped", m, T0 + 9) for m in (bad, nan)]]
+    path = ros2_log(tmp_path / "a.mcap", messages)
+    with pytest.warns(LogWarning, match=r"topic /0: 2 left out, the first: .*norm 0 in place of 1"):
+        assert len(read(path)) == 3
+    with pytest.raises(MessageError, match="norm 0"):
+        read(path, on_bad="raise")
+
+
+def test_missing_and_unreadable_topics(tmp_path: Path) -> None:
+    path = ros2_log(tmp_path / "a.mcap", [*pose_messages(1), ("/text", "std_msgs/String", {"data": "hello"}, T0)])
+    assert len(read(path)) == 1
+    with pytest.raises(LogError, match=r"no topic /nothing; it has: /0 \(geometry_msgs/msg/PoseStamped\), /text"):
+        read(path, topics=["/nothing"])
+    with pytest.raises(LogError, match=r"/text: schema 'std_msgs/msg/String' .* is not read"):
+        read(path, topics=["/text"])
+
+
+def test_pose_series(tmp_path: Path) -> None:
+    transforms = [
+        {"header": header(T0 - i, "base"), "child_frame_id": f"c{i % 2}", "transform": TRANSFORM} for i in range(10)
+    ]
+    path = ros2_log(
+        tmp_path / "a.mcap", [("/tf", "tf2_msgs/TFMessage", {"transforms": [t]}, i) for i, t in enumerate(transforms)]
+    )
+    with open_log(path) as log:
+        series = log.poses("/tf", child="c1")
+        assert (series.parent, series.child) == ("base", "c1")
+        assert series.stamps_ns.tolist() == [T0 - 9, T0 - 7, T0 - 5, T0 - 3, T0 - 1]
+        assert series.T.shape == (5, 4, 4)
+        with pytest.raises(LogError, match="base to c0; base to c1"):
+            log.poses("/tf")
+
+
+@pytest.mark.parametrize("content", [b"", b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n"[:5], bytes(100)])
+def test_not_mcap(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=r"a\.mcap is not an MCAP file"):
+        open_log(path)
+
+
+def test_nothing_there(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="no MCAP files"):
+        open_log(tmp_path)
+    with pytest.raises(LogError, match="cannot be read: No such file"):
+        open_log(tmp_path / "a.mcap")
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    folder = tmp_path_factory.mktemp("seeds")
+    stamped = {"header": header(T0), "child_frame_id": "c", "transform": TRANSFORM}
+    ros2 = [*pose_messages(4), ("/tf", "tf2_msgs/TFMessage", {"transforms": [stamped]}, T0)]
+    paths = [
+        ros2_log(folder / "a.mcap", ros2, CompressionType.NONE, enable_crcs=False),  # so that what is inside is reached
+        ros2_log(folder / "b.mcap", ros2),
+        json_log(folder / "c.mcap", json_poses(3), compression=CompressionType.LZ4),
+        json_log(folder / "d.mcap", json_poses(3), **LOOSE),
+    ]
+    return [path.read_bytes() for path in paths]
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_bytes_give_records_or_an_error_of_ours(tmp_path: Path, seeds: list[bytes], data: st.DataObject) -> None:
+    content = bytearray(data.draw(st.sampled_from(seeds)))
+    for _ in range(data.draw(st.integers(0, 6))):
+        at = data.draw(st.integers(8, len(content) - 1))
+        patch = data.draw(st.binary(min_size=1, max_size=8))
+        content[at : at + len(patch)] = patch
+    content = content[: data.draw(st.integers(8, len(content)))] if data.draw(st.booleans()) else content
+    path = tmp_path / "fuzzed.mcap"
+    path.write_bytes(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LogWarning)
+        try:
+            for record in read(path):
+                assert not isinstance(record, PoseRecord) or np.isfinite(record.T).all()
+        except RwhecError:
+            pass
