@@ -2,6 +2,7 @@
 
 from gtsam_rwhec.logs.mcap_reader import Log, PoseSeries, Topic, open_log
 from gtsam_rwhec.logs.records import DetectionRecord, ImageRecord, IntrinsicsRecord, PoseRecord, Record
+from gtsam_rwhec.logs.transforms import TfBuffer
 
 __all__ = [
     "DetectionRecord",
@@ -11,6 +12,7 @@ __all__ = [
     "PoseRecord",
     "PoseSeries",
     "Record",
+    "TfBuffer",
     "Topic",
     "open_log",
 ]

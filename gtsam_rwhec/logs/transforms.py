@@ -1,0 +1,175 @@
+"""Frames that hang on one another, as tf has them: chains of static and moving transforms composed at given stamps."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from rwhec_factors import se3
+
+from gtsam_rwhec.errors import TransformError
+from gtsam_rwhec.logs.records import Array, PoseRecord
+
+Stamps: TypeAlias = NDArray[np.int64]
+
+
+@dataclass
+class _Link:
+    """T_parent_child over time; a static one has one transform and no stamps."""
+
+    parent: str
+    topic: str
+    is_static: bool
+    stamps_ns: list[int] = field(default_factory=list)
+    T: list[Array] = field(default_factory=list)
+    sorted: tuple[Stamps, Array] | None = None
+
+    def by_stamp(self) -> tuple[Stamps, Array]:
+        """Strictly increasing stamps; of transforms with the same stamp the last counts."""
+        if self.sorted is None:
+            stamps = np.array(self.stamps_ns, dtype=np.int64)
+            order = np.argsort(stamps, kind="stable")
+            last = np.append(np.diff(stamps[order]) != 0, True)
+            self.sorted = stamps[order][last], np.stack(self.T)[order][last]
+        return self.sorted
+
+
+class TfBuffer:
+    """Transforms of a log, to be asked for T_a_b of any two frames that a chain joins."""
+
+    def __init__(self, records: Iterable[object] = ()) -> None:
+        self._links: dict[str, _Link] = {}
+        for record in records:
+            if isinstance(record, PoseRecord) and record.child:
+                self.add(record)
+
+    def add(self, record: PoseRecord) -> None:
+        """Take a transform; static if it came by ``tf_static``.
+
+        Raises
+        ------
+        TransformError
+            It has no child frame, a frame is its own parent, has two parents, or is both static and moving.
+        """
+        parent, child = record.parent, record.child
+        if not child or not parent:
+            raise TransformError(
+                f"topic {record.topic}: a pose of {child or 'no frame'} in {parent or 'no frame'} is no transform "
+                "between two named frames"
+            )
+        if parent == child:
+            raise TransformError(f"topic {record.topic}: frame {child} is its own parent")
+        link = self._links.get(child)
+        if link is None:
+            link = self._links[child] = _Link(parent, record.topic, record.is_static)
+        if link.parent != parent:
+            raise TransformError(
+                f"frame {child} has two parents, {link.parent} (topic {link.topic}) and {parent} (topic "
+                f"{record.topic}); leave one of them out"
+            )
+        if link.is_static != record.is_static:
+            raise TransformError(
+                f"T_{parent}_{child} is said to be static and moving (topics {link.topic} and {record.topic}); "
+                "leave one of them out"
+            )
+        if link.is_static:
+            link.T = [record.T.copy()]
+        else:
+            link.stamps_ns.append(record.stamp_ns)
+            link.T.append(record.T)
+            link.sorted = None
+
+    def frames(self) -> tuple[str, ...]:
+        """Every frame, by name."""
+        return tuple(sorted(set(self._links) | {link.parent for link in self._links.values()}))
+
+    def chain(self, parent: str, child: str) -> tuple[str, ...]:
+        """The frames on the way from `parent` to `child`, both included.
+
+        Raises
+        ------
+        TransformError
+            An unknown frame, a missing link, or a loop; with the chains as far as they go.
+        """
+        up_from_parent, up_from_child = self._up(parent), self._up(child)
+        common = next((frame for frame in up_from_parent if frame in set(up_from_child)), None)
+        if common is None:
+            raise TransformError(
+                f"no chain of transforms from {parent} to {child}: {_arrows(up_from_parent)} ends there, and "
+                f"{_arrows(up_from_child)} does; one link between the two is missing"
+            )
+        down = up_from_child[: up_from_child.index(common)]
+        return (*up_from_parent[: up_from_parent.index(common) + 1], *reversed(down))
+
+    def at(self, parent: str, child: str, stamps_ns: Stamps) -> tuple[Array, Array]:
+        """T_parent_child at stamps.
+
+        Parameters
+        ----------
+        parent, child
+            Any two frames that a chain joins, in either direction.
+        stamps_ns : (M,) integers
+
+        Returns
+        -------
+        T : (M, 4, 4)
+            Each moving link interpolated on SE(3) between its neighbours in time, T_i Expmap(tau Log(T_i^-1 T_i+1)).
+        gap_s : (M,)
+            The longest time between two such neighbours; 0 where all links are static or met, infinite where a link
+            has no transforms on both sides (T then has the nearest).
+
+        Raises
+        ------
+        TransformError
+            As `chain`.
+        """
+        stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
+        T = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
+        gap_s = np.zeros(len(stamps_ns))
+        frames = self.chain(parent, child)
+        for a, b in itertools.pairwise(frames):
+            # Going down the link hangs on b, going up on a.
+            down = b in self._links and self._links[b].parent == a
+            T_link, gap_link = _at(self._links[b if down else a], stamps_ns)
+            T = T @ (T_link if down else se3.inverse(T_link))
+            gap_s = np.maximum(gap_s, gap_link)
+        return np.array(T), gap_s
+
+    def _up(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on to the root."""
+        if frame not in self._links and all(link.parent != frame for link in self._links.values()):
+            raise TransformError(f"no frame {frame}; there are: {', '.join(self.frames()) or 'none'}")
+        chain = [frame]
+        while chain[-1] in self._links:
+            parent = self._links[chain[-1]].parent
+            if parent in chain:
+                raise TransformError(f"the transforms go round in a loop: {_arrows([*chain, parent])}")
+            chain.append(parent)
+        return chain
+
+
+def _at(link: _Link, stamps_ns: Stamps) -> tuple[Array, Array]:
+    count = len(stamps_ns)
+    if link.is_static:
+        return np.broadcast_to(link.T[0], (count, 4, 4)), np.zeros(count)
+    stamps, T = link.by_stamp()
+    after = np.clip(np.searchsorted(stamps, stamps_ns), 0, len(stamps) - 1)
+    met = stamps[after] == stamps_ns
+    outside = (stamps_ns < stamps[0]) | (stamps_ns > stamps[-1])
+    between = ~met & ~outside
+    poses, gap_s = T[after], np.where(outside, np.inf, 0.0)
+    late, early = after[between], after[between] - 1
+    gap_ns = stamps[late] - stamps[early]
+    share = (stamps_ns[between] - stamps[early]) / gap_ns
+    step = se3.logmap(se3.inverse(T[early]) @ T[late])
+    poses[between] = T[early] @ se3.expmap(share[:, None] * step)
+    gap_s[between] = gap_ns * 1e-9
+    return poses, gap_s
+
+
+def _arrows(frames: list[str]) -> str:
+    return " -> ".join(frames)
