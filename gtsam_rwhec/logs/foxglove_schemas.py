@@ -17,7 +17,15 @@ import numpy as np
 
 from gtsam_rwhec.errors import MessageError
 from gtsam_rwhec.logs.checked_poses import transforms
-from gtsam_rwhec.logs.records import Array, DetectionRecord, ImageRecord, IntrinsicsRecord, PoseRecord, Record
+from gtsam_rwhec.logs.records import (
+    Array,
+    DetectionRecord,
+    ImageRecord,
+    IntrinsicsRecord,
+    PairRecord,
+    PoseRecord,
+    Record,
+)
 
 #: A message's records, or what is wrong with it.
 Read = Sequence[Record] | str
@@ -231,7 +239,7 @@ def _vector(values: Any, name: str) -> Array:
 
 
 def _tag_detections(message: Any, access: Access, topic: str, logged: int) -> Read:
-    """Our own ``gtsam_rwhec.TagDetections`` (see `own_schemas`)."""
+    """Our own ``gtsam_rwhec.TagDetections`` (see `written_schemas`)."""
     get = access.get
     stamp, frame = access.stamp(message), _frame(get, message)
     records = []
@@ -253,6 +261,19 @@ def _tag_detections(message: Any, access: Access, topic: str, logged: int) -> Re
     return records
 
 
+def _measured_pair(message: Any, access: Access, topic: str, logged: int) -> Read:
+    """Our own ``gtsam_rwhec.MeasuredPair`` (see `written_schemas`)."""
+    get = access.get
+    A, B = (_vector(get(message, name), name).reshape(4, 4) for name in "AB")
+    for name, T in (("A", A), ("B", B)):
+        R = T[:3, :3]
+        if not (np.abs(R.T @ R - np.eye(3)).max() < 1e-3 and np.isfinite(T).all() and T[3].tolist() == [0, 0, 0, 1]):
+            return f"{name} is no transform: {T.tolist()}"
+    target, sensor, reason = (_text(get, message, name) for name in ("target", "sensor", "reason"))
+    stamp, inlier = access.stamp(message), bool(get(message, "is_inlier"))
+    return (PairRecord(logged, stamp, topic, target, sensor, A, B, inlier, reason),)
+
+
 _POSES: dict[str, Callable[[Any, Access], list[_Row]]] = {
     "foxglove.FrameTransform": _frame_transform,
     "foxglove.FrameTransforms": _frame_transforms,
@@ -264,5 +285,6 @@ _OTHERS: dict[str, Callable[[Any, Access, str, int], Read]] = {
     "foxglove.RawImage": _raw_image,
     "foxglove.CameraCalibration": _camera_calibration,
     "gtsam_rwhec.TagDetections": _tag_detections,
+    "gtsam_rwhec.MeasuredPair": _measured_pair,
 }
 SCHEMAS = frozenset(_POSES) | frozenset(_OTHERS)

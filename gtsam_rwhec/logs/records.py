@@ -104,4 +104,22 @@ class DetectionRecord:
     size_m: float | None = None
 
 
-Record: TypeAlias = PoseRecord | ImageRecord | IntrinsicsRecord | DetectionRecord
+@dataclass(frozen=True, slots=True, eq=False)
+class PairRecord:
+    """A synchronised measurement as this library writes it: A = T_sensorcarrier_targetcarrier, B = T_sensor_target.
+
+    `reason` says why it is no inlier; empty where it is one.
+    """
+
+    logged_ns: int
+    stamp_ns: int
+    topic: str
+    target: str
+    sensor: str
+    A: Array
+    B: Array
+    is_inlier: bool = True
+    reason: str = ""
+
+
+Record: TypeAlias = PoseRecord | ImageRecord | IntrinsicsRecord | DetectionRecord | PairRecord

@@ -1,0 +1,270 @@
+"""Logs written in MCAP: another log's messages untouched, and beside them what was made of them.
+
+    with open_log("run.mcap") as log, LogWriter("clean.mcap") as out:
+        out.copy(log, images="leave_out")
+        out.transforms("/calibration", stamp_ns, [("rig", "cam_0", T_rig_cam)])
+
+The file has its name only once it is whole: it is written beside, and an error leaves what was there before.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from scipy.spatial.transform import Rotation
+
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.logs.mcap_reader import Log
+from gtsam_rwhec.logs.records import Array, DetectionRecord, PairRecord
+from gtsam_rwhec.logs.written_schemas import json_schema
+
+Images = Literal["copy", "leave_out"]
+#: Schemas' last words; such messages are left out of a copy without images.
+IMAGE_SCHEMAS = ("Image", "CompressedImage", "RawImage", "CompressedVideo")
+#: foxglove.PointsAnnotation's number for a closed line
+_LINE_LOOP = 2
+_GREEN = {"r": 0.0, "g": 1.0, "b": 0.0, "a": 1.0}
+_BLACK = {"r": 0.0, "g": 0.0, "b": 0.0, "a": 0.6}
+
+
+class LogWriter:
+    """Writes one MCAP file; a context manager.
+
+    Parameters
+    ----------
+    path
+        Replaced, if it is there, when the block ends without an error.
+
+    Raises
+    ------
+    LogError
+        The file cannot be written (no such folder, no right to, disk full): here, or from any method.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(os.path.realpath(path))
+        self._temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels: dict[tuple[str, str, int, tuple[tuple[str, str], ...]], int] = {}
+        with self._saying():
+            self._stream = open(self._temporary, "wb")  # noqa: SIM115  (closed by __exit__)
+        self._writer = McapWriter(self._stream, compression=CompressionType.ZSTD)
+        with self._saying():
+            self._writer.start(profile="", library="gtsam-rwhec")
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                with self._saying():
+                    self._writer.finish()  # type: ignore[no-untyped-call]
+                    self._stream.flush()
+                    os.fsync(self._stream.fileno())
+                    self._stream.close()
+                    os.replace(self._temporary, self.path)
+        finally:
+            self._abandon()
+
+    def copy(self, log: Log, topics: Iterable[str] | None = None, images: Images = "copy") -> int:
+        """Copy messages byte for byte, with their schemas, channels and times; metadata and attachments stay behind.
+
+        Parameters
+        ----------
+        log
+            Its damaged blocks are left out (``log.losses`` and `Log.records` say them).
+        topics
+            None for all.
+        images
+            ``"leave_out"``: without the topics of images, which are large.
+
+        Returns
+        -------
+        int
+            How many messages were copied.
+        """
+        wanted = None if topics is None else set(topics)
+        copied = 0
+        for file in log.files:
+            for block in sorted(file.blocks, key=lambda block: block.start_ns):
+                try:
+                    messages = file.open(block)
+                except LogError:
+                    continue
+                made: dict[int, int | None] = {}
+                for i, channel_id in enumerate(messages.channel):
+                    if channel_id not in made:
+                        made[channel_id] = self._copied_channel(file, channel_id, wanted, images)
+                    target = made[channel_id]
+                    if target is None:
+                        continue
+                    data = messages.data[messages.start[i] : messages.end[i]]
+                    with self._saying():
+                        self._writer.add_message(
+                            target, messages.log_time[i], data, messages.publish_time[i], messages.sequence[i]
+                        )
+                    copied += 1
+        return copied
+
+    def transforms(self, topic: str, stamp_ns: int, transforms: Iterable[tuple[str, str, Array]]) -> None:
+        """Write a ``foxglove.FrameTransforms`` of (parent, child, T_parent_child)."""
+        parts = []
+        for parent, child, T in transforms:
+            pose = _pose(T)
+            parts.append(
+                {
+                    "timestamp": _time(stamp_ns),
+                    "parent_frame_id": parent,
+                    "child_frame_id": child,
+                    "translation": pose["position"],
+                    "rotation": pose["orientation"],
+                }
+            )
+        self._write(topic, "foxglove.FrameTransforms", stamp_ns, {"transforms": parts})
+
+    def poses(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
+        """Write a ``foxglove.PosesInFrame`` of (N, 4, 4) poses."""
+        message = {"timestamp": _time(stamp_ns), "frame_id": frame, "poses": [_pose(pose) for pose in T]}
+        self._write(topic, "foxglove.PosesInFrame", stamp_ns, message)
+
+    def annotations(self, topic: str, stamp_ns: int, outlines: Sequence[tuple[str, Array]]) -> None:
+        """Write a ``foxglove.ImageAnnotations`` of (label, points (N, 2) in pixels): closed outlines, labelled."""
+        time = _time(stamp_ns)
+        points, texts = [], []
+        for label, corners in outlines:
+            places = [{"x": float(x), "y": float(y)} for x, y in corners]
+            points.append(
+                {
+                    "timestamp": time, "type": _LINE_LOOP, "points": places, "outline_color": _GREEN,
+                    "outline_colors": [], "fill_color": {**_GREEN, "a": 0.0}, "thickness": 2.0,
+                }
+            )  # fmt: skip
+            texts.append(
+                {
+                    "timestamp": time, "position": places[0], "text": label, "font_size": 12.0, "text_color": _GREEN,
+                    "background_color": _BLACK,
+                }
+            )  # fmt: skip
+        self._write(topic, "foxglove.ImageAnnotations", stamp_ns, {"circles": [], "points": points, "texts": texts})
+
+    def detections(self, topic: str, stamp_ns: int, frame: str, tags: Iterable[DetectionRecord]) -> None:
+        """Write a ``gtsam_rwhec.TagDetections`` of one image; stamp and frame are the arguments, not the records'."""
+        parts = []
+        for tag in tags:
+            part: dict[str, Any] = {"family": tag.family, "id": tag.id}
+            if tag.size_m is not None:
+                part["size_m"] = float(tag.size_m)
+            if tag.corners_px is not None:
+                part["corners_px"] = [{"x": float(x), "y": float(y)} for x, y in tag.corners_px]
+            if tag.T_camera_tag is not None:
+                part["pose"] = _pose(tag.T_camera_tag)
+            if tag.covariance is not None:
+                part["covariance"] = np.ravel(tag.covariance).tolist()
+            parts.append(part)
+        message = {"timestamp": _time(stamp_ns), "frame_id": frame, "detections": parts}
+        self._write(topic, "gtsam_rwhec.TagDetections", stamp_ns, message)
+
+    def pair(self, pair: PairRecord) -> None:
+        """Write a ``gtsam_rwhec.MeasuredPair`` to its topic; numbers come back as they were, to the last bit."""
+        message = {
+            "timestamp": _time(pair.stamp_ns), "target": pair.target, "sensor": pair.sensor,
+            "A": np.ravel(pair.A).tolist(), "B": np.ravel(pair.B).tolist(),
+            "is_inlier": bool(pair.is_inlier), "reason": pair.reason,
+        }  # fmt: skip
+        self._write(pair.topic, "gtsam_rwhec.MeasuredPair", pair.stamp_ns, message)
+
+    def metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        """Write a metadata record."""
+        with self._saying():
+            self._writer.add_metadata(name, dict(entries))
+
+    def attachment(self, name: str, media_type: str, data: bytes, stamp_ns: int = 0) -> None:
+        """Attach a file."""
+        with self._saying():
+            self._writer.add_attachment(stamp_ns, stamp_ns, name, media_type, data)
+
+    def _write(self, topic: str, schema: str, stamp_ns: int, message: dict[str, Any]) -> None:
+        try:
+            data = json.dumps(message, allow_nan=False).encode()
+        except ValueError as error:
+            raise LogError(f"topic {topic}: a {schema} with numbers that are not finite cannot be written") from error
+        channel = self._channel(topic, "json", self._schema(schema, "jsonschema", json_schema(schema)), {})
+        with self._saying():
+            self._writer.add_message(channel, stamp_ns, data, stamp_ns)
+
+    def _copied_channel(self, file: Any, channel_id: int, wanted: set[str] | None, images: Images) -> int | None:
+        """The channel here that takes over one of a file's; None if it is not to be copied."""
+        channel = file.channels.get(channel_id)
+        if channel is None or (wanted is not None and channel.topic not in wanted):
+            return None
+        schema = file.schemas.get(channel.schema_id)
+        if (
+            images == "leave_out"
+            and schema is not None
+            and schema.name.replace("/", ".").split(".")[-1] in IMAGE_SCHEMAS
+        ):
+            return None
+        schema_id = 0 if schema is None else self._schema(schema.name, schema.encoding, schema.data)
+        return self._channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)
+
+    def _schema(self, name: str, encoding: str, data: bytes) -> int:
+        key = name, encoding, data
+        if key not in self._schemas:
+            with self._saying():
+                self._schemas[key] = self._writer.register_schema(name, encoding, data)
+        return self._schemas[key]
+
+    def _channel(self, topic: str, encoding: str, schema_id: int, metadata: Mapping[str, str]) -> int:
+        key = topic, encoding, schema_id, tuple(sorted(metadata.items()))
+        if key not in self._channels:
+            with self._saying():
+                self._channels[key] = self._writer.register_channel(topic, encoding, schema_id, dict(metadata))
+        return self._channels[key]
+
+    @contextmanager
+    def _saying(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise LogError(f"{self.path} cannot be written: {error.strerror}.") from error
+
+    def _abandon(self) -> None:
+        """Close, whatever state the file is in, and let nothing lie about."""
+        try:
+            self._stream.close()
+        except OSError:
+            # What is still buffered does not fit the full disk either; the first error has been raised.
+            self._stream.raw.close()
+        self._temporary.unlink(missing_ok=True)
+
+
+def _time(stamp_ns: int) -> dict[str, int]:
+    if not 0 <= stamp_ns < 1 << 64:
+        raise LogError(f"stamp {stamp_ns} ns cannot be written: it must be between 0 and 2^64")
+    return {"sec": int(stamp_ns) // 10**9, "nsec": int(stamp_ns) % 10**9}
+
+
+def _pose(T: Array) -> dict[str, dict[str, float]]:
+    T = np.asarray(T, dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise LogError(f"a pose must be a finite (4, 4) matrix to be written, not {T.tolist()}")
+    R = T[:3, :3]
+    if np.abs(R.T @ R - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise LogError(f"a pose to be written has {R.tolist()} where its rotation should be")
+    quaternion = Rotation.from_matrix(R).as_quat()
+    return {
+        "position": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
+        "orientation": dict(zip("xyzw", quaternion.tolist(), strict=True)),
+    }
