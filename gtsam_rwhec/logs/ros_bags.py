@@ -1,0 +1,81 @@
+"""ROS 1 bags and ROS 2 db3 bags made MCAP, with the `rosbags` library (an optional extra: ``gtsam-rwhec[rosbags]``).
+
+ROS 1 messages are re-encoded as CDR, the same fields and numbers; ROS 2's are copied as they are.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from mcap.writer import Writer as McapWriter
+
+from gtsam_rwhec.errors import LogError
+
+#: Bytes of messages kept before they are compressed and written.
+CHUNK_BYTES = 1 << 20
+
+
+def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
+    """Write a bag's messages as an MCAP file, in the order of time.
+
+    Parameters
+    ----------
+    bag
+        A ROS 1 ``.bag`` file, or the folder of a ROS 2 bag.
+    path
+        Replaced, if it is there, once all is written.
+
+    Returns
+    -------
+    int
+        How many messages were written.
+
+    Raises
+    ------
+    LogError
+        `rosbags` is not installed; the bag cannot be read or has no definitions of its messages; the file cannot be
+        written.
+    """
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.serde import SerdeError
+        from rosbags.typesys import Stores, TypesysError, get_typestore
+    except ImportError as error:
+        raise LogError("rosbags is not installed: pip install gtsam-rwhec[rosbags]") from error
+    bag, path = Path(bag), Path(os.path.realpath(path))
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    count = 0
+    try:
+        with AnyReader([bag]) as reader, open(temporary, "wb") as stream:
+            writer = McapWriter(stream, CHUNK_BYTES)
+            writer.start(profile="ros2", library="gtsam-rwhec")
+            # ROS 2's Header lacks ROS 1's seq; with it, the rest of the definitions are the bag's own.
+            definitions = dict(reader.typestore.fielddefs)
+            if not reader.is2:
+                definitions["std_msgs/msg/Header"] = get_typestore(Stores.LATEST).fielddefs["std_msgs/msg/Header"]
+            types = get_typestore(Stores.EMPTY)
+            types.register(definitions)
+            schemas: dict[str, int] = {}
+            channels: dict[int, int] = {}
+            for connection in reader.connections:
+                name = connection.msgtype
+                if name not in schemas:
+                    definition, _ = types.generate_msgdef(name, ros_version=2)
+                    schemas[name] = writer.register_schema(name, "ros2msg", definition.encode())
+                channels[id(connection)] = writer.register_channel(connection.topic, "cdr", schemas[name])
+            for connection, stamp_ns, raw in reader.messages():
+                data = raw if reader.is2 else bytes(types.ros1_to_cdr(raw, connection.msgtype))
+                writer.add_message(channels[id(connection)], stamp_ns, data, stamp_ns)
+                count += 1
+            writer.finish()  # type: ignore[no-untyped-call]
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except (AnyReaderError, SerdeError, TypesysError) as error:
+        raise LogError(f"{bag} cannot be read as a ROS bag: {error}") from error
+    except OSError as error:
+        raise LogError(f"{bag} could not be made {path}: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return count
