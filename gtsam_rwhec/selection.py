@@ -56,7 +56,7 @@ def selected(problem: Problem, keep: Mapping[Pair, ArrayLike]) -> Problem:
             )
         if mask.any():
             edges[pair] = raw if mask.all() else _taken(raw, mask)
-    return _with_measurements(problem, edges)
+    return with_measurements(problem, edges)
 
 
 def reweighted(
@@ -108,7 +108,7 @@ def reweighted(
         if positive.any():
             kept, w = (raw, w) if positive.all() else (_taken(raw, positive), w[positive])
             edges[pair] = _weighed(kept, w, rotation_factor, translation_factor)
-    return _with_measurements(problem, edges)
+    return with_measurements(problem, edges)
 
 
 def _check_pairs(problem: Problem, given: Mapping[Pair, ArrayLike]) -> None:
@@ -141,7 +141,7 @@ def _weighed(raw: Measurements, w: np.ndarray, rotation_factor: float, translati
     )
 
 
-def _with_measurements(problem: Problem, edges: dict[Pair, Measurements]) -> Problem:
+def with_measurements(problem: Problem, edges: dict[Pair, Measurements]) -> Problem:
     """The same knowledge with other measurements of the same frames."""
     if not edges:
         raise CountError(f"nothing is left of {problem}: no measurement was to be kept")

@@ -18,7 +18,7 @@ from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.optimisation import Optimum, information_of, optimise
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.variables import State, Variables
-from gtsam_rwhec.refinement.weighting import VarianceFactors
+from gtsam_rwhec.refinement.weighting import Group, VarianceFactors
 
 Model = GeodesicModel | ChordalModel
 
@@ -36,7 +36,7 @@ class Fit:
     optimum: Optimum
     information: Array
     factors: VarianceFactors
-    redundancy: dict[tuple[str, str], float]
+    redundancy: dict[tuple[Group, str], float]
     initial_cost: float
     iterations: int
 
@@ -46,7 +46,7 @@ def fit(
 ) -> Fit:
     """Optimise, and where weights depend on the answer or on the residuals, again until they are settled."""
     factors = VarianceFactors.ones(problem.pairs)
-    redundancy: dict[tuple[str, str], float] = {}
+    redundancy: dict[tuple[Group, str], float] = {}
     state, values = start, model.values(start)
     iterations = 0
     if isinstance(model, GeodesicModel) and model.first_loss is not None:

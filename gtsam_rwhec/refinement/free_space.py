@@ -11,6 +11,7 @@ from gtsam_rwhec.certify.variables import given_answer
 from gtsam_rwhec.identifiability import free_directions_of, identify, typical_length
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.refinement.weighting import VarianceFactors
 from gtsam_rwhec.residuals import PairPoses, costs_of_pairs
 
 
@@ -23,8 +24,13 @@ class FreeSpace:
     unit: Array
 
 
-def free_space_of(parts: list[Part], variables: Variables, state: State) -> FreeSpace:
-    """Tested as the certified solution's are (``identifiability``), at the refined answer."""
+def free_space_of(
+    parts: list[Part], variables: Variables, state: State, fitted: VarianceFactors | None = None
+) -> FreeSpace:
+    """Tested as the certified solution's are (``identifiability``), at the refined answer.
+
+    The residuals tell the noise; where a loss holds outliers off, which are among them, the noise as ``fitted`` does.
+    """
     unknown = variables.unknown
     place = dict(zip(unknown, np.cumsum([0, *unknown.values()])[:-1], strict=True))
     size = sum(unknown.values())
@@ -35,20 +41,23 @@ def free_space_of(parts: list[Part], variables: Variables, state: State) -> Free
         answer = given_answer(part, state.X, state.Y, scale)
         poses = PairPoses.of(part, answer)
         J_t, J_R = costs_of_pairs(part, poses)
+        if fitted is not None:  # what these factors predict, 3 / 2 a measurement
+            factors = np.array([fitted.of[pair] for pair in part.pairs])
+            J_R, J_t = 1.5 * part.moments.count * factors[:, 0], 1.5 * part.moments.count * factors[:, 1]
         length = typical_length(part)
         basis = free_directions_of(part, poses, J_t, J_R)
         mapped = np.zeros((size, basis.shape[1]))
         for i, name in enumerate(part.free):
             rows = slice(place[name], place[name] + 6)
             mapped[rows] = basis[7 * i : 7 * i + 6]
-            unit[rows] = np.r_[np.full(3, 1.0 / length), np.ones(3)]
+            unit[rows] = np.r_[np.ones(3), np.full(3, length)]
             own = f"scale:{name}"
             if own in place:  # d alpha = alpha d log alpha
                 mapped[place[own]] = state.scales[own] * basis[7 * i + 6]
-                unit[place[own]] = state.scales[own] / length
+                unit[place[own]] = state.scales[own]
         if "scale" in place:
             mapped[place["scale"]] = state.scales["scale"] * basis[-1]
-            unit[place["scale"]] = state.scales["scale"] / length
+            unit[place["scale"]] = state.scales["scale"]
         columns.append(mapped)
         if basis.shape[1]:
             sentences += identify(part, poses, J_t, J_R).free_directions

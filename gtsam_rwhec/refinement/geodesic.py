@@ -21,6 +21,7 @@ from gtsam_rwhec.refinement.variables import State, Variables, carrier_key
 from gtsam_rwhec.refinement.variance_components import SMALLEST, VarianceComponents, from_measurements
 from gtsam_rwhec.refinement.weighting import (
     COMPONENTS,
+    Group,
     VarianceFactors,
     group_of,
     residual_covariance,
@@ -86,17 +87,7 @@ class GeodesicModel:
 
     def linearize(self, state: State) -> dict[Pair, Linearization]:
         """Residuals and Jacobians of every pair at an estimate."""
-        frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
-        result = {}
-        for item in self.data:
-            scale = self.variables.scale_of_pair.get(item.pair)
-            result[item.pair] = item.residuals.linearize(
-                frames[item.pair[0]],
-                frames[item.pair[1]],
-                1.0 if scale is None else state.scales[scale],
-                state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0),
-            )
-        return result
+        return linearized(self.data, self.variables, state)
 
     def covariances(self, state: State, factors: VarianceFactors) -> dict[Pair, Array]:
         """(N, 6, 6) of every pair's residuals at an estimate."""
@@ -188,7 +179,7 @@ class GeodesicModel:
     ) -> VarianceFactors:
         """Where outliers are expected: medians of squared residuals against a chi-square's, 3 dimensions each."""
         at = self.linearize(state)
-        squares: dict[tuple[str, int], list[Array]] = {}
+        squares: dict[tuple[Group, int], list[Array]] = {}
         for item in self.data:
             covariance = residual_covariance(item, at[item.pair], factors.of[item.pair], propagated=True)
             for i, block in enumerate((slice(0, 3), slice(3, 6))):
@@ -206,3 +197,18 @@ class GeodesicModel:
                 for pair, old in factors.of.items()
             }
         )
+
+
+def linearized(data: list[PairData], variables: Variables, state: State) -> dict[Pair, Linearization]:
+    """Residuals and Jacobians of pairs at an estimate."""
+    frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
+    result = {}
+    for item in data:
+        scale = variables.scale_of_pair.get(item.pair)
+        result[item.pair] = item.residuals.linearize(
+            frames[item.pair[0]],
+            frames[item.pair[1]],
+            1.0 if scale is None else state.scales[scale],
+            state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0),
+        )
+    return result

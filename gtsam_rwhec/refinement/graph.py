@@ -15,6 +15,7 @@ from rwhec_factors.priors import position_prior_factor, rotation_prior_factor
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify.parts import Part
+from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.poses import Array, to_pose3
 from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.refinement.options import ResidualKind, Robust
@@ -61,6 +62,7 @@ class CarrierVariables:
         index: dict[Pair, np.ndarray] = {}
         A: list[Array] = []
         covariance: list[Array] = []
+        owner: list[Pair] = []
         for item in data:
             if item.carrier is None or item.pair[0] == item.pair[1]:
                 continue
@@ -73,6 +75,12 @@ class CarrierVariables:
                     place[key] = len(A)
                     A.append(pose)
                     covariance.append(item.carrier[i])
+                    owner.append(item.pair)
+                elif not np.allclose(covariance[place[key]], item.carrier[i], rtol=1e-6, atol=0.0):
+                    raise NoiseError(
+                        f"{'-'.join(owner[place[key]])} and {'-'.join(item.pair)} saw one carrier pose (measurement "
+                        f"{i} of the latter), and CarrierNoise.covariances gives it two noises; one pose has one"
+                    )
                 of_pair[i] = place[key]
             index[item.pair] = of_pair
         return CarrierVariables(index, np.array(A), np.array(covariance))

@@ -13,6 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from rwhec_factors import se3
+from scipy.linalg import block_diag
 
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.poses import Array
@@ -20,6 +22,8 @@ from gtsam_rwhec.poses import Array
 #: A linear function whose share along the free directions is below this is called determined (the share below which a
 #: free direction's sentence leaves a frame out).
 SHARE = 0.05
+#: How far along a free direction an estimate is taken to be from the truth, in units (the typical length).
+DISPLACED = 1.0
 #: Below this, of the largest, an equilibrated information's eigenvalue is rounding.
 ROUNDING = 1e-13
 
@@ -97,29 +101,30 @@ class JointCovariance:
         selected: Array = np.eye(len(self.unit))[self.rows(names)]
         return selected
 
-    def free_shares(self, G: Array) -> Array:
-        """(m, k): how far each row of G reaches along each free direction; 0 where next to nothing."""
+    def reach(self, G: Array) -> Array:
+        """(m, k): how far the rows of G move when the free directions are gone along until the parameter that moves
+        most has moved by one unit."""
         if self.free.shape[1] == 0:
             return np.zeros((len(G), 0))
-        scaled = G * self.unit
-        length = np.linalg.norm(scaled, axis=1, keepdims=True)
-        # In units of the parameter that moves most: many frames that move together share one direction's length.
+        # Many frames that move together share one direction's length.
         largest = np.linalg.norm(self.free, axis=1).max()
-        shares = (scaled @ self.free) / np.where(length > 0.0, length, 1.0) / largest
-        touched = np.linalg.norm(shares, axis=1, keepdims=True) > SHARE
-        result: Array = np.where(touched, shares, 0.0)
-        return result
+        moved: Array = (G * self.unit) @ self.free / largest
+        return moved
 
     def covariance_of(self, G: Array) -> Array:
         """(m, m) covariance of the linear functions G (m, d) of the unknowns.
 
         Infinite in every row that a free direction reaches, and between two such rows of one direction (with the sign
-        of their correlation); finite elsewhere.
+        of their correlation). A row that it reaches by next to nothing (``SHARE``) has the variance that going along
+        it by ``DISPLACED`` units makes: an estimate is somewhere on the free direction, not anywhere.
         """
-        covariance: Array = G @ self.finite @ G.T
-        shares = self.free_shares(G)
+        moved = self.reach(G)
+        length = np.linalg.norm(G * self.unit, axis=1)
+        shares = moved / np.where(length > 0.0, length, 1.0)[:, None]
+        touched = np.linalg.norm(shares, axis=1) > SHARE
+        covariance: Array = G @ self.finite @ G.T + DISPLACED**2 * moved @ moved.T
         along = shares @ shares.T
-        reached = np.abs(along) > SHARE**2 * 1e-3
+        reached = touched[:, None] & touched & (np.abs(along) > SHARE**2 * 1e-3)
         covariance[reached] = np.inf * np.sign(along[reached])
         return covariance
 
@@ -127,12 +132,31 @@ class JointCovariance:
         """(m, m) marginal information: the inverse of the covariance where it is finite, 0 along free directions."""
         chosen = self.selector(names)
         unit = self.unit[self.rows(names)]
-        finite = (chosen @ self.finite @ chosen.T) / unit[:, None] / unit
-        basis = _orthonormal(self.free_shares(chosen))
-        Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if basis.shape[1] else np.eye(len(unit))
+        moved = self.reach(chosen) / unit[:, None]
+        # Directions within these names that a free one reaches, strongest first; the rest of them counts as displaced.
+        U, s, _ = np.linalg.svd(moved, full_matrices=True)
+        rank = int((s > SHARE).sum())
+        turned = block_diag(*(self.turned(name) for name in names))
+        finite = (chosen @ self.finite @ chosen.T + turned) / unit[:, None] / unit
+        finite += DISPLACED**2 * moved @ moved.T
+        Q = U[:, rank:]
         inside: Array = Q @ np.linalg.inv(Q.T @ finite @ Q) @ Q.T
         marginal: Array = inside / unit[:, None] / unit
         return marginal
+
+    def turned(self, name: str) -> Array:
+        """(m, m): what a rotation's error does to a frame that is displaced along a free direction.
+
+        The direction is known as well as the rotation is: displaced by f, an error omega moves the frame across it by
+        omega x f. Second order, but f is no small perturbation.
+        """
+        rows = np.arange(self.slots[name].start, self.slots[name].stop)
+        result = np.zeros((len(rows), len(rows)))
+        if len(rows) == 6:
+            for f in DISPLACED * self.reach(self.selector((name,)))[3:].T:
+                across = se3.hat(f)
+                result[3:, 3:] += across @ self.finite[np.ix_(rows[:3], rows[:3])] @ across.T
+        return result
 
 
 def _orthonormal(basis: Array) -> Array:

@@ -79,6 +79,20 @@ class PairData:
             raw.stamps_ns,
         )
 
+    def selected(self, mask: np.ndarray) -> PairData:
+        """Of the measurements marked; what is known of A all along (its twists) stays known."""
+        return PairData(
+            self.pair,
+            BatchResiduals(
+                self.residuals.A[mask],
+                self.residuals.B[mask],
+                twists=None if self.residuals.twists is None else self.residuals.twists[mask],
+            ),
+            self.covariance[mask],
+            None if self.carrier is None else self.carrier[mask],
+            None if self.stamps_ns is None else self.stamps_ns[mask],
+        )
+
 
 def carrier_covariances(noise: CarrierNoise, pair: Pair, A: Array) -> Array:
     """Of A's right perturbation, (N, 6, 6), whichever way they were given.

@@ -8,16 +8,17 @@ from collections.abc import Callable
 
 import gtsam
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
 from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.calibration import check_against_knowledge
-from gtsam_rwhec.certify.parts import Part, parts_of
+from gtsam_rwhec.calibration import check_against_knowledge, solve
+from gtsam_rwhec.certify.parts import parts_of
 from gtsam_rwhec.errors import (
     FrameError,
     MeasurementsNotKeptError,
     NotUniqueWarning,
     OptionError,
+    RwhecWarning,
     ScaleError,
     WeightsWarning,
 )
@@ -27,6 +28,7 @@ from gtsam_rwhec.refinement.fit import Fit, Model, fit
 from gtsam_rwhec.refinement.free_space import free_space_of
 from gtsam_rwhec.refinement.geodesic import GeodesicModel
 from gtsam_rwhec.refinement.graduated import graduated
+from gtsam_rwhec.refinement.inliers import agreeing, under_worst_axis
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.pair_data import PairData
@@ -37,6 +39,9 @@ from gtsam_rwhec.selection import selected
 from gtsam_rwhec.solution import Solution
 
 Progress = Callable[[str], None]
+
+#: Times that outliers are chosen anew under the noise as it is; two or three are usual.
+MAX_CHOICES = 10
 
 
 def refine(
@@ -86,25 +91,43 @@ def refine(
     tell = progress if progress is not None else _silent
     _check(problem, solution, options)
     estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)
+    everything = Variables.of(problem, _sensors_with_offset(problem, options))
+    data = _data(problem, everything, options)
     inliers: dict[Pair, np.ndarray] = {}
-    start = solution
+    start, whole, judged = solution, problem, problem
     if options.robust == "gnc":
         tell("rejecting outliers")
+        if data and (problem.has_covariances or options.carrier_noise is not None):
+            judged = under_worst_axis(problem, data, everything, everything.start(solution))
         found = graduated(
-            problem,
+            judged,
             confidence=options.inlier_confidence,
             noise_scale="estimate" if estimates else "given",
             progress=progress,
         )
-        problem, start, inliers = selected(problem, found.inliers), found.solution, found.inliers
-    variables = Variables.of(problem, _sensors_with_offset(problem, options))
-    parts = parts_of(problem)
-    model = _model(problem, parts, variables, options)
-    tell("refining")
-    settled = fit(problem, model, variables, variables.start(start), options, estimates)
-    state = variables.state(settled.optimum.values)
+        start, inliers = found.solution, found.inliers
+    for _ in range(MAX_CHOICES):
+        if inliers:
+            problem = selected(whole, inliers)
+        offsets = tuple(name for name in _sensors_with_offset(whole, options) if name in problem.sensors)
+        variables, parts = Variables.of(problem, offsets), parts_of(problem)
+        kept = [item.selected(inliers[item.pair]) if inliers else item for item in data if item.pair in problem.pairs]
+        model = GeodesicModel.of(kept, variables, options) if kept else ChordalModel(parts, variables)
+        tell("refining")
+        settled = fit(problem, model, variables, variables.start(start), options, estimates)
+        state = variables.state(settled.optimum.values)
+        if judged is whole:
+            break
+        threshold = float(chdtri(6, 1.0 - options.inlier_confidence))
+        again = agreeing(data, variables, state, settled.factors, threshold)
+        if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
+            break
+        inliers = again
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)  # of this choice; what is wrong with the last one is told
+            start = solve(selected(whole, inliers))
     tell("covariances")
-    space = free_space_of(parts, variables, state)
+    space = free_space_of(parts, variables, state, None if options.robust in ("none", "gnc") else settled.factors)
     if space.sentences:
         warnings.warn(
             "the measurements do not determine everything; variances are infinite along: " + "; ".join(space.sentences),
@@ -165,21 +188,21 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: Fit, optio
         )
 
 
-def _model(problem: Problem, parts: list[Part], variables: Variables, options: RefineOptions) -> Model:
+def _data(problem: Problem, variables: Variables, options: RefineOptions) -> list[PairData]:
+    """Of every pair; none for the chordal residual, which has moments."""
     if options.residual == "chordal":
         if problem.has_covariances:
             raise OptionError(
                 "some measurements came with full covariances, which the chordal residual cannot hold; take "
                 "residual='geodesic', or add them with sigma and kappa"
             )
-        return ChordalModel(parts, variables)
+        return []
     if not problem.has_measurements:
         raise MeasurementsNotKeptError(
             "the geodesic residual needs the raw measurements, and they were not kept (keep_measurements=False); make "
             "the problem with keep_measurements=True, or refine with RefineOptions(residual='chordal')"
         )
-    data = [PairData.of(problem, p, options, variables.offset_key(p) is not None) for p in problem.pairs]
-    return GeodesicModel.of(data, variables, options)
+    return [PairData.of(problem, p, options, variables.offset_key(p) is not None) for p in problem.pairs]
 
 
 def _check(problem: Problem, solution: Solution, options: RefineOptions) -> None:

@@ -106,7 +106,13 @@ class RefinedPoses:
         if not (names or self.names):  # everything is fixed
             return np.zeros((0, 0))
         rows = [self._rows_of(name) for name in (names or self.names)]
-        return self.joint.covariance_of(np.concatenate(rows))
+        covariance = self.joint.covariance_of(np.concatenate(rows))
+        first = 0
+        for name, of_name in zip(names or self.names, rows, strict=True):
+            if name in self.joint.slots:
+                covariance[first : first + len(of_name), first : first + len(of_name)] += self.joint.turned(name)
+            first += len(of_name)
+        return covariance
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -123,7 +129,10 @@ class RefinedPoses:
         FrameError
             For a name that is not among the unknowns.
         """
-        return self.joint.information_of(names or self.names)
+        names = names or self.names
+        if len(set(names)) != len(names):
+            raise FrameError(f"the information of {', '.join(names)}: name each once, or it is singular")
+        return self.joint.information_of(names)
 
     def relative(self, first: str, second: str) -> tuple[gtsam.Pose3, Array]:
         """T_first_second of two frames on one carrier, and the covariance (6, 6) of its right perturbation.
@@ -221,6 +230,12 @@ class Refined(RefinedPoses):
     inliers: dict[Pair, np.ndarray]
     solution: Solution
     options: RefineOptions
+
+    def __reduce__(self) -> str:
+        raise TypeError(
+            "a Refined holds a GTSAM graph with Python factors, which can be neither pickled nor copied; write_json "
+            "keeps everything but the graph (rw.read_refined)"
+        )
 
     def write_json(self, path: str | Path) -> None:
         """Write the certified solution and everything refined, but the graph (``gtsam_rwhec.read_refined``)."""

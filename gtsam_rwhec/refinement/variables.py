@@ -51,6 +51,11 @@ class Variables:
     @staticmethod
     def of(problem: Problem, time_offsets: tuple[str, ...]) -> Variables:
         """Of a problem, with time offsets of the sensors named."""
+        for name in problem.targets + problem.sensors:
+            if name == "scale" or name.startswith(("scale:", "time_offset:")):
+                raise FrameError(
+                    f"a frame is called {name!r}, which is what refinement calls a scale or a time offset; rename it"
+                )
         scale_of_pair: dict[Pair, str] = {}
         if problem.scale == "shared":
             scale_of_pair = dict.fromkeys(problem.pairs, "scale")

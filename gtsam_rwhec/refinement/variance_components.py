@@ -24,6 +24,7 @@ from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import Variables
 from gtsam_rwhec.refinement.weighting import (
     COMPONENTS,
+    Group,
     VarianceFactors,
     group_of,
     measurement_covariance,
@@ -39,7 +40,7 @@ class VarianceComponents:
     """Factors, and by group and component how many equations to spare they rest on."""
 
     factors: VarianceFactors
-    redundancy: dict[tuple[str, str], float]
+    redundancy: dict[tuple[Group, str], float]
 
 
 @dataclass
@@ -93,7 +94,7 @@ def from_measurements(
     NoiseError
         When a group has no equation to spare.
     """
-    sums: dict[tuple[str, str], _Sums] = {}
+    sums: dict[tuple[Group, str], _Sums] = {}
     for item in data:
         pair, linear = item.pair, at[item.pair]
         C = residual_covariance(item, linear, factors.of[pair], propagated=True)
@@ -145,7 +146,7 @@ def from_moments(
     NoiseError
         When a group has no equation to spare.
     """
-    sums: dict[tuple[str, str], _Sums] = {}
+    sums: dict[tuple[Group, str], _Sums] = {}
     for part in parts:
         for pair, count in zip(part.pairs, part.moments.count, strict=True):
             for i, component in enumerate(COMPONENTS):
@@ -167,9 +168,9 @@ def from_moments(
     )
 
 
-def _ratio(group: str, component: str, total: _Sums) -> float:
+def _ratio(group: Group, component: str, total: _Sums) -> float:
     if not total.redundancy > 0.5:
-        where = "the measurements" if group == "all" else group
+        where = "the measurements" if group == ("all",) else "-".join(group)
         raise NoiseError(
             f"the {component} noise of {where} cannot be estimated: {total.redundancy:.2g} equations to spare; measure "
             "more, join groups (noise_groups='all'), or give sigma and kappa (noise='given')"

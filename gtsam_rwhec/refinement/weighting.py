@@ -35,9 +35,15 @@ class VarianceFactors:
         return float(np.abs(np.log(mine / theirs)).max(initial=0.0))
 
 
-def group_of(pair: Pair, groups: NoiseGroups) -> str:
+#: Whose residuals share a variance factor: ("all",), (sensor,) or (target, sensor).
+Group = tuple[str, ...]
+
+
+def group_of(pair: Pair, groups: NoiseGroups) -> Group:
     """The group whose residuals a pair's noise is estimated from."""
-    return {"all": "all", "sensor": pair[1], "pair": "-".join(pair)}[groups]
+    if groups == "all":
+        return ("all",)
+    return (pair[1],) if groups == "sensor" else pair
 
 
 def measurement_covariance(data: PairData, factors: tuple[float, float]) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -121,3 +123,37 @@ def test_unknown_names(ask: Callable[[rw.Refined], Any], words: str) -> None:
 def test_bad_confidence() -> None:
     with pytest.raises(rw.errors.OptionError, match="confidence=95"):
         rw.refine(PROBLEM, SOLUTION).squared_radius(6, 95)
+
+
+@pytest.mark.parametrize("name", ["scale", "scale:tag", "time_offset:cam"])
+def test_names_that_refinement_uses_itself(name: str) -> None:
+    raw = PROBLEM.measurements("target0", "sensor0")
+    problem = rw.Problem(scale="shared")
+    problem.add(name, "sensor0", raw.A, raw.B, SIGMA_M, KAPPA)
+    with pytest.raises(rw.errors.FrameError, match=f"a frame is called '{name}'"):
+        rw.refine(problem, rw.solve(problem))
+
+
+def test_information_of_one_name_twice() -> None:
+    with pytest.raises(rw.errors.FrameError, match="name each once"):
+        rw.refine(PROBLEM, SOLUTION).information("target0", "target0")
+
+
+def test_groups_of_pairs_are_not_confused_by_dashes() -> None:
+    """a-b with c, and a with b-c, are two pairs."""
+    problem = rw.Problem()
+    for (target, sensor), (pair, sigma) in zip(
+        (("a-b", "c"), ("a", "b-c")), ((PROBLEM.pairs[0], 0.005), (PROBLEM.pairs[3], 0.5)), strict=True
+    ):
+        raw = PROBLEM.measurements(*pair)
+        B = raw.B.copy()
+        B[:, :3, 3] += np.random.default_rng(0).normal(0.0, sigma, (len(B), 3))
+        problem.add(target, sensor, raw.A, B, SIGMA_M, KAPPA)
+    r = refined(problem, noise="estimate", noise_groups="pair")
+    assert r.noise["a", "b-c"].translation_m > 10.0 * r.noise["a-b", "c"].translation_m
+
+
+@pytest.mark.parametrize("copy_of", [pickle.dumps, copy.deepcopy])
+def test_copies_are_refused_in_words(copy_of: Callable[[object], object]) -> None:
+    with pytest.raises(TypeError, match="write_json"):
+        copy_of(rw.refine(PROBLEM, SOLUTION))

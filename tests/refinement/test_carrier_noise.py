@@ -127,3 +127,11 @@ def test_noise_about_an_origin_a_thousand_kilometres_away_is_refused() -> None:
     problem = copied(rig(2, 2, seed=3).problem, A=lambda pair, raw: raw.A @ np.linalg.inv(far))
     with pytest.raises(rw.errors.NoiseError, match="about the other carrier"):
         refined(problem, carrier_noise=rw.CarrierNoise(rotation_rad=1e-3, translation_m=1e-3))
+
+
+def test_one_carrier_pose_has_one_noise() -> None:
+    problem = rig(1, 2, seed=3).problem
+    first, second = problem.pairs
+    noises = {first: np.tile(np.eye(6) * 1e-6, (20, 1, 1)), second: np.tile(np.eye(6) * 1e-4, (20, 1, 1))}
+    with pytest.raises(rw.errors.NoiseError, match="target0-sensor0 and target0-sensor1 saw one carrier pose"):
+        refined(problem, carrier_noise=rw.CarrierNoise(covariances=noises))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from refinement_problems import copied, distance, refined, rig
+from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.selection import selected
-from gtsam_rwhec.simulate import Simulation
+from gtsam_rwhec.simulate import Noise, Simulation, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
 
 LOSSES = ("huber", "cauchy", "tukey", "geman_mcclure")
@@ -79,3 +80,59 @@ def test_the_estimated_noise_of_what_is_left_is_not_shrunk_by_the_cut() -> None:
         pair = problem.pairs[0]
         estimates.append(r.noise[pair].translation_m / plain.noise[pair].translation_m)
     assert np.mean(estimates) == pytest.approx(1.0, abs=0.03)
+
+
+DEPTH = np.diag(np.r_[np.full(3, np.radians(0.3)), 0.002, 0.002, 0.02]) ** 2
+
+
+def depth_camera(seed: int, bad_share: float = 0.0) -> tuple[rw.Problem, np.ndarray]:
+    """A camera that sees depth ten times worse than the rest; full covariances, true ones."""
+    raw = rig(1, 1, seed=seed, noise=None, number_of_measurements=30).problem.measurements("target0", "sensor0")
+    generator = np.random.default_rng(seed)
+    bad = generator.random(30) < bad_share
+    xi = generator.multivariate_normal(np.zeros(6), DEPTH, 30)
+    B = raw.B @ se3.expmap(xi)
+    B[bad] = random_poses(int(bad.sum()), 2.0, generator)
+    problem = rw.Problem()
+    problem.add("target0", "sensor0", raw.A, B, covariances=DEPTH)
+    return problem, bad
+
+
+def test_gnc_judges_by_full_covariances_and_keeps_good_measurements() -> None:
+    kept = outliers = good = 0
+    for seed in range(6):
+        problem, bad = depth_camera(seed, bad_share=0.2)
+        inliers = refined(problem, robust="gnc").inliers["target0", "sensor0"]
+        kept, good, outliers = kept + inliers[~bad].sum(), good + (~bad).sum(), outliers + inliers[bad].sum()
+    assert outliers == 0
+    assert kept / good > 0.97
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_gnc_knows_the_noise_of_A(each: bool) -> None:
+    """A is five times worse than B: believed to be exact, it would make outliers of all."""
+    raw = rig(1, 1, seed=2, noise=None, number_of_measurements=40).problem.measurements("target0", "sensor0")
+    generator = np.random.default_rng(0)
+    A = perturb(raw.A, Noise(0.005, 0.5 / 0.005**2), generator)
+    B = perturb(raw.B, Noise(0.001, 0.5 / 0.001**2), generator)
+    B[:8] = random_poses(8, 2.0, generator)
+    problem = rw.Problem()
+    problem.add("target0", "sensor0", A, B, 0.001, 0.5 / 0.001**2, stamps_ns=raw.stamps_ns)
+    covariances = {("target0", "sensor0"): np.tile(np.eye(6) * 0.005**2, (40, 1, 1))}
+    noise = rw.CarrierNoise(covariances=covariances) if each else rw.CarrierNoise(0.005, 0.005)
+    inliers = refined(problem, robust="gnc", noise="given", carrier_noise=noise).inliers["target0", "sensor0"]
+    assert not inliers[:8].any()
+    assert inliers[8:].mean() > 0.9
+
+
+@pytest.mark.parametrize("loss", ["huber", "tukey"])
+def test_losses_do_not_call_free_what_outliers_only_blur(loss: str) -> None:
+    for seed in range(4):
+        simulation = rig(1, 1, seed=seed, scale="shared", number_of_measurements=40)
+        generator = np.random.default_rng(seed)
+
+        raw = simulation.problem.measurements("target0", "sensor0")
+        B = raw.B.copy()
+        B[:8] = random_poses(8, 2.0, generator)
+        problem = copied(simulation.problem, B=lambda pair, raw, B=B: B)
+        assert refined(problem, robust=loss).free_directions == []

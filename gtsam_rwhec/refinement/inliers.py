@@ -1,0 +1,58 @@
+"""Which measurements agree where their noise is no pair of numbers: full covariances of B, and noise in A.
+
+Graduated truncation runs on the certified form, which has one sigma and one kappa a measurement. With covariances that
+are long one way, a fit under their mean is off by many standard deviations the other way, and good measurements would
+go. So it runs under the worst axis first, which keeps every good one and leaves out what is gross, and what is kept is
+then refined and chosen anew under the noise as it is, until the choice stays the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.refinement.geodesic import linearized
+from gtsam_rwhec.refinement.pair_data import PairData
+from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.refinement.weighting import VarianceFactors, residual_covariance
+from gtsam_rwhec.selection import with_measurements
+
+
+def under_worst_axis(problem: Problem, data: list[PairData], variables: Variables, state: State) -> Problem:
+    """The problem with isotropic noise as large as that of B and A together is along its worst axis.
+
+    ``state`` tells how far A's noise reaches.
+    """
+    at = linearized(data, variables, state)
+    edges = {}
+    for item in data:
+        C = residual_covariance(item, at[item.pair], (1.0, 1.0), propagated=True)
+        scale = problem.fixed_scales.get(item.pair[0], 1.0)  # the data are in true metres there
+        edges[item.pair] = dataclasses.replace(
+            problem.measurements(*item.pair),
+            sigma=scale * np.sqrt(np.linalg.eigvalsh(C[:, 3:, 3:])[:, -1]),
+            kappa=0.5 / np.linalg.eigvalsh(C[:, :3, :3])[:, -1],
+            covariances=None,
+        )
+    return with_measurements(problem, edges)
+
+
+def agreeing(
+    data: list[PairData], variables: Variables, state: State, factors: VarianceFactors, threshold: float
+) -> dict[Pair, np.ndarray]:
+    """Of every pair (N,) booleans: r' C^-1 r is within the threshold. Of frames that the estimate lacks: none."""
+    known = set(state.X) | set(state.Y)
+    present = [item for item in data if known.issuperset(item.pair)]
+    at = linearized(present, variables, state)
+    result = {item.pair: np.zeros(item.count, dtype=bool) for item in data}
+    everywhere = next(iter(factors.of.values()))
+    for item in present:
+        r = at[item.pair].residual
+        C = residual_covariance(item, at[item.pair], factors.of.get(item.pair, everywhere), propagated=True)
+        square: Array = np.einsum("ni,ni->n", r, np.linalg.solve(C, r[:, :, None])[:, :, 0])
+        result[item.pair] = square <= threshold
+    return result
