@@ -1,5 +1,6 @@
 """Logs of robots and rigs: MCAP files with ROS 2 or Foxglove messages, read as checked records, and written."""
 
+from gtsam_rwhec.logs.image_folder import write_image_folder
 from gtsam_rwhec.logs.mcap_reader import Log, PoseSeries, Topic, open_log
 from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.records import (
@@ -10,6 +11,7 @@ from gtsam_rwhec.logs.records import (
     PoseRecord,
     Record,
 )
+from gtsam_rwhec.logs.ros_bags import convert_ros_bag
 from gtsam_rwhec.logs.transforms import TfBuffer
 
 __all__ = [
@@ -24,5 +26,7 @@ __all__ = [
     "Record",
     "TfBuffer",
     "Topic",
+    "convert_ros_bag",
     "open_log",
+    "write_image_folder",
 ]

@@ -9,6 +9,7 @@ The file has its name only once it is whole: it is written beside, and an error 
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -138,6 +139,16 @@ class LogWriter:
         """Write a ``foxglove.PosesInFrame`` of (N, 4, 4) poses."""
         message = {"timestamp": _time(stamp_ns), "frame_id": frame, "poses": [_pose(pose) for pose in T]}
         self._write(topic, "foxglove.PosesInFrame", stamp_ns, message)
+
+    def compressed_image(self, topic: str, stamp_ns: int, frame: str, encoding: str, data: bytes) -> None:
+        """Write a ``foxglove.CompressedImage``; `encoding` is ``jpeg``, ``png`` or the like."""
+        message = {
+            "timestamp": _time(stamp_ns),
+            "frame_id": frame,
+            "data": base64.b64encode(data).decode(),
+            "format": encoding,
+        }
+        self._write(topic, "foxglove.CompressedImage", stamp_ns, message)
 
     def annotations(self, topic: str, stamp_ns: int, outlines: Sequence[tuple[str, Array]]) -> None:
         """Write a ``foxglove.ImageAnnotations`` of (label, points (N, 2) in pixels): closed outlines, labelled."""

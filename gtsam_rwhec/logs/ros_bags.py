@@ -6,6 +6,7 @@ ROS 1 messages are re-encoded as CDR, the same fields and numbers; ROS 2's are c
 from __future__ import annotations
 
 import os
+import struct
 from pathlib import Path
 
 from mcap.writer import Writer as McapWriter
@@ -38,11 +39,19 @@ def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
         written.
     """
     try:
+        import apsw
         from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.rosbag1 import ReaderError as Ros1Error
+        from rosbags.rosbag2 import ReaderError as Ros2Error
         from rosbags.serde import SerdeError
         from rosbags.typesys import Stores, TypesysError, get_typestore
     except ImportError as error:
         raise LogError("rosbags is not installed: pip install gtsam-rwhec[rosbags]") from error
+    # The last ones are what rosbags raises for damaged bags that it does not recognise as such.
+    faults = (
+        AnyReaderError, Ros1Error, Ros2Error, SerdeError, TypesysError, apsw.Error,
+        AssertionError, ValueError, KeyError, IndexError, struct.error,
+    )  # fmt: skip
     bag, path = Path(bag), Path(os.path.realpath(path))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     count = 0
@@ -72,8 +81,9 @@ def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
-    except (AnyReaderError, SerdeError, TypesysError) as error:
-        raise LogError(f"{bag} cannot be read as a ROS bag: {error}") from error
+    except faults as error:
+        what = str(error) or type(error).__name__
+        raise LogError(f"{bag} cannot be read as a ROS bag: {what}") from error
     except OSError as error:
         raise LogError(f"{bag} could not be made {path}: {error.strerror or error}") from error
     finally:

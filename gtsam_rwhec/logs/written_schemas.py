@@ -77,6 +77,9 @@ _SCHEMAS = {
     "foxglove.ImageAnnotations": _message(
         circles=_several(_message()), points=_several(_POINTS), texts=_several(_TEXT)
     ),
+    "foxglove.CompressedImage": _message(
+        timestamp=_TIME, frame_id=_STRING, data={"type": "string", "contentEncoding": "base64"}, format=_STRING
+    ),
     "gtsam_rwhec.TagDetections": _message(timestamp=_TIME, frame_id=_STRING, detections=_several(_DETECTION)),
     "gtsam_rwhec.MeasuredPair": _message(
         timestamp=_TIME,

@@ -63,3 +63,22 @@ def test_what_is_no_bag(tmp_path: Path, name: str) -> None:
         convert_ros_bag(bag, out)
     assert not out.exists()
     assert list(tmp_path.glob(".*")) == []
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_damaged_bags_give_messages_or_an_error_of_ours(tmp_path: Path, version: int) -> None:
+    bag = bag_of_poses(tmp_path / ("in.bag" if version == 1 else "in"), version)
+    file = bag if version == 1 else next(bag.glob("*.db3"))
+    content = file.read_bytes()
+    rng = np.random.default_rng(version)
+    failed = 0
+    for _ in range(40):
+        damaged = bytearray(content)
+        for at in rng.integers(len(content), size=4):
+            damaged[at] = rng.integers(256)
+        file.write_bytes(damaged[: rng.integers(len(content))] if rng.random() < 0.3 else damaged)
+        try:
+            convert_ros_bag(bag, tmp_path / "out.mcap")
+        except LogError:
+            failed += 1
+    assert 0 < failed < 40

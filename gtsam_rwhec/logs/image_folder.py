@@ -1,0 +1,160 @@
+"""A folder of images and a text file of poses, the form in which older tools take data, made a log.
+
+Each line of the file is one pose: what it belongs to, then seven numbers, with commas or blanks between; lines that
+begin with # and a line of column names are passed over. What it belongs to is
+
+- an image's file name, with or without its ending: that image was taken there. Images get stamps 1 s apart;
+- or a stamp, in seconds (``1700000000.25``) or integer nanoseconds (16 digits or more): then images are named with
+  theirs (``1700000000250000000.png``), and poses may come at another rate.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from decimal import Decimal
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.logs.checked_poses import transforms
+from gtsam_rwhec.logs.mcap_writer import LogWriter
+from gtsam_rwhec.logs.records import Array
+
+Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
+FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
+NANOSECOND_DIGITS = 16
+
+
+def write_image_folder(
+    images: str | Path,
+    poses: str | Path,
+    path: str | Path,
+    *,
+    columns: Columns = "tx ty tz qx qy qz qw",
+    parent: str = "base",
+    child: str = "hand",
+    camera: str = "camera",
+) -> tuple[int, int]:
+    """Write images and poses as one log.
+
+    Topics are ``/<camera>/image`` (``foxglove.CompressedImage``, the files' bytes as they are) and ``/tf``
+    (``foxglove.FrameTransforms`` of T_parent_child).
+
+    Parameters
+    ----------
+    images
+        The folder; files that end otherwise than `FORMATS` are passed over.
+    poses
+        The text file, T_parent_child in metres and unit quaternions.
+    path
+        The MCAP file to write.
+    columns
+        The order of the seven numbers.
+    parent, child, camera
+        Names of the frames.
+
+    Returns
+    -------
+    int, int
+        How many images and how many poses were written.
+
+    Raises
+    ------
+    LogError
+        A folder without images, a line that is no pose, names that do not fit; with file and line.
+    """
+    images, poses = Path(images), Path(poses)
+    files = sorted((f for f in images.glob("*") if f.suffix.lower() in FORMATS), key=lambda f: _natural(f.name))
+    if not files:
+        raise LogError(f"{images} has no images ({', '.join(FORMATS)}).")
+    names, T = _read_poses(poses, columns)
+    image_stamps, pose_stamps = _stamps(files, names, poses)
+    entries = [(stamp, 1, i) for i, stamp in enumerate(image_stamps)]
+    entries += [(stamp, 0, i) for i, stamp in enumerate(pose_stamps)]
+    with LogWriter(path) as out:
+        for stamp, is_image, i in sorted(entries):
+            if not is_image:
+                out.transforms("/tf", stamp, [(parent, child, T[i])])
+                continue
+            try:
+                data = files[i].read_bytes()
+            except OSError as error:
+                raise LogError(f"{files[i]} cannot be read: {error.strerror}.") from error
+            out.compressed_image(f"/{camera}/image", stamp, camera, FORMATS[files[i].suffix.lower()], data)
+    return len(files), len(T)
+
+
+def _read_poses(path: Path, columns: Columns) -> tuple[list[str], Array]:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise LogError(f"{path} cannot be read as text: {error}.") from error
+    names: list[str] = []
+    rows: list[list[float]] = []
+    numbers: list[int] = []
+    has_header = False
+    for number, line in enumerate(lines, start=1):
+        fields = re.split(r"\s*,\s*|\s+", line.strip())
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            row = [float(field) for field in fields[1:]]
+        except ValueError:
+            row = []
+        if len(row) != 7:
+            if not names and not has_header and re.search(r"[A-Za-z]", "".join(fields[1:])):
+                has_header = True
+                continue
+            raise LogError(f"{path}, line {number}: not a name or stamp and {columns}: {line[:80]!r}.")
+        names.append(fields[0])
+        rows.append(row)
+        numbers.append(number)
+    if not rows:
+        raise LogError(f"{path} has no poses; each line is a name or stamp, then {columns}.")
+    order = columns.split()
+    table = dict(zip(order, np.array(rows).T, strict=True))
+    T, faults = transforms(
+        np.stack([table[f"t{axis}"] for axis in "xyz"], axis=1),
+        np.stack([table[f"q{axis}"] for axis in "xyzw"], axis=1),
+    )
+    for i, fault in faults.items():
+        raise LogError(f"{path}, line {numbers[i]}: {fault}. Are the columns {columns}?")
+    return names, T
+
+
+def _stamps(files: Sequence[Path], names: Sequence[str], poses: Path) -> tuple[list[int], list[int]]:
+    """Stamps of images and of poses."""
+    known = {file.name: i for i, file in enumerate(files)} | {file.stem: i for i, file in enumerate(files)}
+    if all(name in known for name in names):
+        if len(set(names)) < len(names):
+            raise LogError(f"{poses}: an image has two poses: {next(n for n in names if names.count(n) > 1)}.")
+        if all(_as_ns(file.stem) is None for file in files):
+            return [(i + 1) * 10**9 for i in range(len(files))], [(known[name] + 1) * 10**9 for name in names]
+    image_stamps = [_as_ns(file.stem) for file in files]
+    pose_stamps = [_as_ns(name.removesuffix(Path(name).suffix) if name in known else name) for name in names]
+    for stamps, what in ((pose_stamps, names), (image_stamps, [file.name for file in files])):
+        if None in stamps:
+            raise LogError(
+                f"{poses}: {what[stamps.index(None)]!r} is neither the name of an image nor a stamp in seconds or "
+                f"nanoseconds; the first image is {files[0].name}, the first pose's name {names[0]!r}."
+            )
+    return [s for s in image_stamps if s is not None], [s for s in pose_stamps if s is not None]
+
+
+def _as_ns(text: str) -> int | None:
+    """Exact nanoseconds of a stamp in seconds (with a point) or in nanoseconds; None for any other name."""
+    if re.fullmatch(rf"\d{{{NANOSECOND_DIGITS},19}}", text, flags=re.ASCII):
+        stamp = int(text)
+    elif re.fullmatch(r"\d{1,10}\.\d{1,15}", text, flags=re.ASCII):
+        stamp = int((Decimal(text) * 10**9).to_integral_value())
+    else:
+        return None
+    return stamp if stamp < 1 << 63 else None
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Numbers in names count as numbers: image_2 before image_10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
