@@ -11,7 +11,7 @@ import io
 import struct
 import zlib
 from array import array
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import lz4.frame
@@ -38,13 +38,17 @@ _FAULTS = (McapError, struct.error, UnicodeDecodeError, ValueError)
 
 @dataclass(frozen=True)
 class Block:
-    """Where messages are: a chunk's record, or records outside chunks; and the span of their log times."""
+    """Where messages are: a chunk's record, or records outside chunks; and the span of their log times.
+
+    `is_cut`: the file ends inside the chunk.
+    """
 
     offset: int
     length: int
     is_chunk: bool
     start_ns: int
     end_ns: int
+    is_cut: bool = False
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,7 @@ class McapFile:
             It cannot be: wrong compression, size or checksum.
         """
         raw = self._read(block.offset, block.length)
-        return self._split(self._opened(raw, block.offset) if block.is_chunk else raw, block.offset)
+        return self._split(self._opened(raw, block) if block.is_chunk else raw, block.offset)
 
     def _read(self, offset: int, length: int) -> bytes:
         try:
@@ -188,7 +192,7 @@ class McapFile:
 
     def _read_through(self) -> None:
         """Find the blocks of a file without an index, and where it stops making sense."""
-        at, loose_at = len(MAGIC), 0
+        at, loose_at, is_cut = len(MAGIC), 0, False
         while at + _RECORD.size <= self.size:
             opcode, length = _RECORD.unpack(self._read(at, _RECORD.size))
             whole = _RECORD.size + length
@@ -196,6 +200,7 @@ class McapFile:
                 self._count_loose(loose_at, at)
                 return
             if at + whole > self.size:
+                is_cut = opcode == Opcode.CHUNK
                 break
             is_loose = opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
             if is_loose and not loose_at:
@@ -207,9 +212,13 @@ class McapFile:
                 self._count(Block(at, whole, True, 0, 0))
             at += whole
         self._count_loose(loose_at, at)
+        before = sum(seen.count for seen in self.seen.values())
+        if is_cut:
+            self._count(Block(at, self.size - at, True, 0, 0, is_cut=True))
+        saved = sum(seen.count for seen in self.seen.values()) - before
         self.losses.append(
-            f"{self.path} ends too early, or is damaged, at byte {at} of {self.size}: "
-            f"the last {self.size - at} bytes and whatever should follow are lost"
+            f"{self.path} ends too early, or is damaged, at byte {at} of {self.size}: the last {self.size - at} bytes "
+            f"and whatever should follow are lost, but for {saved} messages of the chunk that breaks off"
         )
 
     def _count_loose(self, start: int, end: int) -> None:
@@ -232,11 +241,11 @@ class McapFile:
             seen.count += 1
             _widen(seen, log_time, log_time)
         start, end = min(messages.log_time), max(messages.log_time)
-        self.blocks.append(Block(block.offset, block.length, block.is_chunk, start, end))
+        self.blocks.append(replace(block, start_ns=start, end_ns=end))
 
-    def _opened(self, raw: bytes, offset: int) -> bytes:
-        """What a chunk record holds."""
-        where = f"{self.path}, chunk at byte {offset}"
+    def _opened(self, raw: bytes, block: Block) -> bytes:
+        """What a chunk record holds; as much as there is of one that is cut."""
+        where = f"{self.path}, chunk at byte {block.offset}"
         try:
             opcode, _ = _RECORD.unpack_from(raw)
             _, _, size, crc, name_length = _CHUNK.unpack_from(raw, _RECORD.size)
@@ -246,7 +255,7 @@ class McapFile:
         except (struct.error, UnicodeDecodeError) as error:
             raise LogError(f"{where}: no chunk can be read there ({error}); its messages are lost") from error
         data = raw[at + 8 : at + 8 + length]
-        if opcode != Opcode.CHUNK or len(data) != length:
+        if opcode != Opcode.CHUNK or (len(data) != length and not block.is_cut):
             raise LogError(f"{where}: no whole chunk is there; its messages are lost")
         if size > LARGEST_CHUNK:
             raise LogError(f"{where}: {size} bytes when opened, beyond the limit of {LARGEST_CHUNK}; not opened")
@@ -256,6 +265,8 @@ class McapFile:
             raise LogError(f"{where}: does not decompress ({error}); its messages are lost") from error
         except KeyError as error:
             raise LogError(f"{where}: compression {error} is not supported; its messages are lost") from error
+        if block.is_cut:
+            return data
         if len(data) != size:
             raise LogError(f"{where}: opens to other than the {size} bytes that it states; its messages are lost")
         if crc and zlib.crc32(data) != crc:

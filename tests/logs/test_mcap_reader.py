@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import struct
+import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from log_files import POSE, TRANSFORM, foxglove_protobuf, header, json_log, ros2_log, xyz
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from mcap_protobuf.writer import Writer as ProtobufWriter
@@ -223,6 +226,38 @@ def test_truncated_file_is_read_as_far_as_it_goes(tmp_path: Path, options: dict[
         log = open_log(path)
     with log:
         assert 50 < len(list(log.records())) < 150
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_chunk_that_breaks_off_gives_what_there_is_of_it(tmp_path: Path, compression: CompressionType) -> None:
+    # Positions at random, or compression would leave no part to cut off.
+    messages = pose_messages(20_000)
+    numbers = np.random.default_rng(0).normal(size=(20_000, 3))
+    for (_, _, message, _), xyz_ in zip(messages, numbers, strict=True):
+        message["pose"]["position"] = xyz(*xyz_)
+    path = ros2_log(tmp_path / "a.mcap", messages, compression, chunk_size=1 << 24)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.warns(LogWarning, match=r"lost, but for \d+ messages of the chunk that breaks off"):
+        records = read(path)
+    assert 5_000 < len(records) < 20_000
+    for record, expected in zip(records, numbers, strict=False):
+        np.testing.assert_array_equal(record.T[:3, 3], expected)
+
+
+def test_reading_takes_at_most_three_times_what_going_through_takes(tmp_path: Path) -> None:
+    path = ros2_log(tmp_path / "a.mcap", pose_messages(20_000))
+
+    def undecoded() -> int:
+        with open(path, "rb") as stream:
+            return sum(1 for _ in make_reader(stream).iter_messages())
+
+    def seconds(call: Callable[[], int]) -> float:
+        start = time.perf_counter()
+        assert call() == 20_000
+        return time.perf_counter() - start
+
+    ratios = [seconds(lambda: len(read(path))) / seconds(undecoded) for _ in range(3)]
+    assert min(ratios) < 3, ratios
 
 
 def test_damaged_chunk_costs_its_own_messages(tmp_path: Path) -> None:
