@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from rwhec_factors import se3
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.calibration import solve
@@ -34,7 +33,7 @@ from gtsam_rwhec.refinement.refine import refine
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.selection import selected
 from gtsam_rwhec.solution import Solution
-from gtsam_rwhec.twists import carrier_twists
+from gtsam_rwhec.twists import LocalPaths
 
 Split = Literal["time", "pair", "sensor"]
 Progress = Callable[[str], None]
@@ -331,7 +330,7 @@ def _errors(problem: Problem, answer: Solution | Refined, pair: Pair, one: Measu
     A = one.A
     offset = getattr(answer, "time_offsets_s", {}).get(pair[1], 0.0)
     if offset and one.stamps_ns is not None:
-        A = A @ se3.expmap(offset * carrier_twists(A, one.stamps_ns, "-".join(dict.fromkeys(pair))))
+        A = A @ LocalPaths.of(A, one.stamps_ns, "-".join(dict.fromkeys(pair))).motion(offset)
     predicted = np.linalg.inv(poses[pair[1]]) @ A @ poses[pair[0]]
     translation = np.linalg.norm(one.B[:, :3, 3] / scale - predicted[:, :3, 3], axis=1)
     chord = np.linalg.norm(one.B[:, :3, :3] - predicted[:, :3, :3], axis=(1, 2))  # sqrt(8) sin(angle / 2)

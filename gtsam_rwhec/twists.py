@@ -1,6 +1,13 @@
-"""The carriers' velocity at each stamp, from the poses themselves: what a time offset moves A along."""
+"""The carriers' motion about each stamp, from the poses themselves: what a time offset moves A along.
+
+A cubic in the tangent space of each pose, A(t + d) = A(t) Expmap(c_1 d + c_2 d^2 + c_3 d^3), fitted to the poses within
+half a second. Differences of neighbouring poses would be noise at a camera's rate, and noise in a velocity pulls the
+offset towards zero.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from rwhec_factors import se3
@@ -8,52 +15,108 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.poses import Array
 
-#: Differences over longer than this say little of the velocity in between.
+#: Poses this far from a stamp, in time, tell the motion there.
+WINDOW_S = 0.5
+#: Poses further apart than this say little of the motion in between.
 LONGEST_GAP_S = 1.0
+#: Poses of one stamp differ by no more than this, or they are of two carriers.
+SAME = 1e-6
 
 
-def carrier_twists(A: Array, stamps_ns: np.ndarray, where: str) -> Array:
-    """Twists (N, 6), [omega rad/s, v m/s], such that A(t + d) = A Expmap(d twist) to first order.
+@dataclass(frozen=True)
+class LocalPaths:
+    """The motion about each of N stamps.
 
-    From the neighbours in time: the slope at the stamp of the parabola through before, at and after (one side alone at
-    the ends and beside gaps), on the Lie algebra of each pose.
-
-    Parameters
+    Attributes
     ----------
-    A : (N, 4, 4) array
-        T_sensorcarrier_targetcarrier, in any order.
-    stamps_ns : (N,) integers
-    where : str
-        For messages.
-
-    Raises
-    ------
-    CountError
-        For fewer than two stamps, two poses at one stamp, or a pose without any neighbour within a second.
+    coefficients : (N, 3, 6) array
+        c_1 (rad/s, m/s), c_2, c_3.
+    leverage : (N,) array
+        Variance of c_1 over that of a pose's noise, 1/s^2.
+    scatter : (6,) array
+        Variance of the poses about the cubics, rad^2 and m^2.
     """
-    if len(A) < 2:
-        raise CountError(f"{where}: a time offset needs at least two stamped measurements; there is {len(A)}")
-    order = np.argsort(stamps_ns, kind="stable")
-    seconds = (stamps_ns[order] - stamps_ns[order[0]]) * 1e-9
-    step = np.diff(seconds)
-    if (step <= 0.0).any():
-        index = int(np.flatnonzero(step <= 0.0)[0])
-        raise CountError(
-            f"{where}: two measurements have the stamp {stamps_ns[order[index]]} ns; an offset needs each stamp once"
-        )
-    near = step <= LONGEST_GAP_S
-    slope = se3.logmap(se3.inverse(A[order[:-1]]) @ A[order[1:]]) / step[:, None]  # mean twist of each gap
-    twists = np.zeros((len(A), 6))
-    before, after = np.r_[False, near], np.r_[near, False]
-    alone = np.flatnonzero(~before & ~after)
-    if alone.size:
-        raise CountError(
-            f"{where}: the measurement at {stamps_ns[order[alone[0]]]} ns has no other within {LONGEST_GAP_S:g} s, so "
-            "nothing tells how fast the carrier moved there; leave it out, or estimate no time offset for its sensor"
-        )
-    h_before, h_after = np.r_[1.0, step][:, None], np.r_[step, 1.0][:, None]
-    s_before, s_after = np.vstack([slope[:1], slope]), np.vstack([slope, slope[-1:]])
-    parabola = (h_after * s_before + h_before * s_after) / (h_before + h_after)
-    ordered = np.where((before & after)[:, None], parabola, np.where(before[:, None], s_before, s_after))
-    twists[order] = ordered
-    return twists
+
+    coefficients: Array
+    leverage: Array
+    scatter: Array
+
+    def motion(self, offset_s: float) -> Array:
+        """Expmap(c_1 d + c_2 d^2 + c_3 d^3), (N, 4, 4)."""
+        powers = float(np.clip(offset_s, -WINDOW_S, WINDOW_S)) ** np.arange(1, 4)  # nothing is known beyond
+        return se3.expmap(np.einsum("k,nki->ni", powers, self.coefficients))
+
+    def twists(self, offset_s: float = 0.0) -> Array:
+        """Velocity (N, 6) at the stamps plus an offset, [omega rad/s, v m/s], in the moved carrier's own axes."""
+        if offset_s == 0.0:
+            return self.coefficients[:, 0]
+        h = 1e-4
+        return se3.logmap(se3.inverse(self.motion(offset_s - h)) @ self.motion(offset_s + h)) / (2.0 * h)
+
+    def selected(self, mask: np.ndarray) -> LocalPaths:
+        """Of the stamps marked or indexed."""
+        return LocalPaths(self.coefficients[mask], self.leverage[mask], self.scatter)
+
+    @staticmethod
+    def of(A: Array, stamps_ns: np.ndarray, where: str) -> LocalPaths:
+        """Fit them.
+
+        Parameters
+        ----------
+        A : (N, 4, 4) array
+            T_sensorcarrier_targetcarrier, in any order; a stamp may be there several times, with one pose.
+        stamps_ns : (N,) integers
+        where : str
+            For messages.
+
+        Raises
+        ------
+        CountError
+            For fewer than two stamps, two poses at one stamp, or a pose without any neighbour within a second.
+        """
+        stamps, first, place = np.unique(stamps_ns, return_index=True, return_inverse=True)
+        poses = A[first]
+        off = np.abs(A - poses[place]).max(axis=(1, 2))
+        if off.max() > SAME:
+            raise CountError(
+                f"{where}: two carrier poses have the stamp {stamps_ns[int(off.argmax())]} ns; a time offset needs one "
+                "for each stamp"
+            )
+        if len(stamps) < 2:
+            raise CountError(f"{where}: a time offset needs at least two stamps; there is {len(stamps)}")
+        seconds = (stamps - stamps[0]) * 1e-9
+        coefficients, leverage = np.zeros((len(stamps), 3, 6)), np.zeros(len(stamps))
+        squares, freedom = np.zeros(6), 0
+        for i in range(len(stamps)):
+            near = _neighbours(seconds, i)
+            if len(near) < 2:
+                raise CountError(
+                    f"{where}: the measurement at {stamps[i]} ns has no other within {LONGEST_GAP_S:g} s, so nothing "
+                    "tells how fast the carrier moved there; leave it out, or estimate no time offset for its sensor"
+                )
+            tau = seconds[near] - seconds[i]
+            xi = se3.logmap(se3.inverse(poses[i : i + 1]) @ poses[near])
+            # A constant takes up the noise of the pose itself, where there are poses enough.
+            degree = min(3, len(near) - 1)
+            Z = tau[:, None] ** np.arange(0 if len(near) > 2 else 1, degree + 1)
+            solution, _, _, _ = np.linalg.lstsq(Z, xi, rcond=None)
+            start = 1 if len(near) > 2 else 0
+            coefficients[i, : len(solution) - start] = solution[start:]
+            leverage[i] = np.linalg.pinv(Z.T @ Z)[start, start]
+            squares += ((xi - Z @ solution) ** 2).sum(axis=0)
+            freedom += len(near) - Z.shape[1]
+        return LocalPaths(coefficients[place], leverage[place], squares / max(freedom, 1))
+
+
+def _neighbours(seconds: Array, i: int) -> np.ndarray:
+    """Indices of the poses about the i-th, itself too: half a second either way, two at least, across no long gap."""
+    low = high = i
+    while low > 0 and seconds[low] - seconds[low - 1] <= LONGEST_GAP_S:
+        if seconds[i] - seconds[low - 1] > WINDOW_S and i - low >= 2:
+            break
+        low -= 1
+    while high < len(seconds) - 1 and seconds[high + 1] - seconds[high] <= LONGEST_GAP_S:
+        if seconds[high + 1] - seconds[i] > WINDOW_S and high - i >= 2:
+            break
+        high += 1
+    return np.arange(low, high + 1)

@@ -26,6 +26,8 @@ Model = GeodesicModel | ChordalModel
 MAX_ROUNDS = 30
 #: Variance factors are settled when none changes by more than this, of itself.
 SETTLED = 1e-4
+#: A time offset is settled when a round changes it by no more than this.
+OFFSET_SETTLED_S = 1e-6
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,13 @@ def fit(
         graph = _with_knowledge(model.graph(state, factors), problem, variables, options)
         optimum = optimise(graph, values, options.max_iterations)
         iterations += optimum.iterations
-        state, values = variables.state(optimum.values), optimum.values
+        before, state, values = state, variables.state(optimum.values), optimum.values
         information = _information(problem, model, variables, options, state, factors, values)
         settled = not model.reweighs or round_number > 0
+        # A time offset is linearised where the round began.
+        settled = settled and all(
+            abs(offset - before.offsets_s[name]) < OFFSET_SETTLED_S for name, offset in state.offsets_s.items()
+        )
         if estimates:
             size = len(information)
             joint = JointCovariance.of(variables.unknown, information, np.zeros((size, 0)), np.ones(size))

@@ -10,22 +10,34 @@ from gtsam_rwhec.certify.parts import Part
 from gtsam_rwhec.certify.variables import given_answer
 from gtsam_rwhec.identifiability import free_directions_of, identify, typical_length
 from gtsam_rwhec.poses import Array
+from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.weighting import VarianceFactors
 from gtsam_rwhec.residuals import PairPoses, costs_of_pairs
 
+#: A velocity's mean square, in units of what noise makes of it, up to which a carrier counts as standing still.
+MOVED = 4.0
+
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Free directions: basis (d, k) over ``Variables.unknown``; sentences; unit (d,): what counts as one of each."""
+    """Free directions: basis (d, k) over ``Variables.unknown``; sentences; unit (d,): what counts as one of each.
+
+    ``shrinkage``: see ``free_offsets``.
+    """
 
     basis: Array
     sentences: list[str]
     unit: Array
+    shrinkage: dict[str, float]
 
 
 def free_space_of(
-    parts: list[Part], variables: Variables, state: State, fitted: VarianceFactors | None = None
+    parts: list[Part],
+    variables: Variables,
+    state: State,
+    data: list[PairData],
+    fitted: VarianceFactors | None = None,
 ) -> FreeSpace:
     """Tested as the certified solution's are (``identifiability``), at the refined answer.
 
@@ -61,7 +73,52 @@ def free_space_of(
         columns.append(mapped)
         if basis.shape[1]:
             sentences += identify(part, poses, J_t, J_R).free_directions
-    return FreeSpace(np.hstack(columns) if columns else np.zeros((size, 0)), sentences, unit)
+    still, more, shrinkage = free_offsets(data, variables)
+    for name in still:
+        columns.append(np.zeros((size, 1)))
+        columns[-1][place[name]] = 1.0
+    sentences += more
+    return FreeSpace(np.hstack(columns) if columns else np.zeros((size, 0)), sentences, unit, shrinkage)
+
+
+def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[str], list[str], dict[str, float]]:
+    """Time offsets that the carriers' motion does not tell.
+
+    An offset shows as far as the carrier moves while the sensor looks. Its velocity comes from noisy poses: where its
+    mean square is no more than ``MOVED`` times what their noise alone would make it, the carrier stood still for all
+    that is known.
+
+    Returns
+    -------
+    names : list of str
+        Of the offsets that are free.
+    sentences : list of str
+    shrinkage : dict of str to float
+        Of the others: by what part noise in the velocity pulls the offset towards zero.
+    """
+    names, sentences, shrinkage = [], [], {}
+    for name in variables.offsets:
+        sensor = name.partition(":")[2]
+        squares, noise = np.zeros(2), np.zeros(2)
+        for item in data:
+            if item.pair[1] != sensor or item.paths is None:
+                continue
+            weight = 1.0 / np.einsum("nii->i", item.covariance).reshape(2, 3).mean(axis=1) * item.count
+            squares += weight * (item.paths.twists() ** 2).sum(axis=0).reshape(2, 3).sum(axis=1)
+            variance = item.paths.scatter.reshape(2, 3).sum(axis=1)
+            if item.carrier is not None:
+                variance = np.maximum(
+                    variance, np.einsum("nii->i", item.carrier).reshape(2, 3).sum(axis=1) / item.count
+                )
+            noise += weight * item.paths.leverage.sum() * variance
+        if (squares <= MOVED * noise + 1e-18 * np.maximum(squares.max(), 1.0)).all():
+            names.append(name)
+            sentences.append(
+                f"{name.replace(':', ' of ')}: the carriers moved no faster than the noise of their poses makes it seem"
+            )
+        else:
+            shrinkage[name] = float(noise.sum() / squares.sum())
+    return names, sentences, shrinkage
 
 
 def _scales_of(part: Part, state: State) -> float | dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from dataclasses import dataclass
 
@@ -73,7 +74,7 @@ class GeodesicModel:
 
     @property
     def reweighs(self) -> bool:
-        """Whether the weights depend on the estimate: A's noise is carried into the residual at it."""
+        """Whether the factors depend on the estimate: A's noise is carried into the residual at it."""
         return self.options.carrier_noise is not None and self.carriers is None
 
     @property
@@ -98,10 +99,13 @@ class GeodesicModel:
         """The measurements' factors, weighed as of an estimate; in another loss than the options', if told."""
         loss = self.options.robust if robust is None else robust
         graph = gtsam.NonlinearFactorGraph()
-        rest = self.data
+        rest = [
+            dataclasses.replace(item, residuals=item.at(state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0)))
+            for item in self.data
+        ]
         if self.carriers is not None:
             graphs.add_with_carriers(graph, self.variables, self.data, self.carriers, factors, loss)
-            rest = [item for item in self.data if item.pair not in self.carriers.index]
+            rest = [item for item in rest if item.pair not in self.carriers.index]
         covariances = self.covariances(state, factors) if rest else {}
         if loss in graphs.LOSSES:
             graphs.add_single(graph, self.variables, rest, covariances, loss)
@@ -205,10 +209,11 @@ def linearized(data: list[PairData], variables: Variables, state: State) -> dict
     result = {}
     for item in data:
         scale = variables.scale_of_pair.get(item.pair)
-        result[item.pair] = item.residuals.linearize(
+        offset_s = state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0)
+        result[item.pair] = item.at(offset_s).linearize(
             frames[item.pair[0]],
             frames[item.pair[1]],
             1.0 if scale is None else state.scales[scale],
-            state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0),
+            offset_s,
         )
     return result

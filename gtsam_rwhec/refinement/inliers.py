@@ -25,15 +25,19 @@ from gtsam_rwhec.selection import with_measurements
 def under_worst_axis(problem: Problem, data: list[PairData], variables: Variables, state: State) -> Problem:
     """The problem with isotropic noise as large as that of B and A together is along its worst axis.
 
-    ``state`` tells how far A's noise reaches.
+    ``state`` tells how far A's noise reaches, and where the carriers were when a sensor's clock is off.
     """
     at = linearized(data, variables, state)
     edges = {}
     for item in data:
         C = residual_covariance(item, at[item.pair], (1.0, 1.0), propagated=True)
         scale = problem.fixed_scales.get(item.pair[0], 1.0)  # the data are in true metres there
+        A = item.residuals.A
+        if item.paths is not None:
+            A = A @ item.paths.motion(state.offsets_s[f"time_offset:{item.pair[1]}"])
         edges[item.pair] = dataclasses.replace(
             problem.measurements(*item.pair),
+            A=A,
             sigma=scale * np.sqrt(np.linalg.eigvalsh(C[:, 3:, 3:])[:, -1]),
             kappa=0.5 / np.linalg.eigvalsh(C[:, :3, :3])[:, -1],
             covariances=None,

@@ -14,7 +14,7 @@ from gtsam_rwhec.measurements import checked_covariances
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
-from gtsam_rwhec.twists import carrier_twists
+from gtsam_rwhec.twists import SAME, LocalPaths
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,8 @@ class PairData:
     carrier : (N, 6, 6) array or None
         Of A's right perturbation.
     stamps_ns : (N,) array or None
+    paths : LocalPaths or None
+        The carriers' motion about each stamp, where the sensor's clock has an offset.
     """
 
     pair: Pair
@@ -38,6 +40,7 @@ class PairData:
     covariance: Array
     carrier: Array | None
     stamps_ns: np.ndarray | None
+    paths: LocalPaths | None = None
 
     @property
     def count(self) -> int:
@@ -45,15 +48,15 @@ class PairData:
         return len(self.covariance)
 
     @staticmethod
-    def of(problem: Problem, pair: Pair, options: RefineOptions, with_offset: bool) -> PairData:
-        """From a problem.
+    def of(problem: Problem, pair: Pair, options: RefineOptions, paths: LocalPaths | None) -> PairData:
+        """From a problem; with a time offset where there are ``paths``.
 
         Raises
         ------
         MeasurementsNotKeptError
             When there are moments only.
         NoiseError, CountError
-            For carrier covariances that lack this pair or have another count; time offsets without stamps.
+            For carrier covariances that lack this pair or have another count.
         """
         raw = problem.measurements(*pair)
         scale = problem.fixed_scales.get(pair[0], 1.0)
@@ -64,20 +67,22 @@ class PairData:
             B = B.copy()
             B[:, :3, 3] /= scale
             covariance = covariance * unit[:, None] * unit
-        twists = None
-        if with_offset:
-            if raw.stamps_ns is None:
-                raise CountError(
-                    f"{'-'.join(pair)}: a time offset needs stamps for every measurement; add them with stamps_ns="
-                )
-            twists = carrier_twists(raw.A, raw.stamps_ns, "-".join(pair))
         return PairData(
             pair,
-            BatchResiduals(raw.A, B, twists=twists),
+            BatchResiduals(raw.A, B, twists=None if paths is None else paths.twists()),
             covariance,
             None if options.carrier_noise is None else carrier_covariances(options.carrier_noise, pair, raw.A),
             raw.stamps_ns,
+            paths,
         )
+
+    def at(self, offset_s: float) -> BatchResiduals:
+        """Residuals whose time offset is linearised where it stands: exact there, along the twist of that instant."""
+        if self.paths is None or offset_s == 0.0:
+            return self.residuals
+        twists = self.paths.twists(offset_s)
+        there = self.residuals.A @ self.paths.motion(offset_s)
+        return BatchResiduals(there @ se3.expmap(-offset_s * twists), self.residuals.B, twists=twists)
 
     def selected(self, mask: np.ndarray) -> PairData:
         """Of the measurements marked; what is known of A all along (its twists) stays known."""
@@ -91,7 +96,55 @@ class PairData:
             self.covariance[mask],
             None if self.carrier is None else self.carrier[mask],
             None if self.stamps_ns is None else self.stamps_ns[mask],
+            None if self.paths is None else self.paths.selected(mask),
         )
+
+
+def local_paths(problem: Problem, sensors: tuple[str, ...]) -> dict[Pair, LocalPaths]:
+    """The carriers' motion about the stamps of the sensors' pairs.
+
+    The carriers are the same for all sensors and targets, as a rule, so that every pair's poses tell it; where two
+    pairs have different poses at one stamp (several robots), each pair's own do.
+
+    Raises
+    ------
+    CountError
+        For measurements without stamps, or poses that do not tell a motion.
+    OptionError
+        For a sensor with motions of its own.
+    """
+    pairs = [pair for pair in problem.pairs if pair[1] in sensors]
+    for target, sensor in pairs:
+        if target == sensor:
+            raise OptionError(
+                f"a time offset of {sensor} would move both ends of its motions (add_motion), which are not modelled; "
+                "leave it out of time_offsets"
+            )
+        if problem.measurements(target, sensor).stamps_ns is None:
+            raise CountError(
+                f"{target}-{sensor}: a time offset needs stamps for every measurement; add them with stamps_ns="
+            )
+    if not pairs:
+        return {}
+    telling = [problem.measurements(*pair) for pair in problem.pairs if pair[0] != pair[1]]
+    telling = [raw for raw in telling if raw.stamps_ns is not None]
+    A = np.concatenate([raw.A for raw in telling])
+    stamps = np.concatenate([raw.stamps_ns for raw in telling])
+    order = np.argsort(stamps, kind="stable")
+    same = np.diff(stamps[order]) == 0
+    if (np.abs(np.diff(A[order], axis=0))[same] > SAME).any():
+        return {pair: _paths_of_pair(problem, pair) for pair in pairs}
+    # Of all stamps once, then each pair's own among them.
+    unique, first = np.unique(stamps, return_index=True)
+    paths = LocalPaths.of(A[first], unique, "the carriers")
+    of_pairs = {pair: problem.measurements(*pair).stamps_ns for pair in pairs}
+    return {pair: paths.selected(np.searchsorted(unique, s)) for pair, s in of_pairs.items() if s is not None}
+
+
+def _paths_of_pair(problem: Problem, pair: Pair) -> LocalPaths:
+    raw = problem.measurements(*pair)
+    assert raw.stamps_ns is not None
+    return LocalPaths.of(raw.A, raw.stamps_ns, "-".join(pair))
 
 
 def carrier_covariances(noise: CarrierNoise, pair: Pair, A: Array) -> Array:

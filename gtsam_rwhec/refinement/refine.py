@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -16,6 +17,7 @@ from gtsam_rwhec.certify.parts import parts_of
 from gtsam_rwhec.errors import (
     FrameError,
     MeasurementsNotKeptError,
+    NotConvergedWarning,
     NotUniqueWarning,
     OptionError,
     RwhecWarning,
@@ -25,18 +27,19 @@ from gtsam_rwhec.errors import (
 from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.refinement.chordal import ChordalModel
 from gtsam_rwhec.refinement.fit import Fit, Model, fit
-from gtsam_rwhec.refinement.free_space import free_space_of
+from gtsam_rwhec.refinement.free_space import FreeSpace, free_space_of
 from gtsam_rwhec.refinement.geodesic import GeodesicModel
 from gtsam_rwhec.refinement.graduated import graduated
 from gtsam_rwhec.refinement.inliers import agreeing, under_worst_axis
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.refinement.pair_data import PairData
+from gtsam_rwhec.refinement.pair_data import PairData, local_paths
 from gtsam_rwhec.refinement.refined import Movement, PairNoise, Refined
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.weighting import group_of
 from gtsam_rwhec.selection import selected
 from gtsam_rwhec.solution import Solution
+from gtsam_rwhec.twists import WINDOW_S
 
 Progress = Callable[[str], None]
 
@@ -97,8 +100,13 @@ def refine(
     start, whole, judged = solution, problem, problem
     if options.robust == "gnc":
         tell("rejecting outliers")
-        if data and (problem.has_covariances or options.carrier_noise is not None):
-            judged = under_worst_axis(problem, data, everything, everything.start(solution))
+        if data and (problem.has_covariances or options.carrier_noise is not None or everything.offsets):
+            guess = everything.start(solution)
+            if everything.offsets:  # a clock that is off looks like outliers wherever the carrier moves
+                first = GeodesicModel.of(data, everything, replace(options, robust="huber"))
+                rough = fit(problem, first, everything, guess, options, estimates)
+                guess = everything.state(rough.optimum.values)
+            judged = under_worst_axis(problem, data, everything, guess)
         found = graduated(
             judged,
             confidence=options.inlier_confidence,
@@ -127,7 +135,7 @@ def refine(
             warnings.simplefilter("ignore", RwhecWarning)  # of this choice; what is wrong with the last one is told
             start = solve(selected(whole, inliers))
     tell("covariances")
-    space = free_space_of(parts, variables, state, None if options.robust in ("none", "gnc") else settled.factors)
+    space = free_space_of(parts, variables, state, kept, None if options.robust in ("none", "gnc") else settled.factors)
     if space.sentences:
         warnings.warn(
             "the measurements do not determine everything; variances are infinite along: " + "; ".join(space.sentences),
@@ -137,6 +145,7 @@ def refine(
     if not estimates:
         _warn_of_weights(problem, variables, settled, options)
     joint = JointCovariance.of(variables.unknown, settled.information, space.basis, space.unit)
+    _warn_of_offsets(space, joint, state)
     return Refined(
         X=state.X,
         Y=state.Y,
@@ -188,6 +197,27 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: Fit, optio
         )
 
 
+def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> None:
+    """Where a time offset is biased by more than its standard deviation says, or beyond what poses nearby tell."""
+    for name, part in space.shrinkage.items():
+        offset_s, what = abs(state.offsets_s[name]), name.replace(":", " of ")
+        if offset_s > WINDOW_S:
+            warnings.warn(
+                f"{what} is {offset_s:.3g} s, beyond the {WINDOW_S:g} s about each stamp in which the carriers' motion "
+                "is looked at; shift the stamps first (cleaning.coarse_time_offset finds by how much)",
+                NotConvergedWarning,
+                stacklevel=3,
+            )
+        elif part * offset_s > 0.5 * math.sqrt(joint.covariance_of(joint.selector((name,)))[0, 0]):
+            warnings.warn(
+                f"{what}: the carriers' velocity is {100.0 * part:.2g} % noise, which pulls the offset towards zero by "
+                f"about {1e3 * part * offset_s:.2g} ms, more than its standard deviation says; move faster, or take "
+                "denser poses",
+                WeightsWarning,
+                stacklevel=3,
+            )
+
+
 def _data(problem: Problem, variables: Variables, options: RefineOptions) -> list[PairData]:
     """Of every pair; none for the chordal residual, which has moments."""
     if options.residual == "chordal":
@@ -202,7 +232,8 @@ def _data(problem: Problem, variables: Variables, options: RefineOptions) -> lis
             "the geodesic residual needs the raw measurements, and they were not kept (keep_measurements=False); make "
             "the problem with keep_measurements=True, or refine with RefineOptions(residual='chordal')"
         )
-    return [PairData.of(problem, p, options, variables.offset_key(p) is not None) for p in problem.pairs]
+    paths = local_paths(problem, tuple(name.partition(":")[2] for name in variables.offsets))
+    return [PairData.of(problem, pair, options, paths.get(pair)) for pair in problem.pairs]
 
 
 def _check(problem: Problem, solution: Solution, options: RefineOptions) -> None:

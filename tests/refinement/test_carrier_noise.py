@@ -55,7 +55,7 @@ def test_stamps_tell_which_measurements_share_a_pose() -> None:
     options = rw.RefineOptions(carrier_noise=CARRIER)
 
     def variables(problem: rw.Problem) -> CarrierVariables:
-        return CarrierVariables.of([PairData.of(problem, pair, options, False) for pair in problem.pairs])
+        return CarrierVariables.of([PairData.of(problem, pair, options, None) for pair in problem.pairs])
 
     assert len(variables(simulation.problem).A) == 8
     apart = copied(

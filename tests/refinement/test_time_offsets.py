@@ -10,7 +10,8 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, perturb
-from gtsam_rwhec.twists import carrier_twists
+from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.twists import LocalPaths
 
 X = gtsam.Pose3.Expmap(np.array([0.3, 0.1, -0.4, 1.0, 0.5, 0.2])).matrix()
 Y = {
@@ -50,7 +51,7 @@ def test_twists_are_the_trajectorys_velocity() -> None:
     stamps = (t * 1e9).astype(np.int64)
     shuffled = np.random.default_rng(0).permutation(100)
     twists = np.empty((100, 6))
-    twists[shuffled] = carrier_twists(trajectory(t[shuffled]), stamps[shuffled], "here")
+    twists[shuffled] = LocalPaths.of(trajectory(t[shuffled]), stamps[shuffled], "here").twists()
     h = 1e-5
     expected = se3.logmap(se3.inverse(trajectory(t - h)) @ trajectory(t + h)) / (2 * h)
     np.testing.assert_allclose(twists[1:-1], expected[1:-1], atol=2e-3)
@@ -100,11 +101,91 @@ def test_an_offset_that_nothing_tells_has_infinite_variance() -> None:
     assert r.covariance("time_offset:cam0")[0, 0] == np.inf or np.sqrt(r.covariance("time_offset:cam0")[0, 0]) > 10.0
 
 
+@pytest.mark.parametrize("noise_of_A", [0.0, 1e-6, 1e-4, 1e-3])
+def test_stop_and_go_does_not_tell_an_offset(noise_of_A: float) -> None:
+    """The carrier stood at every stamp; noise in its poses looks like motion."""
+    generator = np.random.default_rng(1)
+    stops = np.repeat(trajectory(np.arange(10) * 1.7), 6, axis=0)
+    stamps = np.array([int((5.0 * k + 0.1 * j) * 1e9) for k in range(10) for j in range(6)])
+    B = perturb(np.linalg.inv(Y["cam0"]) @ stops @ X, Noise(SIGMA_M, KAPPA), generator)
+    A = perturb(stops, Noise(noise_of_A, 0.5 / noise_of_A**2), generator) if noise_of_A else stops
+    problem = rw.Problem()
+    problem.add("tag", "cam0", A, B, SIGMA_M, KAPPA, stamps_ns=stamps)
+    r = refined(problem, time_offsets=True)
+    assert r.covariance("time_offset:cam0")[0, 0] == np.inf
+    assert any("time_offset of cam0: the carriers moved no faster" in sentence for sentence in r.free_directions)
+    assert r.contains("cam0", Y["cam0"], 0.9999)
+
+
+def test_noise_in_the_carriers_poses_does_not_pull_an_offset_to_zero() -> None:
+    """At 30 Hz differences of neighbouring poses would be noise: five times the true motion."""
+    noise, scores = 0.003, []
+    for seed in range(6):
+        generator = np.random.default_rng(seed)
+        stamps = np.arange(400) * 33_333_333
+        t = 0.3e-9 * stamps
+        A = perturb(trajectory(t), Noise(noise, 0.5 / noise**2), generator)
+        B = perturb(np.linalg.inv(Y["cam0"]) @ trajectory(t + 0.3 * 0.03) @ X, Noise(0.003, 5e4), generator)
+        problem = rw.Problem()
+        problem.add("tag", "cam0", A, B, 0.003, 5e4, stamps_ns=stamps)
+        r = refined(problem, time_offsets=True, carrier_noise=rw.CarrierNoise(noise, noise))
+        scores.append((r.time_offsets_s["cam0"] - 0.03) / np.sqrt(r.covariance("time_offset:cam0")[0, 0]))
+    assert np.sqrt(np.mean(np.square(scores))) < 2.0
+
+
+@pytest.mark.parametrize("offset_s", [0.02, 0.1])
+def test_large_offsets_leave_no_bias_in_the_poses(offset_s: float) -> None:
+    """The carrier accelerates: along the first twist alone a pose would be off by half a metre's second square."""
+    held = []
+    for seed in range(8):
+        stamps = np.arange(300) * 100_000_000
+        B = np.linalg.inv(Y["cam0"]) @ trajectory(1e-9 * stamps + offset_s) @ X
+        problem = rw.Problem()
+        noisy = perturb(B, Noise(SIGMA_M, KAPPA), seed)
+        problem.add("tag", "cam0", trajectory(1e-9 * stamps), noisy, SIGMA_M, KAPPA, stamps_ns=stamps)
+        r = refined(problem, time_offsets=True)
+        held.append(r.contains("cam0", Y["cam0"], 0.95))
+    assert np.mean(held) > 0.7
+
+
+def test_outliers_and_an_offset_together() -> None:
+    generator = np.random.default_rng(0)
+    raw = problem_with({"cam0": 0.03}).measurements("tag", "cam0")
+    B = raw.B.copy()
+    bad = generator.random(len(B)) < 0.3
+    B[bad] = random_poses(int(bad.sum()), 2.0, generator)
+    problem = rw.Problem()
+    problem.add("tag", "cam0", raw.A, B, SIGMA_M, KAPPA, stamps_ns=raw.stamps_ns)
+    r = refined(problem, time_offsets=True, robust="gnc", noise="given")
+    inliers = r.inliers["tag", "cam0"]
+    assert not inliers[bad].any()
+    assert inliers[~bad].mean() > 0.95
+    assert r.time_offsets_s["cam0"] == pytest.approx(0.03, abs=0.002)
+
+
+def test_a_tag_that_is_rarely_seen_knows_the_motion_from_the_others() -> None:
+    often = problem_with({"cam0": 0.02}).measurements("tag", "cam0")
+    rare = np.arange(3, 200, 45)
+    problem = rw.Problem()
+    problem.add("tag", "cam0", often.A, often.B, SIGMA_M, KAPPA, stamps_ns=often.stamps_ns)
+    stamps = often.stamps_ns[rare]
+    problem.add("rare", "cam0", often.A[rare], often.B[rare], SIGMA_M, KAPPA, stamps_ns=stamps)
+    assert refined(problem, time_offsets=True).time_offsets_s["cam0"] == pytest.approx(0.02, abs=0.002)
+
+
+def test_motions_have_two_stamps() -> None:
+    problem = problem_with({"cam0": 0.0}, count=20)
+    raw = problem.measurements("tag", "cam0")
+    problem.add_motion("cam0", raw.A, raw.A, SIGMA_M, KAPPA, stamps_ns=raw.stamps_ns)
+    with pytest.raises(rw.errors.OptionError, match="both ends of its motions"):
+        refined(problem, time_offsets=True)
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
         ({"stamps_ns": None}, rw.errors.CountError, "tag-cam0: a time offset needs stamps"),
-        ({"stamps_ns": np.zeros(20, dtype=np.int64)}, rw.errors.CountError, "two measurements have the stamp 0 ns"),
+        ({"stamps_ns": np.zeros(20, dtype=np.int64)}, rw.errors.CountError, "two carrier poses have the stamp 0 ns"),
         (
             {"stamps_ns": np.arange(20) * 5 * 10**9},
             rw.errors.CountError,
