@@ -27,7 +27,7 @@ _BUILTIN = {
     "builtin_interfaces/Time": (("int32", "sec"), ("uint32", "nanosec")),
     "builtin_interfaces/Duration": (("int32", "sec"), ("uint32", "nanosec")),
 }
-_FIELD = re.compile(r"([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(<=)?(\d*)\])?\s+([A-Za-z]\w*)(\s*=.*|\s.*)?$")
+_FIELD = re.compile(r"([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(<=)?(\d{0,9})\])?\s+([A-Za-z]\w*)(\s*=.*|\s.*)?$")
 #: Messages inside messages; every one of ROS's own is far below both.
 MOST_PARTS = 100_000
 DEEPEST = 16

@@ -157,16 +157,19 @@ def test_foxglove_json(tmp_path: Path) -> None:
     np.testing.assert_array_equal(records[8].P, [[1, 0, 2, 0], [0, 1, 2, 0], [0, 0, 1, 0]])
 
 
-def test_foxglove_protobuf(tmp_path: Path) -> None:
+def protobuf_log(path: Path, **options: Any) -> Path:
     classes = foxglove_protobuf()
     message = classes["FrameTransform"](parent_frame_id="base", child_frame_id="hand")
     message.timestamp.FromNanoseconds(T0 + 5)
     message.translation.x, message.translation.y, message.translation.z = 1, 2, 3
     message.rotation.z, message.rotation.w = 0.6, 0.8
-    path = tmp_path / "a.mcap"
-    with open(path, "wb") as stream, ProtobufWriter(stream) as writer:
+    with open(path, "wb") as stream, ProtobufWriter(stream, **options) as writer:
         writer.write_message("/tf", message, log_time=T0, publish_time=T0)
-    (record,) = read(path)
+    return path
+
+
+def test_foxglove_protobuf(tmp_path: Path) -> None:
+    (record,) = read(protobuf_log(tmp_path / "a.mcap"))
     np.testing.assert_allclose(record.T, T_EXPECTED, atol=1e-15)
     assert (record.parent, record.child, record.stamp_ns) == ("base", "hand", T0 + 5)
 
@@ -305,6 +308,24 @@ def test_bad_messages_are_left_out_and_said(tmp_path: Path) -> None:
         read(path, on_bad="raise")
 
 
+def test_ros2_and_json_give_the_same(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    ros2: list[Any] = []
+    foxglove: list[Any] = []
+    for i in range(50):
+        q = rng.normal(size=4)
+        pose = {"position": xyz(*rng.normal(size=3)), "orientation": xyz(*q / np.linalg.norm(q))}
+        stamp = header(T0 + i)
+        ros2.append(("/a", "geometry_msgs/PoseStamped", {"header": stamp, "pose": pose}, T0 + i))
+        time = {"sec": stamp["stamp"]["sec"], "nsec": stamp["stamp"]["nanosec"]}
+        foxglove.append(("/a", "foxglove.PoseInFrame", {"timestamp": time, "frame_id": "world", "pose": pose}, T0 + i))
+    with open_log(ros2_log(tmp_path / "a.mcap", ros2)) as a, open_log(json_log(tmp_path / "b.mcap", foxglove)) as b:
+        one, other = a.poses("/a"), b.poses("/a")
+    np.testing.assert_array_equal(one.T, other.T)
+    np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
+    assert (one.parent, one.child) == (other.parent, other.child)
+
+
 def test_missing_and_unreadable_topics(tmp_path: Path) -> None:
     path = ros2_log(tmp_path / "a.mcap", [*pose_messages(1), ("/text", "std_msgs/String", {"data": "hello"}, T0)])
     assert len(read(path)) == 1
@@ -355,6 +376,8 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
         ros2_log(folder / "b.mcap", ros2),
         json_log(folder / "c.mcap", json_poses(3), compression=CompressionType.LZ4),
         json_log(folder / "d.mcap", json_poses(3), **LOOSE),
+        json_log(folder / "e.mcap", json_poses(3), compression=CompressionType.NONE, enable_crcs=False),
+        protobuf_log(folder / "f.mcap", compression=CompressionType.NONE, enable_crcs=False),
     ]
     return [path.read_bytes() for path in paths]
 
