@@ -37,7 +37,7 @@ class BatchResiduals:
 
     Attributes
     ----------
-    A, B : (N, 4, 4) arrays
+    A, B : (N, 4, 4) arrays or lists of gtsam.Pose3
         T_sensorcarrier_targetcarrier and T_sensor_target; metres (B's times the scale).
     residual : "geodesic" or "chordal"
         Log(B^-1 S(Y^-1 A X)), (6,), with S(R, t) = (R, scale t); or (12,) [vec(R_A R_X - R_Y R_B),
@@ -140,7 +140,7 @@ def robot_world_hand_eye_batch_factor(
     target_key, sensor_key : int
         Keys of X = T_targetcarrier_target and Y = T_sensorcarrier_sensor, Pose3. One key for both makes every
         measurement A Y = Y B (AX = XB), A and B both T_before_after.
-    A, B : (N, 4, 4) arrays
+    A, B : (N, 4, 4) arrays or lists of gtsam.Pose3
         T_sensorcarrier_targetcarrier and T_sensor_target; metres.
     sqrt_information : (6, 6) or (N, 6, 6) array
         W with W' W the information of B's right perturbation, rotation first. For the chordal residual W must be
@@ -163,7 +163,7 @@ def robot_world_hand_eye_batch_factor(
     ValueError
         For arrays that do not go together, or weights that the chordal residual cannot hold.
     """
-    A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
+    A, B = se3.stacked(A), se3.stacked(B)
     if A.ndim != 3 or A.shape[1:] != (4, 4) or A.shape != B.shape or len(A) == 0:
         raise ValueError(f"A has shape {A.shape} and B {B.shape}; both must be (N, 4, 4) with one N of at least 1")
     count = len(A)
@@ -171,6 +171,8 @@ def robot_world_hand_eye_batch_factor(
         raise ValueError("a time offset needs both its key (time_offset_key=) and the carriers' twists (twists=)")
     if twists is not None and np.shape(twists) != (count, 6):
         raise ValueError(f"twists have shape {np.shape(twists)}; give ({count}, 6), [omega rad/s, v m/s]")
+    if isinstance(sqrt_information, gtsam.noiseModel.Base):
+        raise TypeError("sqrt_information is a noise model; give a (6, 6) array: noise.R() of a Gaussian one")
     whitening = _whitening(np.asarray(sqrt_information, dtype=np.float64), count, residual)
     batch = BatchResiduals(A, B, residual, None if twists is None else np.asarray(twists, dtype=np.float64))
     ends = [target_key] if target_key == sensor_key else [target_key, sensor_key]
@@ -207,6 +209,8 @@ def _whitening(root: Array, count: int, residual: Residual) -> Array:
         raise ValueError(f"sqrt_information has shape {root.shape}; give (6, 6) or ({count}, 6, 6)")
     if not np.isfinite(root).all():
         raise ValueError("sqrt_information has entries that are NaN or infinite; is a covariance singular?")
+    if not (np.linalg.svd(root, compute_uv=False)[..., -1] > 0.0).all():
+        raise ValueError("sqrt_information is singular: it says nothing of some direction")
     root = np.broadcast_to(root, (count, 6, 6))
     if residual == "geodesic":
         return root

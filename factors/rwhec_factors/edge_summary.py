@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rwhec_factors.se3 import Array, hat
+from rwhec_factors.se3 import Array, hat, stacked
 from rwhec_factors.values import number_of, pose_of
 
 #: Measurements summed at once.
@@ -60,7 +60,7 @@ class EdgeSummary:
 
         Parameters
         ----------
-        A, B : (N, 4, 4) arrays
+        A, B : (N, 4, 4) arrays or lists of gtsam.Pose3
             T_sensorcarrier_targetcarrier and T_sensor_target; metres (B's times the scale).
         sigma, kappa : float or (N,)
             Standard deviation of B's translation, m an axis; concentration of its rotation, 1 / (2 s^2) for s rad an
@@ -73,7 +73,7 @@ class EdgeSummary:
         ValueError
             For arrays that do not go together, or weights that are not positive and finite.
         """
-        A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
+        A, B = stacked(A), stacked(B)
         if A.ndim != 3 or A.shape[1:] != (4, 4) or A.shape != B.shape or len(A) == 0:
             raise ValueError(f"A has shape {A.shape} and B {B.shape}; both must be (N, 4, 4) with one N of at least 1")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):

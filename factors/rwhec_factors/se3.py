@@ -18,6 +18,13 @@ SMALL = 1e-2
 LARGE = 3.0
 
 
+def stacked(poses: Any) -> Array:
+    """(N, 4, 4) of an array, or of a list of gtsam.Pose3."""
+    if isinstance(poses, (list, tuple)) and poses and hasattr(poses[0], "matrix"):
+        poses = [pose.matrix() for pose in poses]
+    return np.asarray(poses, dtype=np.float64)
+
+
 def hat(v: Array) -> Array:
     """(N, 3, 3) with hat(v) w = v x w."""
     x, y, z = np.moveaxis(v, -1, 0)

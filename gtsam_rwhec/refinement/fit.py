@@ -79,9 +79,17 @@ def fit(
         if settled:
             break
     else:
+        few = sorted(redundancy, key=lambda key: redundancy[key])[:3]
+        where = ", ".join(
+            f"{'-'.join(group)}, {component}: {redundancy[group, component]:.2g}" for group, component in few
+        )
         warnings.warn(
-            f"the estimated noise did not settle in {MAX_ROUNDS} rounds: a part of it goes to zero, as where the noise "
-            "given for A already explains the residuals; give B's noise (noise='given'), or less for A",
+            f"the estimated noise did not settle in {MAX_ROUNDS} rounds; the fewest equations to spare have {where}. "
+            + (
+                "The noise given for A may explain the residuals already: give less, or B's noise (noise='given')"
+                if options.carrier_noise is not None
+                else "Join groups (noise_groups='sensor' or 'all'), or give sigma and kappa (noise='given')"
+            ),
             NotConvergedWarning,
             stacklevel=3,
         )

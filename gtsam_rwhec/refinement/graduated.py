@@ -41,6 +41,8 @@ from gtsam_rwhec.solution import Solution
 
 #: A frame or pair of which a smaller share of measurements agrees is named in a warning.
 SUSPECT = 0.5
+#: No sensor is this noisy about each axis, rad: an estimate of so much has taken outliers in.
+GROSS_RAD = 0.35
 #: So many of them at most.
 NAMED = 5
 
@@ -163,6 +165,15 @@ def graduated(
         if mask.sum() < SUSPECT * len(mask) and not any(name in suspect for name in pair)
     }
     _warn(keep, suspect, suspect_pairs, left_out, work.threshold, noise_scale)
+    rotation_rad = float(np.sqrt(0.5 * work.factors.rotation / np.median(work.measured.kappa)))
+    if noise_scale == "estimate" and rotation_rad > GROSS_RAD:
+        warnings.warn(
+            f"no majority of the measurements agrees: the noise estimated for them is {np.degrees(rotation_rad):.0f} "
+            "degrees an axis, in which outliers hide. More than half may be wrong; noise='given', with sigma and "
+            "kappa, withstands more",
+            OutliersWarning,
+            stacklevel=2,
+        )
     return Graduated(
         solution=solution,
         weights=weights,

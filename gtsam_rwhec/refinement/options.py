@@ -112,6 +112,10 @@ class RefineOptions:
                 )
         if not (isinstance(self.inlier_confidence, float) and 0.5 < self.inlier_confidence < 1.0):
             raise OptionError(f"RefineOptions.inlier_confidence={self.inlier_confidence!r}; give one between 0.5 and 1")
+        if not isinstance(self.time_offsets, (bool, tuple)):
+            raise OptionError(
+                f"RefineOptions.time_offsets={self.time_offsets!r}; give True, or a tuple of sensors' names: ('cam_0',)"
+            )
         if not (isinstance(self.max_iterations, int) and self.max_iterations > 0):
             raise OptionError(f"RefineOptions.max_iterations={self.max_iterations!r}; give a positive number")
         if self.carrier_noise is not None and not isinstance(self.carrier_noise, CarrierNoise):

@@ -15,6 +15,7 @@ from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.calibration import check_against_knowledge, solve
 from gtsam_rwhec.certify.parts import parts_of
 from gtsam_rwhec.errors import (
+    CountError,
     FrameError,
     MeasurementsNotKeptError,
     NotConvergedWarning,
@@ -158,9 +159,9 @@ def refine(
         noise_source="estimated" if estimates else "given",
         noise=_noise(model, settled, options, estimates),
         cost=settled.optimum.cost,
-        initial_cost=settled.initial_cost,
+        initial_cost=settled.graph.error(model.values(variables.start(solution))),
         iterations=settled.iterations,
-        moved=_moved(start, state),
+        moved=_moved(solution, state),
         inlier_counts={pair: (int(kept.sum()), len(kept)) for pair, kept in inliers.items()},
         inliers=inliers,
         free_directions=space.sentences,
@@ -248,7 +249,12 @@ def _check(problem: Problem, solution: Solution, options: RefineOptions) -> None
             f"the solution is of a problem with scale={solution.scale_mode!r}, this one has scale={problem.scale!r}; "
             "solve this problem first"
         )
-    check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
+    if not problem.pairs:
+        raise CountError("the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)")
+    try:
+        check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
+    except FrameError as error:
+        raise FrameError(f"the solution is of another problem; solve this one first ({error})") from error
     if options.noise == "given" and problem.is_relative:
         raise OptionError(
             "noise='given', but some measurements were added without sigma or kappa, so that no noise was given; "

@@ -160,6 +160,11 @@ class RefinedPoses:
 
     def standard_deviations(self, name: str) -> tuple[Array, Array]:
         """A frame's (3,) in degrees about, and (3,) in millimetres along, its own x, y, z."""
+        if name not in self.X and name not in self.Y:
+            raise FrameError(
+                f"{name!r} is no frame, and has no axes; there are {', '.join(self.X | self.Y)} (of a scale or an "
+                "offset take the root of covariance(name))"
+            )
         return standard_deviations(self.covariance(name))
 
     @property
@@ -198,13 +203,16 @@ class RefinedPoses:
         """(m, d): a name's rows of the unknowns; zero for a fixed frame."""
         if name not in self.joint.slots:
             known = dict.fromkeys((*self.X, *self.Y, *self.joint.slots))
+            if name == "scale":
+                why = "it is known, 1" if self.scale_mode == "known" else "each target has its own: 'scale:NAME'"
+                raise FrameError(f"there is no one scale to ask for; {why}")
             if name not in known:
                 raise FrameError(f"there is no {name!r}; there are {', '.join(known)}")
             return np.zeros((6, len(self.joint.unit)))
         return self.joint.selector((name,))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Refined(RefinedPoses):
     """A refined calibration, with covariances, and the graph to go on with.
 
@@ -230,6 +238,12 @@ class Refined(RefinedPoses):
     inliers: dict[Pair, np.ndarray]
     solution: Solution
     options: RefineOptions
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({len(self.X)} targets, {len(self.Y)} sensors, noise {self.noise_source}, "
+            f"cost {self.cost:.6g}, {len(self.free_directions)} free directions)"
+        )
 
     def __reduce__(self) -> str:
         raise TypeError(

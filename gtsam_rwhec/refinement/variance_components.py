@@ -9,7 +9,7 @@ quieter than they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from rwhec_factors.batch import Linearization
@@ -45,9 +45,12 @@ class VarianceComponents:
 
 @dataclass
 class _Sums:
-    found: float = 0.0
-    expected: float = 0.0
-    redundancy: float = 0.0
+    """Of a group: r' C^-1 S C^-1 r of rotation and translation, what is expected of them (which is also how many
+    equations they rest on), and the Fisher information of both factors' logarithms."""
+
+    found: Array = field(default_factory=lambda: np.zeros(2))
+    expected: Array = field(default_factory=lambda: np.zeros(2))
+    fisher: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 def jacobian_of(pair: Pair, at: Linearization, variables: Variables, joint: JointCovariance) -> tuple[Array, Array]:
@@ -74,7 +77,6 @@ def from_measurements(
     joint: JointCovariance,
     factors: VarianceFactors,
     groups: NoiseGroups,
-    weights: dict[Pair, Array] | None = None,
     consistency: float = 1.0,
 ) -> VarianceComponents:
     """The next factors, from geodesic residuals.
@@ -84,8 +86,6 @@ def from_measurements(
     data, at, variables, joint, factors
         The pairs, their residuals, and the covariance of the unknowns at the current factors.
     groups : "all", "sensor" or "pair"
-    weights : dict of pair to (N,) array, optional
-        What a robust loss leaves of each measurement.
     consistency : float
         Share of their variance that residuals keep when those beyond a threshold are left out.
 
@@ -94,34 +94,58 @@ def from_measurements(
     NoiseError
         When a group has no equation to spare.
     """
-    sums: dict[tuple[Group, str], _Sums] = {}
+    sums: dict[Group, _Sums] = {}
     for item in data:
         pair, linear = item.pair, at[item.pair]
         C = residual_covariance(item, linear, factors.of[pair], propagated=True)
         inverse = np.linalg.inv(C)
         J, rows = jacobian_of(pair, linear, variables, joint)
-        fitted = J @ joint.finite[np.ix_(rows, rows)] @ J.transpose(0, 2, 1)
-        left = C - fitted  # expected r r'
-        w = np.ones(item.count) if weights is None else weights[pair]
+        left = C - J @ joint.finite[np.ix_(rows, rows)] @ J.transpose(0, 2, 1)  # expected r r'
         whole = measurement_covariance(item, factors.of[pair])
-        for component, block in zip(COMPONENTS, (slice(0, 3), slice(3, 6)), strict=True):
+        whitened = np.einsum("nij,nj->ni", inverse, linear.residual)
+        total = sums.setdefault(group_of(pair, groups), _Sums())
+        scaled = []
+        for k, block in enumerate((slice(0, 3), slice(3, 6))):
+            # d (D Sigma D) / d log f_k: the rows and columns of its block, half each; without correlations the block.
             S = np.zeros_like(whole)
-            S[:, block, block] = whole[:, block, block]
-            M = inverse @ S @ inverse
-            total = sums.setdefault((group_of(pair, groups), component), _Sums())
-            total.found += float(np.einsum("n,ni,nij,nj->", w, linear.residual, M, linear.residual))
-            total.expected += float(np.einsum("n,nij,nji->", w, M, left))
-            total.redundancy += float(np.einsum("n,nij,nji,n->", w, inverse @ S, inverse @ left, w))
-    ratios = {key: _ratio(*key, total) / consistency for key, total in sums.items()}
+            S[:, block] += 0.5 * whole[:, block]
+            S[:, :, block] += 0.5 * whole[:, :, block]
+            scaled.append(inverse @ S)
+            total.found[k] += float(np.einsum("ni,nij,nj->", whitened, S, whitened))
+            total.expected[k] += float(np.einsum("nij,nji->", scaled[k], inverse @ left))
+        for k in range(2):
+            for m in range(2):
+                total.fisher[k, m] += float(np.einsum("nij,nji->", scaled[k], scaled[m]))
+    steps = {group: _step(group, total, consistency) for group, total in sums.items()}
     updated = {}
     for item in data:
-        group = group_of(item.pair, groups)
-        old = factors.of[item.pair]
-        updated[item.pair] = (
-            max(old[0] * ratios[group, "rotation"], SMALLEST),
-            max(old[1] * ratios[group, "translation"], SMALLEST),
-        )
-    return VarianceComponents(VarianceFactors(updated), {key: total.redundancy for key, total in sums.items()})
+        old, step = factors.of[item.pair], steps[group_of(item.pair, groups)]
+        updated[item.pair] = (max(old[0] * step[0], SMALLEST), max(old[1] * step[1], SMALLEST))
+    redundancy: dict[tuple[Group, str], float] = {
+        (group, component): float(total.expected[k])
+        for group, total in sums.items()
+        for k, component in enumerate(COMPONENTS)
+    }
+    return VarianceComponents(VarianceFactors(updated), redundancy)
+
+
+def _step(group: Group, total: _Sums, consistency: float) -> Array:
+    """By what the factors of rotation and translation are multiplied, (2,)."""
+    for k, component in enumerate(COMPONENTS):
+        _check(group, component, float(total.expected[k]), float(total.fisher.sum()))
+    found = total.found / consistency
+    ratios = found / total.expected
+    size = np.sqrt(np.diagonal(total.fisher))
+    if abs(total.fisher[0, 1]) < 0.05 * size[0] * size[1]:
+        result: Array = np.maximum(ratios, 1e-12)
+        return result
+    # Correlated: each factor changes the other's residuals. Their common size first, then Fisher scoring on both.
+    common = float(found.sum() / total.expected.sum())
+    if not 0.5 < common < 2.0:
+        return np.full(2, max(common, 1e-12))
+    information = total.fisher * (total.expected.sum() / total.fisher.sum())
+    step: Array = np.exp(np.clip(np.linalg.solve(information, found - total.expected), -0.5, 0.5))
+    return step
 
 
 def from_moments(
@@ -146,16 +170,17 @@ def from_moments(
     NoiseError
         When a group has no equation to spare.
     """
-    sums: dict[tuple[Group, str], _Sums] = {}
+    sums: dict[tuple[Group, str], list[float]] = {}
     for part in parts:
         for pair, count in zip(part.pairs, part.moments.count, strict=True):
             for i, component in enumerate(COMPONENTS):
-                total = sums.setdefault((group_of(pair, groups), component), _Sums())
-                total.found += 2.0 * costs[pair][i]
-                total.expected += 3.0 * float(count) - fitted[pair][i]
-    for total in sums.values():
-        total.redundancy = total.expected
-    ratios = {key: max(_ratio(*key, total), SMALLEST) for key, total in sums.items()}
+                total = sums.setdefault((group_of(pair, groups), component), [0.0, 0.0])
+                total[0] += 2.0 * costs[pair][i]
+                total[1] += 3.0 * float(count) - fitted[pair][i]
+    ratios = {}
+    for (group, kind), (found, expected) in sums.items():
+        _check(group, kind, expected, expected)
+        ratios[group, kind] = max(found / expected, SMALLEST)
     pairs = [pair for part in parts for pair in part.pairs]
     return VarianceComponents(
         VarianceFactors(
@@ -164,15 +189,22 @@ def from_moments(
                 for pair in pairs
             }
         ),
-        {key: total.redundancy for key, total in sums.items()},
+        {key: expected for key, (_, expected) in sums.items()},
     )
 
 
-def _ratio(group: Group, component: str, total: _Sums) -> float:
-    if not total.redundancy > 0.5:
-        where = "the measurements" if group == ("all",) else "-".join(group)
+def _check(group: Group, component: str, spare: float, weighed: float) -> None:
+    """Refuse to estimate from nothing; ``weighed``: how much of the residuals' variance the factors make up."""
+    if spare > 0.5:
+        return
+    where = "the measurements" if group == ("all",) else "-".join(group)
+    if weighed < 0.5:
         raise NoiseError(
-            f"the {component} noise of {where} cannot be estimated: {total.redundancy:.2g} equations to spare; measure "
-            "more, join groups (noise_groups='all'), or give sigma and kappa (noise='given')"
+            f"the {component} noise of {where} cannot be estimated: the noise given for A already explains the "
+            "residuals; give less noise of A, or B's own (noise='given')"
         )
-    return total.found / total.expected
+    joined = "" if group == ("all",) else "join groups (noise_groups='all'), "
+    raise NoiseError(
+        f"the {component} noise of {where} cannot be estimated: {spare:.2g} equations to spare; measure more, {joined}"
+        "give less noise of A if you gave any, or give sigma and kappa (noise='given')"
+    )

@@ -199,3 +199,25 @@ def test_missing_and_wrong_variables_are_named(kind: str) -> None:
     values.insert(S(0), gtsam.Rot3())
     with pytest.raises(TypeError, match="s0 should be the scale"):
         graph.linearize(values)
+
+
+def test_lists_of_poses_are_arrays_of_matrices() -> None:
+    generator = np.random.default_rng(0)
+    matrices = se3.expmap(generator.standard_normal((4, 6)))
+    poses = [gtsam.Pose3(T) for T in matrices]
+    one, other = EdgeSummary.of(poses, poses, 0.1, 3.0), EdgeSummary.of(matrices, matrices, 0.1, 3.0)
+    np.testing.assert_allclose(one.form, other.form, atol=1e-12)
+    robot_world_hand_eye_batch_factor(1, 2, poses, poses, np.eye(6))
+
+
+@pytest.mark.parametrize(
+    ("root", "error", "words"),
+    [
+        (np.zeros((6, 6)), ValueError, "singular"),
+        (gtsam.noiseModel.Unit.Create(6), TypeError, "is a noise model; give a"),
+    ],
+)
+def test_weights_that_are_none(root: object, error: type[Exception], words: str) -> None:
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    with pytest.raises(error, match=words):
+        robot_world_hand_eye_batch_factor(1, 2, poses, poses, root)

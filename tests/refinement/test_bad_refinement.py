@@ -44,7 +44,7 @@ def few() -> rw.Problem:
         (
             lambda: rw.refine(rig(3, 2, seed=1).problem, SOLUTION),
             rw.errors.FrameError,
-            "X has no pose of 'target2'; it has 'target0', 'target1'",
+            "another problem; solve this one first .X has no pose of 'target2'; it has 'target0', 'target1'",
         ),
         (
             lambda: rw.refine(rig(1, 2, seed=1).problem, SOLUTION),
@@ -83,6 +83,8 @@ def few() -> rw.Problem:
         (lambda: RefineOptions(carrier_model="exact"), rw.errors.OptionError, "carrier_model='exact'"),
         (lambda: RefineOptions(carrier_noise=0.1), rw.errors.OptionError, "carrier_noise is a float"),
         (lambda: RefineOptions(inlier_confidence=1.5), rw.errors.OptionError, "inlier_confidence=1.5"),
+        (lambda: RefineOptions(time_offsets="cam_0"), rw.errors.OptionError, "time_offsets='cam_0'; give True, or a"),
+        (lambda: rw.refine(rw.Problem(), SOLUTION), rw.errors.CountError, "the problem is empty"),
         (lambda: RefineOptions(max_iterations=0), rw.errors.OptionError, "max_iterations=0"),
         (
             lambda: RefineOptions(residual="chordal", robust="huber"),
@@ -110,7 +112,8 @@ def test_refused(call: Callable[[], Any], error: type[Exception], words: str) ->
     ("ask", "words"),
     [
         (lambda r: r.covariance("cam"), "there is no 'cam'; there are target0"),
-        (lambda r: r.covariance("scale"), "there is no 'scale'"),
+        (lambda r: r.covariance("scale"), "no one scale to ask for; it is known, 1"),
+        (lambda r: r.standard_deviations("scale"), "'scale' is no frame, and has no axes"),
         (lambda r: r.information("cam"), "no 'cam' among the unknowns"),
         (lambda r: r.contains("cam", np.eye(4)), "there is no frame 'cam'"),
     ],

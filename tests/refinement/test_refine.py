@@ -354,3 +354,22 @@ def test_a_free_direction_just_off_an_axis_is_not_forgotten(tilt_rad: float) -> 
         assert millimetres[2] == np.inf
         assert millimetres[:2].max() > 300.0 * tilt_rad  # displaced by decimetres
     assert np.mean(held) > 0.8
+
+
+def test_estimated_noise_of_correlated_covariances() -> None:
+    """Equations to spare are no more than there are, and covariances nine times too large are told to be."""
+    factors = []
+    for seed in range(6):
+        generator = np.random.default_rng(seed)
+        raw = rig(1, 1, seed=seed, noise=None, number_of_measurements=60).problem.measurements("target0", "sensor0")
+        L = 0.004 * generator.standard_normal((60, 6, 6))
+        covariances = L @ L.transpose(0, 2, 1) + 1e-7 * np.eye(6)
+        xi = np.array([generator.multivariate_normal(np.zeros(6), C) for C in covariances])
+        problem = rw.Problem()
+        problem.add("target0", "sensor0", raw.A, raw.B @ se3.expmap(xi), covariances=9.0 * covariances)
+        r = refined(problem, noise="estimate")
+        noise = r.noise["target0", "sensor0"]
+        assert sum(noise.redundancy) == pytest.approx(6 * 60 - 12, abs=1.0)
+        given_m2 = 9.0 * np.einsum("nii->ni", covariances)[:, 3:].mean()
+        factors.append(noise.translation_m**2 / given_m2)
+    assert np.mean(factors) == pytest.approx(1.0 / 9.0, rel=0.2)

@@ -136,3 +136,22 @@ def test_losses_do_not_call_free_what_outliers_only_blur(loss: str) -> None:
         B[:8] = random_poses(8, 2.0, generator)
         problem = copied(simulation.problem, B=lambda pair, raw, B=B: B)
         assert refined(problem, robust=loss).free_directions == []
+
+
+def test_no_majority_is_told_where_the_noise_is_estimated() -> None:
+    """Most of B at random: an estimated noise grows until everything is an inlier."""
+    _, problem, _ = with_outliers(0.8)
+    solution = rw.solve(problem)
+    with pytest.warns(rw.errors.OutliersWarning, match="no majority of the measurements agrees.*noise='given'"):
+        rw.refine(problem, solution, rw.RefineOptions(robust="gnc", noise="estimate"))
+
+
+def test_moved_is_from_the_solution_that_was_given() -> None:
+    """Outliers had pulled it away; refinement's own start had not been."""
+    _, problem, _ = with_outliers(0.2)
+    solution = rw.solve(problem)
+    r = rw.refine(problem, solution, rw.RefineOptions(robust="gnc"))
+    apart = np.linalg.norm(solution.Y["sensor0"].between(r.Y["sensor0"]).translation())
+    assert r.moved["sensor0"].translation_mm == pytest.approx(1e3 * apart, rel=1e-6)
+    assert r.moved["sensor0"].translation_mm > 10.0
+    assert r.initial_cost > 2.0 * r.cost
