@@ -47,6 +47,18 @@ PARTS = {
     ),
     "apriltag_msgs/AprilTagDetectionArray": "std_msgs/Header header\nAprilTagDetection[] detections",
     "ros2_aruco_interfaces/ArucoMarkers": "std_msgs/Header header\nint64[] marker_ids\ngeometry_msgs/Pose[] poses",
+    "isaac_ros_apriltag_interfaces/AprilTagDetection": (
+        "string family\nint32 id\ngeometry_msgs/Point center\ngeometry_msgs/Point[4] corners\n"
+        "geometry_msgs/PoseWithCovarianceStamped pose"
+    ),
+    "isaac_ros_apriltag_interfaces/AprilTagDetectionArray": "std_msgs/Header header\nAprilTagDetection[] detections",
+    "aruco_msgs/Marker": (
+        "std_msgs/Header header\nuint32 id\ngeometry_msgs/PoseWithCovariance pose\nfloat64 confidence"
+    ),
+    "aruco_msgs/MarkerArray": "std_msgs/Header header\nMarker[] markers",
+    "aruco_opencv_msgs/MarkerPose": "uint16 marker_id\ngeometry_msgs/Pose pose",
+    "aruco_opencv_msgs/BoardPose": "string board_name\ngeometry_msgs/Pose pose",
+    "aruco_opencv_msgs/ArucoDetection": "std_msgs/Header header\nMarkerPose[] markers\nBoardPose[] boards",
     "std_msgs/String": "string data",
 }
 

@@ -123,6 +123,48 @@ def test_ros2_images_intrinsics_and_detections(tmp_path: Path) -> None:
     np.testing.assert_allclose(four.T_camera_tag, T_EXPECTED, atol=1e-15)
 
 
+def test_detections_of_other_drivers(tmp_path: Path) -> None:
+    covariance = np.diag([0.01, 0.01, 0.04, 1e-4, 1e-4, 9e-4]).ravel().tolist()
+    pose = {"pose": POSE, "covariance": covariance}
+    isaac = {
+        "family": "tag36h11", "id": 5, "center": xyz(1, 1, 0), "corners": [xyz(i, i, 0) for i in range(4)],
+        "pose": {"header": header(T0, "cam"), "pose": pose},
+    }  # fmt: skip
+    marker = {"header": header(T0, "cam"), "id": 9, "pose": pose, "confidence": 1.0}
+    opencv = {
+        "header": header(T0, "cam"),
+        "markers": [{"marker_id": 2, "pose": POSE}],
+        "boards": [{"board_name": "lid", "pose": POSE}],
+    }
+    records = read(
+        ros2_log(
+            tmp_path / "a.mcap",
+            [
+                (
+                    "/isaac",
+                    "isaac_ros_apriltag_interfaces/AprilTagDetectionArray",
+                    {"header": header(T0, "cam"), "detections": [isaac]},
+                    T0,
+                ),
+                ("/aruco", "aruco_msgs/MarkerArray", {"header": header(T0, "cam"), "markers": [marker]}, T0 + 1),
+                ("/opencv", "aruco_opencv_msgs/ArucoDetection", opencv, T0 + 2),
+            ],
+        )
+    )
+    assert [(r.topic, r.family, r.id, r.frame) for r in records] == [
+        ("/isaac", "tag36h11", "5", "cam"),
+        ("/aruco", "", "9", "cam"),
+        ("/opencv", "", "2", "cam"),
+        ("/opencv", "", "lid", "cam"),
+    ]
+    for record in records:
+        np.testing.assert_allclose(record.T_camera_tag, T_EXPECTED, atol=1e-15)
+    np.testing.assert_array_equal(records[0].corners_px, [[i, i] for i in range(4)])
+    for record in records[:2]:  # ROS has translation first, along fixed axes; turned by 73.74 degrees about z
+        assert record.covariance is not None
+        np.testing.assert_allclose(np.diagonal(record.covariance), [1e-4, 1e-4, 9e-4, 0.01, 0.01, 0.04], atol=1e-12)
+
+
 def test_foxglove_json(tmp_path: Path) -> None:
     time = {"sec": T0 // 10**9, "nsec": 5}
     transform = {"timestamp": time, "parent_frame_id": "base", "child_frame_id": "hand", **TRANSFORM}
