@@ -138,6 +138,7 @@ def test_losses_do_not_call_free_what_outliers_only_blur(loss: str) -> None:
         assert refined(problem, robust=loss).free_directions == []
 
 
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
 def test_no_majority_is_told_where_the_noise_is_estimated() -> None:
     """Most of B at random: an estimated noise grows until everything is an inlier."""
     _, problem, _ = with_outliers(0.8)
@@ -146,6 +147,7 @@ def test_no_majority_is_told_where_the_noise_is_estimated() -> None:
         rw.refine(problem, solution, rw.RefineOptions(robust="gnc", noise="estimate"))
 
 
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
 def test_moved_is_from_the_solution_that_was_given() -> None:
     """Outliers had pulled it away; refinement's own start had not been."""
     _, problem, _ = with_outliers(0.2)
