@@ -67,6 +67,18 @@ class TransformError(RwhecError):
     """Frames that no chain of transforms joins, or that go round in a loop; the message has the chain."""
 
 
+class CameraError(RwhecError):
+    """Intrinsics that are those of no camera, or of a model that is not supported; a point no lens can have seen."""
+
+
+class ImageError(RwhecError):
+    """An image that cannot be decoded, or is not what its camera takes; the message has topic and stamp."""
+
+
+class TargetError(RwhecError):
+    """A target that cannot be printed: an unknown family, an id that it lacks, a size that is none."""
+
+
 class ResultVersionError(FileFormatError):
     """A result file that another version of the format wrote."""
 

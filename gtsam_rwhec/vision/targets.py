@@ -1,0 +1,203 @@
+"""What is printed: tags, ChArUco boards, AprilGrids (Kalibr's) and checkerboards, and where their corners are.
+
+One frame for all: its origin is in the middle of the tag or of the board's pattern, x to the right and y up as
+printed, z out of the paper. Corners of a tag are in OpenCV's order: top left, top right, bottom right, bottom left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from gtsam_rwhec.errors import TargetError
+from gtsam_rwhec.poses import Array
+
+#: How many tags each family has.
+FAMILIES: dict[str, int] = {
+    "tag16h5": 30, "tag25h9": 35, "tag36h10": 2320, "tag36h11": 587,
+    **{f"aruco_{n}x{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    "aruco_original": 1024, "aruco_mip_36h12": 250,
+}  # fmt: skip
+LARGEST_M = 10.0
+
+
+@dataclass(frozen=True)
+class Tag:
+    """A single tag; size_m is the side of its black square."""
+
+    name: str
+    family: str
+    id: int
+    size_m: float
+
+    def __post_init__(self) -> None:
+        _check(self.name, self.family, (self.id,), {"size_m": self.size_m})
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The one id."""
+        return (self.id,)
+
+    @property
+    def length_m(self) -> float:
+        """The length that its scale is about."""
+        return self.size_m
+
+    def corners(self) -> Array:
+        """(4, 3), metres."""
+        return _square(self.size_m)
+
+
+@dataclass(frozen=True)
+class Charuco:
+    """A ChArUco board of columns x rows squares; markers in the white ones, counted from first_id.
+
+    Its corners are the inner corners of the chessboard, numbered as OpenCV does: left to right, from the top.
+    """
+
+    name: str
+    family: str
+    columns: int
+    rows: int
+    square_m: float
+    marker_m: float
+    first_id: int = 0
+
+    def __post_init__(self) -> None:
+        _check_grid(self.name, self.columns, self.rows, 2)
+        _check(self.name, self.family, self.ids, {"square_m": self.square_m, "marker_m": self.marker_m})
+        if not self.marker_m < self.square_m:
+            raise TargetError(
+                f"target {self.name}: marker_m = {self.marker_m:g} must be less than square_m = {self.square_m:g}"
+            )
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Of its markers."""
+        return tuple(range(self.first_id, self.first_id + self.columns * self.rows // 2))
+
+    @property
+    def length_m(self) -> float:
+        """The length that its scale is about."""
+        return self.square_m
+
+    def corners(self) -> Array:
+        """((columns - 1) (rows - 1), 3), metres."""
+        return _grid(self.columns - 1, self.rows - 1, self.square_m)
+
+
+@dataclass(frozen=True)
+class AprilGrid:
+    """Kalibr's AprilGrid: columns x rows tags with a double black border, spacing = gap / tag_m.
+
+    Ids count from first_id at the bottom left, to the right, then up. Corners are the tags', four each, in that order.
+    """
+
+    name: str
+    family: str
+    columns: int
+    rows: int
+    tag_m: float
+    spacing: float
+    first_id: int = 0
+
+    def __post_init__(self) -> None:
+        _check_grid(self.name, self.columns, self.rows, 1)
+        _check(self.name, self.family, self.ids, {"tag_m": self.tag_m})
+        if not 0.0 < self.spacing <= 10.0:
+            raise TargetError(
+                f"target {self.name}: spacing = {self.spacing!r}; Kalibr's is gap / tag size, 0.3 as a rule"
+            )
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Of its tags."""
+        return tuple(range(self.first_id, self.first_id + self.columns * self.rows))
+
+    @property
+    def length_m(self) -> float:
+        """The length that its scale is about."""
+        return self.tag_m
+
+    def corners(self) -> Array:
+        """(4 columns rows, 3), metres; rows of tags from the bottom."""
+        middles = _grid(self.columns, self.rows, self.tag_m * (1.0 + self.spacing))
+        from_below = middles.reshape(self.rows, self.columns, 3)[::-1].reshape(-1, 1, 3)
+        corners: Array = (from_below + _square(self.tag_m)).reshape(-1, 3)
+        return corners
+
+
+@dataclass(frozen=True)
+class Checkerboard:
+    """A checkerboard of columns x rows inner corners, numbered left to right, from the top.
+
+    Unless one of the two is even and the other odd, a board turned by half a turn looks the same, and poses may be of
+    either.
+    """
+
+    name: str
+    columns: int
+    rows: int
+    square_m: float
+
+    def __post_init__(self) -> None:
+        _check_grid(self.name, self.columns, self.rows, 3)
+        _check(self.name, None, (), {"square_m": self.square_m})
+        if (self.columns + self.rows) % 2 == 0:
+            raise TargetError(
+                f"target {self.name}: a checkerboard of {self.columns} x {self.rows} inner corners looks the same "
+                "after half a turn; take one with an odd and an even number, or a ChArUco board"
+            )
+
+    @property
+    def family(self) -> str:
+        """No tags."""
+        return "checkerboard"
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """No tags."""
+        return ()
+
+    @property
+    def length_m(self) -> float:
+        """The length that its scale is about."""
+        return self.square_m
+
+    def corners(self) -> Array:
+        """(columns rows, 3), metres."""
+        return _grid(self.columns, self.rows, self.square_m)
+
+
+Target: TypeAlias = Tag | Charuco | AprilGrid | Checkerboard
+
+
+def _square(side_m: float) -> Array:
+    """Corners of a square about the origin: top left, top right, bottom right, bottom left."""
+    return 0.5 * side_m * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+
+
+def _grid(columns: int, rows: int, step_m: float) -> Array:
+    """Points of a grid about the origin, left to right, from the top."""
+    x, y = np.meshgrid(np.arange(columns) - 0.5 * (columns - 1), 0.5 * (rows - 1) - np.arange(rows))
+    return step_m * np.stack([x.ravel(), y.ravel(), np.zeros(columns * rows)], axis=1)
+
+
+def _check(name: str, family: str | None, ids: tuple[int, ...], lengths: dict[str, float]) -> None:
+    if family is not None:
+        if family not in FAMILIES:
+            raise TargetError(f"target {name}: there is no family {family!r}; there are {', '.join(FAMILIES)}")
+        if min(ids) < 0 or max(ids) >= FAMILIES[family]:
+            raise TargetError(
+                f"target {name}: ids {min(ids)} to {max(ids)} are not in {family}: 0 to {FAMILIES[family] - 1}"
+            )
+    for word, length in lengths.items():
+        if not 0.0 < length < LARGEST_M:
+            raise TargetError(f"target {name}: {word} = {length!r}; give metres, above 0 and below {LARGEST_M:g}")
+
+
+def _check_grid(name: str, columns: int, rows: int, least: int) -> None:
+    if not (least <= columns <= 100 and least <= rows <= 100):
+        raise TargetError(f"target {name}: {columns} columns and {rows} rows; each must be {least} to 100")
