@@ -168,8 +168,8 @@ class Camera:
 
     def inside(self, pixels: Array) -> np.ndarray:
         """Which pixels (..., 2) are in the image; (...) booleans."""
-        inside: np.ndarray = ((pixels >= -0.5) & (pixels <= np.array([self.width, self.height]) - 0.5)).all(axis=-1)
-        return inside
+        inside = np.asarray((pixels >= -0.5) & (pixels <= np.array([self.width, self.height]) - 0.5))
+        return np.asarray(inside.all(axis=-1))
 
     @property
     def _focal(self) -> Array:

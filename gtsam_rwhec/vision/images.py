@@ -1,0 +1,108 @@
+"""Images of a log to gray pixels: JPEG, PNG and the like, and the raw encodings of ROS and Foxglove."""
+
+from __future__ import annotations
+
+import struct
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gtsam_rwhec.errors import ImageError
+from gtsam_rwhec.logs.records import ImageRecord
+from gtsam_rwhec.vision.camera import MOST_PIXELS
+
+Gray = NDArray[np.uint8]
+
+#: Channels and bytes a channel of raw encodings, and OpenCV's conversion to gray (None: it is gray).
+_RAW: dict[str, tuple[int, int, int | None]] = {
+    "mono8": (1, 1, None), "8uc1": (1, 1, None), "mono16": (1, 2, None), "16uc1": (1, 2, None),
+    "rgb8": (3, 1, cv2.COLOR_RGB2GRAY), "8uc3": (3, 1, cv2.COLOR_BGR2GRAY), "bgr8": (3, 1, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, 1, cv2.COLOR_RGBA2GRAY), "bgra8": (4, 1, cv2.COLOR_BGRA2GRAY), "8uc4": (4, 1, cv2.COLOR_BGRA2GRAY),
+    # OpenCV names a Bayer pattern by the second row's second and third pixels, ROS by the first row's first two.
+    "bayer_rggb8": (1, 1, cv2.COLOR_BayerBG2GRAY), "bayer_bggr8": (1, 1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGR2GRAY), "bayer_grbg8": (1, 1, cv2.COLOR_BayerGB2GRAY),
+    "yuv422": (2, 1, cv2.COLOR_YUV2GRAY_UYVY), "uyvy": (2, 1, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2GRAY_YUY2), "yuyv": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
+}  # fmt: skip
+RAW_ENCODINGS = tuple(_RAW)
+
+
+def decode_gray(image: ImageRecord) -> Gray:
+    """Pixels (height, width), 8 bits, of an image of a log.
+
+    16-bit images are scaled so that their brightest pixel is 255.
+
+    Raises
+    ------
+    ImageError
+        For an image that cannot be decoded, is larger than `MOST_PIXELS`, or has an encoding that is not supported.
+    """
+    where = f"topic {image.topic}, image at {image.stamp_ns} ns"
+    return _compressed(image, where) if image.is_compressed else _raw(image, where)
+
+
+def _compressed(image: ImageRecord, where: str) -> Gray:
+    size = _stated_size(image.data)
+    if size is not None and size[0] * size[1] > MOST_PIXELS:
+        raise ImageError(f"{where}: {size[0]} x {size[1]} pixels are more than the {MOST_PIXELS} that are decoded")
+    buffer = np.frombuffer(image.data, dtype=np.uint8)
+    try:
+        # The lens does not turn with the viewer's wish: no EXIF orientation.
+        gray = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise ImageError(f"{where}: not decoded: {str(error).strip().splitlines()[0]}") from error
+    if gray is None:
+        raise ImageError(
+            f"{where}: {len(image.data)} bytes that begin with {image.data[:8].hex()} and claim to be "
+            f"{image.encoding!r} are no image that OpenCV can decode"
+        )
+    return np.asarray(gray, dtype=np.uint8)
+
+
+def _stated_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a PNG or JPEG as its header has them: checked before a small file becomes gigabytes."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+        return width, height
+    if data[:2] != b"\xff\xd8":
+        return None
+    at = 2
+    while at + 9 <= len(data):
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if data[at] != 0xFF:
+            return None
+        if marker in (0xC0, 0xC1, 0xC2):  # start of frame
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return width, height
+        at += 2 + length
+    return None
+
+
+def _raw(image: ImageRecord, where: str) -> Gray:
+    width, height, step = image.width, image.height, image.step
+    if width is None or height is None or step is None:
+        raise ImageError(f"{where}: a raw image without width, height or step")
+    encoding = image.encoding.strip().lower()
+    if encoding not in _RAW:
+        raise ImageError(f"{where}: encoding {image.encoding!r} is not supported; supported are {', '.join(_RAW)}")
+    channels, size, code = _RAW[encoding]
+    if step < width * channels * size or len(image.data) < step * height or width * height == 0:
+        raise ImageError(
+            f"{where}: {width} x {height} pixels of {encoding} in rows of {step} bytes do not fit {len(image.data)}"
+        )
+    if width * height > MOST_PIXELS:
+        raise ImageError(f"{where}: {width} x {height} pixels are more than the {MOST_PIXELS} that are decoded")
+    rows = np.frombuffer(image.data, dtype=np.uint8, count=step * height).reshape(height, step)
+    rows = np.ascontiguousarray(rows[:, : width * channels * size])
+    if size == 2:
+        wide = rows.view(">u2" if image.is_bigendian else "<u2").astype(np.float32)
+        scaled: Gray = np.rint(wide * (255.0 / max(float(wide.max()), 1.0))).astype(np.uint8)
+        return scaled
+    pixels = rows.reshape(height, width, channels) if channels > 1 else rows
+    if code is None:
+        return pixels
+    try:
+        return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
+    except cv2.error as error:
+        raise ImageError(f"{where}: {encoding} of {width} x {height} pixels not converted: {error}") from error

@@ -1,0 +1,175 @@
+"""Poses of flat targets from their corners: both of a plane's two candidates, refined, with covariances.
+
+IPPE (Collins and Bartoli 2014, as OpenCV has it) gives two poses; each is refined by Gauss-Newton on the reprojection
+error in pixels, all of an image at once. Far or nearly frontal planes have two minima of nearly the same error; which
+is the right one no single image tells (`ambiguity`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.vision.camera import Camera
+
+STEPS = 15
+#: The iteration ends when costs change by less than this share.
+SETTLED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class PlanePoses:
+    """Poses of N flat targets, two candidates each, the better first.
+
+    Attributes
+    ----------
+    T : (N, 2, 4, 4) array
+        T_camera_target, metres; nan where none was found.
+    squared_px : (N, 2) array
+        Sums of squared reprojection errors, px^2.
+    reprojection_px : (N, 2) array
+        Root mean square over corners (of the error's length).
+    covariance : (N, 2, 6, 6) array
+        Of the right perturbation, rotation first, from corner noise along each axis.
+    errors_px : (N, n, 2) array
+        Of the better candidate's corners, seen minus predicted; nan where a target has fewer corners.
+    """
+
+    T: Array
+    squared_px: Array
+    reprojection_px: Array
+    covariance: Array
+    errors_px: Array
+
+
+def plane_poses(
+    camera: Camera, corners_m: Sequence[Array], corners_px: Sequence[Array], *, corner_px: float
+) -> PlanePoses:
+    """Estimate poses of flat targets.
+
+    Parameters
+    ----------
+    camera : Camera
+    corners_m : sequence of (n_i, 3) arrays
+        In each target's frame, z = 0; four or more.
+    corners_px : sequence of (n_i, 2) arrays
+        Where they were seen.
+    corner_px : float
+        Standard deviation of a corner along each axis, pixels.
+    """
+    N, most = len(corners_m), max((len(points) for points in corners_m), default=0)
+    p, u, known = np.zeros((N, most, 3)), np.zeros((N, most, 2)), np.zeros((N, most), dtype=bool)
+    for i, (points, pixels) in enumerate(zip(corners_m, corners_px, strict=True)):
+        n = len(points)
+        p[i, :n], u[i, :n], known[i, :n] = points, pixels, True
+    x = camera.undistort(np.where(known[..., None], u, camera.K[:2, 2]))
+    start = np.array([_ippe(p[i, k], x[i, k]) for i, k in enumerate(known)]).reshape(N, 2, 4, 4)
+    T, squared, covariance, errors = _refined(camera, start, p, u, known, corner_px)
+    order = np.argsort(np.where(np.isfinite(squared), squared, np.inf), axis=1)
+    T, covariance = (np.take_along_axis(x, order[:, :, None, None], axis=1) for x in (T, covariance))
+    squared = np.take_along_axis(squared, order, axis=1)
+    errors = np.take_along_axis(errors, order[:, :1, None, None], axis=1)[:, 0]
+    errors[~known] = np.nan
+    count = np.maximum(known.sum(axis=1), 1)[:, None]
+    return PlanePoses(T, squared, np.sqrt(squared / count), covariance, errors)
+
+
+def _ippe(points: Array, x: Array) -> Array:
+    """(2, 4, 4): IPPE's two poses from normalised coordinates; nan for what it does not find."""
+    T = np.full((2, 4, 4), np.nan)
+    if not np.isfinite(x).all():
+        return T
+    try:
+        _, rotations, translations, _ = cv2.solvePnPGeneric(
+            points[:, None], x[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        )
+    except cv2.error:
+        return T  # corners on one line
+    for k, (turn, t) in enumerate(zip(rotations[:2], translations[:2], strict=True)):
+        if np.isfinite(turn).all() and np.isfinite(t).all() and t[2, 0] > 0.0:
+            T[k] = np.eye(4)
+            T[k, :3, :3], T[k, :3, 3] = cv2.Rodrigues(turn)[0], t[:, 0]
+    return T
+
+
+def _refined(
+    camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, corner_px: float
+) -> tuple[Array, Array, Array, Array]:
+    """Gauss-Newton, damped where a step does not help: T, sum of squares, covariances, errors (N, 2, n, 2)."""
+    T = T.copy()
+    errors, J = _linearised(camera, T, p, u, known)
+    cost = np.einsum("ncki,ncki->nc", errors, errors)
+    damping = np.full(cost.shape, 1e-9)
+    with np.errstate(invalid="ignore"):
+        for _ in range(STEPS):
+            H = np.einsum("nckia,nckib->ncab", J, J)
+            g = np.einsum("nckia,ncki->nca", J, errors)
+            diagonal = np.einsum("ncaa->nca", H)
+            step = _solved(H + np.eye(6) * (damping[..., None] * diagonal + 1e-12)[..., None, :], g)
+            tried = T @ se3.expmap(np.nan_to_num(step).reshape(-1, 6)).reshape(T.shape)
+            new_errors, new_J = _linearised(camera, tried, p, u, known)
+            new_cost = np.einsum("ncki,ncki->nc", new_errors, new_errors)
+            better = new_cost <= cost
+            T, errors, J = (
+                np.where(better.reshape(better.shape + (1,) * (a.ndim - 2)), b, a)
+                for a, b in ((T, tried), (errors, new_errors), (J, new_J))
+            )
+            # Worse by rounding alone is as settled as better by rounding alone.
+            moved = np.abs(cost - new_cost) > SETTLED * (1e-6 + cost)
+            cost = np.where(better, new_cost, cost)
+            damping = np.where(better, damping * 0.1, np.maximum(damping, 1e-6) * 100.0)
+            if not (moved & (better | (damping < 1.0))).any():
+                break
+    H = np.einsum("nckia,nckib->ncab", J, J) / corner_px**2
+    eye = np.broadcast_to(np.eye(6), H.shape)
+    covariance = _solved(H, eye)
+    covariance = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+    cost = np.where(np.isfinite(T).all(axis=(-1, -2)) & np.isfinite(covariance).all(axis=(-1, -2)), cost, np.nan)
+    return T, cost, covariance, errors
+
+
+def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray) -> tuple[Array, Array]:
+    """Errors (N, 2, n, 2), seen minus predicted, and the predictions' derivatives (N, 2, n, 2, 6).
+
+    A right perturbation [omega, v] moves a point of the target by R (omega x p + v) in the camera's frame.
+    """
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    seen = np.einsum("ncij,nkj->ncki", R, p) + t[:, :, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = np.where(seen[..., 2] > 1e-9, seen[..., 2], np.nan)
+        x = seen[..., :2] / z[..., None]
+        pixels, D = camera.pixel_jacobian(x)
+        # d(x, y)/d(X, Y, Z) = [I, -x] / Z
+        to_x = np.concatenate([np.broadcast_to(np.eye(2), (*x.shape, 2)), -x[..., None]], axis=-1) / z[..., None, None]
+        DR = D @ to_x @ R[:, :, None]
+    moved = np.concatenate([-_skew(p), np.broadcast_to(np.eye(3), (*p.shape, 3))], axis=-1)
+    J = DR @ moved[:, None]
+    errors = u[:, None] - pixels
+    mask = known[:, None, :, None]
+    return np.where(mask, errors, 0.0), np.where(mask[..., None], J, 0.0)
+
+
+def _skew(p: Array) -> Array:
+    zero = np.zeros(p.shape[:-1])
+    rows = [zero, -p[..., 2], p[..., 1], p[..., 2], zero, -p[..., 0], -p[..., 1], p[..., 0], zero]
+    return np.stack(rows, axis=-1).reshape(*p.shape, 3)
+
+
+def _solved(H: Array, g: Array) -> Array:
+    """H^-1 g where H is finite and regular, nan elsewhere; g (..., 6) or (..., 6, 6)."""
+    bad = np.asarray(~np.isfinite(H).all(axis=(-1, -2)))
+    # Units differ (rad, m): scale to a unit diagonal before judging and solving.
+    unit = np.sqrt(np.where(bad[..., None], 1.0, np.maximum(np.einsum("...aa->...a", H), 1e-300)))
+    scaled = np.where(bad[..., None, None], np.eye(6), H / (unit[..., :, None] * unit[..., None, :]))
+    bad |= np.linalg.eigvalsh(scaled)[..., 0] < 1e-14
+    scaled = np.where(bad[..., None, None], np.eye(6), scaled)
+    if g.ndim == H.ndim:
+        result = np.linalg.solve(scaled, np.nan_to_num(g) / unit[..., :, None]) / unit[..., :, None]
+        return np.where(bad[..., None, None], np.nan, result)
+    result = np.linalg.solve(scaled, (np.nan_to_num(g) / unit)[..., None])[..., 0] / unit
+    return np.where(bad[..., None], np.nan, result)
