@@ -16,23 +16,27 @@ from gtsam_rwhec.result_file import (
     pose_from_file,
     pose_to_file,
     read_result,
+    result_json,
     scale_from_file,
     scale_to_file,
     write_result,
 )
 from gtsam_rwhec.result_schema import (
     FORMAT_VERSION,
+    REFINED_VERSION,
     Deviations,
     Joint,
     RefinedFields,
     RefinedFrame,
     RefinedPair,
+    ResultFile,
     Row,
     Unknown,
 )
+from gtsam_rwhec.stage_reports import LogFields
 
 
-def write_refined(refined: Refined, path: str | Path) -> None:
+def write_refined(refined: Refined, path: str | Path, log: LogFields | None = None) -> None:
     """Write a refined calibration, with the certified solution that it began at, as JSON.
 
     Parameters
@@ -40,17 +44,29 @@ def write_refined(refined: Refined, path: str | Path) -> None:
     refined : Refined
     path : str or Path
         The file; replaced if it is there. Its folder must be there.
+    log : LogFields, optional
+        Where the measurements came from and what became of them.
 
     Raises
     ------
     FileFormatError
         The file cannot be written (the message says why), or a number is NaN.
     """
-    write_result(
-        path,
-        lambda: fields_of(refined.solution).model_copy(
-            update={"format_version": FORMAT_VERSION, "refined": _to_file(refined)}
-        ),
+    write_result(path, lambda: _fields(refined, log))
+
+
+def refined_json(refined: Refined, log: LogFields | None = None) -> bytes:
+    """What `write_refined` writes."""
+    return result_json(lambda: _fields(refined, log), "the result")
+
+
+def _fields(refined: Refined, log: LogFields | None) -> ResultFile:
+    return fields_of(refined.solution).model_copy(
+        update={
+            "format_version": REFINED_VERSION if log is None else FORMAT_VERSION,
+            "refined": _to_file(refined),
+            "log": log,
+        }
     )
 
 
@@ -62,7 +78,18 @@ def read_refined(path: str | Path) -> RefinedPoses:
     ResultVersionError, FileFormatError
         As for ``read_solution``; and where the file holds no refined poses.
     """
-    fields = read_result(path).refined
+    return refined_of(read_result(path), path)
+
+
+def refined_of(result: ResultFile, path: str | Path) -> RefinedPoses:
+    """The refined poses among a file's fields; `path` is for messages.
+
+    Raises
+    ------
+    FileFormatError
+        Where there are none.
+    """
+    fields = result.refined
     if fields is None:
         raise FileFormatError(
             f"{path} holds a solution that was not refined; read it with read_solution, or refine and write that "

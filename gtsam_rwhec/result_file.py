@@ -70,15 +70,27 @@ def write_result(path: str | Path, make: Callable[[], ResultFile]) -> None:
     FileFormatError
         The file cannot be written (the message says why), or ``make`` meets a number that is none.
     """
+    content = result_json(make, path)
+    try:
+        write_atomically(Path(path), content)
+    except OSError as error:
+        raise FileFormatError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def result_json(make: Callable[[], ResultFile], path: str | Path) -> bytes:
+    """The fields that ``make`` returns as JSON; `path` is for messages.
+
+    Raises
+    ------
+    FileFormatError
+        ``make`` meets a number that is none.
+    """
     try:
         result = make()
     except ValidationError as error:
         raise FileFormatError(f"{path} was not written, the solution is not sound: {_in_words(error)}") from error
-    content = result.model_dump_json(indent=2, exclude=None if result.refined is not None else {"refined"}) + "\n"
-    try:
-        write_atomically(Path(path), content.encode("utf-8"))
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be written: {error.strerror}.") from error
+    absent = {name for name in ("refined", "log") if getattr(result, name) is None}
+    return (result.model_dump_json(indent=2, exclude=absent) + "\n").encode("utf-8")
 
 
 def read_solution(path: str | Path) -> Solution:
@@ -94,7 +106,7 @@ def read_solution(path: str | Path) -> Solution:
         The file cannot be read, is not JSON, is not a result, or a field is missing, unknown or not what it should be;
         the message gives its JSON path.
     """
-    return _from_file(read_result(path))
+    return solution_of(read_result(path))
 
 
 def read_result(path: str | Path) -> ResultFile:
@@ -103,6 +115,11 @@ def read_result(path: str | Path) -> ResultFile:
         content = Path(path).read_bytes()
     except OSError as error:
         raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
+    return parse_result(content, path)
+
+
+def parse_result(content: bytes, path: str | Path) -> ResultFile:
+    """The fields of a file's content; `path` is for messages. Raises as `read_solution` does."""
     try:
         header = _Header.model_validate_json(content)
     except ValidationError as error:
@@ -111,7 +128,7 @@ def read_result(path: str | Path) -> ResultFile:
         raise FileFormatError(
             f"{path}: $.format is {header.format!r}, expected {FORMAT!r}: this is another kind of file."
         )
-    if header.format_version not in (UNREFINED_VERSION, FORMAT_VERSION):
+    if not UNREFINED_VERSION <= header.format_version <= FORMAT_VERSION:
         remedy = (
             "install a newer gtsam-rwhec"
             if header.format_version > FORMAT_VERSION
@@ -119,7 +136,7 @@ def read_result(path: str | Path) -> ResultFile:
         )
         raise ResultVersionError(
             f"{path} has version {header.format_version} of the result format (written by {header.written_by}); this "
-            f"gtsam-rwhec reads versions {UNREFINED_VERSION} and {FORMAT_VERSION}: {remedy}."
+            f"gtsam-rwhec reads versions {UNREFINED_VERSION} to {FORMAT_VERSION}: {remedy}."
         )
     try:
         return ResultFile.model_validate_json(content)
@@ -184,7 +201,7 @@ def fields_of(solution: Solution) -> ResultFile:
     )
 
 
-def _from_file(file: ResultFile) -> Solution:
+def solution_of(file: ResultFile) -> Solution:
     identifiability = Identifiability(
         is_unique=file.identifiability.is_unique,
         free_directions=list(file.identifiability.free_directions),

@@ -14,12 +14,14 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
 
 from gtsam_rwhec.certify.certificate import Status
+from gtsam_rwhec.stage_reports import LogFields
 
 FORMAT: Final = "gtsam-rwhec result"
-FORMAT_VERSION: Final = 2
-"""Raised whenever a reader of the last version would misread or refuse the file."""
+FORMAT_VERSION: Final = 3
+"""Raised whenever a reader of the last version would misread or refuse the file: 3 with what became of a log."""
+REFINED_VERSION: Final = 2
 UNREFINED_VERSION: Final = 1
-"""Still written where nothing is refined, for such readers."""
+"""Still written where there is less, for readers of these."""
 
 CONVENTIONS = {
     "pose": (
@@ -262,7 +264,9 @@ class ResultFile(_Model):
     """A calibration and everything that is known about it."""
 
     format: Literal["gtsam-rwhec result"] = Field(description="what kind of file this is")
-    format_version: Literal[1, 2] = Field(description="the version of these fields: 2 with refined, 1 without")
+    format_version: Literal[1, 2, 3] = Field(
+        description="the version of these fields: 1 without refined, 2 with it, 3 with it and log"
+    )
     written_by: str = Field(description="the library and its version")
     conventions: dict[str, str] = Field(description="what poses, scale and units mean, for people; not read back")
     targets: tuple[Pose, ...] = Field(description="X: T_targetcarrier_target of each target")
@@ -275,11 +279,16 @@ class ResultFile(_Model):
     pairs: tuple[PairFields, ...] = Field(description="every pair that was measured")
     parts: tuple[Part, ...] = Field(description="the unconnected parts; one when all is connected")
     refined: RefinedFields | None = Field(default=None, description="left out where nothing was refined")
+    log: LogFields | None = Field(default=None, description="left out where the measurements are of no log")
 
     @model_validator(mode="after")
     def _names_fit_together(self) -> ResultFile:
-        if (self.refined is not None) != (self.format_version == FORMAT_VERSION):
-            raise ValueError(f"a file of version {self.format_version} with refined: {self.refined is not None}")
+        version = 1 + (self.refined is not None) + (self.log is not None)
+        if self.format_version != version or (self.refined is None and self.log is not None):
+            raise ValueError(
+                f"a file of version {self.format_version} with refined: {self.refined is not None}, log: "
+                f"{self.log is not None}"
+            )
         names = [pose.child for pose in (*self.targets, *self.sensors)]
         twice = {name for name in names if names.count(name) > 1}
         if twice:

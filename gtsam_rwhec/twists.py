@@ -12,11 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.cleaning.trajectory import Trajectory
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.poses import Array
 
 #: Poses this far from a stamp, in time, tell the motion there.
 WINDOW_S = 0.5
+#: Of a path that was logged fast, this many poses about a stamp.
+NEAREST = 32
 #: Poses further apart than this say little of the motion in between.
 LONGEST_GAP_S = 1.0
 #: Poses of one stamp differ by no more than this, or they are of two carriers.
@@ -106,6 +109,46 @@ class LocalPaths:
             squares += ((xi - Z @ solution) ** 2).sum(axis=0)
             freedom += len(near) - Z.shape[1]
         return LocalPaths(coefficients[place], leverage[place], squares / max(freedom, 1))
+
+    @staticmethod
+    def along(path: Trajectory, stamps_ns: np.ndarray) -> LocalPaths:
+        """Fit them to a path that was logged faster than anything was measured: to the poses next to each stamp.
+
+        Parameters
+        ----------
+        path : Trajectory
+            T_sensorcarrier_targetcarrier over time.
+        stamps_ns : (N,) integers
+
+        Raises
+        ------
+        CountError
+            For a stamp that has fewer than four of the path's poses within half a second.
+        """
+        stamps, place = np.unique(stamps_ns, return_inverse=True)
+        here, _ = path.at(stamps)
+        first = np.searchsorted(path.stamps_ns, stamps) - NEAREST // 2
+        rows = np.clip(first, 0, max(len(path.T) - NEAREST, 0))[:, None] + np.arange(min(NEAREST, len(path.T)))
+        tau = (path.stamps_ns[rows] - stamps[:, None]) * 1e-9
+        near = np.abs(tau) <= WINDOW_S
+        if (near.sum(axis=1) < 4).any():
+            i = int(np.argmin(near.sum(axis=1)))
+            raise CountError(
+                f"{path.where}: {near[i].sum()} poses within {WINDOW_S:g} s of the measurement at {stamps[i]} ns; a time "
+                "offset needs four and more, to tell how fast the carrier moved"
+            )
+        xi = se3.logmap((se3.inverse(here)[:, None] @ path.T[rows]).reshape(-1, 4, 4)).reshape(*tau.shape, 6)
+        # Columns scaled by the window: third powers of milliseconds are nothing.
+        Z = np.where(near[..., None], (tau[..., None] / WINDOW_S) ** np.arange(4), 0.0)
+        inverse = np.linalg.pinv(Z)
+        solution = inverse @ np.where(near[..., None], xi, 0.0)
+        left = np.where(near[..., None], xi - Z @ solution, 0.0)
+        freedom = max(int((near.sum(axis=1) - 4).sum()), 1)
+        powers = WINDOW_S ** np.arange(1, 4)
+        leverage = (inverse[:, 1] ** 2).sum(axis=1) / WINDOW_S**2
+        return LocalPaths(
+            (solution[:, 1:] / powers[:, None])[place], leverage[place], (left**2).sum(axis=(0, 1)) / freedom
+        )
 
 
 def _neighbours(seconds: Array, i: int) -> np.ndarray:

@@ -171,7 +171,7 @@ def test_another_version_says_what_to_do(written: Path, version: int, remedy: st
     for words in (
         f"has version {version}",
         "written by gtsam-rwhec 9.9",
-        f"reads versions 1 and {FORMAT_VERSION}",
+        f"reads versions 1 to {FORMAT_VERSION}",
         remedy,
     ):
         assert words in str(caught.value)

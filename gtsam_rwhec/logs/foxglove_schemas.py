@@ -254,10 +254,13 @@ def _tag_detections(message: Any, access: Access, topic: str, logged: int) -> Re
         if tag.get("covariance") is not None:
             covariance = _vector(tag["covariance"], "covariance").reshape(6, 6)
         if tag.get("corners_px") is not None:
-            corners = _vector([float(c[axis]) for c in tag["corners_px"] for axis in "xy"], "corners").reshape(4, 2)
-        size = None if tag.get("size_m") is None else float(tag["size_m"])
+            corners = _vector([float(c[axis]) for c in tag["corners_px"] for axis in "xy"], "corners").reshape(-1, 2)
+        size, error = (None if tag.get(n) is None else float(tag[n]) for n in ("size_m", "reprojection_px"))
         family, name = _text(get, tag, "family"), _text(get, tag, "id")
-        records.append(DetectionRecord(logged, stamp, topic, frame, family, name, corners, T, covariance, size))
+        reason = _text(get, tag, "reason") if "reason" in tag else ""
+        records.append(
+            DetectionRecord(logged, stamp, topic, frame, family, name, corners, T, covariance, size, error, reason)
+        )
     return records
 
 
@@ -271,7 +274,9 @@ def _measured_pair(message: Any, access: Access, topic: str, logged: int) -> Rea
             return f"{name} is no transform: {T.tolist()}"
     target, sensor, reason = (_text(get, message, name) for name in ("target", "sensor", "reason"))
     stamp, inlier = access.stamp(message), bool(get(message, "is_inlier"))
-    return (PairRecord(logged, stamp, topic, target, sensor, A, B, inlier, reason),)
+    given = message.get("covariance")
+    covariance = None if given is None else _vector(given, "covariance").reshape(6, 6)
+    return (PairRecord(logged, stamp, topic, target, sensor, A, B, inlier, reason, covariance),)
 
 
 _POSES: dict[str, Callable[[Any, Access], list[_Row]]] = {

@@ -10,6 +10,7 @@ for record in log.records(["/tf", "/detections"]):
 from __future__ import annotations
 
 import heapq
+import struct
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from types import TracebackType
 from typing import Literal
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Channel, Schema
 
 from gtsam_rwhec.errors import LogError, LogWarning, MessageError
@@ -124,6 +127,31 @@ class Log:
                 unreadable = decoder if isinstance(decoder, str) else ""
                 found[key] = Topic(*key, count, min(firsts, default=None), max(lasts, default=None), unreadable)
         return tuple(found[key] for key in sorted(found))
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """The metadata records of all files by name; of one name the last counts.
+
+        Found by the files' index: a file that lacks it, or is truncated, has none.
+        """
+        found: dict[str, dict[str, str]] = {}
+        for file in self.files:
+            with open(file.path, "rb") as stream:
+                try:
+                    found |= {entry.name: dict(entry.metadata) for entry in make_reader(stream).iter_metadata()}
+                except (McapError, struct.error, ValueError, EOFError):
+                    continue  # `losses` says what is wrong with the file
+        return found
+
+    def attachment(self, name: str) -> bytes | None:
+        """What is attached under a name, found as `metadata` is; None if nothing is."""
+        found = None
+        for file in self.files:
+            with open(file.path, "rb") as stream:
+                try:
+                    found = next((a.data for a in make_reader(stream).iter_attachments() if a.name == name), found)
+                except (McapError, struct.error, ValueError, EOFError):
+                    continue
+        return found
 
     def records(self, topics: Iterable[str] | None = None, on_bad: OnBad = "warn") -> Iterator[Record]:
         """Go through the log in the order of log time.

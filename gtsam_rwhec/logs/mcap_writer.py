@@ -183,17 +183,23 @@ class LogWriter:
                 part["pose"] = _pose(tag.T_camera_tag)
             if tag.covariance is not None:
                 part["covariance"] = np.ravel(tag.covariance).tolist()
+            if tag.reprojection_px is not None:
+                part["reprojection_px"] = float(tag.reprojection_px)
+            if tag.reason:
+                part["reason"] = tag.reason
             parts.append(part)
         message = {"timestamp": _time(stamp_ns), "frame_id": frame, "detections": parts}
         self._write(topic, "gtsam_rwhec.TagDetections", stamp_ns, message)
 
     def pair(self, pair: PairRecord) -> None:
         """Write a ``gtsam_rwhec.MeasuredPair`` to its topic; numbers come back as they were, to the last bit."""
-        message = {
+        message: dict[str, Any] = {
             "timestamp": _time(pair.stamp_ns), "target": pair.target, "sensor": pair.sensor,
             "A": np.ravel(pair.A).tolist(), "B": np.ravel(pair.B).tolist(),
             "is_inlier": bool(pair.is_inlier), "reason": pair.reason,
         }  # fmt: skip
+        if pair.covariance is not None:
+            message["covariance"] = np.ravel(pair.covariance).tolist()
         self._write(pair.topic, "gtsam_rwhec.MeasuredPair", pair.stamp_ns, message)
 
     def metadata(self, name: str, entries: Mapping[str, str]) -> None:

@@ -89,7 +89,8 @@ class DetectionRecord:
     """A tag as a driver saw it; a message with several tags becomes as many records.
 
     `family` is empty where the message does not say. `id` is a number, or a board's name. `corners_px` is (4, 2) in
-    the driver's order, `T_camera_tag` (4, 4), `covariance` (6, 6) as in `PoseRecord`.
+    the driver's order (of a board as many as were seen), `T_camera_tag` (4, 4), `covariance` (6, 6) as in `PoseRecord`,
+    `reprojection_px` the root mean square over the corners. `reason` says why it is not used; empty where it is.
     """
 
     logged_ns: int
@@ -102,13 +103,15 @@ class DetectionRecord:
     T_camera_tag: Array | None = None
     covariance: Array | None = None
     size_m: float | None = None
+    reprojection_px: float | None = None
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairRecord:
     """A synchronised measurement as this library writes it: A = T_sensorcarrier_targetcarrier, B = T_sensor_target.
 
-    `reason` says why it is no inlier; empty where it is one.
+    `covariance` is B's, (6, 6) as in `PoseRecord`. `reason` says why it is no inlier; empty where it is one.
     """
 
     logged_ns: int
@@ -120,6 +123,7 @@ class PairRecord:
     B: Array
     is_inlier: bool = True
     reason: str = ""
+    covariance: Array | None = None
 
 
 Record: TypeAlias = PoseRecord | ImageRecord | IntrinsicsRecord | DetectionRecord | PairRecord

@@ -87,6 +87,10 @@ class TfBuffer:
         """Every frame, by name."""
         return tuple(sorted(set(self._links) | {link.parent for link in self._links.values()}))
 
+    def children(self) -> tuple[str, ...]:
+        """Every frame that hangs on another, by name."""
+        return tuple(sorted(self._links))
+
     def chain(self, parent: str, child: str) -> tuple[str, ...]:
         """The frames on the way from `parent` to `child`, both included.
 
@@ -104,6 +108,19 @@ class TfBuffer:
             )
         down = up_from_child[: up_from_child.index(common)]
         return (*up_from_parent[: up_from_parent.index(common) + 1], *reversed(down))
+
+    def stamps(self, parent: str, child: str) -> Stamps:
+        """Every stamp at which a moving link of the chain has a transform, (N,) increasing; none if all are static.
+
+        Raises
+        ------
+        TransformError
+            As `chain`.
+        """
+        frames = self.chain(parent, child)
+        below = [b if b in self._links and self._links[b].parent == a else a for a, b in itertools.pairwise(frames)]
+        moving = [self._links[name].by_stamp()[0] for name in below if not self._links[name].is_static]
+        return np.unique(np.concatenate(moving)) if moving else np.zeros(0, dtype=np.int64)
 
     def at(self, parent: str, child: str, stamps_ns: Stamps) -> tuple[Array, Array]:
         """T_parent_child at stamps.

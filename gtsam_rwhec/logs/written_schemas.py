@@ -2,11 +2,13 @@
 
 ``gtsam_rwhec.TagDetections``
     Tags seen in one image. ``frame_id`` is the camera's frame; each detection has ``family``, ``id`` and, where known,
-    ``size_m``, ``corners_px`` (four points), ``pose`` (T_camera_tag) and ``covariance`` (36 numbers, row-major;
-    rotation first, radians and metres, right perturbation of the pose).
+    ``size_m``, ``corners_px`` (four points; of a board, those that were seen), ``pose`` (T_camera_tag), ``covariance``
+    (36 numbers, row-major; rotation first, radians and metres, right perturbation of the pose), ``reprojection_px``
+    (root mean square) and, if it is not used, ``reason``.
 ``gtsam_rwhec.MeasuredPair``
     A synchronised measurement of A X = Y B: ``A`` = T_sensorcarrier_targetcarrier and ``B`` = T_sensor_target, 16
-    numbers each, row-major, metres; ``target`` and ``sensor``; ``is_inlier``, and if it is none, ``reason``.
+    numbers each, row-major, metres; ``target`` and ``sensor``; ``is_inlier``, and if it is none, ``reason``; where
+    known, B's ``covariance`` as above.
 """
 
 from __future__ import annotations
@@ -69,6 +71,8 @@ _DETECTION = _message(
     corners_px=_several(_POINT),
     pose=_POSE,
     covariance=_several(_NUMBER),
+    reprojection_px=_NUMBER,
+    reason=_STRING,
 )
 
 _SCHEMAS = {
@@ -89,6 +93,7 @@ _SCHEMAS = {
         B=_several(_NUMBER),
         is_inlier={"type": "boolean"},
         reason=_STRING,
+        covariance=_several(_NUMBER),
     ),
 }
 

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.cleaning.trajectory import Trajectory
 from gtsam_rwhec.errors import NoiseError, OptionError
 from gtsam_rwhec.poses import Array
 
@@ -89,6 +90,9 @@ class RefineOptions:
     time_offsets : bool or tuple of str
         Estimate an offset of the clock of each sensor, or of those named: a stamp t is the carriers' t + offset
         (Kalibr's convention). Needs stamps.
+    carrier_path : Trajectory, optional
+        T_sensorcarrier_targetcarrier over time as it was logged, faster than measurements were made: time offsets move
+        A along it. Left out, the measurements' own A tell how the carriers moved.
     max_iterations : int
         Levenberg-Marquardt steps.
     """
@@ -101,6 +105,7 @@ class RefineOptions:
     carrier_noise: CarrierNoise | None = None
     carrier_model: CarrierModel = "auto"
     time_offsets: bool | tuple[str, ...] = False
+    carrier_path: Trajectory | None = None
     max_iterations: int = 100
 
     def __post_init__(self) -> None:
@@ -123,6 +128,8 @@ class RefineOptions:
                 f"RefineOptions.carrier_noise is a {type(self.carrier_noise).__name__}; give "
                 "CarrierNoise(rotation_rad=..., translation_m=...)"
             )
+        if self.carrier_path is not None and not self.time_offsets:
+            raise OptionError("RefineOptions.carrier_path is for time offsets; without time_offsets it says nothing")
         if self.residual == "chordal":
             for name, value in (
                 ("carrier_noise", self.carrier_noise),

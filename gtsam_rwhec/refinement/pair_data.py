@@ -9,6 +9,7 @@ from rwhec_factors import se3
 from rwhec_factors.batch import BatchResiduals
 
 from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.cleaning.trajectory import Trajectory
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.measurements import checked_covariances
 from gtsam_rwhec.poses import Array
@@ -100,10 +101,12 @@ class PairData:
         )
 
 
-def local_paths(problem: Problem, sensors: tuple[str, ...]) -> dict[Pair, LocalPaths]:
+def local_paths(
+    problem: Problem, sensors: tuple[str, ...], carrier_path: Trajectory | None = None
+) -> dict[Pair, LocalPaths]:
     """The carriers' motion about the stamps of the sensors' pairs.
 
-    The carriers are the same for all sensors and targets, as a rule, so that every pair's poses tell it; where two
+    From the path as it was logged where it is given; else from the measurements' own poses. The carriers are the same for all sensors and targets, as a rule, so that every pair's poses tell it; where two
     pairs have different poses at one stamp (several robots), each pair's own do.
 
     Raises
@@ -126,6 +129,11 @@ def local_paths(problem: Problem, sensors: tuple[str, ...]) -> dict[Pair, LocalP
             )
     if not pairs:
         return {}
+    if carrier_path is not None:
+        stamps_of = {pair: problem.measurements(*pair).stamps_ns for pair in pairs}
+        return {
+            pair: LocalPaths.along(carrier_path, stamps) for pair, stamps in stamps_of.items() if stamps is not None
+        }
     telling = [problem.measurements(*pair) for pair in problem.pairs if pair[0] != pair[1]]
     telling = [raw for raw in telling if raw.stamps_ns is not None]
     A = np.concatenate([raw.A for raw in telling])

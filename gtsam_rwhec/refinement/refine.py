@@ -233,7 +233,8 @@ def _data(problem: Problem, variables: Variables, options: RefineOptions) -> lis
             "the geodesic residual needs the raw measurements, and they were not kept (keep_measurements=False); make "
             "the problem with keep_measurements=True, or refine with RefineOptions(residual='chordal')"
         )
-    paths = local_paths(problem, tuple(name.partition(":")[2] for name in variables.offsets))
+    sensors = tuple(name.partition(":")[2] for name in variables.offsets)
+    paths = local_paths(problem, sensors, options.carrier_path)
     return [PairData.of(problem, pair, options, paths.get(pair)) for pair in problem.pairs]
 
 

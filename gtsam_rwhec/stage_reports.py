@@ -1,0 +1,74 @@
+"""What each stage from a log to a calibration reports: how much it used, and everything that it did not, with the reason.
+
+Kept in the logs that stages write, and in the result file.
+"""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Report(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TrackCount(_Report):
+    """One target in one sensor: how many measurements go on, and how many were removed for which reason."""
+
+    target: str = Field(description="the target's name")
+    sensor: str = Field(description="the sensor's name")
+    used: int = Field(description="measurements that went on")
+    removed: dict[str, int] = Field(default={}, description="those that did not, by reason")
+
+
+class DetectionReport(_Report):
+    """Of the detection stage."""
+
+    images: dict[str, int] = Field(description="images, or messages of a detection driver, by sensor")
+    undecoded: dict[str, tuple[str, ...]] = Field(description="images that could not be used, and why, by sensor")
+    tracks: tuple[TrackCount, ...] = Field(description="detections of each target in each sensor")
+    strangers: dict[str, int] = Field(description="tags that are no target, family and id: how often they were seen")
+    corner_px: dict[str, float] = Field(
+        description="standard deviation of a corner along each axis, pixels, by target/sensor, as measured"
+    )
+
+
+class CleaningReport(_Report):
+    """Of the cleaning stage."""
+
+    tracks: tuple[TrackCount, ...] = Field(description="measurements of each target by each sensor")
+    time_offsets_s: dict[str, float] = Field(
+        description="by sensor, with which the carriers' poses were taken: as given, or from turning rates"
+    )
+    coarse_sigma_s: dict[str, float] = Field(description="standard deviations of those from turning rates")
+
+
+class SizeFields(_Report):
+    """What the measurements say of a target's stated size."""
+
+    target: str = Field(description="the target's name")
+    stated_m: float = Field(description="the length as the rig file has it, metres")
+    scale: float = Field(description="stated / true length")
+    sigma: float = Field(description="standard deviation of scale")
+    is_free: bool = Field(description="true: left free in the answer, as the stated size does not fit, or on request")
+
+
+class TimeOffsetFields(_Report):
+    """A sensor's clock."""
+
+    sensor: str = Field(description="the sensor's name")
+    offset_s: float = Field(description="its stamp t is the carriers' t + offset")
+    sigma_s: float | None = Field(description="standard deviation; null where it was given, not estimated")
+
+
+class LogFields(_Report):
+    """Where a calibration's measurements came from, and what became of them."""
+
+    sources: tuple[str, ...] = Field(description="file names of the logs")
+    sensor_carrier: str = Field(description="name of the frame that carries the sensors")
+    target_carrier: str = Field(description="name of the frame that carries the targets")
+    detection: DetectionReport = Field(description="what the detection stage reported")
+    cleaning: CleaningReport = Field(description="what the cleaning stage reported")
+    outliers: tuple[TrackCount, ...] = Field(description="what the robust estimation used, and left out")
+    sizes: tuple[SizeFields, ...] = Field(description="none where sizes were taken as known")
+    time_offsets: tuple[TimeOffsetFields, ...] = Field(description="of every sensor that was used")
