@@ -55,6 +55,10 @@ class FileFormatError(RwhecError):
     """A file that cannot be read as what it should be; the message has the file and the line or field."""
 
 
+class RigError(FileFormatError):
+    """A rig file that cannot be used, each fault with its line; or a log of which none can be made."""
+
+
 class LogError(FileFormatError):
     """A log that cannot be read, or lacks what is asked of it; or one that could not be written."""
 

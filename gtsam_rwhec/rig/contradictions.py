@@ -1,0 +1,118 @@
+"""What is wrong with a rig file although each of its values is right: names given twice, targets that look alike."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING
+
+from gtsam_rwhec.errors import OptionError, TargetError
+from gtsam_rwhec.vision.options import DetectionOptions
+from gtsam_rwhec.vision.targets import Checkerboard, Target
+from gtsam_rwhec.yaml_lines import KeyPath, suggestion
+
+if TYPE_CHECKING:
+    from gtsam_rwhec.rig.schema import RigFile
+
+Fault = tuple[KeyPath, str]
+
+
+def contradictions(rig: RigFile) -> Iterator[Fault]:
+    """Every fault: the path of the value, and what is wrong with it."""
+    yield from _carriers(rig)
+    yield from _sensors(rig)
+    targets = []
+    if not rig.targets:
+        yield ("targets",), "none; give one or more"
+    for name, section in rig.targets.items():
+        try:
+            targets.append(section.target(name))
+        except TargetError as error:
+            yield ("targets", name), str(error).removeprefix(f"target {name}: ")
+    yield from _names(rig)
+    yield from _detection(rig)
+    yield from _lookalikes(targets)
+
+
+def _carriers(rig: RigFile) -> Iterator[Fault]:
+    carriers = rig.carriers
+    if carriers.sensors == carriers.targets:
+        yield ("carriers", "targets"), f"{carriers.targets!r} carries the sensors too; name two different frames"
+    elif set(carriers.poses.frames) != {carriers.sensors, carriers.targets}:
+        key = "tf" if carriers.poses.tf is not None else "parent"
+        parent, child = carriers.poses.frames
+        yield (
+            ("carriers", "poses", key),
+            f"poses of {child} in {parent} are not those of the carriers, {carriers.sensors} and {carriers.targets}; "
+            "name these two, either way round",
+        )
+
+
+def _sensors(rig: RigFile) -> Iterator[Fault]:
+    if not rig.sensors:
+        yield ("sensors",), "none; give one or more"
+    for key in ("images", "detections"):
+        first: dict[str, str] = {}
+        for name, sensor in rig.sensors.items():
+            topic = getattr(sensor, key)
+            if topic is not None and first.setdefault(topic, name) != name:
+                yield (
+                    ("sensors", name, key),
+                    f"{topic} is the topic of sensor {first[topic]} too; each sensor needs its own",
+                )
+
+
+def _names(rig: RigFile) -> Iterator[Fault]:
+    """Frames that have one name, whatever they are of."""
+    carriers = rig.carriers
+    named: list[tuple[str, KeyPath, str]] = [(carriers.sensors, ("carriers", "sensors"), "the sensors' carrier")]
+    if carriers.targets != carriers.sensors:
+        named.append((carriers.targets, ("carriers", "targets"), "the targets' carrier"))
+    for name, sensor in rig.sensors.items():
+        named.append((name, ("sensors", name), f"sensor {name}"))
+        if sensor.frame not in (None, name):
+            named.append((str(sensor.frame), ("sensors", name, "frame"), f"the frame of sensor {name}"))
+    named += [(name, ("targets", name), f"target {name}") for name in rig.targets]
+    first: dict[str, str] = {}
+    for name, path, what in named:
+        if first.setdefault(name, what) != what:
+            yield path, f"{name!r} is the name of {first[name]} already; each frame needs its own"
+
+
+def _detection(rig: RigFile) -> Iterator[Fault]:
+    known = [field.name for field in fields(DetectionOptions)]
+    for key, value in rig.detection.items():
+        if key not in known:
+            yield ("detection", key), suggestion(key, known)
+            continue
+        try:
+            replace(DetectionOptions(), **{key: value})
+        except OptionError as error:
+            yield ("detection", key), str(error)
+
+
+def _lookalikes(targets: list[Target]) -> Iterator[Fault]:
+    for first, second in itertools.combinations(targets, 2):
+        if isinstance(first, Checkerboard) and isinstance(second, Checkerboard):
+            if {first.columns, first.rows} == {second.columns, second.rows}:
+                yield (
+                    ("targets", second.name),
+                    f"a checkerboard of {second.columns} x {second.rows} inner corners like {first.name}: no image "
+                    "tells the two apart; take boards with tags",
+                )
+            continue
+        shared = sorted(set(first.ids) & set(second.ids))
+        if shared and _kind(first.family) == _kind(second.family):
+            some = ", ".join(map(str, shared[:5])) + (", ..." if len(shared) > 5 else "")
+            yield (
+                ("targets", second.name),
+                f"tags {some} of {second.family} belong to target {first.name} too: no image tells the two apart; "
+                "print targets with different ids",
+            )
+
+
+def _kind(family: str) -> str:
+    """Families whose tags with one id look the same: ArUco's smaller dictionaries begin its larger ones."""
+    return re.sub(r"^(aruco_\dx\d)_\d+$", r"\1", family)

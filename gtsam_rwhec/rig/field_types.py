@@ -1,0 +1,70 @@
+"""What single values of a rig file may be: names, lengths, positive numbers; wrong ones said in words."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import AfterValidator, BeforeValidator
+
+from gtsam_rwhec.vision.targets import LARGEST_M
+from gtsam_rwhec.yaml_lines import shown
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*")
+LONGEST_NAME = 100
+#: Seconds; beyond, nanoseconds do not fit 64 bits.
+LARGEST_OFFSET_S = 4e9
+
+
+def _name(text: str) -> str:
+    if not NAME.fullmatch(text) or len(text) > LONGEST_NAME:
+        raise ValueError(
+            f"{shown(text)} cannot be a frame's name: a letter first, then letters, digits and _, parts joined by /, "
+            f"at most {LONGEST_NAME} characters"
+        )
+    return text
+
+
+def _text(text: str) -> str:
+    if not text or not text.isprintable() or len(text) > 1000:
+        raise ValueError(f"{shown(text)} has no characters, unprintable ones, or too many")
+    return text
+
+
+def _positive(number: float) -> float:
+    if not number > 0.0:
+        raise ValueError(f"{number!r} must be above 0")
+    return number
+
+
+def _length(number: float) -> float:
+    if not number > 0.0:
+        raise ValueError(f"{number!r} is no length; give metres, above 0")
+    if number >= LARGEST_M:
+        raise ValueError(f"{number!r} m is {LARGEST_M:g} m or more; millimetres? Then write {number / 1000.0:g}")
+    return number
+
+
+def list_of(count: int, words: str) -> BeforeValidator:
+    """Of so many, which `words` describe."""
+
+    def check(given: Any) -> Any:
+        if not isinstance(given, (tuple, list)) or len(given) != count:
+            raise ValueError(f"{shown(given)}; give {words}")
+        return tuple(given)
+
+    return BeforeValidator(check)
+
+
+def _offset(given: Any) -> Any:
+    number = isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) <= LARGEST_OFFSET_S
+    if given != "estimate" and not number:
+        raise ValueError(f"{shown(given)}; give seconds, or the word estimate")
+    return given
+
+
+Name: TypeAlias = Annotated[str, AfterValidator(_name)]
+Text: TypeAlias = Annotated[str, AfterValidator(_text)]
+Positive: TypeAlias = Annotated[float, AfterValidator(_positive)]
+Length: TypeAlias = Annotated[float, AfterValidator(_length)]
+TimeOffset: TypeAlias = Annotated[float | Literal["estimate"], BeforeValidator(_offset)]

@@ -1,0 +1,263 @@
+"""The sections of a rig file, field by field: what there is, in which units, and what contradicts what.
+
+Read and written by `gtsam_rwhec.rig.rig_file`; made in Python as any pydantic model is. Nothing is converted, and a key
+that is not here is an error.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, ValidationError, model_validator
+from pydantic import Tag as UnionTag
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from gtsam_rwhec.rig.contradictions import contradictions
+from gtsam_rwhec.rig.field_types import Length, Name, Positive, Text, TimeOffset, list_of
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    def _given(self, *names: str) -> list[str]:
+        """Which of these are there."""
+        return [name for name in names if getattr(self, name) is not None]
+
+
+class PoseNoise(_Section):
+    """Standard deviations about and along each axis."""
+
+    rotation_deg: Positive = Field(description="standard deviation about each axis, degrees")
+    translation_mm: Positive = Field(description="standard deviation along each axis, millimetres")
+
+
+class PoseSource(_Section):
+    """Where the carriers' poses are: a pair of tf frames, or a topic whose poses are T_parent_child."""
+
+    tf: Annotated[tuple[Name, Name], list_of(2, "two frames, [parent, child]")] | None = None
+    topic: Text | None = None
+    parent: Name | None = None
+    child: Name | None = None
+
+    @property
+    def frames(self) -> tuple[str, str]:
+        """Parent and child, wherever the poses are."""
+        return self.tf if self.tf is not None else (self.parent or "", self.child or "")
+
+    @model_validator(mode="after")
+    def _is_one(self) -> PoseSource:
+        if len(self._given("tf", "topic")) != 1:
+            raise ValueError("give one of tf: [parent, child] and topic: ... (with parent and child)")
+        if self.tf is not None and self._given("parent", "child"):
+            raise ValueError("tf names both frames; leave parent and child out")
+        if self.topic is not None and len(self._given("parent", "child")) < 2:
+            raise ValueError(f"say of which frames the poses of {self.topic} are: parent: ..., child: ...")
+        return self
+
+
+class Carriers(_Section):
+    """What the sensors are mounted on, what the targets are, and where the log has the one's pose in the other."""
+
+    sensors: Name = Field(description="the frame that carries the sensors, such as hand")
+    targets: Name = Field(description="the frame that carries the targets, such as base")
+    poses: PoseSource = Field(description="where their poses are: {tf: [parent, child]} or {topic, parent, child}")
+    max_gap_s: Positive = 0.2
+    noise: PoseNoise | None = None
+
+
+class Intrinsics(_Section):
+    """Where a camera's intrinsics are: a topic, a Kalibr camchain, another YAML file, or right here."""
+
+    topic: Text | None = None
+    kalibr: Text | None = None
+    camera: Text | None = None
+    file: Text | None = None
+    model: str | None = None
+    width: int | None = None
+    height: int | None = None
+    K: Annotated[tuple[float, float, float, float], list_of(4, "[fx, fy, cx, cy] in pixels")] | None = None
+    D: tuple[float, ...] | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Intrinsics:
+        numbers = self._given("model", "width", "height", "K", "D")
+        sources = self._given("topic", "kalibr", "file") + (["numbers"] if numbers else [])
+        if len(sources) != 1:
+            raise ValueError(
+                f"{' and '.join(sources) or 'nothing'} given; give one of topic, kalibr (with camera), file, or "
+                "numbers (model, width, height, K, D)"
+            )
+        if (self.kalibr is None) != (self.camera is None):
+            raise ValueError("kalibr and camera go together: {kalibr: camchain.yaml, camera: cam0}")
+        if numbers:
+            self._check_numbers()
+        return self
+
+    def _check_numbers(self) -> None:
+        if self.width is None or self.height is None or self.K is None or self.model is None:
+            missing = [name for name in ("model", "width", "height", "K") if getattr(self, name) is None]
+            raise ValueError(f"{' and '.join(missing)} missing")
+        fx, fy, cx, cy = self.K
+        K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+        Camera.of(self.width, self.height, self.model, K, self.D or (), "these numbers")
+
+
+class Sensor(_Section):
+    """A camera, or a detection driver behind one."""
+
+    images: Text | None = Field(None, description="topic of the camera's images")
+    detections: Text | None = Field(None, description="topic of a driver's detections")
+    intrinsics: Intrinsics | None = None
+    time_offset: TimeOffset = 0.0
+    frame: Name | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Sensor:
+        given = self._given("images", "detections")
+        if len(given) != 1:
+            raise ValueError(
+                f"{' and '.join(given) or 'nothing'} given; give one of images and detections, which are topics"
+            )
+        if self.images is not None and self.intrinsics is None:
+            raise ValueError(
+                "images without intrinsics; give {topic: ...}, {kalibr: ..., camera: ...}, {file: ...} or numbers"
+            )
+        return self
+
+
+class TagTarget(_Section):
+    """A single tag."""
+
+    type: Literal["tag"]
+    family: str = Field(description="such as tag36h11")
+    id: int = Field(description="the number of the tag")
+    size_m: Length = Field(description="side of the black square, metres")
+
+    def target(self, name: str) -> Tag:
+        """Named."""
+        return Tag(name, self.family, self.id, self.size_m)
+
+
+class CharucoTarget(_Section):
+    """A ChArUco board of columns x rows squares."""
+
+    type: Literal["charuco"]
+    family: str = Field(description="such as aruco_5x5_100")
+    columns: int = Field(description="squares across")
+    rows: int = Field(description="squares down")
+    square_m: Length = Field(description="side of a square, metres")
+    marker_m: Length = Field(description="side of a marker, metres")
+    first_id: int = 0
+
+    def target(self, name: str) -> Charuco:
+        """Named."""
+        return Charuco(name, self.family, self.columns, self.rows, self.square_m, self.marker_m, self.first_id)
+
+
+class AprilGridTarget(_Section):
+    """Kalibr's AprilGrid."""
+
+    type: Literal["aprilgrid"]
+    family: str = Field(description="tag36h11 as a rule")
+    columns: int = Field(description="tags across")
+    rows: int = Field(description="tags down")
+    tag_m: Length = Field(description="side of a tag's black square, metres (Kalibr's tagSize)")
+    spacing: Positive = Field(description="gap between tags / side of a tag (Kalibr's tagSpacing)")
+    first_id: int = 0
+
+    def target(self, name: str) -> AprilGrid:
+        """Named."""
+        return AprilGrid(name, self.family, self.columns, self.rows, self.tag_m, self.spacing, self.first_id)
+
+
+class CheckerboardTarget(_Section):
+    """A checkerboard, counted by inner corners."""
+
+    type: Literal["checkerboard"]
+    columns: int = Field(description="inner corners across")
+    rows: int = Field(description="inner corners down")
+    square_m: Length = Field(description="side of a square, metres")
+
+    def target(self, name: str) -> Checkerboard:
+        """Named."""
+        return Checkerboard(name, self.columns, self.rows, self.square_m)
+
+
+TargetSection: TypeAlias = Annotated[
+    TagTarget | CharucoTarget | AprilGridTarget | CheckerboardTarget, Field(discriminator="type")
+]
+
+
+class Noise(_Section):
+    """Of B: standard deviations about and along each axis, or that of a corner in pixels."""
+
+    rotation_deg: Positive | None = None
+    translation_mm: Positive | None = None
+    corner_px: Positive | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Noise:
+        given = self._given("rotation_deg", "translation_mm", "corner_px")
+        if given not in (["rotation_deg", "translation_mm"], ["corner_px"]):
+            raise ValueError(
+                f"{' and '.join(given) or 'nothing'} given; give rotation_deg and translation_mm, or corner_px, or the "
+                "word estimate in place of the section"
+            )
+        return self
+
+
+class Cleaning(_Section):
+    """What is taken out before anything is solved; a limit that is left out (null) takes nothing out."""
+
+    min_rotation_deg: Positive = 0.5
+    min_translation_mm: Positive = 3.0
+    max_rotation_deg_s: Positive | None = None
+    max_translation_m_s: Positive | None = None
+    consensus: bool = True
+    thin: bool = True
+    robust: Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "gnc"] = "gnc"
+
+
+class RigFile(_Section):
+    """What a rig file says."""
+
+    carriers: Carriers = Field(description="what carries the sensors, what the targets, and where their poses are")
+    sensors: dict[Name, Sensor] = Field(description="by name, each with images or detections")
+    targets: dict[Name, TargetSection] = Field(description="by name, each with type and sizes")
+    sizes: Literal["known", "check", "estimate"] = "check"
+    noise: Annotated[
+        Annotated[Noise, UnionTag("numbers")] | Annotated[Literal["estimate"], UnionTag("word")],
+        Discriminator(lambda given: "word" if isinstance(given, str) else "numbers"),
+    ] = "estimate"
+    detection: dict[str, Any] = Field({}, description="fields of vision's DetectionOptions")
+    cleaning: Cleaning = Cleaning()
+
+    @cached_property
+    def target_list(self) -> tuple[Target, ...]:
+        """The targets as the vision package has them, named, in the file's order."""
+        return tuple(section.target(name) for name, section in self.targets.items())
+
+    def frame_of(self, sensor: str) -> str:
+        """The name of a sensor's frame."""
+        return self.sensors[sensor].frame or sensor
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> RigFile:
+        # pydantic puts the faults of a ValidationError that is raised here under their own places.
+        faults = [
+            InitErrorDetails(type=PydanticCustomError("value_error", "{words}", {"words": words}), loc=path, input=None)
+            for path, words in contradictions(self)
+        ]
+        if faults:
+            raise ValidationError.from_exception_data("rig", faults)
+        return self
+
+
+class Rig(RigFile):
+    """A rig file that has been read: what it says, and the folder that its relative paths are relative to."""
+
+    folder: Path = Path()

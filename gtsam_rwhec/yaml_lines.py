@@ -1,0 +1,272 @@
+"""YAML files whose every value knows its line, for messages that say where; read without trust.
+
+Only what people write by hand is read: one document of mappings, lists and scalars. Aliases (which can blow a small
+file up), tags (which can stand for any object), keys given twice and keys that are no text are refused. A scalar
+without quotes is a number, true, false or null as in YAML 1.2: ``1e-3`` is a number, ``no`` and ``12:30`` are text.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn, TypeAlias
+
+import yaml
+
+from gtsam_rwhec.errors import FileFormatError
+
+KeyPath: TypeAlias = tuple[str | int, ...]
+
+MOST_BYTES = 1_000_000
+#: Mappings and lists inside one another.
+DEEPEST = 20
+#: What `parse_yaml` is told to pass over in OpenCV's files.
+OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
+
+_WORDS = {
+    "": None, "~": None, "null": None, "Null": None, "NULL": None,
+    "true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False,
+}  # fmt: skip
+#: Longer ones become floats: Python does not convert thousands of digits.
+_INTEGER = re.compile(r"[-+]?[0-9]{1,18}")
+_NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_NOT_FINITE = re.compile(r"([-+]?)\.(inf|nan)", re.IGNORECASE)
+_PLAIN_KEY = re.compile(r"[A-Za-z0-9_/.-]+")
+
+
+@dataclass(frozen=True)
+class YamlFile:
+    """What a file holds, and where.
+
+    Attributes
+    ----------
+    where : str
+        The file, for messages.
+    data
+        Mappings are dicts with keys of text, lists are tuples, scalars are str, int, float, bool or None.
+    lines : mapping of key path to int
+        For each value the line of its key, or its own in a list; counted from 1.
+    """
+
+    where: str
+    data: Any
+    lines: Mapping[KeyPath, int]
+
+    def line(self, path: KeyPath) -> int:
+        """The line of a value; of what should contain it, if it is not there."""
+        while path and path not in self.lines:
+            path = path[:-1]
+        return self.lines.get(path, 1)
+
+    def fault(self, path: KeyPath, words: str) -> str:
+        """``FILE, line N: a.b[0]: words``."""
+        name = dotted(path)
+        return f"{self.where}, line {self.line(path)}: {name}{': ' if name else ''}{words}"
+
+
+def read_yaml(path: str | Path, *, tags: Collection[str] = ()) -> YamlFile:
+    """Read a file; see `parse_yaml`.
+
+    Raises
+    ------
+    FileFormatError
+        It cannot be read, is larger than `MOST_BYTES` or is not UTF-8; or as `parse_yaml`.
+    """
+    return parse_yaml(read_text(path), str(path), tags=tags)
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a small file.
+
+    Raises
+    ------
+    FileFormatError
+        It cannot be read, is larger than `MOST_BYTES` or is not UTF-8.
+    """
+    try:
+        with open(path, "rb") as stream:
+            content = stream.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
+    except ValueError as error:  # a name with a null character
+        raise FileFormatError(f"{str(path)!r} cannot be read: {error}.") from error
+    if len(content) > MOST_BYTES:
+        raise FileFormatError(f"{path} is larger than {MOST_BYTES} bytes; is it the right file? YAML was expected.")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path} is not a text file in UTF-8 (byte {error.start}); YAML was expected.") from error
+
+
+def parse_yaml(text: str, where: str, *, tags: Collection[str] = ()) -> YamlFile:
+    """Parse one document.
+
+    Parameters
+    ----------
+    text : str
+    where : str
+        The file, for messages.
+    tags : collection of str
+        Tags that are passed over; any other is refused.
+
+    Raises
+    ------
+    FileFormatError
+        It is not YAML, is empty, or has what is refused here (see the module); with the line.
+    """
+    builder = _Builder(where, frozenset(tags))
+    for event in _events(text, where):
+        builder.take(event)
+    if builder.documents == 0 or (builder.data is None and not builder.lines):
+        raise FileFormatError(f"{where} is empty; a YAML mapping was expected.")
+    return YamlFile(where, builder.data, builder.lines)
+
+
+def dotted(path: KeyPath) -> str:
+    """``sensors.cam_left.D[2]``; keys that are not plain in quotes."""
+    text = ""
+    for key in path:
+        if isinstance(key, int):
+            text += f"[{key}]"
+        else:
+            text += ("." if text else "") + (key if _PLAIN_KEY.fullmatch(key) else shown(key))
+    return text
+
+
+def suggestion(key: str, known: Collection[str]) -> str:
+    """What to say of an unknown key."""
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    return f"unknown key; did you mean {near[0]}?" if near else f"unknown key; there are {', '.join(known)}"
+
+
+def shown(value: Any) -> str:
+    """A value for a message, shortened."""
+    if value is None:
+        return "empty"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, dict):
+        return f"a mapping of {len(value)} keys"
+    if isinstance(value, tuple) and len(repr(value)) > 60:
+        return f"a list of {len(value)}"
+    text = repr(list(value)) if isinstance(value, tuple) else repr(value)
+    return text if len(text) <= 60 else text[:60] + "..."
+
+
+def _events(text: str, where: str) -> Iterator[Any]:
+    try:
+        loader = yaml.SafeLoader(text)
+        while loader.check_event():  # type: ignore[no-untyped-call]
+            yield loader.get_event()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = 1 if mark is None else mark.line + 1
+        said = " ".join(part for part in (error.context, error.problem) if part)
+        hint = "; indent with blanks, not tabs" if "'\\t'" in said else ""
+        raise FileFormatError(f"{where}, line {line}: not YAML: {said}{hint}") from error
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise FileFormatError(
+            f"{where}, line {line}: a character that no YAML file has ({error.character!r}); is it a text file?"
+        ) from error
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # escapes and versions beyond all bounds
+        raise FileFormatError(f"{where}: not YAML: {error}") from error
+
+
+@dataclass
+class _Open:
+    """A mapping or list that is being filled; `key` waits for its value."""
+
+    items: dict[str, Any] | list[Any]
+    path: KeyPath
+    key: str | None = None
+
+
+@dataclass
+class _Builder:
+    where: str
+    tags: frozenset[str]
+    data: Any = None
+    documents: int = 0
+    lines: dict[KeyPath, int] = field(default_factory=dict)
+    stack: list[_Open] = field(default_factory=list)
+
+    def take(self, event: Any) -> None:
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.DocumentStartEvent):
+            self.documents += 1
+            if self.documents > 1:
+                self._refuse(line, "a second document begins ('---'); one is read")
+        elif isinstance(event, yaml.AliasEvent):
+            self._refuse(line, f"the alias *{event.anchor}: aliases are not read; write the value out")
+        elif isinstance(event, yaml.NodeEvent):
+            self._take_node(event, line)
+        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
+            done = self.stack.pop()
+            self._place(done.items if isinstance(done.items, dict) else tuple(done.items))
+
+    def _take_node(self, event: Any, line: int) -> None:
+        if event.anchor is not None:
+            self._refuse(line, f"the anchor &{event.anchor}: anchors are not read; write values out where they are")
+        if event.tag is not None and event.tag not in self.tags:
+            tag = event.tag.replace("tag:yaml.org,2002:", "!!")
+            self._refuse(line, f"the tag {shown(tag)}: tags are not read; write a plain value")
+        top = self.stack[-1] if self.stack else None
+        if top is not None and isinstance(top.items, dict) and top.key is None:
+            self._take_key(top, event, line)
+            return
+        path = self._path()
+        # In a mapping the key's line stands already.
+        self.lines.setdefault(path, line)
+        if isinstance(event, yaml.ScalarEvent):
+            self._place(_scalar(event.value) if event.style is None else event.value)
+            return
+        if len(self.stack) == DEEPEST:
+            self._refuse(line, f"more than {DEEPEST} mappings and lists inside one another")
+        self.stack.append(_Open({} if isinstance(event, yaml.MappingStartEvent) else [], path))
+
+    def _take_key(self, mapping: _Open, event: Any, line: int) -> None:
+        if not isinstance(event, yaml.ScalarEvent):
+            self._refuse(line, "a key that is itself a list or a mapping; is a {, [ or ? too many there?")
+        key = event.value
+        path = (*mapping.path, key)
+        if key in mapping.items:
+            self._refuse(line, f"{dotted(path)} is there twice, first in line {self.lines[path]}; keep one")
+        mapping.key = key
+        self.lines[path] = line
+
+    def _path(self) -> KeyPath:
+        """Of the next value."""
+        if not self.stack:
+            return ()
+        top = self.stack[-1]
+        return (*top.path, len(top.items) if top.key is None else top.key)
+
+    def _place(self, value: Any) -> None:
+        if not self.stack:
+            self.data = value
+            return
+        top = self.stack[-1]
+        if isinstance(top.items, list):
+            top.items.append(value)
+        elif top.key is not None:
+            top.items[top.key] = value
+            top.key = None
+
+    def _refuse(self, line: int, words: str) -> NoReturn:
+        raise FileFormatError(f"{self.where}, line {line}: {words}.")
+
+
+def _scalar(text: str) -> str | int | float | bool | None:
+    """What a scalar without quotes stands for, as YAML 1.2's core schema has it (without 0o and 0x)."""
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INTEGER.fullmatch(text):
+        return int(text)
+    if _NUMBER.fullmatch(text):
+        return float(text)
+    match = _NOT_FINITE.fullmatch(text)
+    return float(match[1] + match[2]) if match else text
