@@ -159,8 +159,8 @@ def shown(value: Any) -> str:
 def _events(text: str, where: str) -> Iterator[Any]:
     try:
         loader = yaml.SafeLoader(text)
-        while loader.check_event():  # type: ignore[no-untyped-call]
-            yield loader.get_event()
+        while loader.check_event():
+            yield loader.get_event()  # type: ignore[no-untyped-call]
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = 1 if mark is None else mark.line + 1

@@ -1,0 +1,209 @@
+"""Intrinsics from files: Kalibr's camchains, ROS's camera_info YAML, and what OpenCV's FileStorage writes.
+
+OpenCV's own reader is not used: it gives no lines, and takes nearly anything.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.vision.camera import MODELS, Camera
+from gtsam_rwhec.yaml_lines import OPENCV_MATRIX, KeyPath, YamlFile, parse_yaml, read_text, read_yaml, shown
+
+#: Kalibr's words for distortion of its camera model pinhole.
+KALIBR_DISTORTIONS = ("none", "radtan", "equidistant")
+_KALIBR_CAMERA = re.compile(r"cam\d+")
+#: Keys of intrinsics, in lower case and without underscores, as ROS, OpenCV's samples and people write them.
+_WIDTH, _HEIGHT = ("imagewidth", "width"), ("imageheight", "height")
+_MATRIX = ("cameramatrix", "k")
+_COEFFICIENTS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "d")
+_MODEL = ("distortionmodel", "cameramodel")
+
+
+def read_kalibr_camchain(path: str | Path) -> dict[str, Camera]:
+    """Read a Kalibr camchain (``camchain.yaml``, ``camchain-imucam.yaml``).
+
+    Parameters
+    ----------
+    path
+        Each camera has camera_model (pinhole), intrinsics [fu, fv, pu, pv], distortion_model (none, radtan or
+        equidistant), distortion_coeffs and resolution [width, height]. Poses and time shifts are passed over.
+
+    Returns
+    -------
+    dict of str to Camera
+        By Kalibr's names, ``cam0`` and so on.
+
+    Raises
+    ------
+    FileFormatError
+        It cannot be read or is no camchain, a field is missing or is not what it should be; with its line.
+    CameraError
+        The intrinsics are those of no camera.
+    """
+    file = read_yaml(path)
+    chain = file.data if isinstance(file.data, dict) else {}
+    names = [name for name in chain if _KALIBR_CAMERA.fullmatch(name)]
+    if not names:
+        other = " (it has a camera matrix: is it a calibration of ROS or OpenCV?)" if _found(chain, _MATRIX) else ""
+        _refuse(file, (), f"no cameras cam0, cam1, ...{other}; a Kalibr camchain was expected")
+    return {name: _kalibr_camera(file, name) for name in names}
+
+
+def _kalibr_camera(file: YamlFile, name: str) -> Camera:
+    section = file.data[name]
+    if not isinstance(section, dict):
+        _refuse(file, (name,), f"{shown(section)}; a camera's section was expected")
+    for key in ("camera_model", "intrinsics", "distortion_model", "resolution"):
+        if key not in section:
+            _refuse(file, (name, key), "is missing")
+    if section["camera_model"] != "pinhole":
+        _refuse(
+            file,
+            (name, "camera_model"),
+            f"{shown(section['camera_model'])} is not supported, only pinhole is; calibrate with Kalibr's "
+            "pinhole-radtan or, for wide lenses, pinhole-equi",
+        )
+    model = section["distortion_model"]
+    if model not in KALIBR_DISTORTIONS:
+        _refuse(
+            file,
+            (name, "distortion_model"),
+            f"{shown(model)} is not supported; supported are {', '.join(KALIBR_DISTORTIONS)}",
+        )
+    fu, fv, pu, pv = _numbers(file, (name, "intrinsics"), section["intrinsics"], 4)
+    resolution = _numbers(file, (name, "resolution"), section["resolution"], 2)
+    width, height = (_pixels(file, (name, "resolution"), float(side)) for side in resolution)
+    coefficients = section.get("distortion_coeffs", () if model == "none" else None)
+    D = _numbers(file, (name, "distortion_coeffs"), coefficients, None if model == "none" else 4)
+    K = np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
+    return Camera.of(width, height, model, K, D, file.fault((name,), "").removesuffix(": "))
+
+
+def read_calibration_yaml(path: str | Path) -> Camera:
+    """Read a camera from ROS's camera_info YAML (``ost.yaml``) or from what OpenCV's FileStorage writes.
+
+    Parameters
+    ----------
+    path
+        With image_width, image_height, camera_matrix, distortion_coefficients, and distortion_model. Where there is no
+        distortion_model, fisheye_model (OpenCV's sample) tells; five coefficients or more are OpenCV's radtan.
+
+    Raises
+    ------
+    FileFormatError
+        It cannot be read, a field is missing or is not what it should be, or four coefficients could be of either
+        model; with the line.
+    CameraError
+        The intrinsics are those of no camera.
+    """
+    # OpenCV's "%YAML:1.0" is no directive of YAML's.
+    text = re.sub(r"\A%YAML:", "%YAML ", read_text(path))
+    file = parse_yaml(text, str(path), tags=(OPENCV_MATRIX,))
+    fields = file.data if isinstance(file.data, dict) else {}
+    if any(_KALIBR_CAMERA.fullmatch(name) for name in fields):
+        _refuse(file, (), "a Kalibr camchain; give it in the rig file as {kalibr: FILE, camera: cam0}")
+    width, height = (_pixels(file, (key,), fields[key]) for key in (_key(file, _WIDTH), _key(file, _HEIGHT)))
+    key = _key(file, _MATRIX)
+    K = _matrix(file, key, 9).reshape(3, 3)
+    D = _matrix(file, _key(file, _COEFFICIENTS), None)
+    return Camera.of(width, height, _model(file, D), K, D, file.fault((key,), "").removesuffix(": "))
+
+
+def _model(file: YamlFile, D: Array) -> str:
+    fields = file.data
+    key = _found(fields, _MODEL)
+    if key is not None:
+        word = fields[key]
+        if not isinstance(word, str) or word.strip().lower() not in MODELS:
+            _refuse(
+                file,
+                (key,),
+                f"{shown(word)} is not supported; supported are {', '.join(word for word in MODELS if word)}",
+            )
+        return word
+    fisheye = _found(fields, ("fisheyemodel",))
+    if fisheye is not None:
+        if fields[fisheye] not in (0, 1):
+            _refuse(file, (fisheye,), f"{shown(fields[fisheye])}; give 0 or 1")
+        return "fisheye" if fields[fisheye] else "radtan"
+    if len(D) == 4 and D.any():
+        _refuse(
+            file,
+            (_key(file, _COEFFICIENTS),),
+            "four coefficients, which OpenCV's fisheye model has and its other one can have; add a line "
+            "distortion_model: fisheye, or distortion_model: radtan",
+        )
+    return "radtan"
+
+
+def _found(fields: dict[str, Any], names: tuple[str, ...]) -> str | None:
+    """The key that stands for one of `names`, if there is one."""
+    plain = {key.lower().replace("_", ""): key for key in reversed(fields)}
+    return next((plain[name] for name in names if name in plain), None)
+
+
+def _key(file: YamlFile, names: tuple[str, ...]) -> str:
+    key = _found(file.data, names) if isinstance(file.data, dict) else None
+    if key is None:
+        _refuse(
+            file,
+            (),
+            f"no {_SAID[names]}; a calibration with image_width, image_height, camera_matrix and "
+            "distortion_coefficients was expected (as ROS's camera_info and OpenCV's samples have it)",
+        )
+    return key
+
+
+_SAID = {
+    _WIDTH: "image_width",
+    _HEIGHT: "image_height",
+    _MATRIX: "camera_matrix",
+    _COEFFICIENTS: "distortion_coefficients",
+}
+
+
+def _matrix(file: YamlFile, key: str, count: int | None) -> Array:
+    """Numbers of a matrix: {rows, cols, data}, a list, or a list of rows."""
+    value, path = file.data[key], (key,)
+    if not isinstance(value, dict):
+        if isinstance(value, tuple) and value and all(isinstance(row, tuple) for row in value):
+            value = tuple(number for row in value for number in row)
+        return _numbers(file, path, value, count)
+    for part in ("rows", "cols", "data"):
+        if part not in value:
+            _refuse(file, (*path, part), "is missing; a matrix has rows, cols and data")
+    numbers = _numbers(file, (*path, "data"), value["data"], count)
+    rows, cols = value["rows"], value["cols"]
+    if not isinstance(rows, int) or not isinstance(cols, int) or rows * cols != len(numbers):
+        _refuse(file, (*path, "data"), f"{len(numbers)} numbers for {shown(rows)} rows and {shown(cols)} columns")
+    return numbers
+
+
+def _numbers(file: YamlFile, path: KeyPath, value: Any, count: int | None) -> Array:
+    if value is None:
+        _refuse(file, path, "is missing" if path not in file.lines else "is empty")
+    if not isinstance(value, tuple) or (count is not None and len(value) != count):
+        many = f"a list of {count} numbers" if count is not None else "a list of numbers"
+        _refuse(file, path, f"{shown(value)}; {many} was expected")
+    for i, number in enumerate(value):
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
+            _refuse(file, (*path, i), f"{shown(number)}; a finite number was expected")
+    return np.array(value, dtype=float)
+
+
+def _pixels(file: YamlFile, path: KeyPath, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value % 1:
+        _refuse(file, path, f"{shown(value)}; a whole number of pixels was expected")
+    return int(value)
+
+
+def _refuse(file: YamlFile, path: KeyPath, words: str) -> NoReturn:
+    raise FileFormatError(file.fault(path, words) + ".")
