@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs.mcap_reader import Log
-from gtsam_rwhec.logs.records import Array, DetectionRecord, PairRecord
+from gtsam_rwhec.logs.records import Array, DetectionRecord, IntrinsicsRecord, PairRecord
 from gtsam_rwhec.logs.written_schemas import json_schema
 
 Images = Literal["copy", "leave_out"]
@@ -149,6 +149,21 @@ class LogWriter:
             "format": encoding,
         }
         self._write(topic, "foxglove.CompressedImage", stamp_ns, message)
+
+    def calibration(self, intrinsics: IntrinsicsRecord) -> None:
+        """Write a ``foxglove.CameraCalibration`` to its topic; numbers come back as they were, to the last bit.
+
+        `intrinsics.model` is written as it is; Foxglove knows ``plumb_bob`` (k1, k2, p1, p2, k3),
+        ``rational_polynomial`` (k1, k2, p1, p2, k3 to k6) and ``kannala_brandt`` (OpenCV's fisheye, k1 to k4).
+        """
+        message = {
+            "timestamp": _time(intrinsics.stamp_ns), "frame_id": intrinsics.frame,
+            "width": int(intrinsics.width), "height": int(intrinsics.height),
+            "distortion_model": intrinsics.model, "D": np.ravel(intrinsics.D).tolist(),
+            "K": np.ravel(intrinsics.K).tolist(), "R": np.ravel(intrinsics.R).tolist(),
+            "P": np.ravel(intrinsics.P).tolist(),
+        }  # fmt: skip
+        self._write(intrinsics.topic, "foxglove.CameraCalibration", intrinsics.stamp_ns, message)
 
     def annotations(self, topic: str, stamp_ns: int, outlines: Sequence[tuple[str, Array]]) -> None:
         """Write a ``foxglove.ImageAnnotations`` of (label, points (N, 2) in pixels): closed outlines, labelled."""

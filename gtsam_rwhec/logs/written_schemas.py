@@ -84,6 +84,17 @@ _SCHEMAS = {
     "foxglove.CompressedImage": _message(
         timestamp=_TIME, frame_id=_STRING, data={"type": "string", "contentEncoding": "base64"}, format=_STRING
     ),
+    "foxglove.CameraCalibration": _message(
+        timestamp=_TIME,
+        frame_id=_STRING,
+        width=_INTEGER,
+        height=_INTEGER,
+        distortion_model=_STRING,
+        D=_several(_NUMBER),
+        K=_several(_NUMBER),
+        R=_several(_NUMBER),
+        P=_several(_NUMBER),
+    ),
     "gtsam_rwhec.TagDetections": _message(timestamp=_TIME, frame_id=_STRING, detections=_several(_DETECTION)),
     "gtsam_rwhec.MeasuredPair": _message(
         timestamp=_TIME,

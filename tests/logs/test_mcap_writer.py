@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs import DetectionRecord, LogWriter, PairRecord, PoseRecord, open_log
+from gtsam_rwhec.logs import DetectionRecord, IntrinsicsRecord, LogWriter, PairRecord, PoseRecord, open_log
 
 T0 = 1_700_000_000_000_000_001
 T = se3.expmap(np.random.default_rng(0).normal(size=(4, 6)))
@@ -55,6 +55,25 @@ def test_detections_and_pairs_come_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.A, T[1])
     np.testing.assert_array_equal(back.B, T[2])
     assert (back.target, back.sensor, back.is_inlier, back.reason) == ("tag", "cam", False, "too fast")
+
+
+def test_calibrations_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    K, P = np.array([[520.1, 0, 322.3], [0, 518.7, 238.9], [0, 0, 1]]), np.arange(12.0).reshape(3, 4) / 7
+    given = [
+        IntrinsicsRecord(T0, T0, "/left/info", "left", 640, 480, "plumb_bob", K, np.arange(5) / 3, T[0][:3, :3], P),
+        IntrinsicsRecord(T0 + 1, T0 + 1, "/wide/info", "wide", 320, 240, "kannala_brandt", K / 2, K[0], np.eye(3), P),
+        IntrinsicsRecord(T0 + 2, T0 + 2, "/bare/info", "bare", 8, 6, "", K, np.zeros(0), np.eye(3), P),
+    ]
+    with LogWriter(path) as out:
+        for intrinsics in given:
+            out.calibration(intrinsics)
+    for back, intrinsics in zip(read(path), given, strict=True):
+        assert isinstance(back, IntrinsicsRecord)
+        for name in ("logged_ns", "stamp_ns", "topic", "frame", "width", "height", "model"):
+            assert getattr(back, name) == getattr(intrinsics, name)
+        for name in "KDRP":
+            np.testing.assert_array_equal(getattr(back, name), getattr(intrinsics, name))
 
 
 def test_annotations_metadata_and_attachments(tmp_path: Path) -> None:
