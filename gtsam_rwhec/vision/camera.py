@@ -7,9 +7,11 @@ u = f x_distorted + c with pixel centres at whole numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CameraError
@@ -29,7 +31,7 @@ COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5, 8, 12, 14), "equidistant": (4,
 #: pinhole, 50 one degree.
 FOCAL_RANGE = (0.05, 50.0)
 MOST_PIXELS = 1 << 28
-#: Newton steps of undistorting, and how near (normalised) they must come.
+#: Newton's steps of undistorting, and how near (normalised) they must come.
 STEPS, NEAR = 30, 1e-10
 
 
@@ -118,11 +120,14 @@ class Camera:
         return Camera(width, height, kind, K, padded)
 
     def project(self, points: Array) -> Array:
-        """Pixels (..., 2) of points (..., 3) in the camera's frame, any unit; nan behind the camera."""
+        """Pixels (..., 2) of points (..., 3) in the camera's frame, any unit.
+
+        nan behind the camera and beyond `ring`: polynomials bring such points back into the image, lenses do not.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             x = points[..., :2] / points[..., 2:]
-        x = np.where(points[..., 2:] > 0.0, x, np.nan)
-        return self.pixels(x)
+            seen = (points[..., 2:] > 0.0) & (np.linalg.norm(x, axis=-1, keepdims=True) < self.ring)
+        return self.pixels(np.where(seen, x, np.nan))
 
     def pixels(self, x: Array) -> Array:
         """Pixels (..., 2) of normalised coordinates (..., 2)."""
@@ -141,10 +146,9 @@ class Camera:
         wanted = (np.asarray(pixels, dtype=float) - self._centre) / self._focal
         if self.model == "pinhole":
             return wanted
+        if self.model == "equidistant":
+            return self._undistorted_fisheye(wanted)
         x = wanted.copy()
-        if self.model == "equidistant":  # theta_d as if it were theta: near for any lens
-            theta = np.linalg.norm(wanted, axis=-1, keepdims=True)
-            x = wanted * np.where(theta < 1.5, np.tan(np.minimum(theta, 1.5)) / np.maximum(theta, 1e-12), np.nan)
         with np.errstate(all="ignore"):
             for _ in range(STEPS):
                 distorted, J = self._distorted(x)
@@ -162,9 +166,41 @@ class Camera:
                 x = np.where(det[..., None] > 0.0, x + step, np.nan)
                 if not np.nanmax(np.abs(step), initial=0.0) > NEAR:
                     break
-            again = self._distorted(x)[0]
-            x = np.where((np.abs(again - wanted) < 1e-8).all(axis=-1, keepdims=True), x, np.nan)
-        return x
+            reached = (np.abs(self._distorted(x)[0] - wanted) < 1e-8).all(axis=-1, keepdims=True)
+            within = np.linalg.norm(x, axis=-1, keepdims=True) < self.ring
+        return np.where(reached & within, x, np.nan)
+
+    def _undistorted_fisheye(self, wanted: Array) -> Array:
+        """As `undistort`, of distorted normalised coordinates: Newton on the angle, at which tan does not run away."""
+        k1, k2, k3, k4 = self.D
+        curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4])
+        slope = curve.deriv()
+        furthest = float(np.arctan(self.ring))
+        theta_d = np.linalg.norm(wanted, axis=-1, keepdims=True)
+        theta = np.minimum(theta_d, furthest)
+        with np.errstate(all="ignore"):
+            for _ in range(STEPS):
+                before = theta
+                theta = np.clip(theta + (theta_d - curve(theta)) / slope(theta), 0.0, furthest)
+                if not np.nanmax(np.abs(theta - before), initial=0.0) > NEAR:
+                    break
+            seen = (np.abs(curve(theta) - theta_d) < 1e-9) & (theta < furthest)
+            return np.where(seen, wanted * np.where(theta_d > 0.0, np.tan(theta) / theta_d, 1.0), np.nan)
+
+    @cached_property
+    def ring(self) -> float:
+        """Normalised radius at which the radial distortion folds back (or has a pole), infinite where it never does."""
+        if self.model == "pinhole":
+            return float("inf")
+        if self.model == "equidistant":
+            # d theta_d / d theta, in theta^2
+            squared = _first_root(Polynomial([1.0, *(self.D * [3.0, 5.0, 7.0, 9.0])]))
+            return float(np.tan(np.sqrt(squared))) if squared < (0.5 * np.pi) ** 2 else float("inf")
+        k1, k2, _, _, k3, k4, k5, k6 = np.pad(self.D, (0, 8))[:8]
+        above, below = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+        # d(r above / below) / dr, times below^2, in r^2
+        slope = above * below + Polynomial([0.0, 2.0]) * (above.deriv() * below - above * below.deriv())
+        return float(np.sqrt(min(_first_root(slope), _first_root(below))))
 
     def inside(self, pixels: Array) -> np.ndarray:
         """Which pixels (..., 2) are in the image; (...) booleans."""
@@ -186,6 +222,14 @@ class Camera:
         if self.model == "radtan":
             return _radtan(x, self.D)
         return x, np.broadcast_to(np.eye(2), (*x.shape[:-1], 2, 2))
+
+
+def _first_root(polynomial: Polynomial) -> float:
+    """Smallest real root above 0 of a polynomial that is 1 at 0; infinite if it has none."""
+    # Of its reciprocals: the last coefficients may be next to nothing, the first is not.
+    roots = np.roots(polynomial.coef)
+    inverse = float(roots[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)].real.max(initial=0.0))
+    return 1.0 / inverse if inverse > 1e-12 else float("inf")
 
 
 def _radtan(x: Array, D: Array) -> tuple[Array, Array]:

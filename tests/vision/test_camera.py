@@ -1,0 +1,230 @@
+"""Projection against OpenCV's, derivatives in numbers, the way back, and intrinsics that are those of no camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gtsam_rwhec.errors import CameraError
+from gtsam_rwhec.vision.camera import Camera
+
+K = np.array([[420.0, 0.0, 322.5], [0.0, 431.0, 236.0], [0.0, 0.0, 1.0]])
+#: Ordinary lenses of each model.
+LENSES = {
+    "none": ("pinhole", ()),
+    "four": ("plumb_bob", (-0.28, 0.09, 0.0008, -0.0005)),
+    "five": ("plumb_bob", (-0.31, 0.14, -0.001, 0.0012, -0.03)),
+    "eight": ("rational_polynomial", (0.5, 0.2, 0.001, -0.0007, 0.01, 0.85, 0.31, 0.05)),
+    "twelve": ("rational_polynomial", (0.4, 0.1, 1e-3, -7e-4, 0.01, 0.75, 0.2, 0.03, 2e-3, -1e-3, 1e-3, 5e-4)),
+    "pincushion": ("plumb_bob", (0.11, 0.04, -0.0006, 0.0004)),
+    "fisheye": ("equidistant", (-0.02, 0.006, -0.004, 0.0008)),
+    "wide fisheye": ("fisheye", (0.06, -0.01, 0.002, -0.0003)),
+}
+EVERY = pytest.mark.parametrize("lens", LENSES)
+
+
+def camera_of(lens: str) -> Camera:
+    model, D = LENSES[lens]
+    return Camera.of(640, 480, model, K, D, "test")
+
+
+def coefficients(count: int) -> st.SearchStrategy[np.ndarray]:
+    number = st.floats(-0.3, 0.3, allow_subnormal=False)
+    return st.lists(number, min_size=count, max_size=count).map(np.array)
+
+
+POINTS = st.lists(
+    st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(0.8, 5.0)), min_size=1, max_size=5
+).map(lambda rows: np.array(rows, dtype=float))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from([4, 5, 8, 12]).flatmap(coefficients), POINTS)
+def test_radtan_is_opencvs(D: np.ndarray, points: np.ndarray) -> None:
+    camera = Camera.of(640, 480, "plumb_bob" if len(D) < 8 else "rational_polynomial", K, D, "test")
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, D)
+    found = camera.pixels(points[:, :2] / points[:, 2:])
+    # Random rational coefficients have poles, near which all digits go.
+    size = 1.0 + np.abs(expected).max()
+    if size < 1e7:
+        np.testing.assert_allclose(found, expected[:, 0], atol=1e-9 * size)
+
+
+@settings(max_examples=80, deadline=None)
+@given(coefficients(4), POINTS)
+def test_equidistant_is_opencvs(D: np.ndarray, points: np.ndarray) -> None:
+    camera = Camera.of(640, 480, "equidistant", K, D, "test")
+    expected, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), K, D)
+    np.testing.assert_allclose(camera.pixels(points[:, :2] / points[:, 2:]), expected[:, 0], atol=1e-7)
+
+
+@EVERY
+def test_project_is_pixels_of_what_is_in_front(lens: str) -> None:
+    camera = camera_of(lens)
+    points = np.random.default_rng(2).uniform([-0.6, -0.6, 1.0], [0.6, 0.6, 2.0], (5, 8, 3))
+    np.testing.assert_allclose(camera.project(points), camera.pixels(points[..., :2] / points[..., 2:]))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from([4, 5, 8]).flatmap(coefficients), st.booleans())
+def test_the_ring_is_where_the_radius_turns_back(D: np.ndarray, is_fisheye: bool) -> None:
+    D = D[:4] if is_fisheye else np.concatenate([D[:2], [0.0, 0.0], D[4:]])
+    camera = Camera.of(640, 480, "equidistant" if is_fisheye else "rational_polynomial", K, D, "test")
+    r = np.linspace(0.0, 30.0, 3001) if is_fisheye else np.linspace(0.0, 5.0, 3001)
+    slope = camera.pixel_jacobian(np.stack([r, np.zeros_like(r)], axis=1))[1][:, 0, 0]
+    assert (slope[r < 0.999 * camera.ring] > 0.0).all()
+    if camera.ring < r[-1]:  # at once beyond it
+        beyond = np.array([[camera.ring * 1.0001, 0.0]])
+        at_a_pole = np.abs(camera.pixels(beyond)).max() > 1e4
+        assert at_a_pole or camera.pixel_jacobian(beyond)[1][0, 0, 0] < 1e-6
+        points = np.array([[0.999 * camera.ring, 0.0, 1.0], [1.001 * camera.ring, 0.0, 1.0]])
+        assert np.isnan(camera.project(points)).any(axis=1).tolist() == [False, True]
+
+
+def test_the_axis_is_the_principal_point() -> None:
+    for lens in LENSES:
+        assert camera_of(lens).project(np.array([0.0, 0.0, 2.0])).tolist() == [322.5, 236.0]
+
+
+@EVERY
+def test_derivatives_in_numbers(lens: str) -> None:
+    camera, h = camera_of(lens), 1e-6
+    random = np.random.default_rng(0).uniform(-0.8, 0.8, (40, 2))
+    near_the_axis = np.random.default_rng(1).normal(size=(20, 2)) * np.repeat(10.0 ** -np.arange(3, 8), 4)[:, None]
+    x = np.concatenate([random, near_the_axis, np.zeros((1, 2)), [[0.3, 0.0], [0.0, -0.4]]])
+    pixels, J = camera.pixel_jacobian(x)
+    np.testing.assert_allclose(pixels, camera.pixels(x))
+    for k, step in enumerate(h * np.eye(2)):
+        numeric = (camera.pixels(x + step) - camera.pixels(x - step)) / (2 * h)
+        np.testing.assert_allclose(J[..., k], numeric, atol=2e-6 * 431)
+
+
+@EVERY
+def test_there_and_back(lens: str) -> None:
+    camera = camera_of(lens)
+    u, v = np.meshgrid(np.linspace(-0.5, 639.5, 33), np.linspace(-0.5, 479.5, 25))
+    pixels = np.stack([u, v], axis=-1)
+    x = camera.undistort(pixels)
+    assert np.isfinite(x).all()
+    np.testing.assert_allclose(camera.pixels(x), pixels, atol=1e-5)
+    again = camera.undistort(camera.pixels(0.9 * x))
+    np.testing.assert_allclose(again, 0.9 * x, atol=1e-8)
+
+
+def test_a_fisheye_sees_nearly_to_the_side() -> None:
+    wide = [[200.0, 0.0, 320.0], [0.0, 200.0, 240.0], [0.0, 0.0, 1.0]]
+    camera = Camera.of(640, 480, "equidistant", wide, (0.1, 0.0, 0.0, 0.0), "test")
+    theta = np.radians([60.0, 75.0, 85.0])
+    x = np.tan(theta)[:, None] * np.array([0.6, 0.8])
+    np.testing.assert_allclose(camera.undistort(camera.pixels(x)), x, rtol=1e-8)
+
+
+def test_behind_the_camera_nothing_is_seen() -> None:
+    points = np.array([[0.1, 0.2, 1.0], [0.1, 0.2, -1.0], [0.1, 0.2, 0.0], [0.0, 0.0, 0.0]])
+    for lens in LENSES:
+        pixels = camera_of(lens).project(points)
+        assert np.isfinite(pixels).all(axis=1).tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("model", "D", "ring"),
+    [("plumb_bob", (-0.28, 0.0, 0.0, 0.0), np.sqrt(1.0 / (3 * 0.28))), ("equidistant", (-0.2, 0.0, 0.0, 0.0), None)],
+)
+def test_beyond_the_ring_where_the_lens_folds_back_no_ray_leads(model: str, D: tuple[float], ring: float) -> None:
+    camera = Camera.of(640, 480, model, K, D, "test")
+    if ring is None:  # theta (1 - 0.2 theta^2) is largest where 0.6 theta^2 = 1
+        theta = np.sqrt(1.0 / 0.6)
+        furthest, ring = theta * (1.0 - 0.2 * theta**2), np.tan(theta)
+    else:
+        furthest = ring * (1.0 - 0.28 * ring**2)
+    directions = np.stack([np.cos(np.arange(12.0)), np.sin(np.arange(12.0))], axis=1)
+    for share in (0.5, 0.9, 0.99):
+        x = camera.undistort(camera.pixels(share * ring * directions))
+        np.testing.assert_allclose(x, share * ring * directions, atol=1e-7)
+    for share in (1.01, 1.1, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0):
+        pixels = share * furthest * directions * np.diagonal(K)[:2] + K[:2, 2]
+        assert np.isnan(camera.undistort(pixels)).all(), share
+
+
+def test_one_pixel_that_no_ray_leads_to_does_not_spoil_others() -> None:
+    camera = Camera.of(640, 480, "plumb_bob", K, (-0.28, 0.0, 0.0, 0.0), "test")
+    x = np.array([[0.1, 0.2], [0.3, -0.1]])
+    pixels = np.concatenate([camera.pixels(x), [[5000.0, 5000.0], [np.nan, 3.0]]])
+    back = camera.undistort(pixels)
+    np.testing.assert_allclose(back[:2], x, atol=1e-9)
+    assert np.isnan(back[2:]).all()
+
+
+def test_inside_goes_to_the_pixels_outer_edges() -> None:
+    camera = camera_of("none")
+    pixels = np.array([[-0.5, -0.5], [639.5, 479.5], [-0.6, 0.0], [640.0, 0.0], [0.0, 480.0], [np.nan, 1.0]])
+    assert camera.inside(pixels).tolist() == [True, True, False, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("word", "model"),
+    [
+        ("plumb_bob", "radtan"),
+        ("Rational_Polynomial", "radtan"),
+        ("radtan", "radtan"),
+        ("kannala_brandt", "equidistant"),
+        ("fisheye", "equidistant"),
+        (" equidistant ", "equidistant"),
+    ],
+)
+def test_everyones_words_for_models(word: str, model: str) -> None:
+    assert Camera.of(640, 480, word, K, (0.1, 0.02, 0.0, 0.0), "test").model == model
+
+
+def test_zeros_are_no_distortion() -> None:
+    for word in ("", "none", "pinhole", "plumb_bob", "rational_polynomial"):
+        camera = Camera.of(640, 480, word, K, np.zeros(14), "test")
+        assert (camera.model, camera.D.tolist()) == ("pinhole", [])
+    fisheye = Camera.of(640, 480, "equidistant", K, (), "test")  # no coefficients are still no pinhole
+    assert (fisheye.model, fisheye.D.tolist()) == ("equidistant", [0.0] * 4)
+
+
+def test_trailing_zeros_are_left_out() -> None:
+    assert Camera.of(640, 480, "plumb_bob", K, [0.1, 0.0, 0.0, 0.0, 0.0], "test").D.tolist() == [0.1, 0, 0, 0]
+    assert len(Camera.of(640, 480, "rational_polynomial", K, [0.1, 0, 0, 0, 0, 0.2, *[0] * 8], "test").D) == 8
+
+
+def changed(row: int, column: int, value: float) -> np.ndarray:
+    other = K.copy()
+    other[row, column] = value
+    return other
+
+
+@pytest.mark.parametrize(
+    ("size", "model", "matrix", "D", "words"),
+    [
+        ((640, 480), "plumb_bob", np.zeros((3, 3)), (), "not calibrated"),
+        ((640, 480), "plumb_bob", changed(0, 0, np.nan), (), "finite 3 x 3"),
+        ((640, 480), "plumb_bob", np.eye(2), (), "finite 3 x 3"),
+        ((640, 480), "plumb_bob", changed(0, 1, 0.5), (), "must be"),
+        ((640, 480), "plumb_bob", changed(2, 2, 0.0), (), "must be"),
+        ((640, 480), "plumb_bob", changed(0, 0, -420.0), (), "fx = -420"),
+        ((640, 480), "plumb_bob", changed(1, 1, 0.0036), (), "fy = 0.0036 .* another unit"),
+        ((640, 480), "plumb_bob", changed(0, 0, 1e6), (), r"fx = 1e\+06"),
+        ((640, 480), "plumb_bob", changed(0, 2, 2000.0), (), "cx = 2000"),
+        ((640, 480), "plumb_bob", changed(1, 2, -600.0), (), "cy = -600"),
+        ((0, 480), "plumb_bob", K, (), "0 x 480"),
+        ((640, -1), "plumb_bob", K, (), "640 x -1"),
+        ((10**6, 10**6), "plumb_bob", K, (), "1000000 x 1000000"),
+        ((640, 480), "plumb_bob", K, (0.1, np.inf, 0.0, 0.0), "distortion coefficients"),
+        ((640, 480), "plumb_bob", K, (1e5, 0.0, 0.0, 0.0), "distortion coefficients"),
+        ((640, 480), "omnidirectional", K, (0.1, 0.0, 0.0, 0.0), "'omnidirectional' is not supported.*'plumb_bob'"),
+        ((640, 480), "rational_polynomial", K, (*[0.01] * 12, 0.02, 0.0), "tilted sensor"),
+        ((640, 480), "equidistant", K, (0.01, 0.0, 0.0, 0.0, 0.02), "5 coefficients are too many"),
+        ((640, 480), "", K, (0.1, 0.0, 0.0, 0.0), "without a distortion model"),
+        ((640, 480), "pinhole", K, (0.1, 0.0, 0.0, 0.0), "without a distortion model"),
+    ],
+)  # fmt: skip
+def test_what_is_no_camera(
+    size: tuple[int, int], model: str, matrix: np.ndarray, D: tuple[float, ...], words: str
+) -> None:
+    with pytest.raises(CameraError, match=rf"^/cam/info: .*{words}"):
+        Camera.of(*size, model, matrix, D, "/cam/info")

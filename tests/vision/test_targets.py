@@ -1,0 +1,124 @@
+"""Where corners are: one frame for all targets, and OpenCV's boards up to the change of frame."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from gtsam_rwhec.errors import TargetError
+from gtsam_rwhec.vision.dictionaries import WIDEST, dictionary, modules
+from gtsam_rwhec.vision.targets import FAMILIES, AprilGrid, Charuco, Checkerboard, Tag, Target
+
+TAG = Tag("tag", "tag36h11", 3, 0.12)
+BOARD = Charuco("board", "aruco_5x5_100", 7, 5, 0.04, 0.03)
+GRID = AprilGrid("grid", "tag36h11", 6, 4, 0.088, 0.3, first_id=5)
+CHESS = Checkerboard("chess", 8, 5, 0.03)
+
+
+def from_opencvs(points: np.ndarray, width_m: float, height_m: float) -> np.ndarray:
+    """Of OpenCV's boards: origin at the top left outer corner, y down, z into the paper."""
+    return points * [1.0, -1.0, -1.0] + [-0.5 * width_m, 0.5 * height_m, 0.0]
+
+
+@pytest.mark.parametrize("target", [TAG, BOARD, GRID, CHESS], ids=lambda target: target.name)
+def test_the_origin_is_in_the_middle_of_the_plane(target: Target) -> None:
+    corners = target.corners()
+    assert corners.shape[1] == 3
+    np.testing.assert_allclose(corners.mean(axis=0), 0.0, atol=1e-15)
+    np.testing.assert_allclose(corners.min(axis=0), -corners.max(axis=0), atol=1e-15)
+    assert not corners[:, 2].any()
+
+
+def test_a_tags_corners_are_opencvs_for_ippe_square() -> None:
+    # x to the right, y up, from the top left clockwise: SOLVEPNP_IPPE_SQUARE's order.
+    np.testing.assert_allclose(TAG.corners()[:, :2], 0.06 * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]))
+    assert TAG.ids == (3,)
+    assert TAG.length_m == 0.12
+
+
+def test_a_charuco_boards_corners_are_opencvs() -> None:
+    made = cv2.aruco.CharucoBoard((7, 5), 0.04, 0.03, dictionary("aruco_5x5_100"))
+    expected = from_opencvs(np.array(made.getChessboardCorners()), 7 * 0.04, 5 * 0.04)
+    np.testing.assert_allclose(BOARD.corners(), expected, atol=1e-8)
+    assert BOARD.ids == tuple(np.ravel(made.getIds()))
+    assert BOARD.corners()[0, 0] < 0.0 < BOARD.corners()[0, 1]  # top left first
+    assert BOARD.length_m == 0.04
+
+
+def test_aprilgrid_is_kalibrs() -> None:
+    # Kalibr counts from the bottom left, to the right, then up; its spacing is the gap over the tag's side.
+    corners = GRID.corners().reshape(4, 6, 4, 3)
+    pitch = 0.088 * 1.3
+    middles = corners.mean(axis=2)
+    np.testing.assert_allclose(np.diff(middles, axis=1), np.broadcast_to([pitch, 0.0, 0.0], (4, 5, 3)), atol=1e-12)
+    np.testing.assert_allclose(np.diff(middles, axis=0), np.broadcast_to([0.0, pitch, 0.0], (3, 6, 3)), atol=1e-12)
+    np.testing.assert_allclose(
+        corners - middles[:, :, None],
+        np.broadcast_to(Tag("t", "tag36h11", 0, 0.088).corners(), (4, 6, 4, 3)),
+        atol=1e-12,
+    )
+    assert (GRID.ids[0], GRID.ids[-1]) == (5, 28)
+    assert GRID.length_m == 0.088
+
+
+def test_the_tags_of_an_aprilgrid_are_opencvs_grid_board() -> None:
+    # Its rows count from the top.
+    made = cv2.aruco.GridBoard((6, 4), 0.088, 0.3 * 0.088, dictionary("tag36h11"))
+    width, height = (n * 0.088 + (n - 1) * 0.3 * 0.088 for n in (6, 4))
+    theirs = from_opencvs(np.array(made.getObjPoints()).reshape(-1, 3), width, height)
+    ours = GRID.corners().reshape(4, 6, 4, 3)[::-1].reshape(-1, 3)
+    np.testing.assert_allclose(ours, theirs, atol=1e-7)
+
+
+def test_a_checkerboards_corners_go_left_to_right_from_the_top() -> None:
+    corners = CHESS.corners().reshape(5, 8, 3)
+    np.testing.assert_allclose(np.diff(corners, axis=1), np.broadcast_to([0.03, 0.0, 0.0], (5, 7, 3)), atol=1e-12)
+    np.testing.assert_allclose(np.diff(corners, axis=0), np.broadcast_to([0.0, -0.03, 0.0], (4, 8, 3)), atol=1e-12)
+    assert (CHESS.ids, CHESS.family, CHESS.length_m) == ((), "checkerboard", 0.03)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_opencv_has_every_family_with_as_many_tags(family: str) -> None:
+    tags = dictionary(family)
+    assert len(tags.bytesList) == FAMILIES[family]
+    assert modules(family, 2) == modules(family) + 2 == tags.markerSize + 4
+
+
+def test_the_widest_dictionaries_begin_with_the_others() -> None:
+    for family in FAMILIES:
+        if family in WIDEST:
+            continue
+        stem = family.rpartition("_")[0]
+        (wide,) = (other for other in WIDEST if other.startswith(stem + "_"))
+        np.testing.assert_array_equal(dictionary(wide).bytesList[: FAMILIES[family]], dictionary(family).bytesList)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Tag("t", "tag36h12", 0, 0.1), "no family 'tag36h12'; there are tag16h5"),
+        (lambda: Tag("t", "tag36h11", 587, 0.1), "ids 587 to 587 are not in tag36h11: 0 to 586"),
+        (lambda: Tag("t", "tag36h11", -1, 0.1), "ids -1"),
+        (lambda: Tag("t", "tag36h11", 0, 0.0), "size_m = 0.0"),
+        (lambda: Tag("t", "tag36h11", 0, -0.1), "size_m = -0.1"),
+        (lambda: Tag("t", "tag36h11", 0, 120.0), "size_m = 120.0; give metres"),
+        (lambda: Tag("t", "tag36h11", 0, np.nan), "size_m = nan"),
+        (lambda: Charuco("t", "aruco_4x4_50", 7, 5, 0.03, 0.03), "marker_m = 0.03 must be less than square_m"),
+        (lambda: Charuco("t", "aruco_4x4_50", 7, 5, 0.03, -0.02), "marker_m = -0.02"),
+        (lambda: Charuco("t", "aruco_4x4_50", 20, 6, 0.03, 0.02), "ids 0 to 59 are not in aruco_4x4_50: 0 to 49"),
+        (lambda: Charuco("t", "aruco_4x4_50", 7, 5, 0.03, 0.02, first_id=40), "ids 40 to 56"),
+        (lambda: Charuco("t", "aruco_4x4_50", 1, 5, 0.03, 0.02), "1 columns and 5 rows"),
+        (lambda: AprilGrid("t", "tag36h11", 6, 6, 0.088, 0.0), "spacing = 0.0"),
+        (lambda: AprilGrid("t", "tag36h11", 6, 6, 0.088, np.nan), "spacing = nan"),
+        (lambda: AprilGrid("t", "tag36h11", 6, 101, 0.088, 0.3), "101 rows"),
+        (lambda: AprilGrid("t", "tag36h11", 6, 6, 88.0, 0.3), "tag_m = 88.0; give metres"),
+        (lambda: Checkerboard("t", 8, 6, 0.03), "looks the same after half a turn"),
+        (lambda: Checkerboard("t", 7, 5, 0.03), "looks the same after half a turn"),
+        (lambda: Checkerboard("t", 2, 5, 0.03), "2 columns"),
+        (lambda: Checkerboard("t", 8, 5, 30.0), "square_m = 30.0"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_printed(make: object, words: str) -> None:
+    with pytest.raises(TargetError, match=rf"^target t: .*{words}"):
+        make()  # type: ignore[operator]
