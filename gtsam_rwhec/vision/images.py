@@ -47,17 +47,26 @@ def _compressed(image: ImageRecord, where: str) -> Gray:
     if size is not None and size[0] * size[1] > MOST_PIXELS:
         raise ImageError(f"{where}: {size[0]} x {size[1]} pixels are more than the {MOST_PIXELS} that are decoded")
     buffer = np.frombuffer(image.data, dtype=np.uint8)
+    # The lens does not turn with the viewer's wish: no EXIF orientation. More than 8 bits stay until they are scaled.
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        # The lens does not turn with the viewer's wish: no EXIF orientation.
-        gray = cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise ImageError(f"{where}: not decoded: {str(error).strip().splitlines()[0]}") from error
+        gray = cv2.imdecode(buffer, flags)
+    except cv2.error:  # 4 and 5 raise for some of what they cannot decode, and return nothing for the rest
+        gray = None
     if gray is None:
         raise ImageError(
             f"{where}: {len(image.data)} bytes that begin with {image.data[:8].hex()} and claim to be "
             f"{image.encoding!r} are no image that OpenCV can decode"
         )
-    return np.asarray(gray, dtype=np.uint8)
+    return gray.astype(np.uint8, copy=False) if gray.dtype == np.uint8 else _eight_bits(gray)
+
+
+def _eight_bits(wide: NDArray[np.generic]) -> Gray:
+    """Scaled so that the brightest pixel is 255; what is negative or no number is black."""
+    values = np.nan_to_num(wide.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    brightest = float(values.max(initial=0.0))
+    gray: Gray = np.rint(np.maximum(values, 0.0) * (255.0 / brightest if brightest > 0.0 else 0.0)).astype(np.uint8)
+    return gray
 
 
 def _stated_size(data: bytes) -> tuple[int, int] | None:
@@ -72,7 +81,10 @@ def _stated_size(data: bytes) -> tuple[int, int] | None:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
         if data[at] != 0xFF:
             return None
-        if marker in (0xC0, 0xC1, 0xC2):  # start of frame
+        if marker == 0xFF:  # fills up
+            at += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
             height, width = struct.unpack(">HH", data[at + 5 : at + 9])
             return width, height
         at += 2 + length
@@ -87,7 +99,7 @@ def _raw(image: ImageRecord, where: str) -> Gray:
     if encoding not in _RAW:
         raise ImageError(f"{where}: encoding {image.encoding!r} is not supported; supported are {', '.join(_RAW)}")
     channels, size, code = _RAW[encoding]
-    if step < width * channels * size or len(image.data) < step * height or width * height == 0:
+    if width < 1 or height < 1 or step < width * channels * size or len(image.data) < step * height:
         raise ImageError(
             f"{where}: {width} x {height} pixels of {encoding} in rows of {step} bytes do not fit {len(image.data)}"
         )
@@ -96,9 +108,7 @@ def _raw(image: ImageRecord, where: str) -> Gray:
     rows = np.frombuffer(image.data, dtype=np.uint8, count=step * height).reshape(height, step)
     rows = np.ascontiguousarray(rows[:, : width * channels * size])
     if size == 2:
-        wide = rows.view(">u2" if image.is_bigendian else "<u2").astype(np.float32)
-        scaled: Gray = np.rint(wide * (255.0 / max(float(wide.max()), 1.0))).astype(np.uint8)
-        return scaled
+        return _eight_bits(rows.view(">u2" if image.is_bigendian else "<u2"))
     pixels = rows.reshape(height, width, channels) if channels > 1 else rows
     if code is None:
         return pixels

@@ -1,0 +1,158 @@
+"""Exact pictures of flat targets, drawn with OpenCV's projection and not with the library's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.dictionaries import dictionary
+from gtsam_rwhec.vision.targets import AprilGrid, Checkerboard, Tag, Target
+
+#: Rays a pixel along each axis, and the pictures' pixels along a tag's module.
+SAMPLES, PER_MODULE = 4, 16
+
+K_LONG, K_SHORT, K_FISH = (
+    [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    for fx, fy, cx, cy in ((300.0, 302.0, 157.0, 121.5), (260.0, 258.0, 157.0, 121.5), (150.0, 149.0, 161.0, 118.5))
+)
+PINHOLE = Camera.of(320, 240, "", K_LONG, (), "test")
+BARREL = Camera.of(320, 240, "plumb_bob", K_SHORT, (-0.28, 0.09, 8e-4, -5e-4), "test")
+FISHEYE = Camera.of(320, 240, "equidistant", K_FISH, (-0.02, 6e-3, -4e-3, 8e-4), "test")
+
+
+@dataclass(frozen=True, eq=False)
+class Print:
+    """What is printed, 0 to 1, its middle the frame's origin; metres a pixel."""
+
+    picture: np.ndarray
+    pixel_m: float
+
+
+def pose(rotation_deg: tuple[float, float, float], t_m: tuple[float, float, float]) -> np.ndarray:
+    """T_camera_target of what looks straight at the camera if it is not turned: its y is up, the camera's down."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.radians(np.array(rotation_deg)))[0] @ np.diag([1.0, -1.0, -1.0])
+    T[:3, 3] = t_m
+    return T
+
+
+def tag_modules(family: str, number: int, border_bits: int = 1) -> np.ndarray:
+    """(n, n) of 0 and 1: a tag with its black border."""
+    side = int(dictionary(family).markerSize) + 2 * border_bits
+    return cv2.aruco.generateImageMarker(dictionary(family), number, side, borderBits=border_bits) / 255.0
+
+
+def printed(target: Target, *, quarter_turns: int = 0) -> Print:
+    """A target with a white margin; `quarter_turns` turns the tags of an AprilGrid where they are."""
+    if isinstance(target, Tag):
+        modules = tag_modules(target.family, target.id)
+        return Print(_enlarged(np.pad(modules, 1, constant_values=1.0)), target.size_m / len(modules) / PER_MODULE)
+    if isinstance(target, AprilGrid):
+        return _aprilgrid(target, quarter_turns)
+    if isinstance(target, Checkerboard):
+        rows, columns = np.indices((target.rows + 1, target.columns + 1))
+        squares = np.pad(((rows + columns) % 2).astype(float), 1, constant_values=1.0)
+        return Print(_enlarged(squares, 40), target.square_m / 40)
+    made = cv2.aruco.CharucoBoard(
+        (target.columns, target.rows), target.square_m, target.marker_m, dictionary(target.family),
+        np.array(target.ids, dtype=np.int32),
+    )  # fmt: skip
+    picture = made.generateImage((target.columns * 80, target.rows * 80), marginSize=0) / 255.0
+    return Print(np.pad(picture, 40, constant_values=1.0), target.square_m / 80)
+
+
+def _enlarged(modules: np.ndarray, by: int = PER_MODULE) -> np.ndarray:
+    return np.kron(modules, np.ones((by, by)))
+
+
+def _aprilgrid(grid: AprilGrid, quarter_turns: int) -> Print:
+    side = 8 * (int(dictionary(grid.family).markerSize) + 4)
+    gap = round(grid.spacing * side)
+    pitch = side + gap
+    picture = np.ones((grid.rows * pitch + gap, grid.columns * pitch + gap))
+    for k, number in enumerate(grid.ids):
+        row, column = grid.rows - 1 - k // grid.columns, k % grid.columns
+        tag = np.rot90(_enlarged(tag_modules(grid.family, number, 2), 8), quarter_turns)
+        picture[gap + row * pitch :, gap + column * pitch :][:side, :side] = tag
+    for row in range(grid.rows + 1):  # Kalibr's small black squares between the tags' corners
+        for column in range(grid.columns + 1):
+            picture[row * pitch :, column * pitch :][:gap, :gap] = 0.0
+    return Print(np.pad(picture, 10, constant_values=1.0), grid.tag_m / side)
+
+
+def projected(camera: Camera, points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) of points (n, 3) of a target, by OpenCV."""
+    turn = cv2.Rodrigues(T[:3, :3])[0]
+    if camera.model == "equidistant":
+        pixels, _ = cv2.fisheye.projectPoints(points[:, None], turn, T[:3, 3], camera.K, camera.D)
+    else:
+        pixels, _ = cv2.projectPoints(points, turn, T[:3, 3], camera.K, camera.D)
+    return pixels[:, 0]
+
+
+@cache
+def _rays(camera: Camera) -> np.ndarray:
+    """(height * S, width * S, 2) normalised coordinates of S x S points in each pixel."""
+    u, v = np.meshgrid(*((np.arange(n * SAMPLES) + 0.5) / SAMPLES - 0.5 for n in (camera.width, camera.height)))
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
+    if camera.model == "equidistant":
+        x = cv2.fisheye.undistortPoints(pixels, camera.K, camera.D)[:, 0]
+    else:
+        x0 = (pixels[:, 0] - camera.K[:2, 2]) / np.diagonal(camera.K)[:2]
+        x = x0.copy()
+        for _ in range(20 if camera.model == "radtan" else 0):
+            k1, k2, p1, p2 = camera.D[:4]
+            r2, ab = (x * x).sum(axis=1), x.prod(axis=1)
+            off = np.column_stack(
+                [2 * p1 * ab + p2 * (r2 + 2 * x[:, 0] ** 2), p1 * (r2 + 2 * x[:, 1] ** 2) + 2 * p2 * ab]
+            )
+            x = (x0 - off) / (1.0 + k1 * r2 + k2 * r2 * r2)[:, None]
+    return x.reshape(*u.shape, 2)
+
+
+def render(
+    camera: Camera,
+    scene: list[tuple[Print, np.ndarray]],
+    *,
+    blur_px: float = 0.7,
+    noise: float = 2.0,
+    seed: int = 0,
+    covered: tuple[slice, slice] | None = None,
+) -> np.ndarray:
+    """(height, width) uint8; the later ones of (what is printed, T_camera_target) lie over the earlier ones.
+
+    `covered` rows and columns are gray: somebody's hand.
+    """
+    image = np.full((camera.height * SAMPLES, camera.width * SAMPLES), 0.45, dtype=np.float32)
+    for what, T in scene:
+        height, width = what.picture.shape
+        # Of the picture's pixels on the plane, z = 1.
+        on_plane = what.pixel_m * np.array([[1.0, 0.0, 0.5 - 0.5 * width], [0.0, -1.0, 0.5 * height - 0.5]])
+        H = T[:3, :2] @ on_plane + np.outer(T[:3, 3], [0.0, 0.0, 1.0])
+        picture = what.picture.astype(np.float32)
+        if camera.model == "pinhole":
+            S = np.array([[SAMPLES, 0.0, 0.5 * SAMPLES - 0.5], [0.0, SAMPLES, 0.5 * SAMPLES - 0.5], [0.0, 0.0, 1.0]])
+            drawn = cv2.warpPerspective(
+                picture, S @ camera.K @ H, image.shape[::-1], flags=cv2.INTER_LINEAR, borderValue=-1e6
+            )
+        else:
+            x = _rays(camera)
+            back = np.linalg.inv(H)
+            places = x @ back[:, :2].T + back[:, 2]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                places = np.nan_to_num((places[..., :2] / places[..., 2:]), nan=-9.0, posinf=-9.0, neginf=-9.0)
+            places = np.clip(places, -9.0, 1e4).astype(np.float32)
+            drawn = cv2.remap(picture, places, None, cv2.INTER_LINEAR, borderValue=-1e6)
+        on_it = drawn >= 0.0
+        image[on_it] = 0.08 + 0.8 * drawn[on_it]
+    image = image.reshape(camera.height, SAMPLES, camera.width, SAMPLES).mean(axis=(1, 3))
+    if covered is not None:
+        image[covered] = 0.45
+    if blur_px > 0.0:
+        image = cv2.GaussianBlur(image, (0, 0), blur_px)
+    noisy = 255.0 * image + noise * np.random.default_rng(seed).normal(size=image.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
