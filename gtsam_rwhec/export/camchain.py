@@ -1,0 +1,94 @@
+"""The cameras as a Kalibr camchain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from rwhec_factors.se3 import inverse
+
+from gtsam_rwhec.export.frames import RigFrames
+from gtsam_rwhec.export.overlaps import overlaps
+from gtsam_rwhec.export.written_poses import number
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.vision.camera import Camera
+
+_HEAD = """\
+# Cameras in the form of a Kalibr camchain. The frame {carrier}, which carries them, takes the place of the IMU:
+#   T_cam_imu          pose of {carrier} in the camera, metres
+#   T_cn_cnm1          pose of the camera before in this one
+#   timeshift_cam_imu  seconds: stamp of {carrier}'s poses = stamp of the image + shift
+#   cam_overlaps       cameras whose fields of view meet this one's, by geometry
+"""
+#: Kalibr's radial-tangential distortion: k1, k2, p1, p2.
+RADTAN = 4
+
+
+def camchain_yaml(frames: RigFrames) -> str:
+    """The text of ``camchain.yaml``: cam0, cam1, ... in the order of the sensors.
+
+    What Kalibr cannot express is left out, and a comment says which sensor and why: sensors without intrinsics, and
+    radial-tangential distortion beyond k1, k2, p1, p2. Dropping such coefficients would bend the images' edges by
+    pixels without a word.
+    """
+    left_out = {name: _reason(frames.cameras.get(name)) for name in frames.sensors}
+    names = [name for name, reason in left_out.items() if not reason]
+    head = _HEAD.format(carrier=frames.sensor_carrier)
+    head += "".join(f"# Left out: {name}, {reason}\n" for name, reason in left_out.items() if reason)
+    if not names:
+        return f"{head}# No camera is left.\n{{}}\n"
+    T_rig_camera = [frames.sensors[name] for name in names]
+    cameras = [frames.cameras[name] for name in names]
+    T_camera_rig = inverse(np.array(T_rig_camera))
+    meeting = overlaps(cameras, T_rig_camera)
+    sections = []
+    for n, (name, camera) in enumerate(zip(names, cameras, strict=True)):
+        D = camera.D if camera.model == "equidistant" else _four(camera)
+        lines = [
+            f"cam{n}:  # {name}",
+            "  camera_model: pinhole",
+            f"  intrinsics: {_row(camera.K[[0, 1, 0, 1], [0, 1, 2, 2]])}",
+            f"  distortion_model: {'equidistant' if camera.model == 'equidistant' else 'radtan'}",
+            f"  distortion_coeffs: {_row(D)}",
+            f"  resolution: [{camera.width}, {camera.height}]",
+        ]
+        if name in frames.topics:
+            lines.append(f"  rostopic: {_quoted(frames.topics[name])}")
+        lines += _matrix("T_cam_imu", T_camera_rig[n])
+        if n:
+            lines += _matrix("T_cn_cnm1", T_camera_rig[n] @ T_rig_camera[n - 1])
+        lines.append(f"  timeshift_cam_imu: {number(frames.time_offsets_s.get(name, 0.0))}")
+        lines.append(f"  cam_overlaps: [{', '.join(map(str, meeting[n]))}]")
+        sections.append("\n".join(lines) + "\n")
+    return head + "".join(sections)
+
+
+def _reason(camera: Camera | None) -> str:
+    """Why a sensor cannot be in a camchain; empty if it can."""
+    if camera is None:
+        return "whose intrinsics are not known."
+    more = camera.D[RADTAN:] if camera.model == "radtan" else np.zeros(0)
+    if more.any():
+        return (
+            f"whose distortion has coefficients that Kalibr's radtan (k1, k2, p1, p2) lacks: {_row(more)} "
+            "from the fifth on. Calibrate its intrinsics with four (k3 = 0), or with Kalibr itself."
+        )
+    return ""
+
+
+def _four(camera: Camera) -> Array:
+    """k1, k2, p1, p2; zeros for a pinhole, which more readers of camchains know than distortion_model: none."""
+    return np.pad(camera.D, (0, RADTAN))[:RADTAN]
+
+
+def _matrix(key: str, T: Array) -> list[str]:
+    return [f"  {key}:"] + [f"  - {_row(row)}" for row in T]
+
+
+def _row(values: Iterable[float]) -> str:
+    return f"[{', '.join(number(value) for value in values)}]"
+
+
+def _quoted(text: str) -> str:
+    """YAML's single quotes, in which nothing but themselves has a meaning."""
+    return "'" + text.replace("'", "''") + "'"

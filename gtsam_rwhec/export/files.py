@@ -1,0 +1,50 @@
+"""All exported files of a calibration, written into one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from gtsam_rwhec.atomic_write import write_atomically
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.export.camchain import camchain_yaml
+from gtsam_rwhec.export.frames import RigFrames
+from gtsam_rwhec.export.static_tf import static_tf_launch
+from gtsam_rwhec.export.tf_yaml import tf_yaml
+from gtsam_rwhec.export.urdf import urdf_xacro
+
+FILES: dict[str, Callable[[RigFrames], str]] = {
+    "static_tf.launch.py": static_tf_launch,
+    "tf.yaml": tf_yaml,
+    "rig.urdf.xacro": urdf_xacro,
+    "camchain.yaml": camchain_yaml,
+}
+
+
+def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
+    """Write ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro`` and ``camchain.yaml``.
+
+    Parameters
+    ----------
+    frames : RigFrames
+    folder
+        Must be there; files of these names in it are replaced.
+
+    Returns
+    -------
+    list of Path
+        What was written.
+
+    Raises
+    ------
+    FileFormatError
+        A file cannot be written; the message says why.
+    """
+    # All texts first: what cannot be written leaves no half of it.
+    texts = {Path(folder) / name: text(frames) for name, text in FILES.items()}
+    for path, text in texts.items():
+        try:
+            write_atomically(path, text.encode())
+        except OSError as error:
+            raise FileFormatError(f"{path} cannot be written: {error.strerror or error}.") from error
+    return list(texts)

@@ -1,0 +1,38 @@
+"""Numbers and rotations as files have them: digits that give the same double again, quaternions, fixed-axis angles."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gtsam_rwhec.poses import Array
+
+
+def number(value: float) -> str:
+    """The fewest digits (at most 17) that are this double again when read, with a point in any case.
+
+    Without the point YAML 1.1 takes 1e-05 for text, and 1 for an integer.
+    """
+    text = repr(float(value) + 0.0)  # + 0.0: no -0.0
+    mantissa, e, exponent = text.partition("e")
+    return f"{mantissa}.0e{exponent}" if e and "." not in mantissa else text
+
+
+def quaternion_xyzw(T: Array) -> Array:
+    """(4,) unit quaternion x, y, z, w of a transform's rotation, w not below 0."""
+    quaternion: Array = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+    return quaternion
+
+
+def fixed_axis_angles(T: Array) -> tuple[float, float, float]:
+    """Roll, pitch, yaw in radians with R = Rz(yaw) Ry(pitch) Rx(roll): URDF's rpy.
+
+    Near pitch = +-90 degrees yaw and roll are free but for their difference or sum. Yaw is taken first, whatever it is,
+    and roll from what is left, Rz(yaw)' R = Ry(pitch) Rx(roll), so that the three always compose to R again.
+    """
+    R = T[:3, :3]
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return float(roll), float(pitch), float(yaw)
