@@ -138,7 +138,7 @@ def dotted(path: KeyPath) -> str:
 
 def suggestion(key: str, known: Collection[str]) -> str:
     """What to say of an unknown key."""
-    near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.65)
     return f"unknown key; did you mean {near[0]}?" if near else f"unknown key; there are {', '.join(known)}"
 
 

@@ -12,6 +12,7 @@ from gtsam_rwhec.yaml_lines import shown
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*")
 LONGEST_NAME = 100
+LONGEST_TEXT = 1000
 #: Seconds; beyond, nanoseconds do not fit 64 bits.
 LARGEST_OFFSET_S = 4e9
 
@@ -26,22 +27,24 @@ def _name(text: str) -> str:
 
 
 def _text(text: str) -> str:
-    if not text or not text.isprintable() or len(text) > 1000:
-        raise ValueError(f"{shown(text)} has no characters, unprintable ones, or too many")
+    if not text:
+        raise ValueError("'' is empty")
+    if not text.isprintable() or len(text) > LONGEST_TEXT:
+        raise ValueError(f"{shown(text)} has unprintable characters, or more than {LONGEST_TEXT}")
     return text
 
 
 def _positive(number: float) -> float:
     if not number > 0.0:
-        raise ValueError(f"{number!r} must be above 0")
+        raise ValueError(f"{number:g} must be above 0")
     return number
 
 
 def _length(number: float) -> float:
     if not number > 0.0:
-        raise ValueError(f"{number!r} is no length; give metres, above 0")
+        raise ValueError(f"{number:g} is no length; give metres, above 0")
     if number >= LARGEST_M:
-        raise ValueError(f"{number!r} m is {LARGEST_M:g} m or more; millimetres? Then write {number / 1000.0:g}")
+        raise ValueError(f"{number:g} m is {LARGEST_M:g} m or more; millimetres? Then write {number / 1000.0:g}")
     return number
 
 

@@ -102,6 +102,8 @@ def parse_rig(text: str, where: str, folder: Path = Path()) -> Rig:
 def _in_words(error: ValidationError, file: YamlFile) -> Iterator[tuple[KeyPath, str]]:
     for fault in error.errors(include_url=False):
         path = _path(fault["loc"])
+        if fault["type"].startswith("union_tag") and path[0] == "targets":
+            path = (*path, "type")
         yield path, _words(fault, path, file)
 
 
@@ -129,9 +131,9 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
         section = " or a section" if path == ("noise",) else ""
         return f"{shown(given)}; give {context['expected']}{section}"
     if kind == "union_tag_invalid":
-        return f"type {shown(context['tag'])}; give one of {context['expected_tags']}"
+        return f"{shown(given['type'])}; give one of {', '.join(_TARGETS)}"
     if kind == "union_tag_not_found":
-        return f"type is missing: one of {', '.join(_TARGETS)}"
+        return f"is missing: one of {', '.join(_TARGETS)}"
     if kind in ("model_type", "model_attributes_type"):
         model = _section(path, file.data)
         keys = f" with {', '.join(model.model_fields)}" if model else " with type and sizes"

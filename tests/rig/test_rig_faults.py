@@ -1,0 +1,147 @@
+"""Every fault that a rig file can have, with its line."""
+
+from __future__ import annotations
+
+import pytest
+from rig_texts import FULL, MINIMAL
+
+from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.rig import parse_rig
+
+# What stands in place of what, the line that the message has, and its words.
+FAULTS = [
+    ("  sensors: hand", "  sensers: hand", 2, "carriers.sensors: is missing: the frame that carries the sensors,"),
+    ("  sensors: hand", "  sensers: hand", 3, "carriers.sensers: unknown key; did you mean sensors?"),
+    ("sizes: check", "size: check", 29, "size: unknown key; did you mean sizes?"),
+    ("sizes: check", "wholly_other: 3", 29, "wholly_other: unknown key; there are carriers, sensors, targets, sizes,"),
+    ("sizes: check", "folder: /etc", 29, "folder: unknown key; there are carriers, sensors, targets, sizes, noise,"),
+    ("sizes: check", "sizes: right", 29, "sizes: 'right'; give 'known', 'check' or 'estimate'"),
+    ("[base, hand]", "[base, arm]", 5, "carriers.poses.tf: poses of arm in base are not those of the carriers, hand"),
+    ("[base, hand]", "[base]", 5, "carriers.poses.tf: ['base']; give two frames, [parent, child]"),
+    ("[base, hand]", "base", 5, "carriers.poses.tf: 'base'; give two frames, [parent, child]"),
+    ("[base, hand]", "[base, /hand]", 5, "carriers.poses.tf[1]: '/hand' cannot be a frame's name: a letter first,"),
+    ("{tf: [base, hand]}", "{topic: /pose}", 5, "carriers.poses: say of which frames the poses of /pose are: parent:"),
+    ("{tf: [base, hand]}", "{}", 5, "carriers.poses: give one of tf: [parent, child] and topic: ... (with parent and"),
+    ("{tf: [base, hand]}", "{tf: [base, hand], child: hand}", 5, "carriers.poses: tf names both frames; leave parent"),
+    ("{tf: [base, hand]}", "{tf: [base, hand], topic: /pose}", 5, "carriers.poses: give one of tf: [parent, child]"),
+    ("{tf: [base, hand]}", "/pose", 5, "carriers.poses: '/pose'; give a section with tf, topic, parent, child"),
+    ("targets: base", "targets: hand", 4, "carriers.targets: 'hand' carries the sensors too; name two different"),
+    ("max_gap_s: 0.3", "max_gap_s: 0", 6, "carriers.max_gap_s: 0 must be above 0"),
+    ("max_gap_s: 0.3", "max_gap_s: .inf", 6, "carriers.max_gap_s: inf; give a finite number"),
+    ("max_gap_s: 0.3", "max_gap_s: 1e999", 6, "carriers.max_gap_s: inf; give a finite number"),
+    ("max_gap_s: 0.3", "max_gap_s: true", 6, "carriers.max_gap_s: true; give a number"),
+    ("rotation_deg: 0.02, ", "", 7, "carriers.noise.rotation_deg: is missing: standard deviation about each axis,"),
+    ("cam_left:", "2cam:", 9, "sensors.2cam: '2cam' cannot be a frame's name: a letter first, then letters, digits"),
+    ("cam_left:", "'../cam':", 9, "sensors.../cam: '../cam' cannot be a frame's name: a letter first, then letters,"),
+    ("cam_left:", "cam left:", 9, "sensors.'cam left': 'cam left' cannot be a frame's name: a letter first, then"),
+    ("cam_left:", "c" * 101 + ":", 9, "at most 100 characters"),
+    ("cam_left:", "hand:", 9, "sensors.hand: 'hand' is the name of the sensors' carrier already; each frame needs"),
+    ("cam_left:", "tag_0:", 25, "targets.tag_0: 'tag_0' is the name of sensor tag_0 already; each frame needs its"),
+    ("frame: cam_left_optical", "frame: cam_right", 14, "sensors.cam_right: 'cam_right' is the name of the frame of"),
+    ("frame: cam_left_optical", "frame: base", 13, "sensors.cam_left.frame: 'base' is the name of the targets'"),
+    ("frame: cam_left_optical", "frame: a/../b", 13, "sensors.cam_left.frame: 'a/../b' cannot be a frame's name: a"),
+    ("    images: /cam_left/image\n", "", 9, "sensors.cam_left: nothing given; give one of images and detections,"),
+    ("images: /cam_left/image", "images: 3", 10, "sensors.cam_left.images: 3; give text (in quotes if it looks like"),
+    ("images: /cam_left/image", "images: ''", 10, "sensors.cam_left.images: '' is empty"),
+    ("images: /cam_left/image", 'images: "/a\\e"', 10, "sensors.cam_left.images: '/a\\x1b' has unprintable"),
+    ("images: /cam_right/image", "images: /cam_left/image", 15, "sensors.cam_right.images: /cam_left/image is the"),
+    ("detections: /tag_detections", "detections: /t\n    images: /i", 22, "sensors.driver: images and detections"),
+    ("detections: /tag_detections", "images: /i", 22, "sensors.driver: images without intrinsics; give {topic: ...},"),
+    ("{topic: /cam_left/camera_info}", "{kalibr: c.yaml}", 11, "sensors.cam_left.intrinsics: kalibr and camera go"),
+    ("{topic: /cam_left/camera_info}", "{}", 11, "sensors.cam_left.intrinsics: nothing given; give one of topic,"),
+    ("{topic: /cam_left/camera_info}", "{topic: /t, file: f}", 11, "sensors.cam_left.intrinsics: topic and file"),
+    ("{topic: /cam_left/camera_info}", "{file: f, width: 3}", 11, "sensors.cam_left.intrinsics: file and numbers"),
+    ("width: 640", "width: 640.5", 18, "sensors.cam_right.intrinsics.width: 640.5; give a whole number"),
+    ("width: 640", "depth: 640", 18, "sensors.cam_right.intrinsics.depth: unknown key; there are topic, kalibr,"),
+    ("      width: 640\n", "", 16, "sensors.cam_right.intrinsics: width missing"),
+    ("width: 640", "width: 0", 16, "sensors.cam_right.intrinsics: these numbers: the image size is 0 x 480 pixels"),
+    ("model: equidistant", "model: omni", 16, "sensors.cam_right.intrinsics: these numbers: distortion model 'omni'"),
+    ("K: [300, 300.5, 320, 240]", "K: [3, 3, 320, 240]", 16, "sensors.cam_right.intrinsics: these numbers: fx = 3"),
+    ("K: [300, 300.5, 320, 240]", "K: [300, 320, 240]", 20, "sensors.cam_right.intrinsics.K: [300, 320, 240]; give"),
+    ("K: [300, 300.5, 320, 240]", "K: [a, 1, 2, 3]", 20, "sensors.cam_right.intrinsics.K[0]: 'a'; give a number"),
+    ("D: [0.01, 0, 1e-4, -0.0]", "D: [0.01, ., 0]", 21, "sensors.cam_right.intrinsics.D[1]: '.'; give a number"),
+    ("D: [0.01, 0, 1e-4, -0.0]", "D: 0", 21, "sensors.cam_right.intrinsics.D: 0; give a list, [..., ...]"),
+    ("time_offset: estimate", "time_offset: guess", 12, "sensors.cam_left.time_offset: 'guess'; give seconds, or the"),
+    ("time_offset: estimate", "time_offset: 1e10", 12, "sensors.cam_left.time_offset: 10000000000.0; give seconds,"),
+    ("time_offset: estimate", "time_offset: .nan", 12, "sensors.cam_left.time_offset: nan; give seconds, or the word"),
+    ("size_m: 0.12", "size_m: 120", 25, "targets.tag_0.size_m: 120 m is 10 m or more; millimetres? Then write"),
+    ("size_m: 0.12", "size_m: 0", 25, "targets.tag_0.size_m: 0 is no length; give metres, above 0"),
+    ("size_m: 0.12", "size_m: -0.12", 25, "targets.tag_0.size_m: -0.12 is no length; give metres, above 0"),
+    ("size_m: 0.12", "size_m: 120mm", 25, "targets.tag_0.size_m: '120mm'; give a number"),
+    ("size_m: 0.12", "size_mm: 120", 25, "targets.tag_0.size_m: is missing: side of the black square, metres"),
+    ("size_m: 0.12", "size_mm: 120", 25, "targets.tag_0.size_mm: unknown key; did you mean size_m?"),
+    ("type: tag,", "type: aruco,", 25, "targets.tag_0.type: 'aruco'; give one of tag, charuco, aprilgrid,"),
+    ("type: tag,", "type: [tag],", 25, "targets.tag_0.type: ['tag']; give one of tag, charuco, aprilgrid,"),
+    ("type: tag,", "", 25, "targets.tag_0.type: is missing: one of tag, charuco, aprilgrid, checkerboard"),
+    ("family: tag36h11, id: 0", "family: 36h11, id: 0", 25, "targets.tag_0: there is no family '36h11'; there are"),
+    ("id: 0,", "id: 587,", 25, "targets.tag_0: ids 587 to 587 are not in tag36h11: 0 to 586"),
+    ("id: 0,", "id: '0',", 25, "targets.tag_0.id: '0'; give a whole number"),
+    ("id: 0,", "id: 1.5,", 25, "targets.tag_0.id: 1.5; give a whole number"),
+    ("id: 0,", "id: 10,", 27, "targets.grid: tags 10 of tag36h11 belong to target tag_0 too: no image tells the two"),
+    ("first_id: 10", "first_id: 560", 27, "targets.grid: ids 560 to 595 are not in tag36h11: 0 to 586"),
+    ("marker_m: 0.03075", "marker_m: 0.05", 26, "targets.board: marker_m = 0.05 must be less than square_m ="),
+    ("columns: 9, rows: 6", "columns: 8, rows: 6", 28, "targets.chess: a checkerboard of 8 x 6 inner corners looks"),
+    ("columns: 9, rows: 6", "columns: 9000000000, rows: 6", 28, "targets.chess: 9000000000 columns and 6 rows; each"),
+    ("spacing: 0.3", "spacing: 30", 27, "targets.grid: spacing = 30.0; Kalibr's is gap / tag size, 0.3 as a rule"),
+    ("sizes: check", "  chess_b: {type: checkerboard, columns: 6, rows: 9, square_m: 1}", 29, "like chess: no image"),
+    ("sizes: check", "  t: {type: tag, family: aruco_5x5_50, id: 16, size_m: 1}", 29, "belong to target board"),
+    ("noise: estimate", "noise: guess", 30, "noise: 'guess'; give 'estimate' or a section"),
+    ("noise: estimate", "noise: 3", 30, "noise: 3; give a section with rotation_deg, translation_mm, corner_px"),
+    ("noise: estimate", "noise:", 30, "noise: empty; give a section with rotation_deg, translation_mm, corner_px"),
+    ("noise: estimate", "noise: {}", 30, "noise: nothing given; give rotation_deg and translation_mm, or corner_px,"),
+    ("noise: estimate", "noise: {rotation_deg: 1}", 30, "noise: rotation_deg given; give rotation_deg and"),
+    ("noise: estimate", "noise: {corner_pix: 1}", 30, "noise.corner_pix: unknown key; did you mean corner_px?"),
+    ("noise: estimate", "noise: {corner_px: -1}", 30, "noise.corner_px: -1 must be above 0"),
+    ("min_side_px: 18", "min_side: 18", 31, "detection.min_side: unknown key; did you mean min_side_px?"),
+    ("min_side_px: 18", "min_side_px: big", 31, "detection.min_side_px: DetectionOptions.min_side_px='big'; give a"),
+    ("min_side_px: 18", "min_side_px: [1]", 31, "detection.min_side_px: DetectionOptions.min_side_px=(1,); give a"),
+    ("thin: false", "thin: no", 38, "cleaning.thin: 'no'; give true or false"),
+    ("thin: false", "thin: 0", 38, "cleaning.thin: 0; give true or false"),
+    ("robust: gnc", "robust: ransac", 39, "cleaning.robust: 'ransac'; give 'none', 'huber', 'cauchy', 'tukey',"),
+    ("robust: gnc", "rob: gnc", 39, "cleaning.rob: unknown key; did you mean robust?"),
+    ("sizes: check", "targets: {}", 29, "targets is there twice, first in line 24; keep one."),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "line", "words"), FAULTS)
+def test_every_fault_has_its_line(old: str, new: str, line: int, words: str) -> None:
+    assert old in FULL
+    with pytest.raises(RigError) as caught:
+        parse_rig(FULL.replace(old, new, 1), "my/rig.yaml")
+    faults = str(caught.value).split("\n")
+    assert any(fault.startswith(f"my/rig.yaml, line {line}: ") and words in fault for fault in faults), faults
+    assert all(fault.startswith("my/rig.yaml, line ") for fault in faults)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "rig.yaml is empty"),
+        ("3", "line 1: 3 in place of the sections"),
+        ("- a\n- b", "line 1: ['a', 'b'] in place of the sections"),
+        ("a: [", "line 1: not YAML"),
+        ("\nsensors: &x {}", "line 2: the anchor &x"),
+        ("sensors: !!python/name:os.system {}", "the tag '!!python/name:os.system'"),
+        (MINIMAL.replace("{cam: {detections: /tags}}", "{}"), "line 2: sensors: none; give one or more"),
+        (MINIMAL.replace("{cam: {detections: /tags}}", ""), "line 2: sensors: empty; give a section"),
+        (MINIMAL.replace("{cam: {detections: /tags}}", "{cam: }"), "line 2: sensors.cam: empty; give a section with"),
+        (MINIMAL.replace("{tag: {type: tag, family: tag36h11, id: 3, size_m: 0.1}}", "{}"), "line 3: targets: none"),
+        (MINIMAL.replace("{type: tag, family: tag36h11, id: 3, size_m: 0.1}", "3"), "line 3: targets.tag: 3; give a"),
+        ("sizes: known", "line 1: carriers: is missing: what carries the sensors"),
+    ],
+)
+def test_files_that_are_none(text: str, words: str) -> None:
+    with pytest.raises(RigError) as caught:
+        parse_rig(text, "rig.yaml")
+    assert words in str(caught.value)
+
+
+def test_all_faults_are_listed_by_line_and_counted() -> None:
+    text = FULL.replace("size_m: 0.12", "size_m: 120").replace("sensors: hand", "sensors: 3").replace("thin:", "thick:")
+    with pytest.raises(RigError) as caught:
+        parse_rig(text, "f")
+    lines = [fault.split(":")[0] for fault in str(caught.value).split("\n")]
+    assert lines == ["f, line 3", "f, line 25", "f, line 38", "f, line 38"][:3]
+    with pytest.raises(RigError) as caught:
+        parse_rig("\n".join(f"key{i}: 1" for i in range(30)), "f")
+    assert str(caught.value).split("\n")[20:] == ["and 13 more faults"]

@@ -1,0 +1,237 @@
+"""Rig files: everything that one can say, every fault with its line, and what is written reads back equal."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rig_texts import FULL, MINIMAL
+
+from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.refinement.options import Robust
+from gtsam_rwhec.rig import (
+    AprilGridTarget,
+    Carriers,
+    CharucoTarget,
+    CheckerboardTarget,
+    Cleaning,
+    Intrinsics,
+    Noise,
+    PoseNoise,
+    PoseSource,
+    Rig,
+    Sensor,
+    TagTarget,
+    parse_rig,
+    read_rig,
+    rig_text,
+)
+from gtsam_rwhec.vision.options import DetectionOptions
+from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag
+
+
+def test_everything_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(FULL)
+    rig = read_rig(path)
+    assert rig.folder == tmp_path
+    assert rig.carriers == Carriers(
+        sensors="hand", targets="base", poses=PoseSource(tf=("base", "hand")), max_gap_s=0.3,
+        noise=PoseNoise(rotation_deg=0.02, translation_mm=0.2),
+    )  # fmt: skip
+    assert list(rig.sensors) == ["cam_left", "cam_right", "driver"]
+    assert rig.sensors["cam_left"] == Sensor(
+        images="/cam_left/image", intrinsics=Intrinsics(topic="/cam_left/camera_info"), time_offset="estimate",
+        frame="cam_left_optical",
+    )  # fmt: skip
+    right = rig.sensors["cam_right"].intrinsics
+    assert right is not None
+    assert right.K == (300.0, 300.5, 320.0, 240.0)
+    assert right.D == (0.01, 0.0, 1e-4, 0.0)
+    assert (rig.frame_of("cam_left"), rig.frame_of("driver")) == ("cam_left_optical", "driver")
+    assert rig.target_list == (
+        Tag("tag_0", "tag36h11", 0, 0.12),
+        Charuco("board", "aruco_5x5_100", 7, 5, 0.041, 0.03075),
+        AprilGrid("grid", "tag36h11", 6, 6, 0.088, 0.3, 10),
+        Checkerboard("chess", 9, 6, 0.03),
+    )
+    assert (rig.sizes, rig.noise) == ("check", "estimate")
+    assert rig.detection == {"min_side_px": 18, "max_reprojection_px": 2.0}
+    assert rig.cleaning == Cleaning(max_translation_m_s=0.5, thin=False)
+
+
+def test_what_is_left_out() -> None:
+    rig = parse_rig(MINIMAL, "rig.yaml")
+    assert rig.carriers.max_gap_s == 0.2
+    assert rig.carriers.noise is None
+    assert rig.sensors["cam"] == Sensor(detections="/tags", time_offset=0.0)
+    assert (rig.sizes, rig.noise, rig.detection, rig.cleaning) == ("check", "estimate", {}, Cleaning())
+    assert Cleaning().model_dump() == {
+        "min_rotation_deg": 0.5, "min_translation_mm": 3.0, "max_rotation_deg_s": None, "max_translation_m_s": None,
+        "consensus": True, "thin": True, "robust": "gnc",
+    }  # fmt: skip
+    assert rig.folder == Path()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "noise"),
+    [
+        ("noise: estimate", "noise: {corner_px: 0.3}", Noise(corner_px=0.3)),
+        (
+            "noise: estimate",
+            "noise: {rotation_deg: 1, translation_mm: 2}",
+            Noise(rotation_deg=1.0, translation_mm=2.0),
+        ),
+    ],
+)
+def test_noise_given(old: str, new: str, noise: Noise) -> None:
+    assert parse_rig(FULL.replace(old, new), "rig.yaml").noise == noise
+
+
+def test_poses_of_a_topic_in_either_direction() -> None:
+    for parent, child in (("base", "hand"), ("hand", "base")):
+        text = FULL.replace("{tf: [base, hand]}", f"{{topic: /pose, parent: {parent}, child: {child}}}")
+        source = parse_rig(text, "rig.yaml").carriers.poses
+        assert source == PoseSource(topic="/pose", parent=parent, child=child)
+        assert source.frames == (parent, child)
+    assert parse_rig(FULL.replace("[base, hand]", "[hand, base]"), "f").carriers.poses.frames == ("hand", "base")
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(RigError, match=r"none\.yaml cannot be read: No such file"):
+        read_rig(tmp_path / "none.yaml")
+    (tmp_path / "rig.yaml").write_bytes(b"\xff")
+    with pytest.raises(RigError, match="not a text file in UTF-8"):
+        read_rig(tmp_path / "rig.yaml")
+    (tmp_path / "rig.yaml").write_bytes(b"a: 1\n" * 300_000)
+    with pytest.raises(RigError, match="larger than"):
+        read_rig(tmp_path / "rig.yaml")
+
+
+def test_lists_that_are_kept_elsewhere_too() -> None:
+    assert get_args(Cleaning.model_fields["robust"].annotation) == get_args(Robust)
+    options = asdict(DetectionOptions())
+    assert set(options) == {field.name for field in fields(DetectionOptions)}
+    text = MINIMAL + f"detection: {{{', '.join(f'{key}: {value}' for key, value in options.items())}}}"
+    assert parse_rig(text, "f").detection == options
+
+
+NAMES = st.from_regex(r"[a-z][a-zA-Z0-9_]{0,5}(/[A-Za-z0-9_]{1,4})?", fullmatch=True)
+TOPICS = st.text(min_size=1, max_size=12).filter(str.isprintable) | st.sampled_from(
+    ["/a/b", "no", "a: b", "1e3", "# x"]
+)
+POSITIVE = st.floats(1e-300, 1e300)
+LENGTHS = st.floats(1e-9, 9.99)
+INTRINSICS = st.one_of(
+    st.builds(lambda topic: Intrinsics(topic=topic), TOPICS),
+    st.builds(lambda path, camera: Intrinsics(kalibr=path, camera=camera), TOPICS, TOPICS),
+    st.builds(lambda path: Intrinsics(file=path), TOPICS),
+    st.builds(
+        lambda f, c, D: Intrinsics(model="radtan", width=640, height=480, K=(f, f, *c), D=D),
+        st.floats(100, 900), st.tuples(st.floats(0, 640), st.floats(0, 480)),
+        st.lists(st.floats(-1, 1), min_size=5, max_size=5).map(tuple).filter(any),
+    ),
+)  # fmt: skip
+
+
+@st.composite
+def rigs(draw: st.DrawFn) -> Rig:
+    names = iter(draw(st.lists(NAMES, min_size=14, max_size=14, unique=True)))
+    topics = iter(draw(st.lists(TOPICS, min_size=6, max_size=6, unique=True)))
+    hand, base = next(names), next(names)
+    tf = draw(st.permutations((hand, base)))
+    poses = PoseSource(tf=(tf[0], tf[1])) if draw(st.booleans()) else PoseSource(
+        topic=next(topics), parent=tf[0], child=tf[1]
+    )  # fmt: skip
+    noise = st.builds(PoseNoise, rotation_deg=POSITIVE, translation_mm=POSITIVE)
+    carriers = Carriers(
+        sensors=hand, targets=base, poses=poses, max_gap_s=draw(POSITIVE), noise=draw(st.none() | noise)
+    )
+    sensors = {}
+    for _ in range(draw(st.integers(1, 3))):
+        source: dict[str, Any] = {draw(st.sampled_from(["images", "detections"])): next(topics)}
+        intrinsics = draw(INTRINSICS if "images" in source else st.none() | INTRINSICS)
+        offset = draw(st.just("estimate") | st.floats(-1e9, 1e9))
+        frame = next(names) if draw(st.booleans()) else None
+        sensors[next(names)] = Sensor(**source, intrinsics=intrinsics, time_offset=offset, frame=frame)
+    targets = {
+        next(names): TagTarget(type="tag", family="tag36h11", id=draw(st.integers(0, 99)), size_m=draw(LENGTHS)),
+        next(names): CharucoTarget(
+            type="charuco", family="aruco_5x5_100", columns=5, rows=3, square_m=1.0, marker_m=draw(st.floats(0.1, 0.9))
+        ),
+        next(names): AprilGridTarget(
+            type="aprilgrid", family="tag36h11", columns=3, rows=2, tag_m=draw(LENGTHS), spacing=0.3, first_id=100
+        ),
+        next(names): CheckerboardTarget(type="checkerboard", columns=5, rows=4, square_m=draw(LENGTHS)),
+    }  # fmt: skip
+    some = draw(st.sets(st.sampled_from(sorted(targets)), min_size=1))
+    return Rig(
+        carriers=carriers,
+        sensors=sensors,
+        targets={name: target for name, target in targets.items() if name in some},
+        sizes=draw(st.sampled_from(["known", "check", "estimate"])),
+        noise=draw(st.sampled_from(["estimate", Noise(corner_px=0.3), Noise(rotation_deg=1e-7, translation_mm=1.0)])),
+        detection=draw(st.dictionaries(st.sampled_from(["min_side_px", "max_blur_px"]), st.floats(1e-300, 1e300))),
+        cleaning=Cleaning(
+            min_rotation_deg=draw(POSITIVE), max_translation_m_s=draw(st.none() | POSITIVE), thin=draw(st.booleans())
+        ),
+    )
+
+
+@settings(max_examples=60)
+@given(rigs())
+def test_what_is_written_reads_back_equal(rig: Rig) -> None:
+    text = rig_text(rig)
+    again = parse_rig(text, "rig.yaml")
+    assert again == rig
+    assert list(again.targets) == list(rig.targets)
+    assert rig_text(again) == text
+    # Other readers of YAML see the same: here PyYAML, which is of YAML 1.1.
+    seen = yaml.safe_load(text)
+    assert seen["carriers"]["max_gap_s"] == rig.carriers.max_gap_s
+    assert [s.get("images", s.get("detections")) for s in seen["sensors"].values()] == [
+        s.images or s.detections for s in rig.sensors.values()
+    ]
+
+
+@settings(max_examples=150)
+@given(st.binary(max_size=60) | st.text(st.sampled_from("carsen:o \n-{}[],&*!'\"1.te"), max_size=80).map(str.encode))
+def test_random_files(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+    path = tmp_path_factory.getbasetemp() / "random.yaml"
+    path.write_bytes(content)
+    with pytest.raises(RigError, match=r"random\.yaml"):
+        read_rig(path)
+
+
+WORDS = [
+    "", "null", "[]", "{}", "-1", "0", "1e400", ".nan", "true", "'", '"', "{", "}", "[", "]", ":", "\n", "  ", "\t",
+    "hand", "base", "tag", "estimate", "99999999999999999999", "\ud800", "\x00", "é", "- ", "? ", "<<", "!!int ",
+    "&a ", "*a", "[key]", "type", "noise: ", "{tag: {tag: 1}}",
+]  # fmt: skip
+
+
+@settings(max_examples=300)
+@given(st.data())
+def test_mutated_files(data: st.DataObject) -> None:
+    text = FULL
+    for _ in range(data.draw(st.integers(1, 4))):
+        # A whole word, as a rule: then what is wrong gets as far as the schema.
+        start = data.draw(st.integers(0, len(text) - 1))
+        end = min(len(text), start + data.draw(st.integers(0, 12)))
+        if data.draw(st.booleans()):
+            while start > 0 and text[start - 1].isalnum():
+                start -= 1
+            end = start + 1
+            while end < len(text) and text[end].isalnum():
+                end += 1
+        text = text[:start] + data.draw(st.sampled_from(WORDS)) + text[end:]
+    try:
+        rig = parse_rig(text, "rig.yaml")
+    except RigError:
+        return
+    assert parse_rig(rig_text(rig), "again") == rig
