@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gtsam_rwhec.errors import FileFormatError
@@ -117,6 +117,7 @@ def test_paths_and_values_for_messages() -> None:
     )  # fmt: skip
 
 
+@settings(deadline=None)
 @given(st.text(st.sampled_from("ab:-[]{}?,&*!|>'\"%@#\\\n \tU01.xF~<=é\x00\x85\ufeff\ud800"), max_size=60))
 def test_any_text_is_read_or_refused(text: str) -> None:
     try:

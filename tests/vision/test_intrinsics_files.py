@@ -83,19 +83,19 @@ def test_camchain_without_distortion(path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("camera_model: pinhole", "camera_model: omni", "line 3: cam0.camera_model: 'omni' is not supported, only pinhole"),
+        ("camera_model: pinhole", "camera_model: omni", "line 3: cam0.camera_model: 'omni' is not supported, only"),
         ("camera_model: pinhole", "camera_model: ds", "line 3: cam0.camera_model: 'ds' is not supported"),
         ("camera_model: pinhole", "camera_model: eucm", "line 3: cam0.camera_model: 'eucm' is not supported"),
         ("distortion_model: radtan", "distortion_model: fov", "line 5: cam0.distortion_model: 'fov' is not supported"),
         ("  distortion_model: radtan\n", "", "line 1: cam0.distortion_model: is missing"),
         ("  intrinsics: [458.6, 457.3, 367.2, 248.4]\n", "", "line 1: cam0.intrinsics: is missing"),
         ("  distortion_coeffs: [-0.28, 0.07, 0.0002, 1.8e-05]\n", "", "line 1: cam0.distortion_coeffs: is missing"),
-        ("distortion_coeffs: [-0.28,", "distortion_coeffs: [", "line 4: cam0.distortion_coeffs: [0.07, 0.0002, 1.8e-05]; a"),
+        ("distortion_coeffs: [-0.28,", "distortion_coeffs: [", "line 4: cam0.distortion_coeffs: [0.07, 0.0002, 1.8e-05]"),
         ("[458.6,", "[1, 458.6,", "line 6: cam0.intrinsics: [1, 458.6, 457.3, 367.2, 248.4]; a list of 4 numbers was"),
         ("[458.6,", "[a,", "line 6: cam0.intrinsics[0]: 'a'; a finite number was expected"),
         ("[458.6,", "[.nan,", "line 6: cam0.intrinsics[0]: nan; a finite number was expected"),
         ("[458.6,", "[true,", "line 6: cam0.intrinsics[0]: true; a finite number was expected"),
-        ("resolution: [752, 480]", "resolution: [752.5, 480]", "line 7: cam0.resolution: 752.5; a whole number of pixels"),
+        ("resolution: [752, 480]", "resolution: [752.5, 480]", "line 7: cam0.resolution: 752.5; a whole number"),
         ("resolution: [752, 480]", "resolution: 752", "line 7: cam0.resolution: 752; a list of 2 numbers was expected"),
         ("resolution: [752, 480]", "resolution:", "line 7: cam0.resolution: is empty"),
         ("cam1:\n", "cam1: 3\nother:\n", "line 9: cam1: 3; a camera's section was expected"),
@@ -179,7 +179,7 @@ def test_other_names(path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("image_width: 640\n", "", "line 1: no image_width; a calibration with image_width, image_height, camera_matrix"),
+        ("image_width: 640\n", "", "line 1: no image_width; a calibration with image_width, image_height"),
         ("image_height: 480\n", "", "line 1: no image_height"),
         ("image_width: 640", "image_width: wide", "line 1: image_width: 'wide'; a whole number of pixels was expected"),
         ("camera_matrix:", "camera_matrices:", "line 1: no camera_matrix"),
@@ -190,8 +190,8 @@ def test_other_names(path: Path) -> None:
         ("[430.2, 0,", "[430.2,", "line 7: camera_matrix.data: [430.2, 306.7, 0, 430.5, 227.2, 0, 0, 1]; a list of 9 "),
         ("[430.2, 0,", "[430.2, o,", "line 7: camera_matrix.data[1]: 'o'; a finite number was expected"),
         ("[-0.34,", "[.inf,", "line 12: distortion_coefficients.data[0]: inf; a finite number was expected"),
-        ("  data: [-0.34,", "  data: 3 # [", "line 12: distortion_coefficients.data: 3; a list of numbers was expected"),
-        ("plumb_bob", "omni", "line 8: distortion_model: 'omni' is not supported; supported are none, pinhole, plumb_bob"),
+        ("  data: [-0.34,", "  data: 3 # [", "line 12: distortion_coefficients.data: 3; a list of numbers"),
+        ("plumb_bob", "omni", "line 8: distortion_model: 'omni' is not supported; supported are none, pinhole"),
         ("plumb_bob", "5", "line 8: distortion_model: 5 is not supported"),
         ("camera_matrix:", "camera_matrix: !!python/tuple", "line 4: the tag '!!python/tuple'"),
         ("image_width: 640", "cam0: {}", "line 1: a Kalibr camchain; give it in the rig file as {kalibr: FILE"),
@@ -209,9 +209,8 @@ def test_calibration_faults(path: Path, old: str, new: str, words: str) -> None:
 
 
 def test_four_coefficients_without_a_model_could_be_either(path: Path) -> None:
-    text = (
-        ROS.replace("distortion_model: plumb_bob\n", "").replace("cols: 5", "cols: 4").replace(", 0]\nrect", "]\nrect")
-    )
+    text = ROS.replace("distortion_model: plumb_bob\n", "").replace("cols: 5", "cols: 4")
+    text = text.replace(", 0]\nrect", "]\nrect")
     path.write_text(text)
     with pytest.raises(FileFormatError, match=r"line 8: distortion_coefficients: four coefficients.*add a line"):
         read_calibration_yaml(path)
@@ -238,7 +237,7 @@ def test_the_one_for_the_other(path: Path) -> None:
         read_calibration_yaml(path.with_name("none.yaml"))
 
 
-@settings(max_examples=100)
+@settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_mutated_files(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     kalibr = data.draw(st.booleans())
@@ -246,11 +245,8 @@ def test_mutated_files(tmp_path_factory: pytest.TempPathFactory, data: st.DataOb
     for _ in range(data.draw(st.integers(1, 3))):
         start = data.draw(st.integers(0, len(text) - 1))
         end = start + data.draw(st.integers(0, 8))
-        text = (
-            text[:start]
-            + data.draw(st.sampled_from(["", "0", "9", ".nan", "[", "]", ":", "\n", "-", "a"]))
-            + text[end:]
-        )
+        word = data.draw(st.sampled_from(["", "0", "9", ".nan", "[", "]", ":", "\n", "-", "a"]))
+        text = text[:start] + word + text[end:]
     path = tmp_path_factory.getbasetemp() / "mutated.yaml"
     path.write_text(text)
     read = read_kalibr_camchain if kalibr else read_calibration_yaml
