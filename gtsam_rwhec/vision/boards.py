@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from gtsam_rwhec.poses import Array
+from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.dictionaries import dictionary
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard
@@ -14,6 +15,17 @@ from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 #: A corner that refinement moves further than this share of its window went to another one.
 MOST_MOVED = 0.8
+#: Windows at an AprilGrid's corners, half their size as shares of a tag's side, and of the gap between tags at most:
+#: first to find the corner (where black squares touch OpenCV's contours go astray by pixels), then to measure it.
+FIND, FIND_GAP, MEASURE, MEASURE_GAP = 0.2, 0.7, 0.13, 0.55
+#: Corners further than this from where the others say are somebody's finger, or another corner (pixels).
+ASTRAY_PX = 1.5
+#: Windows at a checkerboard's corners, half their size as a share of a square.
+OF_SQUARE = 0.4
+#: How far a marker's edge reaches out of it, by blur and by the gradient's own window, pixels.
+GRADIENT_PX = 0.5
+#: A checkerboard's outermost squares differ by no less than this share of what its inner ones do.
+LEAST_CONTRAST = 0.3
 
 
 def charuco_detector(board: Charuco) -> cv2.aruco.CharucoDetector:
@@ -26,9 +38,13 @@ def charuco_detector(board: Charuco) -> cv2.aruco.CharucoDetector:
 
 
 def charuco_corners(
-    gray: Gray, detector: cv2.aruco.CharucoDetector, ids: np.ndarray, markers_px: Array
+    gray: Gray, board: Charuco, detector: cv2.aruco.CharucoDetector, ids: np.ndarray, markers_px: Array
 ) -> tuple[np.ndarray, Array]:
-    """Indices (n,) and places (n, 2) of a board's inner corners, from its markers' ids (m,) and corners (m, 4, 2)."""
+    """Indices (n,) and places (n, 2) of a board's inner corners, from its markers' ids (m,) and corners (m, 4, 2).
+
+    OpenCV's windows reach into the markers where a board is turned or slanted, and corners are tenths of a pixel off:
+    measured again in windows that do not.
+    """
     if len(ids) == 0:
         return np.zeros(0, dtype=int), np.zeros((0, 2))
     corners, indices, _, _ = detector.detectBoard(
@@ -36,7 +52,22 @@ def charuco_corners(
     )
     if indices is None or len(indices) == 0:
         return np.zeros(0, dtype=int), np.zeros((0, 2))
-    return np.ravel(indices).astype(int), np.reshape(corners, (-1, 2)).astype(float)
+    indices, found = np.ravel(indices).astype(int), np.reshape(corners, (-1, 2)).astype(float)
+    half = _to_the_markers(board, board.corners()[indices, :2], found) - GRADIENT_PX
+    return indices, refined_corners(gray, found, int(np.clip(half, 2, 8)))
+
+
+def _to_the_markers(board: Charuco, plane: Array, pixels: Array) -> float:
+    """How far from a corner (n, 2) the nearest marker begins, pixels along x or y, at the least."""
+    if len(plane) < 4:
+        return 0.0
+    H, _ = cv2.findHomography(plane, pixels)
+    if H is None:
+        return 0.0
+    gap = 0.5 * (board.square_m - board.marker_m)
+    around = plane[:, None] + gap * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    there, here = (cv2.perspectiveTransform(p.reshape(-1, 1, 2), H).reshape(p.shape) for p in (around, plane))
+    return float(np.abs(there - here[:, None]).max(axis=2).min())
 
 
 def aprilgrid_corners(gray: Gray, board: AprilGrid, ids: np.ndarray, tags_px: Array) -> tuple[np.ndarray, Array]:
@@ -55,11 +86,25 @@ def aprilgrid_corners(gray: Gray, board: AprilGrid, ids: np.ndarray, tags_px: Ar
     fits = [_plane_error(plane, np.roll(tags_px, turn, axis=1).reshape(-1, 2)) for turn in range(4)]
     corners = np.roll(tags_px, int(np.argmin(fits)), axis=1)
     side = float(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min())
-    # Inside the window only this corner's two black squares: a tag's border is an eighth of it and more.
-    half = int(np.clip(0.5 * min(board.spacing, 0.2) * side, 2, 7))
-    refined = refined_corners(gray, corners.reshape(-1, 2), half)
-    stayed = np.linalg.norm(refined - corners.reshape(-1, 2), axis=1) < MOST_MOVED * half
-    return indices[stayed], refined[stayed]
+    rough = corners.reshape(-1, 2)
+    # Inside the windows only this corner's two black squares: a tag's border is a fifth of it.
+    half = int(np.clip(min(FIND, FIND_GAP * board.spacing) * side, 3, 12))
+    found = refined_corners(gray, rough, half)
+    moved = np.linalg.norm(found - rough, axis=1)
+    kept = (moved > 0.0) & (moved < MOST_MOVED * half)  # where it does not converge OpenCV returns what it was given
+    half = int(np.clip(min(MEASURE, MEASURE_GAP * board.spacing) * side, 2, 8))
+    return indices[kept], refined_corners(gray, found[kept], half)
+
+
+def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndarray:
+    """Which (n,) of a board's corners (n, 3) and (n, 2) agree with most of them; all where too few could tell."""
+    everyone = np.ones(len(corners_m), dtype=bool)
+    x = camera.undistort(corners_px)
+    if len(corners_m) < 6 or not np.isfinite(x).all():
+        return everyone
+    focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
+    H, agrees = cv2.findHomography(corners_m[:, :2], x * focal, cv2.RANSAC, ASTRAY_PX)
+    return everyone if H is None else agrees.ravel().astype(bool)
 
 
 def checkerboard_corners(gray: Gray, board: Checkerboard) -> Array:
@@ -67,25 +112,44 @@ def checkerboard_corners(gray: Gray, board: Checkerboard) -> Array:
 
     The top is where the first corner's outer square is black: a half turn changes its colour.
     """
-    found, corners = cv2.findChessboardCornersSB(
-        gray, (board.columns, board.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-    )
-    if not found:
-        return np.zeros((0, 2))
-    grid = np.reshape(corners, (board.rows, board.columns, 2)).astype(float)
-    right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: nobody sees a board from behind
-        grid = grid[::-1]
-    if _outer_square(gray, grid) > _outer_square(gray, grid[::-1, ::-1]):
-        grid = grid[::-1, ::-1]
-    return grid.reshape(-1, 2)
+    # OpenCV takes an outer edge for inner corners now and then; with other options it does not, or elsewhere.
+    for flags in (cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY, 0):
+        found, corners = cv2.findChessboardCornersSB(gray, (board.columns, board.rows), flags=flags)
+        if not found:
+            return np.zeros((0, 2))
+        grid = np.reshape(corners, (board.rows, board.columns, 2)).astype(float)
+        right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+        if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: nobody sees a board from behind
+            grid = grid[::-1]
+        contrast = _contrast(gray, grid)
+        if contrast < 0.0:
+            grid, contrast = grid[::-1, ::-1], -contrast
+        if contrast > 0.0:
+            steps = (np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
+            return refined_corners(gray, grid.reshape(-1, 2), int(np.clip(OF_SQUARE * min(steps), 2, 9)))
+    return np.zeros((0, 2))
 
 
-def _outer_square(gray: Gray, grid: Array) -> float:
-    """Gray value of the middle of the square outside the first corner (by the inner square's mirror image)."""
-    middle = grid[0, 0] - 0.5 * (grid[1, 1] - grid[0, 0])
-    x, y = np.clip(np.rint(middle).astype(int), 0, [gray.shape[1] - 1, gray.shape[0] - 1])
-    return float(gray[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].mean())
+def _contrast(gray: Gray, grid: Array) -> float:
+    """How much lighter squares beside black ones are, with the first corner's outer square black; negative if white.
+
+    0 where the outermost squares in the image do not alternate: then an outer edge was taken for inner corners.
+    """
+    beyond = np.pad(grid, ((1, 1), (1, 1), (0, 0)), mode="reflect", reflect_type="odd")
+    middles = 0.25 * (beyond[1:, 1:] + beyond[1:, :-1] + beyond[:-1, 1:] + beyond[:-1, :-1])
+    x, y = np.moveaxis(np.rint(middles).astype(int), 2, 0)
+    seen = (x >= 0) & (y >= 0) & (x < gray.shape[1]) & (y < gray.shape[0])
+    values = cv2.blur(gray, (3, 3))[np.where(seen, y, 0), np.where(seen, x, 0)].astype(float)
+    white = np.indices(values.shape).sum(axis=0) % 2 == 1
+
+    def difference(part: tuple[slice | int, slice | int]) -> float:
+        light, dark = values[part][seen[part] & white[part]], values[part][seen[part] & ~white[part]]
+        return float(light.mean() - dark.mean()) if len(light) and len(dark) else np.nan
+
+    whole = np.s_[:]
+    inner = difference((slice(1, -1), slice(1, -1)))
+    edges = [difference(part) for part in ((0, whole), (-1, whole), (whole, 0), (whole, -1))]
+    return 0.0 if any(edge / inner < LEAST_CONTRAST for edge in edges) else inner
 
 
 def refined_corners(gray: Gray, corners: Array, half: int) -> Array:

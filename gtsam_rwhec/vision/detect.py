@@ -118,7 +118,8 @@ class Detector:
                     if _kind(board) == kind:
                         indices, seen_px = self._board(gray, board, ids, corners)
                         if len(indices):
-                            sightings[k].append(_Sighting(board, indices, seen_px))
+                            kept = boards.on_one_plane(self.camera, board.corners()[indices], seen_px)
+                            sightings[k].append(_Sighting(board, indices[kept], seen_px[kept]))
             for k, sighting in self._single_tags(images, kind, found):
                 sightings[k].append(sighting)
         for checkerboard in self._checkerboards:
@@ -157,7 +158,7 @@ class Detector:
         mine = [k for k, i in enumerate(ids) if i in board.ids]
         numbers = np.array([ids[k] for k in mine], dtype=int)
         if isinstance(board, Charuco):
-            return boards.charuco_corners(gray, self._charuco[board.name], numbers, corners[mine])
+            return boards.charuco_corners(gray, board, self._charuco[board.name], numbers, corners[mine])
         assert isinstance(board, AprilGrid)
         return boards.aprilgrid_corners(gray, board, numbers, corners[mine])
 
