@@ -202,6 +202,7 @@ def fields_of(solution: Solution) -> ResultFile:
 
 
 def solution_of(file: ResultFile) -> Solution:
+    """The certified solution among a file's fields."""
     identifiability = Identifiability(
         is_unique=file.identifiability.is_unique,
         free_directions=list(file.identifiability.free_directions),

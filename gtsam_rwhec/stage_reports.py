@@ -1,4 +1,4 @@
-"""What each stage from a log to a calibration reports: how much it used, and everything that it did not, with the reason.
+"""What each stage from a log to a calibration reports: how much it used, and what it did not, with the reasons.
 
 Kept in the logs that stages write, and in the result file.
 """

@@ -134,8 +134,8 @@ class LocalPaths:
         if (near.sum(axis=1) < 4).any():
             i = int(np.argmin(near.sum(axis=1)))
             raise CountError(
-                f"{path.where}: {near[i].sum()} poses within {WINDOW_S:g} s of the measurement at {stamps[i]} ns; a time "
-                "offset needs four and more, to tell how fast the carrier moved"
+                f"{path.where}: {near[i].sum()} poses within {WINDOW_S:g} s of the measurement at {stamps[i]} ns; a "
+                "time offset needs four and more, to tell how fast the carrier moved"
             )
         xi = se3.logmap((se3.inverse(here)[:, None] @ path.T[rows]).reshape(-1, 4, 4)).reshape(*tau.shape, 6)
         # Columns scaled by the window: third powers of milliseconds are nothing.

@@ -19,6 +19,7 @@ from rwhec_factors.priors import (
     position_prior_factor,
     rotation_prior_factor,
 )
+from rwhec_factors.shifted_pose_prior import shifted_pose_prior_factor
 
 __all__ = [
     "BatchResiduals",
@@ -39,5 +40,6 @@ __all__ = [
     "robot_world_hand_eye_factor",
     "rotation_prior_factor",
     "scaled_robot_world_hand_eye_factor",
+    "shifted_pose_prior_factor",
     "two_pose_robot_world_hand_eye_factor",
 ]

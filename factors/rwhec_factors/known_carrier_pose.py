@@ -114,7 +114,7 @@ def _factor(
     check_pose(A, "A")
     if (time_offset_key is None) != (twist is None):
         raise ValueError("a time offset needs both its key (time_offset_key=) and the carriers' twist (twist=)")
-    velocity = None if twist is None else _checked_twist(twist)
+    velocity = None if twist is None else checked_twist(twist)
 
     def predict(values: gtsam.Values, wanted: bool) -> Prediction:
         X = pose_of(values, target_key, "X = T_targetcarrier_target")
@@ -136,7 +136,14 @@ def _factor(
     return measurement_factor(keys, sensor_key, B, noise, predict, scale_key, residual)
 
 
-def _checked_twist(twist: ArrayLike) -> Array:
+def checked_twist(twist: ArrayLike) -> Array:
+    """Six finite numbers.
+
+    Raises
+    ------
+    ValueError
+        For anything else.
+    """
     velocity = np.asarray(twist, dtype=np.float64)
     if velocity.shape != (6,) or not np.isfinite(velocity).all():
         raise ValueError(f"the twist is {velocity}; give six finite numbers, [omega (rad/s), v (m/s)]")

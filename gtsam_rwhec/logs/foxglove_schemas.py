@@ -258,8 +258,13 @@ def _tag_detections(message: Any, access: Access, topic: str, logged: int) -> Re
         size, error = (None if tag.get(n) is None else float(tag[n]) for n in ("size_m", "reprojection_px"))
         family, name = _text(get, tag, "family"), _text(get, tag, "id")
         reason = _text(get, tag, "reason") if "reason" in tag else ""
+        indices = None if tag.get("corner_indices") is None else tuple(int(i) for i in tag["corner_indices"])
+        if indices is not None and (corners is None or len(indices) != len(corners)):
+            return f"{len(indices)} corner_indices for {0 if corners is None else len(corners)} corners"
         records.append(
-            DetectionRecord(logged, stamp, topic, frame, family, name, corners, T, covariance, size, error, reason)
+            DetectionRecord(
+                logged, stamp, topic, frame, family, name, corners, T, covariance, size, error, reason, indices
+            )
         )
     return records
 

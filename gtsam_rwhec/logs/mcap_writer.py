@@ -194,6 +194,8 @@ class LogWriter:
                 part["size_m"] = float(tag.size_m)
             if tag.corners_px is not None:
                 part["corners_px"] = [{"x": float(x), "y": float(y)} for x, y in tag.corners_px]
+            if tag.corner_indices is not None:
+                part["corner_indices"] = list(tag.corner_indices)
             if tag.T_camera_tag is not None:
                 part["pose"] = _pose(tag.T_camera_tag)
             if tag.covariance is not None:

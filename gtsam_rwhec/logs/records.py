@@ -90,7 +90,8 @@ class DetectionRecord:
 
     `family` is empty where the message does not say. `id` is a number, or a board's name. `corners_px` is (4, 2) in
     the driver's order (of a board as many as were seen), `T_camera_tag` (4, 4), `covariance` (6, 6) as in `PoseRecord`,
-    `reprojection_px` the root mean square over the corners. `reason` says why it is not used; empty where it is.
+    `reprojection_px` the root mean square over the corners, `corner_indices` says which of a target's corners (as its
+    class numbers them) those in `corners_px` are. `reason` says why it is not used; empty where it is.
     """
 
     logged_ns: int
@@ -105,6 +106,7 @@ class DetectionRecord:
     size_m: float | None = None
     reprojection_px: float | None = None
     reason: str = ""
+    corner_indices: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,9 +2,9 @@
 
 ``gtsam_rwhec.TagDetections``
     Tags seen in one image. ``frame_id`` is the camera's frame; each detection has ``family``, ``id`` and, where known,
-    ``size_m``, ``corners_px`` (four points; of a board, those that were seen), ``pose`` (T_camera_tag), ``covariance``
-    (36 numbers, row-major; rotation first, radians and metres, right perturbation of the pose), ``reprojection_px``
-    (root mean square) and, if it is not used, ``reason``.
+    ``size_m``, ``corners_px`` (four points; of a board, those that were seen: ``corner_indices``), ``pose``
+    (T_camera_tag), ``covariance`` (36 numbers, row-major; rotation first, radians and metres, right perturbation of the
+    pose), ``reprojection_px`` (root mean square) and, if it is not used, ``reason``.
 ``gtsam_rwhec.MeasuredPair``
     A synchronised measurement of A X = Y B: ``A`` = T_sensorcarrier_targetcarrier and ``B`` = T_sensor_target, 16
     numbers each, row-major, metres; ``target`` and ``sensor``; ``is_inlier``, and if it is none, ``reason``; where
@@ -71,6 +71,7 @@ _DETECTION = _message(
     corners_px=_several(_POINT),
     pose=_POSE,
     covariance=_several(_NUMBER),
+    corner_indices=_several(_INTEGER),
     reprojection_px=_NUMBER,
     reason=_STRING,
 )

@@ -49,7 +49,7 @@ class GeodesicModel:
         """Decide whether carrier poses are variables."""
         check_carriers(data, options)
         carriers = None
-        if options.carrier_noise is not None and options.carrier_model != "propagated" and not options.time_offsets:
+        if options.carrier_noise is not None and options.carrier_model != "propagated":
             candidates = graphs.CarrierVariables.of(data)
             if options.carrier_model == "variables" or candidates.is_shared:
                 carriers = candidates
@@ -57,7 +57,7 @@ class GeodesicModel:
             warnings.warn(
                 "some measurements share a carrier pose, whose error does not average out between them, but its "
                 "noise is propagated to each on its own: standard deviations are too small; take "
-                "carrier_model='variables'" + (", without time offsets" if options.time_offsets else ""),
+                "carrier_model='variables'",
                 WeightsWarning,
                 stacklevel=4,
             )
@@ -99,13 +99,14 @@ class GeodesicModel:
         """The measurements' factors, weighed as of an estimate; in another loss than the options', if told."""
         loss = self.options.robust if robust is None else robust
         graph = gtsam.NonlinearFactorGraph()
-        rest = [
+        here = [
             dataclasses.replace(item, residuals=item.at(state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0)))
             for item in self.data
         ]
+        rest = here
         if self.carriers is not None:
-            graphs.add_with_carriers(graph, self.variables, self.data, self.carriers, factors, loss)
-            rest = [item for item in rest if item.pair not in self.carriers.index]
+            graphs.add_with_carriers(graph, self.variables, here, self.carriers, factors, loss)
+            rest = [item for item in here if item.pair not in self.carriers.index]
         covariances = self.covariances(state, factors) if rest else {}
         if loss in graphs.LOSSES:
             graphs.add_single(graph, self.variables, rest, covariances, loss)

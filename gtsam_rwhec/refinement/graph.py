@@ -12,6 +12,7 @@ from rwhec_factors.carrier_pose_variables import pose_robot_world_hand_eye_facto
 from rwhec_factors.edge_summary import EdgeSummary, edge_summary_factor, hand_eye_summary_factor
 from rwhec_factors.known_carrier_pose import robot_world_hand_eye_factor, scaled_robot_world_hand_eye_factor
 from rwhec_factors.priors import position_prior_factor, rotation_prior_factor
+from rwhec_factors.shifted_pose_prior import shifted_pose_prior_factor
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.certify.parts import Part
@@ -42,11 +43,13 @@ LOSSES: dict[str, tuple[Any, float]] = {
 class CarrierVariables:
     """Carrier poses that are variables: one for each distinct (stamp, A) of the problem.
 
-    index (dict of pair to (N,) integers) tells which one a measurement saw; A (M, 4, 4) are the poses as given, and
-    covariance (M, 6, 6) their noise.
+    index (dict of pair to (N,) integers) tells which one a measurement saw, and first ((pair, i) of M) the other way
+    round; A (M, 4, 4) are the poses as given, and covariance (M, 6, 6) their noise. Sensors whose clocks are off by an
+    unknown time share none with others.
     """
 
     index: dict[Pair, np.ndarray]
+    first: list[tuple[Pair, int]]
     A: Array
     covariance: Array
 
@@ -58,11 +61,11 @@ class CarrierVariables:
     @staticmethod
     def of(data: list[PairData]) -> CarrierVariables:
         """Measurements of one stamp and one A, and where there are no stamps those of one A, share a variable."""
-        place: dict[tuple[int, bytes], int] = {}
+        place: dict[tuple[int, bytes, str], int] = {}
         index: dict[Pair, np.ndarray] = {}
         A: list[Array] = []
         covariance: list[Array] = []
-        owner: list[Pair] = []
+        first: list[tuple[Pair, int]] = []
         for item in data:
             if item.carrier is None or item.pair[0] == item.pair[1]:
                 continue
@@ -70,20 +73,21 @@ class CarrierVariables:
             for i, pose in enumerate(item.residuals.A):
                 stamp = -1 if item.stamps_ns is None else int(item.stamps_ns[i])
                 # Rounded well below any noise: the same pose may come out of two interpolations.
-                key = (stamp, np.round(pose[:3], 9).tobytes())
+                clock = item.pair[1] if item.paths is not None else ""
+                key = (stamp, np.round(pose[:3], 9).tobytes(), clock)
                 if key not in place:
                     place[key] = len(A)
                     A.append(pose)
                     covariance.append(item.carrier[i])
-                    owner.append(item.pair)
+                    first.append((item.pair, i))
                 elif not np.allclose(covariance[place[key]], item.carrier[i], rtol=1e-6, atol=0.0):
                     raise NoiseError(
-                        f"{'-'.join(owner[place[key]])} and {'-'.join(item.pair)} saw one carrier pose (measurement "
+                        f"{'-'.join(first[place[key]][0])} and {'-'.join(item.pair)} saw one carrier pose (measurement "
                         f"{i} of the latter), and CarrierNoise.covariances gives it two noises; one pose has one"
                     )
                 of_pair[i] = place[key]
             index[item.pair] = of_pair
-        return CarrierVariables(index, np.array(A), np.array(covariance))
+        return CarrierVariables(index, first, np.array(A), np.array(covariance))
 
 
 def summary_of(
@@ -192,10 +196,19 @@ def add_with_carriers(
     factors: VarianceFactors,
     robust: Robust,
 ) -> None:
-    """Carrier poses as variables, each with a prior at what was measured; one factor for each measurement."""
-    for i, (A, covariance) in enumerate(zip(carriers.A, carriers.covariance, strict=True)):
+    """Carrier poses as variables, each with a prior at what was measured; one factor for each measurement.
+
+    Where a clock is off, the variable is the pose at the true time, and its prior moves along the carrier's path.
+    """
+    of_pair = {item.pair: item for item in data}
+    for i, ((pair, place), covariance) in enumerate(zip(carriers.first, carriers.covariance, strict=True)):
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        graph.add(gtsam.PriorFactorPose3(carrier_key(i), to_pose3(A[:3, :3], A[:3, 3]), noise))
+        residuals, offset_key = of_pair[pair].residuals, variables.offset_key(pair)
+        A = to_pose3(residuals.A[place, :3, :3], residuals.A[place, :3, 3])
+        if offset_key is None or residuals.twists is None:
+            graph.add(gtsam.PriorFactorPose3(carrier_key(i), A, noise))
+        else:
+            graph.add(shifted_pose_prior_factor(carrier_key(i), offset_key, A, residuals.twists[place], noise))
     for item in data:
         if item.pair not in carriers.index:
             continue

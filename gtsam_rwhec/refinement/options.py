@@ -140,11 +140,6 @@ class RefineOptions:
                     raise OptionError(
                         f"RefineOptions.{name}={value!r} needs residual='geodesic': the chordal one is made of moments"
                     )
-        if self.carrier_model == "variables" and self.time_offsets:
-            raise OptionError(
-                "RefineOptions: time_offsets with carrier_model='variables' would let the carrier poses move along "
-                "their twists twice; take carrier_model='propagated'"
-            )
 
 
 _CHOICES = {

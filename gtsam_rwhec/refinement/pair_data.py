@@ -106,8 +106,9 @@ def local_paths(
 ) -> dict[Pair, LocalPaths]:
     """The carriers' motion about the stamps of the sensors' pairs.
 
-    From the path as it was logged where it is given; else from the measurements' own poses. The carriers are the same for all sensors and targets, as a rule, so that every pair's poses tell it; where two
-    pairs have different poses at one stamp (several robots), each pair's own do.
+    From the path as it was logged where it is given; else from the measurements' own poses. The carriers are the same
+    for all sensors and targets, as a rule, so that every pair's poses tell it; where two pairs have different poses at
+    one stamp (several robots), each pair's own do.
 
     Raises
     ------

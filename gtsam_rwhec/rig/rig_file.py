@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -153,45 +153,68 @@ def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
     return _SECTIONS.get(general)
 
 
-def rig_text(rig: RigFile) -> str:
+def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
     """YAML that `parse_rig` reads back equal, with comments.
 
     Parameters
     ----------
     rig : Rig
         Its folder is not written: relative paths are relative to where the text will be.
+    remarks : mapping of key path to str, optional
+        Comments in place of the usual ones: ``("targets", "tag_0")``.
     """
-    return "\n".join(_lines(rig)) + "\n"
+    said = {**_REMARKS, **(remarks or {})}
+    lines = []
+    for path, text in _lines(rig):
+        remark = said.get(path)
+        if remark is None and path[:1] == ("sensors",) and path[2:] == ("time_offset",):
+            remark = "s: the sensor's stamp t is the carriers' t + offset; or the word estimate"
+        lines.append(f"{text:<{_COLUMN}}  # {remark}" if remark else text)
+    return "\n".join(lines) + "\n"
 
 
-def _lines(rig: RigFile) -> Iterator[str]:
+#: Where comments begin, where lines are shorter.
+_COLUMN = 30
+_REMARKS: dict[KeyPath, str] = {
+    ("carriers",): "frames: what the sensors are mounted on, and what the targets are",
+    ("carriers", "max_gap_s"): "between poses further apart in time nothing is interpolated",
+    ("carriers", "noise"): "standard deviations of the carriers' poses",
+    ("targets",): "lengths in metres, as measured on the print",
+    ("sizes",): "are the targets' sizes right? known, check or estimate",
+    ("noise",): "of detections: estimate, {rotation_deg, translation_mm} or {corner_px}",
+    ("cleaning", "max_rotation_deg_s"): "faster is left out; null: nothing is",
+}
+
+
+def _lines(rig: RigFile) -> Iterator[tuple[KeyPath, str]]:
+    """Each line with the path of what it says."""
     carriers = rig.carriers
-    yield "carriers:                  # frames: what the sensors are mounted on, and what the targets are"
-    yield f"  sensors: {_scalar(carriers.sensors)}"
-    yield f"  targets: {_scalar(carriers.targets)}"
-    yield f"  poses: {_flow(carriers.poses)}"
-    yield f"  max_gap_s: {_scalar(carriers.max_gap_s)}  # poses further apart in time are not interpolated between"
+    yield ("carriers",), "carriers:"
+    yield ("carriers", "sensors"), f"  sensors: {_scalar(carriers.sensors)}"
+    yield ("carriers", "targets"), f"  targets: {_scalar(carriers.targets)}"
+    yield ("carriers", "poses"), f"  poses: {_flow(carriers.poses)}"
+    yield ("carriers", "max_gap_s"), f"  max_gap_s: {_scalar(carriers.max_gap_s)}"
     if carriers.noise is not None:
-        yield f"  noise: {_flow(carriers.noise)}  # standard deviations of the carriers' poses"
-    yield "sensors:"
+        yield ("carriers", "noise"), f"  noise: {_flow(carriers.noise)}"
+    yield ("sensors",), "sensors:"
     for name, sensor in rig.sensors.items():
-        yield f"  {name}:"
-        for key in ("images", "detections", "intrinsics", "frame"):
-            value = getattr(sensor, key)
+        yield ("sensors", name), f"  {name}:"
+        for key, value in sensor:
             if value is not None:
-                yield f"    {key}: {_flow(value) if isinstance(value, BaseModel) else _scalar(value)}"
-        yield f"    time_offset: {_scalar(sensor.time_offset)}  # s: its stamp t is the carriers' t + offset"
-    yield "targets:                   # lengths in metres, as measured on the print"
+                text = _flow(value) if isinstance(value, BaseModel) else _scalar(value)
+                yield ("sensors", name, key), f"    {key}: {text}"
+    yield ("targets",), "targets:"
     for name, target in rig.targets.items():
-        yield f"  {name}: {_flow(target)}"
-    yield f"sizes: {rig.sizes}               # known, check or estimate: are the targets' sizes right?"
-    noise = rig.noise if isinstance(rig.noise, str) else _flow(rig.noise)
-    yield f"noise: {noise}            # of detections: estimate, or {{rotation_deg, translation_mm}}, or {{corner_px}}"
+        yield ("targets", name), f"  {name}: {_flow(target)}"
+    yield ("sizes",), f"sizes: {rig.sizes}"
+    yield ("noise",), f"noise: {rig.noise if isinstance(rig.noise, str) else _flow(rig.noise)}"
     if rig.detection:
-        yield "detection:"
-        yield from (f"  {_scalar(key)}: {_scalar(value)}" for key, value in rig.detection.items())
-    yield "cleaning:"
-    yield from (f"  {key}: {_scalar(value)}" for key, value in rig.cleaning)
+        yield ("detection",), "detection:"
+        for key, value in rig.detection.items():
+            yield ("detection", key), f"  {key}: {_scalar(value)}"
+    yield ("cleaning",), "cleaning:"
+    for key, value in rig.cleaning:
+        yield ("cleaning", key), f"  {key}: {_scalar(value)}"
 
 
 def _flow(section: BaseModel) -> str:

@@ -20,9 +20,10 @@ from gtsam_rwhec.vision.images import Gray
 #: Profiles along a side, over this part of it (near the corners two edges mix).
 PROFILES, PART = 18, (0.12, 0.88)
 #: Samples across an edge.
-SAMPLES = 11
-#: Half of a profile, in modules of the tag and in pixels at most.
-REACH_MODULES, REACH_PX = 0.85, 5.0
+SAMPLES = 13
+#: How far a profile reaches inwards and outwards, in modules of the tag, and in pixels at most. Inwards the code may be
+#: white a module away and must not blur into it; outwards the paper may end.
+INWARDS, OUTWARDS, REACH_PX = 0.55, 0.7, 5.0
 ROUNDS = 2
 #: Points further from their line than this many times the median are an occluder's.
 GROSS = 3.5
@@ -82,28 +83,33 @@ def _once(stack: Gray, image_of: np.ndarray, corners: Array, camera: Camera, mod
     share = np.linspace(*PART, PROFILES)
     # Across a slanted tag there is less than its sides are long: its area over the longest.
     with np.errstate(invalid="ignore", divide="ignore"):
-        reach = np.minimum(REACH_MODULES * _area(corners) / length[..., 0].max(axis=1) / modules, REACH_PX)  # (N,)
-    d = np.linspace(-1.0, 1.0, SAMPLES)
+        module = _area(corners) / length[..., 0].max(axis=1) / modules  # (N,)
+    inwards, outwards = np.minimum(INWARDS * module, REACH_PX), np.minimum(OUTWARDS * module, REACH_PX)
+    reach = (inwards + outwards)[:, None, None]
+    u = np.linspace(0.0, 1.0, SAMPLES)
+    d = u * reach[..., 0] - inwards[:, None]
     foot = start[:, :, None] + share[:, None] * length[:, :, None] * along[:, :, None]  # (N, 4, P, 2)
     # (N, 4, P, S, 2): from inside the dark border outwards
-    points = foot[:, :, :, None] + (d * reach[:, None])[:, None, None, :, None] * normal[:, :, None, None]
+    points = foot[:, :, :, None] + d[:, None, None, :, None] * normal[:, :, None, None]
     profile = _sampled(stack, image_of, points)
-    dark, light = profile[..., :3].mean(axis=-1), profile[..., -3:].mean(axis=-1)
+    dark, light = profile[..., 0], profile[..., -2:].mean(axis=-1)
     contrast = light - dark  # (N, 4, P)
+    # Black is as black all along a side, and one sample alone is noisy; white is as white as the light makes it there.
+    black = np.median(dark, axis=2, keepdims=True)[..., None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        rise = (profile - dark[..., None]) / contrast[..., None]
+        rise = (profile - black) / (light[..., None] - black)
         # The area under the rise tells where a step with the same plateaus would be, whatever its (symmetric) blur.
-        step = 2.0 / (SAMPLES - 1)
-        area = step * (rise.sum(axis=-1) - 0.5 * (rise[..., 0] + rise[..., -1]))
-        place = 1.0 - area  # in units of reach
+        area = (rise.sum(axis=-1) - 0.5 * (rise[..., 0] + rise[..., -1])) / (SAMPLES - 1)
+        place = 1.0 - area  # in units of reach, from its inner end
         # The rise is the blur's distribution function: its variance is the second moment of its differences.
-        centres = 0.5 * (d[1:] + d[:-1])
+        centres = 0.5 * (u[1:] + u[:-1])
         mass = np.diff(rise, axis=-1)
         variance = (mass * (centres - place[..., None]) ** 2).sum(axis=-1)
     half = 0.5 * np.median(np.maximum(contrast, 0.0), axis=(1, 2), keepdims=True)
     with np.errstate(invalid="ignore"):
-        good = (contrast > np.maximum(half, 8.0)) & (np.abs(place) < 0.7)
-    edge = foot + (np.where(good, place, 0.0) * reach[:, None, None])[..., None] * normal[:, :, None]
+        good = (contrast > np.maximum(half, 8.0)) & (place > 0.1) & (place < 0.9)
+    off = np.where(good, place, 0.0) * reach - inwards[:, None, None]
+    edge = foot + off[..., None] * normal[:, :, None]
     lines = _lines(camera.undistort(edge), good)  # (N, 4, 3)
     # Corner k is where side k - 1 meets side k: the cross product of two lines.
     met = np.cross(np.roll(lines, 1, axis=1), lines)
@@ -111,10 +117,10 @@ def _once(stack: Gray, image_of: np.ndarray, corners: Array, camera: Camera, mod
         refined = camera.pixels(met[..., :2] / met[..., 2:])
     # Further than the profiles reach, nothing was seen.
     moved = np.linalg.norm(refined - corners, axis=-1).max(axis=1)
-    refined = np.where((moved < 1.5 * reach + 0.5)[:, None, None], refined, np.nan)
+    refined = np.where((moved[:, None, None] < reach + 0.5), refined, np.nan)
     middle_one = _median(np.where(good, variance, np.inf).reshape(len(corners), -1), good.sum(axis=(1, 2)))
     with np.errstate(invalid="ignore"):
-        blur = np.sqrt(np.maximum(middle_one, 0.0)) * reach
+        blur = np.sqrt(np.maximum(middle_one, 0.0)) * reach[:, 0, 0]
     return refined, blur
 
 

@@ -12,6 +12,7 @@ import pytest
 from refinement_problems import KAPPA, SIGMA_M, refined, rig
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cleaning import Trajectory
 from gtsam_rwhec.refinement.options import RefineOptions
 
 PROBLEM = rig(seed=1).problem
@@ -97,9 +98,9 @@ def few() -> rw.Problem:
             "time_offsets=True needs residual='geodesic'",
         ),
         (
-            lambda: RefineOptions(carrier_model="variables", time_offsets=True),
+            lambda: RefineOptions(carrier_path=Trajectory.of([1, 2], np.tile(np.eye(4), (2, 1, 1)))),
             rw.errors.OptionError,
-            "carrier_model='propagated'",
+            "carrier_path is for time offsets",
         ),
     ],
 )

@@ -9,6 +9,7 @@ from refinement_problems import KAPPA, SIGMA_M, refined
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cleaning import Trajectory
 from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
 from gtsam_rwhec.twists import LocalPaths
@@ -204,3 +205,60 @@ def test_bad_stamps(change: dict[str, object], error: type[Exception], words: st
 def test_unknown_sensor() -> None:
     with pytest.raises(rw.errors.FrameError, match="names 'cam9', which is no sensor; there are cam0"):
         refined(problem_with({"cam0": 0.0}, count=20), time_offsets=("cam9",))
+
+
+def fast_path(noise: tuple[float, float] = (0.0, 0.0), seed: int = 0) -> Trajectory:
+    """The carriers' path at 100 Hz, with noise in each pose (rad, m)."""
+    stamps = np.arange(-100, 2200) * 10_000_000
+    xi = np.random.default_rng(seed).normal(size=(len(stamps), 6)) * np.repeat(noise, 3)
+    return Trajectory.of(stamps, trajectory(stamps * 1e-9) @ se3.expmap(xi))
+
+
+def slow_problem(path: Trajectory, offset_s: float, seed: int = 0) -> rw.Problem:
+    """Three targets seen at 2 Hz by one camera whose stamps are early: too slow to tell how the carriers move."""
+    stamps = np.arange(40) * 500_000_000
+    problem = rw.Problem()
+    for k in range(3):
+        target = gtsam.Pose3.Expmap(np.array([0.2 * k, -0.3, 0.1, 0.5 - 0.5 * k, 0.3, 0.1 * k])).matrix()
+        B = np.linalg.inv(Y["cam0"]) @ trajectory(stamps * 1e-9 + offset_s) @ target
+        problem.add(
+            f"tag{k}", "cam0", path.at(stamps)[0], perturb(B, Noise(SIGMA_M, KAPPA), 10 * seed + k), SIGMA_M, KAPPA,
+            stamps_ns=stamps,
+        )  # fmt: skip
+    return problem
+
+
+def test_twists_along_a_path_are_its_velocity() -> None:
+    stamps = np.arange(40) * 500_000_000 + 3_000_000
+    twists = LocalPaths.along(fast_path(), stamps).twists()
+    t, h = stamps * 1e-9, 1e-5
+    expected = se3.logmap(se3.inverse(trajectory(t - h)) @ trajectory(t + h)) / (2 * h)
+    np.testing.assert_allclose(twists, expected, atol=1e-4)
+    with pytest.raises(rw.errors.CountError, match="four and more"):
+        LocalPaths.along(fast_path(), np.array([90_000_000_000]))
+
+
+def test_a_path_tells_the_offset_of_a_slow_camera() -> None:
+    problem = slow_problem(fast_path(), 0.004)
+    r = refined(problem, time_offsets=True, carrier_path=fast_path())
+    deviation = np.sqrt(r.covariance("time_offset:cam0")[0, 0])
+    assert deviation < 0.001
+    assert abs(r.time_offsets_s["cam0"] - 0.004) < 4.0 * deviation
+
+
+def test_offset_with_carrier_poses_that_targets_share() -> None:
+    noise = (0.002, 0.004)
+    squares = []
+    for seed in range(12):
+        path = fast_path(noise, seed)
+        r = refined(
+            slow_problem(path, 0.003, seed),
+            time_offsets=True,
+            carrier_path=path,
+            carrier_noise=rw.CarrierNoise(*noise),
+        )
+        xi = se3.logmap(np.linalg.inv(Y["cam0"])[None] @ r.Y["cam0"].matrix())[0]
+        off = r.time_offsets_s["cam0"] - 0.003
+        squares.append(float(xi @ r.information("cam0") @ xi) + off**2 / r.covariance("time_offset:cam0")[0, 0])
+    # Seven degrees of freedom: the mean of twelve has a standard deviation of 1.1; without sharing it is beyond 13.
+    assert 4.0 < np.mean(squares) < 10.5
