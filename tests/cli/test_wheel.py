@@ -27,8 +27,10 @@ def unpacked_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_has_all_data_and_none_of_the_real_dataset(unpacked_wheel: Path) -> None:
-    shipped = {path.name for path in (unpacked_wheel / "gtsam_rwhec" / "demo_data").iterdir()}
-    assert shipped == {path.name for path in (REPOSITORY / "data" / "demo").iterdir()}
+    shipped = unpacked_wheel / "gtsam_rwhec" / "demo_data"
+    for folder, source in ((shipped, "demo"), (shipped / "cell", "cell")):
+        files = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+        assert files == {path.name: path.read_bytes() for path in (REPOSITORY / "data" / source).iterdir()}
     assert (unpacked_wheel / "gtsam_rwhec" / "utias_files.txt").is_file()
     assert (unpacked_wheel / "gtsam_rwhec" / "py.typed").is_file()
     assert {path.parent.name for path in unpacked_wheel.rglob("*.csv")} == {"demo_data"}
