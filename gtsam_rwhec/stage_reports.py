@@ -24,6 +24,7 @@ class TrackCount(_Report):
 class DetectionReport(_Report):
     """Of the detection stage."""
 
+    sources: tuple[str, ...] = Field(description="file names of the logs")
     images: dict[str, int] = Field(description="images, or messages of a detection driver, by sensor")
     undecoded: dict[str, tuple[str, ...]] = Field(description="images that could not be used, and why, by sensor")
     tracks: tuple[TrackCount, ...] = Field(description="detections of each target in each sensor")
@@ -64,7 +65,6 @@ class TimeOffsetFields(_Report):
 class LogFields(_Report):
     """Where a calibration's measurements came from, and what became of them."""
 
-    sources: tuple[str, ...] = Field(description="file names of the logs")
     sensor_carrier: str = Field(description="name of the frame that carries the sensors")
     target_carrier: str = Field(description="name of the frame that carries the targets")
     detection: DetectionReport = Field(description="what the detection stage reported")

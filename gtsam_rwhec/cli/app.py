@@ -19,6 +19,7 @@ from gtsam_rwhec.calibration import solve
 from gtsam_rwhec.cli.demo_data import KAPPA, SIGMA_M, demo_folder
 from gtsam_rwhec.cli.exit_status import HELP, ExitStatus, exit_status
 from gtsam_rwhec.cli.failures import failures_in_words
+from gtsam_rwhec.cli.log_commands import add_log_commands, calibrate_from_log, is_log
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.csv_files import read_csv
 from gtsam_rwhec.errors import FileFormatError, NotCertifiedWarning, NotUniqueWarning
@@ -38,6 +39,7 @@ app = typer.Typer(
 )
 fetch_app = typer.Typer(help="Download public measurements.", no_args_is_help=True)
 app.add_typer(fetch_app, name="fetch")
+add_log_commands(app)
 
 
 class Scale(StrEnum):
@@ -91,7 +93,12 @@ def common(
 
 @app.command(epilog=HELP)
 def calibrate(
-    folder: Annotated[Path, typer.Argument(help="Folder of <targets>_<id>_<sensors>_<id>_{A,B}.csv files.")],
+    source: Annotated[
+        Path, typer.Argument(help="MCAP log, or folder of <targets>_<id>_<sensors>_<id>_{A,B}.csv files.")
+    ],
+    rig: Annotated[
+        Path | None, typer.Option(help="Of a log: rig file (YAML). Left out for a log that a stage wrote.")
+    ] = None,
     scale: Annotated[Scale, typer.Option(help="Is the targets' size known, wrong by one factor, or by one each?")] = (
         Scale.known
     ),
@@ -124,9 +131,29 @@ def calibrate(
     carrier_noise_mm: Annotated[
         float | None, typer.Option(help="With --refine: noise of the carriers' poses A along each axis, mm.")
     ] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the result here as JSON.")] = None,
+    images: Annotated[bool, typer.Option("--images", help="Of a log: have the images in clean.mcap too.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Of a log: threads for detection.", show_default="all cores")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Of CSV files: result (JSON). Of a log: the folder for everything."),
+    ] = None,
 ) -> None:
-    """Calibrate from a folder of CSV files, and print poses, residuals and the certificate."""
+    """Calibrate from a log, or from a folder of CSV files; print poses, residuals, the certificate, covariances.
+
+    For a log, noise, scale and the like are in the rig file, and everything is written to a folder: clean.mcap,
+    result.json, static_tf.launch.py, tf.yaml, rig.urdf.xacro, camchain.yaml and plots.
+    """
+    if is_log(source, rig):
+        _refuse_csv_options(scale, sigma, kappa, method, initial, refine_with, robust)
+        if output is None:
+            raise typer.BadParameter("a log's calibration is a folder of files: say which with -o FOLDER")
+        calibrate_from_log(source, rig, output, images=images, workers=workers)
+        return
+    if images or workers is not None:
+        raise typer.BadParameter("--images and --workers are for logs")
+    folder = source
     if (initial is not None) != (method is Method.local):
         raise typer.BadParameter("--method local and --initial FILE go together")
     carrier_noises = {carrier_noise_deg is None, carrier_noise_mm is None}
@@ -170,6 +197,30 @@ def calibrate(
         if refined is not None and refined.free_directions and status is ExitStatus.CERTIFIED:
             status = ExitStatus.NOT_UNIQUE
         raise typer.Exit(status)
+
+
+def _refuse_csv_options(
+    scale: Scale,
+    sigma: float | None,
+    kappa: float | None,
+    method: Method,
+    initial: Path | None,
+    refine_with: Refine | None,
+    robust: Robust,
+) -> None:
+    """A log's rig file says all this: an option that would be passed over is refused."""
+    given = {
+        "--scale": scale is not Scale.known,
+        "--sigma": sigma is not None,
+        "--kappa": kappa is not None,
+        "--method": method is not Method.auto,
+        "--initial": initial is not None,
+        "--refine": refine_with is not None,
+        "--robust": robust is not Robust.none,
+    }
+    names = [name for name, is_given in given.items() if is_given]
+    if names:
+        raise typer.BadParameter(f"{', '.join(names)}: of a log, the rig file says this (sizes, noise, cleaning)")
 
 
 def _carrier_noise(deg: float | None, mm: float | None) -> CarrierNoise | None:

@@ -1,0 +1,85 @@
+"""Detections that a driver made: their corners made poses with the rig file's sizes, or their poses as they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gtsam_rwhec.errors import CameraError, LogError
+from gtsam_rwhec.logs import DetectionRecord, Log
+from gtsam_rwhec.pipeline.tracks import target_of
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.pose import plane_poses
+from gtsam_rwhec.vision.targets import Target
+
+
+def from_driver(log: Log, rig: Rig, sensor: str, camera: Camera | None) -> list[DetectionRecord]:
+    """Records of a sensor's targets.
+
+    With intrinsics, poses are made anew from the corners and the rig file's sizes (a driver's may be configured to
+    others); of the two that a plane has, the one nearer to the driver's where it has one, else the one of smaller
+    reprojection error. Without, the driver's poses stand, and its size.
+
+    Raises
+    ------
+    LogError
+        The topic is not there, or has no detections.
+    CameraError
+        There are neither poses nor intrinsics to make them.
+    """
+    source = rig.sensors[sensor]
+    assert source.detections is not None
+    result, others = [], set()
+    for record in log.records([source.detections]):
+        if not isinstance(record, DetectionRecord):
+            raise LogError(f"topic {source.detections} has no detections but {type(record).__name__}s")
+        target = target_of(record, rig.target_list)
+        if target is None:
+            others.add(f"{record.family} {record.id}".strip())
+            continue
+        result.append(_made(record, target, camera, sensor))
+    if not result:
+        raise LogError(
+            f"topic {source.detections}: no target of the rig file was detected; tags there: "
+            f"{', '.join(sorted(others)) or 'none'}"
+        )
+    return result
+
+
+def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor: str) -> DetectionRecord:
+    record = replace(record, id=target.name, family=target.family, size_m=target.length_m)
+    if camera is None or record.corners_px is None or len(record.corners_px) != 4:
+        if record.T_camera_tag is None:
+            raise CameraError(
+                f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver gives no pose of {target.name}, and "
+                f"sensor {sensor} has no intrinsics from which to make one"
+            )
+        return record
+    poses = plane_poses(camera, [target.corners()], [_in_our_order(record.corners_px)], corner_px=CORNER_PX)
+    which = 0
+    if record.T_camera_tag is not None:
+        # Only the normal tells the two apart, and drivers turn a tag's axes as they like: up to its sign.
+        normal = record.T_camera_tag[:3, 2]
+        which = int(np.argmax([abs(float(T[:3, 2] @ normal)) for T in np.nan_to_num(poses.T[0])]))
+    T = poses.T[0, which]
+    if not np.isfinite(T).all() or not np.isfinite(poses.covariance[0, which]).all():
+        return replace(record, T_camera_tag=None, covariance=None, reason="no pose")
+    return replace(
+        record,
+        T_camera_tag=T,
+        covariance=poses.covariance[0, which],
+        reprojection_px=float(poses.reprojection_px[0, which]),
+    )
+
+
+#: Drivers do not say how well they find corners; as for our own, only proportions count with estimated noise.
+CORNER_PX = 0.1
+
+
+def _in_our_order(corners_px: np.ndarray) -> np.ndarray:
+    """Clockwise as seen, from wherever the driver begins: the AprilTag library goes the other way round."""
+    first, second = corners_px[2] - corners_px[0], corners_px[3] - corners_px[1]
+    clockwise = first[0] * second[1] - first[1] * second[0] > 0.0  # with y down
+    return corners_px if clockwise else corners_px[::-1]

@@ -1,0 +1,135 @@
+"""A target in a sensor over time: its measurements from the log; each that is not used says why."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.logs import DetectionRecord
+from gtsam_rwhec.pipeline.carriers import check_order
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.stage_reports import TrackCount
+from gtsam_rwhec.vision.targets import Tag, Target
+
+#: Of one target in one message: two of its measurements cannot both be true.
+TWICE = "seen twice at one stamp"
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One target in one sensor.
+
+    Attributes
+    ----------
+    target, sensor : str
+    stamps_ns : (N,) integers
+        The sensor's, increasing.
+    B : (N, 4, 4) array
+        T_sensor_target, metres; the identity where there is none (and a reason).
+    covariance : (N, 6, 6) array or None
+        None where not every measurement has one.
+    reasons : tuple of N str
+        Why each is not used; empty where it is.
+    """
+
+    target: str
+    sensor: str
+    stamps_ns: np.ndarray
+    B: Array
+    covariance: Array | None
+    reasons: tuple[str, ...]
+
+    @property
+    def used(self) -> np.ndarray:
+        """(N,) booleans."""
+        return np.array([not reason for reason in self.reasons], dtype=bool)
+
+    @property
+    def count(self) -> TrackCount:
+        """For a report."""
+        removed = Counter(reason for reason in self.reasons if reason)
+        return TrackCount(target=self.target, sensor=self.sensor, used=int(self.used.sum()), removed=dict(removed))
+
+    def without(self, bad: np.ndarray, reasons: Iterable[str]) -> Track:
+        """Mark those of `bad` (N,) booleans as not used; `reasons` of those, in order."""
+        given = iter(reasons)
+        marked = tuple(next(given) if is_bad else old for old, is_bad in zip(self.reasons, bad, strict=True))
+        return Track(self.target, self.sensor, self.stamps_ns, self.B, self.covariance, marked)
+
+
+def tracks_of(records: Iterable[DetectionRecord], rig: Rig, sensor: str) -> list[Track]:
+    """Sort a sensor's detections by target; those of no target are left out.
+
+    Raises
+    ------
+    StampError
+        Stamps that tell no time.
+    FrameError
+        A tag whose driver does not say its family, where two targets have its id.
+    """
+    of_target: dict[str, list[DetectionRecord]] = defaultdict(list)
+    stamps = []
+    targets = rig.target_list
+    for record in records:
+        stamps.append(record.stamp_ns)
+        target = target_of(record, targets)
+        if target is not None:
+            of_target[target.name].append(record)
+    check_order(np.array(stamps, dtype=np.int64), f"detections of {sensor}")
+    return [_track(name, sensor, of_target[name]) for name in sorted(of_target)]
+
+
+def _track(target: str, sensor: str, records: list[DetectionRecord]) -> Track:
+    records = sorted(records, key=lambda record: record.stamp_ns)
+    stamps = np.array([record.stamp_ns for record in records], dtype=np.int64)
+    poses = [record.T_camera_tag for record in records]
+    reasons = [r.reason or ("no pose" if r.T_camera_tag is None else "") for r in records]
+    usable = Counter(stamp for stamp, reason in zip(stamps.tolist(), reasons, strict=True) if not reason)
+    reasons = [TWICE if not why and usable[s] > 1 else why for s, why in zip(stamps.tolist(), reasons, strict=True)]
+    known = [r.covariance for r, why in zip(records, reasons, strict=True) if not why]
+    covariance = None
+    if known and all(c is not None for c in known):
+        covariance = np.array([np.eye(6) if r.covariance is None else r.covariance for r in records])
+    B = np.array([np.eye(4) if pose is None else pose for pose in poses])
+    return Track(target, sensor, stamps, B, covariance, tuple(reasons))
+
+
+def target_of(record: DetectionRecord, targets: Iterable[Target]) -> Target | None:
+    """The target that a detection is of: by its name (as this library writes it), or by family and id.
+
+    Raises
+    ------
+    FrameError
+        Its driver does not say the family, and two targets have the id.
+    """
+    targets = list(targets)
+    named = next((t for t in targets if t.name == record.id), None)
+    if named is not None:
+        return named
+    mine = [
+        t
+        for t in targets
+        if isinstance(t, Tag)
+        and record.id == str(t.id)
+        and (not record.family or bare_family(record.family) == bare_family(t.family))
+    ]
+    if len(mine) > 1:
+        raise FrameError(
+            f"topic {record.topic}: a tag with id {record.id} and no family could be "
+            f"{' or '.join(t.name for t in mine)}; have the driver say the family, or leave one "
+            "of these targets out of the rig file"
+        )
+    return mine[0] if mine else None
+
+
+def bare_family(name: str) -> str:
+    """Drivers' words for one family made one: tag36h11, 36h11, tagStandard36h11, DICT_APRILTAG_36h11."""
+    word = name.lower()
+    for prefix in ("dict_apriltag_", "dict_", "aruco_", "apriltag_", "tag"):
+        word = word.removeprefix(prefix)
+    return word

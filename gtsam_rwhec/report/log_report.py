@@ -1,0 +1,107 @@
+"""What became of a log's measurements, for people: counts by target and sensor, reasons, sizes."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from gtsam_rwhec.report.solution_report import report_console
+from gtsam_rwhec.stage_reports import LogFields, TrackCount
+
+
+def print_log(log: LogFields, console: Console | None = None) -> None:
+    """Print what was detected, cleaned and left out, and which sizes are doubted."""
+    console = report_console() if console is None else console
+    console.print(_table(log))
+    for sentence in log_sentences(log):
+        console.print(Text(sentence), soft_wrap=not console.is_terminal)
+    for sentence in doubts(log):
+        console.print(Text(sentence, style="bold yellow"), soft_wrap=not console.is_terminal)
+    console.print()
+
+
+def log_sentences(log: LogFields) -> list[str]:
+    """What was looked at, and everything that was removed, by reason."""
+    looked = ", ".join(f"{count} of {sensor}" for sensor, count in log.detection.images.items())
+    sentences = [f"Looked at {looked} in {', '.join(log.detection.sources)}."]
+    for stage, tracks in (
+        ("Detections not used", log.detection.tracks),
+        ("Removed in cleaning", log.cleaning.tracks),
+        ("Left out by robust estimation", log.outliers),
+    ):
+        reasons = _by_reason(
+            tracks, {why for t in log.detection.tracks for why in t.removed} if "clean" in stage else set()
+        )
+        if reasons:
+            sentences.append(f"{stage}: {'; '.join(reasons)}.")
+    for size in log.sizes:
+        if size.is_free:
+            found_mm, sigma_mm = (1e3 * size.stated_m * x for x in (1.0 / size.scale, size.sigma / size.scale**2))
+            sentences.append(
+                f"Size of {size.target}: stated {1e3 * size.stated_m:.3f} mm, found {found_mm:.3f} ± {sigma_mm:.3f} mm "
+                f"({100.0 * (size.scale - 1.0):+.2f} %)."
+            )
+    return sentences
+
+
+def doubts(log: LogFields) -> list[str]:
+    """What a person should look at."""
+    said = []
+    for sensor, faults in log.detection.undecoded.items():
+        if faults:
+            said.append(f"{len(faults)} images of {sensor} could not be used, the first: {faults[0]}")
+    free = [size for size in log.sizes if size.is_free]
+    for size in free:
+        if abs(size.scale - 1.0) > 3.0 * size.sigma:
+            said.append(
+                f"The stated size of {size.target} does not fit the motion: it is {100.0 * (size.scale - 1.0):+.2f} % "
+                "off (printed to fit the page?). It was estimated; measure it again and mend the rig file."
+            )
+    if len(free) > 1 and len(free) == len(log.sizes) and np.ptp([size.scale for size in free]) < 0.005:
+        said.append(
+            "All targets are off by about the same: rather the carriers' unit or the focal lengths are wrong than all "
+            "sizes."
+        )
+    if log.detection.strangers:
+        names = [f"{name} ({count})" for name, count in list(log.detection.strangers.items())[:10]]
+        said.append(f"Tags that are no target were seen: {', '.join(names)}.")
+    return said
+
+
+def _table(log: LogFields) -> Table:
+    """Detected, after cleaning, used: for each target and sensor."""
+    table = Table(title="Measurements", box=box.SIMPLE_HEAD, title_justify="left")
+    for heading in ("target", "sensor"):
+        table.add_column(heading)
+    for heading in ("seen", "usable", "after cleaning", "used"):
+        table.add_column(heading, justify="right")
+    cleaned = {(t.target, t.sensor): t for t in log.cleaning.tracks}
+    used = {(t.target, t.sensor): t for t in log.outliers}
+    for track in log.detection.tracks:
+        pair = track.target, track.sensor
+        table.add_row(
+            *pair,
+            str(track.used + sum(track.removed.values())),
+            str(track.used),
+            str(cleaned[pair].used if pair in cleaned else 0),
+            str(used[pair].used if pair in used else 0),
+        )
+    return table
+
+
+def _by_reason(tracks: tuple[TrackCount, ...], known: set[str]) -> list[str]:
+    """Each reason with its count and where it was met; reasons of an earlier stage are left to that one."""
+    reasons: dict[str, list[tuple[TrackCount, int]]] = {}
+    for track in tracks:
+        for why, count in track.removed.items():
+            if why not in known:
+                reasons.setdefault(why, []).append((track, count))
+    return [
+        f"{sum(count for _, count in found)} {why} ("
+        + ", ".join(f"{track.target} in {track.sensor}: {count}" for track, count in found)
+        + ")"
+        for why, found in sorted(reasons.items())
+    ]
