@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -169,12 +170,17 @@ def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
         remark = said.get(path)
         if remark is None and path[:1] == ("sensors",) and path[2:] == ("time_offset",):
             remark = "s: the sensor's stamp t is the carriers' t + offset; or the word estimate"
-        lines.append(f"{text:<{_COLUMN}}  # {remark}" if remark else text)
+        line = f"{text:<{_COLUMN}}  # {remark}" if remark else text
+        if remark and len(line) > _WIDTH:
+            indent = " " * (len(text) - len(text.lstrip()))
+            lines += textwrap.wrap(remark, _WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
+            line = text
+        lines.append(line)
     return "\n".join(lines) + "\n"
 
 
-#: Where comments begin, where lines are shorter.
-_COLUMN = 30
+#: Where comments begin, where lines are shorter; beyond this width they stand on lines of their own.
+_COLUMN, _WIDTH = 30, 120
 _REMARKS: dict[KeyPath, str] = {
     ("carriers",): "frames: what the sensors are mounted on, and what the targets are",
     ("carriers", "max_gap_s"): "between poses further apart in time nothing is interpolated",

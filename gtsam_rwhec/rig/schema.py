@@ -109,8 +109,8 @@ class Intrinsics(_Section):
 class Sensor(_Section):
     """A camera, or a detection driver behind one."""
 
-    images: Text | None = Field(None, description="topic of the camera's images")
-    detections: Text | None = Field(None, description="topic of a driver's detections")
+    images: Text | None = Field(default=None, description="topic of the camera's images")
+    detections: Text | None = Field(default=None, description="topic of a driver's detections")
     intrinsics: Intrinsics | None = None
     time_offset: TimeOffset = 0.0
     frame: Name | None = None
@@ -233,7 +233,7 @@ class RigFile(_Section):
         Annotated[Noise, UnionTag("numbers")] | Annotated[Literal["estimate"], UnionTag("word")],
         Discriminator(lambda given: "word" if isinstance(given, str) else "numbers"),
     ] = "estimate"
-    detection: dict[str, Any] = Field({}, description="fields of vision's DetectionOptions")
+    detection: dict[str, Any] = Field(default={}, description="fields of vision's DetectionOptions")
     cleaning: Cleaning = Cleaning()
 
     @cached_property
