@@ -16,7 +16,7 @@ import typer
 
 from gtsam_rwhec import __version__
 from gtsam_rwhec.calibration import solve
-from gtsam_rwhec.cli.demo_data import KAPPA, SIGMA_M, demo_folder
+from gtsam_rwhec.cli.demo_data import LOG, RIG, demo_folder
 from gtsam_rwhec.cli.exit_status import HELP, ExitStatus, exit_status
 from gtsam_rwhec.cli.failures import failures_in_words
 from gtsam_rwhec.cli.log_commands import add_log_commands, calibrate_from_log, is_log
@@ -228,14 +228,18 @@ def _carrier_noise(deg: float | None, mm: float | None) -> CarrierNoise | None:
 
 
 @app.command(epilog=HELP)
-def demo() -> None:
-    """Calibrate three simulated cameras that saw four tags; the measurements come with this package."""
-    folder = demo_folder()
+def demo(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for everything.")] = Path("gtsam-rwhec-demo"),
+) -> None:
+    """Calibrate two cameras on a robot's hand from a log of images, which comes with this package."""
+    with failures_in_words():
+        folder = demo_folder()
+    log, rig = folder / LOG, folder / RIG
     command = (
-        f"gtsam-rwhec calibrate {shlex.quote(str(folder))} --sigma {SIGMA_M:g} --kappa {KAPPA:.4f} --refine estimate"
+        f"gtsam-rwhec calibrate {shlex.quote(str(log))} --rig {shlex.quote(str(rig))} -o {shlex.quote(str(output))}"
     )
     report_console().print(f"The same as: {command}\n", markup=False, soft_wrap=True)
-    calibrate(folder, sigma=SIGMA_M, kappa=KAPPA, refine_with=Refine.estimate)
+    calibrate_from_log(log, rig, output, images=False, workers=None)
 
 
 @fetch_app.command(epilog=HELP)

@@ -1,22 +1,17 @@
-"""Where the measurements of the demo are, and with which noise they were made."""
+"""Where the demo's log is."""
 
 from __future__ import annotations
 
-import math
 from importlib.resources import files
 from pathlib import Path
 
 from gtsam_rwhec.errors import FileFormatError
 
-SIGMA_M = 0.005
-"""Standard deviation of the demo's measured translations, along each axis."""
-
-KAPPA = 1.0 / (2.0 * math.radians(0.5) ** 2)
-"""Concentration that belongs to 0.5 degrees about each axis: kappa = 1 / (2 sigma_R^2)."""
+LOG, RIG = "robot_cell.mcap", "rig.yaml"
 
 
 def demo_folder() -> Path:
-    """The folder of CSV files: inside the package when installed from a wheel, ``data/demo`` in a checkout.
+    """The folder of the shipped log: inside the package when installed from a wheel, ``data/cell`` in a checkout.
 
     Raises
     ------
@@ -24,7 +19,7 @@ def demo_folder() -> Path:
         Neither is there.
     """
     package = Path(str(files("gtsam_rwhec")))
-    candidates = (package / "demo_data", package.parent / "data" / "demo")
+    candidates = (package / "demo_data", package.parent / "data" / "cell")
     for folder in candidates:
         if folder.is_dir():
             return folder

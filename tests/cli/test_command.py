@@ -94,29 +94,6 @@ def slow_address() -> Iterator[str]:
     server.stop()
 
 
-def test_demo_needs_no_arguments(tmp_path: Path) -> None:
-    done = run("demo", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    for words in (
-        "4 targets, 3 sensors, 11 pairs",
-        " cam_2 ",
-        " tag_3 ",
-        "Certified globally optimal",
-        "Time: ",
-        " ±x mm ",
-        "estimated",
-    ):
-        assert words in done.stdout
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_demo_says_how_to_do_the_same() -> None:
-    arguments = run("demo").stdout.splitlines()[0].removeprefix("The same as: gtsam-rwhec ").split()
-    demo, same = run("demo").stdout.splitlines(), run(*arguments).stdout.splitlines()
-    assert [line for line in demo[2:] if "Time:" not in line] == [line for line in same if "Time:" not in line]
-
-
 def test_the_real_dataset_and_its_result_file(utias_folder: Path, tmp_path: Path) -> None:
     result = tmp_path / "result.json"
     done = run("calibrate", utias_folder, "--sigma", 1, "--kappa", 1, "-o", result)
@@ -335,7 +312,7 @@ def test_version_and_help() -> None:
 def test_a_terminal_without_our_signs_gets_others() -> None:
     environment = {**os.environ, "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
     done = subprocess.run(
-        [sys.executable, "-m", "gtsam_rwhec.cli", "demo"], capture_output=True, env=environment, check=False, timeout=60
+        [*COMMAND, "calibrate", str(DEMO)], capture_output=True, env=environment, check=False, timeout=60
     )
     assert done.returncode == 0
     assert b"Certified globally optimal" in done.stdout

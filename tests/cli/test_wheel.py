@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
+import gtsam
+import numpy as np
 import pytest
 
+import gtsam_rwhec as rw
+
 REPOSITORY = Path(__file__).resolve().parents[2]
+CELL = REPOSITORY / "data" / "cell"
 
 
 @pytest.fixture(scope="module")
@@ -28,15 +34,15 @@ def unpacked_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_it_has_all_data_and_none_of_the_real_dataset(unpacked_wheel: Path) -> None:
     shipped = unpacked_wheel / "gtsam_rwhec" / "demo_data"
-    for folder, source in ((shipped, "demo"), (shipped / "cell", "cell")):
-        files = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-        assert files == {path.name: path.read_bytes() for path in (REPOSITORY / "data" / source).iterdir()}
+    assert sorted(path.name for path in shipped.iterdir()) == ["rig.yaml", "robot_cell.mcap"]
+    for path in shipped.iterdir():  # the truth stays behind
+        assert path.read_bytes() == (CELL / path.name).read_bytes()
     assert (unpacked_wheel / "gtsam_rwhec" / "utias_files.txt").is_file()
     assert (unpacked_wheel / "gtsam_rwhec" / "py.typed").is_file()
-    assert {path.parent.name for path in unpacked_wheel.rglob("*.csv")} == {"demo_data"}
+    assert not list(unpacked_wheel.rglob("*.csv"))
 
 
-def test_the_demo_runs_from_it(unpacked_wheel: Path, tmp_path: Path) -> None:
+def test_the_demo_runs_from_it_and_meets_the_truth(unpacked_wheel: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "gtsam_rwhec.cli", "demo"],
         capture_output=True,
@@ -46,5 +52,37 @@ def test_the_demo_runs_from_it(unpacked_wheel: Path, tmp_path: Path) -> None:
         env={**os.environ, "PYTHONPATH": str(unpacked_wheel), "PYTHONIOENCODING": "utf-8"},
     )
     assert done.returncode == 0, done.stderr
-    assert str(unpacked_wheel / "gtsam_rwhec" / "demo_data") in done.stdout
-    assert "Certified globally optimal" in done.stdout
+    assert "Warning" not in done.stderr
+    log = unpacked_wheel / "gtsam_rwhec" / "demo_data" / "robot_cell.mcap"
+    assert done.stdout.startswith(f"The same as: gtsam-rwhec calibrate {log} --rig {log.parent / 'rig.yaml'} -o ")
+    for words in ("Certified globally optimal", "Outliers: ", "6 id seen twice in one image", "Size of board: stated"):
+        assert words in done.stdout
+    out = tmp_path / "gtsam-rwhec-demo"
+    files = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
+    assert files == {
+        "clean.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
+        "plots/coverage.png", "plots/deviations.png", "plots/frames.png", "plots/residuals.png",
+    }  # fmt: skip
+    check_against_truth(out)
+
+
+def check_against_truth(out: Path) -> None:
+    """Poses within 1 mm and 0.1 degrees and in their ellipsoids, clocks within 2 ms, the board's size within 0.2 %."""
+    truth = json.loads((CELL / "truth.json").read_text(encoding="utf-8"))
+    refined = rw.read_refined(out / "result.json")
+    assert rw.read_solution(out / "result.json").certificate.is_certified
+    for name, T in (truth["T_hand_camera"] | truth["T_base_target"]).items():
+        off = gtsam.Pose3(np.array(T)).between((refined.X | refined.Y)[name])
+        assert 1e3 * np.linalg.norm(off.translation()) < 1.0, name
+        assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(off.rotation()))) < 0.1, name
+        assert refined.contains(name, np.array(T), 0.95), name
+    for sensor, offset_s in truth["time_offset_s"].items():
+        sigma_s = np.sqrt(refined.covariance(f"time_offset:{sensor}")[0, 0])
+        assert abs(refined.time_offsets_s[sensor] - offset_s) < min(0.002, 4.0 * sigma_s)
+    assert isinstance(refined.scale, dict)
+    assert refined.scale["board"] == pytest.approx(truth["scale"]["board"], rel=0.002)
+    # JSON for people: what was removed, and why.
+    said = json.loads((out / "result.json").read_text(encoding="utf-8"))["log"]
+    twice = [track["removed"] for track in said["detection"]["tracks"] if track["target"] == "tag_2"]
+    assert {"id seen twice in one image": 6} in twice
+    assert [size["target"] for size in said["sizes"] if size["is_free"]] == ["board"]
