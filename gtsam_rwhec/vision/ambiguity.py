@@ -5,7 +5,8 @@ One image tells them apart by its reprojection errors alone, a little. A track t
 target turns against the camera by the same angle as the carriers turn against each other, whatever the extrinsics
 (A_i^-1 A_j and B_i B_j^-1 are conjugate), and a wrong choice changes that angle. So the most likely choice is that of
 the whole track: a chain with two states an image, by dynamic programming; the cost of the best chain through the other
-state says how sure each choice is.
+state says how sure each choice is. Where the carriers' poses are known in enough images, one extrinsic rotation for all
+of them then says more than angles between neighbours do (`agreement`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.poses import Array
+from gtsam_rwhec.vision.agreement import LEAST_IMAGES, choose_by_agreement
 
 #: Of an angle between two images beyond what corner noise explains: clocks apart, an arm that is not exact (rad).
 SIGMA_TURN_RAD = float(np.radians(3.0))
@@ -79,6 +81,14 @@ def choose_over_time(
     which = np.argmin(through, axis=1)
     with np.errstate(invalid="ignore"):
         margin = np.abs(through[:, 1] - through[:, 0])
+    known = np.zeros(n, dtype=bool) if carrier is None else np.asarray(np.isfinite(carrier).all(axis=(1, 2)))
+    known &= np.isfinite(image).any(axis=1)
+    if carrier is not None and known.sum() >= LEAST_IMAGES:
+        of_rotation = np.nan_to_num(covariance[known, :, :3, :3]) + SIGMA_TURN_RAD**2 * np.eye(3)
+        which[known], margin[known] = choose_by_agreement(
+            T[known], carrier[known], of_rotation, image[known], which[known], most=MOST_OF_A_LINK
+        )
+    with np.errstate(invalid="ignore"):
         R = T[..., :3, :3]
         apart = np.linalg.norm(se3.so3_logmap(np.nan_to_num(np.swapaxes(R[:, 0], 1, 2) @ R[:, 1])), axis=1)
     margin[(apart < SAME_RAD) | ~np.isfinite(T[:, 1]).all(axis=(1, 2))] = np.inf

@@ -1,0 +1,205 @@
+"""Which of a plane's two poses: by one extrinsic rotation for the whole track.
+
+A_i X = Y B_i in every image, so R_A R_X = R_Y R_B with one R_X and one R_Y: what the carriers did and these two say
+how the target is turned in each image, to a degree or so, and its two poses are tens of degrees apart. Rotations and
+choices are found in turns. The mirror images of a whole track agree among themselves nearly as well as the right poses
+do (with R_Y turned by half a turn about the line of sight), so both are tried: the translations and the reprojection
+errors of all images together tell them apart, or else nobody can.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.poses import Array
+
+#: With fewer images two rotations agree with too many choices.
+LEAST_IMAGES = 12
+#: Rounds of choices, and of the two rotations in each: by turns, then by Gauss-Newton.
+ROUNDS, TURNS, STEPS = 10, 4, 4
+#: All choices are tried for so many images, whose carriers are turned far from one another; the best are starts.
+FEW, BEST = 4, 3
+#: Images apart whose turning is compared for a first R_Y.
+LAGS = (1, 2, 4, 8, 16, 32)
+#: Of a translation, as a share of the distance: the tag's size, clocks, corner noise.
+SIGMA_SHARE = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """Of n images: R_A (n, 3, 3), t_A (n, 3), candidates R_B (n, 2, 3, 3), t_B (n, 2, 3).
+
+    information (n, 2, 3, 3) of a candidate's rotation (rad^-2, right perturbation), image (n, 2) what each costs by its
+    own image; no cost above `most`.
+    """
+
+    R_A: Array
+    t_A: Array
+    R_B: Array
+    t_B: Array
+    information: Array
+    image: Array
+    most: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """Choices (n,), what both candidates cost (n, 2), what all of it costs."""
+
+    which: np.ndarray
+    cost: Array
+    total: float
+
+
+def choose_by_agreement(
+    T: Array, carrier: Array, covariance: Array, image: Array, which: np.ndarray, *, most: float
+) -> tuple[np.ndarray, Array]:
+    """Choices (n,) and margins (n,) as in `ambiguity.Choice`.
+
+    Parameters
+    ----------
+    T : (n, 2, 4, 4) array
+        Candidates T_camera_target.
+    carrier : (n, 4, 4) array
+        T_sensorcarrier_targetcarrier.
+    covariance : (n, 2, 3, 3) array
+        Of each candidate's rotation (rad^2, right perturbation), clocks and carriers included.
+    image : (n, 2) array
+        What each costs by its own image (negative log-likelihood), infinite for what is none.
+    which : (n,) integers
+        A first choice.
+    most : float
+        No image's disagreement costs more than this.
+    """
+    B = np.nan_to_num(T)
+    information = np.linalg.inv(covariance)
+    track = _Track(carrier[:, :3, :3], carrier[:, :3, 3], B[..., :3, :3], B[..., :3, 3], information, image, most)
+    each, there = np.arange(len(which)), np.isfinite(image)
+
+    def settled(start: np.ndarray) -> _Answer:
+        return _settled(track, np.where(there[each, start], start, 1 - start))
+
+    answers = [settled(start) for start in (which, 1 - which, np.argmin(image, axis=1), *_starts(track))]
+    answers.append(settled(1 - min(answers, key=lambda answer: answer.total).which))
+    best = min(answers, key=lambda answer: answer.total)
+    margin = np.abs(best.cost[:, 1] - best.cost[:, 0])
+    for other in answers:
+        differs = other.which != best.which
+        margin[differs] = np.minimum(margin[differs], other.total - best.total)
+    return best.which, margin
+
+
+def _starts(track: _Track) -> list[np.ndarray]:
+    """Choices (n,) that agree with one for each of a few images, of all choices there the best."""
+    few = _apart(track.R_A)
+    found: list[tuple[float, np.ndarray]] = []
+    for picked in itertools.product((0, 1), repeat=len(few)):
+        R_B = track.R_B[few, np.array(picked)]
+        first = _first_rotation(track.R_A[few], R_B)
+        R_X, R_Y = _rotations(track.R_A[few], R_B, np.ones(len(few)), np.eye(3), first)
+        cost = track.image + _disagreement(track, R_X, R_Y)
+        found.append((float(cost.min(axis=1).sum()), np.argmin(cost, axis=1)))
+    return [which for _, which in sorted(found, key=lambda item: item[0])[:BEST]]
+
+
+def _apart(R: Array) -> np.ndarray:
+    """`FEW` of the rotations (n, 3, 3), far from one another."""
+    chosen = [0]
+    nearest = np.full(len(R), np.inf)
+    for _ in range(FEW):
+        cosine = 0.5 * (np.einsum("nij,ij->n", R, R[chosen[-1]]) - 1.0)
+        nearest = np.minimum(nearest, np.arccos(np.clip(cosine, -1.0, 1.0)))
+        chosen.append(int(np.argmax(nearest)))
+    return np.array(chosen[1:])
+
+
+def _disagreement(track: _Track, R_X: Array, R_Y: Array) -> Array:
+    """What each candidate's rotation costs (n, 2), if the extrinsics are these."""
+    off = _off(track.R_A, track.R_B, R_X, R_Y)
+    cost: Array = np.minimum(0.5 * np.einsum("nci,ncij,ncj->nc", off, track.information, off), track.most)
+    return cost
+
+
+def _settled(track: _Track, which: np.ndarray) -> _Answer:
+    n = len(which)
+    each = np.arange(n)
+    weight: Array = np.ones(n)
+    R_X: Array = np.eye(3)
+    R_Y, cost = _first_rotation(track.R_A, track.R_B[each, which]), track.image
+    for _ in range(ROUNDS):
+        R_X, R_Y = _rotations(track.R_A, track.R_B[each, which], weight, R_X, R_Y)
+        disagreement = _disagreement(track, R_X, R_Y)
+        cost = track.image + disagreement
+        before, which = which, np.argmin(cost, axis=1)
+        # Those that cost the most are somebody else's tag, or a clock that jumped.
+        sure = np.trace(track.information[each, which], axis1=1, axis2=2)
+        weight = np.where(disagreement[each, which] < track.most, sure, 0.0)
+        if not weight.any():
+            weight = np.ones(n)
+        if np.array_equal(before, which):
+            break
+    return _Answer(which, cost, float(cost[each, which].sum()) + _translations(track, R_Y, which))
+
+
+def _off(R_A: Array, R_B: Array, R_X: Array, R_Y: Array) -> Array:
+    """(n, c, 3) rotation vectors from the predicted R_Y' R_A R_X to R_B (n, c, 3, 3), in the target's frame."""
+    predicted = R_Y.T @ R_A @ R_X
+    return se3.so3_logmap((predicted[:, None].swapaxes(-1, -2) @ R_B).reshape(-1, 3, 3)).reshape(*R_B.shape[:2], 3)
+
+
+def _rotations(R_A: Array, R_B: Array, weight: Array, R_X: Array, R_Y: Array) -> tuple[Array, Array]:
+    """R_X and R_Y of R_A R_X = R_Y R_B, weighted least squares from a first R_Y."""
+    w = weight[:, None, None]
+    for _ in range(TURNS):
+        R_X = _rotation((w * (R_A.swapaxes(1, 2) @ R_Y @ R_B)).sum(axis=0))
+        R_Y = _rotation((w * (R_A @ R_X @ R_B.swapaxes(1, 2))).sum(axis=0))
+    root = np.sqrt(weight)
+    for _ in range(STEPS):
+        off = _off(R_A, R_B[:, None], R_X, R_Y)[:, 0]
+        # R_X Exp(x), R_Y Exp(y): the prediction P turns by x - P' y. Of minimum norm, where one axis leaves some free.
+        P = R_Y.T @ R_A @ R_X
+        J = np.concatenate([np.broadcast_to(np.eye(3), P.shape), -P.swapaxes(1, 2)], axis=2)
+        rows, right = (root[:, None, None] * J).reshape(-1, 6), (root[:, None] * off).ravel()
+        step = np.linalg.lstsq(rows, right, rcond=1e-6)[0]
+        R_X, R_Y = (
+            R @ se3.expmap(np.append(v, np.zeros(3))[None])[0, :3, :3] for R, v in ((R_X, step[:3]), (R_Y, step[3:]))
+        )
+    return R_X, R_Y
+
+
+def _first_rotation(R_A: Array, R_B: Array) -> Array:
+    """R_Y that turns the axes about which the target turned into the carriers' (R_A R_A' = R_Y R_B R_B' R_Y')."""
+    M = np.zeros((3, 3))
+    for lag in LAGS:
+        if lag < len(R_A):
+            a, b = (se3.so3_logmap(R[:-lag] @ R[lag:].swapaxes(1, 2)) for R in (R_A, R_B))
+            alike = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1)) < np.radians(6.0)
+            M += a[alike].T @ b[alike]
+    return _rotation(M)
+
+
+def _translations(track: _Track, R_Y: Array, which: np.ndarray) -> float:
+    """What is left of R_A t_X + t_A = R_Y t_B scale + t_Y with the best t_X, t_Y and scale."""
+    n = len(which)
+    turned = track.t_B[np.arange(n), which] @ R_Y.T
+    matrix: Array = np.concatenate([track.R_A, np.broadcast_to(-np.eye(3), (n, 3, 3)), -turned[..., None]], axis=2)
+    sigma = SIGMA_SHARE * np.linalg.norm(turned, axis=1) + 1e-9
+    weight, cost = 1.0 / sigma, np.zeros(n)
+    for _ in range(4):
+        rows = (weight[:, None, None] * matrix).reshape(-1, 7)
+        x = np.linalg.lstsq(rows, -(weight[:, None] * track.t_A).ravel(), rcond=None)[0]
+        squared = ((matrix @ x + track.t_A) ** 2).sum(axis=1) / sigma**2
+        cost = np.minimum(0.5 * squared, track.most)
+        weight = 1.0 / (sigma * np.maximum(1.0, np.sqrt(squared) / 2.0))
+    return float(cost.sum())
+
+
+def _rotation(M: Array) -> Array:
+    """The rotation nearest to a matrix (3, 3)."""
+    U, _, Vt = np.linalg.svd(M)
+    R: Array = U @ np.diag([1.0, 1.0, float(np.linalg.det(U @ Vt))]) @ Vt
+    return R
