@@ -17,8 +17,18 @@ LONGEST_TEXT = 1000
 LARGEST_OFFSET_S = 4e9
 
 
+def is_name(text: str) -> bool:
+    """Whether a frame can be called so."""
+    return len(text) <= LONGEST_NAME and NAME.fullmatch(text) is not None
+
+
+def is_text(text: str) -> bool:
+    """Whether a topic or a path can be."""
+    return 0 < len(text) <= LONGEST_TEXT and text.isprintable()
+
+
 def _name(text: str) -> str:
-    if not NAME.fullmatch(text) or len(text) > LONGEST_NAME:
+    if not is_name(text):
         raise ValueError(
             f"{shown(text)} cannot be a frame's name: a letter first, then letters, digits and _, parts joined by /, "
             f"at most {LONGEST_NAME} characters"
@@ -29,7 +39,7 @@ def _name(text: str) -> str:
 def _text(text: str) -> str:
     if not text:
         raise ValueError("'' is empty")
-    if not text.isprintable() or len(text) > LONGEST_TEXT:
+    if not is_text(text):
         raise ValueError(f"{shown(text)} has unprintable characters, or more than {LONGEST_TEXT}")
     return text
 

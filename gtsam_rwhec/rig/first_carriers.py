@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gtsam_rwhec.rig.field_types import NAME
+from gtsam_rwhec.rig.field_types import is_name
 from gtsam_rwhec.rig.first_look import Poses
 from gtsam_rwhec.rig.schema import PoseSource
 
@@ -38,7 +38,7 @@ def moving_pairs(poses: Iterable[Poses], camera_frames: Iterable[str]) -> tuple[
     """
     poses = list(poses)
     cameras = list(camera_frames)
-    pairs, remarks = _of_tf([p for p in poses if p.is_tf and p.child], cameras)
+    pairs, remarks = _of_tf([p for p in poses if p.is_tf and p.child and p.child != p.parent], cameras)
     by_topic: dict[str, list[Poses]] = {}
     for series in poses:
         if not series.is_tf:
@@ -70,10 +70,12 @@ def _of_tf(series: list[Poses], cameras: list[str]) -> tuple[list[MovingPair], l
     bodies = [body(camera) for camera in cameras if camera in known]
     carrying_others = {frame for child in moving for frame in up(child)[1:]}
     pairs, remarks = [], []
-    for child in sorted(moving - carrying_others, key=lambda child: -links[child].count):
+    for child in sorted(
+        moving - carrying_others, key=lambda child: (-links[child].count, *(-x for x in links[child].motion()))
+    ):
         top = [frame for frame in up(child) if frame in moving][-1]
         parent = links[top].parent
-        bad = [frame for frame in (parent, child) if not NAME.fullmatch(frame)]
+        bad = [frame for frame in (parent, child) if not is_name(frame)]
         if bad:
             remarks.append(f"tf {parent} to {child} moves, but a rig file cannot name {', '.join(map(repr, bad))}")
             continue
@@ -98,4 +100,4 @@ def _words(series: Poses, where: str) -> str:
 def frame_name(text: str) -> str:
     """Text as a frame's name: what cannot be in one becomes _; empty if nothing is left."""
     words = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in text)[:60].strip("_")
-    return words if NAME.fullmatch(words) else (f"f_{words}" if words else "")
+    return words if is_name(words) else (f"f_{words}" if words else "")

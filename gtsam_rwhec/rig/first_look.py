@@ -12,6 +12,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
 from gtsam_rwhec.poses import Array
+from gtsam_rwhec.rig.field_types import is_text
 from gtsam_rwhec.rig.tags_in_image import BY_TRUST, tags_in_image
 from gtsam_rwhec.vision.images import decode_gray
 
@@ -114,7 +115,8 @@ def look_through(log: Log) -> Look:
     """Go through a log once."""
     topics = log.topics()
     look = Look(topics)
-    readable = {topic.name for topic in topics} - {topic.name for topic in topics if topic.unreadable}
+    readable = {topic.name for topic in topics if is_text(topic.name)}
+    readable -= {topic.name for topic in topics if topic.unreadable}
     transforms = {topic.name for topic in topics if _is_tf(topic)}
     for topic in topics:
         if topic.name in readable and last_word(topic.schema) in IMAGE_SCHEMAS:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.rig.field_types import NAME
+from gtsam_rwhec.rig.field_types import is_name, is_text
 from gtsam_rwhec.rig.first_carriers import MovingPair, frame_name, moving_pairs
 from gtsam_rwhec.rig.first_look import Images, Look, look_through
 from gtsam_rwhec.rig.first_targets import Guess, targets_seen
@@ -102,14 +102,15 @@ def _text(log: Log, carriers: Carriers, carrier_remark: str, cameras: list[_Came
     sensors = {}
     for camera in cameras:
         name = names[camera.name]
-        frame = camera.frame if NAME.fullmatch(camera.frame) and camera.frame not in taken else None
+        frame = camera.frame if is_name(camera.frame) and camera.frame not in taken else None
         taken |= {frame} if frame else set()
         sensors[name] = camera.section.model_copy(update={"frame": frame})
         remarks |= {("sensors", name, key): words for key, words in camera.remarks.items()}
         remarks["sensors", name, "time_offset"] = _TIME_OFFSET
     rig = Rig(carriers=carriers, sensors=sensors, targets=targets)
+    file = log.files[0].path.name
     head = (
-        f"# A first rig file, made by looking at {_where(log).rpartition('/')[2]}.\n"
+        f"# A first rig file, made by looking at {file if is_text(file) else repr(file)}.\n"
         "# TODO marks what only a person knows, above all the sizes of the targets: those here are guesses.\n"
     )
     return head + rig_text(rig, remarks)
@@ -199,8 +200,8 @@ def _shared(first: str, second: str) -> int:
 
 def _name(topic: str, frame: str) -> str:
     """A camera's name: the words of its topic that say which it is, else its frame."""
-    words = [frame_name(word) for word in topic.split("/") if word.lower() not in _COMMON]
-    return "_".join(word for word in words if word) or frame_name(frame) or "camera"
+    words = [word for word in topic.split("/") if word.lower() not in _COMMON]
+    return frame_name("_".join(words)) or frame_name(frame) or "camera"
 
 
 def _free(name: str, taken: set[str]) -> str:

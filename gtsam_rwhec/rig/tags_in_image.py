@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from gtsam_rwhec.poses import Array
@@ -18,6 +19,8 @@ BY_TRUST = (
 )  # fmt: skip
 #: Kalibr prints AprilGrids of this one, with a double border.
 DOUBLE = "tag36h11"
+#: Pixels of a flattened tag.
+SIDE = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +37,15 @@ class SeenTag:
 def tags_in_image(gray: Gray, families: Iterable[str] = BY_TRUST) -> list[SeenTag]:
     """Look for tags of some of the families in `BY_TRUST`.
 
-    A place (middles less than half a side apart) where two families are read is the more trustworthy one's. One that
-    reads with both borders is there twice: only many images tell which it has.
+    A place (middles less than half a side apart) where two families are read is the more trustworthy one's.
     """
     wanted = set(families)
     found: list[SeenTag] = []
     for family in BY_TRUST:
         if family in wanted:
-            tags = _of_family(gray, family, border_bits=1)
-            if family == DOUBLE:
-                tags += _of_family(gray, family, border_bits=2)
-            found += [tag for tag in tags if not any(_overlap(tag, other) for other in found)]
+            for border_bits in (2, 1) if family == DOUBLE else (1,):
+                tags = _of_family(gray, family, border_bits)
+                found += [tag for tag in tags if not any(_overlap(tag, other) for other in found)]
     return found
 
 
@@ -52,12 +53,30 @@ def _of_family(gray: Gray, family: str, border_bits: int) -> list[SeenTag]:
     corners, ids, _ = tag_detector(family, border_bits).detectMarkers(gray)
     if ids is None:
         return []
-    quads = np.reshape(corners, (-1, 4, 2)).astype(float)
+    quads = np.reshape(corners, (-1, 4, 2)).astype(np.float32)
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).max(axis=1)
     return [
-        SeenTag(family, int(i), border_bits == 2, quad.mean(axis=0), float(side))
+        SeenTag(family, int(i), family == DOUBLE and _has_double_border(gray, quad), quad.mean(axis=0), float(side))
         for i, quad, side in zip(np.ravel(ids), quads, sides, strict=True)
     ]
+
+
+def _has_double_border(gray: Gray, quad: Array) -> bool:
+    """Whether a tag is black in its first and second tenth from the edge, all around.
+
+    With a double border (10 modules) black reaches to 0.2; with a single one (8) there is the code's outer ring from
+    0.125 on, which no tag of the family has all black. (OpenCV reads either tag with either border, so well does it
+    correct errors, and from squares inside and around the tag too.)
+    """
+    square = np.array([[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE]], dtype=np.float32) - 0.5
+    flat = cv2.warpPerspective(gray, cv2.getPerspectiveTransform(quad.astype(np.float32), square), (SIDE, SIDE))
+    dark = cv2.threshold(flat, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[1] == 0
+    for depth in (0.06, 0.16):
+        near, far = round(depth * SIDE), SIDE - 1 - round(depth * SIDE)
+        ring = [*dark[near, near:far], *dark[far, near:far], *dark[near:far, near], *dark[near:far, far]]
+        if np.mean(ring) < 0.9:
+            return False
+    return True
 
 
 def _overlap(first: SeenTag, second: SeenTag) -> bool:
