@@ -116,7 +116,8 @@ def look_through(log: Log) -> Look:
     topics = log.topics()
     look = Look(topics)
     readable = {topic.name for topic in topics if is_text(topic.name)}
-    readable -= {topic.name for topic in topics if topic.unreadable}
+    # Several poses in a message are of several things (of targets, as a rule): no carrier's.
+    readable -= {topic.name for topic in topics if topic.unreadable or last_word(topic.schema) == "PosesInFrame"}
     transforms = {topic.name for topic in topics if _is_tf(topic)}
     for topic in topics:
         if topic.name in readable and last_word(topic.schema) in IMAGE_SCHEMAS:

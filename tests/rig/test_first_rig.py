@@ -184,6 +184,13 @@ def test_poses_of_a_topic(scene: Scene) -> None:
     assert "check the frames' names" in text.replace("\n  #", "")
 
 
+def test_several_poses_in_a_message_are_of_no_carrier(scene: Scene) -> None:
+    for i in range(POSES):
+        scene.out.poses("/seen", i, "map", np.array([pose(i)]))
+    with pytest.raises(RigError, match="no poses of anything that moves"):
+        scene.images("/cam/image", "cam", BLANK).first()
+
+
 def test_tf_is_taken_rather_than_a_topic(scene: Scene) -> None:
     scene.stamped_poses("/robot/pose", "map").moving("base", "hand").images("/cam/image", "cam", TAGS)
     rig, _, notes = scene.first()
