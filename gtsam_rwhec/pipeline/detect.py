@@ -72,7 +72,8 @@ def detect_log(
         found = {sensor: _chosen(seen[sensor], sensor, rig, carrier_at, corner_px) for sensor in seen}
         for sensor, source in rig.sensors.items():
             if source.detections is not None:
-                found[sensor] = from_driver(log, rig, sensor, cameras.get(sensor))
+                found[sensor], others = from_driver(log, rig, sensor, cameras.get(sensor))
+                strangers.update(others)
                 counts[sensor] = len({record.stamp_ns for record in found[sensor]})
         report = DetectionReport(
             sources=tuple(file.path.name for file in log.files),
@@ -96,13 +97,13 @@ def detect_log(
 
 def _look(
     log: Log, rig: Rig, cameras: dict[str, Camera], workers: int | None, tell: Progress
-) -> tuple[dict[str, list[_Seen]], dict[str, list[str]], dict[str, int], Counter[tuple[str, int]]]:
+) -> tuple[dict[str, list[_Seen]], dict[str, list[str]], dict[str, int], Counter[tuple[str, str]]]:
     """Every image once: detections, faults and counts by sensor, and the tags of no target."""
     sensor_of = {source.images: name for name, source in rig.sensors.items() if source.images is not None}
     found: dict[str, list[_Seen]] = {sensor: [] for sensor in sensor_of.values()}
     undecoded: dict[str, list[str]] = defaultdict(list)
     counts: dict[str, int] = dict.fromkeys(sensor_of.values(), 0)
-    strangers: Counter[tuple[str, int]] = Counter()
+    strangers: Counter[tuple[str, str]] = Counter()
     if not sensor_of:
         return found, undecoded, counts, strangers
     options = detection_options(rig)
@@ -131,7 +132,7 @@ def _look(
         if image.seen is None:
             undecoded[sensor].append(image.fault)
             continue
-        strangers.update(image.seen.strangers)
+        strangers.update({(family, str(i)): n for (family, i), n in image.seen.strangers.items()})
         found[sensor] += [_Seen(image.stamp_ns, detection) for detection in image.seen.detections]
     for topic, in_order in stamps.items():
         check_order(np.array(in_order, dtype=np.int64), f"topic {topic}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +16,10 @@ from gtsam_rwhec.vision.pose import plane_poses
 from gtsam_rwhec.vision.targets import Target
 
 
-def from_driver(log: Log, rig: Rig, sensor: str, camera: Camera | None) -> list[DetectionRecord]:
-    """Records of a sensor's targets.
+def from_driver(
+    log: Log, rig: Rig, sensor: str, camera: Camera | None
+) -> tuple[list[DetectionRecord], Counter[tuple[str, str]]]:
+    """Records of a sensor's targets; and how often tags were seen that are none, by family and id.
 
     With intrinsics, poses are made anew from the corners and the rig file's sizes (a driver's may be configured to
     others); of the two that a plane has, the one nearer to the driver's where it has one, else the one of smaller
@@ -31,21 +34,22 @@ def from_driver(log: Log, rig: Rig, sensor: str, camera: Camera | None) -> list[
     """
     source = rig.sensors[sensor]
     assert source.detections is not None
-    result, others = [], set()
+    result: list[DetectionRecord] = []
+    strangers: Counter[tuple[str, str]] = Counter()
     for record in log.records([source.detections]):
         if not isinstance(record, DetectionRecord):
             raise LogError(f"topic {source.detections} has no detections but {type(record).__name__}s")
         target = target_of(record, rig.target_list)
         if target is None:
-            others.add(f"{record.family} {record.id}".strip())
+            strangers[record.family or "tag", record.id] += 1
             continue
         result.append(_made(record, target, camera, sensor))
     if not result:
+        there = ", ".join(f"{family} {number} ({count} times)" for (family, number), count in sorted(strangers.items()))
         raise LogError(
-            f"topic {source.detections}: no target of the rig file was detected; tags there: "
-            f"{', '.join(sorted(others)) or 'none'}"
+            f"topic {source.detections}: no target of the rig file was detected; tags there: {there or 'none'}"
         )
-    return result
+    return result, strangers
 
 
 def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor: str) -> DetectionRecord:

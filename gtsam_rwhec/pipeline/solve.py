@@ -107,6 +107,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and _is_used(pairs, name)
     )
     run = _Run(rig, carriers, estimated, tell)
+    # A log that was solved before is solved anew: outliers and clocks as cleaning left them.
+    pairs = run.at(_with_outliers(pairs), offsets)
     sizes: tuple[SizeFields, ...] = ()
     known: tuple[str, ...] = tuple(target.name for target in rig.target_list)
     if rig.sizes != "known":
@@ -274,6 +276,13 @@ def without_outliers(pairs: Pairs, inliers: Mapping[Pair, np.ndarray]) -> Pairs:
                 reasons[i] = OUTLIER
         result[pair] = replace(measured, reasons=tuple(reasons))
     return result
+
+
+def _with_outliers(pairs: Pairs) -> Pairs:
+    return {
+        pair: replace(measured, reasons=tuple("" if why == OUTLIER else why for why in measured.reasons))
+        for pair, measured in pairs.items()
+    }
 
 
 def _outlier_count(pair: Pair, measured: MeasuredPairs) -> TrackCount:
