@@ -14,6 +14,9 @@ from gtsam_rwhec.vision.camera import MOST_PIXELS
 
 Gray = NDArray[np.uint8]
 
+#: How a PNG begins.
+PNG = b"\x89PNG\r\n\x1a\n"
+
 #: Channels and bytes a channel of raw encodings, and OpenCV's conversion to gray (None: it is gray).
 _RAW: dict[str, tuple[int, int, int | None]] = {
     "mono8": (1, 1, None), "8uc1": (1, 1, None), "mono16": (1, 2, None), "16uc1": (1, 2, None),
@@ -46,6 +49,8 @@ def _compressed(image: ImageRecord, where: str) -> Gray:
     size = _stated_size(image.data)
     if size is not None and size[0] * size[1] > MOST_PIXELS:
         raise ImageError(f"{where}: {size[0]} x {size[1]} pixels are more than the {MOST_PIXELS} that are decoded")
+    if image.data.startswith(PNG) and b"IEND" not in image.data:  # libpng would say so on the terminal, for each
+        raise ImageError(f"{where}: {len(image.data)} bytes of a PNG that goes on")
     buffer = np.frombuffer(image.data, dtype=np.uint8)
     # The lens does not turn with the viewer's wish: no EXIF orientation. More than 8 bits stay until they are scaled.
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
@@ -71,7 +76,7 @@ def _eight_bits(wide: NDArray[np.generic]) -> Gray:
 
 def _stated_size(data: bytes) -> tuple[int, int] | None:
     """Width and height of a PNG or JPEG as its header has them: checked before a small file becomes gigabytes."""
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+    if data.startswith(PNG) and len(data) >= 24:
         width, height = struct.unpack(">II", data[16:24])
         return width, height
     if data[:2] != b"\xff\xd8":

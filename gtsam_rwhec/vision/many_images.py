@@ -68,7 +68,7 @@ def detect_in_images(
         return _look(batch, detectors[topic])
 
     done = 0
-    with _one_thread_each(), ThreadPoolExecutor(count) as pool:
+    with _quiet_on_one_thread(), ThreadPoolExecutor(count) as pool:
         waiting: deque[Future[list[Looked]]] = deque()
         try:
             for batch in _batches(images):
@@ -127,14 +127,16 @@ def _batches(images: Iterable[ImageRecord]) -> Iterator[list[ImageRecord]]:
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """OpenCV's own threads would fight with ours."""
-    before = cv2.getNumThreads()
+def _quiet_on_one_thread() -> Iterator[None]:
+    """OpenCV's own threads would fight with ours, and faults are told by us."""
+    threads, level = cv2.getNumThreads(), cv2.utils.logging.getLogLevel()
     cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
     finally:
-        cv2.setNumThreads(before)
+        cv2.setNumThreads(threads)
+        cv2.utils.logging.setLogLevel(level)
 
 
 def measured_corner_px(squared_px: np.ndarray, corners: np.ndarray, least_px: float = 0.02) -> float:

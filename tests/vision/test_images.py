@@ -165,10 +165,11 @@ def jpeg_that_claims(width: int, height: int, before: bytes = b"") -> bytes:
     ("image", "words"),
     [
         (compressed(b""), "0 bytes"),
+        (compressed(encoded(GRAY, ".png")[:-40] + b"IEND", "png"), "no image that OpenCV can decode"),
         (compressed(b"\xff\xd8"), "2 bytes that begin with ffd8 and claim to be 'jpeg'"),
         (compressed(b"not an image at all", "png"), "19 bytes that begin with 6e6f7420616e2069 and claim to be 'png'"),
         (compressed(encoded(GRAY, ".jpg")[:-60]), "no image that OpenCV can decode"),
-        (compressed(encoded(GRAY, ".png")[:-40], "png"), "no image that OpenCV can decode"),
+        (compressed(encoded(GRAY, ".png")[:-40], "png"), "of a PNG that goes on"),
         (compressed(png_that_claims(60_000, 60_000), "png"), "60000 x 60000 pixels are more than"),
         (compressed(png_that_claims(0, 5), "png"), "no image that OpenCV can decode"),
         (compressed(jpeg_that_claims(60_000, 60_000)), "60000 x 60000 pixels are more than"),
