@@ -1,8 +1,8 @@
 """A sensor's clock against its carrier's, before anything is calibrated: turning has no frame.
 
 A_i X = Y B_i makes A_i^-1 A_j and B_i B_j^-1 rotations by one angle, whatever X and Y are. The offset that makes the
-angles agree best over all intervals is found on a grid (by the median difference, which wrong detections do not move),
-then by Gauss-Newton. Refinement takes it from there, with poses, as a variable (``RefineOptions.time_offsets``).
+angles agree best over all intervals is found on a grid (by a quantile of the differences that wrong detections do not
+move), then by Gauss-Newton. Refinement takes it from there, with poses, as a variable (``RefineOptions.time_offsets``).
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ MOST = 3000
 GRID_S = 0.01
 #: For derivatives of the angle by the offset.
 STEP_S = 0.005
+#: Of the differences, which tells how well an offset fits: an interval has two detections, so that 30 % wrong ones
+#: spoil half of all intervals. And this quantile of |x| for a normal x of unit variance.
+QUANTILE, NORMAL_QUANTILE = 0.3, 0.3853
 #: Beyond this many standard deviations a difference of angles is a wrong detection's.
 GROSS = 3.0
 
@@ -100,7 +103,7 @@ def coarse_time_offset(
         at = np.abs(differences(float(offset)))
         known = np.isfinite(at)
         if known.sum() >= max(10, 0.5 * len(at)):
-            costs[i] = np.median(at[known])
+            costs[i] = np.quantile(at[known], QUANTILE)
     if not np.isfinite(costs).any():
         raise StampError(
             f"{where}: no offset of up to {search_s:g} s brings half of its stamps into {carrier.where} (gaps of up to "
@@ -151,7 +154,7 @@ def _refined(differences: Callable[[float], Array], offset: float) -> tuple[floa
         d = differences(offset)
         slope = (differences(offset + STEP_S) - differences(offset - STEP_S)) / (2.0 * STEP_S)
         known = np.isfinite(d) & np.isfinite(slope)
-        scatter = 1.4826 * float(np.median(np.abs(d[known])))
+        scatter = float(np.quantile(np.abs(d[known]), QUANTILE)) / NORMAL_QUANTILE
         good = known & (np.abs(d) <= GROSS * max(scatter, 1e-9))
         information = float(np.sum(slope[good] ** 2))
         used = int(good.sum())
