@@ -5,6 +5,8 @@ Kept in the logs that stages write, and in the result file.
 
 from __future__ import annotations
 
+from collections import Counter
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -72,3 +74,21 @@ class LogFields(_Report):
     outliers: tuple[TrackCount, ...] = Field(description="what the robust estimation used, and left out")
     sizes: tuple[SizeFields, ...] = Field(description="none where sizes were taken as known")
     time_offsets: tuple[TimeOffsetFields, ...] = Field(description="of every sensor that was used")
+
+    @property
+    def contradicted(self) -> tuple[str, ...]:
+        """Sensors and targets of which more than half of the measurements were left out as outliers, in words.
+
+        Then it is as likely that the rest are the wrong ones: a clock, a size or a mounting that changed.
+        """
+        kept: Counter[str] = Counter()
+        left_out: Counter[str] = Counter()
+        for track in self.outliers:
+            for name in (track.target, track.sensor):
+                kept[name] += track.used
+                left_out[name] += sum(track.removed.values())
+        return tuple(
+            f"{name}: {left_out[name]} of its {kept[name] + left_out[name]} measurements contradict the answer"
+            for name in kept
+            if left_out[name] > kept[name]
+        )

@@ -20,13 +20,15 @@ class ExitStatus(IntEnum):
     """An answer without a proof that there is no better one."""
     DOWNLOAD_FAILED = 5
     """No network, or not the expected files; what was downloaded stays."""
+    CONTRADICTED = 6
+    """Most measurements of a sensor or target were left out as outliers: do not use the answer."""
     INTERRUPTED = 130
     """Ctrl-C."""
 
 
 HELP = (
     "Exit status: 0 certified (or done); 2 bad input; 3 certified, but the measurements do not determine every frame; "
-    "4 not certified; 5 download failed; 130 interrupted."
+    "4 not certified; 5 download failed; 6 most measurements of a frame contradict the answer; 130 interrupted."
 )
 
 

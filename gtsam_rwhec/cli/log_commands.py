@@ -179,6 +179,8 @@ def _print(calibrated: Calibrated) -> None:
 
 def _status(calibrated: Calibrated) -> ExitStatus:
     status = exit_status(calibrated.refined.solution)
+    if status is ExitStatus.CERTIFIED and calibrated.log.contradicted:
+        return ExitStatus.CONTRADICTED
     if status is ExitStatus.CERTIFIED and calibrated.refined.free_directions:
         return ExitStatus.NOT_UNIQUE
     return status

@@ -42,7 +42,7 @@ OUTLIER = "outlier (robust estimation)"
 #: intrinsics are seldom better.
 SIZE_SIGMAS, SIZE_SHARE = 5.0, 0.004
 #: Rounds of taking A anew at the refined time offsets, and the change (s) that ends them.
-ROUNDS, SETTLED_S = 6, 2e-6
+ROUNDS, SETTLED_S = 6, 2e-5
 #: Clocks that change by less change no outliers.
 SAME_OUTLIERS_S = 1e-4
 
@@ -112,7 +112,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     sizes: tuple[SizeFields, ...] = ()
     known: tuple[str, ...] = tuple(target.name for target in rig.target_list)
     if rig.sizes != "known":
-        sizes = run.sizes(pairs, offsets)
+        sizes, offsets = run.sizes(pairs, offsets)
+        pairs = run.at(pairs, offsets)
         known = tuple(size.target for size in sizes if not size.is_free)
     scale: ScaleMode = "known" if rig.sizes == "known" or all(not s.is_free for s in sizes) else "per_target"
     pairs, offsets = run.settled(pairs, offsets, scale, known)
@@ -223,8 +224,8 @@ class _Run:
             solution = solve(problem, progress=self.tell)
             return refine(problem, solution, options, progress=self.tell)
 
-    def sizes(self, pairs: dict[Pair, MeasuredPairs], offsets: dict[str, float]) -> tuple[SizeFields, ...]:
-        """Every target's stated size against what all measurements say of it."""
+    def sizes(self, pairs: Pairs, offsets: dict[str, float]) -> tuple[tuple[SizeFields, ...], dict[str, float]]:
+        """Every target's stated size against what all measurements say of it, and the clocks that go with that."""
         self.tell("looking at the targets' sizes")
         stated = {target.name: target.length_m for target in self.rig.target_list}
         check = self.rig.sizes == "check"
@@ -237,7 +238,7 @@ class _Run:
         except ScaleError:
             if not check:
                 raise
-            return ()
+            return (), offsets
         assert not isinstance(refined.scale, float)
         result = []
         for target, scale in refined.scale.items():
@@ -249,7 +250,7 @@ class _Run:
                     target=target, stated_m=stated[target], scale=scale, sigma=sigma, is_free=bool(doubted) or not check
                 )
             )
-        return tuple(result)
+        return tuple(result), offsets
 
 
 def _final(size: SizeFields, refined: Refined) -> SizeFields:

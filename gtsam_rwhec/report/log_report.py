@@ -16,6 +16,8 @@ def print_log(log: LogFields, console: Console | None = None) -> None:
     """Print what was detected, cleaned and left out, and which sizes are doubted."""
     console = report_console() if console is None else console
     console.print(_table(log))
+    for sentence in log.contradicted:
+        console.print(Text(f"Do not use: {sentence}.", style="bold red"), soft_wrap=not console.is_terminal)
     for sentence in log_sentences(log):
         console.print(Text(sentence), soft_wrap=not console.is_terminal)
     for sentence in doubts(log):
