@@ -19,11 +19,12 @@ from gtsam_rwhec.errors import FileFormatError, NotCertifiedWarning, NotUniqueWa
 from gtsam_rwhec.logs import convert_ros_bag, open_log, write_image_folder
 from gtsam_rwhec.pipeline.clean import clean_log
 from gtsam_rwhec.pipeline.detect import detect_log
+from gtsam_rwhec.pipeline.draw import draw_log
 from gtsam_rwhec.pipeline.run import CLEAN, RESULT, calibrate_log, export_solved, solve_into
 from gtsam_rwhec.pipeline.solve import Calibrated
 from gtsam_rwhec.report import print_refined, print_solution, report_console
 from gtsam_rwhec.report.log_report import print_log
-from gtsam_rwhec.rig import read_rig
+from gtsam_rwhec.rig import first_rig, read_rig
 
 RigOption = Annotated[Path | None, typer.Option("--rig", help="Rig file (YAML); left out, the one inside the log.")]
 ImagesOption = Annotated[bool, typer.Option("--images", help="Copy the images too; they are large.")]
@@ -56,8 +57,6 @@ def init(
         with StageDisplay() as stage:
             stage(f"looking at {log}")
             with open_log(log) as opened:
-                from gtsam_rwhec.rig.first_rig import first_rig
-
                 text, notes = first_rig(opened, output)
         _write_text(output, text)
         for note in notes:
@@ -100,6 +99,7 @@ def detect(
     rig: Annotated[Path, typer.Option("--rig", help="Rig file (YAML).")],
     output: Annotated[Path, typer.Option("--output", "-o", help="MCAP file to write.")],
     images: ImagesOption = False,
+    draw: Annotated[Path | None, typer.Option(help="Write every image with what was detected to this folder.")] = None,
     workers: WorkersOption = None,
 ) -> None:
     """First stage: images to poses of targets."""
@@ -110,6 +110,8 @@ def detect(
         used = sum(track.used for track in report.tracks)
         removed = sum(sum(track.removed.values()) for track in report.tracks)
         typer.echo(f"{used} detections to use, {removed} rejected, each with its reason, in {output}.")
+        if draw is not None:
+            typer.echo(f"{draw_log(log, output, draw, progress=stage)} images drawn in {draw}.")
 
 
 def clean(
