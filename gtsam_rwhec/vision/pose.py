@@ -84,12 +84,17 @@ def _ippe(points: Array, x: Array) -> Array:
     T = np.full((2, 4, 4), np.nan)
     if not np.isfinite(x).all():
         return T
-    try:
-        _, rotations, translations, _ = cv2.solvePnPGeneric(
-            points[:, None], x[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
-    except cv2.error:
-        return T  # corners on one line
+    # OpenCV's is wrong, or divides by zero, for what is exactly frontal or on the axis: with a little noise it is not.
+    aside = np.stack([np.cos(np.arange(len(x))), np.sin(2.0 * np.arange(len(x)))], axis=1) * np.ptp(x, axis=0).max()
+    for share in (1e-6, 1e-5):
+        try:
+            _, rotations, translations, _ = cv2.solvePnPGeneric(
+                points[:, None], (x + share * aside)[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+            )
+        except cv2.error:
+            return T  # corners on one line
+        if all(np.isfinite(turn).all() for turn in rotations):
+            break
     for k, (turn, t) in enumerate(zip(rotations[:2], translations[:2], strict=True)):
         if np.isfinite(turn).all() and np.isfinite(t).all() and t[2, 0] > 0.0:
             T[k] = np.eye(4)

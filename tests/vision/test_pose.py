@@ -56,6 +56,18 @@ def test_without_noise_it_is_the_truth(
     np.testing.assert_allclose(found.errors_px[0], 0.0, atol=1e-4)
 
 
+@pytest.mark.parametrize("far", [0.3, 0.3046875, 0.5])
+@pytest.mark.parametrize("tilt_deg", [0.0, 10.0, 30.0])
+def test_exactly_on_the_axis_too(tilt_deg: float, far: float) -> None:
+    for camera in CAMERAS:
+        for target in TARGETS:
+            T = pose((tilt_deg, 0.0, 0.0), (0.0, 0.0, far))
+            found = estimated(camera, target, projected(camera, target.corners(), T)[None])
+            assert found.squared_px[0, 0] < 1e-10
+            if tilt_deg:
+                np.testing.assert_allclose(nearest(found.T, T)[0][0], 0.0, atol=2e-5)
+
+
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.model)
 @pytest.mark.parametrize("target", [TAG, BOARD], ids=lambda target: target.name)
 def test_the_covariance_covers(camera: Camera, target: Target) -> None:
