@@ -18,6 +18,7 @@ RUNS = {
     "sparsity": (["--leaves", "2", "4"], r"8 X: ([\d.]+)% of Q' filled before, \1% after"),
     "certify_other_solver": (["--runs", "4"], "After local descent: certified"),
     "covariance_report": ([], r"cam_1 .* free .*[^$]*Not determined: cam_1: translation along y"),
+    "log_in_a_viewer": ([], "certified: cost 1"),
     "slam_graph": ([], r"Batch and iSAM2 agree to [\d.]+e-0[4-9] mm"),
 }
 
