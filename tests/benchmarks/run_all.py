@@ -1,7 +1,7 @@
 """Every benchmark in one table.
 
     python tests/benchmarks/run_all.py [--no-scs] [--plot FOLDER] [--outlier-seeds 40] [--coverage-runs 1000]
-                                       [--tables-runs 1000] [--lom-runs 300]
+                                       [--tables-runs 1000] [--lom-runs 300] [--corrupted-seeds 8]
 
 Takes an hour or two: SCS a minute, outliers ten, coverage half an hour, the paper's tables the rest (these three in
 processes of their own, with their own tables); 0 for any of the numbers leaves that part out. The noise sweep is
@@ -16,6 +16,8 @@ import sys
 import time
 from pathlib import Path
 
+import camera_logs
+import corrupted_detections
 import edge_summaries
 import many_frames
 import million_measurements
@@ -36,6 +38,7 @@ def main() -> int:
     parser.add_argument("--tables-runs", type=int, default=1000, help="of each experiment of Tables 2-5; 0: none")
     parser.add_argument("--lom-runs", type=int, default=300, help="of each row LOM of Tables 2-5; 0: none")
     parser.add_argument("--coverage-runs", type=int, default=1000, help="of each case of coverage; 0: none")
+    parser.add_argument("--corrupted-seeds", type=int, default=8, help="of wrong detections; 0: none")
     arguments = parser.parse_args()
     parts = {
         "answers on the real dataset": real_dataset.answers,
@@ -47,6 +50,10 @@ def main() -> int:
         "world origin": world_origin.rows,
         "outliers": lambda: outliers.rows(arguments.outlier_seeds, arguments.plot) if arguments.outlier_seeds else [],
         "edge summaries in GTSAM": lambda: edge_summaries.rows(repetitions=5),
+        "from camera images": camera_logs.rows,
+        "wrong detections": lambda: (
+            corrupted_detections.rows(arguments.corrupted_seeds) if arguments.corrupted_seeds else []
+        ),
     }
     rows: list[Row] = []
     for name, make in parts.items():
