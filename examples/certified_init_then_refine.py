@@ -1,12 +1,14 @@
 """A certified start, refined under the noise that there is, without the outliers; then on in the user's own graph."""
 
+from pathlib import Path
+
 import gtsam
 import numpy as np
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.demo_data import KAPPA, SIGMA_M, demo_folder
 
-problem = rw.read_csv(demo_folder(), sigma=SIGMA_M, kappa=KAPPA)
+folder = Path(__file__).parents[1] / "data" / "demo"
+problem = rw.read_csv(folder, sigma=0.005, kappa=0.5 / np.radians(0.5) ** 2)
 solution = rw.solve(problem)
 print(solution.certificate)
 refined = rw.refine(problem, solution, rw.RefineOptions(noise="estimate", residual="geodesic", robust="gnc"))

@@ -8,14 +8,19 @@ alike: ``tag_0_cam_0_A.csv`` has the rig's poses, ``tag_0_cam_0_B.csv`` what cam
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from figures import BLUE, GREEN, GREY, VERMILLION, arguments_of, plain, save
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.demo_data import KAPPA, SIGMA_M, demo_folder
 from gtsam_rwhec.report import print_solution
+
+FOLDER = Path(__file__).resolve().parents[1] / "data" / "demo"
+#: Standard deviations of its measurements: 5 mm, and 0.5 degrees as a concentration.
+SIGMA_M, KAPPA = 0.005, 0.5 / np.radians(0.5) ** 2
 
 
 def draw_from_above(axes: Axes, name: str, T: np.ndarray, length_m: float) -> None:
@@ -36,7 +41,7 @@ def draw_from_above(axes: Axes, name: str, T: np.ndarray, length_m: float) -> No
 
 def main() -> None:
     arguments = arguments_of(__doc__).parse_args()
-    problem = rw.read_csv(demo_folder(), scale="known", sigma=SIGMA_M, kappa=KAPPA)
+    problem = rw.read_csv(FOLDER, scale="known", sigma=SIGMA_M, kappa=KAPPA)
     solution = rw.solve(problem)
     print_solution(solution)
 

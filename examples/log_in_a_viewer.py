@@ -58,7 +58,7 @@ def draw(path: Path) -> Figure:
         for name in CAMERAS:
             images[name] = [r for r in log.records([f"/{name}/image/compressed"]) if isinstance(r, ImageRecord)]
     stamp = images[CAMERAS[0]][12].stamp_ns
-    figure = Figure(figsize=(13, 5.2), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     axes = figure.add_subplot(1, 3, 1, projection="3d")
     path_stamps = buffer.stamps("base", "hand")
     hand, _ = buffer.at("base", "hand", path_stamps)
@@ -67,7 +67,7 @@ def draw(path: Path) -> Figure:
         T = buffer.at("base", name, np.array([stamp]))[0][0]
         for axis, colour in zip(T[:3, :3].T, AXES, strict=True):
             axes.plot(*np.array([T[:3, 3], T[:3, 3] + 0.12 * axis]).T, color=colour, lw=2)
-        axes.text(*T[:3, 3], f" {name}", fontsize=9)
+        axes.text(*T[:3, 3], f" {name}", fontsize=8)
         if name in cameras:
             camera = cameras[name]
             corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]]) - 0.5
@@ -75,18 +75,30 @@ def draw(path: Path) -> Figure:
             for start, end in zip(rays, np.roll(rays, -1, axis=0), strict=True):
                 axes.plot(*np.array([start, end]).T, color="0.3", lw=0.8)
                 axes.plot(*np.array([T[:3, 3], start]).T, color="0.3", lw=0.8)
-    axes.set(xlabel="x of base (m)", ylabel="y (m)", zlabel="z (m)", title="/tf and /calibration/tf_static")
+    axes.set(xlabel="x of base (m)", ylabel="y (m)", zlabel="z (m)")
+    axes.set_title("/tf and /calibration/tf_static", fontsize=9)
     axes.set_aspect("equal")
     for k, name in enumerate(CAMERAS):
         image = min(images[name], key=lambda record: abs(record.stamp_ns - stamp))
         panel = figure.add_subplot(1, 3, 2 + k)
-        panel.imshow(cv2.cvtColor(decode_gray(image), cv2.COLOR_GRAY2RGB))
+        gray = decode_gray(image)
+        height, width = gray.shape
+        small = cv2.resize(gray, (width // 3, height // 3), interpolation=cv2.INTER_AREA)
+        panel.imshow(
+            small,
+            interpolation="nearest",
+            cmap="gray",
+            vmin=0,
+            vmax=255,
+            extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+        )
         said = annotations(path, f"/calibration/{name}/annotations").get(image.stamp_ns)
         for outline, text in zip(said["points"], said["texts"], strict=True) if said else ():
             points = np.array([[p["x"], p["y"]] for p in outline["points"]])
             panel.plot(*np.vstack([points, points[:1]]).T, color=ORANGE, lw=1.5)
-            panel.text(text["position"]["x"], text["position"]["y"] - 8, text["text"], color=ORANGE, fontsize=9)
-        panel.set(title=f"/{name}/image/compressed and annotations", xticks=[], yticks=[])
+            panel.text(text["position"]["x"], text["position"]["y"] - 8, text["text"], color=ORANGE, fontsize=8)
+        panel.set(title=f"/{name}/image and annotations", xticks=[], yticks=[])
+        panel.title.set_fontsize(9)
     return figure
 
 

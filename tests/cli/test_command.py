@@ -160,7 +160,7 @@ def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
         (["calibrate", DEMO, "--robust", "gnc"], "without --refine"),
         (["calibrate", DEMO, "--refine", "estimate", "--carrier-noise-mm", "2"], "go together"),
         (["calibrate", DEMO, "--refine", "given"], "noise='estimate'"),
-        (["calibrate"], "folder"),
+        (["calibrate"], "source"),
         (["fetch", "other"], "other"),
         (["guess"], "guess"),
     ],
