@@ -105,8 +105,10 @@ def coarse_time_offset(
         if known.sum() >= max(10, 0.5 * len(at)):
             costs[i] = np.quantile(at[known], QUANTILE)
     if not np.isfinite(costs).any():
+        first, last = carrier.span_s
         raise StampError(
-            f"{where}: no offset of up to {search_s:g} s brings half of its stamps into {carrier.where} (gaps of up to "
+            f"{where}: no offset of up to {search_s:g} s brings half of its stamps, from {start.min() * 1e-9:.3f} to "
+            f"{end.max() * 1e-9:.3f} s, into {carrier.where}, from {first:.3f} to {last:.3f} s (gaps of up to "
             f"{max_gap_s:g} s bridged); are they of another clock?"
         )
     best = int(np.argmin(costs))

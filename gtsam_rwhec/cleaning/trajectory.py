@@ -126,7 +126,13 @@ def checked_stamps(stamps_ns: ArrayLike, count: int, where: str) -> np.ndarray:
 
 
 def synchronise(
-    carrier: Trajectory, stamps_ns: np.ndarray, *, time_offset_s: float = 0.0, max_gap_s: float = MAX_GAP_S
+    carrier: Trajectory,
+    stamps_ns: np.ndarray,
+    *,
+    time_offset_s: float = 0.0,
+    max_gap_s: float = MAX_GAP_S,
+    where: str = "the sensor",
+    needs_overlap: bool = True,
 ) -> tuple[Array, Kept]:
     """The carrier's pose at each of a sensor's stamps.
 
@@ -139,6 +145,10 @@ def synchronise(
         The sensor's stamp t is the carrier's t + offset (Kalibr's convention).
     max_gap_s : float
         Between poses further apart than this nothing is interpolated.
+    where : str
+        The sensor, for messages.
+    needs_overlap : bool
+        Whether it is an error that no stamp is inside the trajectory.
 
     Returns
     -------
@@ -148,17 +158,18 @@ def synchronise(
     Raises
     ------
     StampError
-        When no stamp is inside the trajectory: other clocks, most often.
+        When no stamp is inside the trajectory, and one must: other clocks, most often.
     """
     stamps = np.asarray(stamps_ns, dtype=np.int64)
     A, gap_s = carrier.at(stamps + round(time_offset_s * 1e9))
     outside = np.isinf(gap_s)
-    if len(stamps) and outside.all():
+    if needs_overlap and len(stamps) and outside.all():
         first, last = carrier.span_s
         raise StampError(
-            f"no overlap in time: {carrier.where} is from {first:.3f} to {last:.3f} s, the sensor's stamps from "
-            f"{stamps.min() * 1e-9:.3f} to {stamps.max() * 1e-9:.3f} s; are they of different clocks? A constant "
-            "difference goes into time_offset_s"
+            f"no overlap in time: {carrier.where} is from {first:.3f} to {last:.3f} s, the stamps of {where} (with its "
+            f"time offset of {time_offset_s:g} s) from {stamps.min() * 1e-9 + time_offset_s:.3f} to "
+            f"{stamps.max() * 1e-9 + time_offset_s:.3f} s; are they of different clocks? If their difference is "
+            "constant and known, it goes into the sensor's time offset"
         )
     far = ~outside & (gap_s > max_gap_s)
     removed = [

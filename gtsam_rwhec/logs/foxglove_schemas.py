@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gtsam_rwhec.errors import MessageError
-from gtsam_rwhec.logs.checked_poses import transforms
+from gtsam_rwhec.logs.checked_poses import LARGEST_M, transforms
 from gtsam_rwhec.logs.records import (
     Array,
     DetectionRecord,
@@ -30,6 +30,8 @@ from gtsam_rwhec.logs.records import (
 #: A message's records, or what is wrong with it.
 Read = Sequence[Record] | str
 Get = Callable[[Any, str], Any]
+#: Of a board's corners: those of 100 x 100 squares.
+MOST_NUMBERS = 20_000
 #: What a stranger's message can raise on its way to numbers.
 _FAULTS = (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, IndexError)
 
@@ -46,9 +48,11 @@ class Access:
         """Nanoseconds of a message's ``timestamp``."""
         time = self.get(message, "timestamp")
         seconds, nanoseconds = (self.get(time, name) for name in self._time)
-        if type(seconds) is not int or type(nanoseconds) is not int or abs(seconds) > 1 << 40:
-            raise ValueError(f"timestamp {seconds!r}, {nanoseconds!r} is no seconds and nanoseconds")
-        return seconds * 1_000_000_000 + nanoseconds
+        if type(seconds) is int and type(nanoseconds) is int:
+            stamp = seconds * 1_000_000_000 + nanoseconds
+            if abs(stamp) < 1 << 63:
+                return stamp
+        raise ValueError(f"timestamp {str(seconds)[:40]}, {str(nanoseconds)[:40]} is no seconds and nanoseconds")
 
 
 JSON = Access(operator.getitem, "sec", "nsec", lambda text: base64.b64decode(text, validate=True))
@@ -231,9 +235,9 @@ def _camera_calibration(message: Any, access: Access, topic: str, logged: int) -
     return (IntrinsicsRecord(logged, access.stamp(message), topic, frame, width, height, model, K, D, R, P),)
 
 
-def _vector(values: Any, name: str) -> Array:
+def _vector(values: Any, name: str, most: int = 1000) -> Array:
     array = np.array([float(value) for value in values], dtype=np.float64)
-    if len(array) > 1000:
+    if len(array) > most:
         raise ValueError(f"{name} has {len(array)} numbers")
     return array
 
@@ -254,11 +258,16 @@ def _tag_detections(message: Any, access: Access, topic: str, logged: int) -> Re
         if tag.get("covariance") is not None:
             covariance = _vector(tag["covariance"], "covariance").reshape(6, 6)
         if tag.get("corners_px") is not None:
-            corners = _vector([float(c[axis]) for c in tag["corners_px"] for axis in "xy"], "corners").reshape(-1, 2)
+            corners = _vector([c[axis] for c in tag["corners_px"] for axis in "xy"], "corners", MOST_NUMBERS)
+            corners = corners.reshape(-1, 2)
         size, error = (None if tag.get(n) is None else float(tag[n]) for n in ("size_m", "reprojection_px"))
         family, name = _text(get, tag, "family"), _text(get, tag, "id")
         reason = _text(get, tag, "reason") if "reason" in tag else ""
         indices = None if tag.get("corner_indices") is None else tuple(int(i) for i in tag["corner_indices"])
+        numbers_of = {"covariance": covariance, "corners_px": corners, "size_m": size, "reprojection_px": error}
+        for field, given in numbers_of.items():
+            if given is not None and not np.isfinite(given).all():
+                return f"{field} is not finite: {np.asarray(given).tolist()}"
         if indices is not None and (corners is None or len(indices) != len(corners)):
             return f"{len(indices)} corner_indices for {0 if corners is None else len(corners)} corners"
         records.append(
@@ -275,12 +284,15 @@ def _measured_pair(message: Any, access: Access, topic: str, logged: int) -> Rea
     A, B = (_vector(get(message, name), name).reshape(4, 4) for name in "AB")
     for name, T in (("A", A), ("B", B)):
         R = T[:3, :3]
-        if not (np.abs(R.T @ R - np.eye(3)).max() < 1e-3 and np.isfinite(T).all() and T[3].tolist() == [0, 0, 0, 1]):
+        is_rotation = np.isfinite(T).all() and np.abs(R.T @ R - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0.0
+        if not (is_rotation and np.abs(T[:3, 3]).max() <= LARGEST_M and T[3].tolist() == [0, 0, 0, 1]):
             return f"{name} is no transform: {T.tolist()}"
     target, sensor, reason = (_text(get, message, name) for name in ("target", "sensor", "reason"))
     stamp, inlier = access.stamp(message), bool(get(message, "is_inlier"))
     given = message.get("covariance")
     covariance = None if given is None else _vector(given, "covariance").reshape(6, 6)
+    if covariance is not None and not np.isfinite(covariance).all():
+        return f"covariance is not finite: {covariance.tolist()}"
     return (PairRecord(logged, stamp, topic, target, sensor, A, B, inlier, reason, covariance),)
 
 

@@ -22,6 +22,7 @@ class _Link:
     """T_parent_child over time; a static one has one transform and no stamps."""
 
     parent: str
+    child: str
     topic: str
     is_static: bool
     stamps_ns: list[int] = field(default_factory=list)
@@ -65,7 +66,7 @@ class TfBuffer:
             raise TransformError(f"topic {record.topic}: frame {child} is its own parent")
         link = self._links.get(child)
         if link is None:
-            link = self._links[child] = _Link(parent, record.topic, record.is_static)
+            link = self._links[child] = _Link(parent, child, record.topic, record.is_static)
         if link.parent != parent:
             raise TransformError(
                 f"frame {child} has two parents, {link.parent} (topic {link.topic}) and {parent} (topic "
@@ -117,10 +118,18 @@ class TfBuffer:
         TransformError
             As `chain`.
         """
-        frames = self.chain(parent, child)
-        below = [b if b in self._links and self._links[b].parent == a else a for a, b in itertools.pairwise(frames)]
-        moving = [self._links[name].by_stamp()[0] for name in below if not self._links[name].is_static]
+        moving = [link.by_stamp()[0] for link in self._moving(parent, child)]
         return np.unique(np.concatenate(moving)) if moving else np.zeros(0, dtype=np.int64)
+
+    def stamps_as_logged(self, parent: str, child: str) -> dict[str, Stamps]:
+        """The stamps of each moving link of the chain, by its child, in the order in which they were added.
+
+        Raises
+        ------
+        TransformError
+            As `chain`.
+        """
+        return {link.child: np.array(link.stamps_ns, dtype=np.int64) for link in self._moving(parent, child)}
 
     def at(self, parent: str, child: str, stamps_ns: Stamps) -> tuple[Array, Array]:
         """T_parent_child at stamps.
@@ -155,6 +164,12 @@ class TfBuffer:
             T = T @ (T_link if down else se3.inverse(T_link))
             gap_s = np.maximum(gap_s, gap_link)
         return np.array(T), gap_s
+
+    def _moving(self, parent: str, child: str) -> list[_Link]:
+        """The links of the chain that are not static."""
+        frames = self.chain(parent, child)
+        below = [b if b in self._links and self._links[b].parent == a else a for a, b in itertools.pairwise(frames)]
+        return [self._links[name] for name in below if not self._links[name].is_static]
 
     def _up(self, frame: str) -> list[str]:
         """The frame, its parent, and so on to the root."""

@@ -8,15 +8,20 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.cleaning import Trajectory
-from gtsam_rwhec.errors import StampError, TransformError
-from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer
+from gtsam_rwhec.errors import LogError, StampError, TransformError
+from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer, Topic
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.rig import Rig
 
 #: Stamps that go back by more than this, in the order in which messages were logged: a clock was set meanwhile.
 BACKWARDS_S = 1.0
+#: Stamps from here on (the year 2116) are none; so differences and time offsets stay within 64 bits.
+LATEST_NS = 1 << 62
 TF_TOPICS = ("tf", "tf_static")
+_TRANSFORM_SCHEMAS = ("foxglove.FrameTransforms", "foxglove.FrameTransform")
+#: Topics that an error lists, at most: a stranger's log may have thousands.
+MOST_NAMED = 50
 
 
 @dataclass(frozen=True)
@@ -33,11 +38,11 @@ def read_carriers(log: Log, rig: Rig) -> Carriers:
     Raises
     ------
     LogError
-        A topic that is not there, or has no such poses.
+        A topic that is not there, or has no such poses; no transforms at all.
     TransformError
         Frames that no chain of transforms joins, or that never move against each other.
     StampError
-        Stamps that are all zero, or of a clock that was set back meanwhile.
+        Stamps that are all one, or of a clock that was set back meanwhile.
     """
     source = rig.carriers.poses
     parent, child = source.frames
@@ -65,26 +70,41 @@ def read_carriers(log: Log, rig: Rig) -> Carriers:
 
 
 def _from_tf(log: Log, parent: str, child: str) -> tuple[np.ndarray, Array]:
-    topics = [t.name for t in log.topics() if t.name.rpartition("/")[2] in TF_TOPICS or t.schema in _TRANSFORM_SCHEMAS]
-    readable = [t.name for t in log.topics() if t.name in topics and not t.unreadable]
-    buffer = TfBuffer(log.records(readable)) if readable else TfBuffer()
-    stamps = buffer.stamps(parent, child)
-    if not len(stamps):
+    where = f"{log.files[0].path}, tf {parent} to {child}"
+    topics = [t for t in log.topics() if t.name.rpartition("/")[2] in TF_TOPICS or t.schema in _TRANSFORM_SCHEMAS]
+    readable = [t.name for t in topics if not t.unreadable]
+    try:
+        buffer = TfBuffer(log.records(readable)) if readable else TfBuffer()
+        if not buffer.frames():
+            raise LogError(f"{where}: {_no_transforms(log, topics)}")
+        chain = " -> ".join(buffer.chain(parent, child))
+        for link, in_order in buffer.stamps_as_logged(parent, child).items():
+            check_order(in_order, f"{where}, transforms of {link}")
+        stamps = buffer.stamps(parent, child)
+        T, gap_s = buffer.at(parent, child, stamps)
+    except TransformError as error:
+        raise TransformError(f"{where}: {error}") from error
+    if len(stamps) < 2:
+        why = "one pose" if len(stamps) else "static transforms"
         raise TransformError(
-            f"{parent} and {child} are joined by static transforms only ({' -> '.join(buffer.chain(parent, child))}): "
-            "a carrier that does not move calibrates nothing"
+            f"{where}: joined by {why} only ({chain}): a carrier that does not move calibrates nothing"
         )
-    _check_not_zero(stamps, f"tf {parent} to {child}")
-    T, gap_s = buffer.at(parent, child, stamps)
     known = np.isfinite(gap_s)  # before the first and after the last of a link nothing is known
     if not known.any():
-        raise TransformError(
-            f"the links from {parent} to {child} have no time in common: {' -> '.join(buffer.chain(parent, child))}"
-        )
+        raise TransformError(f"{where}: the links of the chain have no time in common: {chain}")
     return stamps[known], T[known]
 
 
-_TRANSFORM_SCHEMAS = ("foxglove.FrameTransforms", "foxglove.FrameTransform")
+def _no_transforms(log: Log, topics: list[Topic]) -> str:
+    """What there is in place of transforms."""
+    said = [f"{t.name} ({t.unreadable or f'{t.count} messages, none of which can be read'})" for t in topics]
+    if said:
+        return f"no transforms can be read; topics of transforms: {', '.join(said)}"
+    there = ", ".join(f"{t.name} ({t.schema})" for t in log.topics()[:MOST_NAMED]) or "none"
+    return (
+        f"the log has no transforms; its topics: {there}. Record /tf and /tf_static too, or name a topic of poses in "
+        "the rig file: poses: {topic: ..., parent: ..., child: ...}"
+    )
 
 
 def _from_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
@@ -97,14 +117,27 @@ def _from_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
 
 
 def check_order(stamps_ns: np.ndarray, where: str) -> None:
-    """Refuse stamps (N,), in the order in which they were logged, that tell no time.
+    """Refuse stamps (N,), one of each message, in the order in which they were logged, that tell no time.
 
     Raises
     ------
     StampError
-        All zero; or going back by more than `BACKWARDS_S`.
+        All one (zero, most often); before 1970 or after 2116; or going back by more than `BACKWARDS_S`.
     """
-    _check_not_zero(stamps_ns, where)
+    if not len(stamps_ns):
+        return
+    wrong = np.flatnonzero((stamps_ns < 0) | (stamps_ns >= LATEST_NS))
+    if len(wrong):
+        raise StampError(
+            f"{where}: stamp {stamps_ns[wrong[0]]} ns (message {wrong[0] + 1}) is before 1970 or after 2116; does the "
+            "driver write nanoseconds, or seconds and nanoseconds, as the schema has it?"
+        )
+    if not stamps_ns.any():
+        raise StampError(f"{where}: every stamp is 0 ({len(stamps_ns)} messages); does the driver fill header.stamp?")
+    if len(stamps_ns) > 1 and (stamps_ns == stamps_ns[0]).all():
+        raise StampError(
+            f"{where}: all {len(stamps_ns)} messages have the one stamp {stamps_ns[0]} ns: a clock stood still"
+        )
     back = np.diff(stamps_ns) * 1e-9
     if len(back) and back.min() < -BACKWARDS_S:
         i = int(np.argmin(back))
@@ -112,8 +145,3 @@ def check_order(stamps_ns: np.ndarray, where: str) -> None:
             f"{where}: stamps go back by {-back[i]:.3f} s at message {i + 2} ({stamps_ns[i]} then {stamps_ns[i + 1]} "
             "ns): a clock was set, or two sources publish there; cut the log at that place"
         )
-
-
-def _check_not_zero(stamps_ns: np.ndarray, where: str) -> None:
-    if len(stamps_ns) and not stamps_ns.any():
-        raise StampError(f"{where}: all {len(stamps_ns)} stamps are 0; does the driver fill header.stamp?")

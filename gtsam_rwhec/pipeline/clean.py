@@ -27,12 +27,13 @@ from gtsam_rwhec.pipeline.embedded import (
     CLEANING,
     DETECTION,
     read_cameras,
-    read_embedded_rig,
     read_report,
     write_cameras,
     write_report,
     write_rig,
 )
+from gtsam_rwhec.pipeline.resumed import rig_for_cleaning
+from gtsam_rwhec.pipeline.taken_over import check_writable, topics_before_cleaning
 from gtsam_rwhec.pipeline.tracks import Track, tracks_of
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.rig import Rig
@@ -64,7 +65,7 @@ def clean_log(
     detected_path
         What ``detect_log`` wrote.
     out_path
-        The MCAP file to write.
+        The MCAP file to write; may be `detected_path`.
     rig : Rig, optional
         Left out, the one that is embedded in the log.
     images : "copy" or "leave_out"
@@ -78,8 +79,9 @@ def clean_log(
         a time offset; and where nothing is left.
     """
     tell = progress if progress is not None else _silent
+    check_writable(out_path)
     with open_log(detected_path) as log:
-        rig = read_embedded_rig(log) if rig is None else rig
+        rig = rig_for_cleaning(log, rig)
         detection = read_report(log, DETECTION, DetectionReport)
         cameras = read_cameras(log)
         tell("reading the carriers' poses")
@@ -92,6 +94,7 @@ def clean_log(
             tell(f"synchronising {sensor}")
             of_sensor = tracks_of(_detections(log, sensor), rig, sensor)
             offsets[sensor] = _offset(rig, sensor, path, of_sensor, sigmas)
+            _check_overlap(of_sensor, path, sensor, offsets[sensor])
             for track in of_sensor:
                 cleaned, A = clean_track(track, path, rig, offsets[sensor])
                 tracks.append(cleaned)
@@ -103,7 +106,7 @@ def clean_log(
             raise LogError(_nothing(log, report))
         tell("writing pairs")
         with LogWriter(out_path) as out:
-            out.copy(log, images=images)
+            out.copy(log, topics_before_cleaning(log), images)
             for pair in sorted(pairs, key=lambda pair: pair.stamp_ns):
                 out.pair(pair)
             write_rig(out, rig)
@@ -114,15 +117,15 @@ def clean_log(
 
 
 def clean_track(track: Track, path: Trajectory, rig: Rig, offset_s: float) -> tuple[Track, Array]:
-    """Synchronise a track and take out what should not be used: the track, marked, and A (N, 4, 4) at its stamps.
-
-    Raises
-    ------
-    StampError
-        No stamp is within the carriers' path.
-    """
+    """Synchronise a track and take out what should not be used: the track, marked, and A (N, 4, 4) at its stamps."""
     options = rig.cleaning
-    A, kept = synchronise(path, track.stamps_ns, time_offset_s=offset_s, max_gap_s=rig.carriers.max_gap_s)
+    A, kept = synchronise(
+        path,
+        track.stamps_ns,
+        time_offset_s=offset_s,
+        max_gap_s=rig.carriers.max_gap_s,
+        needs_overlap=False,
+    )
     track = _mark(track, kept, np.arange(len(A)))
     stamps = track.stamps_ns
     if options.max_rotation_deg_s is not None or options.max_translation_m_s is not None:
@@ -180,6 +183,13 @@ def _offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track], sigmas
     found = coarse_time_offset(path, usable, max_gap_s=rig.carriers.max_gap_s, where=sensor)
     sigmas[sensor] = found.sigma_s
     return found.offset_s
+
+
+def _check_overlap(tracks: list[Track], path: Trajectory, sensor: str, offset_s: float) -> None:
+    """Of all that a sensor saw something must be within the carriers' path; of each target it need not."""
+    if tracks:
+        stamps = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
+        synchronise(path, stamps, time_offset_s=offset_s, where=sensor)
 
 
 def _mark(track: Track, kept: Kept, at: np.ndarray) -> Track:

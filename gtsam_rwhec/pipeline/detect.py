@@ -9,13 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gtsam_rwhec.errors import LogError, TransformError
+from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log, LogWriter, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.carriers import check_order, read_carriers
 from gtsam_rwhec.pipeline.driver_detections import from_driver
 from gtsam_rwhec.pipeline.embedded import DETECTION, write_cameras, write_report, write_rig
 from gtsam_rwhec.pipeline.intrinsics import cameras_of
+from gtsam_rwhec.pipeline.nothing_seen import nothing_seen
+from gtsam_rwhec.pipeline.taken_over import check_not_onto, check_writable, message_count, topics_before_detection
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.stage_reports import DetectionReport, TrackCount
@@ -28,7 +30,8 @@ from gtsam_rwhec.vision.options import DetectionOptions
 Progress = Callable[[str], None]
 #: Under which the detections of a sensor are written.
 TOPIC = "/calibration/{sensor}/detections"
-FRAME = "{sensor}"
+#: Numbers of images after which a camera's stamps are looked at, so that nobody waits for what cannot be used.
+EARLY = (10, 100, 1000, 10_000)
 
 
 def detect_log(
@@ -60,21 +63,24 @@ def detect_log(
 
     Raises
     ------
-    LogError, StampError, CameraError, FrameError
-        For a log that lacks what the rig file names, or in which nothing at all was detected.
+    LogError, StampError, TransformError, CameraError, FrameError
+        For a log that lacks what the rig file names, the carriers' poses too, or in which nothing at all was detected.
     """
     tell = progress if progress is not None else _silent
+    check_writable(out_path)
     with open_log(log_path) as log:
+        check_not_onto(log, out_path)
         cameras = cameras_of(log, rig)
-        seen, undecoded, counts, strangers = _look(log, rig, cameras, workers, tell)
+        tell("reading the carriers' poses")
         carrier_at = _carrier_at(log, rig)
+        seen, undecoded, counts, strangers = _look(log, rig, cameras, workers, tell)
         corner_px: dict[str, float] = {}
         found = {sensor: _chosen(seen[sensor], sensor, rig, carrier_at, corner_px) for sensor in seen}
         for sensor, source in rig.sensors.items():
             if source.detections is not None:
                 found[sensor], others = from_driver(log, rig, sensor, cameras.get(sensor))
                 strangers.update(others)
-                counts[sensor] = len({record.stamp_ns for record in found[sensor]})
+                counts[sensor] = message_count(log, source.detections)
         report = DetectionReport(
             sources=tuple(file.path.name for file in log.files),
             images=counts,
@@ -84,10 +90,10 @@ def detect_log(
             corner_px=corner_px,
         )
         if not any(track.used for track in report.tracks):
-            raise LogError(_nothing(log, report))
+            raise LogError(nothing_seen(log, rig, report))
         tell("writing detections")
         with LogWriter(out_path) as out:
-            out.copy(log, images=images)
+            out.copy(log, topics_before_detection(log), images)
             _write(out, found)
             write_rig(out, rig)
             write_cameras(out, cameras)
@@ -113,7 +119,10 @@ def _look(
         for record in log.records(list(sensor_of)):
             if not isinstance(record, ImageRecord):
                 raise LogError(f"topic {record.topic} has no images but {type(record).__name__}s")
-            stamps[record.topic].append(record.stamp_ns)
+            of_topic = stamps[record.topic]
+            of_topic.append(record.stamp_ns)
+            if len(of_topic) in EARLY:
+                check_order(np.array(of_topic, dtype=np.int64), f"topic {record.topic}")
             yield record
 
     makers = {
@@ -134,8 +143,15 @@ def _look(
             continue
         strangers.update({(family, str(i)): n for (family, i), n in image.seen.strangers.items()})
         found[sensor] += [_Seen(image.stamp_ns, detection) for detection in image.seen.detections]
-    for topic, in_order in stamps.items():
-        check_order(np.array(in_order, dtype=np.int64), f"topic {topic}")
+    for topic, sensor in sensor_of.items():
+        check_order(np.array(stamps[topic], dtype=np.int64), f"topic {topic}")
+        faults = undecoded.get(sensor, [])
+        if len(faults) == counts[sensor]:
+            why = f"the first: {faults[0]}" if faults else "not one can be read as its schema says"
+            raise LogError(
+                f"{log.files[0].path}, topic {topic}: none of the {message_count(log, topic)} images of {sensor} can "
+                f"be used; {why}"
+            )
     return found, undecoded, counts, strangers
 
 
@@ -151,7 +167,7 @@ def _chosen(
     found: list[_Seen],
     sensor: str,
     rig: Rig,
-    carrier_at: Callable[[np.ndarray], Array] | None,
+    carrier_at: Callable[[np.ndarray], Array],
     corner_px: dict[str, float],
 ) -> list[DetectionRecord]:
     """Detections of one sensor as records, each with the pose that its whole track speaks for."""
@@ -176,7 +192,7 @@ def _chosen(
                 squared,
                 factor * np.array([seen.detection.covariance for seen in good]),
                 noise,
-                None if carrier_at is None else carrier_at(stamps),
+                carrier_at(stamps),
             )
             for seen, which, margin in zip(good, choice.which.tolist(), choice.margin.tolist(), strict=True):
                 chosen[id(seen)] = which, AMBIGUOUS if margin < options.ambiguity_margin else ""
@@ -204,12 +220,9 @@ def _chosen(
     return records
 
 
-def _carrier_at(log: Log, rig: Rig) -> Callable[[np.ndarray], Array] | None:
-    """A at stamps, nan where not known; None where the log does not tell: tracks then rely on smoothness."""
-    try:
-        trajectory = read_carriers(log, rig).trajectory
-    except TransformError:
-        return None  # cleaning, which cannot do without, says what is wrong
+def _carrier_at(log: Log, rig: Rig) -> Callable[[np.ndarray], Array]:
+    """A at stamps, nan where not known; read before images are looked at, so that a log without is refused at once."""
+    trajectory = read_carriers(log, rig).trajectory
 
     def at(stamps_ns: np.ndarray) -> Array:
         A, gap_s = trajectory.at(stamps_ns)
@@ -249,28 +262,6 @@ def _write(out: LogWriter, found: dict[str, list[DetectionRecord]]) -> None:
 def label(record: DetectionRecord) -> str:
     """What stands beside a detection in a picture."""
     return record.id if not record.reason else f"{record.id}: {record.reason}"
-
-
-def _nothing(log: Log, report: DetectionReport) -> str:
-    """What was seen, when nothing of it can be used."""
-    parts = [f"{count} images or messages of {sensor}" for sensor, count in report.images.items()]
-    said = [f"looked at {', '.join(parts)}"]
-    said += [
-        f"{len(faults)} of {sensor} not decoded, the first: {faults[0]}" for sensor, faults in report.undecoded.items()
-    ]
-    said += [
-        f"{track.target} in {track.sensor}: {', '.join(f'{count} {why}' for why, count in track.removed.items())}"
-        for track in report.tracks
-    ]
-    if report.strangers:
-        strangers = [f"{name} ({count} times)" for name, count in list(report.strangers.items())[:20]]
-        said.append(f"tags that are no target were seen: {', '.join(strangers)}")
-    else:
-        said.append("no other tags of the targets' families were seen either")
-    return (
-        f"{log.files[0].path}: no target of the rig file was detected in a way that can be used. {'; '.join(said)}. "
-        "Are the families, ids and topics in the rig file right? (gtsam-rwhec init LOG says which tags it finds)"
-    )
 
 
 def _corner_px(rig: Rig) -> float | None:

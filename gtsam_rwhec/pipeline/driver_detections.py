@@ -9,6 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import CameraError, LogError
 from gtsam_rwhec.logs import DetectionRecord, Log
+from gtsam_rwhec.pipeline.carriers import check_order
 from gtsam_rwhec.pipeline.tracks import target_of
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
@@ -19,7 +20,7 @@ from gtsam_rwhec.vision.targets import Target
 def from_driver(
     log: Log, rig: Rig, sensor: str, camera: Camera | None
 ) -> tuple[list[DetectionRecord], Counter[tuple[str, str]]]:
-    """Records of a sensor's targets; and how often tags were seen that are none, by family and id.
+    """Records of a sensor's targets, none where none was seen; and how often other tags were, by family and id.
 
     With intrinsics, poses are made anew from the corners and the rig file's sizes (a driver's may be configured to
     others); of the two that a plane has, the one nearer to the driver's where it has one, else the one of smaller
@@ -29,6 +30,8 @@ def from_driver(
     ------
     LogError
         The topic is not there, or has no detections.
+    StampError
+        Stamps that tell no time.
     CameraError
         There are neither poses nor intrinsics to make them.
     """
@@ -36,19 +39,17 @@ def from_driver(
     assert source.detections is not None
     result: list[DetectionRecord] = []
     strangers: Counter[tuple[str, str]] = Counter()
+    messages: dict[tuple[int, int], None] = {}
     for record in log.records([source.detections]):
         if not isinstance(record, DetectionRecord):
             raise LogError(f"topic {source.detections} has no detections but {type(record).__name__}s")
+        messages[record.logged_ns, record.stamp_ns] = None
         target = target_of(record, rig.target_list)
         if target is None:
             strangers[record.family or "tag", record.id] += 1
             continue
         result.append(_made(record, target, camera, sensor))
-    if not result:
-        there = ", ".join(f"{family} {number} ({count} times)" for (family, number), count in sorted(strangers.items()))
-        raise LogError(
-            f"topic {source.detections}: no target of the rig file was detected; tags there: {there or 'none'}"
-        )
+    check_order(np.array([stamp for _, stamp in messages], dtype=np.int64), f"topic {source.detections}")
     return result, strangers
 
 

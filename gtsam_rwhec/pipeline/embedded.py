@@ -35,8 +35,8 @@ def read_embedded_rig(log: Log) -> Rig:
     found = log.metadata().get(RIG)
     if found is None or "yaml" not in found:
         raise LogError(
-            f"{log.files[0].path} has no rig file in it: it was not written by gtsam-rwhec detect or clean. Give "
-            "--rig, or begin with detect"
+            f"{log.files[0].path} has no rig file in it: it was not written by gtsam-rwhec detect or clean, or is not "
+            "whole. Begin with detect (again)"
         )
     return parse_rig(found["yaml"], f"{log.files[0].path}, metadata {RIG}")
 
@@ -67,8 +67,8 @@ def read_cameras(log: Log) -> dict[str, Camera]:
             fields = json.loads(text)
             numbers = fields["width"], fields["height"], fields["model"], fields["K"], fields["D"]
             cameras[sensor] = Camera.of(*numbers, where)
-        except (ValueError, KeyError, TypeError) as error:
-            raise LogError(f"{where}: the intrinsics of {sensor} cannot be read: {error}") from error
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+            raise LogError(f"{where}: the intrinsics of {sensor} cannot be read: {error!r}") from error
     return cameras
 
 
@@ -88,7 +88,10 @@ def read_report(log: Log, name: str, kind: type[Report]) -> Report:
     found = log.metadata().get(name)
     where = f"{log.files[0].path}, metadata {name}"
     if found is None or "json" not in found:
-        raise LogError(f"{where} is not there: the stage before this one did not write this log")
+        raise LogError(
+            f"{where} is not there: the stage before this one did not write this log, or it is not whole. The stages "
+            "are detect, clean, solve, export; each takes the log that the one before it wrote"
+        )
     try:
         return kind.model_validate_json(found["json"])
     except ValidationError as error:

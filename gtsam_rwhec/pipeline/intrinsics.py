@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.errors import CameraError
+from gtsam_rwhec.errors import CameraError, LogError
 from gtsam_rwhec.logs import IntrinsicsRecord, Log
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.intrinsics_files import read_calibration_yaml, read_kalibr_camchain
 
+#: Topics that an error lists, at most.
+MOST_NAMED = 50
 INTRINSICS_SCHEMAS = ("sensor_msgs/msg/CameraInfo", "sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 
 
@@ -53,6 +55,14 @@ def cameras_of(log: Log, rig: Rig) -> dict[str, Camera]:
 
 def _from_topic(log: Log, topic: str, sensor: str) -> Camera:
     first: Camera | None = None
+    there = log.topics()
+    if topic not in {t.name for t in there}:
+        named = ", ".join(t.name for t in there if t.schema in INTRINSICS_SCHEMAS) or "none"
+        others = ", ".join(t.name for t in there[:MOST_NAMED]) or "none"
+        raise LogError(
+            f"sensor {sensor}: {log.files[0].path} has no topic {topic}; topics of intrinsics in it: {named}; all its "
+            f"topics: {others}. Intrinsics can be in a file too: {{kalibr: ..., camera: ...}} or {{file: ...}}"
+        )
     for record in log.records([topic]):
         if not isinstance(record, IntrinsicsRecord):
             raise CameraError(f"sensor {sensor}: topic {topic} has no intrinsics but {type(record).__name__}s")
@@ -61,8 +71,8 @@ def _from_topic(log: Log, topic: str, sensor: str) -> Camera:
             first = camera
         elif not same(first, camera):
             raise CameraError(
-                f"topic {topic}: intrinsics change at {record.stamp_ns} ns (K from {first.K.tolist()} to "
-                f"{camera.K.tolist()}); a camera whose zoom or resolution changes is several: cut the log there"
+                f"sensor {sensor}, topic {topic}: intrinsics change at {record.stamp_ns} ns (K from "
+                f"{first.K.tolist()} to {camera.K.tolist()}); a camera whose zoom or resolution changes is several: cut the log there"
             )
     if first is None:
         raise CameraError(f"sensor {sensor}: topic {topic} has no message that can be read")

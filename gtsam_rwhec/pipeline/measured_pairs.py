@@ -52,12 +52,12 @@ class MeasuredPairs:
 
 
 def read_pairs(log: Log, rig: Rig) -> dict[Pair, MeasuredPairs]:
-    """Pairs of a cleaned log by (target, sensor), each in order of time."""
+    """Pairs of a cleaned log by (target, sensor), each in order of time; of those that the rig file has."""
     there = {topic.name for topic in log.topics()}
     topics = [PAIR_TOPIC.format(sensor=sensor) for sensor in rig.sensors]
     found: dict[Pair, list[PairRecord]] = defaultdict(list)
     for record in log.records([topic for topic in topics if topic in there]):
-        if isinstance(record, PairRecord):
+        if isinstance(record, PairRecord) and record.target in rig.targets and record.sensor in rig.sensors:
             found[record.target, record.sensor].append(record)
     return {pair: _stacked(sorted(found[pair], key=lambda r: r.stamp_ns)) for pair in sorted(found)}
 

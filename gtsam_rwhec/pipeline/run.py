@@ -12,10 +12,12 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.clean import clean_log
 from gtsam_rwhec.pipeline.detect import detect_log
 from gtsam_rwhec.pipeline.drawn import plot_all
-from gtsam_rwhec.pipeline.embedded import CLEANING, DETECTION
+from gtsam_rwhec.pipeline.embedded import CLEANING, DETECTION, read_embedded_rig
 from gtsam_rwhec.pipeline.exported import frames_of
+from gtsam_rwhec.pipeline.resumed import changes
 from gtsam_rwhec.pipeline.solve import Calibrated, solve_log
 from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
+from gtsam_rwhec.pipeline.taken_over import check_not_onto, check_writable
 from gtsam_rwhec.rig import Rig
 
 Progress = Callable[[str], None]
@@ -35,7 +37,8 @@ def calibrate_log(
 
     Writes ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``, ``camchain.yaml``
     and ``plots/`` into a folder. While it works there is a ``detected.mcap``, from which an interrupted run goes on:
-    give that as the log. A log that a stage of this library wrote is taken up where that stage ended.
+    give that as the log. A log that a stage of this library wrote is taken up where that stage ended; or cleaned anew,
+    where `rig` has other settings for that than the log was cleaned with.
 
     Parameters
     ----------
@@ -56,21 +59,28 @@ def calibrate_log(
     RwhecError
         As each stage does.
     """
-    out = made_folder(out)
+    detected, clean = Path(out) / DETECTED, Path(out) / CLEAN
     with open_log(log_path) as log:
+        source = log.files[0].path
         stages = set(log.metadata()) & {DETECTION, CLEANING}
-    detected, clean = out / DETECTED, out / CLEAN
-    source: str | Path | list[str | Path] = log_path
+        if stages and len(log.files) > 1:
+            raise LogError(
+                f"{', '.join(str(file.path) for file in log.files[:10])}: of several files one or more were written by "
+                "a stage; give that one alone, or the raw ones"
+            )
+        is_cleaned = CLEANING in stages and (rig is None or not changes(read_embedded_rig(log), rig).cleaning)
+        if not stages:
+            check_not_onto(log, detected)
+            check_not_onto(log, clean)
+    out = made_folder(out)
     if not stages:
         if rig is None:
-            raise LogError(f"{log_path}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
+            raise LogError(f"{source}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
         detect_log(log_path, rig, detected, images=images, workers=workers, progress=progress)
         source = detected
-    if CLEANING not in stages:
-        assert not isinstance(source, list)
+    if not is_cleaned:
         clean_log(source, clean, rig, images=images, progress=progress)
         source = clean
-    assert not isinstance(source, list)
     calibrated = solve_into(source, rig, out, images=images, progress=progress)
     export_solved(out / CLEAN, out, progress=progress)
     if not stages:
@@ -126,11 +136,12 @@ def made_folder(path: str | Path) -> Path:
     Raises
     ------
     LogError
-        It cannot be made.
+        It cannot be made, or not be written into.
     """
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LogError(f"{path} cannot be made a folder: {error.strerror}.") from error
+    check_writable(path / CLEAN)
     return path

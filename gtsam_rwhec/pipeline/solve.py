@@ -15,8 +15,9 @@ from gtsam_rwhec.calibration import solve
 from gtsam_rwhec.errors import LogError, RwhecWarning, ScaleError
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carriers import Carriers, read_carriers
-from gtsam_rwhec.pipeline.embedded import CLEANING, DETECTION, read_cameras, read_embedded_rig, read_report
+from gtsam_rwhec.pipeline.embedded import CLEANING, DETECTION, read_cameras, read_report
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, problem_of, read_pairs
+from gtsam_rwhec.pipeline.resumed import rig_for_solving
 from gtsam_rwhec.problem import ScaleMode
 from gtsam_rwhec.refined_file import write_refined
 from gtsam_rwhec.refinement.options import RefineOptions
@@ -94,7 +95,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     """
     tell = progress if progress is not None else _silent
     with open_log(clean_path) as log:
-        rig = read_embedded_rig(log) if rig is None else rig
+        rig = rig_for_solving(log, rig)
         cleaning = read_report(log, CLEANING, CleaningReport)
         detection = read_report(log, DETECTION, DetectionReport)
         cameras = read_cameras(log)

@@ -9,7 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs import Log, LogWriter, PairRecord, TfBuffer, open_log
+from gtsam_rwhec.logs import Log, LogWriter, PairRecord, PoseRecord, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.clean import PAIR_TOPIC
 from gtsam_rwhec.pipeline.embedded import (
@@ -142,7 +142,7 @@ def _raw_children(log: Log) -> set[str]:
     """Frames that the raw log says where they are."""
     topics = [t.name for t in log.topics() if not t.unreadable and t.name.rpartition("/")[2] in ("tf", "tf_static")]
     raw = [name for name in topics if name != SOLUTION_TOPIC]
-    return set(TfBuffer(log.records(raw)).children()) if raw else set()
+    return {record.child for record in log.records(raw) if isinstance(record, PoseRecord)} if raw else set()
 
 
 def _records(pairs: dict[Pair, MeasuredPairs]) -> list[PairRecord]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -80,7 +81,8 @@ def tracks_of(records: Iterable[DetectionRecord], rig: Rig, sensor: str) -> list
         target = target_of(record, targets)
         if target is not None:
             of_target[target.name].append(record)
-    check_order(np.array(stamps, dtype=np.int64), f"detections of {sensor}")
+    # Tags of one image have one stamp.
+    check_order(np.array([stamp for stamp, _ in groupby(stamps)], dtype=np.int64), f"detections of {sensor}")
     return [_track(name, sensor, of_target[name]) for name in sorted(of_target)]
 
 

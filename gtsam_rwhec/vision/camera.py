@@ -82,7 +82,10 @@ class Camera:
     def _checked(self, where: str) -> Camera:
         width, height, K, D = self.width, self.height, self.K, self.D
         if not (width > 0 and height > 0 and width * height <= MOST_PIXELS):
-            raise CameraError(f"{where}: the image size is {width} x {height} pixels")
+            raise CameraError(
+                f"{where}: the image size is {width} x {height} pixels; it must be positive, and at most {MOST_PIXELS} "
+                "pixels in all"
+            )
         if K.shape != (3, 3) or not np.isfinite(K).all():
             raise CameraError(f"{where}: K is {K.tolist()}; a finite 3 x 3 matrix is needed")
         if not K.any():
@@ -100,7 +103,7 @@ class Camera:
             if not -size <= c <= 2 * size:
                 raise CameraError(f"{where}: {name} = {c:g} is far outside the image of {width} x {height} pixels")
         if not np.isfinite(D).all() or (np.abs(D) > 1e4).any():
-            raise CameraError(f"{where}: distortion coefficients {D.tolist()}")
+            raise CameraError(f"{where}: distortion coefficients {D.tolist()} are those of no lens")
         kind, used = self.model, len(np.trim_zeros(D, "b"))
         if kind == "radtan" and used > 12:
             raise CameraError(
