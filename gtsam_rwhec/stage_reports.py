@@ -6,12 +6,19 @@ Kept in the logs that stages write, and in the result file.
 from __future__ import annotations
 
 from collections import Counter
+from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
+#: A stated size is doubted when it is off by this many standard deviations, and by this share: printers, calipers and
+#: intrinsics are seldom better.
+SIZE_SIGMAS, SIZE_SHARE = 5.0, 0.004
+#: Beyond, nanoseconds do not fit 64 bits; rig files have the same limit.
+Seconds: TypeAlias = Annotated[float, Field(ge=-4e9, le=4e9)]
+
 
 class _Report(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class TrackCount(_Report):
@@ -31,6 +38,7 @@ class DetectionReport(_Report):
     undecoded: dict[str, tuple[str, ...]] = Field(description="images that could not be used, and why, by sensor")
     tracks: tuple[TrackCount, ...] = Field(description="detections of each target in each sensor")
     strangers: dict[str, int] = Field(description="tags that are no target, family and id: how often they were seen")
+    unseen: tuple[str, ...] = Field(default=(), description="targets that no sensor saw")
     corner_px: dict[str, float] = Field(
         description="standard deviation of a corner along each axis, pixels, by target/sensor, as measured"
     )
@@ -40,7 +48,7 @@ class CleaningReport(_Report):
     """Of the cleaning stage."""
 
     tracks: tuple[TrackCount, ...] = Field(description="measurements of each target by each sensor")
-    time_offsets_s: dict[str, float] = Field(
+    time_offsets_s: dict[str, Seconds] = Field(
         description="by sensor, with which the carriers' poses were taken: as given, or from turning rates"
     )
     coarse_sigma_s: dict[str, float] = Field(description="standard deviations of those from turning rates")
@@ -52,16 +60,24 @@ class SizeFields(_Report):
     target: str = Field(description="the target's name")
     stated_m: float = Field(description="the length as the rig file has it, metres")
     scale: float = Field(description="stated / true length")
-    sigma: float = Field(description="standard deviation of scale")
+    sigma: float | None = Field(description="standard deviation of scale; null where the motion does not tell it")
     is_free: bool = Field(description="true: left free in the answer, as the stated size does not fit, or on request")
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether the measurements contradict the stated size, clearly and by more than matters little."""
+        off = abs(self.scale - 1.0)
+        return self.sigma is not None and off > SIZE_SHARE and off > SIZE_SIGMAS * self.sigma
 
 
 class TimeOffsetFields(_Report):
     """A sensor's clock."""
 
     sensor: str = Field(description="the sensor's name")
-    offset_s: float = Field(description="its stamp t is the carriers' t + offset")
-    sigma_s: float | None = Field(description="standard deviation; null where it was given, not estimated")
+    offset_s: Seconds = Field(description="its stamp t is the carriers' t + offset")
+    sigma_s: float | None = Field(
+        description="standard deviation; null where it was given, not estimated, and where the motion does not tell it"
+    )
 
 
 class LogFields(_Report):
@@ -72,7 +88,7 @@ class LogFields(_Report):
     detection: DetectionReport = Field(description="what the detection stage reported")
     cleaning: CleaningReport = Field(description="what the cleaning stage reported")
     outliers: tuple[TrackCount, ...] = Field(description="what the robust estimation used, and left out")
-    sizes: tuple[SizeFields, ...] = Field(description="none where sizes were taken as known")
+    sizes: tuple[SizeFields, ...] = Field(description="what the measurements say of them, if they say anything")
     time_offsets: tuple[TimeOffsetFields, ...] = Field(description="of every sensor that was used")
 
     @property

@@ -150,16 +150,30 @@ def closed_form(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, A
     if not options.scale_known:  # R_A t_X + t_A - t_Y = (1 / s) R_Y t_B
         rows[..., 6] = -seen
         right = -A[..., :3, 3]
-    solution = np.einsum("hij,hj->hi", np.linalg.pinv(rows.reshape(H, 3 * n, -1), rcond=1e-6), right.reshape(H, 3 * n))
-    scale = np.ones(H)
+    solution = _least_squares(rows, right)
+    scale: Array = np.ones(H)
     if not options.scale_known:
-        inverse = np.clip(solution[:, 6], 1.0 / (1.0 + options.max_scale_error), 1.0 / (1.0 - options.max_scale_error))
+        low, high = 1.0 / (1.0 + options.max_scale_error), 1.0 / (1.0 - options.max_scale_error)
+        inverse = np.clip(solution[:, 6], low, high)
+        # At a limit the translations are others. So it is where the motion does not tell the scale: turning in place.
+        at_limit = inverse != solution[:, 6]
+        if at_limit.any():
+            right = inverse[at_limit, None, None] * seen[at_limit] - A[at_limit, ..., :3, 3]
+            solution[at_limit, :6] = _least_squares(rows[at_limit, ..., :6], right)
         scale = 1.0 / inverse
     X, Y = np.zeros((H, 4, 4)), np.zeros((H, 4, 4))
     X[:, 3, 3] = Y[:, 3, 3] = 1.0
     X[:, :3, :3], Y[:, :3, :3] = R_X, R_Y
     X[:, :3, 3], Y[:, :3, 3] = solution[:, :3], solution[:, 3:6]
     return X, Y, scale
+
+
+def _least_squares(rows: Array, right: Array) -> Array:
+    """(H, k) solutions of minimum norm of rows (H, n, 3, k) and right sides (H, n, 3)."""
+    H, n, _, k = rows.shape
+    inverse = np.linalg.pinv(rows.reshape(H, 3 * n, k), rcond=1e-6)
+    solution: Array = np.einsum("hij,hj->hi", inverse, right.reshape(H, 3 * n))
+    return solution
 
 
 def _rotation(M: Array) -> Array:

@@ -13,11 +13,12 @@ from rich.text import Text
 
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.errors import FetchError, RwhecError, RwhecWarning
+from gtsam_rwhec.printable import printable
 
 
 @contextmanager
 def failures_in_words() -> Iterator[None]:
-    """Turn this package's errors into a message and an exit status, and its warnings into messages.
+    """Turn this package's errors into a message and an exit status, and its warnings into messages, each told once.
 
     Raises
     ------
@@ -25,6 +26,7 @@ def failures_in_words() -> Iterator[None]:
         With the status of `ExitStatus`. Errors of any other kind are faults of the program and pass with a traceback.
     """
     console = Console(stderr=True, highlight=False, soft_wrap=True)
+    told: set[str] = set()
     with warnings.catch_warnings():
         warnings.simplefilter("always", RwhecWarning)
         in_python = warnings.showwarning
@@ -38,7 +40,10 @@ def failures_in_words() -> Iterator[None]:
             line: str | None = None,
         ) -> None:
             if issubclass(category, RwhecWarning):
-                console.print(Text("Warning: ", style="bold yellow").append(str(message), style="not bold default"))
+                words = printable(str(message))
+                if words not in told:  # a log is gone through several times
+                    told.add(words)
+                    console.print(Text("Warning: ", style="bold yellow").append(words, style="not bold default"))
             else:
                 in_python(message, category, filename, lineno, file, line)
 
@@ -46,7 +51,7 @@ def failures_in_words() -> Iterator[None]:
         try:
             yield
         except RwhecError as error:
-            console.print(Text("Error: ", style="bold red").append(str(error), style="not bold default"))
+            console.print(Text("Error: ", style="bold red").append(printable(str(error)), style="not bold default"))
             status = ExitStatus.DOWNLOAD_FAILED if isinstance(error, FetchError) else ExitStatus.BAD_INPUT
             raise typer.Exit(status) from error
         except KeyboardInterrupt as error:

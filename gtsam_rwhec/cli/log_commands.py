@@ -22,6 +22,7 @@ from gtsam_rwhec.pipeline.detect import detect_log
 from gtsam_rwhec.pipeline.draw import draw_log
 from gtsam_rwhec.pipeline.run import CLEAN, RESULT, calibrate_log, export_solved, solve_into
 from gtsam_rwhec.pipeline.solve import Calibrated
+from gtsam_rwhec.printable import printable
 from gtsam_rwhec.report import print_refined, print_solution, report_console
 from gtsam_rwhec.report.log_report import print_log
 from gtsam_rwhec.rig import first_rig, read_rig
@@ -60,7 +61,7 @@ def init(
                 text, notes = first_rig(opened, output)
         _write_text(output, text)
         for note in notes:
-            typer.echo(note)
+            typer.echo(printable(note))
         typer.echo(
             f"Written to {output}. Fill in what is marked, then: gtsam-rwhec calibrate {log} --rig {output} -o out"
         )

@@ -99,9 +99,10 @@ class McapFile:
             raise LogError(f"{self.path} cannot be read: {error.strerror}.") from error
         if self._read(0, len(MAGIC)) != MAGIC:
             self.close()
+            begins = f"begins with {self._begins!r}" if self._begins else "is empty"
             raise LogError(
-                f"{self.path} is not an MCAP file (version 0): it begins with {self._begins!r}. ROS 1 bags and "
-                "db3 bags must be converted first, for example with rosbags-convert."
+                f"{self.path} is not an MCAP file (version 0): it {begins}. ROS 1 bags and db3 bags must be converted "
+                "first: gtsam-rwhec convert."
             )
         try:
             self.is_indexed = self._read_summary()

@@ -33,6 +33,8 @@ OnBad = Literal["warn", "raise"]
 SLICE = 4096
 #: Opened blocks that overlap in time are held together, up to this many bytes.
 MOST_OPEN_BYTES = 1 << 30
+#: Topics that an error lists, at most: a stranger's log may have thousands.
+MOST_NAMED = 50
 
 _Decoder = Callable[[str, Sequence[bytes | memoryview], list[int]], list[foxglove_schemas.Read]]
 
@@ -249,7 +251,8 @@ class Log:
         wanted = {topics} if isinstance(topics, str) else set(topics)
         known = self.topics()
         for name in sorted(wanted - {topic.name for topic in known}):
-            there = ", ".join(f"{topic.name} ({topic.schema})" for topic in known) or "none"
+            there = ", ".join(f"{topic.name} ({topic.schema})" for topic in known[:MOST_NAMED]) or "none"
+            there += f" and {len(known) - MOST_NAMED} others" if len(known) > MOST_NAMED else ""
             raise LogError(f"{self.files[0].path} has no topic {name}; it has: {there}.")
         for topic in known:
             if topic.name in wanted and topic.unreadable:

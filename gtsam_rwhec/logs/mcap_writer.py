@@ -58,9 +58,13 @@ class LogWriter:
         self._channels: dict[tuple[str, str, int, tuple[tuple[str, str], ...]], int] = {}
         with self._saying():
             self._stream = open(self._temporary, "wb")  # noqa: SIM115  (closed by __exit__)
-        self._writer = McapWriter(self._stream, compression=CompressionType.ZSTD)
-        with self._saying():
-            self._writer.start(profile="", library="gtsam-rwhec")
+        try:
+            self._writer = McapWriter(self._stream, compression=CompressionType.ZSTD)
+            with self._saying():
+                self._writer.start(profile="", library="gtsam-rwhec")
+        except BaseException:
+            self._abandon()
+            raise
 
     def __enter__(self) -> LogWriter:
         return self

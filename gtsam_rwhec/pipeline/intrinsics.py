@@ -72,7 +72,8 @@ def _from_topic(log: Log, topic: str, sensor: str) -> Camera:
         elif not same(first, camera):
             raise CameraError(
                 f"sensor {sensor}, topic {topic}: intrinsics change at {record.stamp_ns} ns (K from "
-                f"{first.K.tolist()} to {camera.K.tolist()}); a camera whose zoom or resolution changes is several: cut the log there"
+                f"{first.K.tolist()} to {camera.K.tolist()}); a camera whose zoom or resolution changes is several: "
+                "cut the log there"
             )
     if first is None:
         raise CameraError(f"sensor {sensor}: topic {topic} has no message that can be read")

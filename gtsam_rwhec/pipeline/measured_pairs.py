@@ -97,7 +97,7 @@ def problem_of(
     Raises
     ------
     NoiseError
-        Where ``noise: {corner_px: ...}`` is asked for and a measurement has no covariance.
+        Where ``noise: {corner_px: ...}`` is asked for and a measurement has no covariance; covariances that are none.
     """
     problem = Problem(scale)
     has_covariances = all(measured.covariance is not None for measured in pairs.values())
@@ -118,15 +118,21 @@ def problem_of(
                 f"{target}-{sensor}: noise: {{corner_px: ...}} needs corners, and the detections of {sensor} are poses "
                 "without a covariance; give rotation_deg and translation_mm, or estimate"
             )
-        problem.add(
-            target,
-            sensor,
-            measured.A[used],
-            measured.B[used],
-            stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(sensor, 0.0)),
-            source="the cleaned log",
-            **weights,  # type: ignore[arg-type]
-        )
+        try:
+            problem.add(
+                target,
+                sensor,
+                measured.A[used],
+                measured.B[used],
+                stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(sensor, 0.0)),
+                source="the cleaned log",
+                **weights,  # type: ignore[arg-type]
+            )
+        except NoiseError as error:
+            raise NoiseError(
+                f"{error}. These are the log's: noise: {{rotation_deg: ..., translation_mm: ...}} in the rig file "
+                "takes their place"
+            ) from error
     for target in known_sizes:
         if target in problem.targets:
             problem.fix_scale(target)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ import numpy as np
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.calibration import solve
-from gtsam_rwhec.errors import LogError, RwhecWarning, ScaleError
+from gtsam_rwhec.errors import LogError, RwhecError, RwhecWarning, ScaleError
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carriers import Carriers, read_carriers
 from gtsam_rwhec.pipeline.embedded import CLEANING, DETECTION, read_cameras, read_report
@@ -39,9 +40,6 @@ Pairs = dict[Pair, MeasuredPairs]
 Stage = Literal["outliers", "clocks", "answer"]
 #: Why a measurement that came this far is not used.
 OUTLIER = "outlier (robust estimation)"
-#: A stated size is doubted when it is off by this many standard deviations, and by this share: printers, calipers and
-#: intrinsics are seldom better.
-SIZE_SIGMAS, SIZE_SHARE = 5.0, 0.004
 #: Rounds of taking A anew at the refined time offsets, and the change (s) that ends them.
 ROUNDS, SETTLED_S = 6, 2e-5
 #: Clocks that change by less change no outliers.
@@ -107,6 +105,9 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     estimated = tuple(
         name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and _is_used(pairs, name)
     )
+    missing = [name for name in estimated if name not in offsets]
+    if missing:
+        raise LogError(f"{clean_path}, metadata {CLEANING}: it has no time offset of {', '.join(missing)}")
     run = _Run(rig, carriers, estimated, tell)
     # A log that was solved before is solved anew: outliers and clocks as cleaning left them.
     pairs = run.at(_with_outliers(pairs), offsets)
@@ -118,6 +119,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         known = tuple(size.target for size in sizes if not size.is_free)
     scale: ScaleMode = "known" if rig.sizes == "known" or all(not s.is_free for s in sizes) else "per_target"
     pairs, offsets = run.settled(pairs, offsets, scale, known)
+    if rig.sizes == "known":
+        sizes = run.looked_into(pairs, offsets)
     refined = run.refined(pairs, offsets, scale, known, stage="answer")
     offsets |= {name: offsets[name] + value for name, value in refined.time_offsets_s.items()}
     outliers = tuple(_outlier_count(pair, measured) for pair, measured in pairs.items())
@@ -228,7 +231,6 @@ class _Run:
     def sizes(self, pairs: Pairs, offsets: dict[str, float]) -> tuple[tuple[SizeFields, ...], dict[str, float]]:
         """Every target's stated size against what all measurements say of it, and the clocks that go with that."""
         self.tell("looking at the targets' sizes")
-        stated = {target.name: target.length_m for target in self.rig.target_list}
         check = self.rig.sizes == "check"
         try:
             with warnings.catch_warnings():
@@ -240,18 +242,30 @@ class _Run:
             if not check:
                 raise
             return (), offsets
+        sizes = self._found_sizes(refined)
+        return tuple(s.model_copy(update={"is_free": s.is_doubted or not check}) for s in sizes), offsets
+
+    def looked_into(self, pairs: Pairs, offsets: Mapping[str, float]) -> tuple[SizeFields, ...]:
+        """What the measurements that are used say of sizes that were taken as known; none where they cannot tell."""
+        self.tell("looking at the targets' sizes")
+        try:
+            return self._found_sizes(self.refined(pairs, offsets, "per_target", (), stage="clocks"))
+        except RwhecError:
+            return ()  # with sizes free there is no answer; nobody asked for one
+
+    def _found_sizes(self, refined: Refined) -> tuple[SizeFields, ...]:
         assert not isinstance(refined.scale, float)
-        result = []
-        for target, scale in refined.scale.items():
-            sigma = _sigma(refined, f"scale:{target}")
-            off = abs(scale - 1.0)
-            doubted = np.isfinite(sigma) and off > SIZE_SHARE and off > SIZE_SIGMAS * sigma
-            result.append(
-                SizeFields(
-                    target=target, stated_m=stated[target], scale=scale, sigma=sigma, is_free=bool(doubted) or not check
-                )
+        stated = {target.name: target.length_m for target in self.rig.target_list}
+        return tuple(
+            SizeFields(
+                target=target,
+                stated_m=stated[target],
+                scale=scale,
+                sigma=_sigma(refined, f"scale:{target}"),
+                is_free=False,
             )
-        return tuple(result), offsets
+            for target, scale in refined.scale.items()
+        )
 
 
 def _final(size: SizeFields, refined: Refined) -> SizeFields:
@@ -260,8 +274,10 @@ def _final(size: SizeFields, refined: Refined) -> SizeFields:
     return size.model_copy(update={"scale": scale, "sigma": _sigma(refined, f"scale:{size.target}")})
 
 
-def _sigma(refined: Refined, name: str) -> float:
-    return float(np.sqrt(refined.covariance(name)[0, 0]))
+def _sigma(refined: Refined, name: str) -> float | None:
+    """None where it is infinite."""
+    variance = float(refined.covariance(name)[0, 0])
+    return math.sqrt(variance) if math.isfinite(variance) else None
 
 
 def _is_used(pairs: Mapping[Pair, MeasuredPairs], sensor: str) -> bool:

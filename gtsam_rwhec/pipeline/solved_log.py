@@ -118,7 +118,7 @@ def read_solved(path: str | Path) -> Solved:
     Raises
     ------
     LogError
-        It has no result in it.
+        It has no result in it, or not the one of its measurements.
     """
     with open_log(path) as log:
         content = log.attachment(RESULT)
@@ -128,9 +128,14 @@ def read_solved(path: str | Path) -> Solved:
         if result.log is None:
             raise LogError(f"{path}, attachment {RESULT}: it does not say which log it is of")
         rig = read_embedded_rig(log)
-        return Solved(
-            refined_of(result, path), solution_of(result), read_pairs(log, rig), result.log, read_cameras(log), rig
+        refined, pairs = refined_of(result, path), read_pairs(log, rig)
+    strangers = [*(set(refined.X) - set(rig.targets)), *(set(refined.Y) - set(rig.sensors))]
+    if strangers or not pairs:
+        why = (
+            f"frames that its rig file has not: {', '.join(sorted(strangers)[:10])}" if strangers else "no measurements"
         )
+        raise LogError(f"{path} has a {RESULT}, and {why}: its parts are not of one calibration")
+    return Solved(refined, solution_of(result), pairs, result.log, read_cameras(log), rig)
 
 
 def free_name(frame: str, taken: set[str]) -> str:

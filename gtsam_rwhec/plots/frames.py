@@ -35,6 +35,8 @@ CHI2_95 = 7.814727903251179
 AXIS_SHARE, ELLIPSE_SHARE = 0.1, 0.07
 #: The carrier's origin is left out when it is this many times further away than the frames are spread.
 FAR_ORIGIN = 5.0
+#: Frames that are spread over less are drawn as if they were in one place.
+SMALLEST_M = 1e-6
 
 
 def plot_frames(frames: RigFrames, covariances: Mapping[str, Array], path: str | Path) -> None:
@@ -88,7 +90,8 @@ class _Scene:
         if self.has_origin:
             places = np.vstack([places, np.zeros(3)])
         sides = np.ptp(places, axis=0)
-        self.extent = float(sides.max()) or 0.1
+        # A scale that nothing determines can draw all frames together into one place.
+        self.extent = float(sides.max()) if sides.max() > SMALLEST_M else 0.1
         #: Above, and the side that shows more.
         self.views = ((0, 1), (0, 2) if sides[0] >= sides[1] else (1, 2))
         largest = max((_semi_axes(c).max() for c in covariances.values() if _is_finite(c)), default=0.0)

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from gtsam_rwhec.printable import printable
 from gtsam_rwhec.report.solution_report import report_console
 from gtsam_rwhec.stage_reports import LogFields, TrackCount
 
@@ -17,11 +18,11 @@ def print_log(log: LogFields, console: Console | None = None) -> None:
     console = report_console() if console is None else console
     console.print(_table(log))
     for sentence in log.contradicted:
-        console.print(Text(f"Do not use: {sentence}.", style="bold red"), soft_wrap=not console.is_terminal)
+        console.print(Text(printable(f"Do not use: {sentence}."), style="bold red"), soft_wrap=not console.is_terminal)
     for sentence in log_sentences(log):
-        console.print(Text(sentence), soft_wrap=not console.is_terminal)
+        console.print(Text(printable(sentence)), soft_wrap=not console.is_terminal)
     for sentence in doubts(log):
-        console.print(Text(sentence, style="bold yellow"), soft_wrap=not console.is_terminal)
+        console.print(Text(printable(sentence), style="bold yellow"), soft_wrap=not console.is_terminal)
     console.print()
 
 
@@ -40,7 +41,7 @@ def log_sentences(log: LogFields) -> list[str]:
         if reasons:
             sentences.append(f"{stage}: {'; '.join(reasons)}.")
     for size in log.sizes:
-        if size.is_free:
+        if size.is_free and size.sigma is not None:
             found_mm, sigma_mm = (1e3 * size.stated_m * x for x in (1.0 / size.scale, size.sigma / size.scale**2))
             sentences.append(
                 f"Size of {size.target}: stated {1e3 * size.stated_m:.3f} mm, found {found_mm:.3f} ± {sigma_mm:.3f} mm "
@@ -55,14 +56,29 @@ def doubts(log: LogFields) -> list[str]:
     for sensor, faults in log.detection.undecoded.items():
         if faults:
             said.append(f"{len(faults)} images of {sensor} could not be used, the first: {faults[0]}")
+    said += _unused(log)
     free = [size for size in log.sizes if size.is_free]
     for size in free:
-        if abs(size.scale - 1.0) > 3.0 * size.sigma:
+        if size.sigma is not None and abs(size.scale - 1.0) > 3.0 * size.sigma:
             said.append(
                 f"The stated size of {size.target} does not fit the motion: it is {100.0 * (size.scale - 1.0):+.2f} % "
                 "off (printed to fit the page?). It was estimated; measure it again and mend the rig file."
             )
-    if len(free) > 1 and len(free) == len(log.sizes) and np.ptp([size.scale for size in free]) < 0.005:
+    taken_as_known = [size for size in log.sizes if size.is_doubted and not size.is_free]
+    for size in taken_as_known:
+        said.append(
+            f"The size of {size.target} was taken as stated, but does not fit the motion: it seems to be "
+            f"{100.0 * (size.scale - 1.0):+.2f} % off, and poses are off with it. Measure it again, or try sizes: "
+            "check in the rig file."
+        )
+    untold = [size.target for size in log.sizes if size.sigma is None]
+    if untold:
+        said.append(
+            f"The motion does not tell the size of {', '.join(untold)} (it hardly moves from its place?): a wrong one "
+            "would go unnoticed."
+        )
+    doubted = free or taken_as_known
+    if len(doubted) > 1 and len(doubted) == len(log.sizes) and np.ptp([size.scale for size in doubted]) < 0.005:
         said.append(
             "All targets are off by about the same: rather the carriers' unit or the focal lengths are wrong than all "
             "sizes."
@@ -70,6 +86,23 @@ def doubts(log: LogFields) -> list[str]:
     if log.detection.strangers:
         names = [f"{name} ({count})" for name, count in list(log.detection.strangers.items())[:10]]
         said.append(f"Tags that are no target were seen: {', '.join(names)}.")
+    return said
+
+
+def _unused(log: LogFields) -> list[str]:
+    """Sensors and targets that the rig file has and the answer has not."""
+    said = []
+    used = {name for track in log.outliers if track.used for name in (track.target, track.sensor)}
+    for sensor, count in log.detection.images.items():
+        if sensor not in used:
+            seen = sum(track.used for track in log.detection.tracks if track.sensor == sensor)
+            why = f"none of its {seen} detections is left" if seen else f"no target was detected in its {count} images"
+            said.append(f"There is no answer for {sensor}: {why}.")
+    if log.detection.unseen:
+        said.append(f"Targets that were never seen: {', '.join(log.detection.unseen)}.")
+    for target in dict.fromkeys(track.target for track in log.detection.tracks):
+        if target not in used:
+            said.append(f"There is no answer for {target}: none of its detections is left.")
     return said
 
 

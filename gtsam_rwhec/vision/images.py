@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +9,9 @@ from numpy.typing import NDArray
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs.records import ImageRecord
 from gtsam_rwhec.vision.camera import MOST_PIXELS
+from gtsam_rwhec.vision.image_sizes import PNG, stated_size
 
 Gray = NDArray[np.uint8]
-
-#: How a PNG begins.
-PNG = b"\x89PNG\r\n\x1a\n"
 
 #: Channels and bytes a channel of raw encodings, and OpenCV's conversion to gray (None: it is gray).
 _RAW: dict[str, tuple[int, int, int | None]] = {
@@ -46,8 +42,12 @@ def decode_gray(image: ImageRecord) -> Gray:
 
 
 def _compressed(image: ImageRecord, where: str) -> Gray:
-    size = _stated_size(image.data)
-    if size is not None and size[0] * size[1] > MOST_PIXELS:
+    begins, claims = image.data[:8].hex(), image.encoding[:40]
+    what = f"{where}: {len(image.data)} bytes that begin with {begins} and claim to be {claims!r}"
+    size = stated_size(image.data)
+    if size is None:
+        raise ImageError(f"{what} are no JPEG, PNG, WebP, TIFF or BMP, or do not state a size")
+    if size[0] * size[1] > MOST_PIXELS:
         raise ImageError(f"{where}: {size[0]} x {size[1]} pixels are more than the {MOST_PIXELS} that are decoded")
     if image.data.startswith(PNG) and b"IEND" not in image.data:  # libpng would say so on the terminal, for each
         raise ImageError(f"{where}: {len(image.data)} bytes of a PNG that goes on")
@@ -59,10 +59,7 @@ def _compressed(image: ImageRecord, where: str) -> Gray:
     except cv2.error:  # 4 and 5 raise for some of what they cannot decode, and return nothing for the rest
         gray = None
     if gray is None:
-        raise ImageError(
-            f"{where}: {len(image.data)} bytes that begin with {image.data[:8].hex()} and claim to be "
-            f"{image.encoding!r} are no image that OpenCV can decode"
-        )
+        raise ImageError(f"{what} are no image that OpenCV can decode")
     return gray.astype(np.uint8, copy=False) if gray.dtype == np.uint8 else _eight_bits(gray)
 
 
@@ -72,28 +69,6 @@ def _eight_bits(wide: NDArray[np.generic]) -> Gray:
     brightest = float(values.max(initial=0.0))
     gray: Gray = np.rint(np.maximum(values, 0.0) * (255.0 / brightest if brightest > 0.0 else 0.0)).astype(np.uint8)
     return gray
-
-
-def _stated_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of a PNG or JPEG as its header has them: checked before a small file becomes gigabytes."""
-    if data.startswith(PNG) and len(data) >= 24:
-        width, height = struct.unpack(">II", data[16:24])
-        return width, height
-    if data[:2] != b"\xff\xd8":
-        return None
-    at = 2
-    while at + 9 <= len(data):
-        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
-        if data[at] != 0xFF:
-            return None
-        if marker == 0xFF:  # fills up
-            at += 1
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
-            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
-        at += 2 + length
-    return None
 
 
 def _raw(image: ImageRecord, where: str) -> Gray:

@@ -1,0 +1,80 @@
+"""Width and height of compressed images as their headers state them: for a look before a file becomes gigabytes."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+#: How files begin.
+PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG, _BMP, _RIFF = b"\xff\xd8", b"BM", b"RIFF"
+_TIFF = {b"II*\0": "<", b"MM\0*": ">"}
+#: TIFF's tags for width and height, and its types for whole numbers: 16 and 32 bits.
+_WIDTH, _HEIGHT = 256, 257
+_WHOLE = {3: "H", 4: "I"}
+
+Size = tuple[int, int]
+
+
+def stated_size(data: bytes) -> Size | None:
+    """(width, height) in pixels of a PNG, JPEG, WebP, TIFF or BMP file; None for anything else, or a broken header."""
+    readers: list[tuple[bool, Callable[[bytes], Size | None]]] = [
+        (data.startswith(PNG), _png),
+        (data.startswith(_JPEG), _jpeg),
+        (data.startswith(_RIFF) and data[8:12] == b"WEBP", _webp),
+        (data[:4] in _TIFF, _tiff),
+        (data.startswith(_BMP), _bmp),
+    ]
+    try:
+        return next((read(data) for begins, read in readers if begins), None)
+    except struct.error:
+        return None  # it ends before its size
+
+
+def _png(data: bytes) -> Size:
+    width, height = struct.unpack_from(">II", data, 16)
+    return width, height
+
+
+def _jpeg(data: bytes) -> Size | None:
+    at = 2
+    while at + 9 <= len(data):
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if data[at] != 0xFF:
+            return None
+        if marker == 0xFF:  # fills up
+            at += 1
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 2 + length
+    return None
+
+
+def _webp(data: bytes) -> Size:
+    if data[12:16] == b"VP8X":  # the only one that can state more than 16384 x 16384
+        if len(data) < 30:
+            raise struct.error("no canvas")
+        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    return 1 << 14, 1 << 14
+
+
+def _tiff(data: bytes) -> Size | None:
+    """Of the first directory; of a tag given twice the larger value."""
+    order = _TIFF[data[:4]]
+    (at,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, at)
+    found = {_WIDTH: 0, _HEIGHT: 0}
+    for i in range(count):
+        tag, kind = struct.unpack_from(order + "HH", data, at + 2 + 12 * i)
+        if tag in found and kind in _WHOLE:
+            (value,) = struct.unpack_from(order + _WHOLE[kind], data, at + 10 + 12 * i)
+            found[tag] = max(found[tag], value)
+    return (found[_WIDTH], found[_HEIGHT]) if all(found.values()) else None
+
+
+def _bmp(data: bytes) -> Size:
+    (header,) = struct.unpack_from("<I", data, 14)
+    width, height = struct.unpack_from("<HH" if header == 12 else "<ii", data, 18)
+    return abs(width), abs(height)
