@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,7 @@ def detect_log(
             undecoded={sensor: tuple(faults) for sensor, faults in undecoded.items()},
             tracks=_counts(found),
             strangers={f"{family} {number}": count for (family, number), count in sorted(strangers.items())},
+            unseen=tuple(name for name in rig.targets if all(r.id != name for of in found.values() for r in of)),
             corner_px=corner_px,
         )
         if not any(track.used for track in report.tracks):
@@ -126,8 +128,7 @@ def _look(
             yield record
 
     makers = {
-        topic: (lambda camera=cameras[sensor]: Detector(camera, rig.target_list, options))
-        for topic, sensor in sensor_of.items()
+        topic: partial(Detector, cameras[sensor], rig.target_list, options) for topic, sensor in sensor_of.items()
     }
     total = sum(topic.count for topic in log.topics() if topic.name in sensor_of)
     looked: list[Looked] = []

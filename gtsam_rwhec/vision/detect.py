@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
-import cv2
 import numpy as np
 
 from gtsam_rwhec.poses import Array
 from gtsam_rwhec.vision import boards
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.dictionaries import WIDEST, modules, tag_detector
+from gtsam_rwhec.vision.codes import identified, quadrangles, unlike
+from gtsam_rwhec.vision.dictionaries import WIDEST, detector_of, modules, tag_detector
 from gtsam_rwhec.vision.edges import refine_corners
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.options import DetectionOptions
@@ -22,6 +23,9 @@ from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Ta
 SMALL, BLURRED, GRAZING = "small", "blurred", "grazing"
 FEW, TWICE, NO_EDGES = "too few corners", "id seen twice in one image", "edges not found"
 NO_POSE, REPROJECTION, AMBIGUOUS = "no pose", "reprojection error", "ambiguous"
+#: Family and border of tags; ids of tags and their corners (n, 4, 2) in pixels.
+_Kind: TypeAlias = tuple[str, int]
+_Tags: TypeAlias = tuple[list[int], Array]
 REASONS = (SMALL, BLURRED, GRAZING, FEW, TWICE, NO_EDGES, NO_POSE, REPROJECTION, AMBIGUOUS)
 
 
@@ -95,12 +99,17 @@ class Detector:
     def __init__(self, camera: Camera, targets: Sequence[Target], options: DetectionOptions | None = None) -> None:
         self.camera = camera
         self.options = DetectionOptions() if options is None else options
-        kinds = {_kind(target) for target in targets if target.ids}
-        self._detectors = {kind: tag_detector(*kind) for kind in sorted(kinds)}
+        self._owners = {(*_kind(t), i) for t in targets for i in t.ids}
+        kinds = sorted({_kind(target) for target in targets if target.ids})
+        self._ids = {kind: sorted(i for *of, i in self._owners if tuple(of) == kind) for kind in kinds}
+        #: By border, as OpenCV has one for all families that it looks for at once.
+        self._detectors = {
+            border: detector_of({family: ids for (family, b), ids in self._ids.items() if b == border}, border)
+            for border in sorted({border for _, border in kinds})
+        }
         self._tags = {(*_kind(t), t.id): t for t in targets if isinstance(t, Tag)}
         self._boards = [t for t in targets if isinstance(t, (Charuco, AprilGrid))]
         self._checkerboards = [t for t in targets if isinstance(t, Checkerboard)]
-        self._owners = {(*_kind(t), i) for t in targets for i in t.ids}
         self._charuco = {t.name: boards.charuco_detector(t) for t in targets if isinstance(t, Charuco)}
 
     def __call__(self, images: Sequence[Gray]) -> list[Seen]:
@@ -109,11 +118,9 @@ class Detector:
         Many at once cost less: OpenCV goes through them one by one, edges and poses are refined together.
         """
         sightings: list[list[_Sighting]] = [[] for _ in images]
-        strangers: list[Counter[tuple[str, int]]] = [Counter() for _ in images]
-        for kind, detector in self._detectors.items():
-            found = [_tags(detector, gray) for gray in images]
+        tags = self._tags_in(images)
+        for kind, found in tags.items():
             for k, (gray, (ids, corners)) in enumerate(zip(images, found, strict=True)):
-                strangers[k].update((kind[0], i) for i in ids if (*kind, i) not in self._owners)
                 for board in self._boards:
                     if _kind(board) == kind:
                         indices, seen_px = self._board(gray, board, ids, corners)
@@ -129,13 +136,39 @@ class Detector:
                     sightings[k].append(_Sighting(checkerboard, np.arange(len(seen_px)), seen_px))
         judged = iter(self._judged([sighting for of_image in sightings for sighting in of_image]))
         return [
-            Seen(tuple(next(judged) for _ in of_image), dict(strange))
-            for of_image, strange in zip(sightings, strangers, strict=True)
+            Seen(tuple(next(judged) for _ in of_image), strangers)
+            for of_image, strangers in zip(sightings, self._strangers(images, tags), strict=True)
         ]
 
-    def _single_tags(
-        self, images: Sequence[Gray], kind: tuple[str, int], found: list[tuple[list[int], Array]]
-    ) -> Iterator[tuple[int, _Sighting]]:
+    def _tags_in(self, images: Sequence[Gray]) -> dict[_Kind, list[_Tags]]:
+        """Targets' tags of each kind in each image, corners in pixels to about one."""
+        tags: dict[_Kind, list[_Tags]] = {kind: [] for kind in self._ids}
+        for gray in images:
+            for border, detector in self._detectors.items():
+                quads, places, _, families = detector.detectMarkersMultiDict(gray)
+                corners = np.array(quads, dtype=float).reshape(-1, 4, 2)
+                place_of = np.ravel(places if len(quads) else []).astype(int)
+                family_of = np.ravel(families if len(quads) else []).astype(int)
+                kinds = [kind for kind in self._ids if kind[1] == border]
+                for number, kind in enumerate(kinds):
+                    mine = np.flatnonzero(family_of == number)
+                    tags[kind].append(([self._ids[kind][i] for i in place_of[mine]], corners[mine]))
+        return tags
+
+    def _strangers(
+        self, images: Sequence[Gray], tags: dict[_Kind, list[_Tags]]
+    ) -> Iterator[dict[tuple[str, int], int]]:
+        """How many tags of the targets' families are no target's, in each image."""
+        for k, gray in enumerate(images):
+            quads = quadrangles(gray) if tags else np.zeros((0, 4, 2))
+            quads = unlike(quads, np.concatenate([quads[:0], *(found[k][1] for found in tags.values())]))
+            strange: Counter[tuple[str, int]] = Counter()
+            for kind in tags:
+                ids = identified(gray, quads, *kind)
+                strange.update((kind[0], int(i)) for i in ids[ids >= 0] if (*kind, int(i)) not in self._owners)
+            yield dict(strange)
+
+    def _single_tags(self, images: Sequence[Gray], kind: _Kind, found: list[_Tags]) -> Iterator[tuple[int, _Sighting]]:
         """Targets that are one tag, with the number of their image."""
         mine = [(k, j) for k, (ids, _) in enumerate(found) for j, i in enumerate(ids) if (*kind, i) in self._tags]
         if not mine:
@@ -203,13 +236,6 @@ class Detector:
         )
 
 
-def _tags(detector: cv2.aruco.ArucoDetector, gray: Gray) -> tuple[list[int], Array]:
-    """Ids, and corners (n, 4, 2) in pixels to about one."""
-    corners, ids, _ = detector.detectMarkers(gray)
-    numbers = [] if ids is None else [int(i) for i in np.ravel(ids)]
-    return numbers, np.array([np.reshape(c, (4, 2)) for c in corners], dtype=float).reshape(-1, 4, 2)
-
-
 def grazing_rad(T_camera_target: Array) -> float:
     """Angle between the line of sight to a target's origin and its normal; 0 is seen from the front."""
     t = T_camera_target[:3, 3]
@@ -225,13 +251,13 @@ def seen(gray: Gray) -> dict[str, list[int]]:
     result: dict[str, list[int]] = {}
     for family in WIDEST:
         for border_bits in (1, 2) if family.startswith("tag36") else (1,):
-            ids, _ = _tags(tag_detector(family, border_bits), gray)
-            if ids:
-                result.setdefault(family, []).extend(ids)
+            _, ids, _ = tag_detector(family, border_bits).detectMarkers(gray)
+            if ids is not None:
+                result.setdefault(family, []).extend(int(i) for i in np.ravel(ids))
     return {family: sorted(ids) for family, ids in result.items()}
 
 
-def _kind(target: Target) -> tuple[str, int]:
+def _kind(target: Target) -> _Kind:
     """Family and border of a target's tags: what one run of OpenCV's detector finds."""
     return target.family, 2 if isinstance(target, AprilGrid) else 1
 

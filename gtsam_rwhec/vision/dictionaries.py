@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import cv2
@@ -27,10 +28,26 @@ def modules(family: str, border_bits: int = 1) -> int:
 
 def tag_detector(family: str, border_bits: int = 1) -> cv2.aruco.ArucoDetector:
     """A detector of a family's tags. Not safe to use from two threads."""
+    return cv2.aruco.ArucoDetector(dictionary(family), _parameters(border_bits))
+
+
+def detector_of(ids: Mapping[str, Sequence[int]], border_bits: int = 1) -> cv2.aruco.ArucoDetector:
+    """A detector of some tags of several families, for ``detectMarkersMultiDict``. Not safe to use from two threads.
+
+    What it calls an id is a place among the family's `ids`, and a dictionary's index is the family's place.
+    """
+    some = []
+    for family, wanted in ids.items():
+        tags = dictionary(family)
+        some.append(cv2.aruco.Dictionary(tags.bytesList[list(wanted)], tags.markerSize, tags.maxCorrectionBits))
+    return cv2.aruco.ArucoDetector(some, _parameters(border_bits))
+
+
+def _parameters(border_bits: int) -> cv2.aruco.DetectorParameters:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # done by us, from the edges
     parameters.markerBorderBits = border_bits
-    return cv2.aruco.ArucoDetector(dictionary(family), parameters)
+    return parameters
 
 
 #: One dictionary of each kind, the largest: ArUco's smaller ones are its beginnings.

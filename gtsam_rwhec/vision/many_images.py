@@ -1,8 +1,11 @@
-"""Detection in all images of a log, on all cores; memory stays that of the few images that are being looked at."""
+"""Detection in all images of a log, on all cores; memory stays that of the few images that are being looked at.
+
+A few images are looked at by threads. Threads share Python's lock, though, and half of the work is NumPy's: with many
+images processes are worth their start, which takes a second or two.
+"""
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -12,6 +15,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from loky import ProcessPoolExecutor, cpu_count
 
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs.records import ImageRecord
@@ -19,7 +23,13 @@ from gtsam_rwhec.vision.detect import Detector, Seen
 from gtsam_rwhec.vision.images import Gray, decode_gray
 
 #: Images that are looked at together: enough for the refinement to be cheap, few enough to hold.
-BATCH = 16
+BATCH = 32
+#: Images that threads look at, before processes are started for the others.
+FEW = 320
+#: What processes find in their environment: one thread each for linear algebra, as there is one of them for each core.
+_ONE_THREAD = dict.fromkeys(
+    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,7 @@ def detect_in_images(
     make_detector: Mapping[str, Callable[[], Detector]],
     *,
     workers: int | None = None,
+    few: int = FEW,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[Looked]:
     """Decode and detect.
@@ -46,9 +57,11 @@ def detect_in_images(
     images
         Of any of the topics, in any order; read as they are needed.
     make_detector : dict of topic to function
-        Called once in each thread: detectors are not for several.
+        Called once in each thread or process: detectors are not for several.
     workers : int, optional
-        Threads (OpenCV lets them run side by side); left out, as many as there are cores for this process.
+        Threads or processes at work; left out, as many as there are cores for this process.
+    few : int
+        Beyond so many images processes take over from threads.
     progress : callable, optional
         Told how many images are done.
 
@@ -57,37 +70,86 @@ def detect_in_images(
     Looked
         One for each image, in batches of a topic.
     """
-    count = workers or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
+    count = workers or cpu_count()
     local = threading.local()
 
     def look(batch: list[ImageRecord]) -> list[Looked]:
         detectors = local.__dict__.setdefault("detectors", {})
-        topic = batch[0].topic
-        if topic not in detectors:
-            detectors[topic] = make_detector[topic]()
-        return _look(batch, detectors[topic])
+        return _look(batch, _kept(detectors, batch[0].topic, make_detector[batch[0].topic]))
 
     done = 0
-    with _quiet_on_one_thread(), ThreadPoolExecutor(count) as pool:
+
+    def results(future: Future[list[Looked]]) -> list[Looked]:
+        nonlocal done
+        of_batch = future.result()
+        done += len(of_batch)
+        if progress is not None:
+            progress(done)
+        return of_batch
+
+    with _quiet_on_one_thread(), ThreadPoolExecutor(count) as threads, _Processes(count) as processes:
         waiting: deque[Future[list[Looked]]] = deque()
         try:
-            for batch in _batches(images):
-                waiting.append(pool.submit(look, batch))
+            for number, batch in enumerate(_batches(images)):
+                if count > 1 and number * BATCH >= few and processes.are_ready():
+                    waiting.append(processes.submit(batch, make_detector[batch[0].topic]))
+                else:
+                    waiting.append(threads.submit(look, batch))
                 while len(waiting) > count + 1 or (waiting and waiting[0].done()):
-                    results = waiting.popleft().result()
-                    done += len(results)
-                    if progress is not None:
-                        progress(done)
-                    yield from results
+                    yield from results(waiting.popleft())
             while waiting:
-                results = waiting.popleft().result()
-                done += len(results)
-                if progress is not None:
-                    progress(done)
-                yield from results
+                yield from results(waiting.popleft())
         finally:
             for future in waiting:
                 future.cancel()
+
+
+class _Processes:
+    """Started when they are first asked for; killed when what needs them ends early."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._pool: ProcessPoolExecutor | None = None
+        self._starting: list[Future[int]] = []
+
+    def are_ready(self) -> bool:
+        """Whether they can take work at once; what imports take there goes on beside the threads' work."""
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(self.count, env=_ONE_THREAD)
+            self._starting = [self._pool.submit(_nothing) for _ in range(self.count)]
+        return all(future.done() for future in self._starting)
+
+    def submit(self, batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> Future[list[Looked]]:
+        assert self._pool is not None
+        future: Future[list[Looked]] = self._pool.submit(_look_in_process, batch, make_detector)
+        return future
+
+    def __enter__(self) -> _Processes:
+        return self
+
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, kill_workers=kind is not None or not self.are_ready())
+
+
+def _nothing() -> int:
+    """What a process does first: import this module."""
+    return cv2.getNumThreads()
+
+
+#: Of this process, which has work of one call of `detect_in_images` only.
+_detectors: dict[str, Detector] = {}
+
+
+def _look_in_process(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> list[Looked]:
+    with _quiet_on_one_thread():
+        return _look(batch, _kept(_detectors, batch[0].topic, make_detector))
+
+
+def _kept(detectors: dict[str, Detector], topic: str, make_detector: Callable[[], Detector]) -> Detector:
+    if topic not in detectors:
+        detectors[topic] = make_detector()
+    return detectors[topic]
 
 
 def _look(batch: list[ImageRecord], detector: Detector) -> list[Looked]:

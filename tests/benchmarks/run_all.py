@@ -25,6 +25,7 @@ import one_pair
 import outliers
 import real_dataset
 import single_pairs
+import vision_rate
 import world_origin
 from bars import Row, print_rows
 
@@ -51,6 +52,7 @@ def main() -> int:
         "outliers": lambda: outliers.rows(arguments.outlier_seeds, arguments.plot) if arguments.outlier_seeds else [],
         "edge summaries in GTSAM": lambda: edge_summaries.rows(repetitions=5),
         "from camera images": camera_logs.rows,
+        "images a second": lambda: vision_rate.rows(repetitions=2),
         "wrong detections": lambda: (
             corrupted_detections.rows(arguments.corrupted_seeds) if arguments.corrupted_seeds else []
         ),

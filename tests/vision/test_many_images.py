@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -142,6 +146,50 @@ def test_no_more_is_read_than_is_looked_at(images: list[ImageRecord]) -> None:
     assert read == 12 * BATCH
     # Two workers' batches wait or are looked at, and one of each topic is being filled.
     assert furthest <= 6 * BATCH
+
+
+def test_processes_see_what_threads_see(images: list[ImageRecord]) -> None:
+    with_faults = [*images, record("/left", 1, b"no image"), record("/right", 2, png(np.zeros((5, 5), np.uint8)))]
+    told: list[int] = []
+    by_threads = by_image(detect_in_images(with_faults, MAKERS, workers=2))
+    by_processes = detect_in_images(with_faults, MAKERS, workers=2, few=BATCH, progress=told.append)
+    assert_same(by_threads, by_image(by_processes))
+    assert told[-1] == len(with_faults)
+
+
+def test_processes_end_with_the_caller(images: list[ImageRecord]) -> None:
+    def processes() -> list[str]:
+        found = subprocess.run(["pgrep", "-P", str(os.getpid()), "-f", "loky.*popen"], capture_output=True, text=True)
+        return found.stdout.split()
+
+    looked = detect_in_images(images * 10, MAKERS, workers=2, few=0)
+    next(looked)
+    assert len(processes()) == 2
+    looked.close()
+    assert processes() == []
+
+
+def test_a_script_needs_no_main(tmp_path: Path, images: list[ImageRecord]) -> None:
+    """Python's own processes would run the caller's script again."""
+    (tmp_path / "image.png").write_bytes(images[1].data)
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from functools import partial\n"
+        "from pathlib import Path\n"
+        "from gtsam_rwhec.logs.records import ImageRecord\n"
+        "from gtsam_rwhec.vision.camera import Camera\n"
+        "from gtsam_rwhec.vision.detect import Detector\n"
+        "from gtsam_rwhec.vision.many_images import detect_in_images\n"
+        "from gtsam_rwhec.vision.targets import Tag\n"
+        "print('begins')\n"
+        f"camera = Camera.of(320, 240, '{PINHOLE.model}', {PINHOLE.K.tolist()}, [], 'the script')\n"
+        "data = (Path(__file__).parent / 'image.png').read_bytes()\n"
+        "images = [ImageRecord(k, k, '/left', 'cam', 'png', data) for k in range(40)]\n"
+        f"make = {{'/left': partial(Detector, camera, [Tag('tag', 'tag36h11', {TAG.id}, 0.08)])}}\n"
+        "print(sum(len(one.seen.detections) for one in detect_in_images(images, make, workers=2, few=0)))\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.stdout, done.stderr) == ("begins\n40\n", "")
 
 
 def test_stopping_early_reads_no_further() -> None:
