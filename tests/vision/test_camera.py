@@ -73,13 +73,13 @@ def test_project_is_pixels_of_what_is_in_front(lens: str) -> None:
 def test_the_ring_is_where_the_radius_turns_back(D: np.ndarray, is_fisheye: bool) -> None:
     D = D[:4] if is_fisheye else np.concatenate([D[:2], [0.0, 0.0], D[4:]])
     camera = Camera.of(640, 480, "equidistant" if is_fisheye else "rational_polynomial", K, D, "test")
-    r = np.linspace(0.0, 30.0, 3001) if is_fisheye else np.linspace(0.0, 5.0, 3001)
-    slope = camera.pixel_jacobian(np.stack([r, np.zeros_like(r)], axis=1))[1][:, 0, 0]
-    assert (slope[r < 0.999 * camera.ring] > 0.0).all()
+    furthest = 30.0 if is_fisheye else 5.0
+    r = np.linspace(0.0, min(furthest, 0.999 * camera.ring), 3001)
+    assert (camera.pixel_jacobian(np.stack([r, np.zeros_like(r)], axis=1))[1][:, 0, 0] > 0.0).all()
     if len(D) == 8 and np.isfinite(camera.ring):
-        # A pole at a root of the numerator is none: whoever has such coefficients loses what is beyond it.
-        assume(abs(np.polyval([*D[[4, 1, 0]], 1.0], camera.ring**2)) > 1e-6)
-    if camera.ring < r[-1]:  # at once beyond it
+        # A pole next to a root of the numerator is hardly one: whoever has such coefficients loses what is beyond it.
+        assume(abs(np.polyval([*D[[4, 1, 0]], 1.0], camera.ring**2)) > 1e-2)
+    if camera.ring < furthest:  # at once beyond it
         beyond = np.array([[camera.ring * 1.0001, 0.0]])
         at_a_pole = np.abs(camera.pixels(beyond)).max() > 1e4
         assert at_a_pole or camera.pixel_jacobian(beyond)[1][0, 0, 0] < 1e-6
