@@ -138,10 +138,11 @@ def check_order(stamps_ns: np.ndarray, where: str) -> None:
         raise StampError(
             f"{where}: all {len(stamps_ns)} messages have the one stamp {stamps_ns[0]} ns: a clock stood still"
         )
-    back = np.diff(stamps_ns) * 1e-9
-    if len(back) and back.min() < -BACKWARDS_S:
-        i = int(np.argmin(back))
+    latest = np.maximum.accumulate(stamps_ns)  # from the latest so far: a clock may go back in small steps, too
+    late = np.flatnonzero((latest - stamps_ns) * 1e-9 > BACKWARDS_S)
+    if len(late):
+        i = int(late[0])
         raise StampError(
-            f"{where}: stamps go back by {-back[i]:.3f} s at message {i + 2} ({stamps_ns[i]} then {stamps_ns[i + 1]} "
-            "ns): a clock was set, or two sources publish there; cut the log at that place"
+            f"{where}: stamps go back by {(latest[i] - stamps_ns[i]) * 1e-9:.3f} s at message {i + 1} ({latest[i]} "
+            f"then {stamps_ns[i]} ns): a clock was set, or two sources publish there; cut the log at that place"
         )

@@ -29,7 +29,7 @@ def from_driver(
     Raises
     ------
     LogError
-        The topic is not there, or has no detections.
+        The topic is not there, or has no detections; poses that the driver made with another size than the rig file's.
     StampError
         Stamps that tell no time.
     CameraError
@@ -54,12 +54,19 @@ def from_driver(
 
 
 def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor: str) -> DetectionRecord:
+    driver_m = record.size_m
     record = replace(record, id=target.name, family=target.family, size_m=target.length_m)
     if camera is None or record.corners_px is None or len(record.corners_px) != 4:
         if record.T_camera_tag is None:
             raise CameraError(
                 f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver gives no pose of {target.name}, and "
                 f"sensor {sensor} has no intrinsics from which to make one"
+            )
+        if driver_m is not None and not np.isclose(driver_m, target.length_m, rtol=SAME_SIZE, atol=0.0):
+            raise LogError(
+                f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver made its pose of {target.name} with a "
+                f"size of {driver_m:g} m, and the rig file says {target.length_m:g} m. Give the driver's size there, "
+                f"or intrinsics of sensor {sensor}, with which poses are made anew from corners"
             )
         return record
     poses = plane_poses(camera, [target.corners()], [_in_our_order(record.corners_px)], corner_px=CORNER_PX)
@@ -81,6 +88,8 @@ def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor
 
 #: Drivers do not say how well they find corners; as for our own, only proportions count with estimated noise.
 CORNER_PX = 0.1
+#: Sizes as near as this, of their length, are one: some messages have them in single precision.
+SAME_SIZE = 1e-4
 
 
 def _in_our_order(corners_px: np.ndarray) -> np.ndarray:
