@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import base64
+import errno
+import os
 import re
-from collections.abc import Callable, Iterable
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +19,10 @@ import pytest
 import synthetic_logs as made
 from synthetic_logs import BEGIN_NS, Message
 
+import gtsam_rwhec as rw
 from gtsam_rwhec.errors import (
     CameraError,
+    FileFormatError,
     LogError,
     LogWarning,
     RigError,
@@ -24,8 +30,16 @@ from gtsam_rwhec.errors import (
     StampError,
     TransformError,
 )
+from gtsam_rwhec.logs import LogWriter, open_log
+from gtsam_rwhec.pipeline.clean import clean_log
 from gtsam_rwhec.pipeline.detect import detect_log
-from gtsam_rwhec.pipeline.run import calibrate_log
+from gtsam_rwhec.pipeline.embedded import DETECTION, RIG
+from gtsam_rwhec.pipeline.run import calibrate_log, solve_into
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 RECORDED = made.recording(4.0)
 MOVING = [message for message in RECORDED if message.topic == "/tf"]
@@ -34,6 +48,11 @@ SEEN = [message for message in RECORDED if message.topic != "/tf"]
 WITH_IMAGES = {
     camera: f"images: /{camera}/image\n    intrinsics: {{topic: /{camera}/camera_info}}" for camera in made.CAMERAS
 }
+#: What there is of a calibration, beside plots/.
+WRITTEN = {
+    "clean.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
+}  # fmt: skip
+TAG = f"{{type: tag, family: tag36h11, id: 0, size_m: {made.SIZE_M}}}"
 ESTIMATED = "detections: /cam_1/tags\n    time_offset: estimate"
 
 
@@ -355,3 +374,164 @@ def test_some_images_that_do_not_decode_are_counted_and_named(tmp_path: Path) ->
     assert {sensor: len(faults) for sensor, faults in report.undecoded.items()} == {"cam_0": 1, "cam_1": 1}
     assert f"/cam_0/image, image at {BEGIN_NS + 2_000_000_000} ns: 60 bytes of a PNG" in report.undecoded["cam_0"][0]
     assert {track.used for track in report.tracks if track.target == "tag_0"} == {5}
+
+
+# Names
+
+ELSEWHERE = "../../x"
+
+
+@pytest.mark.parametrize(
+    ("pieces", "words"),
+    [
+        ({"tag_0": f"{TAG}\n  {ELSEWHERE}: {TAG}"}, "line 13: targets.../../x: '../../x' cannot be a frame's name"),
+        ({"cam_1": f"detections: /a\n  {ELSEWHERE}: {{detections: /b}}"}, "line 11: sensors.../../x: '../../x' cannot"),
+        ({"cam_1": f"detections: /a\n    frame: {ELSEWHERE}"}, "line 11: sensors.cam_1.frame: '../../x' cannot"),
+        ({"poses": f"{{tf: [{ELSEWHERE}, hand]}}"}, "line 4: carriers.poses.tf[0]: '../../x' cannot"),
+    ],
+)
+def test_a_rig_files_names_are_no_paths(pieces: dict[str, str], words: str) -> None:
+    with pytest.raises(RigError) as caught:
+        made.rig(**pieces)
+    assert words in str(caught.value)
+
+
+def test_the_names_in_an_embedded_rig_file_are_no_paths(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "detected.mcap") as out:
+        out.metadata(RIG, {"yaml": made.rig_text().replace("tag_0:", f"{ELSEWHERE}:")})
+        out.metadata(DETECTION, {"json": "{}"})
+    with pytest.raises(RigError, match=r"detected\.mcap, metadata gtsam_rwhec\.rig, line 12.*'\.\./\.\./x' cannot"):
+        calibrate_log(tmp_path / "detected.mcap", None, tmp_path / "a" / "b" / "out")
+    assert {path.name for path in tmp_path.rglob("*")} <= {"detected.mcap", "a", "b", "out"}
+
+
+def test_a_logs_names_are_no_paths(tmp_path: Path) -> None:
+    messages = [replace(m, topic=f"/{ELSEWHERE}/tags") if m.topic == "/cam_0/tags" else m for m in RECORDED]
+    stranger = made.tag(7, np.eye(4), family=ELSEWHERE) | {"id": ELSEWHERE}
+    messages.append(made.detections(f"/{ELSEWHERE}/tags", BEGIN_NS + 4 * 10**9, ELSEWHERE, [stranger]))
+    messages.append(made.transform(BEGIN_NS, ELSEWHERE, "base", np.eye(4), "/tf_static"))
+    messages.append(replace(made.camera_info("cam_0"), topic=ELSEWHERE))
+    log = made.write(tmp_path / "raw.mcap", messages)
+    out = tmp_path / "a" / "b" / "out"
+    calibrated = calibrate_log(log, made.rig(cam_0=f"detections: /{ELSEWHERE}/tags"), out)
+    assert calibrated.log.detection.strangers == {f"{ELSEWHERE} {ELSEWHERE}": 1}
+    assert [path for path in tmp_path.rglob("*") if path.is_file() and out not in path.parents] == [log]
+    assert {path.name for path in out.iterdir()} == WRITTEN | {"plots"}
+    assert all(path.suffix == ".png" for path in (out / "plots").iterdir())
+
+
+# Writes that end early
+
+
+def check_whole(folder: Path) -> None:
+    """That every file under its final name is whole, and that there are no others."""
+    for path in folder.rglob("*"):
+        if path.is_dir():
+            continue
+        assert path.name in WRITTEN | {"detected.mcap"} or path.parent.name == "plots", path
+        if path.suffix == ".mcap":
+            with open_log(path) as log:
+                assert not log.losses
+                assert sum(1 for _ in log.records(["/tf"])) == len(MOVING)
+                assert set(log.metadata()) & {DETECTION}
+        elif path.name == "result.json":
+            assert set(rw.read_refined(path).Y) == set(made.CAMERAS)
+        elif path.suffix == ".png":
+            assert cv2.imread(str(path)) is not None
+        else:
+            assert path.read_bytes().endswith(b"\n")
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """No file can be written that is larger, as on a disk that is full meanwhile."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.skipif(resource is None, reason="no limits of files here")
+def test_stages_that_cannot_write_to_the_end(tmp_path: Path) -> None:
+    raw, detected, clean, out = (tmp_path / name for name in ("raw.mcap", "detected.mcap", "clean.mcap", "out"))
+    made.write(raw, RECORDED)
+    with largest_file(20_000), pytest.raises(LogError, match=r"detected\.mcap cannot be written: File too large"):
+        detect_log(raw, made.rig(), detected)
+    assert set(tmp_path.iterdir()) == {raw}
+    detect_log(raw, made.rig(), detected)
+    with largest_file(20_000), pytest.raises(LogError, match=r"clean\.mcap cannot be written: File too large"):
+        clean_log(detected, clean)
+    assert set(tmp_path.iterdir()) == {raw, detected}
+    clean_log(detected, clean)
+    content = clean.read_bytes()
+    with largest_file(20_000), pytest.raises(LogError, match=r"clean\.mcap cannot be written: File too large"):
+        clean_log(clean, clean)
+    assert clean.read_bytes() == content  # onto itself: the one before stays
+    with largest_file(1000), pytest.raises(FileFormatError, match=r"result\.json cannot be written: File too large"):
+        solve_into(clean, None, out)
+    assert list(out.iterdir()) == []
+    with (
+        largest_file(len(content)),
+        pytest.raises(LogError, match=r"clean\.mcap cannot be written: File too large"),
+    ):
+        solve_into(clean, None, out)
+    assert {path.name for path in out.iterdir()} == {"result.json"}
+    check_whole(out)
+
+
+@pytest.fixture(scope="module")
+def calibrated_before(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with raw.mcap and, in out/, a calibration of it."""
+    folder = tmp_path_factory.mktemp("before")
+    calibrate(folder, RECORDED)
+    return folder
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
+@pytest.mark.parametrize("name", ["detected.mcap", "clean.mcap", "result.json", "tf.yaml", "residuals.png"])
+def test_a_calibration_that_ends_early_leaves_whole_files(
+    calibrated_before: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, stop: BaseException
+) -> None:
+    """When `name` is to get its name; into a folder in which there was a calibration before."""
+    shutil.copytree(calibrated_before / "out", tmp_path / "out")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()}
+    give_name = os.replace
+
+    def stopped(source: str | Path, target: str | Path) -> None:
+        if Path(target).name == name:
+            raise stop
+        give_name(source, target)
+
+    # What takes long is the same each time: only the first two begin with the raw log.
+    log = calibrated_before / ("raw.mcap" if name in ("detected.mcap", "clean.mcap") else "out/clean.mcap")
+    rig = made.rig()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "replace", stopped)
+        kind = KeyboardInterrupt if isinstance(stop, KeyboardInterrupt) else FileFormatError
+        with pytest.raises(kind) as caught:
+            calibrate_log(log, rig, tmp_path / "out", workers=1)
+    if kind is FileFormatError:
+        assert re.search(rf"{re.escape(name)} cannot be written: No space left on device", str(caught.value))
+    check_whole(tmp_path / "out")
+    there = {path.name for path in (tmp_path / "out").iterdir()}
+    assert there - {"detected.mcap"} == WRITTEN | {"plots"}
+    assert ("detected.mcap" in there) == (name == "clean.mcap")  # from which to go on
+    if name in before:
+        assert (tmp_path / "out" / name).read_bytes() == before[name]
+
+
+def test_an_interrupted_calibration_goes_on(tmp_path: Path) -> None:
+    def interrupted(stage: str) -> None:
+        if stage == "writing pairs":
+            raise KeyboardInterrupt
+
+    log, out = made.write(tmp_path / "raw.mcap", RECORDED), tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        calibrate_log(log, made.rig(), out, progress=interrupted)
+    assert {path.name for path in out.iterdir()} == {"detected.mcap"}
+    check_whole(out)
+    calibrate_log(out / "detected.mcap", None, out)
+    check_whole(out)
+    assert {path.name for path in out.iterdir()} >= WRITTEN
