@@ -1,0 +1,53 @@
+"""Anybody's answer under the certified objective: J and each pair's residuals, from the problem's moments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from gtsam_rwhec.accumulation import Pair
+from gtsam_rwhec.calibration import check_against_knowledge
+from gtsam_rwhec.certify.full_form import add_priors, assemble, edge_slots, forms_of_edges
+from gtsam_rwhec.certify.parts import parts_of
+from gtsam_rwhec.certify.variables import as_variables, given_answer
+from gtsam_rwhec.poses import PoseLike
+from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
+
+
+def evaluate(
+    problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
+) -> tuple[float, dict[Pair, Residual]]:
+    """J (eq. 18, priors included; turned round where the certified solver turns it round) and residuals of an answer.
+
+    Parameters
+    ----------
+    problem : Problem
+    X, Y : dict of str to pose
+        T_targetcarrier_target and T_sensorcarrier_sensor, metres.
+    scale : float or dict of str to float
+
+    Raises
+    ------
+    FrameError, PoseError, PriorError, ScaleError
+        For an answer that is none of this problem.
+    """
+    parts = parts_of(problem)
+    check_against_knowledge(problem, X, Y, scale)
+    cost = 0.0
+    residuals: dict[Pair, Residual] = {}
+    for part in parts:
+        answer = given_answer(part, X, Y, scale)
+        translation, rotation = forms_of_edges(part)
+        form = assemble(part, edge_slots(part), translation + rotation)
+        add_priors(form, part)
+        cost += max(form.value(*as_variables(part, answer)), 0.0)
+        poses = PairPoses.of(part, answer)
+        residuals |= residuals_of_pairs(part, poses, *costs_of_pairs(part, poses))
+    return cost, {pair: residuals[pair] for pair in problem.pairs}
+
+
+def cost_of_answer(
+    problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
+) -> float:
+    """J of an answer; see ``evaluate``."""
+    return evaluate(problem, X, Y, scale)[0]

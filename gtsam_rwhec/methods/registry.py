@@ -1,0 +1,86 @@
+"""Every method by name, and one call for all of them."""
+
+from __future__ import annotations
+
+import time
+
+import gtsam
+
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.methods import certified, shah2013
+from gtsam_rwhec.methods.evaluation import evaluate
+from gtsam_rwhec.methods.protocol import Calibration, Estimate, Method, MethodOptions
+from gtsam_rwhec.poses import PoseLike, one_transform
+from gtsam_rwhec.problem import Problem
+
+#: In the order in which ``gtsam-rwhec compare`` shows them: closed forms, iterations, global methods.
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        shah2013.METHOD,
+        certified.METHOD,
+    )
+}
+
+
+def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Estimate:
+    """Solve a problem by a published method.
+
+    Parameters
+    ----------
+    name : str
+        One of ``METHODS``.
+    problem : Problem
+    options : MethodOptions, optional
+
+    Raises
+    ------
+    OptionError
+        For a name that is none, or options that are none.
+    CountError, FrameError, MeasurementsNotKeptError, NoiseError, PriorError, ScaleError
+        For a problem that the method cannot handle, in words.
+    UnderdeterminedError
+        When the measurements do not determine the method's equations.
+    """
+    method = method_of(name)
+    if options is not None and not isinstance(options, MethodOptions):
+        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.methods.MethodOptions")
+    method.check_problem(problem)
+    start = time.perf_counter()
+    found = method.function(problem, options or MethodOptions())
+    seconds = time.perf_counter() - start
+    return _estimate(method, problem, found, seconds)
+
+
+def method_of(name: str) -> Method:
+    """A method by its name.
+
+    Raises
+    ------
+    OptionError
+    """
+    try:
+        return METHODS[name]
+    except (KeyError, TypeError):
+        raise OptionError(f"method {name!r} is not one of {', '.join(METHODS)}") from None
+
+
+def _estimate(method: Method, problem: Problem, found: Calibration, seconds: float) -> Estimate:
+    scale = found.scale if isinstance(found.scale, float) else dict(found.scale)
+    cost, residuals = evaluate(problem, found.X, found.Y, scale)
+    return Estimate(
+        method=method.name,
+        X={name: _pose3(found.X[name], name) for name in problem.targets},
+        Y={name: _pose3(found.Y[name], name) for name in problem.sensors},
+        scale=scale,
+        cost=cost,
+        residuals=residuals,
+        seconds=seconds,
+        starts_from=found.starts_from,
+        notes=found.notes,
+    )
+
+
+def _pose3(pose: PoseLike, name: str) -> gtsam.Pose3:
+    T = one_transform(pose, name)
+    return gtsam.Pose3(gtsam.Rot3(T[:3, :3]), T[:3, 3])
