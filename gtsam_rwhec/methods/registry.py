@@ -7,7 +7,7 @@ import time
 import gtsam
 
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.methods import certified, shah2013
+from gtsam_rwhec.methods import certified, shah2013, strobl2006
 from gtsam_rwhec.methods.evaluation import evaluate
 from gtsam_rwhec.methods.protocol import Calibration, Estimate, Method, MethodOptions
 from gtsam_rwhec.poses import PoseLike, one_transform
@@ -18,6 +18,7 @@ METHODS: dict[str, Method] = {
     method.name: method
     for method in (
         shah2013.METHOD,
+        strobl2006.METHOD,
         certified.METHOD,
     )
 }
