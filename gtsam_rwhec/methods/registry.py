@@ -7,7 +7,7 @@ import time
 import gtsam
 
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.methods import certified, shah2013, strobl2006
+from gtsam_rwhec.methods import certified, dornaika1998, li2010, lom, shah2013, strobl2006, wang2022, zhuang1994
 from gtsam_rwhec.methods.evaluation import evaluate
 from gtsam_rwhec.methods.protocol import Calibration, Estimate, Method, MethodOptions
 from gtsam_rwhec.poses import PoseLike, one_transform
@@ -17,7 +17,14 @@ from gtsam_rwhec.problem import Problem
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
+        zhuang1994.METHOD,
+        dornaika1998.CLOSED,
+        li2010.KRONECKER,
+        li2010.DUAL_QUATERNIONS,
         shah2013.METHOD,
+        wang2022.METHOD,
+        dornaika1998.NONLINEAR,
+        lom.METHOD,
         strobl2006.METHOD,
         certified.METHOD,
     )

@@ -8,14 +8,29 @@ import numpy as np
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.methods import Estimate
-from gtsam_rwhec.simulate import Noise, Simulation, cameras, sphere
+from gtsam_rwhec.problem import ScaleMode
+from gtsam_rwhec.simulate import Noise, Simulation, cameras, general, sphere
 
 NOISE = Noise(sigma_m=0.01, kappa=125.0, model="released")
+STATED_NOISE = Noise(sigma_m=0.01, kappa=1250.0)
 
 
 def one_pair(noise: Noise | None = NOISE, seed: int = 0, *, monocular: bool = False) -> Simulation:
-    """Section 8.1 of the RWHEC paper."""
+    """Section 8.1 of the RWHEC paper: the camera's distance to the target is constant, and Y a half turn."""
     return sphere(noise, seed, monocular=monocular)
+
+
+def general_pair(noise: Noise | None = STATED_NOISE, seed: int = 0, *, scale: ScaleMode = "known") -> Simulation:
+    """One X and one Y, neither a half turn, and motions about and along all axes."""
+    return general(
+        1,
+        1,
+        seed=seed,
+        number_of_measurements=60,
+        noise=noise,
+        scale=scale,
+        true_scale=0.5 if scale == "shared" else None,
+    )
 
 
 def four_targets(noise: Noise | None = NOISE, seed: int = 0, *, monocular: bool = False) -> Simulation:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from method_problems import exchanged, four_targets, largest_errors, moved_translations, one_pair, rotations
+from method_problems import exchanged, four_targets, general_pair, largest_errors, moved_translations, rotations
 from naive_cost import naive_cost
 
 import gtsam_rwhec as rw
@@ -23,7 +23,7 @@ from gtsam_rwhec.methods import METHODS, MethodOptions, cost_of_answer, run
 
 @pytest.mark.parametrize("name", METHODS)
 def test_exact_data_give_the_truth(name: str) -> None:
-    simulation = one_pair(None)
+    simulation = general_pair(None)
     if METHODS[name].applies(simulation.problem):
         pytest.skip("for other problems")
     metres, radians = largest_errors(simulation, run(name, simulation.problem))
@@ -33,7 +33,7 @@ def test_exact_data_give_the_truth(name: str) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_joint_methods_alone_let_translations_move_rotations(name: str) -> None:
-    problem = one_pair().problem
+    problem = general_pair().problem
     if METHODS[name].applies(problem):
         pytest.skip("for other problems")
     other = moved_translations(problem, np.random.default_rng(1))
@@ -43,7 +43,7 @@ def test_joint_methods_alone_let_translations_move_rotations(name: str) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_monocular_methods_recover_a_scale_of_a_half(name: str) -> None:
-    simulation = one_pair(monocular=True)
+    simulation = general_pair(scale="shared")
     if METHODS[name].properties.monocular and not METHODS[name].applies(simulation.problem):
         assert run(name, simulation.problem).scale == pytest.approx(0.5, rel=0.02)
     else:
@@ -72,7 +72,7 @@ def test_methods_for_several_frames_give_them_all(name: str) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_cost_is_that_of_the_certified_objective_and_never_below_the_optimum(name: str) -> None:
-    problem = one_pair().problem
+    problem = general_pair().problem
     if METHODS[name].applies(problem):
         pytest.skip("for other problems")
     estimate = run(name, problem)
@@ -81,7 +81,7 @@ def test_cost_is_that_of_the_certified_objective_and_never_below_the_optimum(nam
     assert cost_of_answer(problem, X, Y, estimate.scale) == pytest.approx(estimate.cost, rel=1e-12)
     assert estimate.cost >= rw.solve(problem).certificate.lower_bound * (1.0 - 1e-12)
     assert estimate.seconds > 0.0
-    assert estimate.residuals["camera", "marker"].number_of_measurements == 100
+    assert estimate.residuals["target0", "sensor0"].number_of_measurements == 60
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -94,23 +94,23 @@ def test_every_method_says_what_it_assumes_and_where_it_is_from(name: str) -> No
 
 @pytest.mark.parametrize("name", [name for name, method in METHODS.items() if not method.takes_priors])
 def test_what_a_method_cannot_hold_is_refused_in_words(name: str) -> None:
-    simulation = one_pair()
-    raw = simulation.problem.measurements("camera", "marker")
+    simulation = general_pair()
+    raw = simulation.problem.measurements("target0", "sensor0")
     with_prior = rw.Problem()
-    with_prior.add("camera", "marker", raw.A, raw.B)
-    with_prior.fix("marker", np.eye(4))
+    with_prior.add("target0", "sensor0", raw.A, raw.B)
+    with_prior.fix("sensor0", np.eye(4))
     motions = rw.Problem()
-    motions.add_motion("marker", raw.A, raw.B)
+    motions.add_motion("sensor0", raw.A, raw.B)
     few = rw.Problem()
-    few.add("camera", "marker", raw.A[:2], raw.B[:2])
+    few.add("target0", "sensor0", raw.A[:2], raw.B[:2])
     moments = rw.Problem(keep_measurements=False)
-    moments.add("camera", "marker", raw.A, raw.B)
+    moments.add("target0", "sensor0", raw.A, raw.B)
     per_target = rw.Problem("per_target")
-    per_target.add("camera", "marker", raw.A, raw.B)
+    per_target.add("target0", "sensor0", raw.A, raw.B)
     if METHODS[name].applies(simulation.problem):
         pytest.skip("for other problems")
     for problem, error, word in (
-        (with_prior, PriorError, "marker"),
+        (with_prior, PriorError, "sensor0"),
         (motions, FrameError, "motions"),
         (few, CountError, "at least 3"),
         (moments, MeasurementsNotKeptError, "keep_measurements"),
@@ -138,7 +138,7 @@ def test_parallel_axes_are_named(name: str) -> None:
 
 
 def test_unknown_names_and_options_are_refused() -> None:
-    problem = one_pair().problem
+    problem = general_pair().problem
     with pytest.raises(OptionError, match="shah2013"):
         run("shah", problem)
     with pytest.raises(OptionError, match="MethodOptions"):

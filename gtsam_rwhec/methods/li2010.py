@@ -1,0 +1,129 @@
+"""Li, Wang and Wu 2010: all 24 entries at once by a Kronecker product; and dual quaternions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.methods import quaternions
+from gtsam_rwhec.methods.absolute import FREE, Stack, nearest_rotations, poses_by_name
+from gtsam_rwhec.methods.plain_form import plain_form
+from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.problem import Problem
+
+_SOURCE = (
+    "A. Li, L. Wang and D. Wu, Simultaneous robot-world and hand-eye calibration using dual-quaternions and Kronecker "
+    "product, Int. J. Physical Sciences 5(10), 2010"
+)
+
+
+def kronecker(problem: Problem, options: MethodOptions) -> Calibration:
+    """A X = Y B in least squares over all entries of X and Y, linear; then the matrices are projected to rotations.
+
+    The translations are those of the linear system, which belong to the matrices before their projection.
+    """
+    stack = Stack.of(problem)
+    form = plain_form(stack)
+    unknown = np.delete(np.arange(25), 6)
+    normal, right = form[np.ix_(unknown, unknown)], -form[unknown, 6]
+    scaling = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    equilibrated = normal * scaling[:, None] * scaling
+    if np.linalg.eigvalsh(equilibrated)[0] <= FREE:
+        raise UnderdeterminedError(
+            "the linear system of the 24 entries of X and Y is singular: rotations about parallel axes or by half "
+            "turns alone, carriers that do not move, or a sensor that always sees the target in the same place; turn "
+            "about a second axis, and change the distance"
+        )
+    x = scaling * np.linalg.solve(equilibrated, scaling * right)
+    R = nearest_rotations(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
+    gauge = stack.gauge
+    return Calibration(
+        poses_by_name(stack.targets, R[:1], x[None, :3] + gauge.target_carrier),
+        poses_by_name(stack.sensors, R[1:], x[None, 3:6] + gauge.sensor_carrier),
+    )
+
+
+def _rows() -> Array:
+    """The equations' coefficients (16, 8, 16): of the features [q_A, q'_A, q_B, q'_B], in [q_X, q'_X, q_Y, q'_Y].
+
+    q_A q_X - q_Y q_B = 0 and q_A q'_X + q'_A q_X - q_Y q'_B - q'_Y q_B = 0.
+    """
+    rows = np.zeros((16, 8, 16))
+    real, dual = slice(0, 4), slice(4, 8)
+    X, dual_X, Y, dual_Y = (slice(4 * i, 4 * i + 4) for i in range(4))
+    rows[0:4, real, X] = rows[0:4, dual, dual_X] = rows[4:8, dual, X] = quaternions.LEFT
+    rows[8:12, real, Y] = rows[8:12, dual, dual_Y] = rows[12:16, dual, Y] = -quaternions.RIGHT
+    return rows
+
+
+_ROWS = _rows()
+
+
+def dual_quaternions(problem: Problem, options: MethodOptions) -> Calibration:
+    """The homogeneous linear system of two dual quaternions, 8 equations a measurement.
+
+    Exact data leave two dimensions, (q, q') and (0, q) of both frames, so the answer is sought among the combinations
+    of the two smallest singular vectors: the one whose real and dual parts are orthogonal (of two, the one with the
+    larger real part), each frame then made a unit dual quaternion of its own.
+    """
+    stack = Stack.of(problem)
+    q_A, q_B = quaternions.paired_quaternions(stack)
+    features = np.concatenate([q_A, _dual(q_A, stack.A), q_B, _dual(q_B, stack.B)], axis=1)
+    normal = np.einsum("fg,fri,grj->ij", features.T @ features, _ROWS, _ROWS, optimize=True)
+    v = np.linalg.eigh(normal)[1][:, :2].T.reshape(2, 2, 2, 4)  # [vector, frame, real or dual, entry]
+    # v_0 cos u + v_1 sin u: real . dual, over both frames, is a quadratic form P in (cos u, sin u)
+    P = np.einsum("afi,bfi->ab", v[:, :, 0], v[:, :, 1])
+    real = np.einsum("afi,bfi->ab", v[:, :, 0], v[:, :, 0])
+    directions = _isotropic(0.5 * (P + P.T))
+    combination = directions[np.argmax(np.einsum("na,ab,nb->n", directions, real, directions))]
+    q, dual = np.moveaxis(np.einsum("a,afki->fki", combination, v), 1, 0)
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    q, dual = q / length, dual / length
+    dual = dual - np.einsum("fi,fi->f", q, dual)[:, None] * q
+    conjugate = q * (1.0, -1.0, -1.0, -1.0)
+    t = 2.0 * np.einsum("fij,fj->fi", quaternions.left(dual), conjugate)[:, 1:]
+    R = np.array([quaternions.to_rotation(one) for one in q])
+    return Calibration(poses_by_name(stack.targets, R[:1], t[:1]), poses_by_name(stack.sensors, R[1:], t[1:]))
+
+
+def _dual(q: Array, T: Array) -> Array:
+    """The dual part t q / 2 (N, 4) of poses whose real part is q."""
+    t = np.concatenate([np.zeros((len(T), 1)), T[:, :3, 3]], axis=1)
+    dual: Array = 0.5 * np.einsum("nij,nj->ni", quaternions.left(t), q)
+    return dual
+
+
+def _isotropic(P: Array) -> Array:
+    """Unit vectors (2, 2) with u' P u = 0, or as near as there is, for a symmetric P (2, 2)."""
+    (small, large), axes = np.linalg.eigh(P)
+    if small * large >= 0.0:  # definite, by noise: the smaller of both values
+        nearest = axes[:, int(abs(small) > abs(large))]
+        return np.array([nearest, nearest])
+    c, s = np.sqrt(large), np.sqrt(-small)
+    u: Array = np.array([c * axes[:, 0] + s * axes[:, 1], c * axes[:, 0] - s * axes[:, 1]]) / np.hypot(c, s)
+    return u
+
+
+# The RWHEC paper's Section 2 counts Li's among the methods that solve rotations and translations apart. Both systems
+# have both in them, and translations move the rotations found: joint, by its mathematics.
+KRONECKER = Method(
+    name="li2010_kronecker",
+    properties=Properties(
+        joint=True, probabilistic=False, certifiable=False, multiple="", monocular=False, representation="matrices"
+    ),
+    source=_SOURCE,
+    assumes="All measurements alike, a radian as much as a metre. X and Y are any matrices until the end, so a target "
+    "must not be seen in the same place all the time (a camera that turns about it tells 24 entries nothing).",
+    function=kronecker,
+)
+DUAL_QUATERNIONS = Method(
+    name="li2010_dq",
+    properties=Properties(
+        joint=True, probabilistic=False, certifiable=False, multiple="", monocular=False, representation="DQ"
+    ),
+    source=_SOURCE,
+    assumes="All measurements alike, a radian as much as a metre; quaternions whose signs fit together; carriers' "
+    "origins near the data, as the dual parts' errors grow with the distance.",
+    function=dual_quaternions,
+)

@@ -1,0 +1,78 @@
+"""Zhuang, Roth and Sudhakar 1994: a linear system in the vector parts of two quaternions, then the translations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.methods import quaternions
+from gtsam_rwhec.methods.absolute import FREE, Stack, linear_rotations, linear_translations, poses_by_name
+from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
+from gtsam_rwhec.problem import Problem
+
+#: A's with a smaller scalar part, half turns, are left out: the equations divide by it.
+SMALLEST_SCALAR = 1e-3
+#: With Y's scalar part below this (11 degrees off a half turn) the user is told.
+NEAR_HALF_TURN = 0.1
+
+
+def zhuang1994(problem: Problem, options: MethodOptions) -> Calibration:
+    """q_A q_X = q_Y q_B with q_X's scalar eliminated and q_Y's divided out; six unknowns.
+
+    With q = (s, v), the equation's scalar part gives s_X = (s_Y s_B - v_Y.v_B + v_A.v_X) / s_A, and the vector part,
+    divided by s_Y, is
+
+        (s_A I + [v_A]x + v_A v_A'/s_A) v_X/s_Y - (s_B I - [v_B]x + v_A v_B'/s_A) v_Y/s_Y = v_B - (s_B/s_A) v_A.
+    """
+    stack = Stack.of(problem)
+    q_A, q_B = quaternions.paired_quaternions(stack)
+    usable = np.abs(q_A[:, 0]) > SMALLEST_SCALAR
+    s_A, v_A, s_B, v_B = q_A[usable, 0, None], q_A[usable, 1:], q_B[usable, 0, None], q_B[usable, 1:]
+    # L(q)'s lower right block is s I + [v]x, R(q)'s is s I - [v]x
+    of_X = quaternions.left(q_A[usable])[:, 1:, 1:] + (v_A / s_A)[:, :, None] * v_A[:, None, :]
+    of_Y = -quaternions.right(q_B[usable])[:, 1:, 1:] - (v_A / s_A)[:, :, None] * v_B[:, None, :]
+    rows = np.concatenate([of_X, of_Y], axis=2).reshape(-1, 6)
+    right = (v_B - s_B / s_A * v_A).ravel()
+    normal = rows.T @ rows
+    values = np.linalg.eigvalsh(normal)
+    if not usable.any() or values[0] <= FREE * values[-1]:
+        raise UnderdeterminedError(
+            "Zhuang's linear system is singular: it divides by the scalar parts of A's and Y's quaternions, and one "
+            "of them is a half turn; or the rotations measured turn about parallel axes. Turn a carrier's frame by a "
+            "known rotation, or use another method"
+        )
+    ratio = np.linalg.solve(normal, rows.T @ right)
+    s_Y = 1.0 / np.sqrt(1.0 + ratio[3:] @ ratio[3:])
+    v_X, v_Y = s_Y * ratio[:3], s_Y * ratio[3:]
+    scalar = s_Y * s_B[:, 0] - v_B @ v_Y + v_A @ v_X  # s_A s_X of each measurement
+    s_X = s_A[:, 0] @ scalar / (s_A[:, 0] @ s_A[:, 0])
+    R_X = quaternions.to_rotation(np.array([s_X, *v_X]))[None]
+    R_Y = quaternions.to_rotation(np.array([s_Y, *v_Y]))[None]
+    t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
+    notes = []
+    # Noise pulls the ratios down, so that the system's own s_Y does not show that it should have been near 0.
+    scalar_of_Y = abs(quaternions.of_rotations(linear_rotations(stack)[1])[0, 0])
+    if scalar_of_Y < NEAR_HALF_TURN:
+        notes.append(f"Y is near a half turn (scalar part {scalar_of_Y:.3g}), by which it divides: a poor answer")
+    if not usable.all():
+        notes.append(f"{np.sum(~usable)} measurements were left out: A is a half turn, by whose scalar part it divides")
+    return Calibration(
+        poses_by_name(stack.targets, R_X, t_X), poses_by_name(stack.sensors, R_Y, t_Y), notes=tuple(notes)
+    )
+
+
+METHOD = Method(
+    name="zhuang1994",
+    properties=Properties(
+        joint=False,
+        probabilistic=False,
+        certifiable=False,
+        multiple="",
+        monocular=False,
+        representation="unit quaternions",
+    ),
+    source="H. Zhuang, Z. S. Roth and R. Sudhakar, Simultaneous robot/world and tool/flange calibration by solving "
+    "homogeneous transformation equations of the form AX = YB, IEEE T-RA 10(4), 1994",
+    assumes="Neither Y nor any A is a half turn, nor near one: it divides by their quaternions' scalar parts.",
+    function=zhuang1994,
+)
