@@ -1,0 +1,158 @@
+"""Rotations and translations as OpenCV takes them: lists or arrays of 3x3 matrices, rotation vectors, 3-vectors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
+from gtsam_rwhec.poses import LARGEST_M, ROTATION_TOLERANCE, Array
+
+#: Fewest poses that hold two motions about different axes; OpenCV asks for as many.
+FEWEST_POSES = 3
+#: Smallest over largest (or over all possible) turning of the axes that is more than rounding.
+PARALLEL = 1e-13
+
+
+def checked_poses(R: Any, t: Any, names: tuple[str, str]) -> tuple[Array, Array]:
+    """Rotations (N, 3, 3) and translations (N, 3) of one argument pair.
+
+    Parameters
+    ----------
+    R : sequence or array of N rotations
+        Each (3, 3), or a rotation vector of shape (3,), (3, 1) or (1, 3) in radians; both may occur in one list.
+    t : sequence or array of N translations
+        Each of shape (3,), (3, 1) or (1, 3).
+    names : (str, str)
+        The arguments' names, for messages.
+
+    Raises
+    ------
+    PoseError
+        A shape that is none of these, entries that are not finite, a matrix that is no rotation.
+    CountError
+        Different numbers of rotations and translations.
+    """
+    rotations, translations = _rotations(R, names[0]), _translations(t, names[1])
+    if len(rotations) != len(translations):
+        raise CountError(
+            f"{names[0]} has {len(rotations)} rotations and {names[1]} {len(translations)} translations; "
+            "give one of each for every pose"
+        )
+    return rotations, translations
+
+
+def check_counts(first: int, second: int, names: tuple[str, str]) -> None:
+    """Refuse unequal numbers of poses, or fewer than three (CountError)."""
+    if first != second:
+        raise CountError(f"{names[0]} has {first} poses and {names[1]} {second}; give both for every station")
+    if first < FEWEST_POSES:
+        raise CountError(
+            f"{first} poses in {names[0]}; at least {FEWEST_POSES} are needed (two motions about different axes)"
+        )
+
+
+def check_axes(R: Array, where: str) -> None:
+    """Refuse motions that leave the answer free whatever the method.
+
+    Over all ordered pairs, the sum of I - R_j' R_i is N^2 I - (sum R)'(sum R): its null space is what every motion's
+    axis leaves unturned. Zero: nothing rotates. Rank two: one axis for all motions.
+
+    Raises
+    ------
+    UnderdeterminedError
+    """
+    total = R.sum(axis=0)
+    turning = np.linalg.eigvalsh(len(R) ** 2 * np.eye(3) - total.T @ total)
+    if turning[2] <= PARALLEL * len(R) ** 2:
+        raise UnderdeterminedError(
+            f"{where}: no motion rotates, so neither the rotation about the common direction nor the translation can "
+            "be told; add poses that turn about two different axes"
+        )
+    if turning[0] <= PARALLEL * turning[2]:
+        raise UnderdeterminedError(
+            f"{where}: all motions rotate about one axis, which leaves the translation along it free; add poses that "
+            "turn about another axis"
+        )
+
+
+def _rotations(values: Any, where: str) -> Array:
+    array = _as_array(values, where)
+    if array is None:  # matrices and vectors in one list
+        return np.concatenate([_rotations([value], f"{where}[{index}]") for index, value in enumerate(values)])
+    if array.size and array.ndim == 3 and array.shape[1:] == (3, 3):
+        _check_finite(array, where)
+        _check_rotations(array, where)
+        return array
+    if array.size and array.shape[1:] in ((3,), (3, 1), (1, 3)):
+        _check_finite(array, where)
+        return rotations_of_vectors(array.reshape(-1, 3))
+    if array.size == 0:
+        raise CountError(f"{where}: no rotations; at least {FEWEST_POSES} are needed")
+    raise PoseError(
+        f"{where}: shape {array.shape} is no list of rotations; give matrices (3, 3) or rotation vectors (3,), (3, 1), "
+        "(1, 3), one for every pose"
+    )
+
+
+def _translations(values: Any, where: str) -> Array:
+    array = _as_array(values, where)
+    if array is None:
+        return np.concatenate([_translations([value], f"{where}[{index}]") for index, value in enumerate(values)])
+    if array.size == 0:
+        raise CountError(f"{where}: no translations; at least {FEWEST_POSES} are needed")
+    if array.shape[1:] not in ((3,), (3, 1), (1, 3)):
+        raise PoseError(
+            f"{where}: shape {array.shape} is no list of translations; give (3,), (3, 1) or (1, 3) for every pose"
+        )
+    _check_finite(array, where)
+    return array.reshape(-1, 3)
+
+
+def _as_array(values: Any, where: str) -> Array | None:
+    """An array of doubles; None where the entries have different shapes."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        if isinstance(values, (list, tuple)) and len({np.shape(value) for value in values}) > 1:
+            return None
+        raise PoseError(f"{where}: cannot be read as numbers ({error}); give arrays of numbers") from error
+
+
+def _check_finite(array: Array, where: str) -> None:
+    if np.abs(array).max() <= LARGEST_M:  # NaN is not
+        return
+    bad = np.flatnonzero(~(np.abs(array.reshape(len(array), -1)) <= LARGEST_M).all(axis=1))
+    raise PoseError(
+        f"{where}: pose {bad[0]} has an entry that is NaN, infinite or too large; leave the pose out:\n{array[bad[0]]}"
+    )
+
+
+def _check_rotations(R: Array, where: str) -> None:
+    deviation = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3))
+    if deviation.max() > ROTATION_TOLERANCE:
+        index = int(deviation.max(axis=(1, 2)).argmax())
+        raise PoseError(
+            f"{where}: the rotation of pose {index} is off by {deviation[index].max():.3g} (largest entry of R'R - I; "
+            f"up to {ROTATION_TOLERANCE:g} is let through):\n{R[index]}"
+        )
+    handed = (np.cross(R[:, 0], R[:, 1]) * R[:, 2]).sum(axis=1)
+    if handed.min() < 0.0:
+        index = int(handed.argmin())
+        raise PoseError(
+            f"{where}: the rotation of pose {index} is left-handed (determinant {handed[index]:.6f}): a mirrored axis; "
+            "check the axis convention"
+        )
+
+
+def rotations_of_vectors(vectors: Array) -> Array:
+    """Rotations (N, 3, 3) of rotation vectors (N, 3): Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=1)
+    x, y, z = vectors.T
+    K = np.zeros((len(vectors), 3, 3))
+    K[:, 2, 1], K[:, 1, 2], K[:, 0, 2], K[:, 2, 0], K[:, 1, 0], K[:, 0, 1] = x, -x, y, -y, z, -z
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # (1 - cos a) / a^2
+    R: Array = np.eye(3) + first[:, None, None] * K + second[:, None, None] * (K @ K)
+    return R

@@ -1,0 +1,170 @@
+"""OpenCV's hand-eye calls with its names, arguments, frames, shapes and constants; OpenCV 5's package has none.
+
+``from gtsam_rwhec.compat import opencv as cv2`` is the one line to change. OpenCV's own methods give its answers (from
+the same motions between all pairs of poses), in a fraction of its time; beside them the library's certified solution,
+which needs no pairs.
+
+Differences, all where OpenCV returns a pose that means nothing: input that determines no answer is refused by name
+(fewer than three poses, motions about parallel axes or without rotation, Tsai's method without two motions in its
+range of angles), and so is an unknown method. Lists of lists are taken as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from gtsam_rwhec.compat.andreff import andreff
+from gtsam_rwhec.compat.certified import certified_hand_eye, certified_robot_world
+from gtsam_rwhec.compat.daniilidis import daniilidis
+from gtsam_rwhec.compat.inputs import check_axes, check_counts, checked_poses
+from gtsam_rwhec.compat.quaternion_methods import horaud, park, tsai
+from gtsam_rwhec.compat.robot_world import li, shah
+from gtsam_rwhec.compat.stations import Stations, stations_of
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.poses import Array
+
+CALIB_HAND_EYE_TSAI = 0
+CALIB_HAND_EYE_PARK = 1
+CALIB_HAND_EYE_HORAUD = 2
+CALIB_HAND_EYE_ANDREFF = 3
+CALIB_HAND_EYE_DANIILIDIS = 4
+#: Not OpenCV's: the library's certified solution, from the poses themselves.
+CALIB_HAND_EYE_CERTIFIED = 101
+
+CALIB_ROBOT_WORLD_HAND_EYE_SHAH = 0
+CALIB_ROBOT_WORLD_HAND_EYE_LI = 1
+#: Not OpenCV's: the library's certified solution.
+CALIB_ROBOT_WORLD_HAND_EYE_CERTIFIED = 101
+
+_HAND_EYE: dict[int, Callable[[Stations], tuple[Array, Array]]] = {
+    CALIB_HAND_EYE_TSAI: tsai,
+    CALIB_HAND_EYE_PARK: park,
+    CALIB_HAND_EYE_HORAUD: horaud,
+    CALIB_HAND_EYE_ANDREFF: andreff,
+    CALIB_HAND_EYE_DANIILIDIS: daniilidis,
+    CALIB_HAND_EYE_CERTIFIED: certified_hand_eye,
+}
+_ROBOT_WORLD: dict[int, Callable[[Array, Array, Array, Array], tuple[Array, Array, Array, Array]]] = {
+    CALIB_ROBOT_WORLD_HAND_EYE_SHAH: shah,
+    CALIB_ROBOT_WORLD_HAND_EYE_LI: li,
+    CALIB_ROBOT_WORLD_HAND_EYE_CERTIFIED: certified_robot_world,
+}
+
+
+def calibrateHandEye(
+    R_gripper2base: Any,
+    t_gripper2base: Any,
+    R_target2cam: Any,
+    t_target2cam: Any,
+    R_cam2gripper: Array | None = None,
+    t_cam2gripper: Array | None = None,
+    method: int = CALIB_HAND_EYE_TSAI,
+) -> tuple[Array, Array]:
+    """Pose of a camera on a gripper, from poses of the gripper and of a fixed target in the camera.
+
+    x2y is OpenCV's for T_y_x, which takes points of frame x to frame y. For a fixed camera that sees a target on the
+    gripper (eye-to-hand), give the base's pose in the gripper (base2gripper) first, and get the camera's in the base.
+
+    Parameters
+    ----------
+    R_gripper2base, R_target2cam : sequence or array of N rotations
+        Matrices (3, 3), or rotation vectors (3,), (3, 1), (1, 3) in radians.
+    t_gripper2base, t_target2cam : sequence or array of N translations
+        (3,), (3, 1) or (1, 3), in the unit that the answer will have.
+    R_cam2gripper, t_cam2gripper : (3, 3) and (3, 1) float64 arrays, optional
+        Filled and returned when they have these shapes, as in OpenCV.
+    method : int
+        One of CALIB_HAND_EYE_TSAI, _PARK, _HORAUD, _ANDREFF, _DANIILIDIS, _CERTIFIED.
+
+    Returns
+    -------
+    R_cam2gripper (3, 3), t_cam2gripper (3, 1)
+
+    Raises
+    ------
+    PoseError
+        Shapes that are none of these, entries that are not finite, a matrix that is no rotation.
+    CountError
+        Fewer than three poses, or different numbers.
+    UnderdeterminedError
+        Motions about one axis only, or without rotation; Tsai with fewer than two motions of 17 to 116 degrees.
+    OptionError
+        An unknown method.
+    """
+    solve = _HAND_EYE.get(method)
+    if solve is None:
+        raise OptionError(_unknown(method, "CALIB_HAND_EYE"))
+    R_G, t_G = checked_poses(R_gripper2base, t_gripper2base, ("R_gripper2base", "t_gripper2base"))
+    R_C, t_C = checked_poses(R_target2cam, t_target2cam, ("R_target2cam", "t_target2cam"))
+    check_counts(len(R_G), len(R_C), ("R_gripper2base", "R_target2cam"))
+    check_axes(R_G, "R_gripper2base")
+    check_axes(R_C.transpose(0, 2, 1), "R_target2cam")
+    R, t = solve(stations_of(R_G, t_G, R_C, t_C))
+    return _into(R_cam2gripper, R), _into(t_cam2gripper, t[:, None])
+
+
+def calibrateRobotWorldHandEye(
+    R_world2cam: Any,
+    t_world2cam: Any,
+    R_base2gripper: Any,
+    t_base2gripper: Any,
+    R_base2world: Array | None = None,
+    t_base2world: Array | None = None,
+    R_gripper2cam: Array | None = None,
+    t_gripper2cam: Array | None = None,
+    method: int = CALIB_ROBOT_WORLD_HAND_EYE_SHAH,
+) -> tuple[Array, Array, Array, Array]:
+    """Poses of a robot's base in the world (a fixed target) and of its gripper in the camera on it.
+
+    Parameters
+    ----------
+    R_world2cam, R_base2gripper : sequence or array of N rotations
+        Matrices (3, 3), or rotation vectors (3,), (3, 1), (1, 3) in radians.
+    t_world2cam, t_base2gripper : sequence or array of N translations
+        (3,), (3, 1) or (1, 3), in the unit that the answer will have.
+    R_base2world, t_base2world, R_gripper2cam, t_gripper2cam : float64 arrays, optional
+        (3, 3), (3, 1), (3, 3), (3, 1): filled and returned when they have these shapes, as in OpenCV.
+    method : int
+        One of CALIB_ROBOT_WORLD_HAND_EYE_SHAH, _LI, _CERTIFIED.
+
+    Returns
+    -------
+    R_base2world (3, 3), t_base2world (3, 1), R_gripper2cam (3, 3), t_gripper2cam (3, 1)
+
+    Raises
+    ------
+    PoseError, CountError, UnderdeterminedError, OptionError
+        As ``calibrateHandEye``.
+    """
+    solve = _ROBOT_WORLD.get(method)
+    if solve is None:
+        raise OptionError(_unknown(method, "CALIB_ROBOT_WORLD_HAND_EYE"))
+    R_A, t_A = checked_poses(R_world2cam, t_world2cam, ("R_world2cam", "t_world2cam"))
+    R_B, t_B = checked_poses(R_base2gripper, t_base2gripper, ("R_base2gripper", "t_base2gripper"))
+    check_counts(len(R_A), len(R_B), ("R_world2cam", "R_base2gripper"))
+    check_axes(R_A.transpose(0, 2, 1), "R_world2cam")
+    check_axes(R_B.transpose(0, 2, 1), "R_base2gripper")
+    R_X, t_X, R_Z, t_Z = solve(R_A, t_A, R_B, t_B)
+    return (
+        _into(R_base2world, R_X),
+        _into(t_base2world, t_X[:, None]),
+        _into(R_gripper2cam, R_Z),
+        _into(t_gripper2cam, t_Z[:, None]),
+    )
+
+
+def _into(given: Array | None, answer: Array) -> Array:
+    """Fill a caller's array that can hold the answer; another one is left as it is."""
+    if isinstance(given, np.ndarray) and given.shape == answer.shape and given.dtype == np.float64:
+        given[...] = answer
+        return given
+    return answer
+
+
+def _unknown(method: object, prefix: str) -> str:
+    names = {name: value for name, value in globals().items() if name.startswith(f"{prefix}_")}
+    listed = ", ".join(f"{name} = {value}" for name, value in names.items())
+    return f"method={method!r} is none of {listed}"

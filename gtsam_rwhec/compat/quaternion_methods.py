@@ -1,0 +1,103 @@
+"""Rotation first, translation second: Tsai & Lenz 1989, Park & Martin 1994, Horaud & Dornaika 1995.
+
+Over all pairs of stations, as OpenCV takes them. The rotations of a pair enter through signs of quaternions,
+logarithms or thresholds, so they are computed pair by pair, in blocks; translations need sums over stations only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.compat.pair_translations import translation_features, translation_of
+from gtsam_rwhec.compat.stations import Stations, left_matrices, pair_blocks
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.poses import Array
+
+#: Tsai's motions have 2 sin(angle / 2) between these, by both sensors; observed of OpenCV 4, to 1e-14, by bisection.
+TSAI_LEAST, TSAI_MOST = 0.3, 1.7
+
+
+def tsai(stations: Stations) -> tuple[Array, Array]:
+    """Tsai & Lenz 1989: Skew(P_A + P_B) P' = P_B - P_A by least squares (eq. 12), P = 2 sin(angle/2) axis.
+
+    Only motions of 17 to 116 degrees are used, as by OpenCV 4, where it returns the identity when fewer than two are
+    left.
+
+    Raises
+    ------
+    UnderdeterminedError
+        When fewer than two motions are in that range.
+    """
+    count = len(stations.u)
+    features = translation_features(stations)
+    feature_sums, used = np.zeros_like(features), 0
+    outer, sums = np.zeros((3, 3)), np.zeros(3)
+    for block in pair_blocks(stations):
+        vectors = 2.0 * np.stack([block.a[:3], block.b[:3]])
+        lengths = np.sqrt((vectors**2).sum(axis=1))
+        inside = (lengths > TSAI_LEAST) & (lengths < TSAI_MOST)
+        use = inside[0] & inside[1] & (block.weight > 0.0)
+        used += int(use.sum())
+        feature_sums[block.first : block.last] = use.astype(float) @ features[: block.last]
+        a, b = vectors[0][:, use], vectors[1][:, use]
+        plus = a + b
+        outer += plus @ plus.T
+        sums += np.cross(b - a, plus, axis=0).sum(axis=1)  # Skew(s)'(b - a) = (b - a) x s
+    if used < 2:
+        raise UnderdeterminedError(
+            f"Tsai's method uses motions with 2 sin(angle/2) between {TSAI_LEAST} and {TSAI_MOST} (17 to 116 degrees) "
+            f"by both sensors; {used} of the {count * (count - 1) // 2} motions are, and two are needed; "
+            "add poses that turn further, or take another method"
+        )
+    x = np.linalg.solve(np.trace(outer) * np.eye(3) - outer, sums)  # Skew(s)'Skew(s) = |s|^2 I - s s'
+    R = rotation_of(np.append(x, 1.0))
+    return R, translation_of(stations, R, feature_sums)
+
+
+def park(stations: Stations) -> tuple[Array, Array]:
+    """Park & Martin 1994: R = (M'M)^(-1/2) M' with M the sum of log(R_B) log(R_A)' (their eq. 27)."""
+    M = np.zeros((3, 3))
+    for block in pair_blocks(stations):
+        M += _moment(block.a[:3], _log_factor(block.a) * _log_factor(block.b) * block.weight, block.b[:3])
+    U, _, Vt = np.linalg.svd(M)  # M here is the sum of log(R_A) log(R_B)'
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return R, translation_of(stations, R)
+
+
+def horaud(stations: Stations) -> tuple[Array, Array]:
+    """Horaud & Dornaika 1995: q minimises the sum of |v_A q - q v_B|^2 (eq. 31), v the quaternions' vector parts.
+
+    Vector parts carry sin(angle/2), which weighs the axes of larger motions more, as in OpenCV.
+    """
+    M = np.zeros((3, 3))
+    for block in pair_blocks(stations):
+        M += _moment(block.a[:3], block.weight, block.b[:3])
+    # |v_A q - q v_B|^2 = |v_A|^2 + |v_B|^2 - 2 v_A . (R v_B): the quaternion of the nearest rotation (Horn 1987).
+    N = np.empty((4, 4))
+    N[:3, :3] = M + M.T - np.trace(M) * np.eye(3)
+    N[:3, 3] = N[3, :3] = M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]
+    N[3, 3] = np.trace(M)
+    R = rotation_of(np.linalg.eigh(N)[1][:, -1])
+    return R, translation_of(stations, R)
+
+
+def rotation_of(q: Array) -> Array:
+    """Rotation (3, 3) of a quaternion xyzw of any length: q v q* / |q|^2."""
+    L = left_matrices(q[None])[0]
+    right = L.copy()  # R(q): L(q) with the cross product turned round; R(q*) is its transpose
+    right[:3, :3] = L[:3, :3].T
+    R: Array = (L @ right.T)[:3, :3] / (q @ q)
+    return R
+
+
+def _moment(a: Array, weight: Array, b: Array) -> Array:
+    moment: Array = (a * weight).reshape(3, -1) @ b.reshape(3, -1).T
+    return moment
+
+
+def _log_factor(q: Array) -> Array:
+    """What takes a quaternion's vector part to the rotation vector, for scalar parts that are not negative."""
+    length = np.sqrt((q[:3] ** 2).sum(axis=0))
+    safe = np.maximum(length, 1e-150)
+    factor: Array = np.where(length > 1e-8, 2.0 * np.arctan2(length, q[3]) / safe, 2.0)
+    return factor

@@ -1,0 +1,137 @@
+"""The poses of a hand-eye problem, station by station, and what the motions between all pairs of them add up to.
+
+A motion is that from station i to a later station j: A = G_j^-1 G_i and B = C_j C_i^-1 with A X = X B, where G is the
+gripper's pose in the base, C the target's in the camera and X the camera's in the gripper. That this direction and all
+pairs i < j are OpenCV's was found by comparing answers on noisy poses.
+
+Everything bilinear in the two stations (translations, products of rotations) is summed in linear time: the sum over
+i < j of f_i g_j is that of g_j and the running sum of f. What is not (signs of quaternions, logarithms, thresholds) is
+computed for blocks of pairs, one GEMM for each block, so memory stays linear too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.poses import Array
+
+#: Pairs in one block: a dozen arrays of this size stay within the processor's cache.
+BLOCK_PAIRS = 1 << 15
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Poses of N stations.
+
+    Parameters
+    ----------
+    R_G, t_G : (N, 3, 3) and (N, 3) arrays
+        Gripper in the base; the base's origin is moved to the mean.
+    R_C : (N, 3, 3) array
+        Target in the camera.
+    u : (N, 3) array
+        R_C' t_C, minus the camera's position in the target's frame, whose origin is moved to the mean.
+    """
+
+    R_G: Array
+    t_G: Array
+    R_C: Array
+    u: Array
+
+    @property
+    def t_C(self) -> Array:
+        """Translations of the target in the camera, (N, 3)."""
+        t: Array = np.einsum("nab,nb->na", self.R_C, self.u)
+        return t
+
+
+def stations_of(R_G: Array, t_G: Array, R_C: Array, t_C: Array) -> Stations:
+    """Stations about the mean origins, which no motion depends on and rounding does."""
+    u = np.einsum("nba,nb->na", R_C, t_C)
+    return Stations(R_G, t_G - t_G.mean(axis=0), R_C, u - u.mean(axis=0))
+
+
+def all_earlier(features: Array) -> Array:
+    """Sums over all earlier stations."""
+    sums = np.zeros_like(features)
+    np.cumsum(features[:-1], axis=0, out=sums[1:])
+    return sums
+
+
+def quaternions(R: Array) -> Array:
+    """Unit quaternions (N, 4), xyzw, of rotations (N, 3, 3), from each one's largest component (Shepperd 1978)."""
+    trace = R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2]
+    P = np.empty((len(R), 4, 4))  # 4 q q', with I added to its scaling
+    for a in range(3):
+        P[:, a, a] = 1.0 - trace + 2.0 * R[:, a, a]
+        b, c = (a + 1) % 3, (a + 2) % 3
+        P[:, b, c] = P[:, c, b] = R[:, b, c] + R[:, c, b]
+        P[:, a, 3] = P[:, 3, a] = R[:, c, b] - R[:, b, c]
+    P[:, 3, 3] = 1.0 + trace
+    largest = np.einsum("naa->na", P).argmax(axis=1)
+    q = P[np.arange(len(R)), largest]
+    unit: Array = q / np.linalg.norm(q, axis=1)[:, None]
+    return unit
+
+
+def left_matrices(q: Array) -> Array:
+    """L(q) with L(q) p = q (x) p, (N, 4, 4), quaternions xyzw (DQ paper, before eq. 6)."""
+    x, y, z, w = q.T
+    return np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]]).transpose(2, 0, 1)
+
+
+CONJUGATION = np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class PairBlock:
+    """Rotations of a block of pairs, as quaternions with scalar parts that are not negative.
+
+    Parameters
+    ----------
+    first, last : int
+        The later stations are first, ..., last - 1.
+    a, b : (4, J, I) arrays
+        Quaternions (xyzw) of A and of B between the later stations (J) and all stations before ``last`` (I).
+    signs : two (J, I) arrays
+        What A's and B's quaternions were multiplied by.
+    weight : (J, I) array
+        1 for pairs of a station and an earlier one, else 0.
+    """
+
+    first: int
+    last: int
+    a: Array
+    b: Array
+    signs: tuple[Array, Array]
+    weight: Array
+
+
+def pair_blocks(stations: Stations) -> Iterator[PairBlock]:
+    """All pairs, block by block; q_A = q_G,j* (x) q_G,i and q_B = q_C,j (x) q_C,i*, each block by one GEMM."""
+    q_G, q_C = quaternions(stations.R_G), quaternions(stations.R_C)
+    left_G, left_C = left_matrices(q_G * CONJUGATION), left_matrices(q_C)
+    right_G, right_C = q_G.T, (q_C * CONJUGATION).T
+    for first, last in blocks_of(len(q_G)):
+        a = products(left_G[first:last], right_G[:, :last])
+        b = products(left_C[first:last], right_C[:, :last])
+        signs = (np.copysign(1.0, a[3]), np.copysign(1.0, b[3]))
+        weight = (np.arange(last) < np.arange(first, last)[:, None]).astype(float)
+        yield PairBlock(first, last, a * signs[0], b * signs[1], signs, weight)
+
+
+def blocks_of(count: int) -> Iterator[tuple[int, int]]:
+    """Ranges of later stations with at most about BLOCK_PAIRS pairs each."""
+    step = max(1, BLOCK_PAIRS // count)
+    for first in range(0, count, step):
+        yield first, min(first + step, count)
+
+
+def products(left: Array, right: Array) -> Array:
+    """left_j right_i of matrices (J, 4, 4) and columns (4, I): (4, J, I)."""
+    stacked = np.ascontiguousarray(left.transpose(1, 0, 2)).reshape(-1, left.shape[2])
+    product: Array = stacked @ right
+    return product.reshape(4, len(left), -1)
