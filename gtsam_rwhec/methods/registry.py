@@ -7,7 +7,17 @@ import time
 import gtsam
 
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.methods import certified, dornaika1998, li2010, lom, shah2013, strobl2006, wang2022, zhuang1994
+from gtsam_rwhec.methods import (
+    certified,
+    dornaika1998,
+    horn2023,
+    li2010,
+    lom,
+    shah2013,
+    strobl2006,
+    wang2022,
+    zhuang1994,
+)
 from gtsam_rwhec.methods.evaluation import evaluate
 from gtsam_rwhec.methods.protocol import Calibration, Estimate, Method, MethodOptions
 from gtsam_rwhec.poses import PoseLike, one_transform
@@ -26,6 +36,7 @@ METHODS: dict[str, Method] = {
         dornaika1998.NONLINEAR,
         lom.METHOD,
         strobl2006.METHOD,
+        horn2023.METHOD,
         certified.METHOD,
     )
 }

@@ -1,0 +1,266 @@
+"""Horn, Wodtko, Buchholz and Dietmayer 2023: unit dual quaternions, a quadratic problem with its own relaxation.
+
+With poses as dual quaternions, p + eps p', p' = t p / 2, the residual a x - y b is linear in x and y, and the cost a
+quadratic form z'Qz over z = [p_X, p_X', ..., p_Y, p_Y', ...]. Each frame has two constraints, |p| = 1 and <p, p'> = 0.
+
+**Signs.** Each measured rotation has two unit quaternions. The sign of a x - y b as a whole means nothing, that of b
+against a does: a measurement whose sign is wrong asks for the opposite of x and y, and there are 2^N problems of N
+measurements, of which one is meant. ``Signs`` are the ways to choose; what is wrong with them is counted in the answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.methods.absolute import Stack, poses_by_name
+from gtsam_rwhec.methods.dual_quaternion_relaxation import Relaxed, multipliers_of, polished, relaxed
+from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
+from gtsam_rwhec.methods.quaternions import left, of_rotations, paired_quaternions, right, to_rotation
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.problem import Problem
+
+#: How the quaternions of A and B get their signs.
+#:
+#: "aligned": those that the answer satisfies, from a rotation estimate without signs and then from the answer itself.
+#: "continuous": of A and of B apart, each nearer to the one before it than its opposite: right for smooth paths.
+#: "scalar": no scalar part is negative, as many conversions from matrices have it.
+#: "random": by the seed.
+Signs = Literal["aligned", "continuous", "scalar", "random"]
+#: Rounds of choosing signs by the answer.
+ROUNDS = 10
+#: A quarter of a squared metre is what the dual part makes of a unit translation; beside it a rotation of an angle
+#: counts a quarter of its square.
+DUAL_WEIGHT = 1.0
+
+
+@dataclass(frozen=True)
+class DualQuaternionAnswer:
+    """Of one choice of signs.
+
+    Attributes
+    ----------
+    R, t : (n, 3, 3) and (n, 3) arrays
+        All targets' frames, then all sensors'; metres.
+    cost, lower_bound : float
+        z'Qz, and what no z goes below with these signs, by the relaxation's multipliers. The cost is of these signs'
+        problem: it says nothing of the others'.
+    signs : (N,) array
+        Of each measurement's <p_a, p_b> times that of the quaternions with which ``quaternions.of_rotations`` answers:
+        two choices of signs can be compared by it, whatever the signs of a and b apart.
+    contradicted : int
+        Measurements whose sign the answer itself contradicts, the one that fits the frame as a whole being free.
+    smallest_margin : float
+        The least |<p_a p_x, p_y p_b>|, the cosine of half the residual's angle: near zero a sign cannot be told.
+    rounds : int
+        Relaxations solved.
+    """
+
+    R: Array
+    t: Array
+    cost: float
+    lower_bound: float
+    signs: Array
+    contradicted: int
+    smallest_margin: float
+    rounds: int
+
+    @property
+    def gap(self) -> float:
+        """Between cost and bound, relative to the cost."""
+        return (self.cost - self.lower_bound) / max(self.cost, 1e-300)
+
+
+def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned") -> Calibration:
+    """Several Xs or several Ys, known scale."""
+    stack = Stack.of(problem)
+    found = solve_dual_quaternions(stack, signs, options.seed)
+    n_X = len(stack.targets)
+    notes = [f"relative gap to the bound of its own relaxation: {found.gap:.1e}"]
+    if found.contradicted:
+        notes.append(
+            f"{found.contradicted} of {len(stack.A)} signs (signs={signs!r}) contradict the answer: another choice of "
+            "signs has a better one"
+        )
+    if found.smallest_margin < np.cos(0.5 * np.radians(150.0)):
+        notes.append("a measurement is off by more than 150 degrees: its sign cannot be told")
+    return Calibration(
+        poses_by_name(stack.targets, found.R[:n_X], found.t[:n_X]),
+        poses_by_name(stack.sensors, found.R[n_X:], found.t[n_X:]),
+        notes=tuple(notes),
+    )
+
+
+def solve_dual_quaternions(
+    stack: Stack, signs: Signs = "aligned", seed: int = 0, dual_weight: float = DUAL_WEIGHT
+) -> DualQuaternionAnswer:
+    """The global optimum of Horn's cost for a choice of signs.
+
+    Parameters
+    ----------
+    stack : Stack
+    signs : "aligned", "continuous", "scalar" or "random"
+    seed : int
+        Of "random".
+    dual_weight : float
+        Of the dual part's square against the primal part's.
+
+    Raises
+    ------
+    OptionError
+        For another choice of signs.
+    UnderdeterminedError
+        When the rotations are not determined (by "aligned", which looks at them first).
+    """
+    q_A, q_B = signed_quaternions(stack, signs, seed)
+    form = _Form.of(stack, q_A, q_B, dual_weight)
+    sign = np.ones(len(q_B))
+    rounds = 0
+    while True:
+        rounds += 1
+        Q = form.matrix(sign)
+        found = relaxed(Q, form.frames)
+        q, t, cost = polished(Q, found.q, found.t)
+        products = _products(stack, q_A, q_B, q)
+        # Each pair's sign as a whole is the frames' own.
+        whole = np.sign(stack.sums(sign * products))[np.repeat(np.arange(len(stack.pairs)), stack.counts)]
+        contradicted = int(np.count_nonzero(whole * sign * products < 0.0))
+        if signs != "aligned" or contradicted == 0 or rounds == ROUNDS:
+            break
+        sign = np.where(whole * products < 0.0, -1.0, 1.0)
+    return DualQuaternionAnswer(
+        np.array([to_rotation(one) for one in q]),
+        t,
+        max(cost, 0.0),
+        _bound(Q, q, t, cost, found),
+        sign * _reference_signs(q_A, q_B, stack),
+        contradicted,
+        float(np.abs(products).min()),
+        rounds,
+    )
+
+
+def signed_quaternions(stack: Stack, signs: Signs, seed: int) -> tuple[Array, Array]:
+    """q_A and q_B (N, 4), scalar first, with a choice of signs.
+
+    Raises
+    ------
+    OptionError
+    """
+    if signs == "aligned":
+        return paired_quaternions(stack)
+    q_A, q_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])
+    if signs == "scalar":
+        return _with(np.where(q_A[:, 0] < 0.0, -1.0, 1.0), q_A), _with(np.where(q_B[:, 0] < 0.0, -1.0, 1.0), q_B)
+    if signs == "continuous":
+        return _with(_continuous(q_A, stack.first), q_A), _with(_continuous(q_B, stack.first), q_B)
+    if signs == "random":
+        generator = np.random.default_rng(seed)
+        return q_A, _with(generator.choice([-1.0, 1.0], len(q_B)), q_B)
+    raise OptionError(f"signs={signs!r} is not one of 'aligned', 'continuous', 'scalar', 'random'")
+
+
+def _with(sign: Array, q: Array) -> Array:
+    return sign[:, None] * q
+
+
+def _continuous(q: Array, first: np.ndarray) -> Array:
+    """Signs (N,) with which each quaternion is nearest to the one before, pair by pair."""
+    steps = np.ones(len(q))
+    steps[1:] = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
+    steps[first[:-1]] = 1.0
+    running: Array = np.cumprod(steps)
+    starts = running[first[:-1]]
+    result: Array = running * np.repeat(starts, np.diff(first))
+    return result
+
+
+def _products(stack: Stack, q_A: Array, q_B: Array, q: Array) -> Array:
+    """<p_a p_x, p_y p_b> (N,): the cosine of half the residual's angle, with the sign."""
+    of_X, of_Y = q[stack.target], q[len(stack.targets) + stack.sensor]
+    product: Array = np.einsum("nij,nj,nik,nk->n", left(q_A), of_X, left(of_Y), q_B)
+    return product
+
+
+def _reference_signs(q_A: Array, q_B: Array, stack: Stack) -> Array:
+    """Of the quaternions' signs together, against those of the plain conversion from matrices."""
+    plain_A, plain_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])
+    result: Array = np.sign(np.einsum("ni,ni->n", plain_A, q_A) * np.einsum("ni,ni->n", plain_B, q_B))
+    return result
+
+
+@dataclass(frozen=True)
+class _Form:
+    """Each pair's 16 x 16 matrix of |a x - y b|^2; only its off-diagonal block knows signs, so rows are kept for it."""
+
+    frames: int
+    own_X: Array
+    own_Y: Array
+    rows_X: Array
+    rows_Y: Array
+    stack: Stack
+
+    @staticmethod
+    def of(stack: Stack, q_A: Array, q_B: Array, dual_weight: float) -> _Form:
+        weight = np.repeat([1.0, np.sqrt(dual_weight)], 4)[:, None]
+        rows_X = weight * _multiplication(q_A, stack.A[:, :3, 3], left)
+        rows_Y = weight * _multiplication(q_B, stack.B[:, :3, 3], right)
+        edges = [slice(8 * i, 8 * j) for i, j in zip(stack.first[:-1], stack.first[1:], strict=True)]
+        flat_X, flat_Y = rows_X.reshape(-1, 8), rows_Y.reshape(-1, 8)
+        own_X = np.array([flat_X[edge].T @ flat_X[edge] for edge in edges])
+        own_Y = np.array([flat_Y[edge].T @ flat_Y[edge] for edge in edges])
+        return _Form(len(stack.targets) + len(stack.sensors), own_X, own_Y, flat_X, flat_Y, stack)
+
+    def matrix(self, sign: Array) -> Array:
+        """Q (8 n, 8 n) with a sign (N,) for each b."""
+        n_X = len(self.stack.targets)
+        Q = np.zeros((self.frames, 8, self.frames, 8))
+        signed = np.repeat(sign, 8)[:, None] * self.rows_Y
+        for e, (j, k) in enumerate(self.stack.pairs):
+            rows = slice(8 * self.stack.first[e], 8 * self.stack.first[e + 1])
+            cross = self.rows_X[rows].T @ signed[rows]
+            Q[j, :, j] += self.own_X[e]
+            Q[n_X + k, :, n_X + k] += self.own_Y[e]
+            Q[j, :, n_X + k] -= cross
+            Q[n_X + k, :, j] -= cross.T
+        return Q.reshape(8 * self.frames, 8 * self.frames)
+
+
+def _multiplication(q: Array, t: Array, side: Callable[[Array], Array]) -> Array:
+    """(N, 8, 8): dual quaternion multiplication by q + eps t q / 2, from the left or from the right."""
+    of_translation = np.concatenate([np.zeros((len(t), 1)), t], axis=1)
+    dual = 0.5 * np.einsum("nij,nj->ni", left(of_translation), q)
+    result = np.zeros((len(q), 8, 8))
+    result[:, :4, :4] = result[:, 4:, 4:] = side(q)
+    result[:, 4:, :4] = side(dual)
+    return result
+
+
+def _bound(Q: Array, q: Array, t: Array, cost: float, found: Relaxed) -> float:
+    """By the multipliers at the polished answer; where those do not prove it, the solver's, true to its tolerance."""
+    value, smallest = multipliers_of(Q, q, t)
+    if smallest >= -1e-13 * len(Q) * float(np.abs(Q).max()):
+        return min(value, cost)
+    return min(found.lower_bound, cost)
+
+
+METHOD = Method(
+    name="horn2023",
+    properties=Properties(
+        joint=True,
+        probabilistic=False,
+        certifiable=True,
+        multiple="Xs or Ys",
+        monocular=False,
+        representation="dual quaternions",
+    ),
+    source="M. Horn, T. Wodtko, M. Buchholz and K. Dietmayer, Extrinsic infrastructure calibration using the hand-eye "
+    "robot-world formulation, IEEE Intelligent Vehicles Symposium 2023",
+    assumes="Errors alike in all measurements, a radian as bad as a metre; a cost that changes with the origins of the "
+    "carriers' frames; signs of the quaternions that fit together, which large rotation errors make uncertain.",
+    function=horn2023,
+)
