@@ -1,0 +1,98 @@
+"""The motions of AX = XB: C_i X = X H_i, checked, and what the DQ paper's equations need of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gtsam_rwhec.errors import CountError, UnderdeterminedError
+from gtsam_rwhec.handeye.cost import BLOCK
+from gtsam_rwhec.handeye.dual_quaternions import from_rows
+from gtsam_rwhec.handeye.signs import UNCERTAIN, resolve_signs
+from gtsam_rwhec.poses import Array, PosesLike, QuaternionOrder, as_transforms, checked_rows
+
+#: Motions all smaller than this (rad, m) are none.
+STILL = 1e-14
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Motions of two rigidly joined frames, C_i X = X H_i (eq. 3).
+
+    Attributes
+    ----------
+    C, H : (N, 4, 4) arrays
+        C_i = T_cbefore_cafter, H_i = T_hbefore_hafter of the same move, metres; X = T_c_h.
+    rows : (14, N) array
+        With v, w the vector and scalar part: v_C + v_H (3), v_C - v_H (3), w_C - w_H, then the same of the dual
+        parts. They are all that A_i and B_i (below eq. 6) depend on. The signs of q_C and q_H agree (``signs``).
+    """
+
+    C: Array
+    H: Array
+    rows: Array = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.C)
+
+
+def motions_of(C: PosesLike, H: PosesLike, order: QuaternionOrder | None = None) -> Motions:
+    """Check motions.
+
+    Parameters
+    ----------
+    C, H : (N, 4, 4) arrays, sequences of N gtsam.Pose3, or (N, 7) arrays
+        Relative poses T_before_after of the two frames, metres.
+    order : "wxyz" or "xyzw", optional
+        Of the quaternions in rows of 7 (quaternion, translation).
+
+    Raises
+    ------
+    PoseError
+        For what is no pose, with the argument and the motion named.
+    CountError
+        Unequal numbers, or fewer than two motions.
+    UnderdeterminedError
+        Every motion is the identity.
+    """
+    C, H = as_transforms(C, order, "C"), as_transforms(H, order, "H")
+    count = len(C)
+    if count != len(H):
+        raise CountError(
+            f"C has {count} motions and H has {len(H)}; C_i X = X H_i pairs them one to one: give as many of both"
+        )
+    if count < 2:
+        raise CountError(
+            f"{count} motion{'s' * (count != 1)} given; AX = XB needs two or more, about axes that are not parallel"
+        )
+    rows = np.empty((14, count))
+    sums = np.empty((2, count))
+    for first in range(0, count, BLOCK):
+        block = slice(first, first + BLOCK)
+        _fill(C[block], H[block], first, rows[:, block], sums[:, block])
+    if np.abs(rows[:7]).max() <= STILL:
+        rows[:7] = 0.0  # rounding of a rotation that there is not would pass for one
+    if np.abs(rows).max() <= STILL:
+        raise UnderdeterminedError(
+            f"all {count} motions are the identity, in C and in H; nothing moved, so nothing can be told: "
+            "give relative poses between times at which the frames stood differently"
+        )
+    uncertain = sums[0] < UNCERTAIN
+    if uncertain.any():
+        resolve_signs(rows, sums, uncertain)
+    return Motions(C, H, rows)
+
+
+def _fill(C: Array, H: Array, first: int, rows: Array, sums: Array) -> None:
+    b = len(C)
+    checked = np.empty((12, 2 * b))
+    checked_rows(C, first, "C", checked[:, :b])
+    checked_rows(H, first, "H", checked[:, b:])
+    q, q_dual = from_rows(checked)
+    for part, top in ((q, 0), (q_dual, 7)):
+        of_C, of_H = part[:, :b], part[:, b:]
+        np.add(of_C[:3], of_H[:3], out=rows[top : top + 3])
+        np.subtract(of_C, of_H, out=rows[top + 3 : top + 7])
+    np.add(q[3, :b], q[3, b:], out=sums[0])
+    np.add(q_dual[3, :b], q_dual[3, b:], out=sums[1])

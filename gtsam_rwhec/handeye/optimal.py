@@ -1,0 +1,68 @@
+"""DQOpt (Section 3.2.1, Algorithm 1): the exact minimum of the DQ paper's cost, with its proof."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.handeye.cost import DualQuaternionCost
+from gtsam_rwhec.handeye.degenerate import free_directions
+from gtsam_rwhec.handeye.dual_quaternions import to_transform
+from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.handeye.saddle import SINGULAR, Minimum, is_singular, minimum
+
+#: Rounding that a Cholesky factorisation in double of an 8 x 8 matrix can hide, of unit diagonal (Higham 2002,
+#: Theorem 10.7: 8 gamma_9 = 8e-15), and that of forming its entries.
+CHOLESKY = 1e-14
+
+
+def dqopt(request: Request) -> Answer:
+    """DQOpt: the least of all costs (8), and lambda* as the proof."""
+    cost = request.cost
+    found = minimum(cost)
+    noise = 0.0 if request.prior is None else request.prior.b
+    return Answer(
+        X=to_transform(found.q, found.q_dual),
+        lower_bound=proven_bound(cost, found),
+        free_directions=free_directions(cost, found.q, found.values, found.vectors, noise),
+    )
+
+
+def proven_bound(cost: DualQuaternionCost, found: Minimum, floor: float = 0.0) -> float:
+    """The largest proven lower bound of the cost over all poses, a little below lambda*.
+
+    Where [[S - lambda, W - mu], [W' - mu, M]] is positive semidefinite, lambda is a lower bound (eq. 9: the
+    Lagrangian is that form plus lambda), and a Cholesky factorisation that succeeds with the rounding it can hide
+    taken off the diagonal proves it. S, M and W are taken as they are in double precision.
+
+    Parameters
+    ----------
+    cost : DualQuaternionCost
+    found : Minimum
+        Any mu proves something; the best of all proves most.
+    floor : float
+        A bound known beforehand: a sum of squares is not negative.
+    """
+    W, M = cost.W - found.mu * np.eye(4), cost.M
+    if is_singular(cost):  # the null space of M couples to nothing but mu, which is 0 (``Z_pseudo``)
+        values, vectors = cost.spectrum
+        used = values > SINGULAR * max(float(values[3]), 0.0)
+        W, M = cost.W @ vectors[:, used], np.diag(values[used])
+    n = 4 + len(M)
+    K = np.empty((n, n))
+    K[:4, :4], K[:4, 4:], K[4:, :4], K[4:, 4:] = cost.S, W, W.T, M
+    diagonal = K.diagonal().copy()
+    value = cost.value(found.q, found.q_dual)
+    step = 1.1 * CHOLESKY * float(diagonal[:4] @ (found.q * found.q) + cost.M.diagonal() @ (found.q_dual**2))
+    lower = value - step
+    while lower > floor:
+        shifted = diagonal.copy()
+        shifted[:4] -= lower
+        np.fill_diagonal(K, shifted * (1.0 - CHOLESKY))
+        try:
+            np.linalg.cholesky(K)
+        except np.linalg.LinAlgError:
+            step *= 4.0
+            lower = value - step
+            continue
+        return lower
+    return floor

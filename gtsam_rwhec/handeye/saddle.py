@@ -1,0 +1,151 @@
+"""The minimum of the DQ paper's cost as the saddle of its two multipliers (Sections 3.1.2 and 3.2.1).
+
+lambda_0(mu), the smallest eigenvalue of Z(mu) (eq. 12), is concave, and for *every* mu a lower bound of the cost over
+all poses (it is the Lagrangian's minimum). At its maximum q . q' = 0: the bound is attained. The search is Newton's,
+from mu = 0, with the derivatives of lambda_0 that one eigendecomposition gives; its first step is eq. 34.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.handeye.cost import DualQuaternionCost
+from gtsam_rwhec.handeye.dual_quaternions import times_vectors
+from gtsam_rwhec.poses import Array
+
+#: M's eigenvalues below this times its largest are rounding: M is singular.
+SINGULAR = 1e-14
+#: The search ends when what is left to gain is this part of lambda_0: far below its rounding.
+GAIN = 1e-17
+STEPS = 200
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Where the Lagrangian's two multipliers have their saddle, and the pose there.
+
+    Attributes
+    ----------
+    q, q_dual : (4,) arrays
+        The answer; |q| = 1, q . q_dual = 0.
+    mu : float
+        The multiplier of q . q' = 0.
+    value : float
+        lambda_0(mu): the cost, up to rounding.
+    values, vectors : (4,), (4, 4) arrays
+        Eigenvalues, ascending, and eigenvectors of Z(mu).
+    """
+
+    q: Array
+    q_dual: Array
+    mu: float
+    value: float
+    values: Array
+    vectors: Array
+
+
+def is_singular(cost: DualQuaternionCost) -> bool:
+    """Whether M has eigenvalues that are rounding only (no noise, no rotation, or parallel axes)."""
+    values, _ = cost.spectrum
+    return not float(values[0]) > SINGULAR * float(values[3])
+
+
+def minimum(cost: DualQuaternionCost) -> Minimum:
+    """Minimise the cost over all unit dual quaternions.
+
+    With M singular the constraint costs nothing to meet, along M's null space, and the minimum is that of the
+    relaxation: mu = 0 (``Z_pseudo``).
+    """
+    if is_singular(cost):
+        values, vectors = np.linalg.eigh(Z_pseudo(cost))
+        q, mu = vectors[:, 0], 0.0
+    else:
+        mu, values, vectors, q = search(cost.Z0, cost.Z1, cost.Z2)
+    return Minimum(q, best_dual(cost, q), mu, float(values[0]), values, vectors)
+
+
+def Z_pseudo(cost: DualQuaternionCost) -> Array:
+    """S - W M^+ W' (4, 4): Z0 (eq. 13) with M's null space left out.
+
+    A vector n with A n = 0 has W n = 0 too, so that q' + c n costs what q' does, and c meets q . q' = 0 unless
+    q . n = 0.
+    """
+    values, vectors = cost.spectrum
+    used = values > SINGULAR * max(float(values[3]), 0.0)
+    half = cost.W @ (vectors[:, used] / np.sqrt(values[used]))
+    result: Array = cost.S - half @ half.T
+    return result
+
+
+def search(Z0: Array, Z1: Array, Z2: Array) -> tuple[float, Array, Array, Array]:
+    """Maximise lambda_0(mu) over mu.
+
+    Returns
+    -------
+    mu : float
+    values, vectors : (4,), (4, 4) arrays
+        Of Z(mu).
+    q : (4,) array
+        The eigenvector of the smallest eigenvalue; where two are equal, that of them with q . q' = 0.
+    """
+    mu, low, high = 0.0, -math.inf, math.inf
+    for step in range(STEPS):
+        values, vectors = np.linalg.eigh(Z0 + mu * (Z1 - mu * Z2))
+        q = vectors[:, 0]
+        derivative = Z1 - 2.0 * mu * Z2
+        g0, g1, g2, g3 = (q @ derivative @ vectors).tolist()  # g0 = d lambda_0 / d mu = -2 f_0 (eq. 18)
+        l0, l1, l2, l3 = values.tolist()
+        rounding = 4e-16 * max(abs(l0), abs(l3))
+        if l1 - l0 <= rounding:  # two curves meet
+            break
+        second = float(q @ Z2 @ q) + g1 * g1 / (l1 - l0) + g2 * g2 / (l2 - l0) + g3 * g3 / (l3 - l0)
+        change = 0.5 * g0 / second
+        # What a Newton step has yet to gain.
+        if abs(g0 * change) <= GAIN * abs(l0) + 1e-32 * l3:
+            return mu, values, vectors, q
+        low, high = (mu, high) if g0 > 0.0 else (low, mu)
+        target = mu + change
+        if not low < target < high or step % 4 == 3:
+            if low == -math.inf or high == math.inf:
+                least, most = bracket(Z1, Z2)
+                low, high = max(low, least), min(high, most)
+            if not low < target < high or step > 8:
+                target = 0.5 * (low + high)
+        if target in (low, high, mu):
+            break
+        mu = target
+    # lambda_0 has a kink where it is largest: two eigenvalues meet (no noise of some kind), and q is that vector of
+    # their plane with q . q' = 0 (it exists: f_0 changes its sign there).
+    plane = vectors[:, :2]
+    F = plane.T @ (mu * Z2 - 0.5 * Z1) @ plane
+    (f0, f1), turn = np.linalg.eigh(F)
+    if f0 < 0.0 < f1:
+        q = plane @ (turn @ np.sqrt(np.array([f1, -f0]) / (f1 - f0)))
+    return mu, values, vectors, q
+
+
+def bracket(Z1: Array, Z2: Array) -> tuple[float, float]:
+    """Bounds of mu* (Appendix C): eq. 14 is the Rayleigh quotient of K = L^-T Z1 L^-1 / 2 with Z2 = L'L."""
+    lower = np.linalg.cholesky(Z2)  # Z2 = lower lower', so L = lower'
+    inverse = np.linalg.inv(lower)
+    least, *_, most = np.linalg.eigvalsh(0.5 * inverse @ Z1 @ inverse.T)
+    margin = 1e-9 * (abs(least) + abs(most))
+    return float(least - margin), float(most + margin)
+
+
+def best_dual(cost: DualQuaternionCost, q: Array) -> Array:
+    """The best q' for a given q, orthogonal to it: eq. 20, without M^-1.
+
+    q' = (t / 2, 0) (x) q, and the cost is quadratic in t: three equations, regular with an M that is not. Directions
+    of t that nothing depends on get the smallest |t|.
+    """
+    V = times_vectors(q)  # q' = V t / 2
+    G, g = V.T @ cost.M @ V, V.T @ (cost.W.T @ q)
+    values, vectors = np.linalg.eigh(G)
+    if not values[0] > SINGULAR * values[2]:
+        values = np.where(values > max(SINGULAR * values[2], 1e-300), values, np.inf)
+    half: Array = V @ (vectors @ ((vectors.T @ g) / -values))
+    return half

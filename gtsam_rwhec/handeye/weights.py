@@ -1,0 +1,84 @@
+"""Checks of what weighs the motions: alpha, one weight for each, or covariances of the residuals."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gtsam_rwhec.errors import CountError, NoiseError, OptionError
+from gtsam_rwhec.poses import Array
+
+
+def check_alpha(alpha: float) -> float:
+    """Alpha as a float.
+
+    Raises
+    ------
+    OptionError
+        When it is not a positive, finite number.
+    """
+    try:
+        number = float(alpha)
+    except (TypeError, ValueError):
+        number = float("nan")
+    if not 0.0 < number < float("inf"):
+        raise OptionError(
+            f"alpha={alpha!r} is not a positive, finite number; it weighs translation residuals (1/m) against rotation "
+            "residuals, about sigma_rotation / sigma_translation; 'estimate' finds it from the residuals"
+        )
+    return number
+
+
+def check_weights(weights: ArrayLike | None, count: int) -> Array | None:
+    """Weights as an array (N,), or None.
+
+    Raises
+    ------
+    CountError, NoiseError
+        Not one for each motion; negative or not finite, or all zero.
+    """
+    if weights is None:
+        return None
+    array = np.asarray(weights, dtype=np.float64)
+    if array.shape != (count,):
+        raise CountError(f"weights have shape {array.shape}; give one number for each of the {count} motions")
+    bad = np.flatnonzero(~(np.isfinite(array) & (array >= 0.0)))
+    if bad.size:
+        raise NoiseError(
+            f"weight {bad[0]} is {array[bad[0]]}; weights are finite and not negative (0 leaves a motion out)"
+        )
+    if np.count_nonzero(array) < 2:
+        raise NoiseError(f"{np.count_nonzero(array)} of {count} weights are not zero; AX = XB needs two motions")
+    return array
+
+
+def check_covariances(covariances: ArrayLike | None, count: int) -> Array | None:
+    """Covariances of the residuals (A q, B q + A q'), (N, 8, 8) or (8, 8) for all; returns (N or 1, 8, 8) or None.
+
+    Raises
+    ------
+    CountError, NoiseError
+        A wrong shape; not symmetric, or not positive definite.
+    """
+    if covariances is None:
+        return None
+    array = np.asarray(covariances, dtype=np.float64)
+    if array.shape == (8, 8):
+        array = array[None]
+    if array.shape[1:] != (8, 8) or len(array) not in (1, count):
+        raise CountError(
+            f"covariances have shape {array.shape}; give (8, 8), or ({count}, 8, 8): one for each motion, of the "
+            "residual (A q, B q + A q')"
+        )
+    asymmetry = np.abs(array - array.transpose(0, 2, 1)).max(axis=(1, 2))
+    bad = np.flatnonzero(~(asymmetry <= 1e-9 * np.abs(array).max(axis=(1, 2))))
+    if bad.size:
+        raise NoiseError(f"covariance {bad[0]} is not finite and symmetric (off by {asymmetry[bad[0]]:.3g})")
+    smallest = np.linalg.eigvalsh(array)[:, 0]
+    bad = np.flatnonzero(smallest <= 0.0)
+    if bad.size:
+        raise NoiseError(
+            f"covariance {bad[0]} is not positive definite (smallest eigenvalue {smallest[bad[0]]:.3g}); add what the "
+            "least certain direction is really uncertain by"
+        )
+    return array
