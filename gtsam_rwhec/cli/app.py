@@ -16,6 +16,7 @@ import typer
 
 from gtsam_rwhec import __version__
 from gtsam_rwhec.calibration import solve
+from gtsam_rwhec.cli.compare_command import add_compare_command
 from gtsam_rwhec.cli.demo_data import LOG, RIG, demo_folder
 from gtsam_rwhec.cli.exit_status import HELP, ExitStatus, exit_status
 from gtsam_rwhec.cli.failures import failures_in_words
@@ -40,6 +41,7 @@ app = typer.Typer(
 fetch_app = typer.Typer(help="Download public measurements.", no_args_is_help=True)
 app.add_typer(fetch_app, name="fetch")
 add_log_commands(app)
+add_compare_command(app)
 
 
 class Scale(StrEnum):

@@ -9,14 +9,24 @@ from gtsam_rwhec.certify.options import SolveOptions
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, WeightsWarning
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.solution import Solution
 
 
 def certified(problem: Problem, options: MethodOptions) -> Calibration:
     """``gtsam_rwhec.solve``; what it would warn of is in the notes."""
+    return calibration_of(quiet_solution(problem, options))
+
+
+def quiet_solution(problem: Problem, options: MethodOptions) -> Solution:
+    """``gtsam_rwhec.solve`` without its warnings: what they say is in the solution."""
     with warnings.catch_warnings():
         for category in (NotUniqueWarning, NotCertifiedWarning, WeightsWarning):
             warnings.simplefilter("ignore", category)
-        solution = solve(problem, options=SolveOptions(seed=options.seed))
+        return solve(problem, options=SolveOptions(seed=options.seed))
+
+
+def calibration_of(solution: Solution) -> Calibration:
+    """A solution as a method's answer."""
     notes = () if solution.certificate.is_certified else (str(solution.certificate),)
     return Calibration(solution.X, solution.Y, solution.scale, notes=notes)
 

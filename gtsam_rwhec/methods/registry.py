@@ -68,7 +68,7 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
     start = time.perf_counter()
     found = method.function(problem, options or MethodOptions())
     seconds = time.perf_counter() - start
-    return _estimate(method, problem, found, seconds)
+    return estimate_of(method, problem, found, seconds)
 
 
 def method_of(name: str) -> Method:
@@ -84,7 +84,8 @@ def method_of(name: str) -> Method:
         raise OptionError(f"method {name!r} is not one of {', '.join(METHODS)}") from None
 
 
-def _estimate(method: Method, problem: Problem, found: Calibration, seconds: float) -> Estimate:
+def estimate_of(method: Method, problem: Problem, found: Calibration, seconds: float) -> Estimate:
+    """A method's answer under the certified objective."""
     scale = found.scale if isinstance(found.scale, float) else dict(found.scale)
     cost, residuals = evaluate(problem, found.X, found.Y, scale)
     return Estimate(

@@ -1,0 +1,142 @@
+"""All methods that apply to one problem, side by side: cost, residuals, time, and the distance from the bound."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from gtsam_rwhec.certify.certificate import Certificate
+from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.methods import certified
+from gtsam_rwhec.methods.protocol import Estimate, Method, MethodOptions
+from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
+from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.residuals import Residual
+from gtsam_rwhec.solution import Solution
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One method's line: its estimate, or the reason why there is none."""
+
+    method: Method
+    estimate: Estimate | None
+    reason: str = ""
+
+    @property
+    def translation_rms_m(self) -> float:
+        """Root mean square over all measurements."""
+        return self._pooled([(r.number_of_measurements, r.translation_rms_m) for r in self._residuals])
+
+    @property
+    def rotation_rms_rad(self) -> float:
+        """Root mean square over all measurements."""
+        return self._pooled([(r.number_of_measurements, r.rotation_rms_rad) for r in self._residuals])
+
+    @property
+    def _residuals(self) -> Iterable[Residual]:
+        return () if self.estimate is None else self.estimate.residuals.values()
+
+    @staticmethod
+    def _pooled(values: list[tuple[int, float]]) -> float:
+        count = sum(number for number, _ in values)
+        return math.sqrt(sum(number * value**2 for number, value in values) / count) if count else math.nan
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All methods' lines, those that apply first, cheapest first.
+
+    Attributes
+    ----------
+    rows : tuple of Compared
+    solution : Solution or None
+        The certified one, whose certificate's bound holds for every answer; None when there is none.
+    no_solution : str
+        Why there is none.
+    """
+
+    rows: tuple[Compared, ...]
+    solution: Solution | None
+    no_solution: str = ""
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """What bounds every answer's cost from below."""
+        return None if self.solution is None else self.solution.certificate
+
+    def gap(self, row: Compared) -> float | None:
+        """By how much a method's answer costs more than any answer must; None without a bound, or an answer."""
+        if row.estimate is None or self.certificate is None or not math.isfinite(self.certificate.lower_bound):
+            return None
+        return max(0.0, row.estimate.cost - self.certificate.lower_bound)
+
+    def is_optimal(self, row: Compared) -> bool:
+        """Whether the answer is proven optimal under the certified objective."""
+        gap = self.gap(row)
+        return gap is not None and self.certificate is not None and gap <= self.certificate.tolerance
+
+
+def compare(
+    problem: Problem,
+    options: MethodOptions | None = None,
+    *,
+    methods: Iterable[str] | None = None,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Solve a problem by every method that applies.
+
+    Parameters
+    ----------
+    problem : Problem
+    options : MethodOptions, optional
+        The same for all.
+    methods : iterable of str, optional
+        Names; left out: all. The certified method is always solved, for its bound.
+    progress : callable, optional
+        Called with each method's name as it begins.
+
+    Raises
+    ------
+    CountError, FrameError, UnderdeterminedError
+        For a problem that nothing can solve.
+    OptionError
+        For a name that is none.
+    """
+    chosen = [method_of(name) for name in (METHODS if methods is None else methods)]
+    options = options or MethodOptions()
+    METHODS["certified"].check_problem(problem)
+    if progress is not None:
+        progress("certified")
+    start = time.perf_counter()
+    solution, no_solution = None, ""
+    try:
+        solution = certified.quiet_solution(problem, options)
+    except RwhecError as error:
+        no_solution = str(error)
+    seconds = time.perf_counter() - start
+    rows = []
+    for method in dict.fromkeys(chosen):
+        if method.name == "certified":
+            if solution is None:
+                rows.append(Compared(method, None, no_solution))
+            else:
+                found = certified.calibration_of(solution)
+                rows.append(Compared(method, estimate_of(method, problem, found, seconds)))
+            continue
+        reason = method.applies(problem)
+        if reason:
+            rows.append(Compared(method, None, reason))
+            continue
+        if progress is not None:
+            progress(method.name)
+        try:
+            rows.append(Compared(method, run(method.name, problem, options)))
+        except RwhecError as error:
+            rows.append(Compared(method, None, str(error)))
+    rows.sort(key=lambda row: math.inf if row.estimate is None else row.estimate.cost)
+    return Comparison(tuple(rows), solution, no_solution)

@@ -1,0 +1,88 @@
+"""A comparison of methods as JSON: one object, lengths in metres, angles in radians, times in seconds."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gtsam
+
+from gtsam_rwhec.atomic_write import write_atomically
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.methods.comparison import Compared, Comparison
+from gtsam_rwhec.result_file import pose_to_file
+from gtsam_rwhec.result_schema import CONVENTIONS
+
+FORMAT = "gtsam-rwhec comparison"
+FORMAT_VERSION = 1
+
+
+def comparison_fields(comparison: Comparison) -> dict[str, Any]:
+    """What the file holds: the bound on any answer, and each method with its answer or the reason why it has none."""
+    certificate = comparison.certificate
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "conventions": {name: CONVENTIONS[name] for name in ("pose", "model", "scale", "units")},
+        "objective": None if certificate is None else certificate.objective,
+        "certificate": None if certificate is None else str(certificate),
+        "no_certificate": comparison.no_solution or None,
+        "lower_bound": None if certificate is None else _finite(certificate.lower_bound),
+        "tolerance": None if certificate is None else certificate.tolerance,
+        "methods": [_row(comparison, row) for row in comparison.rows],
+    }
+
+
+def write_comparison(comparison: Comparison, path: str | Path) -> None:
+    """Write the JSON file.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written; the message says why.
+    """
+    content = json.dumps(comparison_fields(comparison), indent=2, allow_nan=False) + "\n"
+    try:
+        write_atomically(Path(path), content.encode("utf-8"))
+    except OSError as error:
+        raise FileFormatError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _row(comparison: Comparison, row: Compared) -> dict[str, Any]:
+    method, estimate = row.method, row.estimate
+    fields: dict[str, Any] = {
+        "method": method.name,
+        "source": method.source,
+        "assumes": method.assumes,
+        "properties": dataclasses.asdict(method.properties),
+        "reason": row.reason or None,
+    }
+    if estimate is None:
+        return fields | {"answer": None}
+    return fields | {
+        "answer": {
+            "cost": estimate.cost,
+            "gap": comparison.gap(row),
+            "is_optimal": comparison.is_optimal(row),
+            "translation_rms_m": _finite(row.translation_rms_m),
+            "rotation_rms_rad": _finite(row.rotation_rms_rad),
+            "seconds": estimate.seconds,
+            "starts_from": estimate.starts_from,
+            "notes": list(estimate.notes),
+            "scale": estimate.scale,
+            "targets": _poses("targetcarrier", estimate.X),
+            "sensors": _poses("sensorcarrier", estimate.Y),
+        }
+    }
+
+
+def _poses(parent: Any, poses: Mapping[str, gtsam.Pose3]) -> list[dict[str, Any]]:
+    return [pose_to_file(parent, name, pose).model_dump(mode="json") for name, pose in poses.items()]
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None
