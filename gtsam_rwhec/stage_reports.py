@@ -5,7 +5,7 @@ Kept in the logs that stages write, and in the result file.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Sequence
 from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -90,21 +90,47 @@ class LogFields(_Report):
     outliers: tuple[TrackCount, ...] = Field(description="what the robust estimation used, and left out")
     sizes: tuple[SizeFields, ...] = Field(description="what the measurements say of them, if they say anything")
     time_offsets: tuple[TimeOffsetFields, ...] = Field(description="of every sensor that was used")
+    contradicted: tuple[str, ...] = Field(
+        default=(), description="sensors and targets whose poses are not to be used: most of what saw them contradicts"
+    )
 
     @property
-    def contradicted(self) -> tuple[str, ...]:
-        """Sensors and targets of which more than half of the measurements were left out as outliers, in words.
-
-        Then it is as likely that the rest are the wrong ones: a clock, a size or a mounting that changed.
-        """
-        kept: Counter[str] = Counter()
-        left_out: Counter[str] = Counter()
-        for track in self.outliers:
-            for name in (track.target, track.sensor):
-                kept[name] += track.used
-                left_out[name] += sum(track.removed.values())
+    def contradictions(self) -> tuple[str, ...]:
+        """What is contradicted, in sentences."""
+        counts = _counted(self.outliers)
         return tuple(
-            f"{name}: {left_out[name]} of its {kept[name] + left_out[name]} measurements contradict the answer"
-            for name in kept
-            if left_out[name] > kept[name]
+            f"{name}: {counts[name][1]} of its {sum(counts[name])} measurements contradict the answer"
+            for name in self.contradicted
         )
+
+
+def contradicted(outliers: tuple[TrackCount, ...]) -> tuple[str, ...]:
+    """Sensors and targets of which more than half of the measurements were left out as outliers.
+
+    The one that explains most comes first. Then it is as likely that the rest are the wrong ones: a clock, a size or a mounting that changed. What a name
+    explains counts for no other: targets are not to blame for a camera that contradicts all of them.
+    """
+    names: list[str] = []
+    while True:
+        counts = _counted([t for t in outliers if t.target not in names and t.sensor not in names])
+        worst = max((name for name in counts if _is_mostly_out(counts[name])), key=lambda n: counts[n][1], default=None)
+        if worst is None:
+            break
+        names.append(worst)
+    # Seen by nothing else, and mostly left out: it rests on what is contradicted.
+    return tuple(names + [n for n, c in _counted(outliers).items() if n not in {*names, *counts} and _is_mostly_out(c)])
+
+
+def _counted(tracks: Sequence[TrackCount]) -> dict[str, tuple[int, int]]:
+    """How many measurements were used and left out, of each sensor and target."""
+    counts: dict[str, tuple[int, int]] = {}
+    for track in tracks:
+        for name in (track.target, track.sensor):
+            used, out = counts.get(name, (0, 0))
+            counts[name] = used + track.used, out + sum(track.removed.values())
+    return counts
+
+
+def _is_mostly_out(count: tuple[int, int]) -> bool:
+    used, out = count
+    return out > used

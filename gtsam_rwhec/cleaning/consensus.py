@@ -118,13 +118,13 @@ def consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: ConsensusOptio
         return Consensus(kept, share, X_best, Y_best, s_best)
     turned = Kept.of(
         radians > options.max_rotation_rad,
-        "off the pair's consensus (rad)",
+        "rotation off the pair's consensus (rad)",
         stamps_ns,
         radians,
         options.max_rotation_rad,
     )
     far = (metres > options.max_translation_m) & turned.mask
-    moved = Kept.of(far, "off the pair's consensus (m)", stamps_ns, metres, options.max_translation_m)
+    moved = Kept.of(far, "translation off the pair's consensus (m)", stamps_ns, metres, options.max_translation_m)
     removed = tuple(sorted(turned.removed + moved.removed, key=lambda item: item.index))
     return Consensus(Kept(turned.mask & moved.mask, removed), share, X_best, Y_best, s_best)
 

@@ -15,8 +15,9 @@ from gtsam_rwhec.atomic_write import write_atomically
 from gtsam_rwhec.cli.exit_status import HELP, ExitStatus, exit_status
 from gtsam_rwhec.cli.failures import failures_in_words
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.errors import FileFormatError, NotCertifiedWarning, NotUniqueWarning
+from gtsam_rwhec.errors import FileFormatError, LogError, NotCertifiedWarning, NotUniqueWarning
 from gtsam_rwhec.logs import convert_ros_bag, open_log, write_image_folder
+from gtsam_rwhec.logs.image_folder import is_image_folder
 from gtsam_rwhec.pipeline.clean import clean_log
 from gtsam_rwhec.pipeline.detect import detect_log
 from gtsam_rwhec.pipeline.draw import draw_log
@@ -84,6 +85,8 @@ def convert(
     """Make an MCAP log of a ROS bag, or of a folder of images with a file of poses."""
     with failures_in_words(), StageDisplay() as stage:
         stage(f"converting {source}")
+        if poses is None and is_image_folder(source):
+            raise LogError(f"{source} is a folder of images, which say nothing of where they were taken: give --poses")
         if poses is None:
             count = convert_ros_bag(source, output)
             said = f"{count} messages"
@@ -182,7 +185,7 @@ def _print(calibrated: Calibrated) -> None:
 
 def _status(calibrated: Calibrated) -> ExitStatus:
     status = exit_status(calibrated.refined.solution)
-    if status is ExitStatus.CERTIFIED and calibrated.log.contradicted:
+    if status is ExitStatus.CERTIFIED and calibrated.log.contradictions:
         return ExitStatus.CONTRADICTED
     if status is ExitStatus.CERTIFIED and calibrated.refined.free_directions:
         return ExitStatus.NOT_UNIQUE

@@ -41,10 +41,22 @@ def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
         A file cannot be written; the message says why.
     """
     # All texts first: what cannot be written leaves no half of it.
-    texts = {Path(folder) / name: text(frames) for name, text in FILES.items()}
+    texts = {Path(folder) / name: _warned(text(frames), frames.warnings, name) for name, text in FILES.items()}
     for path, text in texts.items():
         try:
             write_atomically(path, text.encode())
         except OSError as error:
             raise FileFormatError(f"{path} cannot be written: {error.strerror or error}.") from error
     return list(texts)
+
+
+def _warned(text: str, warnings: tuple[str, ...], name: str) -> str:
+    """Warnings as comments ahead of everything else."""
+    lines = [f"DO NOT USE: {warning}" for warning in warnings]
+    if not lines:
+        return text
+    if name.endswith(".xacro"):
+        declaration, rest = text.split("\n", 1)  # XML has it on its first line
+        comment = "\n".join(lines).replace("--", "- -")
+        return f"{declaration}\n<!--\n{comment}\n-->\n{rest}"
+    return "".join(f"# {line}\n" for line in lines) + text

@@ -42,6 +42,8 @@ class RigFrames:
         By sensor: its stamp t is the carriers' t + offset. Left out is 0.
     topics : dict of str to str
         Topics of images by sensor; a sensor may lack one.
+    warnings : tuple of str
+        Why the frames, or some of them, are not to be used; written into every file.
 
     Raises
     ------
@@ -60,6 +62,7 @@ class RigFrames:
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     time_offsets_s: Mapping[str, float] = field(default_factory=dict)
     topics: Mapping[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         names = [self.sensor_carrier, self.target_carrier, *self.sensors, *self.targets]

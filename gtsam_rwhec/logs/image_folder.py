@@ -28,6 +28,12 @@ FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
 NANOSECOND_DIGITS = 16
 
 
+def is_image_folder(path: str | Path) -> bool:
+    """Whether a folder has images, and nothing of a bag."""
+    names = [file.suffix.lower() for file in Path(path).glob("*")]
+    return any(suffix in FORMATS for suffix in names) and not {".db3", ".bag", ".mcap"} & set(names)
+
+
 def write_image_folder(
     images: str | Path,
     poses: str | Path,

@@ -23,4 +23,16 @@ def frames_of(solved: Solved) -> RigFrames:
             for name, sensor in rig.sensors.items()
             if sensor.images is not None and name in refined.Y
         },
+        warnings=_warnings(solved),
     )
+
+
+def _warnings(solved: Solved) -> tuple[str, ...]:
+    """What the exit status of solving says too."""
+    said = list(solved.log.contradictions)
+    certificate = solved.solution.certificate
+    if not certificate.is_certified:
+        said.append(f"not certified: {' '.join(certificate.reason.split())}")
+    if solved.refined.free_directions:
+        said.append(f"the motion does not determine {'; '.join(solved.refined.free_directions)}")
+    return tuple(said)

@@ -70,12 +70,13 @@ def calibrate_log(
             )
         is_cleaned = CLEANING in stages and (rig is None or not changes(read_embedded_rig(log), rig).cleaning)
         if not stages:
+            if rig is None:
+                raise LogError(f"{source}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
             check_not_onto(log, detected)
             check_not_onto(log, clean)
     out = made_folder(out)
     if not stages:
-        if rig is None:
-            raise LogError(f"{source}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
+        assert rig is not None
         detect_log(log_path, rig, detected, images=images, workers=workers, progress=progress)
         source = detected
     if not is_cleaned:

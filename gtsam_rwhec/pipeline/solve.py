@@ -32,6 +32,7 @@ from gtsam_rwhec.stage_reports import (
     SizeFields,
     TimeOffsetFields,
     TrackCount,
+    contradicted,
 )
 from gtsam_rwhec.vision.camera import Camera
 
@@ -151,6 +152,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
             for name in rig.sensors
             if name in offsets
         ),
+        contradicted=contradicted(outliers),
     )
     return Calibrated(refined, pairs, fields, cameras, rig)
 

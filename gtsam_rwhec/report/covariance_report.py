@@ -78,8 +78,8 @@ def refined_sentences(refined: Refined) -> list[str]:
     loss = "" if refined.options.robust in ("none", "gnc") else f", {refined.options.robust} loss"
     steps = f"{refined.iterations} iteration{'' if refined.iterations == 1 else 's'}"
     sentences.append(
-        f"Cost: {refined.cost:.6g} after {steps}, {refined.initial_cost:.6g} at the certified solution "
-        f"({refined.options.residual} residual{loss})."
+        f"Cost in the weights of the refinement (not the certified one's): {refined.cost:.6g} after {steps}, "
+        f"{refined.initial_cost:.6g} at the certified solution ({refined.options.residual} residual{loss})."
     )
     if refined.inlier_counts:
         sentences.append(_outlier_sentence(refined.inlier_counts))
@@ -100,7 +100,10 @@ def _noise_sentence(refined: Refined) -> str:
 def _carrier_noise_sentence(refined: Refined) -> str:
     noise = refined.options.carrier_noise
     if noise is None:
-        return "Noise of A: left out; where the carriers' poses are not exact, these standard deviations are too small."
+        return (
+            "Noise of A: left out; where the carriers' poses are not exact, these standard deviations are too small "
+            "(a rig file gives it as carriers: noise:)."
+        )
     if noise.covariances is not None:
         return "Noise of A: the covariances given for each measurement."
     return (

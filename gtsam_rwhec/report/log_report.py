@@ -17,7 +17,7 @@ def print_log(log: LogFields, console: Console | None = None) -> None:
     """Print what was detected, cleaned and left out, and which sizes are doubted."""
     console = report_console() if console is None else console
     console.print(_table(log))
-    for sentence in log.contradicted:
+    for sentence in log.contradictions:
         console.print(Text(printable(f"Do not use: {sentence}."), style="bold red"), soft_wrap=not console.is_terminal)
     for sentence in log_sentences(log):
         console.print(Text(printable(sentence)), soft_wrap=not console.is_terminal)
@@ -57,6 +57,12 @@ def doubts(log: LogFields) -> list[str]:
         if faults:
             said.append(f"{len(faults)} images of {sensor} could not be used, the first: {faults[0]}")
     said += _unused(log)
+    given = [clock.sensor for clock in log.time_offsets if clock.sigma_s is None and clock.sensor in log.contradicted]
+    if given:
+        said.append(
+            f"The clock of {', '.join(given)} was taken as given. If its stamps may be late, set time_offset: estimate "
+            "in the rig file."
+        )
     free = [size for size in log.sizes if size.is_free]
     for size in free:
         if size.sigma is not None and abs(size.scale - 1.0) > 3.0 * size.sigma:

@@ -12,7 +12,7 @@ from gtsam_rwhec.rig.first_carriers import MovingPair, frame_name, moving_pairs
 from gtsam_rwhec.rig.first_look import Images, Look, look_through
 from gtsam_rwhec.rig.first_targets import Guess, targets_seen
 from gtsam_rwhec.rig.rig_file import parse_rig, rig_text
-from gtsam_rwhec.rig.schema import Carriers, Intrinsics, Rig, Sensor, TagTarget, TargetSection
+from gtsam_rwhec.rig.schema import Carriers, Intrinsics, PoseNoise, Rig, Sensor, TagTarget, TargetSection
 from gtsam_rwhec.yaml_lines import KeyPath
 
 #: Words of topics that say what is published and not by which camera.
@@ -21,7 +21,11 @@ _COMMON = frozenset({
     "raw", "color", "colour", "rgb", "detections", "tag_detections", "apriltag_detections", "detection", "tags",
     "apriltag", "apriltags", "aruco", "aruco_markers", "aruco_detections", "markers", "marker_publisher",
 })  # fmt: skip
-_TIME_OFFSET = "TODO estimate, if its stamps may be late (needs uneven turning)"
+_TIME_OFFSET = "or seconds, 0.0 for one clock (to estimate it needs uneven turning)"
+_NOISE = "TODO how far its poses are off, a guess; without, standard deviations are too small"
+
+#: What good arms reach; motion capture and SLAM are worse.
+_GUESSED_NOISE = PoseNoise(rotation_deg=0.03, translation_mm=0.2)
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,7 @@ def first_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
 
 def _text(log: Log, carriers: Carriers, carrier_remark: str, cameras: list[_Camera], guesses: list[Guess]) -> str:
     taken = {carriers.sensors, carriers.targets}
-    remarks: dict[KeyPath, str] = {("carriers", "poses"): carrier_remark}
+    remarks: dict[KeyPath, str] = {("carriers", "poses"): carrier_remark, ("carriers", "noise"): _NOISE}
     names = {camera.name: _free(camera.name, taken) for camera in cameras}
     targets: dict[str, TargetSection] = {}
     for guess in guesses:
@@ -104,7 +108,7 @@ def _text(log: Log, carriers: Carriers, carrier_remark: str, cameras: list[_Came
         name = names[camera.name]
         frame = camera.frame if is_name(camera.frame) and camera.frame not in taken else None
         taken |= {frame} if frame else set()
-        sensors[name] = camera.section.model_copy(update={"frame": frame})
+        sensors[name] = camera.section.model_copy(update={"frame": frame, "time_offset": "estimate"})
         remarks |= {("sensors", name, key): words for key, words in camera.remarks.items()}
         remarks["sensors", name, "time_offset"] = _TIME_OFFSET
     rig = Rig(carriers=carriers, sensors=sensors, targets=targets)
@@ -120,7 +124,7 @@ def _carriers(pair: MovingPair) -> tuple[Carriers, str]:
     parent, child = pair.source.frames
     if pair.on_parent > pair.on_child:
         remark = f"{parent} carries the sensors, as tf has it"
-        return Carriers(sensors=parent, targets=child, poses=pair.source), remark
+        return Carriers(sensors=parent, targets=child, poses=pair.source, noise=_GUESSED_NOISE), remark
     remark = (
         f"{child} carries the sensors, as tf has it"
         if pair.on_child
@@ -128,7 +132,7 @@ def _carriers(pair: MovingPair) -> tuple[Carriers, str]:
     )
     if pair.source.topic is not None:
         remark += "; TODO check the frames' names: they are guesses where the topic has none"
-    return Carriers(sensors=child, targets=parent, poses=pair.source), remark
+    return Carriers(sensors=child, targets=parent, poses=pair.source, noise=_GUESSED_NOISE), remark
 
 
 def _cameras(look: Look, notes: list[str]) -> list[_Camera]:

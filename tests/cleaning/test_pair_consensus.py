@@ -46,8 +46,8 @@ def test_gross_outliers_are_found(share: float, scale: float) -> None:
     assert not found.kept.mask[bad].any()
     assert len(found.kept.removed) == bad.sum()
     assert {item.reason for item in found.kept.removed} <= {
-        "off the pair's consensus (rad)",
-        "off the pair's consensus (m)",
+        "rotation off the pair's consensus (rad)",
+        "translation off the pair's consensus (m)",
     }
     assert all(item.value > item.limit for item in found.kept.removed)
     assert all(item.stamp_ns == stamps[item.index] for item in found.kept.removed)

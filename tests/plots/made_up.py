@@ -13,7 +13,7 @@ TARGETS = ("tag_0", "tag_1", "tag_2", "tag_3", "board")
 REASONS = (
     "standstill (m moved)",
     "outlier (robust estimation)",
-    "off the pair's consensus (rad)",
+    "rotation off the pair's consensus (rad)",
     "moving fast (m/s)",
     "gap in the carriers' poses (s)",
     "ambiguous pose",

@@ -208,9 +208,10 @@ def test_outliers_are_counted(rig: rw.Refined) -> None:
 def test_cost_names_residual_and_loss(rig: rw.Refined) -> None:
     options = dataclasses.replace(rig.options, robust="cauchy")
     once = dataclasses.replace(rig, options=options, iterations=1, cost=12.0, initial_cost=13.5)
-    assert "Cost: 12 after 1 iteration, 13.5 at the certified solution (geodesic residual, cauchy loss)." in (
-        refined_sentences(once)
-    )
+    assert (
+        "Cost in the weights of the refinement (not the certified one's): 12 after 1 iteration, "
+        "13.5 at the certified solution (geodesic residual, cauchy loss)."
+    ) in refined_sentences(once)
 
 
 def test_a_fixed_frame_is_called_fixed() -> None:
