@@ -69,6 +69,7 @@ def main() -> int:
     for name, runs in (
         ("coverage.py", arguments.coverage_runs),
         ("tables_2_to_5.py", arguments.tables_runs),
+        ("method_tables.py", arguments.tables_runs),
         ("lom_tables.py", arguments.lom_runs),
     ):
         if runs:
