@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -32,3 +35,33 @@ def test_a_wrong_size_and_a_late_clock_come_out(tmp_path: Path) -> None:
     assert [name for name, size in sizes.items() if size.is_free] == ["tag_1"]
     assert np.isclose(sizes["tag_1"].scale, 1 / 0.95, rtol=3e-3)
     assert abs(calibrated.refined.time_offsets_s["cam_1"] - 0.04) < 2e-3
+
+
+def test_what_contradicts_is_named_with_its_exit_status_and_in_all_that_is_written(tmp_path: Path) -> None:
+    log = made.write(tmp_path / "raw.mcap", made.recording(12.0, offsets_s={"cam_1": 0.3}))
+    (tmp_path / "rig.yaml").write_text(made.rig_text(sizes="sizes: known"), encoding="utf-8")
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "gtsam_rwhec.cli",
+            "calibrate",
+            log,
+            "--rig",
+            tmp_path / "rig.yaml",
+            "-o",
+            tmp_path / "out",
+        ],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 6, done.stdout + done.stderr
+    said = " ".join(done.stdout.split())
+    assert "Do not use: cam_1: " in said
+    assert "Do not use: cam_0" not in said
+    assert "The clock of cam_1 was taken as given" in said
+    assert json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))["log"]["contradicted"] == [
+        "cam_1"
+    ]
+    for name in ("static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml"):
+        assert "DO NOT USE: cam_1: " in (tmp_path / "out" / name).read_text(encoding="utf-8")
