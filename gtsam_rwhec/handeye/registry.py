@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.handeye.approximate import dq2ndord, dq2ndord_lambda, dq2steps, dqconvrlx
 from gtsam_rwhec.handeye.cost import covariance_cost, moments_of, squared_mahalanobis, squared_residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
+from gtsam_rwhec.handeye.iterative import dqitr
 from gtsam_rwhec.handeye.method import Answer, HandEye, Method, Request, ScaleMode
 from gtsam_rwhec.handeye.motions import motions_of
 from gtsam_rwhec.handeye.optimal import dqopt
@@ -21,7 +23,14 @@ from gtsam_rwhec.poses import Array, PosesLike, QuaternionOrder, to_pose3
 _DQ = "Dekel et al., Optimal least-squares solution to the hand-eye calibration problem"
 METHODS: dict[str, Method] = {
     method.name: method
-    for method in (Method("dqopt", "nothing; its optimum is proven", f"{_DQ}, Section 3.2.1, Algorithm 1", dqopt),)
+    for method in (
+        Method("dqopt", "nothing; its optimum is proven", f"{_DQ}, Section 3.2.1, Algorithm 1", dqopt),
+        Method("dq2steps", "axes that are not parallel", f"{_DQ}, Section 3.2.2, Algorithm 2", dq2steps),
+        Method("dqconvrlx", "little noise: q . q' = 0 nearly without asking", f"{_DQ}, Section 3.2.3", dqconvrlx),
+        Method("dq2ndord", "mu small, as with little noise", f"{_DQ}, Section 3.2.4, Algorithm 4", dq2ndord),
+        Method("dq2ndord_lambda", "lambda near the relaxation's", f"{_DQ}, Appendix A", dq2ndord_lambda),
+        Method("dqitr", "a fixed point that attracts; some noise", f"{_DQ}, Section 3.2.5, Algorithm 5", dqitr),
+    )
 }
 
 #: A gap is closed at this part of the cost.

@@ -1,0 +1,191 @@
+"""The DQ paper's analytic approximations: rotation first, the relaxation, expansions about it (Section 3.2, App. A).
+
+Each finds q; q' is then the best that goes with it (eq. 20, ``best_dual``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.errors import OptionError, UnderdeterminedError
+from gtsam_rwhec.handeye.cost import DualQuaternionCost
+from gtsam_rwhec.handeye.dual_quaternions import to_transform
+from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.handeye.saddle import SINGULAR, Z_pseudo, best_dual, is_singular
+from gtsam_rwhec.poses import Array
+
+
+def dq2steps(request: Request) -> Answer:
+    """DQ2Steps (Section 3.2.2, Algorithm 2): the rotation that fits the rotations best, then the translation.
+
+    Raises
+    ------
+    UnderdeterminedError
+        When the rotations alone leave the rotation free: parallel axes, or no rotation.
+    """
+    values, vectors = request.cost.spectrum
+    if not values[1] > SINGULAR * values[3]:
+        turned = "no motion rotates" if not values[3] > 0.0 else "all motions rotate about parallel axes"
+        raise UnderdeterminedError(
+            f"{turned}, and 'dq2steps' takes the rotation from the rotations alone; use method='dqopt', which takes it "
+            "from the translations too, or add motions about another axis"
+        )
+    return answer_of(request.cost, vectors[:, 0])  # eq. 19
+
+
+def dqconvrlx(request: Request) -> Answer:
+    """DQConvRlx (Section 3.2.3, Algorithm 3): without the constraint q . q' = 0, then projected onto it.
+
+    ``lower_bound`` is lambda_0 (below eq. 22): the gap is at most ``relaxation_gap``.
+    """
+    relaxed = relaxation(request.cost)
+    q = relaxed.vectors[:, 0]
+    found = answer_of(request.cost, q)
+    return Answer(found.X, lower_bound=max(float(relaxed.values[0]) - relaxed.rounding, 0.0))
+
+
+def dq2ndord(request: Request) -> Answer:
+    """DQ2ndOrd (Section 3.2.4, Algorithm 4): the second order in mu about the relaxation (eqs. 23 and 34)."""
+    return dq_nth_order(request, 2)
+
+
+def dq_nth_order(request: Request, order: int) -> Answer:
+    """The expansion in mu to any order (Appendix A): q(mu) of eq. 32 where d lambda / d mu = 0 is nearest mu = 0.
+
+    Parameters
+    ----------
+    request : Request
+    order : int
+        Of lambda and q, >= 1; 2 is ``dq2ndord``. The series converges for |mu| up to where Z's two smallest
+        eigenvalues meet in the complex plane; orders beyond help within it only.
+    """
+    if order < 1:
+        raise OptionError(f"order={order}: the expansion in mu starts at order 1")
+    relaxed = relaxation(request.cost)
+    if is_singular(request.cost):
+        return answer_of(request.cost, relaxed.vectors[:, 0])  # mu = 0 is exact (``Z_pseudo``)
+    lambdas, coefficients = expansion(relaxed, max(order, 2))
+    mu = _stationary(lambdas)
+    in_eigenvectors = sum(c * mu**k for k, c in enumerate(coefficients[: order + 1]))
+    return answer_of(request.cost, relaxed.vectors @ in_eigenvectors)
+
+
+def dq2ndord_lambda(request: Request) -> Answer:
+    """The second order in Delta lambda = lambda - lambda_0 (Section 3.2.4, Appendix A, eqs. 35 and 36, corrected)."""
+    cost = request.cost
+    relaxed = relaxation(cost)
+    q0 = relaxed.vectors[:, 0]
+    if is_singular(cost):
+        return answer_of(cost, q0)
+    q = lambda_expansion(relaxed)
+    return answer_of(cost, q0 if q is None else relaxed.vectors @ q)
+
+
+@dataclass(frozen=True)
+class Relaxation:
+    """Eq. 21 without the constraint, and Z1 and Z2 in its eigenvectors.
+
+    Attributes
+    ----------
+    values, vectors : (4,), (4, 4) arrays
+        lambda_a and q_a of Z0.
+    Z1, Z2 : (4, 4) arrays
+        Entry [a, b] is q_a'Z q_b, the paper's Z^ab.
+    rounding : float
+        What rounding may have added to lambda_0.
+    """
+
+    values: Array
+    vectors: Array
+    Z1: Array
+    Z2: Array
+    rounding: float
+
+
+def relaxation(cost: DualQuaternionCost) -> Relaxation:
+    """Solve Z0 q = lambda q (eq. 21); of a singular M with its pseudo-inverse."""
+    if is_singular(cost):
+        values, vectors = np.linalg.eigh(Z_pseudo(cost))
+        Z1 = Z2 = np.zeros((4, 4))
+    else:
+        values, vectors = np.linalg.eigh(cost.Z0)
+        Z1, Z2 = vectors.T @ cost.Z1 @ vectors, vectors.T @ cost.Z2 @ vectors
+    return Relaxation(values, vectors, Z1, Z2, 1e-13 * float(np.trace(cost.S)))
+
+
+def relaxation_gap(relaxed: Relaxation) -> float:
+    """lambda^c - lambda_0 (eq. 22): lambda_0 <= lambda* <= lambda^c, the cost of DQConvRlx."""
+    if not relaxed.Z2[0, 0] > 0.0:
+        return 0.0
+    return float(0.25 * relaxed.Z1[0, 0] ** 2 / relaxed.Z2[0, 0])
+
+
+def expansion(relaxed: Relaxation, order: int) -> tuple[list[float], list[Array]]:
+    """lambda_k and c_k (4,) of lambda(mu) = sum lambda_k mu^k, q(mu) = sum mu^k sum_a c_ka q_a (eqs. 31 to 33).
+
+    Two signs of eq. 33 as printed do not solve eq. 12: the middle line's second term is Z2 q_{k-2}, as the third
+    line has it, not Z2 q_{k-1} (checked against Z(mu)'s own eigenvalues: tests/handeye/test_approximate.py).
+    """
+    gaps = relaxed.values[0] - relaxed.values[1:]  # lambda_0a
+    lambdas = [float(relaxed.values[0])]
+    c = [np.array([1.0, 0.0, 0.0, 0.0])]
+    for k in range(1, order + 1):
+        driven = relaxed.Z1 @ c[k - 1]
+        if k > 1:
+            driven = driven - relaxed.Z2 @ c[k - 2]
+        lambdas.append(float(driven[0]) - sum(lambdas[k - n] * float(c[n][0]) for n in range(1, k)))
+        rest = driven[1:] - sum((lambdas[k - n] * c[n][1:] for n in range(1, k)), np.zeros(3))
+        along = -0.5 * sum(float(c[k - n] @ c[n]) for n in range(1, k))
+        c.append(np.concatenate([[along], rest / gaps]))
+    return lambdas, c
+
+
+def _stationary(lambdas: list[float]) -> float:
+    """The mu nearest 0 where the truncated series has d lambda / d mu = 0 and a maximum; eq. 34 at second order."""
+    second = -0.5 * lambdas[1] / lambdas[2]  # eq. 34; lambda_2 < 0, lambda_0(mu) being concave
+    if len(lambdas) == 3:
+        return second
+    roots = np.roots([k * lambdas[k] for k in range(len(lambdas) - 1, 0, -1)])
+    real = roots.real[np.abs(roots.imag) < 1e-6 * np.abs(roots)]
+    return float(real[np.abs(real - second).argmin()]) if real.size else second
+
+
+def lambda_expansion(relaxed: Relaxation) -> Array | None:
+    """Q to second order in Delta lambda, in the eigenvectors (4,), not normalised; None where mu = 0 is the answer.
+
+    mu = mu_1 D + mu_2 D^2 and q = q_0 + q_1 D + q_2 D^2 solve (Z0 + mu Z1 - mu^2 Z2) q = (lambda_0 + D) q order by
+    order. As printed, eq. 35 has mu_1^2 Z2 with the wrong sign, in mu_2 and in q_2 (Z2 enters eq. 12 with a minus),
+    eq. 36 the Z2 terms of q.(mu Z2 - Z1/2).q = 0, and Delta lambda's formula divides by 2 where it must divide by
+    2 c_2. With the signs as below the residual of eq. 12 is of third order; as printed, of second
+    (tests/handeye/test_approximate.py).
+    """
+    Z1, Z2 = relaxed.Z1, relaxed.Z2
+    gaps = relaxed.values[0] - relaxed.values[1:]
+    if abs(Z1[0, 0]) * abs(Z1[0, 0]) <= 1e-30 * abs(Z2[0, 0]) * abs(relaxed.values[3]):
+        return None  # lambda does not change with mu: no expansion in it, and eq. 14 gives mu = 0
+    mu1 = 1.0 / Z1[0, 0]
+    q1 = np.concatenate([[0.0], mu1 * Z1[1:, 0] / gaps])
+    mu2 = -(mu1 * Z1[0] @ q1 - mu1**2 * Z2[0, 0]) / Z1[0, 0]
+    driven = Z1[1:] @ (mu1 * q1) + mu2 * Z1[1:, 0] - mu1**2 * Z2[1:, 0] - q1[1:]
+    q2 = np.concatenate([[-0.5 * float(q1 @ q1)], driven / gaps])
+    # q'(Z1 / 2 - mu Z2) q = 0 (eq. 14) to second order: c0 + c1 D + c2 D^2.
+    c0 = 0.5 * Z1[0, 0]
+    c1 = Z1[0] @ q1 - mu1 * Z2[0, 0]
+    c2 = Z1[0] @ q2 + 0.5 * q1 @ Z1 @ q1 - Z2[0] @ (2.0 * mu1 * q1) - mu2 * Z2[0, 0]
+    root = c1 * c1 - 4.0 * c0 * c2
+    # The root that goes to -c0 / c1 as c2 goes to 0, without cancellation.
+    change = -2.0 * c0 / (c1 + math.copysign(math.sqrt(root), c1)) if root >= 0.0 else -c0 / c1
+    q: Array = np.array([1.0, 0.0, 0.0, 0.0]) + change * (q1 + change * q2)
+    return q
+
+
+def answer_of(cost: DualQuaternionCost, q: Array) -> Answer:
+    """The pose of q (4,), not yet of length one, with the best q' (eq. 20).
+
+    Algorithm 4 as printed normalises by q^2; a unit quaternion needs |q|.
+    """
+    q = q / math.sqrt(float(q @ q))
+    return Answer(to_transform(q, best_dual(cost, q)))
