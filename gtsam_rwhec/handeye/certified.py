@@ -1,0 +1,54 @@
+"""The library's own AX = XB: the chordal cost, its minimum proven, with a known or an unknown scale.
+
+``Problem.add_motion`` and ``solve`` do it, for any number of sensors, with priors and with targets in the same problem;
+here is one sensor behind the call that the other methods have.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from gtsam_rwhec.calibration import solve
+from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning
+from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.problem import Problem
+
+
+def certified(request: Request) -> Answer:
+    """Certified minimum of sum |R_C R - R R_H|^2 + alpha^2 |(R_C - 1) T - R T_H + T_C|^2 (eq. 30, first).
+
+    The library's cost J is that with 1 / sigma^2 = 2 alpha^2 w and kappa = 2 w for a motion of weight w. With an
+    unknown scale, t_C = scale * (true length), the equation is turned round, H X^-1 = X^-1 C, so that the scale is the
+    measured side's: the cost is then that of X^-1.
+
+    Raises
+    ------
+    ScaleError
+        A scale that is not positive at the optimum.
+    """
+    C, H, weights = request.motions.C, request.motions.H, request.weights
+    w = np.ones(len(C)) if weights is None else weights
+    used = w > 0.0
+    if not used.all():
+        C, H, w = C[used], H[used], w[used]
+    sigma, kappa = 1.0 / (request.alpha * np.sqrt(2.0 * w)), 2.0 * w
+    known = request.scale == "known"
+    problem = Problem(scale="known" if known else "shared", keep_measurements=False)
+    problem.add_motion("c", *((C, H) if known else (H, C)), sigma, kappa)
+    with warnings.catch_warnings():  # both are in the answer: free directions, and a bound below the cost
+        warnings.simplefilter("ignore", NotUniqueWarning)
+        warnings.simplefilter("ignore", NotCertifiedWarning)
+        solution = solve(problem)
+    Y, scale = solution.Y["c"], solution.scale
+    if isinstance(scale, dict):
+        scale = scale["c"]
+    return Answer(
+        X=(Y if known else Y.inverse()).matrix(),
+        cost=solution.cost,
+        cost_name="eq. 30, chordal" if known else "eq. 30, chordal, of X^-1 with t_C / scale",
+        lower_bound=solution.certificate.lower_bound,
+        free_directions=tuple(solution.identifiability.free_directions),
+        scale=scale,
+    )

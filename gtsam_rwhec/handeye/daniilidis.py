@@ -1,0 +1,91 @@
+"""Dan: Daniilidis, Hand-Eye Calibration Using Dual Quaternions (IJRR 1999), the linear method of the DQ paper's [9].
+
+The scalar parts, which conjugation keeps, are left out of (7): six rows a motion, linear in eight unknowns (q, q'),
+
+    [ P   0 ]           P = [Skew(v_C + v_H), v_C - v_H]   (3 x 4, unknowns with the scalar last),
+    [ P'  P ]           P' the same of the dual parts,
+
+whose null space has two dimensions without noise. It holds one unit dual quaternion. Nothing is minimised: the answer
+is the combination, with |q| = 1 and q . q' = 0, of the two right singular vectors of the smallest singular values.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.handeye.cost import BLOCK, E
+from gtsam_rwhec.handeye.dual_quaternions import to_transform
+from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.poses import Array
+
+#: Squares of singular values below this, relative to the largest, are rounding.
+NULL = 1e-13
+#: Rows of ``Motions.rows`` that hold vector parts.
+_VECTORS = [0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]
+#: Row 6 k + l is vec(P_k' P_l): P is linear in the six numbers (v_C + v_H, v_C - v_H).
+_PRODUCTS = np.einsum("kji,ljm->klim", E[:6, :3], E[:6, :3]).reshape(36, 16)
+
+
+def daniilidis(request: Request) -> Answer:
+    """Dan, with translations multiplied by alpha as in Section 4.3.
+
+    Raises
+    ------
+    UnderdeterminedError
+        When all axes are parallel, or nothing rotates: the null space then has more than two dimensions.
+    """
+    rows = request.motions.rows
+    gram = np.zeros((12, 12))
+    for first in range(0, rows.shape[1], BLOCK):
+        block = rows[_VECTORS, first : first + BLOCK]
+        weighted = block if request.weights is None else block * request.weights[first : first + BLOCK]
+        gram += weighted @ block.T
+    gram[6:] *= request.alpha
+    gram[:, 6:] *= request.alpha
+    values, vectors = np.linalg.eigh(squared(gram))
+    if values[2] <= NULL * values[7]:
+        raise UnderdeterminedError(
+            "Daniilidis' equations have more than the two null vectors of a solvable problem: no motion rotates, or "
+            "all rotate about parallel axes; add motions about another axis, or use method='dqopt', which solves what "
+            "can be solved and names the rest"
+        )
+    q, q_dual = unit_combination(vectors[:4, :2], vectors[4:, :2])
+    return Answer(to_transform(q, q_dual / request.alpha))
+
+
+def squared(gram: Array) -> Array:
+    """T'T (8, 8) from moments (12, 12) of (v_C + v_H, v_C - v_H) of the primal parts, then of the dual parts."""
+    blocks = gram.reshape(2, 6, 2, 6).transpose(0, 2, 1, 3).reshape(4, 36) @ _PRODUCTS
+    PP, _, DP, DD = blocks.reshape(4, 4, 4)
+    return np.block([[PP + DD, DP], [DP.T, PP]])
+
+
+def unit_combination(u: Array, v: Array) -> tuple[Array, Array]:
+    """The unit dual quaternion among the combinations of two vectors, columns of u (4, 2) over those of v (4, 2).
+
+    Of the two combinations with q . q' = 0 the one with the longer q is taken: without noise the other one's vanishes.
+    (The paper takes their coefficients' ratio s as unknown, and has to avoid the vector whose coefficient is 0; an
+    angle avoids none.)
+
+    Raises
+    ------
+    UnderdeterminedError
+        When no combination has a rotation.
+    """
+    (a, b), (c, d) = (u.T @ v).tolist()
+    # (x, y) = (cos phi, sin phi):  a x^2 + (b + c) x y + d y^2 = (a + d + (a - d) cos 2 phi + (b + c) sin 2 phi) / 2
+    amplitude, middle = math.hypot(a - d, b + c), math.atan2(b + c, a - d)
+    spread = math.acos(max(-1.0, min(1.0, -(a + d) / amplitude))) if amplitude > 0.0 else 0.0
+    phi = 0.5 * np.array([middle + spread, middle - spread])
+    candidates = np.stack([np.cos(phi), np.sin(phi)])
+    lengths = np.linalg.norm(u @ candidates, axis=0)
+    best = int(lengths.argmax())
+    if lengths[best] <= 1e-12:
+        raise UnderdeterminedError(
+            "the null vectors of Daniilidis' equations hold no rotation; add motions about two different axes"
+        )
+    x = candidates[:, best] / lengths[best]
+    return u @ x, v @ x

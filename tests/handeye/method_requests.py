@@ -1,0 +1,18 @@
+"""What a method is asked, made without ``solve``; and its answer as a pose."""
+
+from gtsam_rwhec.handeye.cost import cost_of
+from gtsam_rwhec.handeye.method import Request
+from gtsam_rwhec.handeye.motions import motions_of
+from gtsam_rwhec.poses import to_pose3
+
+
+def request_of(C, H, alpha=1.0, weights=None, covariances=None, prior=None, scale="known", rng=None):
+    motions = motions_of(C, H)
+    cost = cost_of(motions, alpha, weights, covariances)
+    if prior is not None:
+        cost = prior.added_to(cost)
+    return Request(motions, cost, alpha, weights, covariances, prior, scale, rng)
+
+
+def pose(X):
+    return to_pose3(X[:3, :3], X[:3, 3])
