@@ -15,6 +15,7 @@ from gtsam_rwhec.methods import (
     lom,
     shah2013,
     strobl2006,
+    tabb2017,
     wang2022,
     zhuang1994,
 )
@@ -37,6 +38,11 @@ METHODS: dict[str, Method] = {
         lom.METHOD,
         strobl2006.METHOD,
         horn2023.METHOD,
+        tabb2017.C1,
+        tabb2017.C2,
+        tabb2017.C1_SEPARABLE,
+        tabb2017.C2_SEPARABLE,
+        tabb2017.RP1,
         certified.METHOD,
     )
 }

@@ -1,0 +1,208 @@
+"""Tabb and Ahmad Yousef 2017: two costs, separable and simultaneous, in three parameterisations of rotations.
+
+::
+
+    c1 = sum |A_i X - Y B_i|_F^2            c2 = sum |A_i - Y B_i X^-1|_F^2
+
+A left multiplication by a pose changes no Frobenius norm, so c2 is sum |B_i X^-1 - Y^-1 A_i|_F^2: c1 of the equation
+turned round, quadratic in the inverses' entries as c1 is in those of X and Y. "Simultaneous" minimises a cost over
+rotations and translations together, "separable" its rotation part first and the translations for those rotations.
+Their third kind, reprojection errors (rp1), needs images: see ``reprojection``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.certify.reduced_form import ReducedForm
+from gtsam_rwhec.certify.rotations import vec
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.methods.absolute import Stack, linear_translations, poses_by_name
+from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
+from gtsam_rwhec.methods.quaternions import LEFT, RIGHT, of_rotations
+from gtsam_rwhec.methods.starts import start_of
+from gtsam_rwhec.methods.unit_weights import UnitForm, unit_weights
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.problem import Problem
+
+Cost = Literal["c1", "c2"]
+Mode = Literal["simultaneous", "separable"]
+#: Euler angles about x, y and z (R = R_z R_y R_x), the rotation vector, the quaternion divided by its length.
+Parameterisation = Literal["euler", "axis-angle", "quaternion"]
+#: R (n, 3, 3) of parameters (n, k), and its derivatives (n, 9, k) column after column.
+Chart = Callable[[Array], tuple[Array, Array]]
+
+
+def tabb2017(
+    problem: Problem,
+    options: MethodOptions,
+    cost: Cost = "c1",
+    mode: Mode = "simultaneous",
+    parameterisation: Parameterisation = "axis-angle",
+) -> Calibration:
+    """One of the method's variants, from a start, by Levenberg-Marquardt.
+
+    Raises
+    ------
+    OptionError
+        For another cost, mode or parameterisation.
+    """
+    for value, known in ((cost, ("c1", "c2")), (mode, ("simultaneous", "separable")), (parameterisation, CHARTS)):
+        if value not in known:
+            raise OptionError(f"tabb2017: {value!r} is not one of {', '.join(map(repr, known))}")
+    turned = cost == "c2"
+    X, Y, _, starts_from = start_of(problem, options)
+    form = UnitForm.of(problem, turned=turned)
+    R = form.rotations_of(X, Y)
+    if mode == "simultaneous":
+        R = least(form.reduced, R, parameterisation, options.max_iterations)
+        return form.calibration(R, starts_from)
+    R = least(form.rotations_alone, R, parameterisation, options.max_iterations)
+    stack = Stack.of(unit_weights(problem, turned=True) if turned else problem)
+    by_name = dict(zip(form.part.free, R, strict=True))
+    R_X = np.array([by_name[name] for name in stack.targets])
+    R_Y = np.array([by_name[name] for name in stack.sensors])
+    t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
+    found_X, found_Y = poses_by_name(stack.targets, R_X, t_X), poses_by_name(stack.sensors, R_Y, t_Y)
+    if turned:
+        found_X, found_Y = ({name: np.linalg.inv(T) for name, T in poses.items()} for poses in (found_X, found_Y))
+    return Calibration(found_X, found_Y, starts_from=starts_from)
+
+
+def least(form: ReducedForm, R: Array, parameterisation: Parameterisation, max_iterations: int) -> Array:
+    """Rotations (n, 3, 3) of a local minimum of x'Q'x, from a start."""
+    from scipy.optimize import least_squares
+
+    to_parameters, chart = CHARTS[parameterisation]
+    values, vectors = np.linalg.eigh(form.dense())
+    root = (np.sqrt(np.maximum(values, 0.0)) * vectors).T  # |root x|^2 = x' Q' x
+    start = to_parameters(R)
+    n, k = start.shape
+
+    def residual(p: Array) -> Array:
+        rows: Array = root[:, :-1] @ vec(chart(p.reshape(n, k))[0]).ravel() + root[:, -1]
+        return rows
+
+    def jacobian(p: Array) -> Array:
+        derivative = chart(p.reshape(n, k))[1]
+        rows: Array = np.einsum("rnv,nvk->rnk", root[:, :-1].reshape(-1, n, 9), derivative).reshape(-1, n * k)
+        return rows
+
+    found = least_squares(
+        residual, start.ravel(), jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=max_iterations
+    )
+    return chart(found.x.reshape(n, k))[0]
+
+
+def from_euler(p: Array) -> tuple[Array, Array]:
+    """R_z R_y R_x of angles (n, 3) about x, y, z."""
+    factors, derivatives = [], []
+    for axis in (2, 1, 0):
+        generator = se3.hat(np.eye(3)[axis])
+        R = se3.expmap(np.concatenate([p[:, axis, None] * np.eye(3)[axis], np.zeros((len(p), 3))], axis=1))[:, :3, :3]
+        factors.append(R)
+        derivatives.append(R @ generator)
+    z, y, x = factors
+    dz, dy, dx = derivatives
+    columns = [z @ y @ dx, z @ dy @ x, dz @ y @ x]
+    return z @ y @ x, np.stack([vec(column) for column in columns], axis=2)
+
+
+def to_euler(R: Array) -> Array:
+    """Angles (n, 3) about x, y, z; at the poles, where two of them are one, the first is zero."""
+    y = np.arcsin(np.clip(-R[:, 2, 0], -1.0, 1.0))
+    pole = np.abs(R[:, 2, 0]) > 1.0 - 1e-12
+    x = np.where(pole, 0.0, np.arctan2(R[:, 2, 1], R[:, 2, 2]))
+    z = np.where(pole, np.arctan2(-R[:, 0, 1], R[:, 1, 1]), np.arctan2(R[:, 1, 0], R[:, 0, 0]))
+    return np.stack([x, y, z], axis=1)
+
+
+def from_rotation_vectors(p: Array) -> tuple[Array, Array]:
+    """The exponential of (n, 3), and its derivative by the right Jacobian."""
+    R = se3.expmap(np.concatenate([p, np.zeros_like(p)], axis=1))[:, :3, :3]
+    right_jacobian = np.linalg.inv(se3.so3_left_jacobian_inverse(-p))
+    columns = [vec(R @ se3.hat(right_jacobian[:, :, k])) for k in range(3)]
+    return R, np.stack(columns, axis=2)
+
+
+def from_quaternions(p: Array) -> tuple[Array, Array]:
+    """Of quaternions (n, 4), scalar first, divided by their lengths."""
+    length = np.linalg.norm(p, axis=1)[:, None]
+    q = p / length
+    # v -> q v q*: L(q) R(q)', bilinear in q
+    halves = np.einsum("cij,dkj->cdik", LEFT, RIGHT)[:, :, 1:, 1:]
+    R = np.einsum("nc,nd,cdik->nik", q, q, halves)
+    by_q = np.einsum("nd,cdik->ncik", q, halves) + np.einsum("nd,dcik->ncik", q, halves)
+    tangent = (np.eye(4) - q[:, :, None] * q[:, None, :]) / length[:, :, None]
+    derivative = np.einsum("ncik,ncm->nkim", by_q, tangent).reshape(len(p), 9, 4)
+    return R, derivative
+
+
+CHARTS: dict[str, tuple[Callable[[Array], Array], Chart]] = {
+    "euler": (to_euler, from_euler),
+    "axis-angle": (se3.so3_logmap, from_rotation_vectors),
+    "quaternion": (of_rotations, from_quaternions),
+}
+
+
+def _without_images(problem: Problem) -> None:
+    raise FrameError(
+        "tabb2017_rp1 minimises reprojection errors, and a Problem has poses, not images; give corners in pixels to "
+        "gtsam_rwhec.methods.reprojection.calibrate"
+    )
+
+
+def _refuse(problem: Problem, options: MethodOptions) -> Calibration:
+    _without_images(problem)
+    raise AssertionError  # never reached: what is checked first has raised
+
+
+_SOURCE = (
+    "A. Tabb and K. Ahmad Yousef, Solving the robot-world hand-eye(s) calibration problem with iterative methods, "
+    "Machine Vision and Applications 28, 2017"
+)
+_PLAIN = "Errors alike in all measurements, a radian as bad as a metre; a start near the answer."
+
+
+def _method(cost: Cost, mode: Mode) -> Method:
+    separable = mode == "separable"
+    return Method(
+        name=f"tabb2017_{cost}" + ("_separable" if separable else ""),
+        properties=Properties(
+            joint=not separable,
+            probabilistic=False,
+            certifiable=False,
+            multiple="Xs or Ys",
+            monocular=False,
+            representation="Euler angles, rotation vectors or quaternions",
+        ),
+        source=_SOURCE,
+        assumes=_PLAIN,
+        function=partial(tabb2017, cost=cost, mode=mode),
+    )
+
+
+C1 = _method("c1", "simultaneous")
+C2 = _method("c2", "simultaneous")
+C1_SEPARABLE = _method("c1", "separable")
+C2_SEPARABLE = _method("c2", "separable")
+RP1 = Method(
+    name="tabb2017_rp1",
+    properties=Properties(
+        joint=True,
+        probabilistic=False,
+        certifiable=False,
+        multiple="Xs or Ys",
+        monocular=False,
+        representation="rotation vectors",
+    ),
+    source=_SOURCE,
+    assumes="Images: corners in pixels, with cameras whose intrinsics are known; a start near the answer.",
+    function=_refuse,
+    check=_without_images,
+)

@@ -1,0 +1,112 @@
+"""A X = Y B with all weights 1, as the certified solver's quadratic form: for methods whose cost knows no noise.
+
+A radian then weighs as much as a metre (times the square root of two, the Frobenius norm's). Translations, and a shared
+scale, are eliminated exactly: x'Q'x over x = [vec R_1, ..., vec R_n, 1] is the least cost that rotations leave (RWHEC
+paper, eq. 48), its 1/2 included.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.certify.parts import Part, parts_of
+from gtsam_rwhec.certify.reduced_form import ReducedForm, reduce
+from gtsam_rwhec.certify.search import Forms
+from gtsam_rwhec.certify.start import spectral_start
+from gtsam_rwhec.certify.variables import answer_of
+from gtsam_rwhec.errors import FrameError, ScaleError
+from gtsam_rwhec.methods.protocol import Calibration, Poses
+from gtsam_rwhec.poses import Array, one_transform
+from gtsam_rwhec.problem import Problem
+
+
+@dataclass(frozen=True)
+class UnitForm:
+    """The form of one connected problem, and the way back to its poses.
+
+    ``turned``: of B X^-1 = Y^-1 A, whose frames are the inverses of the problem's.
+    """
+
+    part: Part
+    forms: Forms
+    turned: bool
+
+    @staticmethod
+    def of(problem: Problem, *, turned: bool = False) -> UnitForm:
+        """From the raw measurements, whatever their weights.
+
+        Raises
+        ------
+        FrameError
+            For a problem that falls into parts that nothing joins.
+        """
+        parts = parts_of(unit_weights(problem, turned=turned))
+        if len(parts) > 1:
+            raise FrameError(
+                f"the measurements fall into {len(parts)} parts that nothing joins ({', '.join(parts[0].names)} is "
+                "one); solve them apart"
+            )
+        return UnitForm(parts[0], Forms.of(parts[0]), turned)
+
+    @property
+    def reduced(self) -> ReducedForm:
+        """Q', translations eliminated."""
+        return self.forms.reduced
+
+    @property
+    def rotations_alone(self) -> ReducedForm:
+        """Of the rotation residuals alone."""
+        return reduce(self.forms.rotation)
+
+    def spectral_start(self) -> list[Array]:
+        """Rotations (n, 3, 3) in the order of ``part.free``, by the smallest eigenvector of the rotation residuals."""
+        return spectral_start(self.part, self.forms.rotation)
+
+    def rotations_of(self, X: Poses, Y: Poses) -> Array:
+        """Rotations (n, 3, 3) of given poses, as the form has them."""
+        R = np.array(
+            [
+                one_transform((X if name in self.part.targets else Y)[name], f"start of {name}")[:3, :3]
+                for name in self.part.free
+            ]
+        )
+        return np.ascontiguousarray(R.transpose(0, 2, 1)) if self.turned else R
+
+    def calibration(self, R: Array, starts_from: str | None = None, notes: tuple[str, ...] = ()) -> Calibration:
+        """Poses with the best translations (and scale) for rotations R (n, 3, 3).
+
+        Raises
+        ------
+        ScaleError
+            For a scale that is not positive.
+        """
+        answer = answer_of(self.part, self.reduced, R)
+        if not answer.scale > 0.0:
+            raise ScaleError(
+                f"the scale of least cost is {answer.scale:.6g}, which no real target has; check the conventions of "
+                "the poses, or move along more than one circle or sphere"
+            )
+        T: Array = np.tile(np.eye(4), (len(R), 1, 1))
+        T[:, :3, :3] = answer.R
+        T[:, :3, 3] = answer.t + np.array([self.part.frame_shift(name) for name in self.part.free])
+        if self.turned:
+            T = np.linalg.inv(T)
+        poses = dict(zip(self.part.free, T, strict=True))
+        X = {name: poses[name] for name in self.part.targets}
+        Y = {name: poses[name] for name in self.part.sensors}
+        return Calibration(X, Y, answer.scale, starts_from, notes)
+
+
+def unit_weights(problem: Problem, *, turned: bool = False) -> Problem:
+    """The same measurements with sigma = 1 m and kappa = 1; ``turned``: as B X^-1 = Y^-1 A."""
+    plain = Problem(problem.scale, keep_measurements=turned)
+    for target, sensor in problem.pairs:
+        raw = problem.measurements(target, sensor)
+        A, B = (raw.B, raw.A) if turned else (raw.A, raw.B)
+        if target == sensor:
+            plain.add_motion(sensor, A, B)
+        else:
+            plain.add(target, sensor, A, B)
+    return plain
