@@ -10,9 +10,12 @@ from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.handeye.approximate import dq2ndord, dq2ndord_lambda, dq2steps, dqconvrlx
+from gtsam_rwhec.handeye.certified import certified
 from gtsam_rwhec.handeye.cost import covariance_cost, moments_of, squared_mahalanobis, squared_residuals
+from gtsam_rwhec.handeye.daniilidis import daniilidis
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.iterative import dqitr
+from gtsam_rwhec.handeye.local import chvecopt, dqnlopt, dqnlopt_random, quatvecopt
 from gtsam_rwhec.handeye.method import Answer, HandEye, Method, Request, ScaleMode
 from gtsam_rwhec.handeye.motions import motions_of
 from gtsam_rwhec.handeye.optimal import dqopt
@@ -21,6 +24,7 @@ from gtsam_rwhec.handeye.weights import check_alpha, check_covariances, check_we
 from gtsam_rwhec.poses import Array, PosesLike, QuaternionOrder, to_pose3
 
 _DQ = "Dekel et al., Optimal least-squares solution to the hand-eye calibration problem"
+_NEAR = "DQOpt's answer in the basin of the best minimum"
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
@@ -30,6 +34,27 @@ METHODS: dict[str, Method] = {
         Method("dq2ndord", "mu small, as with little noise", f"{_DQ}, Section 3.2.4, Algorithm 4", dq2ndord),
         Method("dq2ndord_lambda", "lambda near the relaxation's", f"{_DQ}, Appendix A", dq2ndord_lambda),
         Method("dqitr", "a fixed point that attracts; some noise", f"{_DQ}, Section 3.2.5, Algorithm 5", dqitr),
+        Method(
+            "dan",
+            "two axes that are not parallel, and little noise: it minimises nothing",
+            "Daniilidis, Hand-eye calibration using dual quaternions (IJRR 1999)",
+            daniilidis,
+            prior=False,
+            covariances=False,
+        ),
+        Method("dqnlopt", "nothing: it starts at DQOpt's answer", f"{_DQ}, Section 4.4", dqnlopt),
+        Method("dqnloptrnd", "a random start in the best minimum's basin", f"{_DQ}, Section 4.4", dqnlopt_random),
+        Method("chvecopt", _NEAR, f"{_DQ}, eq. 30, first", chvecopt, prior=False, covariances=False),
+        Method("quatvecopt", _NEAR, f"{_DQ}, eq. 30, second", quatvecopt, prior=False, covariances=False),
+        Method(
+            "certified",
+            "nothing; its bound says whether the optimum is proven",
+            "this library's certified solver, on eq. 30's first cost",
+            certified,
+            prior=False,
+            covariances=False,
+            unknown_scale=True,
+        ),
     )
 }
 
