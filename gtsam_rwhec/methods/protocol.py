@@ -228,7 +228,8 @@ class Method:
             "Xs and Ys": (True, ""),
         }
         can, what = takes[self.properties.multiple]
-        if not can:
+        alone = self.takes_motions and targets == 0 and sensors == 1  # A Y = Y B of one sensor
+        if not can and not alone:
             raise FrameError(
                 f"{self.name} solves for {what}; here are {targets} target{'s' * (targets != 1)} and {sensors} "
                 f"sensor{'s' * (sensors != 1)}"

@@ -17,6 +17,7 @@ from gtsam_rwhec.methods import (
     strobl2006,
     tabb2017,
     wang2022,
+    wise2020,
     zhuang1994,
 )
 from gtsam_rwhec.methods.evaluation import evaluate
@@ -43,6 +44,7 @@ METHODS: dict[str, Method] = {
         tabb2017.C1_SEPARABLE,
         tabb2017.C2_SEPARABLE,
         tabb2017.RP1,
+        wise2020.METHOD,
         certified.METHOD,
     )
 }

@@ -1,0 +1,98 @@
+"""Wise, Giamou, Khoubyarian, Grebe and Kelly 2020: one sensor, certified by the Kronecker form's own relaxation.
+
+A X = Y B of one X and one Y, or A Y = Y B of a sensor's motions (hand-eye calibration, as the paper has it), as a
+quadratic cost of vec R_X and vec R_Y by Kronecker products, translations and the monocular scale eliminated; 21
+quadratic constraints a rotation, solved as a semidefinite program. Its dual is a lower bound on what any answer costs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.certify.bound import lower_bound
+from gtsam_rwhec.certify.descent import descend
+from gtsam_rwhec.certify.relaxation import round_to_rotations, solve_by_clarabel
+from gtsam_rwhec.certify.rotations import kkt_multipliers, vec
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
+from gtsam_rwhec.methods.unit_weights import UnitForm
+from gtsam_rwhec.poses import Array
+from gtsam_rwhec.problem import Problem
+
+TOLERANCE = 1e-10
+STEPS = 200
+#: Second over first eigenvalue of the solution below which it has rank one, and the relaxation is tight.
+RANK_ONE = 1e-5
+
+
+@dataclass(frozen=True)
+class CertifiedRotations:
+    """Rotations (n, 3, 3) of least cost and the proof.
+
+    ``lower_bound`` holds for every answer; ``eigenvalue_ratio`` is the solution's second over its first.
+    """
+
+    R: Array
+    cost: float
+    lower_bound: float
+    eigenvalue_ratio: float
+
+    @property
+    def gap(self) -> float:
+        """Relative to the cost; for exact data, whose cost is rounding, it says nothing."""
+        return (self.cost - self.lower_bound) / max(self.cost, 1e-300)
+
+
+def wise2020(problem: Problem, options: MethodOptions) -> Calibration:
+    """One X and one Y, or one sensor's motions; known or shared scale."""
+    form = UnitForm.of(problem)
+    found = certified_rotations(form)
+    if found.eigenvalue_ratio < RANK_ONE:
+        proof = "the relaxation is tight"
+    else:
+        proof = f"the relaxation is not tight (eigenvalues' ratio {found.eigenvalue_ratio:.1e}): nothing is proven"
+    return form.calibration(found.R, notes=(f"{proof}; relative gap {found.gap:.1e}",))
+
+
+def certified_rotations(form: UnitForm) -> CertifiedRotations:
+    """Solve the relaxation by Clarabel, descend from its rotations, and bound by the better of both multipliers."""
+    reduced = form.reduced
+    Q = reduced.dense()
+    relaxation = solve_by_clarabel(Q, TOLERANCE, STEPS)
+    ends = [descend(reduced, R, STEPS) for R in round_to_rotations(relaxation)]
+    best = min(ends, key=lambda end: end.cost)
+    r = vec(best.R).ravel()
+    of_answer = kkt_multipliers(best.R, reduced.apply(np.append(r, 1.0))[:-1].reshape(-1, 9))
+    bounds = [lower_bound(reduced, multipliers, r).lower for multipliers in (relaxation.multipliers, of_answer)]
+    values = np.linalg.eigvalsh(relaxation.X)
+    return CertifiedRotations(best.R, best.cost, max(bounds), float(max(values[-2], 0.0) / values[-1]))
+
+
+def check_frames(problem: Problem) -> None:
+    """One pair of frames, or one sensor's motions alone.
+
+    Raises
+    ------
+    FrameError
+    """
+    if len(problem.pairs) > 1:
+        raise FrameError(
+            f"one target and one sensor, or one sensor's motions, and here are {len(problem.pairs)} pairs of frames: "
+            f"{', '.join('-'.join(pair) for pair in problem.pairs)}"
+        )
+
+
+METHOD = Method(
+    name="wise2020",
+    properties=Properties(
+        joint=True, probabilistic=False, certifiable=True, multiple="", monocular=True, representation="SE(3)"
+    ),
+    source="E. Wise, M. Giamou, S. Khoubyarian, A. Grebe and J. Kelly, Certifiably optimal monocular hand-eye "
+    "calibration, IEEE MFI 2020",
+    assumes="Errors alike in all measurements, a radian as bad as a metre. Proves its answer, or says that it has not.",
+    function=wise2020,
+    takes_motions=True,
+    check=check_frames,
+)
