@@ -4,6 +4,7 @@ State a ``Problem``, ``solve`` it: poses of every sensor and target, with a proo
 what the motion leaves undetermined.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gtsam_rwhec import errors, pose_covariances
@@ -24,7 +25,7 @@ from gtsam_rwhec.result_file import read_solution
 from gtsam_rwhec.solution import Residual, Solution, SolvedPart
 
 if TYPE_CHECKING:
-    from gtsam_rwhec import simulate
+    from gtsam_rwhec import handeye, methods, simulate
 
 __version__ = "0.1.0"
 
@@ -48,6 +49,8 @@ __all__ = [
     "certify",
     "cross_validate",
     "errors",
+    "handeye",
+    "methods",
     "pose_covariances",
     "read_csv",
     "read_refined",
@@ -58,10 +61,11 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    # The simulators bring in more of SciPy than the rest together: only who simulates waits for it.
-    if name == "simulate":
-        import gtsam_rwhec.simulate
+#: Imported when they are first asked for: the simulators and the other methods bring in more of SciPy than the rest.
+_LATER = ("handeye", "methods", "simulate")
 
-        return gtsam_rwhec.simulate
+
+def __getattr__(name: str) -> Any:
+    if name in _LATER:
+        return import_module(f"gtsam_rwhec.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
