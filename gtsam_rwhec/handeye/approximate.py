@@ -6,12 +6,13 @@ Each finds q; q' is then the best that goes with it (eq. 20, ``best_dual``).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gtsam_rwhec.errors import OptionError, UnderdeterminedError
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
+from gtsam_rwhec.handeye.degenerate import free_directions
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.saddle import SINGULAR, Z_pseudo, best_dual, is_singular
@@ -33,7 +34,7 @@ def dq2steps(request: Request) -> Answer:
             f"{turned}, and 'dq2steps' takes the rotation from the rotations alone; use method='dqopt', which takes it "
             "from the translations too, or add motions about another axis"
         )
-    return answer_of(request.cost, vectors[:, 0])  # eq. 19
+    return answer_of(request, vectors[:, 0])  # eq. 19
 
 
 def dqconvrlx(request: Request) -> Answer:
@@ -43,8 +44,8 @@ def dqconvrlx(request: Request) -> Answer:
     """
     relaxed = relaxation(request.cost)
     q = relaxed.vectors[:, 0]
-    found = answer_of(request.cost, q)
-    return Answer(found.X, lower_bound=max(float(relaxed.values[0]) - relaxed.rounding, 0.0))
+    found = answer_of(request, q)
+    return replace(found, lower_bound=max(float(relaxed.values[0]) - relaxed.rounding, 0.0))
 
 
 def dq2ndord(request: Request) -> Answer:
@@ -66,11 +67,11 @@ def dq_nth_order(request: Request, order: int) -> Answer:
         raise OptionError(f"order={order}: the expansion in mu starts at order 1")
     relaxed = relaxation(request.cost)
     if is_singular(request.cost):
-        return answer_of(request.cost, relaxed.vectors[:, 0])  # mu = 0 is exact (``Z_pseudo``)
+        return answer_of(request, relaxed.vectors[:, 0])  # mu = 0 is exact (``Z_pseudo``)
     lambdas, coefficients = expansion(relaxed, max(order, 2))
     mu = _stationary(lambdas)
     in_eigenvectors = sum(c * mu**k for k, c in enumerate(coefficients[: order + 1]))
-    return answer_of(request.cost, relaxed.vectors @ in_eigenvectors)
+    return answer_of(request, relaxed.vectors @ in_eigenvectors)
 
 
 def dq2ndord_lambda(request: Request) -> Answer:
@@ -79,9 +80,9 @@ def dq2ndord_lambda(request: Request) -> Answer:
     relaxed = relaxation(cost)
     q0 = relaxed.vectors[:, 0]
     if is_singular(cost):
-        return answer_of(cost, q0)
+        return answer_of(request, q0)
     q = lambda_expansion(relaxed)
-    return answer_of(cost, q0 if q is None else relaxed.vectors @ q)
+    return answer_of(request, q0 if q is None else relaxed.vectors @ q)
 
 
 @dataclass(frozen=True)
@@ -182,10 +183,13 @@ def lambda_expansion(relaxed: Relaxation) -> Array | None:
     return q
 
 
-def answer_of(cost: DualQuaternionCost, q: Array) -> Answer:
+def answer_of(request: Request, q: Array) -> Answer:
     """The pose of q (4,), not yet of length one, with the best q' (eq. 20).
 
     Algorithm 4 as printed normalises by q^2; a unit quaternion needs |q|.
     """
     q = q / math.sqrt(float(q @ q))
-    return Answer(to_transform(q, best_dual(cost, q)))
+    X = to_transform(q, best_dual(request.cost, q))
+    relaxed = relaxation(request.cost)
+    free = free_directions(request.cost, q, relaxed.values, relaxed.vectors, request.noise_free_part)
+    return Answer(X, free_directions=free)

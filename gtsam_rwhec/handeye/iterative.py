@@ -28,7 +28,7 @@ def dqitr(request: Request) -> Answer:
     """
     cost = request.cost
     if is_singular(cost):
-        return answer_of(cost, relaxation(cost).vectors[:, 0])
+        return answer_of(request, relaxation(cost).vectors[:, 0])
     Z0, Z1, Z2 = cost.Z0, cost.Z1, cost.Z2
     low, high = bracket(Z1, Z2)
     mu = 0.0
@@ -44,4 +44,4 @@ def dqitr(request: Request) -> Answer:
             NotConvergedWarning,
             stacklevel=4,
         )
-    return answer_of(cost, q)
+    return answer_of(request, q)

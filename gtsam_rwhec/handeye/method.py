@@ -45,6 +45,11 @@ class Request:
     scale: ScaleMode
     rng: np.random.Generator | int | None
 
+    @property
+    def noise_free_part(self) -> float:
+        """What of M is a prior's, and so no sign of noise."""
+        return 0.0 if self.prior is None else self.prior.b
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -86,8 +91,8 @@ class Method:
     source : str
         Paper and section.
     function : callable
-    prior, weights, covariances, unknown_scale : bool
-        What it can take besides motions and alpha.
+    prior, linear_prior, weights, covariances, unknown_scale : bool
+        What it can take besides motions and alpha; ``linear_prior`` is a prior of the form "distance".
     """
 
     name: str
@@ -95,6 +100,7 @@ class Method:
     source: str
     function: Callable[[Request], Answer]
     prior: bool = True
+    linear_prior: bool = False
     weights: bool = True
     covariances: bool = True
     unknown_scale: bool = False

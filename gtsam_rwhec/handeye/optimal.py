@@ -7,23 +7,22 @@ import numpy as np
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.degenerate import free_directions
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
+from gtsam_rwhec.handeye.linear_prior import solve_with_linear_prior
 from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.handeye.proof import HIDDEN, proven
 from gtsam_rwhec.handeye.saddle import SINGULAR, Minimum, is_singular, minimum
-
-#: Rounding that a Cholesky factorisation in double of an 8 x 8 matrix can hide, of unit diagonal (Higham 2002,
-#: Theorem 10.7: 8 gamma_9 = 8e-15), and that of forming its entries.
-CHOLESKY = 1e-14
 
 
 def dqopt(request: Request) -> Answer:
     """DQOpt: the least of all costs (8), and lambda* as the proof."""
     cost = request.cost
+    if request.prior is not None and request.prior.form == "distance":
+        return solve_with_linear_prior(request, request.prior)
     found = minimum(cost)
-    noise = 0.0 if request.prior is None else request.prior.b
     return Answer(
         X=to_transform(found.q, found.q_dual),
         lower_bound=proven_bound(cost, found),
-        free_directions=free_directions(cost, found.q, found.values, found.vectors, noise),
+        free_directions=free_directions(cost, found.q, found.values, found.vectors, request.noise_free_part),
     )
 
 
@@ -50,19 +49,15 @@ def proven_bound(cost: DualQuaternionCost, found: Minimum, floor: float = 0.0) -
     n = 4 + len(M)
     K = np.empty((n, n))
     K[:4, :4], K[:4, 4:], K[4:, :4], K[4:, 4:] = cost.S, W, W.T, M
-    diagonal = K.diagonal().copy()
+    diagonal = cost.S.diagonal()
     value = cost.value(found.q, found.q_dual)
-    step = 1.1 * CHOLESKY * float(diagonal[:4] @ (found.q * found.q) + cost.M.diagonal() @ (found.q_dual**2))
+    step = 1.1 * HIDDEN * float(diagonal @ (found.q * found.q) + cost.M.diagonal() @ (found.q_dual**2))
     lower = value - step
     while lower > floor:
-        shifted = diagonal.copy()
-        shifted[:4] -= lower
-        np.fill_diagonal(K, shifted * (1.0 - CHOLESKY))
-        try:
-            np.linalg.cholesky(K)
-        except np.linalg.LinAlgError:
-            step *= 4.0
-            lower = value - step
-            continue
-        return lower
+        K[range(4), range(4)] = diagonal - lower
+        K[range(4, n), range(4, n)] = M.diagonal()
+        if proven(K):
+            return lower
+        step *= 4.0
+        lower = value - step
     return floor

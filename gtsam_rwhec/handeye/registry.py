@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.handeye.alpha import estimate_alpha
 from gtsam_rwhec.handeye.approximate import dq2ndord, dq2ndord_lambda, dq2steps, dqconvrlx
 from gtsam_rwhec.handeye.certified import certified
 from gtsam_rwhec.handeye.cost import covariance_cost, moments_of, squared_mahalanobis, squared_residuals
@@ -28,8 +29,10 @@ _NEAR = "DQOpt's answer in the basin of the best minimum"
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("dqopt", "nothing; its optimum is proven", f"{_DQ}, Section 3.2.1, Algorithm 1", dqopt),
-        Method("dq2steps", "axes that are not parallel", f"{_DQ}, Section 3.2.2, Algorithm 2", dq2steps),
+        Method(
+            "dqopt", "nothing; its optimum is proven", f"{_DQ}, Section 3.2.1, Algorithm 1", dqopt, linear_prior=True
+        ),
+        Method("dq2steps", "axes that are not parallel", f"{_DQ}, Section 3.2.2, Algorithm 2", dq2steps, prior=False),
         Method("dqconvrlx", "little noise: q . q' = 0 nearly without asking", f"{_DQ}, Section 3.2.3", dqconvrlx),
         Method("dq2ndord", "mu small, as with little noise", f"{_DQ}, Section 3.2.4, Algorithm 4", dq2ndord),
         Method("dq2ndord_lambda", "lambda near the relaxation's", f"{_DQ}, Appendix A", dq2ndord_lambda),
@@ -58,6 +61,10 @@ METHODS: dict[str, Method] = {
     )
 }
 
+#: A cost below this part of all squares is zero.
+NOTHING = 1e-28
+#: The cost's name with a prior.
+_WITH_PRIOR = {"imaginary": "eq. 26", "distance": "eq. 25"}
 #: A gap is closed at this part of the cost.
 CLOSED = 1e-9
 #: Rounding of a cost, as a part of the squares that cancel in it.
@@ -118,14 +125,14 @@ def solve(
     _check_options(chosen, weights, covariances, prior, scale)
     motions = motions_of(C, H, order)
     w, information = check_weights(weights, len(motions)), check_covariances(covariances, len(motions))
-    if alpha == "estimate":
-        raise OptionError("alpha='estimate'")
     if information is not None:
+        if alpha == "estimate":
+            raise OptionError("alpha='estimate' and covariances are both given; covariances take alpha's place")
         number = check_alpha(alpha)
         cost = covariance_cost(motions, information)
     else:
         moments = moments_of(motions.rows, w)
-        number = check_alpha(alpha)
+        number = estimate_alpha(motions, moments, w, prior) if alpha == "estimate" else check_alpha(alpha)
         cost = moments.cost(number)
     if prior is not None:
         cost = prior.added_to(cost)
@@ -142,11 +149,11 @@ def result(request: Request, answer: Answer, method: str, start: float) -> HandE
     if answer.lower_bound is not None:
         gap = cost - answer.lower_bound
         squares = request.cost.S.diagonal() @ (q * q) + request.cost.M.diagonal() @ (q_dual * q_dual)
-        is_optimal = bool(gap <= max(CLOSED * cost, ROUNDING * squares))
+        is_optimal = bool(gap <= max(CLOSED * cost, ROUNDING * squares, NOTHING * float(np.trace(request.cost.S))))
     return HandEye(
         X=to_pose3(X[:3, :3], X[:3, 3]),
         cost=cost,
-        cost_name=answer.cost_name,
+        cost_name=answer.cost_name if request.prior is None else _WITH_PRIOR[request.prior.form],
         lower_bound=answer.lower_bound,
         gap=gap,
         is_optimal=is_optimal,
@@ -183,6 +190,11 @@ def _check_options(
         (weights is not None, method.weights, "weights"),
         (covariances is not None, method.covariances, "covariances"),
         (prior is not None, method.prior, "a prior"),
+        (
+            prior is not None and prior.form == "distance",
+            method.linear_prior,
+            "a prior of the form 'distance' (eq. 25; 'imaginary', eq. 26, makes the cost one of eq. 8's kind)",
+        ),
         (scale == "unknown", method.unknown_scale, "scale='unknown'"),
     ):
         if given and not can:

@@ -1,0 +1,59 @@
+"""The weight alpha between translations and rotations (DQ paper, Sections 3.1 and 4.3), from the residuals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gtsam_rwhec.handeye.cost import Moments, squared_residuals
+from gtsam_rwhec.handeye.motions import Motions
+from gtsam_rwhec.handeye.prior import DualQuaternionPrior
+from gtsam_rwhec.handeye.saddle import minimum
+from gtsam_rwhec.poses import Array
+
+ITERATIONS = 50
+#: Alpha stands still when it changes by less than this part; residuals tell it to a few per cent at best.
+STILL = 1e-6
+#: Residuals below this part of what moved are rounding and tell nothing.
+ROUNDING = 1e-24
+#: How far from its starting value alpha may go.
+RANGE = 1e6
+
+
+def estimate_alpha(
+    motions: Motions, moments: Moments, weights: Array | None = None, prior: DualQuaternionPrior | None = None
+) -> float:
+    """Alpha with which both kinds of residual have the same size: rms |A q| / rms |B q + A q'| at the optimum.
+
+    Each step lowers N log(sum |A q|^2) + N log(sum |B q + A q'|^2), the likelihood of normal residuals whose two
+    sigmas are unknown: with the poses given alpha is that ratio, with alpha given the poses are DQOpt's.
+
+    Parameters
+    ----------
+    motions : Motions
+    moments : Moments
+        Of the same motions and weights.
+    weights : (N,) array, optional
+    prior : DualQuaternionPrior, optional
+        Its a and b keep their meaning while alpha changes.
+
+    Returns
+    -------
+    float
+        1/m. Where the residuals are rounding, or nothing moves, the ratio of the motions' own sizes.
+    """
+    turned, moved = float(np.trace(moments.AA)), float(np.trace(moments.BB))
+    if not (turned > 0.0 and moved > 0.0):
+        return 1.0
+    first = alpha = math.sqrt(turned / moved)
+    for _ in range(ITERATIONS):
+        cost = moments.cost(alpha)
+        found = minimum(cost if prior is None else prior.added_to(cost))
+        rotation, translation = squared_residuals(motions, found.q, found.q_dual, weights)
+        if rotation <= ROUNDING * turned or translation <= ROUNDING * moved:
+            break
+        before, alpha = alpha, min(max(math.sqrt(rotation / translation), first / RANGE), first * RANGE)
+        if abs(alpha - before) <= STILL * before:
+            break
+    return alpha
