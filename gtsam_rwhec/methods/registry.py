@@ -10,6 +10,7 @@ from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.methods import (
     certified,
     dornaika1998,
+    heller2014,
     horn2023,
     li2010,
     lom,
@@ -45,6 +46,8 @@ METHODS: dict[str, Method] = {
         tabb2017.C2_SEPARABLE,
         tabb2017.RP1,
         wise2020.METHOD,
+        heller2014.METHOD,
+        heller2014.MATRIX,
         certified.METHOD,
     )
 }

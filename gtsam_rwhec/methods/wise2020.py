@@ -13,8 +13,10 @@ import numpy as np
 
 from gtsam_rwhec.certify.bound import lower_bound
 from gtsam_rwhec.certify.descent import descend
+from gtsam_rwhec.certify.interior_point import Relaxation
+from gtsam_rwhec.certify.local_blocks import scatter
 from gtsam_rwhec.certify.relaxation import round_to_rotations, solve_by_clarabel
-from gtsam_rwhec.certify.rotations import kkt_multipliers, vec
+from gtsam_rwhec.certify.rotations import CONSTRAINTS, kkt_multipliers, vec
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.unit_weights import UnitForm
@@ -66,8 +68,17 @@ def certified_rotations(form: UnitForm) -> CertifiedRotations:
     r = vec(best.R).ravel()
     of_answer = kkt_multipliers(best.R, reduced.apply(np.append(r, 1.0))[:-1].reshape(-1, 9))
     bounds = [lower_bound(reduced, multipliers, r).lower for multipliers in (relaxation.multipliers, of_answer)]
+    bounds.append(_relaxation_bound(Q, relaxation))
     values = np.linalg.eigvalsh(relaxation.X)
     return CertifiedRotations(best.R, best.cost, max(bounds), float(max(values[-2], 0.0) / values[-1]))
+
+
+def _relaxation_bound(Q: Array, relaxation: Relaxation) -> float:
+    """gamma + (3 n + 1) min(0, lambda_min(Z)), as x'x = 3 n + 1: the better one where the relaxation is not tight."""
+    Z = Q - scatter(np.einsum("nk,kij->nij", relaxation.multipliers, CONSTRAINTS))
+    Z[-1, -1] -= relaxation.dual
+    trace = (len(Q) - 1) / 3.0 + 1.0
+    return relaxation.dual + trace * min(0.0, float(np.linalg.eigvalsh(Z)[0]))
 
 
 def check_frames(problem: Problem) -> None:

@@ -1,0 +1,163 @@
+"""Lasserre's relaxation of order two for a cost quadratic in rotations, over their unit quaternions.
+
+vec R is linear in the ten products q_a q_b (``PRODUCTS``), so x'Q'x is a polynomial of degree four in the quaternions
+of one or two rotations, even in each of them. With y = [1, products of q_1, products of q_2] it is y'Cy, and the
+relaxation is over moments: what a measure on pairs of unit quaternions would have as integrals of the monomials.
+
+    minimise <C, M(y y')>   subject to   M(y y') >= 0,   M(z z') >= 0 for z = q_1 (x) q_2,
+                                         moments of m |q_k|^2 = those of m,   moment of 1 = 1
+
+The flips q_k -> -q_k keep everything, so moments of odd degree vanish and the moment matrix of order two falls into
+these two blocks (and the q_k q_k', which the first one with |q_k| = 1 makes positive semidefinite).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import clarabel
+import numpy as np
+import scipy.sparse
+
+from gtsam_rwhec.certify.rotations import project, unvec
+from gtsam_rwhec.methods.quaternions import LEFT, RIGHT, to_rotation
+from gtsam_rwhec.poses import Array
+
+#: (a, b) of the ten products q_a q_b.
+PRODUCTS = [(a, b) for a in range(4) for b in range(a, 4)]
+TOLERANCE = 1e-11
+STEPS = 200
+
+
+def products_to_rotation() -> Array:
+    """(9, 10): vec R = L [q_a q_b], from v -> q v q*, the product of left and right multiplication."""
+    table = np.einsum("cij,dkj->cdik", LEFT, RIGHT)[:, :, 1:, 1:]  # R = sum of q_c q_d table[c, d]
+    columns = [(table[a, b] + table[b, a] if a != b else table[a, a]).T.ravel() for a, b in PRODUCTS]
+    return np.array(columns).T
+
+
+@dataclass(frozen=True)
+class MomentSolution:
+    """Starts (list of (n, 3, 3) rotations), a lower bound on the cost, how near the moments are to one point's.
+
+    ``eigenvalue_ratio`` is the second eigenvalue of M(y y') over the first: zero where one answer is optimal and the
+    relaxation tight.
+    """
+
+    starts: list[Array]
+    lower_bound: float
+    eigenvalue_ratio: float
+    iterations: int
+
+
+@dataclass(frozen=True)
+class _Moments:
+    """Which moment stands where: index of each entry of M(y y') and M(z z'), and the equations between moments."""
+
+    count: int
+    even: np.ndarray
+    odd: np.ndarray
+    equations: scipy.sparse.csc_matrix
+
+
+@cache
+def _moments(frames: int) -> _Moments:
+    """For one or two quaternions."""
+    place: dict[tuple[int, ...], int] = {}
+
+    def index(exponents: np.ndarray) -> int:
+        return place.setdefault(tuple(int(e) for e in exponents), len(place))
+
+    unit = np.eye(4 * frames, dtype=int)
+    y = [np.zeros(4 * frames, dtype=int)]
+    y += [unit[4 * k + a] + unit[4 * k + b] for k in range(frames) for a, b in PRODUCTS]
+    even = np.array([[index(p + q) for q in y] for p in y])
+    z = [unit[a] + unit[4 + b] for a in range(4) for b in range(4)] if frames == 2 else []
+    odd = np.array([[index(p + q) for q in z] for p in z], dtype=int).reshape(len(z), len(z))
+    rows = []
+    for k in range(frames):
+        for m in y:
+            row = np.zeros(len(place))
+            for a in range(4):
+                row[index(m + 2 * unit[4 * k + a])] += 1.0
+            row[index(m)] -= 1.0
+            rows.append(row)
+    return _Moments(len(place), even, odd, scipy.sparse.csc_matrix(np.array(rows)))
+
+
+def solve_moments(Q: Array) -> MomentSolution:
+    """The relaxation of x'Q'x, x = [vec R_1, (vec R_2,) 1], Q' (10, 10) or (19, 19)."""
+    frames = (len(Q) - 1) // 9
+    moments = _moments(frames)
+    to_x = np.zeros((len(Q), 1 + 10 * frames))
+    to_x[-1, 0] = 1.0
+    for k in range(frames):
+        to_x[9 * k : 9 * k + 9, 1 + 10 * k : 11 + 10 * k] = products_to_rotation()
+    C = to_x.T @ Q @ to_x
+    scale = float(np.abs(C).max()) or 1.0
+    cost = np.zeros(moments.count)
+    np.add.at(cost, moments.even, C / scale)
+    blocks = [block for block in (moments.even, moments.odd) if block.size]
+    first = np.zeros((1, moments.count))
+    first[0, moments.even[0, 0]] = 1.0
+    equations = scipy.sparse.vstack([scipy.sparse.csc_matrix(first), moments.equations], format="csc")
+    cones = [clarabel.ZeroConeT(equations.shape[0]), *[clarabel.PSDTriangleConeT(len(block)) for block in blocks]]
+    A = scipy.sparse.vstack([equations, *[-_triangle(block, moments.count) for block in blocks]], format="csc")
+    b = np.zeros(A.shape[0])
+    b[0] = 1.0
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_iter = STEPS
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
+    zero = scipy.sparse.csc_matrix((moments.count, moments.count))
+    solution = clarabel.DefaultSolver(zero, cost, A, b, cones, settings).solve()
+    mu, z = np.array(solution.x), np.array(solution.z)
+    values = np.linalg.eigvalsh(mu[moments.even])
+    return MomentSolution(
+        _rounded(mu[moments.even], frames),
+        scale * _lower_bound(cost, A, z, equations.shape[0], blocks),
+        float(max(values[-2], 0.0) / values[-1]),
+        int(solution.iterations),
+    )
+
+
+def _triangle(block: np.ndarray, count: int) -> scipy.sparse.csc_matrix:
+    """svec of a block of moments as a linear map: Clarabel stacks the upper triangle, column after column."""
+    j, i = np.tril_indices(len(block))
+    root = np.where(i == j, 1.0, np.sqrt(2.0))
+    return scipy.sparse.csc_matrix((root, (np.arange(len(i)), block[i, j])), (len(i), count))
+
+
+def _lower_bound(cost: Array, A: scipy.sparse.csc_matrix, z: Array, equations: int, blocks: list[np.ndarray]) -> float:
+    """-z_0, less what the solver's tolerance leaves: true (up to rounding) for any multipliers z.
+
+    For the moments mu of any unit quaternions, cost' mu = -z_0 + sum <Z, M> + r' mu with r = cost + A' z. No moment
+    exceeds 1, the trace of M(y y') is at most 1 + n and that of M(z z') is 1. The smallest change of z first makes r
+    vanish.
+    """
+    z = z - np.linalg.lstsq(A.T.toarray(), cost + A.T @ z, rcond=None)[0]
+    bound = -float(z[0]) - float(np.abs(cost + A.T @ z).sum())
+    start = equations
+    for block, trace in zip(blocks, (1.0 + (len(blocks[0]) - 1) // 10, 1.0), strict=False):
+        size = len(block)
+        j, i = np.tril_indices(size)
+        Z = np.zeros((size, size))
+        Z[i, j] = z[start : start + len(i)] / np.where(i == j, 1.0, np.sqrt(2.0))
+        Z = Z + Z.T - np.diag(np.diagonal(Z))
+        bound += trace * min(0.0, float(np.linalg.eigvalsh(Z)[0]))
+        start += len(i)
+    return bound
+
+
+def _rounded(M: Array, frames: int) -> list[Array]:
+    """Rotations from the second moments of each quaternion, and of the rotation matrices that they mean."""
+    by_quaternion = np.empty((frames, 3, 3))
+    for k in range(frames):
+        second = np.zeros((4, 4))
+        for (a, b), moment in zip(PRODUCTS, M[0, 1 + 10 * k : 11 + 10 * k], strict=True):
+            second[a, b] = second[b, a] = moment
+        by_quaternion[k] = to_rotation(np.linalg.eigh(second)[1][:, -1])
+    products = M[0, 1:].reshape(frames, 10)
+    by_matrix = project(unvec(products @ products_to_rotation().T))
+    return [by_quaternion, by_matrix]

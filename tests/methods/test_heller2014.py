@@ -1,0 +1,117 @@
+"""Heller 2014: the polynomial, its moments, both relaxations, where the second is not enough."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from method_problems import one_pair
+from rwhec_factors import se3
+from test_wise2020 import cost_of, motions
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.certify.descent import descend
+from gtsam_rwhec.certify.rotations import random_rotations, vec
+from gtsam_rwhec.errors import OptionError, ScaleError
+from gtsam_rwhec.methods import quaternion_moments, run
+from gtsam_rwhec.methods.heller2014 import Parameterisation, global_minimum
+from gtsam_rwhec.methods.quaternion_moments import PRODUCTS, _moments, products_to_rotation
+from gtsam_rwhec.methods.quaternions import of_rotations
+from gtsam_rwhec.methods.unit_weights import UnitForm
+from gtsam_rwhec.simulate import Noise
+
+BOTH: tuple[Parameterisation, ...] = ("quaternion", "matrix")
+
+
+def unrelated(seed: int) -> UnitForm:
+    """Poses that have nothing to do with one another: the hardest problems there are."""
+    generator = np.random.default_rng(seed)
+    size = np.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+    A, B = (se3.expmap(size * generator.standard_normal((4, 6))) for _ in range(2))
+    problem = rw.Problem()
+    problem.add("target", "sensor", A, B)
+    return UnitForm.of(problem)
+
+
+def test_products_of_a_quaternion_are_its_rotation() -> None:
+    R = random_rotations(10, np.random.default_rng(0))
+    q = of_rotations(R)
+    products = np.array([q[:, a] * q[:, b] for a, b in PRODUCTS]).T
+    np.testing.assert_allclose(products @ products_to_rotation().T, vec(R), atol=1e-14)
+
+
+def test_moments_of_one_pair_of_quaternions_fulfil_everything() -> None:
+    table = _moments(2)
+    assert table.count == 1 + 20 + 2 * 35 + 100  # even in each, of degrees 0, 2 and 4
+    generator = np.random.default_rng(1)
+    q = generator.standard_normal((2, 4))
+    q /= np.linalg.norm(q, axis=1)[:, None]
+    y = np.concatenate([[1.0], *[[one[a] * one[b] for a, b in PRODUCTS] for one in q]])
+    z = np.outer(q[0], q[1]).ravel()
+    mu = np.full(table.count, np.nan)
+    mu[table.even] = np.outer(y, y)
+    np.testing.assert_allclose(mu[table.even], np.outer(y, y), atol=1e-15)  # equal monomials have one place
+    np.testing.assert_allclose(mu[table.odd], np.outer(z, z), atol=1e-15)
+    np.testing.assert_allclose(table.equations @ mu, 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("noise", [Noise(0.01, 125.0), Noise(0.2, 2.0)])
+@pytest.mark.parametrize("parameterisation", BOTH)
+def test_the_answer_is_the_proven_minimum_of_the_cost(noise: Noise, parameterisation: Parameterisation) -> None:
+    simulation = one_pair(noise)
+    problem = simulation.problem
+    found = global_minimum(UnitForm.of(problem), parameterisation)
+    assert found.is_tight
+    assert found.order == (2 if parameterisation == "quaternion" else 1)
+    name = "heller2014" if parameterisation == "quaternion" else "heller2014_matrix"
+    estimate = run(name, problem)
+    assert "is tight" in estimate.notes[0]
+    (X,), (Y,) = ([pose.matrix() for pose in poses.values()] for poses in (estimate.X, estimate.Y))
+    assert cost_of(problem, X, Y, 1.0) == pytest.approx(found.cost, rel=1e-8)
+    generator = np.random.default_rng(0)
+    for size in (1e-1, 1e-3):
+        for _ in range(10):
+            moved = np.stack([X, Y]) @ se3.expmap(size * generator.standard_normal((2, 6)))
+            assert cost_of(problem, *moved, 1.0) > found.cost
+
+
+def test_over_quaternions_it_is_tight_where_over_matrices_it_is_not() -> None:
+    loose = 0
+    for seed in range(40):
+        form = unrelated(seed)
+        quaternion, matrix = (global_minimum(form, one) for one in BOTH)
+        assert quaternion.is_tight
+        assert quaternion.lower_bound >= matrix.lower_bound - 1e-5 * quaternion.cost
+        assert quaternion.cost <= matrix.cost + 1e-9
+        generator = np.random.default_rng(seed)
+        for _ in range(3):
+            assert descend(form.reduced, random_rotations(2, generator), 100).cost >= quaternion.lower_bound
+        if not matrix.is_tight:
+            loose += 1
+            assert matrix.cost - matrix.lower_bound > 1e-3
+    assert 0 < loose < 10
+
+
+def test_a_wrong_solver_cannot_make_a_wrong_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bound is of the multipliers, whatever they are: that of a solver stopped early is lower, never higher."""
+    form = unrelated(0)
+    best = global_minimum(form).cost
+    for steps in (3, 6, 9):
+        monkeypatch.setattr(quaternion_moments, "STEPS", steps)
+        assert quaternion_moments.solve_moments(form.reduced.dense()).lower_bound <= best
+
+
+@pytest.mark.parametrize("name", ["heller2014", "heller2014_matrix"])
+def test_motions_of_one_sensor(name: str) -> None:
+    problem, truth = motions(0.0, 0.0, 1.0, 0)
+    np.testing.assert_allclose(run(name, problem).Y["camera"].matrix(), truth, atol=1e-6)
+    noisy, truth = motions(0.01, 0.02, 1.0, 1)
+    estimate = run(name, noisy)
+    np.testing.assert_allclose(estimate.Y["camera"].matrix(), truth, atol=0.05)
+    assert "is tight" in estimate.notes[0]
+    with pytest.raises(ScaleError):
+        run(name, motions(0.01, 0.02, 0.5, 1)[0])
+
+
+def test_other_parameterisations_are_refused_by_name() -> None:
+    with pytest.raises(OptionError, match="euler"):
+        global_minimum(unrelated(0), "euler")  # type: ignore[arg-type]
