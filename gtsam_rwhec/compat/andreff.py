@@ -65,11 +65,12 @@ def andreff(stations: Stations) -> tuple[Array, Array]:
     # One length for all unknowns, so that millimetres and metres are solved to the same number of digits.
     scale = 1.0 / np.sqrt(np.diag(normal))
     x = scale * np.linalg.solve(normal * scale * scale[:, None], right * scale)
-    return nearest_rotation(x[:9].reshape(3, 3)), x[9:]
+    return nearest_rotations(x[:9].reshape(3, 3)), x[9:]
 
 
-def nearest_rotation(V: Array) -> Array:
-    """Rotation nearest to a matrix (3, 3) in the Frobenius norm."""
+def nearest_rotations(V: Array) -> Array:
+    """Rotations nearest to matrices (..., 3, 3) in the Frobenius norm."""
     U, _, Wt = np.linalg.svd(V)
-    R: Array = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Wt)]) @ Wt
+    U[..., 2] *= np.linalg.det(U @ Wt)[..., None]
+    R: Array = U @ Wt
     return R

@@ -1,8 +1,8 @@
 """OpenCV's hand-eye calls with its names, arguments, frames, shapes and constants; OpenCV 5's package has none.
 
 ``from gtsam_rwhec.compat import opencv as cv2`` is the one line to change. OpenCV's own methods give its answers (from
-the same motions between all pairs of poses), in a fraction of its time; beside them the library's certified solution,
-which needs no pairs.
+the same motions between all pairs of poses), in a fraction of its time; beside them two of this library:
+DQOpt over the same pairs, and the certified solution, which needs no pairs.
 
 Differences, all where OpenCV returns a pose that means nothing: input that determines no answer is refused by name
 (fewer than three poses, motions about parallel axes or without rotation, Tsai's method without two motions in its
@@ -19,6 +19,7 @@ import numpy as np
 from gtsam_rwhec.compat.andreff import andreff
 from gtsam_rwhec.compat.certified import certified_hand_eye, certified_robot_world
 from gtsam_rwhec.compat.daniilidis import daniilidis
+from gtsam_rwhec.compat.dqopt import dqopt
 from gtsam_rwhec.compat.inputs import check_axes, check_counts, checked_poses
 from gtsam_rwhec.compat.quaternion_methods import horaud, park, tsai
 from gtsam_rwhec.compat.robot_world import li, shah
@@ -31,6 +32,8 @@ CALIB_HAND_EYE_PARK = 1
 CALIB_HAND_EYE_HORAUD = 2
 CALIB_HAND_EYE_ANDREFF = 3
 CALIB_HAND_EYE_DANIILIDIS = 4
+#: Not OpenCV's: the least squares optimum of Dekel et al. (CVPR 2020), over the same pairs.
+CALIB_HAND_EYE_DQOPT = 100
 #: Not OpenCV's: the library's certified solution, from the poses themselves.
 CALIB_HAND_EYE_CERTIFIED = 101
 
@@ -45,6 +48,7 @@ _HAND_EYE: dict[int, Callable[[Stations], tuple[Array, Array]]] = {
     CALIB_HAND_EYE_HORAUD: horaud,
     CALIB_HAND_EYE_ANDREFF: andreff,
     CALIB_HAND_EYE_DANIILIDIS: daniilidis,
+    CALIB_HAND_EYE_DQOPT: dqopt,
     CALIB_HAND_EYE_CERTIFIED: certified_hand_eye,
 }
 _ROBOT_WORLD: dict[int, Callable[[Array, Array, Array, Array], tuple[Array, Array, Array, Array]]] = {
@@ -77,7 +81,7 @@ def calibrateHandEye(
     R_cam2gripper, t_cam2gripper : (3, 3) and (3, 1) float64 arrays, optional
         Filled and returned when they have these shapes, as in OpenCV.
     method : int
-        One of CALIB_HAND_EYE_TSAI, _PARK, _HORAUD, _ANDREFF, _DANIILIDIS, _CERTIFIED.
+        One of CALIB_HAND_EYE_TSAI, _PARK, _HORAUD, _ANDREFF, _DANIILIDIS, _DQOPT, _CERTIFIED.
 
     Returns
     -------
@@ -100,8 +104,7 @@ def calibrateHandEye(
     R_G, t_G = checked_poses(R_gripper2base, t_gripper2base, ("R_gripper2base", "t_gripper2base"))
     R_C, t_C = checked_poses(R_target2cam, t_target2cam, ("R_target2cam", "t_target2cam"))
     check_counts(len(R_G), len(R_C), ("R_gripper2base", "R_target2cam"))
-    check_axes(R_G, "R_gripper2base")
-    check_axes(R_C.transpose(0, 2, 1), "R_target2cam")
+    check_axes((R_G, R_C.transpose(0, 2, 1)), ("R_gripper2base", "R_target2cam"))
     R, t = solve(stations_of(R_G, t_G, R_C, t_C))
     return _into(R_cam2gripper, R), _into(t_cam2gripper, t[:, None])
 
@@ -145,8 +148,7 @@ def calibrateRobotWorldHandEye(
     R_A, t_A = checked_poses(R_world2cam, t_world2cam, ("R_world2cam", "t_world2cam"))
     R_B, t_B = checked_poses(R_base2gripper, t_base2gripper, ("R_base2gripper", "t_base2gripper"))
     check_counts(len(R_A), len(R_B), ("R_world2cam", "R_base2gripper"))
-    check_axes(R_A.transpose(0, 2, 1), "R_world2cam")
-    check_axes(R_B.transpose(0, 2, 1), "R_base2gripper")
+    check_axes((R_A.transpose(0, 2, 1), R_B.transpose(0, 2, 1)), ("R_world2cam", "R_base2gripper"))
     R_X, t_X, R_Z, t_Z = solve(R_A, t_A, R_B, t_B)
     return (
         _into(R_base2world, R_X),

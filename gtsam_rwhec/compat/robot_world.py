@@ -1,14 +1,61 @@
-"""Shah 2013 and Li, Wang & Wu 2010: A X = Z B by Kronecker products, in one pass over the poses."""
+"""Shah 2013 and Li, Wang & Wu 2010: A X = Z B by Kronecker products, from one matrix of moments of the poses."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from gtsam_rwhec.compat.andreff import nearest_rotation
+from gtsam_rwhec.compat.andreff import nearest_rotations
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.poses import Array
 
 RobotWorld = tuple[Array, Array, Array, Array]
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Means over the poses of products of (R_A, t_A, 1) and (R_B, t_A, t_B, 1).
+
+    Attributes
+    ----------
+    R_A_R_B : (3, 3, 3, 3) array
+        [a, b, c, d] is the mean of R_A[a, b] R_B[c, d].
+    R_A_t_A, R_A_t_B : (3, 3, 3) arrays
+        [a, b, c] is the mean of R_A[a, b] t[c].
+    t_A_t_B, t_B_t_B, R_A : (3, 3) arrays
+    t_A, t_B : (3,) arrays
+    """
+
+    R_A_R_B: Array
+    R_A_t_A: Array
+    R_A_t_B: Array
+    t_A_t_B: Array
+    t_B_t_B: Array
+    R_A: Array
+    t_A: Array
+    t_B: Array
+
+
+def moments_of(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> Moments:
+    """The means, by one GEMM."""
+    count = len(R_A)
+    F = np.empty((count, 25))
+    F[:, :9], F[:, 9:12], F[:, 12:15] = R_A.reshape(count, 9), t_A, t_B
+    F[:, 15], F[:, 16:] = 1.0, R_B.reshape(count, 9)
+    G = F[:, :16].T @ F
+    G /= count
+    of_R_A = G[:9].reshape(3, 3, 25)
+    return Moments(
+        R_A_R_B=of_R_A[:, :, 16:].reshape(3, 3, 3, 3),
+        R_A_t_A=of_R_A[:, :, 9:12],
+        R_A_t_B=of_R_A[:, :, 12:15],
+        t_A_t_B=G[9:12, 12:15],
+        t_B_t_B=G[12:15, 12:15],
+        R_A=of_R_A[:, :, 15],
+        t_A=G[9:12, 15],
+        t_B=G[12:15, 15],
+    )
 
 
 def shah(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
@@ -18,17 +65,14 @@ def shah(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
     -------
     R_X, t_X, R_Z, t_Z of A X = Z B.
     """
-    count = len(R_A)
-    products = (R_B.reshape(count, 9).T @ R_A.reshape(count, 9)).reshape(3, 3, 3, 3)
-    U, _, Vt = np.linalg.svd(products.transpose(0, 2, 1, 3).reshape(9, 9))  # R_A R_X R_B' = R_Z, vec by columns
-    R_X = _rotation_of_vec(Vt[0].reshape(3, 3).T)
-    R_Z = _rotation_of_vec(U[:, 0].reshape(3, 3).T)
-    # Least squares of t_Z - R_A t_X = t_A - R_Z t_B: 2 x 2 blocks, with t_Z eliminated.
-    turned = t_A - t_B @ R_Z.T
-    S, mean = R_A.mean(axis=0), turned.mean(axis=0)
-    away = np.tensordot(turned, R_A, axes=([0, 1], [0, 1])) / count  # mean of R_A' (t_A - R_Z t_B)
-    t_X = np.linalg.solve(np.eye(3) - S.T @ S, S.T @ mean - away)
-    return R_X, t_X, R_Z, mean + S @ t_X
+    m = moments_of(R_A, t_A, R_B, t_B)
+    U, _, Vt = np.linalg.svd(m.R_A_R_B.transpose(2, 0, 3, 1).reshape(9, 9))  # R_A R_X R_B' = R_Z, vec by columns
+    R_X, R_Z = _rotations_of_vec(np.array([Vt[0], U[:, 0]]))
+    # Least squares of t_Z - R_A t_X = t_A - R_Z t_B =: d, t_Z = mean d + mean R_A t_X eliminated.
+    mean = m.t_A - R_Z @ m.t_B
+    turned = np.einsum("aba->b", m.R_A_t_A) - np.einsum("ac,abc->b", R_Z, m.R_A_t_B)  # mean of R_A' d
+    t_X = np.linalg.solve(np.eye(3) - m.R_A.T @ m.R_A, m.R_A.T @ mean - turned)
+    return R_X, t_X, R_Z, mean + m.R_A @ t_X
 
 
 def li(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
@@ -41,34 +85,35 @@ def li(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
     -------
     R_X, t_X, R_Z, t_Z of A X = Z B.
     """
-    count = len(R_A)
-    flat_A = R_A.reshape(count, 9)
-    # vec(R_X) is eliminated: R_A, an orthogonal factor, leaves count I in its own block.
-    products = (flat_A.T @ R_B.reshape(count, 9)).reshape(3, 3, 3, 3)
-    K = products.transpose(1, 3, 0, 2).reshape(9, 9)  # R_X = 1/count sum of R_A' R_Z R_B
-    A_t = (flat_A.T @ t_B).reshape(3, 3, 3)  # [r, c, b] = sum R_A[r, c] t_B[b]
-    sum_A, sum_t = R_A.sum(axis=0), t_B.sum(axis=0)
+    m = moments_of(R_A, t_A, R_B, t_B)
+    # vec(R_X) is eliminated: R_A, an orthogonal factor, leaves the identity in its block, R_X = mean of R_A' R_Z R_B.
+    K = m.R_A_R_B.transpose(1, 3, 0, 2).reshape(9, 9)
     normal = np.zeros((15, 15))  # vec(R_Z), t_X, t_Z
-    normal[:9, :9] = count * np.eye(9) - K.T @ K / count + np.kron(np.eye(3), t_B.T @ t_B)
-    normal[:9, 9:12] = -A_t.transpose(0, 2, 1).reshape(9, 3)
-    normal[:9, 12:] = np.kron(np.eye(3), sum_t[:, None])
-    normal[9:12, 9:12] = normal[12:, 12:] = count * np.eye(3)
-    normal[9:12, 12:] = -sum_A.T
-    normal[9:, :9] = normal[:9, 9:].T
-    normal[12:, 9:12] = normal[9:12, 12:].T
-    right = np.concatenate([(t_A.T @ t_B).reshape(9), -np.tensordot(t_A, R_A, axes=([0, 1], [0, 1])), t_A.sum(axis=0)])
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    z = scale * np.linalg.solve(normal * scale * scale[:, None], right * scale)
-    R_X = K @ z[:9]
-    return nearest_rotation(R_X.reshape(3, 3)), z[9:12], nearest_rotation(z[:9].reshape(3, 3)), z[12:]
+    normal[:9, :9] = np.eye(9) - K.T @ K
+    of_R_Z = normal[:9].reshape(3, 3, 15)
+    for row in range(3):
+        of_R_Z[row, :, 3 * row : 3 * row + 3] += m.t_B_t_B
+        of_R_Z[row, :, 12 + row] = m.t_B
+    of_R_Z[:, :, 9:12] = -m.R_A_t_B.transpose(0, 2, 1)
+    normal[9:12, 12:] = -m.R_A.T
+    normal[range(9, 15), range(9, 15)] = 1.0
+    right = np.concatenate([m.t_A_t_B.ravel(), -np.einsum("aba->b", m.R_A_t_A), m.t_A])
+    # One length for all unknowns, so that millimetres and metres are solved to the same number of digits.
+    scale = 1.0 / np.sqrt(normal.diagonal())
+    upper = normal * scale * scale[:, None]
+    z = scale * np.linalg.solve(np.triu(upper) + np.triu(upper, 1).T, right * scale)
+    R_X, R_Z = nearest_rotations(np.stack([K @ z[:9], z[:9]]).reshape(2, 3, 3))
+    return R_X, z[9:12], R_Z, z[12:]
 
 
-def _rotation_of_vec(V: Array) -> Array:
-    """The rotation of a singular vector's matrix, which has either sign."""
-    determinant = np.linalg.det(V)
-    if abs(determinant) < 1e-12:
+def _rotations_of_vec(vectors: Array) -> Array:
+    """The rotations (2, 3, 3) of singular vectors (2, 9), each of which is a multiple, of either sign, of one."""
+    U, s, Wt = np.linalg.svd(vectors.reshape(2, 3, 3).transpose(0, 2, 1))
+    if s.min() < 1e-6:
         raise UnderdeterminedError(
             "the largest singular pair of the sum of R_B (x) R_A is that of no rotation; add poses that turn about two "
             "different axes"
         )
-    return nearest_rotation(V * np.sign(determinant))
+    R: Array = U @ Wt
+    R *= np.linalg.det(R)[:, None, None]
+    return R

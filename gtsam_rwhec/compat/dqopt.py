@@ -1,0 +1,62 @@
+"""DQOpt over all pairs of stations: the DQ paper's cost (8) of the motions that OpenCV's methods take, minimised."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.compat.daniilidis import screws
+from gtsam_rwhec.compat.stations import Stations
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.handeye.cost import Moments, moments_of
+from gtsam_rwhec.handeye.dual_quaternions import to_transform
+from gtsam_rwhec.handeye.saddle import Minimum, minimum
+from gtsam_rwhec.handeye.signs import UNCERTAIN
+from gtsam_rwhec.poses import Array
+
+#: Solutions after the first, each with alpha from the residuals of the one before.
+ROUNDS = 3
+
+
+def dqopt(stations: Stations) -> tuple[Array, Array]:
+    """DQOpt (Algorithm 1), with alpha the ratio of the rotation's residual to the translation's.
+
+    Motions of nearly half a turn, whose quaternions' signs are uncertain, are left out: others of the same stations
+    remain.
+
+    Raises
+    ------
+    UnderdeterminedError
+        When no motion is left.
+    """
+    AA, BA, BB, used = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), 0
+    for a, b, dual_a, dual_b, weight in screws(stations):
+        kept = (weight > 0.0) & (a[3] + b[3] >= UNCERTAIN)
+        sides = (a[:3] + b[:3], a - b, dual_a[:3] + dual_b[:3], dual_a - dual_b)  # Motions.rows
+        rows = np.concatenate([side[:, kept] for side in sides])
+        sums = moments_of(rows)
+        AA, BA, BB, used = AA + sums.AA, BA + sums.BA, BB + sums.BB, used + rows.shape[1]
+    if used < 2:
+        raise UnderdeterminedError(
+            f"{used} motions between the poses are not about half a turn, and two are needed; add poses that turn less"
+        )
+    moments = Moments(AA, BA, BB, used)
+    # To begin with, a translation as long as the motions' own counts as much as a rotation of about a radian.
+    alpha = np.sqrt(used / max(float(np.trace(BB)), np.finfo(float).tiny))
+    found = minimum(moments.cost(alpha))
+    for _ in range(ROUNDS):
+        rotation, translation = residuals(moments, found)
+        floor = 1e-14 * used
+        if rotation <= floor or translation * alpha**2 <= floor:
+            break  # exact poses: nothing to weigh
+        alpha = np.sqrt(rotation / translation)
+        found = minimum(moments.cost(alpha))
+    X = to_transform(found.q, found.q_dual)
+    return X[:3, :3], X[:3, 3]
+
+
+def residuals(moments: Moments, found: Minimum) -> tuple[float, float]:
+    """The sums of |A q|^2 and |B q + A q'|^2 of an answer."""
+    q, p = found.q, found.q_dual
+    rotation = float(q @ moments.AA @ q)
+    translation = float(q @ moments.BB @ q + 2.0 * (q @ moments.BA @ p) + p @ moments.AA @ p)
+    return rotation, translation
