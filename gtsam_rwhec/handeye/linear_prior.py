@@ -41,7 +41,7 @@ def solve_with_linear_prior(request: Request, prior: DualQuaternionPrior) -> Ans
         candidates = [on_sphere(cost.Z(m), pull) for m in (mu, mu - near, mu + near)]
     poses = [(q, best_dual(cost, q)) for q, _ in candidates]
     q, q_dual = min(poses, key=lambda pose: cost.value(*pose) - 2.0 * float(pull @ pose[0]))
-    # The tangent directions' curvature is that of Z - lambda: as for DQOpt, beside the noise in Z's smallest eigenvalue.
+    # The tangent directions' curvature is that of Z - lambda; the noise, as for DQOpt, Z's smallest eigenvalue.
     V = times_vectors(q)
     curvatures, turns = np.linalg.eigh(V.T @ (Z - candidates[0][1] * np.eye(4)) @ V)
     noise = max(float(np.linalg.eigvalsh(Z)[0]), 0.0)

@@ -20,6 +20,7 @@ from gtsam_rwhec.handeye.local import chvecopt, dqnlopt, dqnlopt_random, quatvec
 from gtsam_rwhec.handeye.method import Answer, HandEye, Method, Request, ScaleMode
 from gtsam_rwhec.handeye.motions import motions_of
 from gtsam_rwhec.handeye.optimal import dqopt
+from gtsam_rwhec.handeye.polynomial import dqoptpoly_resultant, dqoptpoly_sturm
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
 from gtsam_rwhec.handeye.weights import check_alpha, check_covariances, check_weights
 from gtsam_rwhec.poses import Array, PosesLike, QuaternionOrder, to_pose3
@@ -37,6 +38,8 @@ METHODS: dict[str, Method] = {
         Method("dq2ndord", "mu small, as with little noise", f"{_DQ}, Section 3.2.4, Algorithm 4", dq2ndord),
         Method("dq2ndord_lambda", "lambda near the relaxation's", f"{_DQ}, Appendix A", dq2ndord_lambda),
         Method("dqitr", "a fixed point that attracts; some noise", f"{_DQ}, Section 3.2.5, Algorithm 5", dqitr),
+        Method("dqoptpoly_resultant", "some noise: M is not singular", f"{_DQ}, Appendix B", dqoptpoly_resultant),
+        Method("dqoptpoly_sturm", "some noise: M is not singular", f"{_DQ}, Appendix B", dqoptpoly_sturm),
         Method(
             "dan",
             "two axes that are not parallel, and little noise: it minimises nothing",
