@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from gtsam_rwhec.problem import Problem
 #: "scalar": no scalar part is negative, as many conversions from matrices have it.
 #: "random": by the seed.
 Signs = Literal["aligned", "continuous", "scalar", "random"]
+#: What is squared. Multiplying by a dual quaternion changes the norm, so these are different costs: "a x - y b", or
+#: "x - a* y b", X against what each measurement makes of Y. The RWHEC paper's rows "Horn" are those of the second.
+Residual = Literal["a x - y b", "x - a* y b"]
 #: Rounds of choosing signs by the answer.
 ROUNDS = 10
 #: A quarter of a squared metre is what the dual part makes of a unit translation; beside it a rotation of an angle
@@ -96,7 +99,11 @@ def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned")
 
 
 def solve_dual_quaternions(
-    stack: Stack, signs: Signs = "aligned", seed: int = 0, dual_weight: float = DUAL_WEIGHT
+    stack: Stack,
+    signs: Signs = "aligned",
+    seed: int = 0,
+    dual_weight: float = DUAL_WEIGHT,
+    residual: Residual = "a x - y b",
 ) -> DualQuaternionAnswer:
     """The global optimum of Horn's cost for a choice of signs.
 
@@ -108,16 +115,17 @@ def solve_dual_quaternions(
         Of "random".
     dual_weight : float
         Of the dual part's square against the primal part's.
+    residual : "a x - y b" or "x - a* y b"
 
     Raises
     ------
     OptionError
-        For another choice of signs.
+        For another choice of signs, or another residual.
     UnderdeterminedError
         When the rotations are not determined (by "aligned", which looks at them first).
     """
     q_A, q_B = signed_quaternions(stack, signs, seed)
-    form = _Form.of(stack, q_A, q_B, dual_weight)
+    form = _Form.of(stack, q_A, q_B, dual_weight, residual)
     sign = np.ones(len(q_B))
     rounds = 0
     while True:
@@ -205,10 +213,18 @@ class _Form:
     stack: Stack
 
     @staticmethod
-    def of(stack: Stack, q_A: Array, q_B: Array, dual_weight: float) -> _Form:
+    def of(stack: Stack, q_A: Array, q_B: Array, dual_weight: float, residual: Residual = "a x - y b") -> _Form:
+        if residual not in get_args(Residual):
+            raise OptionError(f"residual={residual!r} is not one of {', '.join(map(repr, get_args(Residual)))}")
         weight = np.repeat([1.0, np.sqrt(dual_weight)], 4)[:, None]
-        rows_X = weight * _multiplication(q_A, stack.A[:, :3, 3], left)
-        rows_Y = weight * _multiplication(q_B, stack.B[:, :3, 3], right)
+        rows_Y = _multiplication(q_B, stack.B[:, :3, 3], right)
+        if residual == "a x - y b":
+            rows_X = weight * _multiplication(q_A, stack.A[:, :3, 3], left)
+            rows_Y = weight * rows_Y
+        else:
+            t_inverse = -np.einsum("nji,nj->ni", stack.A[:, :3, :3], stack.A[:, :3, 3])
+            rows_X = np.tile(weight * np.eye(8), (len(stack.A), 1, 1))
+            rows_Y = weight * (_multiplication(q_A * (1.0, -1.0, -1.0, -1.0), t_inverse, left) @ rows_Y)
         edges = [slice(8 * i, 8 * j) for i, j in zip(stack.first[:-1], stack.first[1:], strict=True)]
         flat_X, flat_Y = rows_X.reshape(-1, 8), rows_Y.reshape(-1, 8)
         own_X = np.array([flat_X[edge].T @ flat_X[edge] for edge in edges])

@@ -195,3 +195,25 @@ def test_sensible_noise_gives_sensible_answers() -> None:
 def test_other_signs_are_refused_by_name() -> None:
     with pytest.raises(OptionError, match="aligned"):
         horn2023(one_pair().problem, MethodOptions(), "given")  # type: ignore[arg-type]
+
+
+def test_the_other_residual_is_x_against_what_each_measurement_makes_of_y() -> None:
+    simulation = four_targets()
+    stack = Stack.of(simulation.problem)
+    q_A, q_B = signed_quaternions(stack, "aligned", 0)
+    Q = _Form.of(stack, q_A, q_B, 1.0, "x - a* y b").matrix(np.ones(len(q_B)))
+    frames = [T for frame in (simulation.X, simulation.Y) for T in frame.values()]
+    z = np.concatenate([np.concatenate(dual_quaternion(T)) for T in frames])
+    expected = 0.0
+    for i in range(len(stack.A)):
+        made = np.linalg.inv(stack.A[i]) @ frames[4 + stack.sensor[i]] @ stack.B[i]
+        x, y = z[8 * stack.target[i] :][:8], np.concatenate(dual_quaternion(made))
+        # Signs as the form has them: those of q_A, q_B and the frames.
+        real = left(left(q_A[i] * (1.0, -1.0, -1.0, -1.0)) @ z[32:36]) @ q_B[i]
+        expected += ((x - np.sign(real @ y[:4]) * y) ** 2).sum()
+    assert z @ Q @ z == pytest.approx(expected, rel=1e-9)
+    truth = four_targets(None)
+    found = solve_dual_quaternions(Stack.of(truth.problem), residual="x - a* y b")
+    np.testing.assert_allclose(found.t, [T[:3, 3] for f in (truth.X, truth.Y) for T in f.values()], atol=1e-6)
+    with pytest.raises(OptionError, match="residual"):
+        solve_dual_quaternions(stack, residual="y - a x b*")  # type: ignore[arg-type]
