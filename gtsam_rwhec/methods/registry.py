@@ -10,6 +10,7 @@ from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.methods import (
     certified,
     dornaika1998,
+    evangelista2023,
     heller2014,
     horn2023,
     li2010,
@@ -48,6 +49,7 @@ METHODS: dict[str, Method] = {
         wise2020.METHOD,
         heller2014.METHOD,
         heller2014.MATRIX,
+        evangelista2023.METHOD,
         certified.METHOD,
     )
 }

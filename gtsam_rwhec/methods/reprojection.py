@@ -1,0 +1,341 @@
+"""Reprojection errors of A X = Y B: corners in pixels in place of measured poses.
+
+A corner p of a target is seen at the pixel of Y^-1 A X p, with A the carriers' pose at that image. The sum of squared
+differences over all corners, images, cameras and targets, least over all X and Y, is the cost of Evangelista et al.
+2023 and of Tabb and Ahmad Yousef's rp1 where intrinsics are known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+from rwhec_factors import se3
+
+from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, TargetError
+from gtsam_rwhec.methods.protocol import MethodOptions, Poses
+from gtsam_rwhec.methods.starts import start_of
+from gtsam_rwhec.poses import Array, PosesLike, as_transforms, checked_rows, one_transform, rows_to_transforms
+from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.vision.camera import Camera
+
+#: Rounds of choosing between a flat target's two poses by the calibration so far.
+ROUNDS = 3
+#: Corners out of their plane by more than this share of the target's size make it no flat one.
+FLAT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Images of one target by one camera: A (N, 4, 4), pixels (N, n, 2), nan where a corner was not seen."""
+
+    A: Array
+    pixels: Array
+
+    @property
+    def known(self) -> np.ndarray:
+        """(N, n) booleans: which corners were seen."""
+        return np.asarray(np.isfinite(self.pixels).all(axis=2))
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What cameras saw.
+
+    Attributes
+    ----------
+    cameras : dict of str to Camera
+        By sensor.
+    corners : dict of str to (n, 3) array
+        By target, in its own frame, metres.
+    views : dict of (target, sensor) to Views
+    corner_px : float
+        Standard deviation of a corner along each axis, pixels.
+    """
+
+    cameras: Mapping[str, Camera]
+    corners: Mapping[str, Array]
+    views: Mapping[tuple[str, str], Views]
+    corner_px: float = 0.1
+
+    @staticmethod
+    def of(
+        cameras: Mapping[str, Camera],
+        corners: Mapping[str, ArrayLike],
+        views: Mapping[tuple[str, str], tuple[PosesLike, ArrayLike]],
+        corner_px: float = 0.1,
+    ) -> Observations:
+        """Check and make them.
+
+        Parameters
+        ----------
+        cameras : dict of str to Camera
+        corners : dict of str to (n, 3)
+        views : dict of (target, sensor) to (A, pixels)
+            A = T_sensorcarrier_targetcarrier of each image, pixels (N, n, 2).
+        corner_px : float
+
+        Raises
+        ------
+        CountError, FrameError, NoiseError, PoseError, TargetError
+            For shapes that do not fit, names without camera or target, what is no pose.
+        """
+        if not (np.isfinite(corner_px) and corner_px > 0.0):
+            raise NoiseError(f"corner_px is {corner_px!r}; give a positive number of pixels")
+        points = {name: np.asarray(value, dtype=float) for name, value in corners.items()}
+        for name, p in points.items():
+            if p.ndim != 2 or p.shape[1] != 3 or len(p) < 4 or not np.isfinite(p).all():
+                raise TargetError(f"the corners of {name} have shape {p.shape}; give four or more finite (n, 3) points")
+        checked = {}
+        for (target, sensor), (A, pixels) in views.items():
+            where = f"the views of {target} by {sensor}"
+            if target not in points or sensor not in cameras:
+                missing = f"corners of {target}" if target not in points else f"camera {sensor}"
+                raise FrameError(f"{where}: there are no {missing}")
+            transforms = as_transforms(A, None, f"A of {where}")
+            seen = np.asarray(pixels, dtype=float)
+            if seen.shape != (len(transforms), len(points[target]), 2) or not len(seen):
+                raise CountError(
+                    f"{where}: pixels have shape {seen.shape} for {len(transforms)} poses and {len(points[target])} "
+                    f"corners; give ({len(transforms)}, {len(points[target])}, 2), nan where a corner was not seen"
+                )
+            fewest = int(np.isfinite(seen).all(axis=2).sum(axis=1).min())
+            if fewest < 4:
+                raise CountError(f"{where}: an image has {fewest} corners; leave out images with fewer than 4")
+            rows, _ = checked_rows(transforms, 0, f"A of {where}")
+            checked[target, sensor] = Views(rows_to_transforms(rows), seen)
+        if not checked:
+            raise CountError("there are no views; give images of a target by a camera")
+        return Observations(dict(cameras), points, checked, float(corner_px))
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names that were seen."""
+        return tuple(dict.fromkeys(target for target, _ in self.views))
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names that saw."""
+        return tuple(dict.fromkeys(sensor for _, sensor in self.views))
+
+    def poses(self, predicted: Mapping[tuple[str, str], Array] | None = None) -> Problem:
+        """The same as a problem of poses: each image's own, by its corners alone, with covariances.
+
+        Parameters
+        ----------
+        predicted : dict of (target, sensor) to (N, 4, 4), optional
+            T_camera_target as a calibration has it: of a flat target's two poses the nearer one is taken. Left out: the
+            one of less reprojection error.
+
+        Raises
+        ------
+        TargetError
+            For a target that is not flat.
+        CameraError
+            For an image whose corners have no pose.
+        """
+        from gtsam_rwhec.vision.pose import plane_poses
+
+        problem = Problem()
+        for (target, sensor), view in self.views.items():
+            flat, T_target_flat = _in_plane(self.corners[target], target)
+            known = view.known
+            found = plane_poses(
+                self.cameras[sensor],
+                [flat[seen] for seen in known],
+                [pixels[seen] for pixels, seen in zip(view.pixels, known, strict=True)],
+                corner_px=self.corner_px,
+            )
+            T = found.T @ np.linalg.inv(T_target_flat)
+            choice = np.zeros(len(T), dtype=int)
+            if predicted is not None:
+                off = np.linalg.norm(T[:, :, :3, :3] - predicted[target, sensor][:, None, :3, :3], axis=(2, 3))
+                choice = np.where(np.isnan(off[:, 1]), 0, np.argmin(np.nan_to_num(off, nan=np.inf), axis=1))
+            at = np.arange(len(T))
+            lost = np.flatnonzero(~np.isfinite(T[at, choice]).all(axis=(1, 2)))
+            if lost.size:
+                raise CameraError(f"image {lost[0]} of {target} by {sensor} has no pose: are its corners on one line?")
+            # of the right perturbation in the flat frame; in the target's, a congruence with the adjoint
+            ad = se3.adjoint(np.broadcast_to(T_target_flat, (len(T), 4, 4)))
+            covariance = ad @ found.covariance[at, choice] @ ad.transpose(0, 2, 1)
+            problem.add(target, sensor, view.A, T[at, choice], covariances=0.5 * (covariance + _transposed(covariance)))
+        return problem
+
+
+@dataclass(frozen=True)
+class ReprojectionAnswer:
+    """Where the descent ended.
+
+    Attributes
+    ----------
+    X, Y : dict of str to gtsam.Pose3
+        T_targetcarrier_target and T_sensorcarrier_sensor, metres.
+    cost : float
+        Half of the sum of squares over corner_px^2.
+    rms_px : float
+        Root mean square of the corners' errors, of their length.
+    iterations : int
+    converged : bool
+    starts_from : str
+    """
+
+    X: dict[str, gtsam.Pose3]
+    Y: dict[str, gtsam.Pose3]
+    cost: float
+    rms_px: float
+    iterations: int
+    converged: bool
+    starts_from: str
+
+
+def calibrate(observations: Observations, options: MethodOptions | None = None) -> ReprojectionAnswer:
+    """Least reprojection error over all X and Y by Levenberg-Marquardt on the manifold.
+
+    Without a start in the options, it is a closed form's answer (``starts.start_of``) for the images' poses; of a flat
+    target's two poses those that this answer predicts are then taken.
+
+    Raises
+    ------
+    CameraError
+        When the start puts a corner that was seen behind its camera.
+    UnderdeterminedError
+        When the closed form finds that the motions do not determine the poses.
+    """
+    options = options or MethodOptions()
+    targets, sensors = observations.targets, observations.sensors
+    X, Y, starts_from = _start(observations, options)
+    T = np.array(
+        [one_transform(X[name], f"start of {name}") for name in targets]
+        + [one_transform(Y[name], f"start of {name}") for name in sensors]
+    )
+    linear = linearised(observations, T)
+    if not np.isfinite(linear.cost):
+        raise CameraError(
+            f"the start ({starts_from}) puts a corner that was seen behind its camera; give a better one by "
+            "MethodOptions.start"
+        )
+    damping, converged, iteration = 1e-6, False, 0
+    while iteration < options.max_iterations and not converged:
+        iteration += 1
+        while True:
+            step = -np.linalg.solve(linear.H + damping * np.diag(np.diagonal(linear.H)), linear.g)
+            tried = T @ se3.expmap(step.reshape(-1, 6))
+            ahead = linearised(observations, tried)
+            if ahead.cost <= linear.cost or damping > 1e9:
+                break
+            damping *= 10.0
+        if ahead.cost > linear.cost:
+            converged = True  # no step goes down: rounding
+            break
+        decrease = linear.cost - ahead.cost
+        converged = bool(decrease <= 1e-12 * ahead.cost and np.abs(step).max() < 1e-7)
+        T, linear, damping = tried, ahead, max(0.1 * damping, 1e-12)
+    poses = [gtsam.Pose3(gtsam.Rot3(one[:3, :3]), one[:3, 3]) for one in T]
+    return ReprojectionAnswer(
+        dict(zip(targets, poses[: len(targets)], strict=True)),
+        dict(zip(sensors, poses[len(targets) :], strict=True)),
+        linear.cost,
+        float(observations.corner_px * np.sqrt(2.0 * linear.cost / linear.corners)),
+        iteration,
+        converged,
+        starts_from,
+    )
+
+
+def _start(observations: Observations, options: MethodOptions) -> tuple[Poses, Poses, str]:
+    if options.start is not None:
+        X, Y, _ = options.start
+        missing = [name for name in observations.targets if name not in X]
+        missing += [name for name in observations.sensors if name not in Y]
+        if missing:
+            raise FrameError(f"the start has no {missing[0]}; it has {', '.join([*X, *Y]) or 'none'}")
+        return X, Y, "the given start"
+    problem = observations.poses()
+    for _ in range(ROUNDS):
+        X, Y, _, _ = start_of(problem, options)
+        predicted = {
+            (target, sensor): np.linalg.inv(np.asarray(Y[sensor])) @ view.A @ np.asarray(X[target])
+            for (target, sensor), view in observations.views.items()
+        }
+        problem = observations.poses(predicted)
+    X, Y, _, words = start_of(problem, options)
+    return X, Y, f"{words} of the images' poses"
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Half the weighed sum of squares, its gradient and Gauss-Newton Hessian by [w, v] of all frames, corner count."""
+
+    cost: float
+    g: Array
+    H: Array
+    corners: int
+
+
+def linearised(observations: Observations, T: Array) -> Linearised:
+    """At poses T (n_X + n_Y, 4, 4), perturbed on the right; infinite where a corner seen is behind its camera."""
+    targets, sensors = observations.targets, observations.sensors
+    n = len(T)
+    H, g = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
+    cost, corners = 0.0, 0
+    for (target, sensor), view in observations.views.items():
+        i, j = targets.index(target), len(targets) + sensors.index(sensor)
+        camera, p = observations.cameras[sensor], observations.corners[target]
+        to_camera = np.linalg.inv(T[j]) @ view.A @ T[i]
+        R = to_camera[:, :3, :3]
+        seen = p @ R.transpose(0, 2, 1) + to_camera[:, None, :3, 3]
+        known = view.known
+        if (seen[known][:, 2] <= 1e-9).any():
+            return Linearised(np.inf, g.ravel(), H.reshape(6 * n, 6 * n), 0)
+        z = np.where(known, seen[:, :, 2], 1.0)
+        x = np.where(known[:, :, None], seen[:, :, :2] / z[:, :, None], 0.0)
+        pixels, D = camera.pixel_jacobian(x)
+        # d(x, y) / d(X, Y, Z) = [I, -x] / Z
+        to_x = np.concatenate([np.broadcast_to(np.eye(2), (*x.shape, 2)), -x[..., None]], axis=-1) / z[..., None, None]
+        by_point = np.where(known[:, :, None, None], D @ to_x, 0.0) / observations.corner_px
+        error = np.where(known[:, :, None], pixels - view.pixels, 0.0) / observations.corner_px
+        # X Expmap([w, v]) moves the point by R (w x p + v), Y Expmap([w, v]) by -(w x P + v).
+        J_X = by_point @ (R[:, None] @ np.concatenate([-se3.hat(p), np.tile(np.eye(3), (len(p), 1, 1))], axis=2))
+        at_P = np.concatenate([se3.hat(seen), np.broadcast_to(-np.eye(3), (*seen.shape, 3))], axis=-1)
+        rows_X, rows_Y, e = J_X.reshape(-1, 6), (by_point @ at_P).reshape(-1, 6), error.ravel()
+        H[i, :, i] += rows_X.T @ rows_X
+        H[j, :, j] += rows_Y.T @ rows_Y
+        cross = rows_X.T @ rows_Y
+        H[i, :, j] += cross
+        H[j, :, i] += cross.T
+        g[i] += rows_X.T @ e
+        g[j] += rows_Y.T @ e
+        cost += 0.5 * float(e @ e)
+        corners += int(known.sum())
+    return Linearised(cost, g.ravel(), H.reshape(6 * n, 6 * n), corners)
+
+
+def _in_plane(points: Array, name: str) -> tuple[Array, Array]:
+    """Corners of a flat target with z = 0, and T_target_flat.
+
+    Raises
+    ------
+    TargetError
+    """
+    middle = points.mean(axis=0)
+    _, singular, Vt = np.linalg.svd(points - middle)
+    if singular[2] > FLAT * singular[0]:
+        raise TargetError(
+            f"the corners of {name} lie in no plane (off by {singular[2] / np.sqrt(len(points)):.3g} m), and poses of "
+            "single images are found for flat targets only; give a start by MethodOptions.start"
+        )
+    if singular[1] <= FLAT * singular[0]:
+        raise TargetError(f"the corners of {name} lie on one line; no pose follows from them")
+    R = Vt.T * np.array([1.0, 1.0, np.linalg.det(Vt)])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, middle
+    flat = (points - middle) @ R
+    flat[:, 2] = 0.0
+    return flat, T
+
+
+def _transposed(M: Array) -> Array:
+    return np.swapaxes(M, -1, -2)
