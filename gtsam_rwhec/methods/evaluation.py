@@ -1,23 +1,44 @@
-"""Anybody's answer under the certified objective: J and each pair's residuals, from the problem's moments."""
+"""Anybody's answer under the certified objective: J, each pair's residuals, what is free; all from moments."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.calibration import check_against_knowledge
 from gtsam_rwhec.certify.full_form import add_priors, assemble, edge_slots, forms_of_edges
 from gtsam_rwhec.certify.parts import parts_of
 from gtsam_rwhec.certify.variables import as_variables, given_answer
+from gtsam_rwhec.identifiability import identify
 from gtsam_rwhec.poses import PoseLike
 from gtsam_rwhec.problem import Problem
 from gtsam_rwhec.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """What an answer costs and how well it fits.
+
+    Attributes
+    ----------
+    cost : float
+        J (eq. 18), priors included; turned round where the certified solver turns it round.
+    residuals : dict of (target, sensor) to Residual
+    free_directions : tuple of str
+        What the measurements leave undetermined, in words, judged by this answer's residuals: where they are far larger
+        than the noise, more counts as free.
+    """
+
+    cost: float
+    residuals: dict[Pair, Residual]
+    free_directions: tuple[str, ...]
+
+
 def evaluate(
     problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
-) -> tuple[float, dict[Pair, Residual]]:
-    """J (eq. 18, priors included; turned round where the certified solver turns it round) and residuals of an answer.
+) -> Evaluation:
+    """Evaluate an answer.
 
     Parameters
     ----------
@@ -35,6 +56,7 @@ def evaluate(
     check_against_knowledge(problem, X, Y, scale)
     cost = 0.0
     residuals: dict[Pair, Residual] = {}
+    free: list[str] = []
     for part in parts:
         answer = given_answer(part, X, Y, scale)
         translation, rotation = forms_of_edges(part)
@@ -42,12 +64,14 @@ def evaluate(
         add_priors(form, part)
         cost += max(form.value(*as_variables(part, answer)), 0.0)
         poses = PairPoses.of(part, answer)
-        residuals |= residuals_of_pairs(part, poses, *costs_of_pairs(part, poses))
-    return cost, {pair: residuals[pair] for pair in problem.pairs}
+        J_t, J_R = costs_of_pairs(part, poses)
+        residuals |= residuals_of_pairs(part, poses, J_t, J_R)
+        free += identify(part, poses, J_t, J_R).free_directions
+    return Evaluation(cost, {pair: residuals[pair] for pair in problem.pairs}, tuple(free))
 
 
 def cost_of_answer(
     problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
 ) -> float:
     """J of an answer; see ``evaluate``."""
-    return evaluate(problem, X, Y, scale)[0]
+    return evaluate(problem, X, Y, scale).cost

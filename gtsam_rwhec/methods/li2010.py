@@ -120,7 +120,12 @@ KRONECKER = Method(
 DUAL_QUATERNIONS = Method(
     name="li2010_dq",
     properties=Properties(
-        joint=True, probabilistic=False, certifiable=False, multiple="", monocular=False, representation="DQ"
+        joint=True,
+        probabilistic=False,
+        certifiable=False,
+        multiple="",
+        monocular=False,
+        representation="dual quaternions",
     ),
     source=_SOURCE,
     assumes="All measurements alike, a radian as much as a metre; quaternions whose signs fit together; carriers' "

@@ -8,7 +8,7 @@ Targets' poses are the X of A X = Y B, sensors' poses the Y.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import gtsam
@@ -131,6 +131,8 @@ class Estimate:
         What an iteration started from; None for closed forms and global methods.
     notes : tuple of str
         What the method says of this answer.
+    free_directions : tuple of str
+        What the measurements leave undetermined, in words, judged by this answer's residuals; empty when nothing.
     """
 
     method: str
@@ -141,7 +143,8 @@ class Estimate:
     residuals: dict[Pair, Residual]
     seconds: float
     starts_from: str | None = None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+    free_directions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -100,17 +100,18 @@ def method_of(name: str) -> Method:
 def estimate_of(method: Method, problem: Problem, found: Calibration, seconds: float) -> Estimate:
     """A method's answer under the certified objective."""
     scale = found.scale if isinstance(found.scale, float) else dict(found.scale)
-    cost, residuals = evaluate(problem, found.X, found.Y, scale)
+    evaluation = evaluate(problem, found.X, found.Y, scale)
     return Estimate(
         method=method.name,
         X={name: _pose3(found.X[name], name) for name in problem.targets},
         Y={name: _pose3(found.Y[name], name) for name in problem.sensors},
         scale=scale,
-        cost=cost,
-        residuals=residuals,
+        cost=evaluation.cost,
+        residuals=evaluation.residuals,
         seconds=seconds,
         starts_from=found.starts_from,
         notes=found.notes,
+        free_directions=evaluation.free_directions,
     )
 
 

@@ -9,7 +9,7 @@ from rich.text import Text
 
 from gtsam_rwhec.methods.comparison import Compared, Comparison
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.sentences import certificate_sentence
+from gtsam_rwhec.report.sentences import certificate_sentence, identifiability_sentences
 from gtsam_rwhec.report.solution_report import report_console
 
 HEADINGS = ("cost J", "gap", "gap %", "rms mm", "rms°", "ms")
@@ -57,6 +57,9 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
     style = "bold green" if comparison.certificate.is_certified else "bold red"
     sentence = certificate_sentence(comparison.certificate).replace("this answer", "the certified answer", 1)
     console.print(Text(sentence, style=style), soft_wrap=wrap)
+    if comparison.solution is not None:
+        for words in identifiability_sentences(comparison.solution):
+            console.print(Text(words, style="bold red"), soft_wrap=wrap)
 
 
 def _remarks(comparison: Comparison) -> list[str]:

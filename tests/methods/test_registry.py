@@ -19,6 +19,7 @@ from gtsam_rwhec.errors import (
     UnderdeterminedError,
 )
 from gtsam_rwhec.methods import METHODS, MethodOptions, cost_of_answer, run
+from gtsam_rwhec.simulate import Noise, general
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -124,19 +125,71 @@ def test_what_a_method_cannot_hold_is_refused_in_words(name: str) -> None:
         assert word in METHODS[name].applies(problem)
 
 
-@pytest.mark.parametrize("name", ["shah2013"])
-def test_parallel_axes_are_named(name: str) -> None:
-    angles = np.linspace(0.0, 2.0, 12)
-    A = np.tile(np.eye(4), (12, 1, 1))
-    A[:, 0, 0] = A[:, 1, 1] = np.cos(angles)
-    A[:, 1, 0] = np.sin(angles)
-    A[:, 0, 1] = -A[:, 1, 0]
-    A[:, 0, 3] = np.arange(12)
-    for poses in (A, np.tile(np.eye(4), (5, 1, 1))):
-        problem = rw.Problem()
-        problem.add("target", "sensor", poses, poses)
-        with pytest.raises(UnderdeterminedError, match="parallel axes"):
-            run(name, problem)
+def planar(noise: Noise | None) -> rw.Problem:
+    """All rotations about one axis."""
+    return general(1, 1, seed=1, motion="planar", number_of_measurements=40, noise=noise).problem
+
+
+def standing_still() -> rw.Problem:
+    problem = rw.Problem()
+    problem.add("target0", "sensor0", np.tile(np.eye(4), (5, 1, 1)), np.tile(np.eye(4), (5, 1, 1)), 0.01, 1250.0)
+    return problem
+
+
+def free_or_refused(name: str, problem: rw.Problem) -> str:
+    """What a method's answer leaves free, or why there is no answer."""
+    try:
+        return "; ".join(run(name, problem).free_directions)
+    except UnderdeterminedError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("noise", [None, Noise(0.001, 1e5)])
+def test_parallel_axes_are_an_error_or_name_what_is_free(name: str, noise: Noise | None) -> None:
+    problem = planar(noise)
+    if METHODS[name].applies(problem):
+        pytest.skip("for other problems")
+    words = free_or_refused(name, problem)
+    assert any(known in words for known in ("one axis only", "parallel axes", "leave a direction free"))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_standing_still_is_an_error_or_names_what_is_free(name: str) -> None:
+    if METHODS[name].applies(standing_still()):
+        pytest.skip("for other problems")
+    words = free_or_refused(name, standing_still())
+    assert any(known in words for known in ("the motion did not turn", "all the same", "do not move"))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_two_motions_about_two_axes_are_enough(name: str) -> None:
+    simulation = general(1, 1, seed=2, number_of_measurements=3)
+    if METHODS[name].applies(simulation.problem):
+        pytest.skip("for other problems")
+    estimate = run(name, simulation.problem)
+    assert max(largest_errors(simulation, estimate)) < 1e-5
+    assert not estimate.free_directions
+
+
+#: The columns of the RWHEC paper's Table 1 that its text has: how many frames.
+TABLE_1 = {
+    "dornaika1998": "",
+    "strobl2006": "",
+    "li2010_dq": "",
+    "shah2013": "",
+    "heller2014": "",
+    "wise2020": "",
+    "wang2022": "Xs or Ys",
+    "evangelista2023": "Xs",
+    "horn2023": "Xs or Ys",
+    "certified": "Xs and Ys",
+}
+
+
+@pytest.mark.parametrize("name", [name for name in TABLE_1 if name in METHODS])
+def test_numbers_of_frames_are_table_1s(name: str) -> None:
+    assert METHODS[name].properties.multiple == TABLE_1[name]
 
 
 def test_unknown_names_and_options_are_refused() -> None:
