@@ -17,11 +17,13 @@ LEAST_RESIDUAL = 1e-6
 def certified_hand_eye(stations: Stations) -> tuple[Array, Array]:
     """Certified pose of the camera in the gripper.
 
-    The base's and target's origins are the means that ``stations`` are about: the answer does not depend on them.
+    The target has its own origin back: what the camera measures with an error of its own is where that is. With an
+    origin elsewhere each error of the rotation would move it.
     """
     R_A = stations.R_G.transpose(0, 2, 1)  # gripper_T_base
     t_A = -np.einsum("nab,nb->na", R_A, stations.t_G)
-    _, Y = certified(R_A, t_A, stations.R_C, stations.t_C)
+    t_C = stations.t_C + stations.R_C @ stations.origin
+    _, Y = certified(R_A, t_A, stations.R_C, t_C)
     return Y[:3, :3], Y[:3, 3]
 
 

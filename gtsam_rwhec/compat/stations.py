@@ -34,16 +34,19 @@ class Stations:
         Target in the camera.
     u : (N, 3) array
         R_C' t_C, minus the camera's position in the target's frame, whose origin is moved to the mean.
+    origin : (3,) array
+        The mean that was taken from u.
     """
 
     R_G: Array
     t_G: Array
     R_C: Array
     u: Array
+    origin: Array
 
     @property
     def t_C(self) -> Array:
-        """Translations of the target in the camera, (N, 3)."""
+        """Translations of the target, its origin moved to the mean, in the camera, (N, 3)."""
         t: Array = np.einsum("nab,nb->na", self.R_C, self.u)
         return t
 
@@ -51,7 +54,8 @@ class Stations:
 def stations_of(R_G: Array, t_G: Array, R_C: Array, t_C: Array) -> Stations:
     """Stations about the mean origins, which no motion depends on and rounding does."""
     u = np.einsum("nba,nb->na", R_C, t_C)
-    return Stations(R_G, t_G - t_G.mean(axis=0), R_C, u - u.mean(axis=0))
+    origin = u.mean(axis=0)
+    return Stations(R_G, t_G - t_G.mean(axis=0), R_C, u - origin, origin)
 
 
 def all_earlier(features: Array) -> Array:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec import handeye
+from gtsam_rwhec import handeye, simulate, solve
 from gtsam_rwhec.compat import opencv
 from gtsam_rwhec.errors import CountError, OptionError, PoseError, UnderdeterminedError
 from gtsam_rwhec.handeye.cost import squared_residuals
@@ -122,9 +122,25 @@ def test_the_answer_does_not_depend_on_where_the_base_and_the_target_are(method)
     gripper, seen, _, _ = stations(15, 4)
     rng = np.random.default_rng(0)
     base, target = transforms(Rotation.random(2, random_state=rng).as_matrix(), 1e3 * rng.normal(size=(2, 3)))
+    if method == opencv.CALIB_HAND_EYE_CERTIFIED:  # errors of the measured rotation would move another origin
+        target[:3, 3] = 0.0
     first = opencv.calibrateHandEye(*parts(gripper, seen), method=method)
     moved = opencv.calibrateHandEye(*parts(base @ gripper, seen @ target), method=method)
     assert largest_difference(first, moved) < 1e-7
+
+
+def test_the_certified_answer_is_that_of_solve_with_the_true_noise():
+    errors = {"certified": [], "solve": [], "park": []}
+    for seed in range(20):
+        simulated = simulate.general(1, 1, seed=seed, number_of_measurements=50, noise=simulate.Noise(0.01, 125.0))
+        truth = simulated.Y["sensor0"][:3, 3]
+        measured = simulated.problem.measurements("target0", "sensor0")
+        poses = parts(np.linalg.inv(measured.A), measured.B)
+        for name, method in (("certified", opencv.CALIB_HAND_EYE_CERTIFIED), ("park", opencv.CALIB_HAND_EYE_PARK)):
+            errors[name].append(np.linalg.norm(opencv.calibrateHandEye(*poses, method=method)[1][:, 0] - truth))
+        errors["solve"].append(np.linalg.norm(solve(simulated.problem).Y["sensor0"].translation() - truth))
+    assert np.median(errors["certified"]) < 1.2 * np.median(errors["solve"])
+    assert np.median(errors["certified"]) < 0.3 * np.median(errors["park"])
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
