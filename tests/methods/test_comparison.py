@@ -55,6 +55,13 @@ def test_gaps_are_those_of_certify() -> None:
         assert result.is_optimal(row) == alone.is_optimal == (row.method.name == "certified")
 
 
+def test_five_ways_to_the_minimum_with_all_weights_one_meet() -> None:
+    """Penalties, a manifold, and three relaxations: of one cost, so the answers are one."""
+    problem = general_pair().problem
+    costs = [run(name, problem).cost for name in ("tabb2017_c1", "wise2020", "heller2014_matrix", "heller2014")]
+    np.testing.assert_allclose(costs, run("dornaika1998", problem).cost, rtol=1e-5)
+
+
 def test_residuals_are_pooled_over_measurements() -> None:
     problem = four_targets().problem
     row = next(row for row in compare(problem, methods=["wang2022"]).rows)
