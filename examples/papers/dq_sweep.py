@@ -1,0 +1,67 @@
+"""Methods of ``gtsam_rwhec.handeye`` over many alphas: a sample's moments are taken once, whatever alpha is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from dq_scenarios import Array, Sample
+
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.handeye import METHODS, motions_of
+from gtsam_rwhec.handeye.cost import moments_of
+from gtsam_rwhec.handeye.method import Request
+
+#: The paper's names, in the order of its Table 2.
+NAMES = {
+    "DQOpt": "dqopt",
+    "DQ2ndOrd": "dq2ndord",
+    "DQConvRlx": "dqconvrlx",
+    "DQ2Steps": "dq2steps",
+    "Dan": "dan",
+    "ChVecOpt": "chvecopt",
+    "QuatVecOpt": "quatvecopt",
+    "DQNLOpt": "dqnlopt",
+    "DQNLOptRnd": "dqnloptrnd",
+}
+#: Whose answer is the same for every alpha.
+WITHOUT_ALPHA = ("DQ2Steps",)
+#: Appendix D: 100 values from 10^-2 to 10^1.7, in 1/m.
+ALPHAS = np.logspace(-2.0, 1.7, 100)
+
+
+def requests(sample: Sample, alphas: Sequence[float] | Array, rng: int = 0) -> list[Request]:
+    """One request for each alpha; S, M and W are linear in alpha^2 (eq. 9). ``rng``: seed of random starts."""
+    motions = motions_of(sample.C, sample.H)
+    moments = moments_of(motions.rows)
+    return [
+        Request(motions, moments.cost(float(a)), float(a), None, None, prior=None, scale="known", rng=rng)
+        for a in alphas
+    ]
+
+
+def errors(sample: Sample, names: Sequence[str], alphas: Sequence[float] | Array = ALPHAS) -> Array:
+    """Errors (names, alphas, 2): rotation in degrees, translation in cm."""
+    asked = requests(sample, alphas)
+    found = np.empty((len(names), len(asked), 2))
+    for of_name, name in zip(found, names, strict=True):
+        function = METHODS[NAMES[name]].function
+        if name in WITHOUT_ALPHA:
+            of_name[:] = distance(function(asked[0]).X, sample.X)
+            continue
+        for of_alpha, request in zip(of_name, asked, strict=True):
+            try:
+                of_alpha[:] = distance(function(request).X, sample.X)
+            except UnderdeterminedError:
+                of_alpha[:] = np.nan
+    return found
+
+
+def distance(X: Array, truth: Array) -> tuple[float, float]:
+    """Angle (degrees) and length (cm) between two poses (4, 4)."""
+    difference = X[:3, :3].T @ truth[:3, :3]
+    sine = np.linalg.norm(difference - difference.T) / np.sqrt(8.0)
+    return (
+        float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(difference) - 1.0)))),
+        100.0 * float(np.linalg.norm(X[:3, 3] - truth[:3, 3])),
+    )
