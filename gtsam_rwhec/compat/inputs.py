@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
-from gtsam_rwhec.poses import LARGEST_M, ROTATION_TOLERANCE, Array, determinant
+from gtsam_rwhec.poses import LARGEST_M, ROTATION_TOLERANCE, Array
 
 #: Fewest poses that hold two motions about different axes; OpenCV asks for as many.
 FEWEST_POSES = 3
 #: Smallest over largest (or over all possible) turning of the axes that is more than rounding.
 PARALLEL = 1e-13
+#: Second row times third row, entries (1, 2), (2, 0), (0, 1), then (2, 1), (0, 2), (1, 0): their cross product.
+_NEXT, _AFTER = [4, 5, 3, 5, 3, 4], [8, 6, 7, 7, 8, 6]
 _DTYPE, _SHAPE = attrgetter("dtype"), attrgetter("shape")
 
 
@@ -71,10 +73,9 @@ def check_axes(R: tuple[Array, Array], where: tuple[str, str]) -> None:
     ------
     UnderdeterminedError
     """
-    count = len(R[0])
-    totals = np.stack([np.add.reduce(rotations) for rotations in R])
-    turnings = np.linalg.eigvalsh(count**2 * np.eye(3) - totals.transpose(0, 2, 1) @ totals)
-    for (least, _, most), name in zip(turnings.tolist(), where, strict=True):
+    for rotations, name in zip(R, where, strict=True):
+        count = len(rotations)
+        least, most = least_and_most_turning(np.einsum("nij->ij", rotations), count)
         if most <= PARALLEL * count**2:
             raise UnderdeterminedError(
                 f"{name}: no motion rotates, so neither the rotation about the common direction nor the translation "
@@ -85,6 +86,23 @@ def check_axes(R: tuple[Array, Array], where: tuple[str, str]) -> None:
                 f"{name}: all motions rotate about one axis, which leaves the translation along it free; add poses "
                 "that turn about another axis"
             )
+
+
+def least_and_most_turning(total: Array, count: int) -> tuple[float, float]:
+    """Of N^2 I - S'S: the determinant over the sum of its 2 x 2 minors (its least eigenvalue where that is small), and
+    its trace.
+
+    Motions about one axis turn two directions alike, so two eigenvalues are never small and one large. In plain
+    numbers: this is asked of three poses as of a million, and NumPy's call alone would take longer.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (total.T @ total).tolist()
+    square = float(count) ** 2
+    a, e, i = square - a, square - e, square - i
+    b, c, d, f, g, h = -b, -c, -d, -f, -g, -h
+    first, second, third = e * i - f * h, f * g - d * i, d * h - e * g
+    minors = first + (a * i - c * g) + (a * e - b * d)
+    determinant = a * first + b * second + c * third
+    return (determinant / minors if minors > 0.0 else 0.0), a + e + i
 
 
 def _rotations(values: Any, where: str) -> Array:
@@ -166,7 +184,10 @@ def are_rotations(R: Array) -> bool:
     """
     rows = np.ascontiguousarray(R.reshape(-1, 9).T)
     squares = np.einsum("kn,kn->n", rows, rows)
-    return bool(np.abs(squares - 3.0).max() < 1e-7 and np.abs(determinant(rows) - 1.0).max() < 1e-7)
+    cross = rows[_NEXT] * rows[_AFTER]
+    determinants = np.einsum("kn,kn->n", rows[:3], cross[:3] - cross[3:])
+    worst = np.abs(np.concatenate([squares - 3.0, determinants - 1.0])).max()
+    return bool(worst < 1e-7)
 
 
 def _check_rotations(R: Array, where: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,7 @@ from gtsam_rwhec.poses import Array
 RobotWorld = tuple[Array, Array, Array, Array]
 
 
-@dataclass(frozen=True)
-class Moments:
+class Moments(NamedTuple):
     """Means over the poses of products of (R_A, t_A, 1) and (R_B, t_A, t_B, 1).
 
     Attributes
@@ -43,8 +42,7 @@ def moments_of(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> Moments:
     F = np.empty((count, 25))
     F[:, :9], F[:, 9:12], F[:, 12:15] = R_A.reshape(count, 9), t_A, t_B
     F[:, 15], F[:, 16:] = 1.0, R_B.reshape(count, 9)
-    G = F[:, :16].T @ F
-    G /= count
+    G = (F[:, :16].T @ F) / count
     of_R_A = G[:9].reshape(3, 3, 25)
     return Moments(
         R_A_R_B=of_R_A[:, :, 16:].reshape(3, 3, 3, 3),
@@ -115,5 +113,7 @@ def _rotations_of_vec(vectors: Array) -> Array:
             "different axes"
         )
     R: Array = U @ Wt
-    R *= np.linalg.det(R)[:, None, None]
+    for rotation, ((a, b, c), (d, e, f), (g, h, i)) in zip(R, R.tolist(), strict=True):
+        if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0.0:
+            rotation *= -1.0
     return R
