@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gtsam_rwhec.errors import CountError, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
 from gtsam_rwhec.handeye.cost import BLOCK
 from gtsam_rwhec.handeye.dual_quaternions import from_rows
 from gtsam_rwhec.handeye.signs import UNCERTAIN, resolve_signs
@@ -86,9 +86,12 @@ def motions_of(C: PosesLike, H: PosesLike, order: QuaternionOrder | None = None)
 
 def _fill(C: Array, H: Array, first: int, rows: Array, sums: Array) -> None:
     b = len(C)
-    checked = np.empty((12, 2 * b))
-    checked_rows(C, first, "C", checked[:, :b])
-    checked_rows(H, first, "H", checked[:, b:])
+    try:  # both at once, in half the calls
+        checked, _ = checked_rows(np.concatenate([C, H]), first, "C and H")
+    except PoseError:
+        checked_rows(C, first, "C")  # each by itself says which and where
+        checked_rows(H, first, "H")
+        raise
     q, q_dual = from_rows(checked)
     for part, top in ((q, 0), (q_dual, 7)):
         of_C, of_H = part[:, :b], part[:, b:]
