@@ -74,5 +74,6 @@ def axes_in_words(directions: Array) -> str:
     basis = left[:, :rank] if rank == 1 else left[:, 2:]
     axis = basis[:, 0] * np.sign(basis[np.abs(basis[:, 0]).argmax(), 0])
     name = "xyz"[int(np.abs(axis).argmax())] if np.abs(axis).max() > AXIS_COSINE else None
-    word = name or f"({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f})"
+    x, y, z = np.round(axis, 2) + 0.0  # no -0.00
+    word = name or f"({x:.2f}, {y:.2f}, {z:.2f})"
     return word if rank == 1 else f"all axes across {word}"

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from simulated import Simulated, distance, hand_held, pair, planar, poses
+
+from gtsam_rwhec.errors import CountError, UnderdeterminedError
+from gtsam_rwhec.handeye import METHODS, DualQuaternionPrior, solve
+from gtsam_rwhec.handeye.degenerate import axes_in_words
+
+HEIGHT = "translation along z of c's axes"
+#: Not turned, so that c's axes have the names of h's.
+UPRIGHT = poses(np.zeros((1, 3)), np.array([[0.1, 0.2, 0.3]]))[0]
+DUAL_QUATERNION = ["dqopt", "dq2steps", "dqconvrlx", "dq2ndord", "dq2ndord_lambda", "dqitr"]
+#: Those that need axes that are not parallel, or noise.
+REFUSED = ["dan", "dq2steps", "dqoptpoly_resultant", "dqoptpoly_sturm"]
+
+
+def cart(count: int, seed: int, sigma_rad: float, sigma_m: float) -> Simulated:
+    rng = np.random.default_rng(seed)
+    H = poses(np.outer(rng.uniform(-0.5, 0.5, count), [0, 0, 1.0]), rng.normal(size=(count, 3)) * [0.3, 0.3, 0.0])
+    return pair(H, rng, sigma_rad, sigma_m, UPRIGHT)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_noise_is_not_taken_for_motion(seed: int) -> None:
+    """A cart: M has full rank from noise alone, at every level of it, and the height is free all the same."""
+    sigma = 10.0 ** np.random.default_rng(seed).uniform(-5, -1.5)
+    s = cart(80, seed, sigma, sigma)
+    assert solve(s.C, s.H).free_directions == (HEIGHT,)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_motion_is_not_taken_for_noise(seed: int) -> None:
+    """Turns about all axes of several times the noise."""
+    rng = np.random.default_rng(seed)
+    s = hand_held(int(rng.integers(10, 200)), seed, 0.01, 0.01, largest_rad=float(rng.uniform(0.1, 3.0)))
+    assert solve(s.C, s.H).free_directions == ()
+
+
+@pytest.mark.parametrize(("tilt_rad", "free"), [(0.0, 1.0), (0.003, 1.0), (0.05, 0.0)])
+def test_the_line_is_drawn_where_signal_is_noise(tilt_rad: float, free: float) -> None:
+    """Noise of 0.01 rad on both: tilts well below are lost in it, well above they tell the height."""
+    said = [HEIGHT in solve(*_tilted(seed, tilt_rad)).free_directions for seed in range(20)]
+    assert np.mean(said) == free
+
+
+def _tilted(seed: int, tilt_rad: float) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    turns = np.outer(rng.uniform(-0.5, 0.5, 200), [0, 0, 1.0]) + rng.normal(0, tilt_rad, (200, 3)) * [1, 1, 0]
+    s = pair(poses(turns, rng.normal(size=(200, 3)) * [0.3, 0.3, 0.0]), rng, 0.01, 0.01, UPRIGHT)
+    return s.C, s.H
+
+
+@pytest.mark.parametrize("method", DUAL_QUATERNION)
+def test_all_name_the_height(method: str) -> None:
+    s = cart(80, 1, 0.003, 0.003)
+    assert solve(s.C, s.H, method=method).free_directions == (HEIGHT,)
+
+
+@pytest.mark.parametrize("method", list(METHODS))
+def test_every_method_solves_or_refuses_a_cart_without_noise(method: str) -> None:
+    s = cart(20, 2, 0.0, 0.0)
+    if method in REFUSED:
+        with pytest.raises(UnderdeterminedError, match="method='dqopt'"):  # what does solve it is named
+            solve(s.C, s.H, method=method, rng=0)
+        return
+    r = solve(s.C, s.H, method=method, rng=0)
+    assert distance(r.X, s.X)[0] < 1e-5
+    assert np.linalg.norm(r.X.translation()[:2] - [0.1, 0.2]) < 1e-5
+    assert any(HEIGHT[:19] in words for words in r.free_directions), r.free_directions
+
+
+@pytest.mark.parametrize("method", list(METHODS))
+def test_every_method_solves_or_refuses_motion_that_does_not_turn(method: str) -> None:
+    rng = np.random.default_rng(3)
+    s = pair(poses(np.zeros((10, 3)), rng.normal(size=(10, 3))), rng, 0.0, 0.0, UPRIGHT)
+    if method in REFUSED:
+        with pytest.raises(UnderdeterminedError, match="method='dqopt'"):  # what does solve it is named
+            solve(s.C, s.H, method=method, rng=0)
+        return
+    r = solve(s.C, s.H, method=method, rng=0)
+    assert distance(r.X, s.X)[0] < 1e-5
+    assert any("translation along" in words for words in r.free_directions), r.free_directions
+
+
+@pytest.mark.parametrize("method", list(METHODS))
+def test_every_method_refuses_one_motion_and_none(method: str) -> None:
+    s = hand_held(1, 4)
+    with pytest.raises(CountError):
+        solve(s.C, s.H, method=method)
+    still = np.tile(np.eye(4), (3, 1, 1))
+    with pytest.raises(UnderdeterminedError, match="all 3 motions are the identity"):
+        solve(still, still, method=method)
+
+
+def test_a_prior_completes_it() -> None:
+    s = cart(80, 5, 0.003, 0.003)
+    near = UPRIGHT.copy()
+    near[2, 3] = 0.31
+    r = solve(s.C, s.H, prior=DualQuaternionPrior(near, 0.01, 0.05))
+    assert r.free_directions == ()
+    assert r.X.translation()[2] == pytest.approx(0.31, abs=0.01)
+
+
+def test_planar_with_jitter_is_solved() -> None:
+    s = planar(300, 6, 0.002, 0.002, jitter_rad=0.05)
+    r = solve(s.C, s.H)
+    assert r.free_directions == ()
+    assert max(distance(r.X, s.X)) < 0.05
+
+
+def test_words() -> None:
+    assert axes_in_words(np.eye(3)[:, :1]) == "x"
+    assert axes_in_words(-np.eye(3)[:, 2:]) == "z"
+    assert axes_in_words(np.array([[0.6], [0.0], [-0.8]])) == "(-0.60, 0.00, 0.80)"
+    assert axes_in_words(np.eye(3)[:, :2]) == "all axes across z"
+    assert axes_in_words(np.eye(3)) == "every axis"
