@@ -3,14 +3,13 @@
     python tests/benchmarks/opencv_hand_eye.py [--repetitions 3] [--problems 200]
 
 Needs opencv-python-headless of version 4 (5 has dropped the functions). OpenCV gets the lists of arrays that it wants,
-made beforehand, and so do ours of the same names; arrays (N, 3, 3) and (N, 3), which both take as well, have rows of
-their own, with the bar, for the robot-world methods: reading 1,600 small arrays takes longer than all the rest of ours.
-Calls take turns; ratios are medians
-within the repetitions. The hand-eye call's frames make eye-in-hand and eye-to-hand one computation.
+made beforehand, and so do ours of the same names. For the robot-world methods arrays (N, 3, 3) and (N, 3), which both
+take as well, have rows of their own, and the bar: reading 1,600 small arrays takes longer than all the rest of ours.
+Calls take turns; ratios are medians within the repetitions. Eye-in-hand and eye-to-hand are one computation.
 
-Methods of 1,000 poses take OpenCV seconds, so each is timed once or twice there, and errors to the truth at N = 1,000
-are those of our calls of the same names, whose answers are OpenCV's (first table; checked again on one problem of
-these). At N = 50 they are OpenCV's own.
+Methods of 1,000 poses take OpenCV seconds, so each is timed once there, after one that does not count, and errors to
+the truth at N = 1,000 are those of our calls of the same names, whose answers are OpenCV's (first table). At N = 50
+they are OpenCV's own.
 """
 
 from __future__ import annotations
