@@ -45,7 +45,7 @@ def resolve_signs(rows: Array, sums: Array, uncertain: NDArray[np.bool_]) -> Non
     """
     same = rows[:, uncertain]
     other = flipped(same, sums[:, uncertain])
-    known = gram(rows[:, ~uncertain])
+    known = gram(rows) - gram(same)
     values, vectors = np.linalg.eigh(known)
     determined = values[1] > DETERMINED * values[0] + 1e-12 * values[3]
     starts = [vectors[:, 0]] if determined else _candidate_rotations(rows)
