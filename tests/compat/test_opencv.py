@@ -2,9 +2,9 @@
 
 import json
 
-import cv2
 import numpy as np
 import pytest
+from compared import METHODS, ROBOT_WORLD, largest_difference
 from hand_eye_stations import CASES, GOLDEN, parts, stations, transforms
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,23 +16,7 @@ from gtsam_rwhec.errors import CountError, OptionError, PoseError, Underdetermin
 from gtsam_rwhec.handeye.cost import squared_residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 
-METHODS = {
-    "tsai": opencv.CALIB_HAND_EYE_TSAI,
-    "park": opencv.CALIB_HAND_EYE_PARK,
-    "horaud": opencv.CALIB_HAND_EYE_HORAUD,
-    "andreff": opencv.CALIB_HAND_EYE_ANDREFF,
-    "daniilidis": opencv.CALIB_HAND_EYE_DANIILIDIS,
-}
-ROBOT_WORLD = {"shah": opencv.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "li": opencv.CALIB_ROBOT_WORLD_HAND_EYE_LI}
 OURS = {"dqopt": opencv.CALIB_HAND_EYE_DQOPT, "certified": opencv.CALIB_HAND_EYE_CERTIFIED}
-#: Poses, how far they turn, their noise.
-SHAPES = [(4, None, 0.01), (9, 0.8, 1e-3), (40, None, 0.1), (25, 1.0, 0.0)]
-has_opencv_4 = hasattr(cv2, "calibrateHandEye")
-needs_opencv_4 = pytest.mark.skipif(not has_opencv_4, reason="OpenCV 5 has no calibrateHandEye")
-
-
-def largest_difference(ours, theirs):
-    return max(np.abs(a - b).max() for a, b in zip(ours, theirs, strict=True))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -55,45 +39,6 @@ def test_robot_world_gives_the_stored_answers_of_opencv_4(case, method):
     expected = [np.array(part) for part in stored["robot_world"][str(method)]]
     assert [part.shape for part in answer] == [(3, 3), (3, 1), (3, 3), (3, 1)]
     assert largest_difference(answer, expected) < 1e-9
-
-
-@needs_opencv_4
-@pytest.mark.parametrize("eye", ["in hand", "to hand"])
-@pytest.mark.parametrize("method", METHODS)
-def test_hand_eye_agrees_with_the_installed_opencv(method, eye):
-    constant = METHODS[method]
-    assert constant == getattr(cv2, f"CALIB_HAND_EYE_{method.upper()}")
-    for seed, (count, spread_rad, noise_rad) in enumerate(
-        [(4, None, 0.01), (9, 0.8, 1e-3), (40, None, 0.1), (25, 1.0, 0)]
-    ):
-        gripper, seen, _, _ = stations(count, seed, noise_rad, noise_rad, spread_rad)
-        if eye == "to hand":  # the same equation with the base's pose in the gripper first
-            seen = stations_to_hand(gripper, seed)
-            gripper = np.linalg.inv(gripper)
-        ours = opencv.calibrateHandEye(*parts(gripper, seen), method=constant)
-        assert largest_difference(ours, cv2.calibrateHandEye(*parts(gripper, seen), method=constant)) < 1e-9
-
-
-def stations_to_hand(gripper, seed):
-    """Target in a fixed camera, the target being on the gripper."""
-    rng = np.random.default_rng(seed)
-    camera, target = transforms(Rotation.random(2, random_state=rng).as_matrix(), rng.normal(size=(2, 3)))
-    noise = transforms(Rotation.from_rotvec(0.01 * rng.normal(size=(len(gripper), 3))).as_matrix(), np.zeros(3))
-    return np.linalg.inv(camera) @ gripper @ target @ noise
-
-
-@needs_opencv_4
-@pytest.mark.parametrize("method", ROBOT_WORLD)
-def test_robot_world_agrees_with_the_installed_opencv(method):
-    constant = ROBOT_WORLD[method]
-    assert constant == getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{method.upper()}")
-    for seed, (count, spread_rad, noise_rad) in enumerate(
-        [(4, None, 0.01), (9, 0.8, 1e-3), (40, None, 0.1), (25, 1.0, 0)]
-    ):
-        gripper, seen, _, _ = stations(count, seed, noise_rad, noise_rad, spread_rad)
-        poses = parts(seen, np.linalg.inv(gripper))
-        ours = opencv.calibrateRobotWorldHandEye(*poses, method=constant)
-        assert largest_difference(ours, cv2.calibrateRobotWorldHandEye(*poses, method=constant)) < 1e-9
 
 
 @pytest.mark.parametrize("method", (METHODS | OURS).values(), ids=METHODS | OURS)

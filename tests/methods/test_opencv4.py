@@ -1,4 +1,4 @@
-"""Shah's and Li's closed forms against OpenCV 4's, where it is installed: OpenCV 5 for Python lacks them."""
+"""Shah and Li in closed form beside OpenCV 4: OpenCV 5 for Python lacks them (tests/vision/test_other_opencv.py)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from gtsam_rwhec.simulate import Noise, Simulation
 METHODS = {"shah2013": "CALIB_ROBOT_WORLD_HAND_EYE_SHAH", "li2010_kronecker": "CALIB_ROBOT_WORLD_HAND_EYE_LI"}
 
 
-@pytest.mark.skipif(not hasattr(cv2, "calibrateRobotWorldHandEye"), reason="needs opencv-python-headless<5")
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("simulation", [general_pair(), general_pair(Noise(0.05, 60.0), 1), general_pair(seed=3)])
 def test_answers_are_opencvs(name: str, simulation: Simulation) -> None:
