@@ -2,7 +2,7 @@
 
     python tests/benchmarks/hand_eye.py [--problems 2450] [--starts 4] [--repetitions 301]
 
-Takes three to five minutes; the times against OpenCV need opencv-python-headless of version 4 (5 has dropped calibrateHandEye)
+Takes five minutes; the times against OpenCV need opencv-python-headless of version 4 (5 has no calibrateHandEye)
 and are left out without it. The paper's recordings are not public: hand-held motion and the three nearly planar ones
 of its cart are simulated, N = 100 motions at 5 Hz each, X = 28 cm and 49 deg as in Appendix D.1, each motion with
 noise of 0.57 deg (its synthetic noise, D.2) and 7 mm; alpha log-uniform over the range of its Table 2. Costs are sums
