@@ -19,6 +19,7 @@ from pathlib import Path
 import camera_logs
 import corrupted_detections
 import edge_summaries
+import hand_eye
 import many_frames
 import million_measurements
 import one_pair
@@ -47,6 +48,7 @@ def main() -> int:
         "real dataset against SCS": lambda: [] if arguments.no_scs else real_dataset.speed(repetitions=15),
         "the pairs alone": lambda: single_pairs.rows_of("known", 100) + single_pairs.rows_of("shared", 100),
         "one X, one Y, against OpenCV": lambda: one_pair.rows(repetitions=51),
+        "AX = XB by dual quaternions": lambda: hand_eye.rows(2450, starts=4, repetitions=5),
         "OpenCV's hand-eye methods": lambda: opencv_hand_eye.rows(repetitions=3, problems=200),
         "a million measurements": lambda: million_measurements.rows(1_000_000, repetitions=9),
         "many frames": lambda: many_frames.rows(repetitions=7),
