@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from dq_scenarios import Array, Sample
@@ -10,7 +10,9 @@ from dq_scenarios import Array, Sample
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.handeye import METHODS, motions_of
 from gtsam_rwhec.handeye.cost import moments_of
-from gtsam_rwhec.handeye.method import Request
+from gtsam_rwhec.handeye.daniilidis import squared, unit_combination
+from gtsam_rwhec.handeye.dual_quaternions import to_transform
+from gtsam_rwhec.handeye.method import Answer, Request
 
 #: The paper's names, in the order of its Table 2.
 NAMES = {
@@ -19,6 +21,7 @@ NAMES = {
     "DQConvRlx": "dqconvrlx",
     "DQ2Steps": "dq2steps",
     "Dan": "dan",
+    "Dan, rows": "",
     "ChVecOpt": "chvecopt",
     "QuatVecOpt": "quatvecopt",
     "DQNLOpt": "dqnlopt",
@@ -40,12 +43,33 @@ def requests(sample: Sample, alphas: Sequence[float] | Array, rng: int = 0) -> l
     ]
 
 
+def dan_rows(request: Request) -> Answer:
+    """Dan with alpha on the equations' lower rows only, not on the unknown q' too.
+
+    Section 4.3 says that the translations are scaled, which is ``dan``: (q, alpha q') has length one. Table 2's Dan
+    (best alpha 42 and 30 at the range's end, errors of meters) is (q, q') of length one, as here.
+    """
+    vectors = request.motions.rows[[0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]]
+    vectors[6:] *= request.alpha
+    form = squared(vectors @ vectors.T)
+    form[4:] *= request.alpha
+    form[:, 4:] *= request.alpha
+    null = np.linalg.eigh(form)[1]
+    q, q_dual = unit_combination(null[:4, :2], null[4:, :2])
+    return Answer(to_transform(q, q_dual))
+
+
+def function_of(name: str) -> Callable[[Request], Answer]:
+    """The method behind a name of ``NAMES``."""
+    return METHODS[NAMES[name]].function if NAMES[name] else dan_rows
+
+
 def errors(sample: Sample, names: Sequence[str], alphas: Sequence[float] | Array = ALPHAS) -> Array:
     """Errors (names, alphas, 2): rotation in degrees, translation in cm."""
     asked = requests(sample, alphas)
     found = np.empty((len(names), len(asked), 2))
     for of_name, name in zip(found, names, strict=True):
-        function = METHODS[NAMES[name]].function
+        function = function_of(name)
         if name in WITHOUT_ALPHA:
             of_name[:] = distance(function(asked[0]).X, sample.X)
             continue

@@ -141,9 +141,9 @@ def picture(of_motion: dict[str, Array]) -> Figure:
 
 def main() -> None:
     parser = arguments_of(__doc__, 2450, "problems, half of them hand-held, half planar")
-    parser.add_argument("--degrees", type=float, default=1.0, help="rotation noise of each pose (%(default)s)")
-    parser.add_argument("--cm", type=float, default=1.0, help="translation noise of each pose (%(default)s)")
-    parser.add_argument("--alpha", type=float, default=1.0, help="1/m (%(default)s)")
+    parser.add_argument("--degrees", type=float, default=1.5, help="rotation noise of each pose (%(default)s)")
+    parser.add_argument("--cm", type=float, default=2.0, help="translation noise of each pose (%(default)s)")
+    parser.add_argument("--alpha", type=float, default=10.0, help="1/m (%(default)s)")
     arguments = parser.parse_args()
     noise = (arguments.degrees, arguments.cm, arguments.alpha)
     seeds = np.random.SeedSequence(arguments.seed).spawn(len(MOTIONS) + 1)
