@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 HERE = Path(__file__).resolve().parent
 OUTPUT = HERE.parent / "output" / "papers"
@@ -33,6 +34,7 @@ __all__ = [
     "markdown",
     "numbers_of",
     "plain",
+    "plain_numbers",
     "quantity",
     "save_picture",
     "save_text",
@@ -97,6 +99,8 @@ def save_picture(figure: Figure, folder: Path, name: str) -> None:
     print(f"Written to {folder / name}.")
 
 
-def panel_title(axes: Axes, title: str) -> None:
-    """Of one of many panels."""
-    axes.set_title(title, fontsize=10)
+def plain_numbers(axis: Axis) -> None:
+    """A logarithmic axis with 1, 2 and 5 written as such."""
+    axis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
