@@ -21,6 +21,15 @@ RUNS = {
     "log_in_a_viewer": ([], "certified: cost 1"),
     "slam_graph": ([], r"Batch and iSAM2 agree to [\d.]+e-0[4-9] mm"),
 }
+#: The papers' tables and figures: likewise.
+PAPERS = {
+    "dq_table_1": (["--runs", "4"], r"DQNLOpt +\| planar .*\| DQOpt +\| from poses"),
+    "dq_table_2": (["--runs", "2", "--slow-runs", "2", "--alphas", "4"], r"Linear, best translation alpha.* of 1\d"),
+    "dq_figure_2": (["--runs", "50"], r"number 16: 8, 6, 4, 6, 4, 2, 0"),
+    "dq_figure_3": (["--runs", "2"], r"Random +\| 1 +\| translation"),
+    "dq_figure_6": (["--runs", "2"], r"DQConvRlx \| rotation +\| +11.50"),
+    "rwhec_tables": (["--runs", "2", "--tables", "5", "--model", "released"], r"Ours .*\| paper .*1\.46 \+- 0\.61"),
+}
 
 
 def run(name: str, arguments: list[str], folder: Path) -> str:
@@ -37,6 +46,25 @@ def test_an_example_runs(name: str, tmp_path: Path) -> None:
     arguments, expected = RUNS[name]
     output = run(name, arguments, tmp_path)
     assert re.search(expected, output), output
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_a_table_or_figure_of_the_papers(name: str, tmp_path: Path) -> None:
+    arguments, expected = PAPERS[name]
+    command = [sys.executable, str(EXAMPLES / "papers" / f"{name}.py"), "--workers", "1", "--output", str(tmp_path)]
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert re.search(expected, done.stdout, re.DOTALL), done.stdout
+    assert (tmp_path / f"{name}.md").read_text(encoding="utf-8") in done.stdout
+    assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_all_of_the_papers_are_run_by_one_command() -> None:
+    listed = re.search(r"SCRIPTS = \((.*?)\)", (EXAMPLES / "papers" / "all.py").read_text(encoding="utf-8"), re.DOTALL)
+    assert listed is not None
+    assert set(re.findall(r'"(\w+)"', listed[1])) == set(PAPERS)
+    scripts = [p.stem for p in (EXAMPLES / "papers").glob("*.py") if "__main__" in p.read_text(encoding="utf-8")]
+    assert set(scripts) == {*PAPERS, "all"}
 
 
 def test_the_grid_of_figure_8(utias_folder: Path, tmp_path: Path) -> None:

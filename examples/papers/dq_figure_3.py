@@ -4,8 +4,8 @@
 
 Maps of the mean over the samples of log(DQOpt's error / Dan's), each at its best alpha (the one of smallest mean error)
 and, in the last column, at alpha = 1/m. Blue: DQOpt is better, e^value times. The paper does not state its noise
-levels, nor which motion its last column is: Random here. ``--dan rows``: Dan with alpha on rows alone, as the paper seems to
-have run it (dq_sweep.py).
+levels, nor which motion its last column is: Random here. ``--dan rows``: Dan with alpha on rows alone, as the paper
+seems to have run it (dq_sweep.py).
 """
 
 from __future__ import annotations

@@ -5,10 +5,10 @@
 Samples of 100 motions (Appendix D.2), each solved with 100 alphas; medians and quartiles at the alpha with the smallest
 median rotation error, and at that with the smallest median translation error. ChVecOpt and QuatVecOpt, which descend
 iteratively, take fewer samples, the first ones. "Dan, rows" is Dan as the paper seems to have run it (dq_sweep.py).
-At the best translation alpha the paper's ChVecOpt and QuatVecOpt (alpha 0.01 to 0.02, 30 to 34 cm) are better than their
-cost's minimum, whose error is 48 to 55 cm from whatever start: an optimiser with an absolute tolerance on the gradient,
-such as scipy.optimize.minimize's 1e-5, leaves the translation at its start when alpha^2 takes its gradient below that
-(started at zero it ended at 100 cm, |t_X|, in Circular and Linear). Here they arrive at their minimum.
+At the best translation alpha the paper's ChVecOpt and QuatVecOpt (alpha 0.01 to 0.02, 30 to 34 cm) are better than
+their cost's minimum, whose error is 48 to 55 cm from whatever start: an optimiser with an absolute tolerance on the
+gradient, such as scipy.optimize.minimize's 1e-5, leaves the translation at its start when alpha^2 takes its gradient
+below that (started at zero it ended at 100 cm, |t_X|, in Circular and Linear). Here they arrive at their minimum.
 Standard errors of medians are 0.93 (quartile distance) / sqrt(samples), as of normal errors.
 """
 
@@ -83,11 +83,15 @@ class Cell:
     alpha: float | None
 
 
-def swept(seeds: list[np.random.SeedSequence], scenario: str, which: str, steps: int, names: tuple[str, ...]) -> Array:
+def swept(
+    seeds: list[np.random.SeedSequence], scenario: str, which: str, steps: int, names: tuple[str, ...], alphas: int
+) -> Array:
     """Errors (samples, names, alphas, 2)."""
     return np.array(
         [
-            errors(sample(scenario, np.random.default_rng(seed), X=extrinsic(which), steps=steps), names)
+            errors(
+                sample(scenario, np.random.default_rng(seed), X=extrinsic(which), steps=steps), names, range_of(alphas)
+            )
             for seed in seeds
         ]
     )
@@ -101,7 +105,7 @@ def measured(arguments: argparse.Namespace) -> dict[tuple[str, str], Array]:
         for names, count in ((FAST, arguments.runs), (SLOW, min(arguments.slow_runs, arguments.runs))):
             for first in range(0, count, CHUNK):
                 chunk = seeds[first : min(first + CHUNK, count)]
-                calls.append((chunk, scenario, arguments.extrinsic, arguments.steps, names))
+                calls.append((chunk, scenario, arguments.extrinsic, arguments.steps, names, arguments.alphas))
     found = in_processes(swept, calls, arguments.workers, "samples")
     of_both: dict[tuple[str, str], Array] = {}
     for scenario in SCENARIOS:
@@ -112,10 +116,15 @@ def measured(arguments: argparse.Namespace) -> dict[tuple[str, str], Array]:
     return of_both
 
 
+def range_of(count: int) -> Array:
+    """The paper's range of alphas in so many steps."""
+    return np.geomspace(ALPHAS[0], ALPHAS[-1], count)
+
+
 def best(values: Array, part: str, name: str) -> Cell:
     """Of errors (samples, alphas, 2)."""
     place = int(np.median(values[:, :, PARTS.index(part)], axis=0).argmin())
-    alpha = None if name == "DQ2Steps" else float(ALPHAS[place])
+    alpha = None if name == "DQ2Steps" else float(range_of(values.shape[1])[place])
     return Cell(Quartiles.of(values[:, place, 0]), Quartiles.of(values[:, place, 1]), alpha)
 
 
@@ -188,12 +197,14 @@ def main() -> None:
     parser.add_argument("--slow-runs", type=int, default=60, help="samples of ChVecOpt and QuatVecOpt (%(default)s)")
     parser.add_argument("--extrinsic", choices=("inferred", "real"), default="inferred", help="see dq_scenarios.py")
     parser.add_argument("--steps", type=int, default=STEPS, help="of a trajectory (%(default)s)")
+    parser.add_argument("--alphas", type=int, default=len(ALPHAS), help="tried, 0.01 to 50 / m (%(default)s)")
     arguments = parser.parse_args()
     of_both = measured(arguments)
     text = (
         "# DQ paper, Table 2, synthetic data\n\n"
         f"{arguments.runs} samples of 100 motions ({min(arguments.slow_runs, arguments.runs)} for {' and '.join(SLOW)}"
-        f"), extrinsic {arguments.extrinsic}, {arguments.steps} steps a trajectory, seed {arguments.seed}; "
+        f"), {arguments.alphas} alphas, extrinsic {arguments.extrinsic}, {arguments.steps} steps a trajectory, "
+        f"seed {arguments.seed}; "
         "median, and distances to the quartiles. `in`: our median lies between the paper's quartiles. `Dan`: "
         "translations scaled by alpha as Section 4.3 says; `Dan, rows`: as the paper's row seems to have been run.\n"
     )
