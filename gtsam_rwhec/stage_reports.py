@@ -107,8 +107,9 @@ class LogFields(_Report):
 def contradicted(outliers: tuple[TrackCount, ...]) -> tuple[str, ...]:
     """Sensors and targets of which more than half of the measurements were left out as outliers.
 
-    The one that explains most comes first. Then it is as likely that the rest are the wrong ones: a clock, a size or a mounting that changed. What a name
-    explains counts for no other: targets are not to blame for a camera that contradicts all of them.
+    The one that explains most comes first. Then it is as likely that the rest are the wrong ones: a clock, a size or a
+    mounting that changed. What a name explains counts for no other: targets are not to blame for a camera that
+    contradicts all of them.
     """
     names: list[str] = []
     while True:
