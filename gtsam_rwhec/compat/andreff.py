@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.compat.stations import Stations, all_earlier
+from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.poses import Array
+
+#: An eigenvalue below this of the scaled normal equations is rounding.
+SINGULAR = 1e-15
 
 
 def andreff(stations: Stations) -> tuple[Array, Array]:
@@ -64,8 +68,24 @@ def andreff(stations: Stations) -> tuple[Array, Array]:
     right = np.concatenate([tB_tA.T.reshape(9), sum_tA - RA_tA])
     # One length for all unknowns, so that millimetres and metres are solved to the same number of digits.
     scale = 1.0 / np.sqrt(np.diag(normal))
-    x = scale * np.linalg.solve(normal * scale * scale[:, None], right * scale)
+    normal = normal * scale * scale[:, None]
+    check_determined(normal, "Andreff's")
+    x = scale * np.linalg.solve(normal, right * scale)
     return nearest_rotations(x[:9].reshape(3, 3)), x[9:]
+
+
+def check_determined(normal: Array, whose: str) -> None:
+    """Refuse linear systems (normal equations, scaled) that leave entries of the rotation free.
+
+    Raises
+    ------
+    UnderdeterminedError
+    """
+    if np.linalg.eigvalsh(normal)[0] <= SINGULAR:
+        raise UnderdeterminedError(
+            f"{whose} linear system takes the rotation's length from the translations, and here they say nothing of "
+            "it: the gripper only turned, or hardly moved beside the length unit; move it, or take another method"
+        )
 
 
 def nearest_rotations(V: Array) -> Array:

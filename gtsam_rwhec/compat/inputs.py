@@ -145,6 +145,8 @@ def _as_array(values: Any, where: str) -> Array | None:
     if joined is not None:
         return joined
     try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex numbers")
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         if isinstance(values, (list, tuple)) and len({np.shape(value) for value in values}) > 1:

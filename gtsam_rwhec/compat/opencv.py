@@ -11,7 +11,7 @@ range of angles), and so is an unknown method. Lists of lists are taken as well.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import numpy as np
@@ -94,11 +94,12 @@ def calibrateHandEye(
     CountError
         Fewer than three poses, or different numbers.
     UnderdeterminedError
-        Motions about one axis only, or without rotation; Tsai with fewer than two motions of 17 to 116 degrees.
+        Motions about one axis only, or without rotation; Tsai with fewer than two motions of 17 to 116 degrees,
+        or about one axis among those; Andreff without translations.
     OptionError
         An unknown method.
     """
-    solve = _HAND_EYE.get(method)
+    solve = _HAND_EYE.get(method) if isinstance(method, Hashable) else None
     if solve is None:
         raise OptionError(_unknown(method, "CALIB_HAND_EYE"))
     R_G, t_G = checked_poses(R_gripper2base, t_gripper2base, ("R_gripper2base", "t_gripper2base"))
@@ -140,9 +141,9 @@ def calibrateRobotWorldHandEye(
     Raises
     ------
     PoseError, CountError, UnderdeterminedError, OptionError
-        As ``calibrateHandEye``.
+        As ``calibrateHandEye``; Li's method without translations of the gripper.
     """
-    solve = _ROBOT_WORLD.get(method)
+    solve = _ROBOT_WORLD.get(method) if isinstance(method, Hashable) else None
     if solve is None:
         raise OptionError(_unknown(method, "CALIB_ROBOT_WORLD_HAND_EYE"))
     R_A, t_A = checked_poses(R_world2cam, t_world2cam, ("R_world2cam", "t_world2cam"))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gtsam_rwhec.compat.inputs import PARALLEL
 from gtsam_rwhec.compat.pair_translations import translation_features, translation_of
 from gtsam_rwhec.compat.stations import Stations, left_matrices, pair_blocks
 from gtsam_rwhec.errors import UnderdeterminedError
@@ -26,7 +27,7 @@ def tsai(stations: Stations) -> tuple[Array, Array]:
     Raises
     ------
     UnderdeterminedError
-        When fewer than two motions are in that range.
+        When fewer than two motions are in that range, or all that are rotate about one axis.
     """
     count = len(stations.u)
     features = translation_features(stations)
@@ -49,7 +50,13 @@ def tsai(stations: Stations) -> tuple[Array, Array]:
             f"by both sensors; {used} of the {count * (count - 1) // 2} motions are, and two are needed; "
             "add poses that turn further, or take another method"
         )
-    x = np.linalg.solve(np.trace(outer) * np.eye(3) - outer, sums)  # Skew(s)'Skew(s) = |s|^2 I - s s'
+    normal = np.trace(outer) * np.eye(3) - outer  # Skew(s)'Skew(s) = |s|^2 I - s s'
+    if np.linalg.eigvalsh(normal)[0] <= PARALLEL * np.trace(outer):
+        raise UnderdeterminedError(
+            f"Tsai's method uses motions of 17 to 116 degrees, and the {used} of these all rotate about one axis; add "
+            "poses that turn about another axis, or take another method"
+        )
+    x = np.linalg.solve(normal, sums)
     R = rotation_of(np.append(x, 1.0))
     return R, translation_of(stations, R, feature_sums)
 

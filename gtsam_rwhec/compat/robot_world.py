@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gtsam_rwhec.compat.andreff import nearest_rotations
+from gtsam_rwhec.compat.andreff import check_determined, nearest_rotations
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.poses import Array
 
@@ -99,7 +99,9 @@ def li(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
     # One length for all unknowns, so that millimetres and metres are solved to the same number of digits.
     scale = 1.0 / np.sqrt(normal.diagonal())
     upper = normal * scale * scale[:, None]
-    z = scale * np.linalg.solve(np.triu(upper) + np.triu(upper, 1).T, right * scale)
+    symmetric = np.triu(upper) + np.triu(upper, 1).T
+    check_determined(symmetric, "Li's")
+    z = scale * np.linalg.solve(symmetric, right * scale)
     R_X, R_Z = nearest_rotations(np.stack([K @ z[:9], z[:9]]).reshape(2, 3, 3))
     return R_X, z[9:12], R_Z, z[12:]
 

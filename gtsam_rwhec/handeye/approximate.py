@@ -12,7 +12,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import OptionError, UnderdeterminedError
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
-from gtsam_rwhec.handeye.degenerate import free_directions
+from gtsam_rwhec.handeye.degenerate import free_directions, free_of_rotations_alone
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.saddle import SINGULAR, Z_pseudo, best_dual, is_singular
@@ -34,7 +34,8 @@ def dq2steps(request: Request) -> Answer:
             f"{turned}, and 'dq2steps' takes the rotation from the rotations alone; use method='dqopt', which takes it "
             "from the translations too, or add motions about another axis"
         )
-    return answer_of(request, vectors[:, 0])  # eq. 19
+    found = answer_of(request, vectors[:, 0])  # eq. 19
+    return replace(found, free_directions=free_of_rotations_alone(request.cost) or found.free_directions)
 
 
 def dqconvrlx(request: Request) -> Answer:

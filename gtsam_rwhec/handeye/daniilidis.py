@@ -17,6 +17,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.handeye.cost import BLOCK, E
+from gtsam_rwhec.handeye.degenerate import free_of_rotations_alone
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.poses import Array
@@ -53,7 +54,8 @@ def daniilidis(request: Request) -> Answer:
             "can be solved and names the rest"
         )
     q, q_dual = unit_combination(vectors[:4, :2], vectors[4:, :2])
-    return Answer(to_transform(q, q_dual / request.alpha))
+    free = free_of_rotations_alone(request.cost)
+    return Answer(to_transform(q, q_dual / request.alpha), free_directions=free)
 
 
 def squared(gram: Array) -> Array:

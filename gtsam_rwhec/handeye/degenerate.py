@@ -60,6 +60,23 @@ def free_directions(
     return tuple(words)
 
 
+def free_of_rotations_alone(cost: DualQuaternionCost) -> tuple[str, ...]:
+    """Free directions of a method that takes the rotation from the rotations alone, or nearly (DQ2Steps, Dan).
+
+    Where the axes differ by no more than their noise, such a rotation about the common axis is noise, and so is the
+    translation along it.
+    """
+    values, vectors = cost.spectrum
+    limit = SIGNAL_AND_NOISE * max(float(values[0]), 0.0) * _lost_to_fit(cost.count) + ROUNDING * float(values[3])
+    if values[1] > limit:
+        return ()
+    axes = axes_in_words(times_vectors(vectors[:, 0]).T @ vectors[:, values <= limit])
+    return (
+        f"rotation about {axes} of c's axes, by this method, which has it from the rotations alone",
+        f"translation along {axes} of c's axes",
+    )
+
+
 def _lost_to_fit(count: int) -> float:
     # Three of a motion's rotation residuals are noise; three in all went into the fit.
     return count / (count - 1.0) if count > 1 else 1.0

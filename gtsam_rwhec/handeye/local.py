@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import least_squares
 
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.handeye.chordal_form import chordal_moments, chordal_residuals
 from gtsam_rwhec.handeye.cost import squared_residuals
 from gtsam_rwhec.handeye.degenerate import free_directions
@@ -23,6 +24,8 @@ from gtsam_rwhec.poses import Array
 
 #: least_squares stops where a step changes cost or unknowns by less than this part of them: rounding.
 STOP = 1e-15
+#: Of a form of unit diagonal: what one entry's rounding leaves.
+ROUNDING = float(np.finfo(np.float64).eps)
 Vector = Callable[[Array], Array]
 
 
@@ -37,7 +40,13 @@ def dqnlopt_random(request: Request) -> Answer:
 
     The rotation is uniform; the translation normal, with the root mean square of the motions' own.
     """
-    rng = np.random.default_rng(request.rng)
+    try:
+        rng = np.random.default_rng(request.rng)
+    except (TypeError, ValueError) as error:
+        raise OptionError(
+            f"rng={request.rng!r} is no source of random numbers ({error}); give a numpy.random.Generator or a seed "
+            "that is not negative"
+        ) from error
     q = rng.normal(size=4)
     q /= np.linalg.norm(q)
     t = rng.normal(size=3) * _length(request)
@@ -147,9 +156,15 @@ def _least_squares(residual: Vector, jacobian: Vector, start: Array) -> Array:
 
 
 def root(form: Array) -> Array:
-    """L with L'L a positive semidefinite form, rounding below zero cut off."""
-    values, vectors = np.linalg.eigh(form)
-    factor: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    """L with L'L a positive semidefinite form, rounding cut off, on both sides of zero.
+
+    Of unit diagonal inside: rotations and lengths of any unit keep their own digits.
+    """
+    size = np.sqrt(np.maximum(form.diagonal(), 0.0))
+    size[size == 0.0] = 1.0
+    values, vectors = np.linalg.eigh(form / size / size[:, None])
+    values = np.where(values > ROUNDING * len(form), values, 0.0)
+    factor: Array = np.sqrt(values)[:, None] * vectors.T * size
     return factor
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from gtsam_rwhec.errors import PriorError
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.dual_quaternions import conjugate, from_transforms, left
+from gtsam_rwhec.handeye.weights import LARGEST
 from gtsam_rwhec.poses import Array, PoseLike, one_transform
 
 PriorForm = Literal["imaginary", "distance"]
@@ -47,8 +48,10 @@ class DualQuaternionPrior:
 
     def __post_init__(self) -> None:
         for name, weight in (("a", self.a), ("b", self.b)):
-            if not 0.0 <= weight < float("inf"):
-                raise PriorError(f"the prior's {name}={weight!r} is no weight; give a finite number that is >= 0")
+            if not (isinstance(weight, (int, float, np.number)) and np.isreal(weight) and 0.0 <= weight <= LARGEST):
+                raise PriorError(
+                    f"the prior's {name}={weight!r} is no weight; give a finite number that is >= 0, up to {LARGEST:g}"
+                )
         if self.a == 0.0 and self.b == 0.0:
             raise PriorError("the prior's a and b are both 0: it says nothing; leave it out, or give weights")
         if self.form not in ("imaginary", "distance"):

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import OptionError, PriorError
 from gtsam_rwhec.handeye.alpha import estimate_alpha
 from gtsam_rwhec.handeye.approximate import dq2ndord, dq2ndord_lambda, dq2steps, dqconvrlx
 from gtsam_rwhec.handeye.certified import certified
@@ -122,20 +122,20 @@ def solve(
         For options, weights or priors that cannot be used, or not with this method.
     """
     start = time.perf_counter()
-    if method not in METHODS:
+    if not isinstance(method, str) or method not in METHODS:
         raise OptionError(f"method={method!r} is not known; choose one of {', '.join(METHODS)}")
     chosen = METHODS[method]
     _check_options(chosen, weights, covariances, prior, scale)
     motions = motions_of(C, H, order)
     w, information = check_weights(weights, len(motions)), check_covariances(covariances, len(motions))
     if information is not None:
-        if alpha == "estimate":
+        if _estimated(alpha):
             raise OptionError("alpha='estimate' and covariances are both given; covariances take alpha's place")
         number = check_alpha(alpha)
         cost = covariance_cost(motions, information)
     else:
         moments = moments_of(motions.rows, w)
-        number = estimate_alpha(motions, moments, w, prior) if alpha == "estimate" else check_alpha(alpha)
+        number = estimate_alpha(motions, moments, w, prior) if _estimated(alpha) else check_alpha(alpha)
         cost = moments.cost(number)
     if prior is not None:
         cost = prior.added_to(cost)
@@ -178,6 +178,10 @@ def cost_of_pose(request: Request, q: Array, q_dual: Array) -> float:
     return cost if request.prior is None else cost + request.prior.value(q, q_dual)
 
 
+def _estimated(alpha: object) -> bool:
+    return isinstance(alpha, str) and alpha == "estimate"
+
+
 def _check_options(
     method: Method,
     weights: ArrayLike | None,
@@ -189,6 +193,8 @@ def _check_options(
         raise OptionError(f"scale={scale!r} is not 'known' or 'unknown'")
     if weights is not None and covariances is not None:
         raise OptionError("weights and covariances are both given; put the weights into the covariances")
+    if prior is not None and not isinstance(prior, DualQuaternionPrior):
+        raise PriorError(f"the prior is a {type(prior).__name__}; give a gtsam_rwhec.handeye.DualQuaternionPrior")
     for given, can, what in (
         (weights is not None, method.weights, "weights"),
         (covariances is not None, method.covariances, "covariances"),

@@ -8,14 +8,17 @@ from numpy.typing import ArrayLike
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.poses import Array
 
+#: Weights beyond this, and below its inverse, leave no room for squares and sums in double precision.
+LARGEST = 1e100
 
-def check_alpha(alpha: float) -> float:
+
+def check_alpha(alpha: float | str) -> float:
     """Alpha as a float.
 
     Raises
     ------
     OptionError
-        When it is not a positive, finite number.
+        When it is not a positive, finite number, or one whose square no sum holds.
     """
     try:
         number = float(alpha)
@@ -26,7 +29,22 @@ def check_alpha(alpha: float) -> float:
             f"alpha={alpha!r} is not a positive, finite number; it weighs translation residuals (1/m) against rotation "
             "residuals, about sigma_rotation / sigma_translation; 'estimate' finds it from the residuals"
         )
+    if not 1.0 / LARGEST <= number <= LARGEST:
+        raise OptionError(
+            f"alpha={alpha!r} is beyond {1.0 / LARGEST:g} to {LARGEST:g}, where no double precision sum holds its "
+            "square; it is about sigma_rotation / sigma_translation (1/m)"
+        )
     return number
+
+
+def _numbers(given: ArrayLike, what: str) -> Array:
+    try:
+        array = np.asarray(given)
+        if array.dtype.kind == "c":
+            raise TypeError("complex numbers")
+        return np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise NoiseError(f"{what} cannot be read as numbers ({error}); give an array of real numbers") from error
 
 
 def check_weights(weights: ArrayLike | None, count: int) -> Array | None:
@@ -39,13 +57,14 @@ def check_weights(weights: ArrayLike | None, count: int) -> Array | None:
     """
     if weights is None:
         return None
-    array = np.asarray(weights, dtype=np.float64)
+    array = _numbers(weights, "weights")
     if array.shape != (count,):
         raise CountError(f"weights have shape {array.shape}; give one number for each of the {count} motions")
-    bad = np.flatnonzero(~(np.isfinite(array) & (array >= 0.0)))
+    bad = np.flatnonzero(~((array >= 0.0) & (array <= LARGEST)))
     if bad.size:
         raise NoiseError(
-            f"weight {bad[0]} is {array[bad[0]]}; weights are finite and not negative (0 leaves a motion out)"
+            f"weight {bad[0]} is {array[bad[0]]}; weights are finite (up to {LARGEST:g}) and not negative (0 leaves a "
+            "motion out)"
         )
     if np.count_nonzero(array) < 2:
         raise NoiseError(f"{np.count_nonzero(array)} of {count} weights are not zero; AX = XB needs two motions")
@@ -62,7 +81,7 @@ def check_covariances(covariances: ArrayLike | None, count: int) -> Array | None
     """
     if covariances is None:
         return None
-    array = np.asarray(covariances, dtype=np.float64)
+    array = _numbers(covariances, "covariances")
     if array.shape == (8, 8):
         array = array[None]
     if array.shape[1:] != (8, 8) or len(array) not in (1, count):

@@ -15,6 +15,9 @@ DUAL_QUATERNION = ["dqopt", "dq2steps", "dqconvrlx", "dq2ndord", "dq2ndord_lambd
 #: Those that need axes that are not parallel, or noise.
 REFUSED = ["dan", "dq2steps", "dqoptpoly_resultant", "dqoptpoly_sturm"]
 
+#: Those whose rotation is noise on a cart.
+FROM_ROTATIONS_ALONE = ["dq2steps", "dan"]
+
 
 def cart(count: int, seed: int, sigma_rad: float, sigma_m: float) -> Simulated:
     rng = np.random.default_rng(seed)
@@ -52,10 +55,12 @@ def _tilted(seed: int, tilt_rad: float) -> tuple[np.ndarray, np.ndarray]:
     return s.C, s.H
 
 
-@pytest.mark.parametrize("method", DUAL_QUATERNION)
+@pytest.mark.parametrize("method", [*DUAL_QUATERNION, "dan"])
 def test_all_name_the_height(method: str) -> None:
     s = cart(80, 1, 0.003, 0.003)
-    assert solve(s.C, s.H, method=method).free_directions == (HEIGHT,)
+    free = solve(s.C, s.H, method=method).free_directions
+    assert HEIGHT in free
+    assert len(free) == 1 + (method in FROM_ROTATIONS_ALONE)
 
 
 @pytest.mark.parametrize("method", list(METHODS))
@@ -92,6 +97,20 @@ def test_every_method_refuses_one_motion_and_none(method: str) -> None:
     still = np.tile(np.eye(4), (3, 1, 1))
     with pytest.raises(UnderdeterminedError, match="all 3 motions are the identity"):
         solve(still, still, method=method)
+
+
+@pytest.mark.parametrize("method", FROM_ROTATIONS_ALONE)
+def test_a_rotation_that_is_noise_is_named(method: str) -> None:
+    """Parallel axes with noise: DQOpt has the rotation from the translations; these have it from noise."""
+    s = cart(80, 1, 0.003, 0.003)
+    free = solve(s.C, s.H, method=method).free_directions
+    assert free[0].startswith("rotation about z of c's axes")
+    assert free[1] == HEIGHT
+    rng = np.random.default_rng(3)
+    still = pair(poses(np.zeros((200, 3)), rng.normal(size=(200, 3))), rng, 0.01, 0.01)
+    assert "every axis" in solve(still.C, still.H, method=method).free_directions[0]
+    turning = hand_held(30, 1)
+    assert solve(turning.C, turning.H, method=method).free_directions == ()
 
 
 def test_a_prior_completes_it() -> None:
