@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Literal
 
 import gtsam
@@ -86,13 +87,17 @@ class MethodOptions:
     max_iterations: int = 1000
 
     def __post_init__(self) -> None:
-        if self.start is not None and not (isinstance(self.start, tuple) and len(self.start) == 3):
-            raise OptionError(
-                f"MethodOptions.start is a {type(self.start).__name__}; give (X, Y, scale): poses of targets and of "
-                "sensors by name, and a scale (1.0 if known)"
-            )
-        if isinstance(self.max_iterations, bool) or self.max_iterations < 1:
-            raise OptionError(f"MethodOptions.max_iterations={self.max_iterations!r}; give a positive number")
+        if self.start is not None:
+            given = self.start if isinstance(self.start, tuple) and len(self.start) == 3 else (None, None, None)
+            if not (isinstance(given[0], Mapping) and isinstance(given[1], Mapping) and isinstance(given[2], Real)):
+                raise OptionError(
+                    f"MethodOptions.start={self.start!r:.100}; give (X, Y, scale): poses of targets and of sensors by "
+                    "name, and a scale (1.0 if known)"
+                )
+        for name, least in (("seed", 0), ("max_iterations", 1)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+                raise OptionError(f"MethodOptions.{name}={value!r}; give a whole number of at least {least}")
 
 
 @dataclass(frozen=True)

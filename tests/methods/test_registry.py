@@ -187,7 +187,12 @@ def test_unknown_names_and_options_are_refused() -> None:
         run("shah", problem)
     with pytest.raises(OptionError, match="MethodOptions"):
         run("shah2013", problem, {"seed": 1})  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="start"):
-        MethodOptions(start=[1, 2, 3])  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="max_iterations"):
-        MethodOptions(max_iterations=0)
+    for start in ([1, 2, 3], (1, 2, 3), ({}, {}, "1"), ({}, {})):
+        with pytest.raises(OptionError, match="start"):
+            MethodOptions(start=start)  # type: ignore[arg-type]
+    for count in (0, "a", None, 1.5, True):
+        with pytest.raises(OptionError, match="max_iterations"):
+            MethodOptions(max_iterations=count)  # type: ignore[arg-type]
+    for seed in (-1, "a", 0.5):
+        with pytest.raises(OptionError, match="seed"):
+            MethodOptions(seed=seed)  # type: ignore[arg-type]
