@@ -7,22 +7,23 @@ what the motion leaves undetermined.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from gtsam_rwhec import errors, pose_covariances
-from gtsam_rwhec.calibration import certify, solve
-from gtsam_rwhec.certify.certificate import Certificate, Status
-from gtsam_rwhec.certify.options import SolveOptions
-from gtsam_rwhec.cross_validation import CrossValidation, cross_validate
-from gtsam_rwhec.csv_files import read_csv
-from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
-from gtsam_rwhec.measurements import Measurements
-from gtsam_rwhec.priors import Prior
-from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.refined_file import read_refined
+from gtsam_rwhec import errors
+from gtsam_rwhec.calibration.cross_validation import CrossValidation, cross_validate
+from gtsam_rwhec.geometry import pose_covariances
+from gtsam_rwhec.identifiability.identification import Identifiability, PairIdentifiability
+from gtsam_rwhec.problem.csv_folder import read_csv
+from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.problem.priors import Prior
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
-from gtsam_rwhec.refinement.refine import refine
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
-from gtsam_rwhec.result_file import read_solution
-from gtsam_rwhec.solution import Residual, Solution, SolvedPart
+from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.results.refined_file import read_refined
+from gtsam_rwhec.results.solution_file import read_solution
+from gtsam_rwhec.solver.certificate import Certificate, Status
+from gtsam_rwhec.solver.options import SolveOptions
+from gtsam_rwhec.solving.certified_solution import certify, solve
+from gtsam_rwhec.solving.solution import Residual, Solution, SolvedPart
 
 if TYPE_CHECKING:
     from gtsam_rwhec import handeye, methods, simulate

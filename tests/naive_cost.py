@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from gtsam_rwhec import Problem
-from gtsam_rwhec.statistics import Gauge
+from gtsam_rwhec.problem.moments import Gauge
 
 Transforms = Mapping[str, np.ndarray]
 

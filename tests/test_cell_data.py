@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import ImageRecord, IntrinsicsRecord, TfBuffer, open_log
-from gtsam_rwhec.poses import Array
 from gtsam_rwhec.rig import read_rig
 from gtsam_rwhec.vision.camera import Camera
 

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from naive_cost import naive_cost
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.certify.bound import lower_bound
-from gtsam_rwhec.certify.descent import homogeneous
-from gtsam_rwhec.certify.parts import parts_of
-from gtsam_rwhec.certify.rotations import kkt_multipliers, random_rotations, vec
-from gtsam_rwhec.certify.search import Forms
 from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
 from gtsam_rwhec.simulate.transforms import inverse, pose, random_poses, rotations_of_vectors
+from gtsam_rwhec.solver.bound import lower_bound
+from gtsam_rwhec.solver.descent import homogeneous
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations, vec
+from gtsam_rwhec.solver.search import Forms
 
 NOISE = Noise(0.01, 500.0)
 SEEDS = st.integers(0, 2**31 - 1)

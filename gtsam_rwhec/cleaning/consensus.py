@@ -14,7 +14,7 @@ import numpy as np
 
 from gtsam_rwhec.cleaning.removed import Kept, Removed
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.cleaning.removed import Kept
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: The paper's: 10 cm or 11.5 degrees between two consecutive frames indicate a tracking error.
 MAX_STEP_M, MAX_STEP_RAD = 0.10, float(np.radians(11.5))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.cleaning.removed import Kept
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: A carrier that has moved less than this since the last measurement that was kept has stood still.
 STILL_RAD, STILL_M = float(np.radians(0.5)), 0.003

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.cleaning.trajectory import Trajectory
 from gtsam_rwhec.errors import StampError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: Angles are compared over about this time: long against a frame's noise, short against what the motion does.
 INTERVAL_S = 0.4

@@ -15,20 +15,20 @@ from typing import Annotated
 import typer
 
 from gtsam_rwhec import __version__
-from gtsam_rwhec.calibration import solve
 from gtsam_rwhec.cli.compare_command import add_compare_command
-from gtsam_rwhec.cli.demo_data import LOG, RIG, demo_folder
 from gtsam_rwhec.cli.exit_status import HELP, ExitStatus, exit_status
 from gtsam_rwhec.cli.failures import failures_in_words
 from gtsam_rwhec.cli.log_commands import add_log_commands, calibrate_from_log, is_log
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.csv_files import read_csv
+from gtsam_rwhec.datasets.demo_log import LOG, RIG, demo_folder
+from gtsam_rwhec.datasets.download import UTIAS_URL, fetch_utias
 from gtsam_rwhec.errors import FileFormatError, NotCertifiedWarning, NotUniqueWarning
-from gtsam_rwhec.fetch import UTIAS_URL, fetch_utias
+from gtsam_rwhec.problem.csv_folder import read_csv
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
-from gtsam_rwhec.refinement.refine import refine
+from gtsam_rwhec.refinement.refining import refine
 from gtsam_rwhec.report import print_refined, print_solution, report_console
-from gtsam_rwhec.result_file import read_solution
+from gtsam_rwhec.results.solution_file import read_solution
+from gtsam_rwhec.solving.certified_solution import solve
 
 app = typer.Typer(
     name="gtsam-rwhec",

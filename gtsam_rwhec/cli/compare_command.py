@@ -12,8 +12,8 @@ import typer
 from gtsam_rwhec.cli.exit_status import HELP, ExitStatus, exit_status
 from gtsam_rwhec.cli.failures import failures_in_words
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.csv_files import read_csv
 from gtsam_rwhec.errors import FileFormatError, RwhecWarning
+from gtsam_rwhec.problem.csv_folder import read_csv
 
 
 class CompareScale(StrEnum):

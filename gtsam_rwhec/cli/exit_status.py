@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from gtsam_rwhec.solution import Solution, Status
+from gtsam_rwhec.solving.solution import Solution, Status
 
 
 class ExitStatus(IntEnum):

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.errors import FetchError, RwhecError, RwhecWarning
-from gtsam_rwhec.printable import printable
+from gtsam_rwhec.files.printable import printable
 
 
 @contextmanager

@@ -11,22 +11,23 @@ from typing import Annotated
 
 import typer
 
-from gtsam_rwhec.atomic_write import write_atomically
 from gtsam_rwhec.cli.exit_status import HELP, ExitStatus, exit_status
 from gtsam_rwhec.cli.failures import failures_in_words
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import FileFormatError, LogError, NotCertifiedWarning, NotUniqueWarning
+from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.printable import printable
+from gtsam_rwhec.first_rig import first_rig
 from gtsam_rwhec.logs import convert_ros_bag, open_log, write_image_folder
 from gtsam_rwhec.logs.image_folder import is_image_folder
-from gtsam_rwhec.pipeline.clean import clean_log
-from gtsam_rwhec.pipeline.detect import detect_log
-from gtsam_rwhec.pipeline.draw import draw_log
-from gtsam_rwhec.pipeline.run import CLEAN, RESULT, calibrate_log, export_solved, solve_into
-from gtsam_rwhec.pipeline.solve import Calibrated
-from gtsam_rwhec.printable import printable
+from gtsam_rwhec.pipeline.all_stages import CLEAN, RESULT, calibrate_log, export_solved, solve_into
+from gtsam_rwhec.pipeline.cleaning_stage import clean_log
+from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.detections_in_images import draw_log
+from gtsam_rwhec.pipeline.solving_stage import Calibrated
 from gtsam_rwhec.report import print_refined, print_solution, report_console
 from gtsam_rwhec.report.log_report import print_log
-from gtsam_rwhec.rig import first_rig, read_rig
+from gtsam_rwhec.rig import read_rig
 
 RigOption = Annotated[Path | None, typer.Option("--rig", help="Rig file (YAML); left out, the one inside the log.")]
 ImagesOption = Annotated[bool, typer.Option("--images", help="Copy the images too; they are large.")]

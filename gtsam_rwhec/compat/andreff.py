@@ -6,7 +6,7 @@ import numpy as np
 
 from gtsam_rwhec.compat.stations import Stations, all_earlier
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: An eigenvalue below this of the scaled normal equations is rounding.
 SINGULAR = 1e-15

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gtsam_rwhec.calibration import solve
 from gtsam_rwhec.compat.stations import Stations
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.solution import Solution
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solving.certified_solution import solve
+from gtsam_rwhec.solving.solution import Solution
 
 #: Residuals below this, in radians or spreads of the translations, are rounding: exact poses have no weights.
 LEAST_RESIDUAL = 1e-6

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from gtsam_rwhec.compat.stations import CONJUGATION, Stations, left_matrices, pair_blocks, products, quaternions
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.daniilidis import squared, unit_combination
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
-from gtsam_rwhec.poses import Array
 
 
 def daniilidis(stations: Stations) -> tuple[Array, Array]:

@@ -7,11 +7,11 @@ import numpy as np
 from gtsam_rwhec.compat.daniilidis import screws
 from gtsam_rwhec.compat.stations import Stations
 from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import Moments, moments_of
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
 from gtsam_rwhec.handeye.signs import UNCERTAIN
-from gtsam_rwhec.poses import Array
 
 #: Solutions after the first, each with alpha from the residuals of the one before.
 ROUNDS = 3

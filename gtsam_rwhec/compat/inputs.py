@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
-from gtsam_rwhec.poses import LARGEST_M, ROTATION_TOLERANCE, Array
+from gtsam_rwhec.geometry.poses import LARGEST_M, ROTATION_TOLERANCE, Array
 
 #: Fewest poses that hold two motions about different axes; OpenCV asks for as many.
 FEWEST_POSES = 3

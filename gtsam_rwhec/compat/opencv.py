@@ -25,7 +25,7 @@ from gtsam_rwhec.compat.quaternion_methods import horaud, park, tsai
 from gtsam_rwhec.compat.robot_world import li, shah
 from gtsam_rwhec.compat.stations import Stations, stations_of
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 CALIB_HAND_EYE_TSAI = 0
 CALIB_HAND_EYE_PARK = 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.compat.stations import Stations, all_earlier
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 
 def translation_features(stations: Stations) -> Array:

@@ -12,7 +12,7 @@ from gtsam_rwhec.compat.inputs import PARALLEL
 from gtsam_rwhec.compat.pair_translations import translation_features, translation_of
 from gtsam_rwhec.compat.stations import Stations, left_matrices, pair_blocks
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: Tsai's motions have 2 sin(angle / 2) between these, by both sensors; observed of OpenCV 4, to 1e-14, by bisection.
 TSAI_LEAST, TSAI_MOST = 0.3, 1.7

@@ -8,7 +8,7 @@ import numpy as np
 
 from gtsam_rwhec.compat.andreff import check_determined, nearest_rotations
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 RobotWorld = tuple[Array, Array, Array, Array]
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: Pairs in one block: a dozen arrays of this size stay within the processor's cache.
 BLOCK_PAIRS = 1 << 15

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 import numpy as np
 from rwhec_factors.se3 import inverse
 
-from gtsam_rwhec.export.frames import RigFrames
 from gtsam_rwhec.export.overlaps import overlaps
 from gtsam_rwhec.export.written_poses import number
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.rig.calibrated_frames import RigFrames
 from gtsam_rwhec.vision.camera import Camera
 
 _HEAD = """\

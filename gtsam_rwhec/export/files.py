@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from gtsam_rwhec.atomic_write import write_atomically
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.export.camchain import camchain_yaml
-from gtsam_rwhec.export.frames import RigFrames
 from gtsam_rwhec.export.static_tf import static_tf_launch
 from gtsam_rwhec.export.tf_yaml import tf_yaml
 from gtsam_rwhec.export.urdf import urdf_xacro
+from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
 FILES: dict[str, Callable[[RigFrames], str]] = {
     "static_tf.launch.py": static_tf_launch,

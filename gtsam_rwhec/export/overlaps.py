@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from rwhec_factors.se3 import inverse
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 
 #: Depths (m) between which things are looked at, and the pixels and depths that are tried.

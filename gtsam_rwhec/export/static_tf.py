@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.export.frames import RigFrames
 from gtsam_rwhec.export.written_poses import number, quaternion_xyzw
+from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
 _LAUNCH = '''\
 """Calibrated frames as static transforms, one tf2_ros static_transform_publisher each.

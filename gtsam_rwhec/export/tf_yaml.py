@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.export.frames import RigFrames
 from gtsam_rwhec.export.written_poses import number, quaternion_xyzw
+from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
 _HEAD = """\
 # Calibrated frames, as a tf2_msgs/TFMessage has them: the pose of child_frame_id in header.frame_id, metres and a unit

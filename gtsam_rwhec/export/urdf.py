@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.export.frames import RigFrames
 from gtsam_rwhec.export.written_poses import fixed_axis_angles, number
+from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
 _XACRO = """\
 <?xml version="1.0"?>

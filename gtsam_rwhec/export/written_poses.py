@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 
 def number(value: float) -> str:

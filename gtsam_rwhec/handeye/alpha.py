@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import Moments, squared_residuals
 from gtsam_rwhec.handeye.motions import Motions
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
 from gtsam_rwhec.handeye.saddle import minimum
-from gtsam_rwhec.poses import Array
 
 ITERATIONS = 50
 #: Alpha stands still when it changes by less than this part; residuals tell it to a few per cent at best.

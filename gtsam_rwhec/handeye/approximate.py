@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gtsam_rwhec.errors import OptionError, UnderdeterminedError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.degenerate import free_directions, free_of_rotations_alone
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.saddle import SINGULAR, Z_pseudo, best_dual, is_singular
-from gtsam_rwhec.poses import Array
 
 
 def dq2steps(request: Request) -> Answer:

@@ -10,10 +10,10 @@ import warnings
 
 import numpy as np
 
-from gtsam_rwhec.calibration import solve
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning
 from gtsam_rwhec.handeye.method import Answer, Request
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solving.certified_solution import solve
 
 
 def certified(request: Request) -> Answer:

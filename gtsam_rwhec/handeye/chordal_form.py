@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import BLOCK
 from gtsam_rwhec.handeye.motions import Motions
-from gtsam_rwhec.poses import Array
 
 
 def chordal_moments(motions: Motions, weights: Array | None = None) -> tuple[Array, Array]:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.weights import check_alpha, check_covariances, check_weights
-from gtsam_rwhec.poses import Array
 
 if TYPE_CHECKING:
     from gtsam_rwhec.handeye.motions import Motions

@@ -16,11 +16,11 @@ import math
 import numpy as np
 
 from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import BLOCK, E
 from gtsam_rwhec.handeye.degenerate import free_of_rotations_alone
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.method import Answer, Request
-from gtsam_rwhec.poses import Array
 
 #: Squares of singular values below this, relative to the largest, are rounding.
 NULL = 1e-13

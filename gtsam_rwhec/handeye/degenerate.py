@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.dual_quaternions import times_vectors
-from gtsam_rwhec.poses import Array
 
 #: Total over noise up to which a direction is free: signal and noise in equal parts.
 SIGNAL_AND_NOISE = 2.0

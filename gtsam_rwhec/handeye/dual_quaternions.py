@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: 4 q q' from the rotation: row 4 i + j of ``_PRODUCTS`` dotted with vec R (column after column) is 4 q_i q_j, up to
 #: the 1 that the diagonal has besides.
@@ -50,7 +50,7 @@ def from_rows(rows: Array) -> tuple[Array, Array]:
     Parameters
     ----------
     rows : (12, N) array
-        vec R, column after column, then t in metres (``gtsam_rwhec.poses.checked_rows``).
+        vec R, column after column, then t in metres (``gtsam_rwhec.geometry.poses.checked_rows``).
 
     Returns
     -------

@@ -12,6 +12,7 @@ import math
 import numpy as np
 from scipy.optimize import brentq
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.degenerate import free_directions
 from gtsam_rwhec.handeye.dual_quaternions import times_vectors, to_transform
@@ -19,7 +20,6 @@ from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
 from gtsam_rwhec.handeye.proof import proven
 from gtsam_rwhec.handeye.saddle import Z_pseudo, best_dual, bracket, is_singular
-from gtsam_rwhec.poses import Array
 
 #: Newton steps that polish the multiplier of |q| = 1.
 POLISHING = 4

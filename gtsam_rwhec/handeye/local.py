@@ -14,13 +14,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.chordal_form import chordal_moments, chordal_residuals
 from gtsam_rwhec.handeye.cost import squared_residuals
 from gtsam_rwhec.handeye.degenerate import free_directions
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms, left, right, to_transform
 from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
-from gtsam_rwhec.poses import Array
 
 #: least_squares stops where a step changes cost or unknowns by less than this part of them: rounding.
 STOP = 1e-15

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import gtsam
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.motions import Motions
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
-from gtsam_rwhec.poses import Array
 
 ScaleMode = Literal["known", "unknown"]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
+from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, as_transforms, checked_rows
 from gtsam_rwhec.handeye.cost import BLOCK
 from gtsam_rwhec.handeye.dual_quaternions import from_rows
 from gtsam_rwhec.handeye.signs import UNCERTAIN, resolve_signs
-from gtsam_rwhec.poses import Array, PosesLike, QuaternionOrder, as_transforms, checked_rows
 
 #: Motions all smaller than this (rad, m) are none.
 STILL = 1e-14

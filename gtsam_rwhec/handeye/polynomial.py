@@ -20,10 +20,10 @@ import numpy as np
 from scipy.optimize import brentq
 
 from gtsam_rwhec.errors import NotConvergedWarning, UnderdeterminedError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.approximate import Relaxation, answer_of, relaxation, relaxation_gap
 from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.saddle import is_singular
-from gtsam_rwhec.poses import Array
 
 #: lambda* is looked for up to this many times eq. 22's gap, an upper bound that rounding may have touched.
 BEYOND = 1.25

@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 
 from gtsam_rwhec.errors import PriorError
+from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.dual_quaternions import conjugate, from_transforms, left
 from gtsam_rwhec.handeye.weights import LARGEST
-from gtsam_rwhec.poses import Array, PoseLike, one_transform
 
 PriorForm = Literal["imaginary", "distance"]
 #: G of eq. 26: the imaginary parts.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: Rounding that a Cholesky factorisation in double of a 9 x 9 matrix can hide, of unit diagonal (Higham 2002,
 #: Theorem 10.7: 9 gamma_10 = 1e-14), and that of forming its entries.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import OptionError, PriorError
+from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, to_pose3
 from gtsam_rwhec.handeye.alpha import estimate_alpha
 from gtsam_rwhec.handeye.approximate import dq2ndord, dq2ndord_lambda, dq2steps, dqconvrlx
 from gtsam_rwhec.handeye.certified import certified
@@ -23,7 +24,6 @@ from gtsam_rwhec.handeye.optimal import dqopt
 from gtsam_rwhec.handeye.polynomial import dqoptpoly_resultant, dqoptpoly_sturm
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
 from gtsam_rwhec.handeye.weights import check_alpha, check_covariances, check_weights
-from gtsam_rwhec.poses import Array, PosesLike, QuaternionOrder, to_pose3
 
 _DQ = "Dekel et al., Optimal least-squares solution to the hand-eye calibration problem"
 _NEAR = "DQOpt's answer in the basin of the best minimum"

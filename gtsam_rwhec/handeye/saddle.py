@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.dual_quaternions import times_vectors
-from gtsam_rwhec.poses import Array
 
 #: M's eigenvalues below this times its largest are rounding: M is singular.
 SINGULAR = 1e-14

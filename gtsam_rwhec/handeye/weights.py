@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: Weights beyond this, and below its inverse, leave no room for squares and sums in double precision.
 LARGEST = 1e100

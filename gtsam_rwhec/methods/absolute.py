@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.certify.parts import connected_components
-from gtsam_rwhec.certify.rotations import project
 from gtsam_rwhec.errors import ScaleError, UnderdeterminedError
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.statistics import Gauge
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.moments import Gauge
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.parts import connected_components
+from gtsam_rwhec.solver.rotations import project
 
 #: A second solution whose equations are this well satisfied, relatively, is one: exact data with a free direction.
 FREE = 1e-10

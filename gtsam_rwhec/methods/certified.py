@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import warnings
 
-from gtsam_rwhec.calibration import solve
-from gtsam_rwhec.certify.options import SolveOptions
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, WeightsWarning
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
-from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.solution import Solution
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.options import SolveOptions
+from gtsam_rwhec.solving.certified_solution import solve
+from gtsam_rwhec.solving.solution import Solution
 
 
 def certified(problem: Problem, options: MethodOptions) -> Calibration:

@@ -7,14 +7,14 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from gtsam_rwhec.certify.certificate import Certificate
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.methods import certified
 from gtsam_rwhec.methods.protocol import Estimate, Method, MethodOptions
 from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
-from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.residuals import Residual
-from gtsam_rwhec.solution import Solution
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.certificate import Certificate
+from gtsam_rwhec.solver.residuals import Residual
+from gtsam_rwhec.solving.solution import Solution
 
 Progress = Callable[[str], None]
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import gtsam
 
-from gtsam_rwhec.atomic_write import write_atomically
 from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.methods.comparison import Compared, Comparison
-from gtsam_rwhec.result_file import pose_to_file
-from gtsam_rwhec.result_schema import CONVENTIONS
+from gtsam_rwhec.results.schema import CONVENTIONS
+from gtsam_rwhec.results.solution_file import pose_to_file
 
 FORMAT = "gtsam-rwhec comparison"
 FORMAT_VERSION = 1

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.methods import quaternions
 from gtsam_rwhec.methods.absolute import Stack, linear_translations, nearest_rotations, poses_by_name
 from gtsam_rwhec.methods.plain_form import plain_form
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.starts import start_of
-from gtsam_rwhec.poses import Array, one_transform
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 
 #: The weight of |R R' - I|^2 against the residuals', which is 1.
 PENALTY = 1e6

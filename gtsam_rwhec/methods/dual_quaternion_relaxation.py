@@ -12,8 +12,8 @@ import clarabel
 import numpy as np
 import scipy.sparse
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.quaternions import left, right
-from gtsam_rwhec.poses import Array
 
 #: Frames up to which the relaxation is solved; a cone of 8 n takes a dense block of order 4 n (8 n + 1) squared.
 MOST_FRAMES = 10

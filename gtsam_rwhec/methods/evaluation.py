@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.calibration import check_against_knowledge
-from gtsam_rwhec.certify.full_form import add_priors, assemble, edge_slots, forms_of_edges
-from gtsam_rwhec.certify.parts import parts_of
-from gtsam_rwhec.certify.variables import as_variables, given_answer
-from gtsam_rwhec.identifiability import identify
-from gtsam_rwhec.poses import PoseLike
-from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
+from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.identifiability.identification import identify
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.full_form import add_priors, assemble, edge_slots, forms_of_edges
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
+from gtsam_rwhec.solver.variables import as_variables, given_answer
+from gtsam_rwhec.solving.certified_solution import check_against_knowledge
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 
 if TYPE_CHECKING:
     from gtsam_rwhec.methods.reprojection import Observations, ReprojectionAnswer

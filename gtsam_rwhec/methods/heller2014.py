@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from gtsam_rwhec.certify.descent import descend
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.quaternion_moments import STEPS, solve_moments
 from gtsam_rwhec.methods.unit_weights import UnitForm
 from gtsam_rwhec.methods.wise2020 import certified_rotations, check_frames
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.descent import descend
 
 Parameterisation = Literal["quaternion", "matrix"]
 #: The order of each one's first relaxation.

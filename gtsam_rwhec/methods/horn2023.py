@@ -23,12 +23,12 @@ from typing import Literal, get_args
 import numpy as np
 
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.absolute import Stack, poses_by_name
 from gtsam_rwhec.methods.dual_quaternion_relaxation import Relaxed, multipliers_of, polished, relaxed
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.quaternions import left, of_rotations, paired_quaternions, right, to_rotation
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 
 #: How the quaternions of A and B get their signs.
 #:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import quaternions
 from gtsam_rwhec.methods.absolute import FREE, Stack, nearest_rotations, poses_by_name
 from gtsam_rwhec.methods.plain_form import plain_form
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 
 _SOURCE = (
     "A. Li, L. Wang and D. Wu, Simultaneous robot-world and hand-eye calibration using dual-quaternions and Kronecker "

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from gtsam_rwhec.errors import ScaleError
+from gtsam_rwhec.methods.local_on_manifold import LomOptions, check_problem, local_on_manifold
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.starts import start_of
-from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.refinement.lom import LomOptions, check_problem, local_on_manifold
+from gtsam_rwhec.problem.problem import Problem
 
 
 def lom(problem: Problem, options: MethodOptions) -> Calibration:

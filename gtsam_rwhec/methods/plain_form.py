@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.absolute import Stack
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.statistics import Moments, MomentStack, edge_forms
+from gtsam_rwhec.problem.moments import Moments, MomentStack, edge_forms
 
 
 def plain_form(stack: Stack) -> Array:

@@ -15,7 +15,6 @@ from typing import Literal
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.errors import (
     CountError,
     FrameError,
@@ -25,9 +24,10 @@ from gtsam_rwhec.errors import (
     RwhecError,
     ScaleError,
 )
-from gtsam_rwhec.poses import PoseLike
-from gtsam_rwhec.problem import Problem, ScaleMode
-from gtsam_rwhec.residuals import Residual
+from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import Problem, ScaleMode
+from gtsam_rwhec.solver.residuals import Residual
 
 #: How many frames a method solves for at once (RWHEC paper, Table 1): one X and one Y; several of one side with one
 #: of the other; several of both.

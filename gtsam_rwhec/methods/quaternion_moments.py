@@ -20,9 +20,9 @@ import clarabel
 import numpy as np
 import scipy.sparse
 
-from gtsam_rwhec.certify.rotations import project, unvec
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.quaternions import LEFT, RIGHT, to_rotation
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.solver.rotations import project, unvec
 
 #: (a, b) of the ten products q_a q_b.
 PRODUCTS = [(a, b) for a in range(4) for b in range(a, 4)]

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.absolute import Stack, linear_rotations
-from gtsam_rwhec.poses import Array
 
 #: L[c] and R[c] (4, 4): left and right multiplication by the c-th unit of (1, i, j, k).
 LEFT = np.array(

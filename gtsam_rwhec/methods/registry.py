@@ -7,6 +7,7 @@ import time
 import gtsam
 
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.geometry.poses import PoseLike, one_transform
 from gtsam_rwhec.methods import (
     certified,
     dornaika1998,
@@ -24,8 +25,7 @@ from gtsam_rwhec.methods import (
 )
 from gtsam_rwhec.methods.evaluation import evaluate
 from gtsam_rwhec.methods.protocol import Calibration, Estimate, Method, MethodOptions
-from gtsam_rwhec.poses import PoseLike, one_transform
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 
 #: In the order in which ``gtsam-rwhec compare`` shows them: closed forms, iterations, global methods.
 METHODS: dict[str, Method] = {

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, TargetError
+from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms, checked_rows, one_transform, rows_to_transforms
 from gtsam_rwhec.methods.protocol import MethodOptions, Poses
 from gtsam_rwhec.methods.starts import start_of
-from gtsam_rwhec.poses import Array, PosesLike, as_transforms, checked_rows, one_transform, rows_to_transforms
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.vision.camera import Camera
 
 #: Rounds of choosing between a flat target's two poses by the calibration so far.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gtsam_rwhec.methods.absolute import Stack, linear_rotations, linear_translations, poses_by_name
 from gtsam_rwhec.methods.protocol import MethodOptions, Poses, checked_start
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 
 
 def start_of(problem: Problem, options: MethodOptions) -> tuple[Poses, Poses, float, str]:

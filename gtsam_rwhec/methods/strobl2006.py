@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.certify.rotations import retract
+from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.methods.absolute import Stack, linear_rotations, linear_translations, poses_by_name
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties, checked_start
-from gtsam_rwhec.poses import Array, one_transform
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.rotations import retract
 
 #: The weights rest when their ratio changes by less than this share.
 SETTLED = 1e-6

@@ -19,16 +19,16 @@ from typing import Literal
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.certify.reduced_form import ReducedForm
-from gtsam_rwhec.certify.rotations import vec
 from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.absolute import Stack, linear_translations, poses_by_name
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.quaternions import LEFT, RIGHT, of_rotations
 from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.methods.unit_weights import UnitForm, unit_weights
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.reduced_form import ReducedForm
+from gtsam_rwhec.solver.rotations import vec
 
 Cost = Literal["c1", "c2"]
 Mode = Literal["simultaneous", "separable"]

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.certify.parts import Part, parts_of
-from gtsam_rwhec.certify.reduced_form import ReducedForm, reduce
-from gtsam_rwhec.certify.search import Forms
-from gtsam_rwhec.certify.start import spectral_start
-from gtsam_rwhec.certify.variables import answer_of
 from gtsam_rwhec.errors import FrameError, ScaleError
+from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.methods.protocol import Calibration, Poses
-from gtsam_rwhec.poses import Array, one_transform
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.parts import Part, parts_of
+from gtsam_rwhec.solver.reduced_form import ReducedForm, reduce
+from gtsam_rwhec.solver.search import Forms
+from gtsam_rwhec.solver.start import spectral_start
+from gtsam_rwhec.solver.variables import answer_of
 
 
 @dataclass(frozen=True)

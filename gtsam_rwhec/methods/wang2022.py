@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gtsam_rwhec.methods.absolute import Stack, linear_rotations, linear_translations, poses_by_name
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 
 
 def wang2022(problem: Problem, options: MethodOptions) -> Calibration:

@@ -11,17 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.certify.bound import lower_bound
-from gtsam_rwhec.certify.descent import descend
-from gtsam_rwhec.certify.interior_point import Relaxation
-from gtsam_rwhec.certify.local_blocks import scatter
-from gtsam_rwhec.certify.relaxation import round_to_rotations, solve_by_clarabel
-from gtsam_rwhec.certify.rotations import CONSTRAINTS, kkt_multipliers, vec
 from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.unit_weights import UnitForm
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.bound import lower_bound
+from gtsam_rwhec.solver.descent import descend
+from gtsam_rwhec.solver.interior_point import Relaxation
+from gtsam_rwhec.solver.local_blocks import scatter
+from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_by_clarabel
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers, vec
 
 TOLERANCE = 1e-10
 STEPS = 200

@@ -8,7 +8,7 @@ from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.methods import quaternions
 from gtsam_rwhec.methods.absolute import FREE, Stack, linear_rotations, linear_translations, poses_by_name
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 
 #: A's with a smaller scalar part, half turns, are left out: the equations divide by it.
 SMALLEST_SCALAR = 1e-3

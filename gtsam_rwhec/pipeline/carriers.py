@@ -9,8 +9,8 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.cleaning import Trajectory
 from gtsam_rwhec.errors import LogError, StampError, TransformError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer, Topic
-from gtsam_rwhec.poses import Array
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.rig import Rig
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.cleaning.trajectory import Trajectory
 from gtsam_rwhec.errors import NoiseError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, PairRecord
-from gtsam_rwhec.pipeline.clean import PAIR_TOPIC
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem, ScaleMode
+from gtsam_rwhec.pipeline.cleaning_stage import PAIR_TOPIC
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import Problem, ScaleMode
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log, LogWriter, PairRecord, PoseRecord, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
-from gtsam_rwhec.pipeline.clean import PAIR_TOPIC
-from gtsam_rwhec.pipeline.embedded import (
+from gtsam_rwhec.pipeline.cleaning_stage import PAIR_TOPIC
+from gtsam_rwhec.pipeline.log_metadata import (
     CLEANING,
     DETECTION,
     read_cameras,
@@ -22,13 +21,14 @@ from gtsam_rwhec.pipeline.embedded import (
     write_rig,
 )
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
-from gtsam_rwhec.pipeline.solve import Calibrated
-from gtsam_rwhec.refined_file import refined_json, refined_of
+from gtsam_rwhec.pipeline.solving_stage import Calibrated
+from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.result_file import parse_result, solution_of
+from gtsam_rwhec.results.refined_file import refined_json, refined_of
+from gtsam_rwhec.results.solution_file import parse_result, solution_of
+from gtsam_rwhec.results.stage_reports import LogFields
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.solution import Solution
-from gtsam_rwhec.stage_reports import LogFields
+from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.vision.camera import Camera
 
 #: Transforms that never change, so that viewers show every frame at any time.

@@ -10,11 +10,11 @@ from itertools import groupby
 import numpy as np
 
 from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord
 from gtsam_rwhec.pipeline.carriers import check_order
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.results.stage_reports import TrackCount
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.stage_reports import TrackCount
 from gtsam_rwhec.vision.targets import Tag, Target
 
 #: Of one target in one message: two of its measurements cannot both be true.

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.certify.options import SolveOptions
-from gtsam_rwhec.certify.parts import Part, parts_of
-from gtsam_rwhec.certify.search import Found, Search
-from gtsam_rwhec.certify.variables import Answer, answer_of, rotations_as_variables
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.exact_scales import with_exact_scales
+from gtsam_rwhec.solver.options import SolveOptions
+from gtsam_rwhec.solver.parts import Part, parts_of
+from gtsam_rwhec.solver.search import Found, Search
+from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables
 
 #: Above this many free frames a gap is left open on the way: the semidefinite relaxation would take most of the time,
 #: and only the last, full solution's certificate is claimed.

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.certify.parts import Part
+from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.refinement.graph import add_summary, summary_of
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.optimisation import information_of
@@ -16,6 +15,7 @@ from gtsam_rwhec.refinement.options import NoiseGroups
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.variance_components import VarianceComponents, from_moments
 from gtsam_rwhec.refinement.weighting import COMPONENTS, VarianceFactors
+from gtsam_rwhec.solver.parts import Part
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.certify.parts import Part
-from gtsam_rwhec.certify.rotations import vec
-from gtsam_rwhec.certify.variables import Answer
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.residuals import PairPoses
-from gtsam_rwhec.statistics import edge_forms
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.moments import edge_forms
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.residuals import PairPoses
+from gtsam_rwhec.solver.rotations import vec
+from gtsam_rwhec.solver.variables import Answer
 
 MAX_STEPS = 30
 #: Steps shorter than this (rad, m) end it.

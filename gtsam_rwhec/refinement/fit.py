@@ -9,8 +9,8 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec.errors import NotConvergedWarning
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.chordal import ChordalModel
 from gtsam_rwhec.refinement.geodesic import GeodesicModel

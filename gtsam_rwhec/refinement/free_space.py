@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.certify.parts import Part
-from gtsam_rwhec.certify.variables import given_answer
-from gtsam_rwhec.identifiability import free_directions_of, identify, typical_length
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.identifiability.identification import free_directions_of, identify, typical_length
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.weighting import VarianceFactors
-from gtsam_rwhec.residuals import PairPoses, costs_of_pairs
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.residuals import PairPoses, costs_of_pairs
+from gtsam_rwhec.solver.variables import given_answer
 
 #: A velocity's mean square, in units of what noise makes of it, up to which a carrier counts as standing still.
 MOVED = 4.0

@@ -11,9 +11,9 @@ import numpy as np
 from rwhec_factors.batch import Linearization
 from scipy.special import chdtr, chdtri
 
-from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.errors import NoiseError, WeightsWarning
-from gtsam_rwhec.poses import Array, to_pose3
+from gtsam_rwhec.geometry.poses import Array, to_pose3
+from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import NoiseGroups, RefineOptions, Robust

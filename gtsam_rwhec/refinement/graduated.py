@@ -22,11 +22,11 @@ from typing import get_args
 import numpy as np
 from scipy.special import chdtri
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.calibration import solve
 from gtsam_rwhec.errors import CountError, OptionError, OutlierError, OutliersWarning, UnderdeterminedError
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import reweighted
 from gtsam_rwhec.refinement.squared_residuals import NoiseFactors
 from gtsam_rwhec.refinement.truncated_least_squares import (
     DOF,
@@ -36,8 +36,8 @@ from gtsam_rwhec.refinement.truncated_least_squares import (
     TruncatedLeastSquares,
     agreeing,
 )
-from gtsam_rwhec.selection import reweighted
-from gtsam_rwhec.solution import Solution
+from gtsam_rwhec.solving.certified_solution import solve
+from gtsam_rwhec.solving.solution import Solution
 
 #: A frame or pair of which a smaller share of measurements agrees is named in a warning.
 SUSPECT = 0.5

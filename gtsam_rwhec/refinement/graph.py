@@ -14,11 +14,11 @@ from rwhec_factors.known_carrier_pose import robot_world_hand_eye_factor, scaled
 from rwhec_factors.priors import position_prior_factor, rotation_prior_factor
 from rwhec_factors.shifted_pose_prior import shifted_pose_prior_factor
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.certify.parts import Part
 from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.poses import Array, to_pose3
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.geometry.poses import Array, to_pose3
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.moments import edge_forms
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import ResidualKind, Robust
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import Variables, carrier_key
@@ -27,7 +27,7 @@ from gtsam_rwhec.refinement.weighting import (
     VarianceFactors,
     measurement_covariance,
 )
-from gtsam_rwhec.statistics import edge_forms
+from gtsam_rwhec.solver.parts import Part
 
 #: Tuning constants: 95 % efficient where the noise is Gaussian in six dimensions. (GTSAM weighs a factor by the length
 #: of its whitened residual; its defaults have that efficiency in one dimension, and 40 to 93 % in six.)

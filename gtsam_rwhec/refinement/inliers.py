@@ -12,14 +12,14 @@ import dataclasses
 
 import numpy as np
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import with_measurements
 from gtsam_rwhec.refinement.geodesic import linearized
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.weighting import VarianceFactors, residual_covariance
-from gtsam_rwhec.selection import with_measurements
 
 
 def under_worst_axis(problem: Problem, data: list[PairData], variables: Variables, state: State) -> Problem:

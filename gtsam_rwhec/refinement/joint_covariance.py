@@ -17,7 +17,7 @@ from rwhec_factors import se3
 from scipy.linalg import block_diag
 
 from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: A linear function whose share along the free directions is below this is called determined (the share below which a
 #: free direction's sentence leaves a frame out).

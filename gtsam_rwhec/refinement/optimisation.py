@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.refinement.variables import Variables
 
 

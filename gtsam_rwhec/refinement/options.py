@@ -8,10 +8,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.cleaning.trajectory import Trajectory
 from gtsam_rwhec.errors import NoiseError, OptionError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 NoiseSource = Literal["auto", "given", "estimate"]
 NoiseGroups = Literal["all", "sensor", "pair"]

@@ -8,14 +8,14 @@ import numpy as np
 from rwhec_factors import se3
 from rwhec_factors.batch import BatchResiduals
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.cleaning.trajectory import Trajectory
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
-from gtsam_rwhec.measurements import checked_covariances
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.measurements import checked_covariances
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
-from gtsam_rwhec.twists import SAME, LocalPaths
+from gtsam_rwhec.trajectories.local_paths import SAME, LocalPaths
+from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

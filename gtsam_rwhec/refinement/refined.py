@@ -10,14 +10,14 @@ import gtsam
 import numpy as np
 from scipy.special import chdtri, fdtri
 
-from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.errors import FrameError, OptionError
-from gtsam_rwhec.pose_covariances import error_of, relative_jacobian, standard_deviations
-from gtsam_rwhec.poses import Array, PoseLike
-from gtsam_rwhec.problem import ScaleMode
+from gtsam_rwhec.geometry.pose_covariances import error_of, relative_jacobian, standard_deviations
+from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import ScaleMode
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
-from gtsam_rwhec.solution import Solution
+from gtsam_rwhec.solving.solution import Solution
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class RefinedPoses:
     """Refined poses and how well they are known: what a result file keeps of a `Refined`.
 
     Covariances are of right perturbations, T Expmap(xi), xi = [omega (rad), v (m)], in the frame's own axes (GTSAM's
-    convention; ``gtsam_rwhec.pose_covariances`` turns them into others). They are infinite along directions that the
+    convention; ``rw.pose_covariances`` turns them into others). They are infinite along directions that the
     measurements leave free.
 
     Attributes
@@ -253,6 +253,6 @@ class Refined(RefinedPoses):
 
     def write_json(self, path: str | Path) -> None:
         """Write the certified solution and everything refined, but the graph (``gtsam_rwhec.read_refined``)."""
-        from gtsam_rwhec.refined_file import write_refined  # the file format imports this module
+        from gtsam_rwhec.results.refined_file import write_refined  # the file format imports this module
 
         write_refined(self, path)

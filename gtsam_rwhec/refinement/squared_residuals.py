@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.certified_fit import Fit
 
 

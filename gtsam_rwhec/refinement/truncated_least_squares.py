@@ -13,14 +13,14 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtr, chdtri
 
-from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.errors import CountError, UnderdeterminedError
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import reweighted
 from gtsam_rwhec.refinement.certified_fit import Fit, certified_fit
-from gtsam_rwhec.refinement.consensus import by_vote
 from gtsam_rwhec.refinement.squared_residuals import Measured, NoiseFactors, Squares
-from gtsam_rwhec.selection import reweighted
+from gtsam_rwhec.refinement.voting import by_vote
 
 Progress = Callable[[str], None]
 NoiseScale = Literal["given", "estimate"]

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.accumulation import Pair
 from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.problem import Problem
-from gtsam_rwhec.solution import Solution
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solving.solution import Solution
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from rwhec_factors.batch import Linearization
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.certify.parts import Part
 from gtsam_rwhec.errors import NoiseError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import NoiseGroups
 from gtsam_rwhec.refinement.pair_data import PairData
@@ -30,6 +29,7 @@ from gtsam_rwhec.refinement.weighting import (
     measurement_covariance,
     residual_covariance,
 )
+from gtsam_rwhec.solver.parts import Part
 
 #: No data are taken for quieter than this times what was given (or 1 m and 1 rad, where nothing was).
 SMALLEST = 1e-20

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from rwhec_factors.batch import Linearization
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.refinement.options import NoiseGroups
 from gtsam_rwhec.refinement.pair_data import PairData
 

@@ -9,10 +9,10 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from gtsam_rwhec.accumulation import Pair
-from gtsam_rwhec.csv_files import natural_key
-from gtsam_rwhec.pose_covariances import standard_deviations
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.geometry.pose_covariances import standard_deviations
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
 from gtsam_rwhec.report.solution_report import report_console

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.text import Text
 
-from gtsam_rwhec.cross_validation import Comparison, CrossValidation
-from gtsam_rwhec.csv_files import natural_key
+from gtsam_rwhec.calibration.cross_validation import Comparison, CrossValidation
+from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.solution_report import report_console
 

@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gtsam_rwhec.printable import printable
+from gtsam_rwhec.files.printable import printable
 from gtsam_rwhec.report.solution_report import report_console
-from gtsam_rwhec.stage_reports import LogFields, TrackCount
+from gtsam_rwhec.results.stage_reports import LogFields, TrackCount
 
 
 def print_log(log: LogFields, console: Console | None = None) -> None:

@@ -10,8 +10,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.style import Style
 from rich.text import Text
 
-from gtsam_rwhec.csv_files import natural_key
-from gtsam_rwhec.identifiability import Identifiability
+from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.identifiability.identification import Identifiability
 
 
 @dataclass(frozen=True)

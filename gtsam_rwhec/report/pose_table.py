@@ -13,8 +13,8 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from gtsam_rwhec.csv_files import natural_key
-from gtsam_rwhec.solution import Residual, Solution
+from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.solving.solution import Residual, Solution
 
 POSE_LEGEND = (
     "Translations in metres; rotations as roll, pitch, yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll). Residuals: root "

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from gtsam_rwhec.csv_files import natural_key
-from gtsam_rwhec.solution import Certificate, Solution, Status
+from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.solving.solution import Certificate, Solution, Status
 
 
 def summary_sentence(solution: Solution) -> str:

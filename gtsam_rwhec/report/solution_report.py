@@ -16,7 +16,7 @@ from gtsam_rwhec.report.sentences import (
     time_sentence,
     weights_sentence,
 )
-from gtsam_rwhec.solution import Solution
+from gtsam_rwhec.solving.solution import Solution
 
 #: Sentences in files are not cut into lines, but tables need some width to be laid out in.
 PLAIN_WIDTH = 160

@@ -1,6 +1,5 @@
 """Rig files: which sensors and targets there are, on which carriers, and where the log has what is needed of each."""
 
-from gtsam_rwhec.rig.first_rig import first_rig
 from gtsam_rwhec.rig.rig_file import parse_rig, read_rig, rig_text
 from gtsam_rwhec.rig.schema import (
     AprilGridTarget,
@@ -30,7 +29,6 @@ __all__ = [
     "Rig",
     "Sensor",
     "TagTarget",
-    "first_rig",
     "parse_rig",
     "read_rig",
     "rig_text",

@@ -9,9 +9,9 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
 from gtsam_rwhec.errors import OptionError, TargetError
+from gtsam_rwhec.files.yaml_lines import KeyPath, suggestion
 from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.targets import Checkerboard, Target
-from gtsam_rwhec.yaml_lines import KeyPath, suggestion
 
 if TYPE_CHECKING:
     from gtsam_rwhec.rig.schema import RigFile

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import AfterValidator, BeforeValidator
 
+from gtsam_rwhec.files.yaml_lines import shown
 from gtsam_rwhec.vision.targets import LARGEST_M
-from gtsam_rwhec.yaml_lines import shown
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*")
 LONGEST_NAME = 100

@@ -13,9 +13,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from gtsam_rwhec.errors import FileFormatError, RigError
+from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
 from gtsam_rwhec.rig import schema
 from gtsam_rwhec.rig.schema import Rig, RigFile
-from gtsam_rwhec.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
 
 #: Faults that one message has, at most.
 MOST_FAULTS = 20

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.random import Generator
 
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate.noise import Noise, Seed, perturb, released_sphere_translations
 from gtsam_rwhec.simulate.scales import SHARED_SCALE
 from gtsam_rwhec.simulate.simulation import Simulation

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate.noise import Noise, Seed, perturb, released_camera_translations
 from gtsam_rwhec.simulate.scales import SHARED_SCALE
 from gtsam_rwhec.simulate.simulation import Simulation

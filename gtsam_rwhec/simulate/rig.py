@@ -8,7 +8,7 @@ from typing import TypedDict, TypeVar
 import numpy as np
 
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.problem import Problem, ScaleMode
+from gtsam_rwhec.problem.problem import Problem, ScaleMode
 from gtsam_rwhec.simulate.graphs import Edge, GraphKind, bipartite_edges
 from gtsam_rwhec.simulate.motion import Motion, MotionKind, carrier_poses
 from gtsam_rwhec.simulate.noise import Noise, Seed, perturb

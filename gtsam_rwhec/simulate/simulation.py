@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gtsam_rwhec.errors import FrameError, ScaleError
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 
 FloatArray = NDArray[np.float64]
 

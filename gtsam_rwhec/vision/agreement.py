@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: With fewer images two rotations agree with too many choices.
 LEAST_IMAGES = 12

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.agreement import LEAST_IMAGES, choose_by_agreement
 
 #: Of an angle between two images beyond what corner noise explains: clocks apart, an arm that is not exact (rad).

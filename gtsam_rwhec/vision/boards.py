@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.dictionaries import dictionary
 from gtsam_rwhec.vision.images import Gray

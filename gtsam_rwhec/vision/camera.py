@@ -15,7 +15,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 Model = Literal["pinhole", "radtan", "equidistant"]
 

@@ -13,7 +13,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.dictionaries import dictionary
 from gtsam_rwhec.vision.images import Gray
 

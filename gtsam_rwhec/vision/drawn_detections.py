@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs.records import DetectionRecord
-from gtsam_rwhec.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.images import Gray
 

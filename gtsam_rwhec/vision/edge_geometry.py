@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.images import Gray
 
 #: Points further from their line than this many times the median are an occluder's.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: Prior standard deviations: of what is beyond the border and beyond the paper, in units of the edge's step; of the
 #: edge's shift and of the blur's change in one round, in units of the blur. They only keep columns apart that the

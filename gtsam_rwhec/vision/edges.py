@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.edge_geometry import area, crossings, from_unit_square, lines_through, mapped, median, sampled
 from gtsam_rwhec.vision.edge_profiles import fit_profiles

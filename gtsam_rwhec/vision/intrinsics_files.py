@@ -13,9 +13,9 @@ from typing import Any, NoReturn
 import numpy as np
 
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.files.yaml_lines import OPENCV_MATRIX, KeyPath, YamlFile, parse_yaml, read_text, read_yaml, shown
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import MODELS, Camera
-from gtsam_rwhec.yaml_lines import OPENCV_MATRIX, KeyPath, YamlFile, parse_yaml, read_text, read_yaml, shown
 
 #: Kalibr's words for distortion of its camera model pinhole.
 KALIBR_DISTORTIONS = ("none", "radtan", "equidistant")

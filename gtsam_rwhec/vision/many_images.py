@@ -19,7 +19,7 @@ from loky import ProcessPoolExecutor, cpu_count
 
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs.records import ImageRecord
-from gtsam_rwhec.vision.detect import Detector, Seen
+from gtsam_rwhec.vision.detection import Detector, Seen
 from gtsam_rwhec.vision.images import Gray, decode_gray
 
 #: Images that are looked at together: enough for the refinement to be cheap, few enough to hold.

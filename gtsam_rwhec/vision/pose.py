@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 
 STEPS = 15

@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from gtsam_rwhec.errors import TargetError
-from gtsam_rwhec.poses import Array
+from gtsam_rwhec.geometry.poses import Array
 
 #: How many tags each family has.
 FAMILIES: dict[str, int] = {

@@ -23,7 +23,7 @@ from mcap.reader import make_reader
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.logs import LogWriter, open_log
-from gtsam_rwhec.pipeline.run import calibrate_log
+from gtsam_rwhec.pipeline.all_stages import calibrate_log
 from gtsam_rwhec.rig import parse_rig, read_rig
 
 TESTS = Path(__file__).resolve().parents[1]

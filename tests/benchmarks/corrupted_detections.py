@@ -21,9 +21,9 @@ import numpy as np
 from bars import Row, print_rows
 
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
-from gtsam_rwhec.pipeline.clean import clean_log
-from gtsam_rwhec.pipeline.detect import TOPIC, detect_log
-from gtsam_rwhec.pipeline.embedded import (
+from gtsam_rwhec.pipeline.cleaning_stage import clean_log
+from gtsam_rwhec.pipeline.detection_stage import TOPIC, detect_log
+from gtsam_rwhec.pipeline.log_metadata import (
     DETECTION,
     read_cameras,
     read_embedded_rig,
@@ -32,10 +32,10 @@ from gtsam_rwhec.pipeline.embedded import (
     write_report,
     write_rig,
 )
-from gtsam_rwhec.pipeline.solve import Calibrated, solve_log
+from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
 from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.results.stage_reports import DetectionReport
 from gtsam_rwhec.rig import read_rig
-from gtsam_rwhec.stage_reports import DetectionReport
 
 CELL = Path(__file__).resolve().parents[2] / "data" / "cell"
 BAR = 1.2

@@ -49,7 +49,7 @@ from paper_tables import (
     wide_console,
 )
 
-from gtsam_rwhec.refinement.lom import LomOptions, LomWeights, local_on_manifold
+from gtsam_rwhec.methods.local_on_manifold import LomOptions, LomWeights, local_on_manifold
 from gtsam_rwhec.simulate import Simulation
 from gtsam_rwhec.simulate.transforms import pose, random_directions, random_poses, rotations_of_vectors
 

@@ -39,12 +39,12 @@ from numpy.typing import NDArray
 from paper_tables import BAR, Experiment, Runs, in_parallel, largest_difference, print_table, simulated, wide_console
 from tables_2_to_5 import EXPERIMENTS
 
+from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.methods import METHODS, MethodOptions, run
 from gtsam_rwhec.methods.absolute import Stack
 from gtsam_rwhec.methods.horn2023 import solve_dual_quaternions
+from gtsam_rwhec.methods.local_on_manifold import LomOptions, local_on_manifold
 from gtsam_rwhec.methods.starts import start_of
-from gtsam_rwhec.poses import to_pose3
-from gtsam_rwhec.refinement.lom import LomOptions, local_on_manifold
 from gtsam_rwhec.simulate import CalibrationErrors, FrameDistance, Simulation, frame_distance
 from gtsam_rwhec.simulate.simulation import Answer
 

@@ -1,7 +1,7 @@
 """The same semidefinite relaxation in SCS: the peer that the benchmarks time against.
 
 ``max gamma  s.t.  Q' - sum lambda_ik A_ik - gamma e_h e_h' >= 0`` with the 20 independent constraints of each rotation,
-as ``gtsam_rwhec.certify.relaxation`` has it, in SCS's standard form: minimise c'y subject to b - A y in the cone.
+as ``gtsam_rwhec.solver.relaxation`` has it, in SCS's standard form: minimise c'y subject to b - A y in the cone.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 import scipy.sparse
 import scs
 
-from gtsam_rwhec.certify.local_blocks import local_indices
-from gtsam_rwhec.certify.rotations import CONSTRAINTS
+from gtsam_rwhec.solver.local_blocks import local_indices
+from gtsam_rwhec.solver.rotations import CONSTRAINTS
 
 
 @dataclass(frozen=True)

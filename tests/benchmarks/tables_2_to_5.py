@@ -21,8 +21,8 @@ import numpy as np
 from paper_tables import BAR, Experiment, Runs, in_parallel, largest_difference, print_table, simulated, wide_console
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.certify.options import Method
 from gtsam_rwhec.simulate.noise import NoiseModel
+from gtsam_rwhec.solver.options import Method
 
 EXPERIMENTS = (
     Experiment(2, 125, 0.01, ((10.9, 5.6), (0.77, 0.36), (3.71, 2.13), (0.62, 0.36))),

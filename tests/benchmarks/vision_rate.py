@@ -27,7 +27,7 @@ from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.logs.records import ImageRecord, IntrinsicsRecord
 from gtsam_rwhec.rig import read_rig
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detect import Detector
+from gtsam_rwhec.vision.detection import Detector
 from gtsam_rwhec.vision.many_images import detect_in_images
 
 CELL = Path(__file__).resolve().parents[2] / "data" / "cell"

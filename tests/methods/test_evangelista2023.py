@@ -10,10 +10,10 @@ from method_problems import four_targets, one_pair
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, TargetError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import MethodOptions, run
 from gtsam_rwhec.methods.evangelista2023 import evangelista2023
 from gtsam_rwhec.methods.reprojection import Observations, calibrate, linearised
-from gtsam_rwhec.poses import Array
 from gtsam_rwhec.simulate.simulation import frame_distance
 from gtsam_rwhec.vision.camera import Camera
 

@@ -9,8 +9,6 @@ from rwhec_factors import se3
 from test_wise2020 import cost_of, motions
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.certify.descent import descend
-from gtsam_rwhec.certify.rotations import random_rotations, vec
 from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.methods import quaternion_moments, run
 from gtsam_rwhec.methods.heller2014 import Parameterisation, global_minimum
@@ -18,6 +16,8 @@ from gtsam_rwhec.methods.quaternion_moments import PRODUCTS, _moments, products_
 from gtsam_rwhec.methods.quaternions import of_rotations
 from gtsam_rwhec.methods.unit_weights import UnitForm
 from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.solver.descent import descend
+from gtsam_rwhec.solver.rotations import random_rotations, vec
 
 BOTH: tuple[Parameterisation, ...] = ("quaternion", "matrix")
 

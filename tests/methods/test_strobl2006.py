@@ -8,11 +8,11 @@ from method_problems import largest_errors, one_pair
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.certify.rotations import random_rotations, retract
 from gtsam_rwhec.methods import MethodOptions, run
 from gtsam_rwhec.methods.absolute import Stack
 from gtsam_rwhec.methods.strobl2006 import METHOD, errors, jacobian, reweighed
 from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.solver.rotations import random_rotations, retract
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-4])

@@ -7,14 +7,14 @@ import pytest
 from method_problems import exchanged, four_targets, one_pair
 from rwhec_factors import se3
 
-from gtsam_rwhec.certify.rotations import random_rotations, vec
 from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import run
 from gtsam_rwhec.methods.protocol import Calibration, MethodOptions
 from gtsam_rwhec.methods.tabb2017 import C1, CHARTS, Cost, Mode, Parameterisation, tabb2017
-from gtsam_rwhec.poses import Array
-from gtsam_rwhec.problem import Problem
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.solver.rotations import random_rotations, vec
 
 NOISE = Noise(0.05, 30.0)
 PARAMETERISATIONS: tuple[Parameterisation, ...] = ("euler", "axis-angle", "quaternion")

@@ -8,13 +8,13 @@ from method_problems import four_targets, one_pair
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.certify.rotations import random_rotations
 from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import run
 from gtsam_rwhec.methods.unit_weights import UnitForm
 from gtsam_rwhec.methods.wise2020 import certified_rotations
-from gtsam_rwhec.poses import Array
 from gtsam_rwhec.simulate import Noise
+from gtsam_rwhec.solver.rotations import random_rotations
 
 
 def cost_of(problem: rw.Problem, X: Array, Y: Array, scale: float) -> float:
@@ -61,7 +61,7 @@ def test_the_answer_is_the_proven_optimum_of_its_cost(monocular: bool) -> None:
 def test_the_bound_is_below_every_descent() -> None:
     form = UnitForm.of(one_pair(Noise(0.3, 2.0), seed=4).problem)
     found = certified_rotations(form)
-    from gtsam_rwhec.certify.descent import descend
+    from gtsam_rwhec.solver.descent import descend
 
     generator = np.random.default_rng(0)
     for _ in range(10):

@@ -21,8 +21,8 @@ from mcap.writer import Writer as McapWriter
 from rwhec_factors import se3
 from scipy.spatial.transform import Rotation
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs.written_schemas import json_schema
-from gtsam_rwhec.poses import Array
 from gtsam_rwhec.rig import Rig, parse_rig
 
 BEGIN_NS = 1_700_000_000_000_000_000

@@ -31,10 +31,10 @@ from gtsam_rwhec.errors import (
     TransformError,
 )
 from gtsam_rwhec.logs import LogWriter, open_log
-from gtsam_rwhec.pipeline.clean import clean_log
-from gtsam_rwhec.pipeline.detect import detect_log
-from gtsam_rwhec.pipeline.embedded import DETECTION, RIG
-from gtsam_rwhec.pipeline.run import calibrate_log, solve_into
+from gtsam_rwhec.pipeline.all_stages import calibrate_log, solve_into
+from gtsam_rwhec.pipeline.cleaning_stage import clean_log
+from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.log_metadata import DETECTION, RIG
 
 try:
     import resource

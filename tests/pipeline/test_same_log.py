@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from ros2_twin import CELL, write_twins
 
-from gtsam_rwhec.pipeline.clean import clean_log
-from gtsam_rwhec.pipeline.detect import detect_log
-from gtsam_rwhec.pipeline.run import calibrate_log, export_solved, solve_into
+from gtsam_rwhec.pipeline.all_stages import calibrate_log, export_solved, solve_into
+from gtsam_rwhec.pipeline.cleaning_stage import clean_log
+from gtsam_rwhec.pipeline.detection_stage import detect_log
 from gtsam_rwhec.rig import read_rig
 
 

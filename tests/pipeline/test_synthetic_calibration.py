@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import synthetic_logs as made
 
-from gtsam_rwhec.pipeline.run import calibrate_log
+from gtsam_rwhec.pipeline.all_stages import calibrate_log
 from gtsam_rwhec.rig import parse_rig
 from gtsam_rwhec.simulate import frame_distance
 

@@ -7,7 +7,7 @@ import pytest
 from refinement_problems import KAPPA, SIGMA_M, refined
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.pose_covariances import error_of
+from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
 
 RUNS = 100

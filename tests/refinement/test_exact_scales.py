@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.certify.parts import parts_of
-from gtsam_rwhec.certify.variables import given_answer
+from gtsam_rwhec.problem.moments import edge_forms
 from gtsam_rwhec.refinement import exact_scales
 from gtsam_rwhec.refinement.certified_fit import Fit
 from gtsam_rwhec.refinement.exact_scales import with_exact_scales
 from gtsam_rwhec.refinement.squared_residuals import Measured, NoiseFactors
-from gtsam_rwhec.residuals import PairPoses
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.statistics import edge_forms
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.residuals import PairPoses
+from gtsam_rwhec.solver.variables import given_answer
 
 NOISE = Noise(sigma_m=0.01, kappa=200.0)
 

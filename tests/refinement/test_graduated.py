@@ -13,9 +13,9 @@ from outlier_problems import Pair, corrupted
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError, OutlierError, OutliersWarning
+from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.graduated import Graduated, graduated
 from gtsam_rwhec.refinement.truncated_least_squares import truncated_weights
-from gtsam_rwhec.selection import selected
 from gtsam_rwhec.simulate import Noise, Simulation, general
 from gtsam_rwhec.simulate.transforms import random_poses
 

@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from gtsam_rwhec.identifiability import Identifiability, PairIdentifiability
+from gtsam_rwhec.identifiability.identification import Identifiability, PairIdentifiability
 from gtsam_rwhec.report import PairGrid
 
 

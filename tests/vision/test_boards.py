@@ -9,7 +9,7 @@ from rendered import BARREL, FISHEYE, PINHOLE, Print, pose, printed, projected, 
 
 from gtsam_rwhec.vision import boards
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detect import Detection, Detector
+from gtsam_rwhec.vision.detection import Detection, Detector
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Target
 
 BOARD = Charuco("board", "aruco_5x5_100", 6, 4, 0.03, 0.0225, first_id=7)

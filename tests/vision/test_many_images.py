@@ -15,7 +15,7 @@ import pytest
 from rendered import BARREL, PINHOLE, pose, printed, render
 
 from gtsam_rwhec.logs.records import ImageRecord
-from gtsam_rwhec.vision.detect import Detector
+from gtsam_rwhec.vision.detection import Detector
 from gtsam_rwhec.vision.many_images import BATCH, Looked, detect_in_images, measured_corner_px
 from gtsam_rwhec.vision.targets import Tag
 
@@ -178,7 +178,7 @@ def test_a_script_needs_no_main(tmp_path: Path, images: list[ImageRecord]) -> No
         "from pathlib import Path\n"
         "from gtsam_rwhec.logs.records import ImageRecord\n"
         "from gtsam_rwhec.vision.camera import Camera\n"
-        "from gtsam_rwhec.vision.detect import Detector\n"
+        "from gtsam_rwhec.vision.detection import Detector\n"
         "from gtsam_rwhec.vision.many_images import detect_in_images\n"
         "from gtsam_rwhec.vision.targets import Tag\n"
         "print('begins')\n"

@@ -1,0 +1,1 @@
+"""What joins solving and refinement."""

@@ -1,0 +1,1 @@
+"""Measurements to try the library on: the shipped log, and public data to download."""

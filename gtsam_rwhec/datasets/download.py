@@ -1,0 +1,153 @@
+"""Download the RWHEC paper's real dataset, which has no licence and is therefore not shipped with this package.
+
+The files come one by one from the authors' public repository and are checked against the sizes and SHA-256 sums in
+``utias_files.txt``, which is shipped. A file appears under its name only once it is complete and verified, so an
+interrupted download is resumed by calling again; a file that is there with other content is never overwritten.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import requests
+from requests.adapters import HTTPAdapter
+from urllib3.util.retry import Retry
+
+from gtsam_rwhec.errors import FetchError
+from gtsam_rwhec.files.atomic_write import write_atomically
+
+UTIAS_URL = "https://raw.githubusercontent.com/utiasSTARS/certifiable-rwhe-calibration/main/data/real-world/combined/"
+"""Folder ``data/real-world/combined`` of utiasSTARS/certifiable-rwhe-calibration on GitHub."""
+
+TIMEOUT_S = (10.0, 60.0)
+"""Seconds to connect, and between two packets; the largest file has under 50 kB."""
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """One line of a registry: what a file is called, how long it is, and what is in it."""
+
+    name: str
+    size_bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Fetched:
+    """What one call of `fetch_utias` did."""
+
+    folder: Path
+    downloaded: tuple[str, ...]
+    """Names of the files that were downloaded now."""
+    already_there: tuple[str, ...]
+    """Names of the files that were there before, verified now."""
+
+
+def utias_files() -> tuple[RemoteFile, ...]:
+    """The dataset's files: 16 tags seen by 8 cameras, 73 pairs, two files each."""
+    registry = files("gtsam_rwhec.datasets").joinpath("utias_files.txt").read_text(encoding="utf-8")
+    lines = [line.split() for line in registry.splitlines() if line and not line.startswith("#")]
+    return tuple(RemoteFile(name, int(size), sha256) for sha256, size, name in lines)
+
+
+def fetch_utias(
+    destination: str | Path,
+    base_url: str = UTIAS_URL,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Fetched:
+    """Download the dataset into a folder, or complete what an earlier call began.
+
+    Parameters
+    ----------
+    destination
+        Folder to write to; made if it is not there.
+    base_url
+        Where the files are: a mirror, or a server inside an institute's network.
+    progress
+        Called before each file with (files done, files in all, name), and once more at the end.
+
+    Raises
+    ------
+    FetchError
+        No network, a status other than 200, content with another checksum, or a file in the way whose content is
+        another. Everything verified until then stays, and the next call goes on from there.
+    """
+    folder = Path(destination)
+    remote_files = utias_files()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FetchError(f"{folder} cannot be made a folder: {error.strerror}. Choose another destination.") from error
+    there = _verified(folder, remote_files)
+    missing = [file for file in remote_files if file.name not in there]
+    with _session() as session:
+        for number, file in enumerate(missing):
+            if progress is not None:
+                progress(len(there) + number, len(remote_files), file.name)
+            content = _download(session, base_url.rstrip("/") + "/" + file.name, file)
+            try:
+                write_atomically(folder / file.name, content)
+            except OSError as error:
+                message = f"{folder / file.name} cannot be written: {error.strerror}. What is complete stays."
+                raise FetchError(message) from error
+    if progress is not None:
+        progress(len(remote_files), len(remote_files), "")
+    return Fetched(folder, tuple(file.name for file in missing), there)
+
+
+def _verified(folder: Path, remote_files: tuple[RemoteFile, ...]) -> tuple[str, ...]:
+    """Names of the files that are there already; nothing that is there with other content is ever written over."""
+    there = []
+    for file in remote_files:
+        path = folder / file.name
+        if not path.exists():
+            continue
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "none, it is not a file"
+        if sha256 != file.sha256:
+            raise FetchError(
+                f"{path} is there but is not the dataset's file (SHA-256 {sha256}, expected {file.sha256}). "
+                "Nothing was overwritten: move it away, or choose another destination."
+            )
+        there.append(file.name)
+    return tuple(there)
+
+
+def _session() -> requests.Session:
+    """One connection for all files; what a moment later may work is tried again, twice, after 0.5 s and 1 s."""
+    session = requests.Session()
+    retry = Retry(total=2, backoff_factor=0.5, status_forcelist=(429, 500, 502, 503, 504), raise_on_status=False)
+    for scheme in ("https://", "http://"):
+        session.mount(scheme, HTTPAdapter(max_retries=retry))
+    return session
+
+
+def _download(session: requests.Session, url: str, file: RemoteFile) -> bytes:
+    try:
+        response = session.get(url, timeout=TIMEOUT_S)
+        status, reason, content = response.status_code, response.reason, response.content
+    except requests.Timeout as error:
+        raise FetchError(f"{url}: no answer in time. Call again: what is complete stays.") from error
+    except requests.ConnectionError as error:
+        raise FetchError(
+            f"{url}: no connection. Is there a network, and a proxy to set (HTTPS_PROXY)? What is complete stays: call "
+            "again later."
+        ) from error
+    except requests.RequestException as error:
+        raise FetchError(f"{url} cannot be downloaded: {error}.") from error
+    if status == requests.codes.not_found:
+        raise FetchError(
+            f"{url}: not found (404). Has the repository moved its files? Give the new folder as base_url."
+        )
+    if status != requests.codes.ok:
+        raise FetchError(f"{url}: the server answered {status} {reason}. What is complete stays: call again later.")
+    sha256 = hashlib.sha256(content).hexdigest()
+    if (len(content), sha256) != (file.size_bytes, file.sha256):
+        raise FetchError(
+            f"{url}: {len(content)} bytes with SHA-256 {sha256}, expected {file.size_bytes} bytes with {file.sha256}. "
+            "Nothing was written. Something on the way changed it (a proxy's page?), or the authors changed the file."
+        )
+    return content

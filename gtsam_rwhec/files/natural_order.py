@@ -1,0 +1,11 @@
+"""Names in the order in which people count: tag_2 before tag_10."""
+
+from __future__ import annotations
+
+import re
+
+
+def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """A sorting key under which numbers inside names count as numbers: tag_2 before tag_10."""
+    parts = [part for part in re.split(r"(\d+)", name) if part]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts], name

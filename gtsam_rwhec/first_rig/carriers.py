@@ -1,0 +1,103 @@
+"""Which of a log's poses are the carriers': of all that moves, what carries the cameras, or what they look at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from gtsam_rwhec.first_rig.look import Poses
+from gtsam_rwhec.rig.field_types import is_name
+from gtsam_rwhec.rig.schema import PoseSource
+
+
+@dataclass(frozen=True)
+class MovingPair:
+    """Two frames that move against each other.
+
+    Attributes
+    ----------
+    source : PoseSource
+    words : str
+        How many poses, and how far they move.
+    on_child, on_parent : int
+        How many of the cameras' frames are fixed to each, as tf has it; both 0 where it has none of them.
+    """
+
+    source: PoseSource
+    words: str
+    on_child: int = 0
+    on_parent: int = 0
+
+
+def moving_pairs(poses: Iterable[Poses], camera_frames: Iterable[str]) -> tuple[list[MovingPair], list[str]]:
+    """Pairs of frames that could be the carriers, the likeliest first; and remarks on what cannot be used.
+
+    Frames of tf that do not move against each other are one body. Of each body that moves and carries no further one,
+    the pair is the topmost frame that its chain moves against, and the frame by which the body hangs on that.
+    """
+    poses = list(poses)
+    cameras = list(camera_frames)
+    pairs, remarks = _of_tf([p for p in poses if p.is_tf and p.child and p.child != p.parent], cameras)
+    by_topic: dict[str, list[Poses]] = {}
+    for series in poses:
+        if not series.is_tf:
+            by_topic.setdefault(series.topic, []).append(series)
+    pairs += [_of_topic(series) for (series, *others) in by_topic.values() if series.is_moving and not others]
+    # A stable sort: what tf has stands before topics, the one with most poses first.
+    pairs.sort(key=lambda pair: (pair.on_child, pair.on_parent), reverse=True)
+    return pairs, remarks
+
+
+def _of_tf(series: list[Poses], cameras: list[str]) -> tuple[list[MovingPair], list[str]]:
+    links: dict[str, Poses] = {}
+    for link in series:
+        links.setdefault(link.child, link)
+    moving = {child for child, link in links.items() if link.is_moving}
+
+    def up(frame: str) -> list[str]:
+        chain = [frame]
+        while chain[-1] in links and links[chain[-1]].parent not in chain:
+            chain.append(links[chain[-1]].parent)
+        return chain
+
+    def body(frame: str) -> str:
+        """The frame by which a frame's body hangs on the rest."""
+        chain = up(frame)
+        return next((f for f in chain if f in moving), chain[-1])
+
+    known = {frame for child in links for frame in up(child)}
+    bodies = [body(camera) for camera in cameras if camera in known]
+    carrying_others = {frame for child in moving for frame in up(child)[1:]}
+    pairs, remarks = [], []
+    for child in sorted(
+        moving - carrying_others, key=lambda child: (-links[child].count, *(-x for x in links[child].motion()))
+    ):
+        top = [frame for frame in up(child) if frame in moving][-1]
+        parent = links[top].parent
+        bad = [frame for frame in (parent, child) if not is_name(frame)]
+        if bad:
+            remarks.append(f"tf {parent} to {child} moves, but a rig file cannot name {', '.join(map(repr, bad))}")
+            continue
+        words = _words(links[child], "/tf" if child == top else f"chain of {len(up(child)) - 1} links")
+        pairs.append(MovingPair(PoseSource(tf=(parent, child)), words, bodies.count(child), bodies.count(body(parent))))
+    return pairs, remarks
+
+
+def _of_topic(series: Poses) -> MovingPair:
+    child = frame_name(series.child) or frame_name(series.topic) or "moving"
+    parent = frame_name(series.parent) or "world"
+    if parent == child:
+        parent = f"{parent}_origin"
+    return MovingPair(PoseSource(topic=series.topic, parent=parent, child=child), _words(series, series.topic))
+
+
+def _words(series: Poses, where: str) -> str:
+    moved, turned = series.motion()
+    return f"{where}: {series.count} poses, up to {moved:.2f} m and {math.degrees(turned):.0f} degrees"
+
+
+def frame_name(text: str) -> str:
+    """Text as a frame's name: what cannot be in one becomes _; empty if nothing is left."""
+    words = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in text)[:60].strip("_")
+    return words if is_name(words) else (f"f_{words}" if words else "")

@@ -1,0 +1,181 @@
+"""What a log holds that a rig file could name: cameras and the tags in a few of their images, drivers, what moves."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.errors import ImageError
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
+from gtsam_rwhec.rig.field_types import is_text
+from gtsam_rwhec.vision.images import decode_gray
+from gtsam_rwhec.vision.tag_survey import BY_TRUST, tags_in_image
+
+#: Images that are looked at, of each topic, evenly from all of them; and those in which all families are looked for.
+IMAGES = 8
+IMAGES_FOR_ALL = 3
+#: Poses that are kept of each pair of frames, to see whether it moves.
+POSES = 1000
+#: Less is taken for standing still.
+STILL_M, STILL_RAD = 0.01, math.radians(1.0)
+#: Schemas' last words.
+IMAGE_SCHEMAS = ("Image", "CompressedImage", "RawImage")
+
+
+@dataclass
+class Tags:
+    """Tags of one family: in how many images each id read with a single border, and with an AprilGrid's double one."""
+
+    single: Counter[int] = field(default_factory=Counter)
+    double: Counter[int] = field(default_factory=Counter)
+
+
+@dataclass
+class Images:
+    """A topic of images: its frame, and what was in those that were looked at."""
+
+    topic: str
+    schema: str
+    count: int
+    frame: str = ""
+    looked_at: int = 0
+    undecoded: str = ""
+    tags: dict[str, Tags] = field(default_factory=dict)
+    wanted: frozenset[int] = frozenset()
+    passed: int = 0
+
+
+@dataclass
+class Driver:
+    """A topic of detections: frame, ids by family in how many messages each, sizes, whether there are poses."""
+
+    topic: str
+    frame: str = ""
+    count: int = 0
+    ids: dict[str, Counter[int]] = field(default_factory=dict)
+    size_m: dict[tuple[str, int], float] = field(default_factory=dict)
+    has_poses: bool = True
+
+
+@dataclass
+class Poses:
+    """Poses of one pair of frames in one topic: how many, and some of them."""
+
+    topic: str
+    parent: str
+    child: str
+    is_tf: bool
+    is_static: bool
+    count: int = 0
+    stride: int = 1
+    kept: list[Array] = field(default_factory=list)
+
+    def add(self, T: Array) -> None:
+        """Keep every `stride`-th, evenly however many there are."""
+        if self.count % self.stride == 0:
+            self.kept.append(T.copy())
+            if len(self.kept) > POSES:
+                self.kept, self.stride = self.kept[::2], 2 * self.stride
+        self.count += 1
+
+    def motion(self) -> tuple[float, float]:
+        """How far (m) and by how much (rad) it gets from where it begins."""
+        step = se3.inverse(self.kept[0][None]) @ np.stack(self.kept)
+        return (
+            float(np.linalg.norm(step[:, :3, 3], axis=1).max()),
+            float(np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1).max()),
+        )
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether it does."""
+        if self.is_static or len(self.kept) < 2:
+            return False
+        moved, turned = self.motion()
+        return moved > STILL_M or turned > STILL_RAD
+
+
+@dataclass
+class Look:
+    """All of it, by topic; poses by topic, parent and child."""
+
+    topics: tuple[Topic, ...]
+    images: dict[str, Images] = field(default_factory=dict)
+    intrinsics: dict[str, str] = field(default_factory=dict)
+    drivers: dict[str, Driver] = field(default_factory=dict)
+    poses: dict[tuple[str, str, str], Poses] = field(default_factory=dict)
+
+
+def look_through(log: Log) -> Look:
+    """Go through a log once."""
+    topics = log.topics()
+    look = Look(topics)
+    readable = {topic.name for topic in topics if is_text(topic.name)}
+    # Several poses in a message are of several things (of targets, as a rule): no carrier's.
+    readable -= {topic.name for topic in topics if topic.unreadable or last_word(topic.schema) == "PosesInFrame"}
+    transforms = {topic.name for topic in topics if _is_tf(topic)}
+    for topic in topics:
+        if topic.name in readable and last_word(topic.schema) in IMAGE_SCHEMAS:
+            wanted = np.linspace(0, max(topic.count - 1, 0), IMAGES).round().astype(int)
+            look.images[topic.name] = Images(topic.name, topic.schema, topic.count, wanted=frozenset(wanted.tolist()))
+    for record in log.records(sorted(readable)):
+        if isinstance(record, PoseRecord):
+            key = record.topic, record.parent, record.child
+            if key not in look.poses:
+                look.poses[key] = Poses(*key, is_tf=record.topic in transforms, is_static=record.is_static)
+            look.poses[key].add(record.T)
+        elif isinstance(record, ImageRecord):
+            _look_at(look.images[record.topic], record)
+        elif isinstance(record, IntrinsicsRecord):
+            look.intrinsics.setdefault(record.topic, record.frame)
+        elif isinstance(record, DetectionRecord):
+            _take_detection(look.drivers.setdefault(record.topic, Driver(record.topic)), record)
+    return look
+
+
+def last_word(schema: str) -> str:
+    """``Image`` of ``sensor_msgs/msg/Image`` and ``foxglove.Image``."""
+    return schema.replace("/", ".").rpartition(".")[2]
+
+
+def _is_tf(topic: Topic) -> bool:
+    """Whether the pipeline takes its transforms together, as tf's."""
+    return topic.name.rpartition("/")[2] in ("tf", "tf_static") or topic.schema in (
+        "foxglove.FrameTransforms",
+        "foxglove.FrameTransform",
+    )
+
+
+def _look_at(images: Images, record: ImageRecord) -> None:
+    images.frame = images.frame or record.frame
+    place, images.passed = images.passed, images.passed + 1
+    if place not in images.wanted:
+        return
+    try:
+        gray = decode_gray(record)
+    except ImageError as error:
+        images.undecoded = str(error)
+        return
+    # The first few tell which families there are: to look for all of them takes a second or so.
+    families = BY_TRUST if images.looked_at < IMAGES_FOR_ALL else tuple(images.tags)
+    images.looked_at += 1
+    tags = tags_in_image(gray, families)
+    for family, number, is_double in {(tag.family, tag.id, tag.is_double) for tag in tags}:
+        found = images.tags.setdefault(family, Tags())
+        (found.double if is_double else found.single)[number] += 1
+
+
+def _take_detection(driver: Driver, record: DetectionRecord) -> None:
+    driver.frame = driver.frame or record.frame
+    driver.count += 1
+    driver.has_poses &= record.T_camera_tag is not None
+    if record.id.isdecimal() and len(record.id) < 10:
+        number = int(record.id)
+        driver.ids.setdefault(record.family, Counter())[number] += 1
+        if record.size_m is not None:
+            driver.size_m[record.family, number] = record.size_m

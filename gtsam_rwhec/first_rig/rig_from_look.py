@@ -1,0 +1,230 @@
+"""A first rig file, made by looking at a log: what a person must fill in is marked TODO."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.first_rig.carriers import MovingPair, frame_name, moving_pairs
+from gtsam_rwhec.first_rig.look import Images, Look, look_through
+from gtsam_rwhec.first_rig.targets import Guess, targets_seen
+from gtsam_rwhec.logs import Log
+from gtsam_rwhec.rig.field_types import is_name, is_text
+from gtsam_rwhec.rig.rig_file import parse_rig, rig_text
+from gtsam_rwhec.rig.schema import Carriers, Intrinsics, PoseNoise, Rig, Sensor, TagTarget, TargetSection
+
+#: Words of topics that say what is published and not by which camera.
+_COMMON = frozenset({
+    "image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "image_rect_raw", "compressed",
+    "raw", "color", "colour", "rgb", "detections", "tag_detections", "apriltag_detections", "detection", "tags",
+    "apriltag", "apriltags", "aruco", "aruco_markers", "aruco_detections", "markers", "marker_publisher",
+})  # fmt: skip
+_TIME_OFFSET = "or seconds, 0.0 for one clock (to estimate it needs uneven turning)"
+_NOISE = "TODO how far its poses are off, a guess; without, standard deviations are too small"
+
+#: What good arms reach; motion capture and SLAM are worse.
+_GUESSED_NOISE = PoseNoise(rotation_deg=0.03, translation_mm=0.2)
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """A sensor to be: its name, section, the frame that the log gives it, and remarks on its lines."""
+
+    name: str
+    section: Sensor
+    frame: str
+    remarks: dict[str, str]
+
+
+def first_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
+    """Write a first rig file for a log, to be completed by a person.
+
+    Parameters
+    ----------
+    log : Log
+    path
+        Where it will be, for messages.
+
+    Returns
+    -------
+    text : str
+        Reads back with `parse_rig`; lengths in it are guesses and marked so.
+    notes : tuple of str
+        What was seen, what was chosen among several, what was left out.
+
+    Raises
+    ------
+    RigError
+        The log has neither images nor detections, or no poses that move; with the topics that there are.
+    """
+    look = look_through(log)
+    notes: list[str] = []
+    cameras = _cameras(look, notes)
+    if not cameras:
+        raise RigError(f"{_where(log)}: no images and no detections that can be read; {_topics(look)}")
+    pairs, remarks = moving_pairs(look.poses.values(), [camera.frame for camera in cameras])
+    notes += remarks
+    if not pairs:
+        raise RigError(
+            f"{_where(log)}: no poses of anything that moves, and without the carriers' motion nothing can be "
+            f"calibrated (or record it together with what poses the robot or the motion capture has); {_topics(look)}"
+        )
+    pair = pairs[0]
+    notes.append(f"moving: {_pair_words(pair)}")
+    notes += [f"moves too, not used: {_pair_words(other)}" for other in pairs[1:6]]
+    carriers, carrier_remark = _carriers(pair)
+    used = [look.images[c.section.images] for c in cameras if c.section.images is not None]
+    drivers = [look.drivers[c.section.detections] for c in cameras if c.section.detections is not None]
+    guesses, remarks = targets_seen(used, drivers)
+    notes += remarks
+    looked_at = sum(images.looked_at for images in used)
+    if guesses:
+        notes.append(f"targets seen: {', '.join(guess.name for guess in guesses)} (their sizes are guesses)")
+    else:
+        notes.append(
+            f"no tags in {looked_at} images that were looked at, nor of drivers; checkerboards are not looked for: "
+            "write the targets into the rig file"
+        )
+        nothing = TagTarget(type="tag", family="tag36h11", id=0, size_m=0.1)
+        guesses = [Guess("tag_0", nothing, "TODO an example: no tags were seen")]
+    text = _text(log, carriers, carrier_remark, cameras, guesses)
+    parse_rig(text, str(path))
+    return text, tuple(notes)
+
+
+def _text(log: Log, carriers: Carriers, carrier_remark: str, cameras: list[_Camera], guesses: list[Guess]) -> str:
+    taken = {carriers.sensors, carriers.targets}
+    remarks: dict[KeyPath, str] = {("carriers", "poses"): carrier_remark, ("carriers", "noise"): _NOISE}
+    names = {camera.name: _free(camera.name, taken) for camera in cameras}
+    targets: dict[str, TargetSection] = {}
+    for guess in guesses:
+        name = _free(guess.name, taken)
+        targets[name] = guess.section
+        remarks["targets", name] = guess.remark
+    sensors = {}
+    for camera in cameras:
+        name = names[camera.name]
+        frame = camera.frame if is_name(camera.frame) and camera.frame not in taken else None
+        taken |= {frame} if frame else set()
+        sensors[name] = camera.section.model_copy(update={"frame": frame, "time_offset": "estimate"})
+        remarks |= {("sensors", name, key): words for key, words in camera.remarks.items()}
+        remarks["sensors", name, "time_offset"] = _TIME_OFFSET
+    rig = Rig(carriers=carriers, sensors=sensors, targets=targets)
+    file = log.files[0].path.name
+    head = (
+        f"# A first rig file, made by looking at {file if is_text(file) else repr(file)}.\n"
+        "# TODO marks what only a person knows, above all the sizes of the targets: those here are guesses.\n"
+    )
+    return head + rig_text(rig, remarks)
+
+
+def _carriers(pair: MovingPair) -> tuple[Carriers, str]:
+    parent, child = pair.source.frames
+    if pair.on_parent > pair.on_child:
+        remark = f"{parent} carries the sensors, as tf has it"
+        return Carriers(sensors=parent, targets=child, poses=pair.source, noise=_GUESSED_NOISE), remark
+    remark = (
+        f"{child} carries the sensors, as tf has it"
+        if pair.on_child
+        else "TODO if the targets are on what moves and the sensors are not, exchange sensors and targets"
+    )
+    if pair.source.topic is not None:
+        remark += "; TODO check the frames' names: they are guesses where the topic has none"
+    return Carriers(sensors=child, targets=parent, poses=pair.source, noise=_GUESSED_NOISE), remark
+
+
+def _cameras(look: Look, notes: list[str]) -> list[_Camera]:
+    """Sensors with images; and drivers' detections where no images are of the same camera."""
+    taken: set[str] = set()
+    cameras = []
+    for images in _without_copies(look, notes):
+        remarks = {}
+        intrinsics, remark = _intrinsics(images.topic, images.frame, look.intrinsics, len(look.images))
+        if remark:
+            remarks["intrinsics"] = remark
+        if intrinsics is None:
+            intrinsics = Intrinsics(file="camera.yaml")
+            remarks["intrinsics"] = "TODO no topic has them; or {kalibr: camchain.yaml, camera: cam0}"
+        name = _free(_name(images.topic, images.frame), taken)
+        cameras.append(_Camera(name, Sensor(images=images.topic, intrinsics=intrinsics), images.frame, remarks))
+        notes.append(f"camera {name}: {images.count} images in {images.topic}, {images.looked_at} looked at")
+    with_images = {camera.frame for camera in cameras if camera.frame}
+    for driver in look.drivers.values():
+        if driver.frame in with_images:
+            notes.append(f"not used: detections in {driver.topic}, whose camera's images are in the log")
+            continue
+        intrinsics, remark = _intrinsics(driver.topic, driver.frame, look.intrinsics, len(look.drivers))
+        remarks = {"intrinsics": remark} if remark else {}
+        if intrinsics is None and not driver.has_poses:
+            intrinsics = Intrinsics(file="camera.yaml")
+            remarks["intrinsics"] = "TODO no topic has them, and the driver gives no poses"
+        name = _free(_name(driver.topic, driver.frame), taken)
+        cameras.append(_Camera(name, Sensor(detections=driver.topic, intrinsics=intrinsics), driver.frame, remarks))
+        notes.append(f"driver {name}: {driver.count} detections in {driver.topic}")
+    return cameras
+
+
+def _without_copies(look: Look, notes: list[str]) -> list[Images]:
+    """One topic for each camera: the one with most images, raw rather than compressed; none of depth."""
+    best: dict[tuple[str, str], Images] = {}
+    ranked = sorted(look.images.values(), key=lambda images: ("Compressed" in images.schema, images.topic))
+    for images in sorted(ranked, key=lambda images: -images.looked_at):
+        key = _name(images.topic, images.frame), images.frame
+        if "depth" in images.topic.lower():
+            notes.append(f"not used: {images.topic}, depth")
+        elif not images.looked_at:
+            notes.append(f"not used: {images.topic}, {images.undecoded or 'no images'}")
+        elif key in best:
+            notes.append(f"not used: {images.topic}, of the same camera as {best[key].topic}")
+        else:
+            best[key] = images
+    return sorted(best.values(), key=lambda images: images.topic)
+
+
+def _intrinsics(topic: str, frame: str, known: dict[str, str], sensors: int) -> tuple[Intrinsics | None, str]:
+    """The topic of intrinsics that belongs to another topic, by frame and by the beginning of its name."""
+    same_frame = [name for name, its_frame in known.items() if frame and its_frame == frame]
+    candidates = same_frame or list(known)
+    shared = {name: _shared(topic, name) for name in candidates}
+    most = max(shared.values(), default=0)
+    best = [name for name in candidates if shared[name] == most]
+    if not best or (not same_frame and not most and (len(known), sensors) != (1, 1)):
+        return None, ""
+    remark = f"TODO or {', '.join(best[1:])}" if len(best) > 1 else ""
+    return Intrinsics(topic=best[0]), remark
+
+
+def _shared(first: str, second: str) -> int:
+    """How many words two topics begin with together."""
+    pairs = list(zip(first.strip("/").split("/"), second.strip("/").split("/"), strict=False))
+    return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
+
+
+def _name(topic: str, frame: str) -> str:
+    """A camera's name: the words of its topic that say which it is, else its frame."""
+    words = [word for word in topic.split("/") if word.lower() not in _COMMON]
+    return frame_name("_".join(words)) or frame_name(frame) or "camera"
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """The name, or with a number behind it; taken from now on."""
+    numbered = (f"{name}_{number}" for number in range(2, len(taken) + 3))
+    free = next(candidate for candidate in (name, *numbered) if candidate not in taken)
+    taken.add(free)
+    return free
+
+
+def _pair_words(pair: MovingPair) -> str:
+    parent, child = pair.source.frames
+    return f"{child} in {parent} ({pair.words})"
+
+
+def _where(log: Log) -> str:
+    return ", ".join(str(file.path) for file in log.files[:3]) + (", ..." if len(log.files) > 3 else "")
+
+
+def _topics(look: Look) -> str:
+    listed = ", ".join(f"{topic.name} ({topic.schema}, {topic.count} messages)" for topic in look.topics)
+    return f"topics: {listed or 'none'}"

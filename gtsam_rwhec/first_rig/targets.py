@@ -1,0 +1,138 @@
+"""Targets from the tags that were seen: single ones, and what looks like boards. Their sizes are guesses."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
+
+from gtsam_rwhec.first_rig.look import Driver, Images
+from gtsam_rwhec.rig.schema import AprilGridTarget, CharucoTarget, TagTarget
+from gtsam_rwhec.vision.targets import FAMILIES
+
+#: Lengths that stand in a first rig file until someone measures.
+TAG_M, SQUARE_M, MARKER_M, SPACING = 0.1, 0.04, 0.03, 0.3
+#: From so many tags of one kind with ids in a row they are taken for a board's.
+BOARD, GRID = 6, 4
+TODO = "TODO measure"
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A target, its name, and what to say beside it."""
+
+    name: str
+    section: TagTarget | CharucoTarget | AprilGridTarget
+    remark: str
+
+
+def targets_seen(images: Iterable[Images], drivers: Iterable[Driver]) -> tuple[list[Guess], list[str]]:
+    """Targets, and remarks on tags that were left out."""
+    images = list(images)
+    looked_at = sum(topic.looked_at for topic in images)
+    guesses, remarks = [], []
+    for family in dict.fromkeys(family for topic in images for family in topic.tags):
+        single, double = Counter[int](), Counter[int]()
+        for topic in images:
+            single.update(topic.tags[family].single if family in topic.tags else {})
+            double.update(topic.tags[family].double if family in topic.tags else {})
+        # A tag that reads with both borders has the one with which it reads more often.
+        grid = sorted(i for i in double if double[i] > single[i])
+        if len(grid) >= GRID:
+            guesses.append(_aprilgrid(family, grid))
+        ids = {i: single[i] for i in sorted(single) if i not in grid}
+        sure = {i: count for i, count in ids.items() if count >= least_sightings(family, looked_at)}
+        doubtful = [i for i in ids if i not in sure]
+        if doubtful:
+            remarks.append(f"left out, seen too seldom to be sure: {family} {_listed(doubtful)}")
+        guesses += _of_family(_smallest(family, sure), sure, looked_at)
+    guesses += _of_drivers(drivers, guesses)
+    return guesses, remarks
+
+
+def least_sightings(family: str, looked_at: int) -> int:
+    """In how many images a tag must have been: families of few bits are found where there are none."""
+    if looked_at < 3 or family == "tag36h11":
+        return 1
+    return 3 if family in ("tag16h5", "aruco_4x4_1000", "aruco_original") else 2
+
+
+def _smallest(family: str, ids: Collection[int]) -> str:
+    """Of ArUco's dictionaries that begin one another, the smallest that has the ids: fewer wrong detections."""
+    stem = re.fullmatch(r"(aruco_\dx\d)_1000", family)
+    if stem is None or not ids:
+        return family
+    sizes = (50, 100, 250, 1000)
+    return next(f"{stem[1]}_{size}" for size in sizes if FAMILIES[f"{stem[1]}_{size}"] > max(ids))
+
+
+def _of_family(family: str, ids: dict[int, int], looked_at: int) -> Iterator[Guess]:
+    """A ChArUco board of ArUco's markers if there are many in a row; else single tags."""
+    order = sorted(ids)
+    if family.startswith("aruco") and len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
+        columns, rows = _squares(order[-1] - order[0] + 1)
+        section = CharucoTarget(
+            type="charuco", family=family, columns=columns, rows=rows, square_m=SQUARE_M, marker_m=MARKER_M,
+            first_id=order[0],
+        )  # fmt: skip
+        yield Guess(
+            f"board_{family.removeprefix('aruco_')}",
+            section,
+            f"TODO count columns and rows, measure: a guess from markers {_listed(order)}",
+        )
+        return
+    for i in order:
+        section_of_tag = TagTarget(type="tag", family=family, id=i, size_m=TAG_M)
+        yield Guess(f"{family}_{i}", section_of_tag, f"{TODO}; seen in {ids[i]} of {looked_at} images")
+
+
+def _aprilgrid(family: str, ids: list[int]) -> Guess:
+    first, last = ids[0], ids[-1]
+    side = math.isqrt(last - first + 1)
+    columns = side if side * side == last - first + 1 else side + 1
+    rows = math.ceil((last - first + 1) / columns)
+    section = AprilGridTarget(
+        type="aprilgrid", family=family, columns=columns, rows=rows, tag_m=TAG_M, spacing=SPACING, first_id=first
+    )
+    return Guess(f"grid_{family}", section, f"TODO count columns and rows, measure: a guess from tags {_listed(ids)}")
+
+
+def _of_drivers(drivers: Iterable[Driver], already: Iterable[Guess]) -> Iterator[Guess]:
+    """Tags that only a driver saw; with the driver's size where it says one."""
+    have = {(g.section.family, g.section.id) for g in already if isinstance(g.section, TagTarget)}
+    for driver in drivers:
+        for family, ids in driver.ids.items():
+            known = family_named(family)
+            for i in sorted(ids):
+                if (known, i) in have or (known is not None and i >= FAMILIES[known]):
+                    continue
+                have.add((known or "tag36h11", i))
+                stated = driver.size_m.get((family, i))
+                size_m = stated if stated is not None and 0.0 < stated < 10.0 else TAG_M
+                remark = f"{TODO}; {'as its driver says' if size_m == stated else 'a guess'}"
+                if known is None:
+                    remark += f"; TODO the family, which its driver calls {family!r}"
+                section = TagTarget(type="tag", family=known or "tag36h11", id=i, size_m=size_m)
+                yield Guess(f"{known or 'tag'}_{i}", section, f"{remark}; {ids[i]} detections")
+
+
+def family_named(word: str) -> str | None:
+    """The family that a driver means: 36h11, tag36h11, tagStandard36h11, DICT_5X5_100; None if it is none of ours."""
+    bare = re.sub(r"^(dict_)?(apriltag_|aruco_)?(tag)?(standard)?", "", word.strip().lower())
+    return next((f for f in (f"tag{bare}", f"aruco_{bare}") if f in FAMILIES), None)
+
+
+def _squares(markers: int) -> tuple[int, int]:
+    """Columns and rows, as near to a square as can be, of a board with so many markers."""
+    sides = [
+        (columns, rows) for columns in range(2, 101) for rows in range(2, columns + 1) if columns * rows // 2 == markers
+    ]
+    return min(sides, key=lambda sides: sides[0] - sides[1], default=(7, 5))
+
+
+def _listed(ids: list[int]) -> str:
+    if len(ids) > 3 and ids[-1] - ids[0] == len(ids) - 1:
+        return f"{ids[0]} to {ids[-1]}"
+    return ", ".join(map(str, ids[:10])) + (", ..." if len(ids) > 10 else "")

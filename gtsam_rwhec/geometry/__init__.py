@@ -1,0 +1,1 @@
+"""Poses as users give them, checked; and covariances of poses between frames and conventions."""

@@ -1,0 +1,1 @@
+"""What the motion determines and what it leaves free."""

@@ -1,0 +1,374 @@
+"""What the motion can and cannot determine (RWHEC paper Section 6, DESIGN fact 8).
+
+Noise excites every direction a little, so rank says nothing on real data. A direction is called *free* when the
+information that the motions give of it is no more than the noise alone would feign there if the true motions left it
+open (``information.pair_information``). In units of that noise a free direction has a ratio of mean 1: a sum of about
+m = 2 N squares of noise over a noise variance estimated with nu degrees of freedom, an F variate. The threshold is its
+99.9 % quantile F(m, nu): a free direction is called determined once in a thousand. The noise of rotations
+and that of translations are estimated apart, each from about half of the equations to spare: three measurements with
+six to spare ask for a ratio of 130, a hundred for 1.5.
+
+Rotation residuals know rotations only, so they are asked first; where they determine every rotation, the rest is about
+translations and scales at those rotations, and where not, everything is asked of all residuals together.
+
+Corollaries 2 and 4 are the same test on one pair: rotations about two distinct axes leave nothing free. Theorems 1 and
+3 (one determined pair determines all that is connected) and endnote 9 (pairs that only together determine) need no
+rule of their own: information adds along the graph, and the whole is tested as the pairs are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse.linalg import LinearOperator, eigsh
+from scipy.special import chdtri, fdtri
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.identifiability.free_directions import describe, reason_for
+from gtsam_rwhec.identifiability.information import (
+    Information,
+    PairInformation,
+    information,
+    noise_level,
+    pair_information,
+    prior_information,
+)
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.moments import ONE, R_A, T_B
+from gtsam_rwhec.solver import arrow
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.residuals import PairPoses
+
+#: A free direction passes for determined with this probability.
+SIGNIFICANCE = 1e-3
+#: Above this many parameters the weakest directions are found by Lanczos on the arrow factor, not densely.
+DENSE_PARAMETERS = 400
+
+
+@dataclass(frozen=True)
+class PairIdentifiability:
+    """What one pair determines on its own.
+
+    Attributes
+    ----------
+    is_unique : bool
+    free_directions : list of str
+        In words.
+    rotation_axes : int
+        About how many axes its motion turned: 0, 1, or 2 for two and more (Corollary 2).
+    number_of_measurements : int
+    weakest : float
+        Information of the weakest direction, in units of what noise alone would create.
+    threshold : float
+        Up to which ``weakest`` counts as free.
+    """
+
+    is_unique: bool
+    free_directions: list[str]
+    rotation_axes: int
+    number_of_measurements: int
+    weakest: float
+    threshold: float
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What a problem's measurements determine.
+
+    Attributes
+    ----------
+    is_unique : bool
+        Whether every frame and scale is determined.
+    free_directions : list of str
+        Each frame's free directions, in words.
+    weakest, threshold : float
+        As in ``PairIdentifiability``, for the whole.
+    pairs : dict of (target, sensor) to PairIdentifiability
+        Each pair on its own: the grid of the paper's Figure 8.
+    parts : tuple of tuple of str
+        Frames of each unconnected part.
+    explanation : str
+        How what a pair determines spreads, in words.
+    """
+
+    is_unique: bool
+    free_directions: list[str]
+    weakest: float
+    threshold: float
+    pairs: dict[Pair, PairIdentifiability]
+    parts: tuple[tuple[str, ...], ...]
+    explanation: str
+
+
+@dataclass(frozen=True)
+class _Weak:
+    """Directions in ascending order of information over threshold: values (k,), thresholds (k,), directions (d, k)."""
+
+    values: Array
+    thresholds: Array
+    directions: Array
+
+    @property
+    def free(self) -> np.ndarray:
+        free: np.ndarray = self.values <= self.thresholds
+        return free
+
+    @property
+    def ratio(self) -> float:
+        return float(self.values[0] / self.thresholds[0]) if len(self.values) else np.inf
+
+
+_IS_ROTATION = np.zeros(15, dtype=bool)
+_IS_ROTATION[[0, 1, 2, 7, 8, 9]] = True
+
+
+def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiability:
+    """Test every direction of a part, and of each of its pairs alone, at its answer.
+
+    Parameters
+    ----------
+    part : Part
+    poses : PairPoses
+        The answer.
+    J_t, J_R : (E,) arrays
+        Costs of the pairs at the answer, in the physical model: they tell the noise.
+    """
+    noise = noise_level(part, J_t, J_R)
+    pairs = pair_information(part, poses, noise)
+    length = typical_length(part)
+    axes, turned = _rotation_axes(part, pairs.carrier_noise, noise.redundancy)
+    residual = np.sqrt(J_R / part.moments.kappa)  # J_R is sum kappa theta^2
+    reasons = [reason_for(*of_pair) for of_pair in zip(axes, turned, residual, strict=True)]
+    of_each = _pairs(part, pairs, noise.redundancy, axes, reasons, length)
+    weak = _weakest_of_part(part, pairs, noise.redundancy)
+    free: list[str] = []
+    if weak.free.any():
+        # The pair that turned most speaks for a frame.
+        speaks = {
+            name: max((a, e) for e, (a, pair) in enumerate(zip(axes, part.pairs, strict=True)) if name in pair)
+            for name in part.free
+        }
+        seen = {name: reasons[e] for name, (_, e) in speaks.items()}
+        free = describe(part.free, weak.directions[:, weak.free], length, seen, part.scale)
+    return Identifiability(
+        is_unique=not free,
+        free_directions=free,
+        weakest=float(weak.values[0]) if len(weak.values) else np.inf,
+        threshold=float(weak.thresholds[0]) if len(weak.values) else 0.0,
+        pairs=of_each,
+        parts=(part.names,),
+        explanation=_explanation(of_each, not free),
+    )
+
+
+def free_directions_of(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Array:
+    """What ``identify`` puts in words, as numbers: a basis (7 n + 1, k) of the directions that are free at an answer.
+
+    [omega (rad), v (m), log own scale] for each of ``part.free``, then the shared scale's logarithm.
+    """
+    noise = noise_level(part, J_t, J_R)
+    weak = _weakest_of_part(part, pair_information(part, poses, noise), noise.redundancy)
+    directions: Array = weak.directions[:, weak.free]
+    return directions
+
+
+def _weakest_of_part(part: Part, pairs: PairInformation, redundancy: int) -> _Weak:
+    """Rotations first; where they are all determined, the rest at those rotations, and else everything together."""
+    index = {name: i for i, name in enumerate(part.free)}
+    counts = np.zeros(len(index) + 1)
+    for pair, count in zip(part.pairs, part.moments.count, strict=True):
+        for name in set(pair) & index.keys():
+            counts[index[name]] += count
+    counts[-1] = part.number_of_measurements
+    rotation_prior, translation_prior = prior_information(part)
+    rotation_only = pairs.used & _IS_ROTATION
+    turning = information(part, pairs.rotation, pairs.noise_rotation, rotation_only, rotation_prior)
+    tests = [_weakest(turning, counts, redundancy)]
+    if tests[0].free.any():
+        everything = information(
+            part,
+            pairs.rotation + pairs.translation,
+            pairs.noise_rotation + pairs.noise_translation,
+            pairs.used,
+            rotation_prior + translation_prior,
+        )
+        tests = [_weakest(everything, counts, redundancy)]
+    else:
+        rest = pairs.used & ~_IS_ROTATION
+        moving = information(part, pairs.translation, pairs.noise_translation, rest, translation_prior)
+        tests.append(_weakest(moving, counts, redundancy))
+    return min(tests, key=lambda test: test.ratio)
+
+
+def combined(results: list[Identifiability], components: tuple[tuple[str, ...], ...]) -> Identifiability:
+    """One result for parts that were solved apart."""
+    weakest = min(results, key=lambda r: r.weakest / max(r.threshold, 1e-300))
+    return Identifiability(
+        is_unique=all(r.is_unique for r in results),
+        free_directions=[direction for r in results for direction in r.free_directions],
+        weakest=weakest.weakest,
+        threshold=weakest.threshold,
+        pairs={pair: value for r in results for pair, value in r.pairs.items()},
+        parts=components,
+        explanation=" ".join(dict.fromkeys(r.explanation for r in results)),
+    )
+
+
+def typical_length(part: Part) -> float:
+    """Root mean square of |t_B|, in metres: weighs radians against metres in words."""
+    square = float(np.einsum("ekk->", part.moments.translation[:, T_B, T_B]))
+    return float(np.sqrt(max(square / float(part.moments.weight.sum()), 1e-12)))
+
+
+def _threshold(squares: Array | float, redundancy: int) -> Array:
+    if redundancy <= 0:  # the weights tell the noise, and nothing else does
+        known: Array = np.asarray(chdtri(squares, SIGNIFICANCE) / squares)
+        return known
+    result: Array = np.asarray(fdtri(squares, 0.5 * redundancy, 1.0 - SIGNIFICANCE))
+    return result
+
+
+def _rotation_axes(part: Part, noise: Array, redundancy: int) -> tuple[list[int], Array]:
+    """About how many axes each pair's A turned (Corollary 2, tested against A's noise, (E,) rad^2): 0, 1 or 2;
+    and by how much, root mean square, in rad.
+
+    The mean of R_A shortens every direction but a common axis: 1 - s^2 of its singular values is the mean square
+    sine of the turning that leaves that direction; noise alone makes it 2 q^2.
+    """
+    means = part.moments.translation[:, R_A, ONE].reshape(-1, 3, 3) / part.moments.weight[:, None, None]
+    counts = part.moments.count
+    s = np.linalg.svd(means, compute_uv=False)
+    ratio = (1.0 - s**2) / (2.0 * noise[:, None])
+    excited = (ratio > _threshold(2.0 * counts, redundancy)[:, None]).sum(axis=1)
+    return [(0, 1, 1, 2)[k] for k in excited], np.sqrt(np.maximum(1.0 - s[:, -1] ** 2, 0.0))
+
+
+def _weakest(info: Information, counts: Array, redundancy: int) -> _Weak:
+    """The directions with the least information in units of noise; all that are free are among them."""
+    leaf_unit = _unit(info.leaf_noise, info.used_leaf)
+    border_unit = _unit(info.border_noise, info.used_border)
+    D = info.leaf * leaf_unit[:, :, None] * leaf_unit[:, None, :]
+    C = info.coupling * leaf_unit[:, :, None] * border_unit
+    E = info.border * border_unit[:, None] * border_unit
+    used = np.r_[info.used_leaf.ravel(), info.used_border]
+    size = int(used.sum())
+    if size == 0:
+        return _Weak(np.zeros(0), np.zeros(0), np.zeros((len(used), 0)))
+    if size <= DENSE_PARAMETERS:
+        values, reduced = _all(D, C, E, used)
+    else:
+        # No direction sums fewer than two squares, and the fewer, the higher its threshold.
+        values, reduced = _weakest_by_lanczos(D, C, E, used, float(_threshold(2.0, redundancy)))
+    vectors = np.zeros((len(used), len(values)))
+    vectors[used] = reduced
+    # Satterthwaite: a direction spread over frames sums as many squares as its shares of their measurements tell.
+    share = np.empty((len(counts), len(values)))
+    share[:-1] = (vectors[:-1] ** 2).reshape(len(counts) - 1, 7, len(values)).sum(axis=1)
+    share[-1] = vectors[-1] ** 2
+    squares = 1.0 / np.maximum((share**2 / (2.0 * counts[:, None])).sum(axis=0), 1e-300)
+    thresholds = _threshold(squares, redundancy)
+    order = np.argsort(values / thresholds)
+    unit = np.r_[leaf_unit.ravel(), border_unit]
+    return _Weak(values[order], thresholds[order], vectors[:, order] * unit[:, None])
+
+
+def _unit(noise: Array, used: np.ndarray) -> Array:
+    """What brings a parameter to units of its noise; 0 where it is not asked."""
+    result: Array = np.where(used, 1.0 / np.sqrt(np.where(used, noise, 1.0)), 0.0)
+    return result
+
+
+def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray, enough: float) -> tuple[Array, Array]:
+    """The smallest eigenpairs, up to one above ``enough``, by Lanczos on the inverse, linear in the leaves."""
+    L, m = D.shape[:2]
+    largest = max(np.einsum("lii->li", D).max(initial=0.0), np.diagonal(E).max(initial=0.0))
+    shift = max(1e-6, 1e-13 * float(largest))  # above the factorisation's rounding, far below any threshold
+    unused = (~used).astype(float)
+    leaf_diagonal = unused[: L * m].reshape(L, m) * 1e30 + shift
+    border_diagonal = unused[L * m :] * 1e30 + shift
+    factor = arrow.cholesky(D + leaf_diagonal[:, :, None] * np.eye(m), C, E + np.diag(border_diagonal))
+    if factor is None:
+        raise FloatingPointError("the information matrix is not positive semidefinite: its entries overflow")
+
+    def solve(v: Array) -> Array:
+        leaf, border = factor.solve(v[: L * m].reshape(L, m, 1), v[L * m :].reshape(-1, 1))
+        return np.concatenate([leaf.ravel(), border.ravel()])
+
+    size = len(used)
+    operator = LinearOperator((size, size), matvec=solve, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(size) * used
+    count = 12
+    while 4 * count < size:
+        inverse, vectors = eigsh(operator, k=count, which="LA", v0=start)
+        values = np.maximum(1.0 / inverse - shift, 0.0)
+        if values.max() > enough:
+            return values, vectors[used]
+        count *= 4
+    return _all(D, C, E, used)  # so many are free that Lanczos is no gain
+
+
+def _all(D: Array, C: Array, E: Array, used: np.ndarray) -> tuple[Array, Array]:
+    """All eigenpairs, densely."""
+    values, vectors = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])
+    return values, vectors
+
+
+def _pairs(
+    part: Part, pairs: PairInformation, redundancy: int, axes: list[int], reasons: list[str], length: float
+) -> dict[Pair, PairIdentifiability]:
+    """Every pair on its own, all in one stack of 15 x 15 problems, asked as the whole is."""
+    counts = part.moments.count
+    threshold = _threshold(2.0 * counts, redundancy)
+    rotations = pairs.used & _IS_ROTATION
+    turning, _ = _weakest_of_each(pairs.rotation, pairs.noise_rotation, rotations)
+    settled = np.all(turning > threshold[:, None], axis=1, keepdims=False)
+    asked = pairs.used & ~(_IS_ROTATION & settled[:, None])
+    rest, directions = _weakest_of_each(
+        pairs.translation + np.where(settled, 0.0, 1.0)[:, None, None] * pairs.rotation,
+        pairs.noise_translation + np.where(settled, 0.0, 1.0)[:, None] * pairs.noise_rotation,
+        asked,
+    )
+    result = {}
+    for e, pair in enumerate(part.pairs):
+        free = np.less_equal(rest[e], threshold[e])
+        ends = {name: 7 * end for end, name in enumerate(pair) if name not in part.fixed}
+        if not free.any() and axes[e] < 2 and len(ends) == 2:
+            free[rest[e].argmin()] = True  # Corollary 4: about one axis a pair alone leaves a direction open
+        sentences: list[str] = []
+        if free.any():
+            rows = [first + k for first in ends.values() for k in range(7)] + [14]
+            sentences = describe(
+                tuple(ends), directions[e][rows][:, free], length, dict.fromkeys(ends, reasons[e]), part.scale
+            )
+        weakest = float(min(rest[e].min(), turning[e].min())) if settled[e] else float(rest[e].min())
+        result[pair] = PairIdentifiability(
+            not free.any(), sentences, axes[e], int(counts[e]), weakest, float(threshold[e])
+        )
+    return result
+
+
+def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array, Array]:
+    """Eigenvalues (E, 15) in units of noise and directions (E, 15, 15); infinite for what a pair does not have."""
+    unit = _unit(noise, used)
+    matrix = info * unit[:, :, None] * unit[:, None, :]
+    diagonal = np.einsum("eii->ei", matrix)  # a view
+    # No larger than needed, or the small eigenvalues lose their digits.
+    diagonal[...] = np.where(used, diagonal, 1e3 + 2.0 * diagonal.max(axis=1, keepdims=True))
+    values, vectors = np.linalg.eigh(matrix)
+    foreign = (vectors**2 * ~used[:, :, None]).sum(axis=1) > 0.5
+    return np.where(foreign, np.inf, values), vectors * unit[:, :, None]
+
+
+def _explanation(pairs: dict[Pair, PairIdentifiability], unique: bool) -> str:
+    alone = sum(pair.is_unique for pair in pairs.values())
+    if unique and len(pairs) == 1:
+        return "The pair's measurements determine both of its frames."
+    if unique and alone:
+        return (
+            f"{alone} of {len(pairs)} pairs determine their frames on their own; along the graph that determines "
+            "every frame (Theorem 3)."
+        )
+    if unique:
+        return "No pair determines its frames on its own; together the pairs determine every frame."
+    return "The measurements leave some directions free; see free_directions."

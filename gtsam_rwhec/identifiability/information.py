@@ -1,0 +1,242 @@
+"""The Fisher information that a part's motions give about poses and scales, and what A's noise alone would create.
+
+Parameters are what users perturb: for each free frame [omega, v], a right perturbation T Expmap(xi) in GTSAM's order
+(rad, m), and the logarithm of each unknown scale. The information is the *expected* one: B enters by its prediction
+Y^-1 A X at the answer, not by its noisy measurement, so that only A can feign excitation. It comes from the moments of
+A alone. With c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carrier's frame):
+
+- rotation residual, weight 2 kappa:        omega_X - (R_Y' R_A R_X)' omega_Y
+- translation residual, weight alpha^2/s^2: R_A R_X v_X - R_Y v_Y + c^ R_Y omega_Y + c dlog alpha
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.moments import ONE, R_A, T_A, T_B
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.residuals import PairPoses
+
+#: No data are taken for more exact than this, in radians and as a part of the measured lengths: where the noise is
+#: zero, the eigenvalues' own rounding (1e-16 / floor^2) must not pass for information.
+FLOOR = 1e-7
+#: A pair's 15 parameters: the target's seven, the sensor's seven, the shared scale. A frame's seven: rotation,
+#: translation, logarithm of its own scale.
+OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
+
+_UPPER = np.triu_indices(15, 1)
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """Variance factors of each pair's residuals, (E,): 1 where the weights are true.
+
+    ``redundancy`` is equations minus unknowns of the whole part.
+    """
+
+    translation: Array
+    rotation: Array
+    redundancy: int
+
+
+def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
+    """Variance factors from the residuals at the optimum: the part's, or a pair's own where that is larger.
+
+    J_t is sum |r|^2 / (2 sigma^2), expected 3 N / 2; J_R is sum kappa |dR|_F^2 / 2 = sum kappa theta^2, expected
+    3 N / 2 too, as each axis has variance 1 / (2 kappa). The part's are corrected for the unknowns that were fitted.
+
+    Parameters
+    ----------
+    part : Part
+    J_t, J_R : (E,) arrays
+        Of each pair, in the physical model.
+    """
+    counts, N = part.moments.count, part.number_of_measurements
+    redundancy = 6 * N - part.number_of_unknowns
+    if redundancy <= 0:  # nothing tells the noise but the weights
+        return NoiseLevel(np.ones(len(counts)), np.ones(len(counts)), redundancy)
+    correction = 6.0 * N / redundancy
+    lengths = np.einsum("eii->e", part.moments.translation[:, T_B, T_B])
+    factors = []
+    for J, floor in (
+        (J_t, (lengths + 1e-4 * part.moments.weight) * FLOOR**2 / counts),  # at least a centimetre's part
+        (J_R, 2.0 * part.moments.kappa * FLOOR**2 / counts),
+    ):
+        of_part = correction * float(J.sum()) / (1.5 * N)
+        factors.append(np.maximum(np.maximum(J / (1.5 * counts), of_part), floor))
+    return NoiseLevel(factors[0], factors[1], redundancy)
+
+
+@dataclass(frozen=True)
+class PairInformation:
+    """Of every pair: rotation residuals' and translation residuals' information, and what noise alone would create.
+
+    rotation, translation (E, 15, 15); noise_rotation, noise_translation (E, 15), diagonal; used (E, 15): the
+    parameters that exist; carrier_noise (E,) in rad^2, the largest variance an axis that A's rotations may have.
+    """
+
+    rotation: Array
+    translation: Array
+    noise_rotation: Array
+    noise_translation: Array
+    used: np.ndarray
+    carrier_noise: Array
+
+
+def pair_information(part: Part, poses: PairPoses, noise: NoiseLevel) -> PairInformation:
+    """The information of every pair and its noise, all pairs at once.
+
+    Noise in a direction that the true motions leave free: with A's rotation off by eps (variance q^2 an axis), what
+    was zero becomes eps x omega or eps x v, expected at 2 q^2 |.|^2; both ends move together along a free direction,
+    so each takes half. The residuals do not tell A's noise from B's, but they bound it: rotation residuals hold all
+    of it, so q^2 <= f_R / (2 kappa); translation residuals hold it at the end of a lever arm a, so
+    2 q^2 |a|^2 <= 3 f_t sigma^2. Where A turns wrongly about its target carrier's origin, as given, the arm is t_X;
+    about its sensor carrier's, it is c: the shorter one is safe. A's translation noise is at most f_t sigma^2 an axis:
+    2 f_t |omega_Y|^2, and 3 f_t for a scale.
+    """
+    E = len(part.pairs)
+    R_X, t_X, R_Y, t_Y, alpha = poses.R_X, poses.t_X, poses.R_Y, poses.t_Y, poses.alpha
+    free, owners = frozenset(part.free), frozenset(part.scale_owners)
+    G, W = part.moments.translation, part.moments.weight
+    K, n = part.moments.kappa, part.moments.count
+
+    # Moments of c = R_A t_X + t_A - t_Y, linear in A's features: c = [t_X' (x) I, I, -t_Y] f.
+    linear = np.zeros((E, 3, 25))
+    linear[:, :, R_A] = np.einsum("ej,ik->eijk", t_X, np.eye(3)).reshape(E, 3, 9)
+    linear[:, :, T_A] = np.eye(3)
+    linear[:, :, ONE] = -t_Y
+    Gc = G @ linear.transpose(0, 2, 1)  # sum w f c'
+    cc = linear @ Gc
+    c = Gc[:, ONE]
+    Rt = G[:, R_A, ONE].reshape(E, 3, 3)  # sum w R_A'
+    Rt_c = Gc[:, R_A].reshape(E, 3, 3, 3)  # [i, k, m]: sum w R_A[k, i] c[m]
+
+    R_Xt, R_Yt = R_X.transpose(0, 2, 1), R_Y.transpose(0, 2, 1)
+    turned = R_Xt @ Rt @ R_Y  # sum w (R_Y' R_A R_X)'
+    eye = np.eye(3)
+    rotation = np.zeros((E, 15, 15))
+    rotation[:, OMEGA_X, OMEGA_X] = rotation[:, OMEGA_Y, OMEGA_Y] = 2.0 * K[:, None, None] * eye
+    rotation[:, OMEGA_X, OMEGA_Y] = -2.0 * (K / W)[:, None, None] * turned
+    translation = np.zeros((E, 15, 15))
+    translation[:, V_X, V_X] = translation[:, V_Y, V_Y] = W[:, None, None] * eye
+    translation[:, V_X, V_Y] = -turned
+    # (c^)_{kj} = -eps_{kjm} c_m, so sum w (R_A' c^)_{ij} = -sum w R_A[k, i] eps_{kjm} c_m.
+    Rt_skew = -np.einsum("eikm,kjm->eij", Rt_c, _LEVI_CIVITA)
+    translation[:, V_X, OMEGA_Y] = R_Xt @ Rt_skew @ R_Y
+    skew = -np.einsum("em,kjm->ekj", c, _LEVI_CIVITA)  # sum w c^
+    translation[:, OMEGA_Y, V_Y] = -(R_Yt @ skew @ R_Y).transpose(0, 2, 1)
+    square = np.einsum("eii->e", cc)
+    translation[:, OMEGA_Y, OMEGA_Y] = R_Yt @ (square[:, None, None] * eye - cc) @ R_Y
+    translation[:, V_X, SHARED] = np.einsum("eij,ej->ei", R_Xt, np.einsum("eikk->ei", Rt_c))
+    translation[:, V_Y, SHARED] = -np.einsum("eij,ej->ei", R_Yt, c)
+    translation[:, SHARED, SHARED] = square  # c^ c = 0: nothing with omega_Y
+    for full in (rotation, translation):
+        full[:, _UPPER[1], _UPPER[0]] = full[:, _UPPER[0], _UPPER[1]]
+    translation *= (alpha**2)[:, None, None]
+
+    given_t_X = t_X + np.array([part.frame_shift(target) for target, _ in part.pairs])
+    arm = np.minimum((given_t_X**2).sum(axis=1), square / W)
+    by_arm = 1.5 * noise.translation * n / np.maximum(alpha**2 * W * arm, 1e-300)
+    q2 = np.maximum(np.minimum(noise.rotation * n / (2.0 * K), by_arm), FLOOR**2)
+    noise_rotation, noise_translation = np.zeros((E, 15)), np.zeros((E, 15))
+    for omega, v in ((OMEGA_X, V_X), (OMEGA_Y, V_Y)):
+        noise_rotation[:, omega] = (2.0 * K * q2)[:, None]
+        noise_translation[:, omega] = (noise.translation * n)[:, None]
+        noise_translation[:, v] = (alpha**2 * W * q2)[:, None]
+    noise_translation[:, SHARED] = 3.0 * noise.translation * n
+
+    used = np.zeros((E, 15), dtype=bool)
+    for e, (target, sensor) in enumerate(part.pairs):
+        if target == sensor:  # both ends are one frame: fold the first onto the second
+            for full in (rotation[e], translation[e]):
+                full[7:14] += full[:7]
+                full[:, 7:14] += full[:, :7]
+                full[:7] = full[:, :7] = 0.0
+            noise_rotation[e, 7:14] += noise_rotation[e, :7]
+            noise_translation[e, 7:14] += noise_translation[e, :7]
+            noise_rotation[e, :7] = noise_translation[e, :7] = 0.0
+        used[e, :6] = target in free and target != sensor
+        used[e, 7:13] = sensor in free
+        used[e, SHARED] = part.scale == "shared"
+        if target in owners:
+            at = OWN_X if target != sensor else 13
+            for full in (translation[e], translation[e].T):
+                full[at] += full[SHARED]
+            translation[e, at, at] = alpha[e] ** 2 * square[e]
+            noise_translation[e, at] = noise_translation[e, SHARED]
+            used[e, at] = True
+    return PairInformation(rotation, translation, noise_rotation, noise_translation, used, q2)
+
+
+_LEVI_CIVITA = np.zeros((3, 3, 3))
+for _i in range(3):
+    _LEVI_CIVITA[_i, (_i + 1) % 3, (_i + 2) % 3] = 1.0
+    _LEVI_CIVITA[_i, (_i + 2) % 3, (_i + 1) % 3] = -1.0
+
+
+@dataclass(frozen=True)
+class Information:
+    """Arrow-shaped: leaf (L, 7, 7), coupling (L, 7, 7 P + 1), border (7 P + 1 square), and the noise's diagonal.
+
+    Order of the border: the centers' seven, then the logarithm of the shared scale.
+    """
+
+    leaf: Array
+    coupling: Array
+    border: Array
+    leaf_noise: Array
+    border_noise: Array
+    used_leaf: np.ndarray
+    used_border: np.ndarray
+
+
+def information(part: Part, by_pair: Array, noise: Array, used: np.ndarray, priors: Array) -> Information:
+    """Add up pairs' information (E, 15, 15) and noise (E, 15), and the priors' (n, 7) diagonal, along the graph."""
+    L, P = len(part.leaves), len(part.centers)
+    place = {name: i for i, name in enumerate(part.free)}
+    leaf, coupling = np.zeros((L, 7, 7)), np.zeros((L, 7, 7 * P + 1))
+    border = np.zeros((7 * P + 1, 7 * P + 1))
+    frame_noise, frame_used = np.zeros((L + P, 7)), np.zeros((L + P, 7), dtype=bool)
+    for e, pair in enumerate(part.pairs):
+        ends = [(place[name], slice(7 * end, 7 * end + 7)) for end, name in enumerate(pair) if name in place]
+        for i, at in ends:
+            frame_noise[i] += noise[e, at]
+            frame_used[i] |= used[e, at]
+            if i < L:
+                leaf[i] += by_pair[e, at, at]
+                coupling[i, :, -1] += by_pair[e, at, 14]
+            else:
+                own = slice(7 * (i - L), 7 * (i - L) + 7)
+                border[own, own] += by_pair[e, at, at]
+                border[own, -1] += by_pair[e, at, 14]
+        if len(ends) == 2 and pair[0] != pair[1]:
+            (i, at_i), (j, at_j) = sorted(ends)
+            coupling[i, :, 7 * (j - L) : 7 * (j - L) + 7] += by_pair[e, at_i, at_j]
+    border[-1, :-1] = border[:-1, -1]
+    border[-1, -1] = by_pair[:, 14, 14].sum()
+    np.einsum("lii->li", leaf)[...] += priors[:L]
+    np.einsum("ii->i", border)[:-1] += priors[L:].ravel()
+    return Information(
+        leaf,
+        coupling,
+        border,
+        frame_noise[:L],
+        np.r_[frame_noise[L:].ravel(), noise[:, 14].sum()],
+        frame_used[:L],
+        np.r_[frame_used[L:].ravel(), used[:, 14].any()],
+    )
+
+
+def prior_information(part: Part) -> tuple[Array, Array]:
+    """The priors' information, diagonal, for rotations and translations apart: (n, 7) each."""
+    rotation, translation = np.zeros((len(part.free), 7)), np.zeros((len(part.free), 7))
+    for i, name in enumerate(part.free):
+        for prior in part.priors.get(name, []):
+            if prior.kappa is not None:
+                rotation[i, :3] += 2.0 * prior.kappa
+            if prior.sigma is not None:
+                translation[i, 3:6] += 1.0 / prior.sigma**2
+    return rotation, translation

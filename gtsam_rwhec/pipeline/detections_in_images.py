@@ -1,0 +1,75 @@
+"""The images of a log with what was detected in them, as PNG files in a folder."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+
+from gtsam_rwhec.errors import ImageError, LogError
+from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, open_log
+from gtsam_rwhec.pipeline.all_stages import made_folder
+from gtsam_rwhec.pipeline.detection_stage import TOPIC
+from gtsam_rwhec.pipeline.log_metadata import read_cameras, read_embedded_rig
+from gtsam_rwhec.vision.drawn_detections import draw
+from gtsam_rwhec.vision.images import decode_gray
+
+
+def draw_log(
+    log_path: str | Path,
+    detected_path: str | Path,
+    folder: str | Path,
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> int:
+    """Draw every image that can be decoded: ``<sensor>_<stamp>.png``; how many.
+
+    Parameters
+    ----------
+    log_path
+        Where the images are.
+    detected_path
+        What ``detect_log`` made of it.
+    folder
+        Made if it is not there.
+    progress : callable, optional
+
+    Raises
+    ------
+    LogError
+        A log cannot be read, or a file cannot be written.
+    """
+    folder = made_folder(folder)
+    count = 0
+    with open_log(detected_path) as detected, open_log(log_path) as log:
+        rig, cameras = read_embedded_rig(detected), read_cameras(detected)
+        there = {topic.name for topic in detected.topics()}
+        for sensor, source in rig.sensors.items():
+            if source.images is None:
+                continue
+            of_stamp: dict[int, list[DetectionRecord]] = defaultdict(list)
+            topic = TOPIC.format(sensor=sensor)
+            for record in detected.records([topic] if topic in there else []):
+                if isinstance(record, DetectionRecord):
+                    of_stamp[record.stamp_ns].append(record)
+            for image in log.records([source.images]):
+                if not isinstance(image, ImageRecord):
+                    continue
+                try:
+                    gray = decode_gray(image)
+                except ImageError:
+                    continue  # detection has counted and named it
+                picture = draw(gray, of_stamp[image.stamp_ns], cameras[sensor])
+                path = folder / f"{sensor.replace('/', '_')}_{image.stamp_ns}.png"
+                _, data = cv2.imencode(".png", picture)
+                try:
+                    write_atomically(path, data.tobytes())
+                except OSError as error:
+                    raise LogError(f"{path} cannot be written: {error.strerror}.") from error
+                count += 1
+                if progress is not None:
+                    progress(f"drawing: image {count}")
+    return count

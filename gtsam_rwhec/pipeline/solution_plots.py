@@ -1,0 +1,131 @@
+"""A solved log as pictures: frames, residuals over time, corners in images, standard deviations."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs import DetectionRecord, Log, open_log
+from gtsam_rwhec.pipeline.carriers import read_carriers
+from gtsam_rwhec.pipeline.detection_stage import TOPIC
+from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs
+from gtsam_rwhec.pipeline.solution_frames import frames_of
+from gtsam_rwhec.pipeline.solved_log import Solved
+from gtsam_rwhec.report.plots import (
+    PlottedCorners,
+    PlottedMeasurement,
+    plot_coverage,
+    plot_deviations,
+    plot_frames,
+    plot_residuals,
+)
+
+FRAMES, RESIDUALS, COVERAGE, DEVIATIONS = "frames.png", "residuals.png", "coverage.png", "deviations.png"
+
+
+def plot_all(solved: Solved, solved_path: str | Path, folder: Path) -> list[Path]:
+    """Draw every picture into a folder that is there; their paths.
+
+    Parameters
+    ----------
+    solved : Solved
+    solved_path
+        The log it was read from: the corners are there.
+    folder : Path
+
+    Raises
+    ------
+    FileFormatError
+        A file cannot be written.
+    """
+    frames = frames_of(solved)
+    names = {name: solved.rig.frame_of(name) for name in solved.refined.Y} | {name: name for name in solved.refined.X}
+    covariances = {frame: solved.refined.covariance(name) for name, frame in names.items()}
+    plot_frames(frames, covariances, folder / FRAMES)
+    plot_deviations(frames, covariances, folder / DEVIATIONS)
+    plot_residuals(plotted_residuals(solved), folder / RESIDUALS)
+    written = [folder / FRAMES, folder / DEVIATIONS, folder / RESIDUALS]
+    with open_log(solved_path) as log:
+        corners = plotted_corners(solved, log)
+    if corners:
+        plot_coverage(corners, {name: solved.cameras[name] for name in corners}, folder / COVERAGE)
+        written.append(folder / COVERAGE)
+    return written
+
+
+def plotted_residuals(solved: Solved) -> dict[tuple[str, str], PlottedMeasurement]:
+    """Each measurement against what the answer predicts of it."""
+    first = min(int(measured.stamps_ns.min()) for measured in solved.pairs.values() if len(measured.stamps_ns))
+    result = {}
+    for (target, sensor), measured in solved.pairs.items():
+        if target not in solved.refined.X or sensor not in solved.refined.Y:
+            continue  # nothing of this pair was used
+        degrees, millimetres = residuals_of(solved, target, sensor, measured)
+        result[target, sensor] = PlottedMeasurement(
+            stamps_s=(measured.stamps_ns - first) * 1e-9,
+            rotation_deg=degrees,
+            translation_mm=millimetres,
+            inlier=measured.used,
+            reason=measured.reasons,
+        )
+    return result
+
+
+def residuals_of(solved: Solved, target: str, sensor: str, measured: MeasuredPairs) -> tuple[Array, Array]:
+    """Degrees (N,) and millimetres (N,) between B and Y^-1 A X."""
+    predicted = predicted_B(solved, target, sensor, measured.A)
+    predicted[:, :3, 3] *= scale_of(solved, target)
+    off = se3.inverse(predicted) @ measured.B
+    degrees: Array = np.degrees(np.linalg.norm(se3.so3_logmap(off[:, :3, :3]), axis=1))
+    return degrees, 1e3 * np.linalg.norm(off[:, :3, 3], axis=1)
+
+
+def predicted_B(solved: Solved, target: str, sensor: str, A: Array) -> Array:
+    """Y^-1 A X, (N, 4, 4), true metres."""
+    X, Y = solved.refined.X[target].matrix(), solved.refined.Y[sensor].matrix()
+    predicted: Array = np.linalg.inv(Y) @ A @ X
+    return predicted
+
+
+def scale_of(solved: Solved, target: str) -> float:
+    """stated / true length of a target."""
+    scale = solved.refined.scale
+    return scale if isinstance(scale, float) else scale[target]
+
+
+def plotted_corners(solved: Solved, log: Log) -> dict[str, PlottedCorners]:
+    """By camera: corners of the detections that were used, and their distance from where the calibration has them."""
+    path = read_carriers(log, solved.rig).trajectory
+    targets = {target.name: target for target in solved.rig.target_list}
+    offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
+    there = {topic.name for topic in log.topics()}
+    seen: dict[str, list[Array]] = defaultdict(list)
+    errors: dict[str, list[Array]] = defaultdict(list)
+    used = {
+        (pair, int(stamp))
+        for pair, measured in solved.pairs.items()
+        for stamp in measured.stamps_ns[measured.used].tolist()
+    }
+    for sensor in solved.refined.Y:
+        topic = TOPIC.format(sensor=sensor)
+        if topic not in there or sensor not in solved.cameras:
+            continue
+        camera = solved.cameras[sensor]
+        for record in log.records([topic]):
+            if (
+                not isinstance(record, DetectionRecord)
+                or record.corners_px is None
+                or record.corner_indices is None
+                or ((record.id, sensor), record.stamp_ns) not in used
+            ):
+                continue
+            A, _ = path.at(np.array([record.stamp_ns + round(1e9 * offsets.get(sensor, 0.0))]))
+            T = predicted_B(solved, record.id, sensor, A)[0]
+            points = targets[record.id].corners()[list(record.corner_indices)] / scale_of(solved, record.id)
+            seen[sensor].append(record.corners_px)
+            errors[sensor].append(record.corners_px - camera.project(points @ T[:3, :3].T + T[:3, 3]))
+    return {sensor: PlottedCorners(np.concatenate(seen[sensor]), np.concatenate(errors[sensor])) for sensor in seen}

@@ -1,0 +1,104 @@
+"""Moments of all pairs of a problem, about one gauge that the first measurements choose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
+
+Pair = tuple[str, str]
+
+#: The gauge may move, and everything be summed anew, until this many measurements are there: a single one says nothing
+#: of where a trajectory is centred. Later ones are summed about the gauge as it then is.
+OPENING = 64
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Measurements as they were added: A, B (N, 4, 4); weight 1/sigma^2 and kappa, () or (N,); where, for messages."""
+
+    pair: Pair
+    A: Array
+    B: Array
+    weight: Array
+    kappa: Array
+    where: str
+
+    @property
+    def is_motion(self) -> bool:
+        """Whether both ends are one sensor (AX = XB)."""
+        return self.pair[0] == self.pair[1]
+
+    @property
+    def sample(self) -> Array:
+        """At most a block of A, from all over the batch: logs begin at rest, which tells no centre."""
+        return self.A[:: -(-len(self.A) // BLOCK)]
+
+    def moments(self, gauge: Gauge) -> Moments:
+        """Checked and summed about a gauge."""
+        return Moments.of(self.A, self.B, self.weight, self.kappa, gauge, self.is_motion, self.where)
+
+
+class Accumulator:
+    """Moments by pair. Nothing in it changes: what is added makes another."""
+
+    def __init__(self, gauge: Gauge | None = None, moments: dict[Pair, Moments] | None = None) -> None:
+        self.gauge = gauge or Gauge()
+        self.moments = moments or {}
+        self._opening: list[Batch] | None = [] if gauge is None else None
+
+    def added(self, batch: Batch) -> tuple[Accumulator, int]:
+        """This and a batch; and how many of its rotations had to be projected to SO(3).
+
+        Raises
+        ------
+        PoseError
+            For a pose that is none.
+        """
+        if self._opening is None:
+            gauge = self.gauge
+            if not batch.is_motion and not self._has_targets():
+                gauge = replace(gauge, target_carrier=Gauge.target_origin(batch.sample, gauge.sensor_carrier))
+            fresh = batch.moments(gauge)
+            known = self.moments.get(batch.pair)
+            return Accumulator(gauge, {**self.moments, batch.pair: known + fresh if known else fresh}), fresh.projected
+        batches = [*self._opening, batch]
+        gauge = Gauge.of(
+            np.concatenate([b.sample for b in batches]),
+            np.concatenate([np.full(len(b.sample), b.is_motion) for b in batches]),
+        )
+        moments: dict[Pair, Moments] = {}
+        fresh = Moments.none()
+        for b in batches:
+            fresh = b.moments(gauge)
+            moments[b.pair] = moments[b.pair] + fresh if b.pair in moments else fresh
+        result = Accumulator(gauge, moments)
+        if sum(len(b.A) for b in batches) < OPENING:
+            # Kept for a while: the caller's arrays may change meanwhile.
+            result._opening = [*self._opening, replace(batch, A=batch.A.copy(), B=batch.B.copy())]
+        return result, fresh.projected
+
+    def _has_targets(self) -> bool:
+        return any(target != sensor for target, sensor in self.moments)
+
+    def merged(self, other: Accumulator) -> Accumulator:
+        """Both together, about the gauge of the one that has settled."""
+        settled, rest = (self, other) if self._opening is None or other._opening is not None else (other, self)
+        if rest._opening is not None:
+            result = settled
+            for batch in rest._opening:
+                result, _ = result.added(batch)
+            return result
+        gauge = settled.gauge
+        if not settled._has_targets():
+            gauge = replace(gauge, target_carrier=rest.gauge.target_carrier)
+        a = gauge.sensor_carrier - rest.gauge.sensor_carrier
+        c = gauge.target_carrier - rest.gauge.target_carrier if rest._has_targets() else np.zeros(3)
+        moments = dict(settled.moments)
+        for pair, edge in rest.moments.items():
+            moved = edge.shifted(a, a if pair[0] == pair[1] else c)
+            moments[pair] = moments[pair] + moved if pair in moments else moved
+        return Accumulator(gauge, moments)

@@ -1,0 +1,269 @@
+"""What the cost needs to know of an edge's measurements: a few moments, and the 25 x 25 form they make.
+
+Moments are sums over the measurements, so they add: batches, logs and machines may be merged, in any order. They are
+sums about a reference (``Gauge``): with the world's origin far away, products of uncentred translations would lose
+the digits that the answer is made of.
+
+One column of features per measurement, 25 of them::
+
+    f = [vec R_A (9), t_A (3), vec R_B (9), t_B (3), 1]          (vec stacks columns)
+
+``translation = sum f f' / sigma^2`` holds everything that eqs. 35-41 of the RWHEC paper need, for Problem 3 and for
+the equation turned round (one scale per target); ``rotation = sum kappa vec(R_A) vec(R_B)'`` all that L(G^rho) needs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import LARGEST_M, Array, checked_rows
+
+R_A, T_A, R_B, T_B, ONE = slice(0, 9), slice(9, 12), slice(12, 21), slice(21, 24), 24
+#: The features of the equation turned round, B X^-1 = Y^-1 A: A and B change places.
+SWAPPED = np.r_[12:24, 0:12, 24]
+#: Measurements handled at once: blocks of this many stay in the processor's cache.
+BLOCK = 2048
+I3 = np.eye(3)
+I9 = np.eye(9)
+_UPPER = np.triu_indices(25, 1)
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """Origins to which translations are referred: A -> T(-sensor_carrier) A T(target_carrier), in metres.
+
+    X moves to T(-target_carrier) X and Y to T(-sensor_carrier) Y: the answer is shifted back exactly.
+    """
+
+    sensor_carrier: Array = field(default_factory=lambda: np.zeros(3))
+    target_carrier: Array = field(default_factory=lambda: np.zeros(3))
+
+    @staticmethod
+    def of(A: Array, motion: np.ndarray) -> Gauge:
+        """The reference that makes the translations of ``A`` (N, 4, 4) small: min |R_A c + t_A - a|^2 over a, c.
+
+        Where ``motion`` (N,) says so, both ends are the sensor's carrier (AX = XB): c = a. A component that the
+        motions leave open stays small (minimum norm). Poses that are none give the zero gauge; the check is elsewhere.
+        """
+        if not np.abs(A).max() <= LARGEST_M:
+            return Gauge()
+        R, t = A[:, :3, :3], A[:, :3, 3]
+        rows = np.zeros((len(A), 3, 6))
+        rows[:, :, :3] = I3 - np.where(motion[:, None, None], R, 0.0)
+        rows[:, :, 3:] = -np.where(motion[:, None, None], 0.0, R)
+        solution = np.linalg.lstsq(rows.reshape(-1, 6), t.ravel(), rcond=1e-9)[0]
+        return Gauge(solution[:3], solution[3:])
+
+    @staticmethod
+    def target_origin(A: Array, sensor_carrier: Array) -> Array:
+        """The best target carrier's origin (3,) when the sensor carrier's is settled."""
+        if not np.abs(A).max() <= LARGEST_M:
+            return np.zeros(3)
+        origin: Array = np.einsum("nji,nj->ni", A[:, :3, :3], sensor_carrier - A[:, :3, 3]).mean(axis=0)
+        return origin
+
+    def moved_by(self, a: Array, c: Array) -> Gauge:
+        """The gauge after a further shift."""
+        return Gauge(self.sensor_carrier + a, self.target_carrier + c)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Sums over the measurements of one edge. Additive: ``a + b`` is the moments of both.
+
+    Attributes
+    ----------
+    count : int
+        Number of measurements.
+    kappa : float
+        Sum of the rotation weights.
+    translation : (25, 25) array
+        sum f f' / sigma^2.
+    rotation : (9, 9) array
+        sum kappa vec(R_A) vec(R_B)'.
+    projected : int
+        Measurements whose rotations were projected to SO(3).
+    """
+
+    count: int
+    kappa: float
+    translation: Array
+    rotation: Array
+    projected: int = 0
+
+    @staticmethod
+    def of(A: Array, B: Array, weight: Array, kappa: Array, gauge: Gauge, motion: bool, where: str) -> Moments:
+        """Moments of N measurements, block by block, checking every pose on the way (``poses.checked_rows``).
+
+        Parameters
+        ----------
+        A, B : (N, 4, 4) arrays
+        weight : () or (N,) array
+            1 / sigma^2, in 1/m^2.
+        kappa : () or (N,) array
+        gauge : Gauge
+        motion : bool
+            Whether both carriers are the sensor's (AX = XB).
+        where : str
+            For messages.
+        """
+        translation = np.zeros((25, 25))
+        rotation = np.zeros((9, 9))
+        projected = 0
+        a = gauge.sensor_carrier[:, None]
+        c = gauge.sensor_carrier if motion else gauge.target_carrier
+        features = np.empty((25, min(BLOCK, len(A))))
+        for first in range(0, len(A), BLOCK):
+            part = slice(first, first + BLOCK)
+            f = features[:, : min(BLOCK, len(A) - first)]
+            _, projected_A = checked_rows(A[part], first, f"A of {where}", f[:12])
+            _, projected_B = checked_rows(B[part], first, f"B of {where}", f[12:24])
+            projected += projected_A + projected_B
+            f[T_A] += c[0] * f[0:3] + c[1] * f[3:6] + c[2] * f[6:9] - a
+            f[ONE] = 1.0
+            if weight.ndim == 0:
+                translation += weight * (f @ f.T)
+            else:
+                translation += (f * weight[part]) @ f.T
+            if kappa.ndim == 0:
+                rotation += kappa * (f[R_A] @ f[R_B].T)
+            else:
+                rotation += (f[R_A] * kappa[part]) @ f[R_B].T
+        total = float(kappa) * len(A) if kappa.ndim == 0 else float(kappa.sum())
+        return Moments(len(A), total, translation, rotation, projected)
+
+    @staticmethod
+    def none() -> Moments:
+        """Of no measurement."""
+        return Moments(0, 0.0, np.zeros((25, 25)), np.zeros((9, 9)))
+
+    def __add__(self, other: Moments) -> Moments:
+        return Moments(
+            self.count + other.count,
+            self.kappa + other.kappa,
+            self.translation + other.translation,
+            self.rotation + other.rotation,
+            self.projected + other.projected,
+        )
+
+    def shifted(self, a: Array, c: Array) -> Moments:
+        """The same measurements about a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
+        shift = _shift(a, c)
+        return Moments(self.count, self.kappa, shift @ self.translation @ shift.T, self.rotation, self.projected)
+
+
+def _shift(a: Array, c: Array) -> Array:
+    """t_A' = t_A + R_A c - a is linear in the features, so that moments change by a congruence with this."""
+    shift = np.eye(25)
+    for i in range(3):
+        shift[T_A, R_A][:, 3 * i : 3 * i + 3] = c[i] * I3
+    shift[T_A, ONE] = -a
+    return shift
+
+
+@dataclass(frozen=True)
+class MomentStack:
+    """Moments of E edges: count (E,), kappa (E,), translation (E, 25, 25), rotation (E, 9, 9); motion (E,) booleans."""
+
+    count: np.ndarray
+    kappa: Array
+    translation: Array
+    rotation: Array
+    motion: np.ndarray
+
+    @staticmethod
+    def of(moments: list[Moments], motion: list[bool]) -> MomentStack:
+        """Stack them."""
+        return MomentStack(
+            np.array([edge.count for edge in moments]),
+            np.array([edge.kappa for edge in moments]),
+            np.array([edge.translation for edge in moments]),
+            np.array([edge.rotation for edge in moments]),
+            np.array(motion),
+        )
+
+    @property
+    def weight(self) -> Array:
+        """(E,) sums of 1 / sigma^2."""
+        return self.translation[:, ONE, ONE]
+
+    def best_shift(self) -> tuple[Array, Array]:
+        """The shift (a, c) that centres all edges together: min sum |t_A + R_A c - a|^2 / sigma^2, minimum norm."""
+        G, still = self.translation, ~self.motion
+        # R_A' summed: entry (i, k) is R_A[k, i], which vec keeps at 3 i + k.
+        Rt = G[:, R_A, ONE].reshape(-1, 3, 3)
+        Rt_t = np.einsum("eikk->ei", G[:, R_A, T_A].reshape(-1, 3, 3, 3))
+        t = G[:, T_A, ONE]
+        normal, right = np.zeros((6, 6)), np.zeros(6)
+        normal[:3, :3] = normal[3:, 3:] = self.weight[still].sum() * I3
+        normal[3:, :3] = -Rt[still].sum(axis=0)
+        normal[:3, 3:] = normal[3:, :3].T
+        right[:3], right[3:] = t[still].sum(axis=0), -Rt_t[still].sum(axis=0)
+        if self.motion.any():  # c = a: residual t_A - (I - R_A) a
+            turned = Rt[self.motion].sum(axis=0)
+            normal[:3, :3] += 2.0 * self.weight[self.motion].sum() * I3 - turned - turned.T
+            right[:3] += (t - Rt_t)[self.motion].sum(axis=0)
+        solution: Array = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+        return solution[:3], solution[3:]
+
+    def shifted(self, a: Array, c: Array) -> MomentStack:
+        """About a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
+        shift = np.where(self.motion[:, None, None], _shift(a, a), _shift(a, c))
+        moved = shift @ self.translation @ shift.transpose(0, 2, 1)
+        return MomentStack(self.count, self.kappa, moved, self.rotation, self.motion)
+
+    def spread(self) -> float:
+        """Root mean square of t_A about the gauge, in metres."""
+        square = np.einsum("ekk->", self.translation[:, T_A, T_A])
+        return float(np.sqrt(max(square, 0.0) / self.weight.sum()))
+
+
+def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array, Array]:
+    """Quadratic forms of E edges over x = [t_X, t_Y, alpha, vec R_X, vec R_Y] (DESIGN fact 1; eqs. 24-33).
+
+    Parameters
+    ----------
+    translation : (E, 25, 25) array
+        Second moments of the features, about the gauge; permuted by ``SWAPPED`` for the equation turned round.
+    rotation : (E, 9, 9) array
+        sum kappa vec(R_A) vec(R_B)' (transposed for the equation turned round).
+    kappa : (E,) array
+
+    Returns
+    -------
+    translation_form, rotation_form : (E, 25, 25) arrays
+        x' form x is the edge's J_t and J_R (eq. 18), the 1/2 included.
+    """
+    G = translation
+    edges = len(G)
+    tX, tY, al, rX, rY = slice(0, 3), slice(3, 6), 6, slice(7, 16), slice(16, 25)
+    weight = G[:, ONE, ONE, None, None]
+    Rt = G[:, R_A, ONE].reshape(edges, 3, 3)  # sum w R_A'
+    Q = np.zeros((edges, 25, 25))
+    # M_t = [R_A, -I, t_A, 0, -t_B' (x) I] (eq. 30); the upper triangle of sum w M_t' M_t:
+    Q[:, tX, tX] = weight * I3
+    Q[:, tX, tY] = -Rt
+    Q[:, tX, al] = np.einsum("eikk->ei", G[:, R_A, T_A].reshape(edges, 3, 3, 3))
+    # -R_A' (t_B' (x) I): entry (i, 3 j + k) is -R_A[k, i] t_B[j]
+    Q[:, tX, rY] = -G[:, R_A, T_B].reshape(edges, 3, 3, 3).transpose(0, 1, 3, 2).reshape(edges, 3, 9)
+    Q[:, tY, tY] = weight * I3
+    Q[:, tY, al] = -G[:, T_A, ONE]
+    Q[:, tY, rY] = np.einsum("ej,ik->eijk", G[:, T_B, ONE], I3).reshape(edges, 3, 9)
+    Q[:, al, al] = np.einsum("ekk->e", G[:, T_A, T_A])
+    Q[:, al, rY] = -G[:, T_B, T_A].reshape(edges, 9)
+    Q[:, rY, rY] = np.einsum("ejl,ik->ejilk", G[:, T_B, T_B], I3).reshape(edges, 9, 9)
+    _mirror(Q)
+    P = np.zeros((edges, 25, 25))
+    # M_R = [I (x) R_A, -R_B' (x) I] (eq. 25); M_R' M_R has kappa I on the diagonal, -R_B' (x) R_A' beside it.
+    P[:, rX, rX] = kappa[:, None, None] * I9
+    P[:, rY, rY] = kappa[:, None, None] * I9
+    cross = rotation.reshape(edges, 3, 3, 3, 3)  # [i, k, p, q] = sum kappa R_A[k, i] R_B[q, p]
+    P[:, rX, rY] = -cross.transpose(0, 3, 1, 4, 2).reshape(edges, 9, 9)
+    _mirror(P)
+    return 0.5 * Q, 0.5 * P
+
+
+def _mirror(Q: Array) -> None:
+    Q[:, _UPPER[1], _UPPER[0]] = Q[:, _UPPER[0], _UPPER[1]]

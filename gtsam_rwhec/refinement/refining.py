@@ -1,0 +1,314 @@
+"""``refine``: from the certified solution to poses under the noise that there is, with covariances."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from gtsam_rwhec.errors import (
+    CountError,
+    FrameError,
+    MeasurementsNotKeptError,
+    NotConvergedWarning,
+    NotUniqueWarning,
+    OptionError,
+    RwhecWarning,
+    ScaleError,
+    WeightsWarning,
+)
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.refinement.chordal import ChordalModel
+from gtsam_rwhec.refinement.fit import Fit, Model, fit
+from gtsam_rwhec.refinement.free_space import FreeSpace, free_space_of
+from gtsam_rwhec.refinement.geodesic import GeodesicModel
+from gtsam_rwhec.refinement.graduated import graduated
+from gtsam_rwhec.refinement.inliers import agreeing, under_worst_axis
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.pair_data import PairData, local_paths
+from gtsam_rwhec.refinement.refined import Movement, PairNoise, Refined
+from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.refinement.weighting import group_of
+from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solving.certified_solution import check_against_knowledge, solve
+from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.trajectories.local_paths import WINDOW_S
+
+Progress = Callable[[str], None]
+
+#: Times that outliers are chosen anew under the noise as it is; two or three are usual.
+MAX_CHOICES = 10
+
+
+def refine(
+    problem: Problem,
+    solution: Solution,
+    options: RefineOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Refined:
+    """Refine a certified solution in GTSAM under the noise that there is, and say how well everything is known.
+
+    Parameters
+    ----------
+    problem : Problem
+        With the raw measurements, unless ``residual="chordal"`` and ``robust="none"``.
+    solution : Solution
+        What ``solve`` returned for it; the start.
+    options : RefineOptions, optional
+    progress : callable, optional
+        Told each stage's name.
+
+    Returns
+    -------
+    Refined
+
+    Raises
+    ------
+    FrameError, ScaleError, PriorError
+        For a solution of another problem.
+    MeasurementsNotKeptError
+        Where raw measurements are needed and were not kept.
+    NoiseError, OptionError, CountError
+        For noise that cannot be estimated or honoured, or options that do not go together.
+    OutlierError
+        With robust="gnc", where hardly any measurement agrees with another.
+
+    Warns
+    -----
+    NotUniqueWarning
+        Where the measurements leave something free, by name; variances are infinite there.
+    WeightsWarning
+        Where the residuals say that the noise as given is too small, or A's noise is shared and is not treated so.
+    NotConvergedWarning
+        Where iterations ended at their limit.
+    """
+    options = RefineOptions() if options is None else options
+    tell = progress if progress is not None else _silent
+    _check(problem, solution, options)
+    estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)
+    everything = Variables.of(problem, _sensors_with_offset(problem, options))
+    data = _data(problem, everything, options)
+    inliers: dict[Pair, np.ndarray] = {}
+    start, whole, judged = solution, problem, problem
+    if options.robust == "gnc":
+        tell("rejecting outliers")
+        if data and (problem.has_covariances or options.carrier_noise is not None or everything.offsets):
+            guess = everything.start(solution)
+            if everything.offsets:  # a clock that is off looks like outliers wherever the carrier moves
+                first = GeodesicModel.of(data, everything, replace(options, robust="huber"))
+                rough = fit(problem, first, everything, guess, options, estimates)
+                guess = everything.state(rough.optimum.values)
+            judged = under_worst_axis(problem, data, everything, guess)
+        found = graduated(
+            judged,
+            confidence=options.inlier_confidence,
+            noise_scale="estimate" if estimates else "given",
+            progress=progress,
+        )
+        start, inliers = found.solution, found.inliers
+    for _ in range(MAX_CHOICES):
+        if inliers:
+            problem = selected(whole, inliers)
+        offsets = tuple(name for name in _sensors_with_offset(whole, options) if name in problem.sensors)
+        variables, parts = Variables.of(problem, offsets), parts_of(problem)
+        kept = [item.selected(inliers[item.pair]) if inliers else item for item in data if item.pair in problem.pairs]
+        model = GeodesicModel.of(kept, variables, options) if kept else ChordalModel(parts, variables)
+        tell("refining")
+        settled = fit(problem, model, variables, variables.start(start), options, estimates)
+        state = variables.state(settled.optimum.values)
+        if judged is whole:
+            break
+        threshold = float(chdtri(6, 1.0 - options.inlier_confidence))
+        again = agreeing(data, variables, state, settled.factors, threshold)
+        if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
+            break
+        inliers = again
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)  # of this choice; what is wrong with the last one is told
+            start = solve(selected(whole, inliers))
+    tell("covariances")
+    space = free_space_of(parts, variables, state, kept, None if options.robust in ("none", "gnc") else settled.factors)
+    if space.sentences:
+        warnings.warn(
+            "the measurements do not determine everything; variances are infinite along: " + "; ".join(space.sentences),
+            NotUniqueWarning,
+            stacklevel=2,
+        )
+    if not estimates:
+        _warn_of_weights(problem, variables, settled, options)
+    joint = JointCovariance.of(variables.unknown, settled.information, space.basis, space.unit)
+    _warn_of_offsets(space, joint, state)
+    return Refined(
+        X=state.X,
+        Y=state.Y,
+        scale=_scale(problem, state),
+        scale_mode=problem.scale,
+        time_offsets_s={name.partition(":")[2]: value for name, value in state.offsets_s.items()},
+        graph=settled.graph,
+        values=settled.optimum.values,
+        keys=variables.keys,
+        noise_source="estimated" if estimates else "given",
+        noise=_noise(model, settled, options, estimates),
+        cost=settled.optimum.cost,
+        initial_cost=settled.graph.error(model.values(variables.start(solution))),
+        iterations=settled.iterations,
+        moved=_moved(solution, state),
+        inlier_counts={pair: (int(kept.sum()), len(kept)) for pair, kept in inliers.items()},
+        inliers=inliers,
+        free_directions=space.sentences,
+        solution=start,
+        options=options,
+        joint=joint,
+    )
+
+
+#: A cost this many times what the given noise predicts makes covariances too small by its root, and is told.
+UNLIKELY = 2.0
+
+
+def _warn_of_weights(problem: Problem, variables: Variables, settled: Fit, options: RefineOptions) -> None:
+    """Compare the residuals with what the noise as given predicts: half the equations to spare."""
+    if options.robust not in ("none", "gnc"):  # a loss makes another cost
+        return
+    beliefs = [p for name, priors in problem.priors.items() if name not in problem.fixed for p in priors]
+    equations = 6 * problem.number_of_measurements + sum(
+        3 * (p.sigma is not None) + 3 * (p.kappa is not None) for p in beliefs
+    )
+    spare = equations - sum(variables.unknown.values())
+    if spare <= 0:
+        return
+    # Beyond doubt, too: a chi-square of few degrees of freedom may well be twice its mean.
+    if settled.optimum.cost > UNLIKELY * 0.5 * spare and chdtrc(spare, 2.0 * settled.optimum.cost) < 1e-3:
+        ratio = settled.optimum.cost / (0.5 * spare)
+        warnings.warn(
+            f"the residuals cost {settled.optimum.cost:.4g}, {ratio:.3g} times what the given noise predicts "
+            f"({0.5 * spare:.4g}): standard deviations are too small by about {math.sqrt(ratio):.2g}; take "
+            "noise='estimate', robust='gnc' if some measurements are wrong, or carrier_noise if A is not exact",
+            WeightsWarning,
+            stacklevel=3,
+        )
+
+
+def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> None:
+    """Where a time offset is biased by more than its standard deviation says, or beyond what poses nearby tell."""
+    for name, part in space.shrinkage.items():
+        offset_s, what = abs(state.offsets_s[name]), name.replace(":", " of ")
+        if offset_s > WINDOW_S:
+            warnings.warn(
+                f"{what} is {offset_s:.3g} s, beyond the {WINDOW_S:g} s about each stamp in which the carriers' motion "
+                "is looked at; shift the stamps first (cleaning.coarse_time_offset finds by how much)",
+                NotConvergedWarning,
+                stacklevel=3,
+            )
+        elif part * offset_s > 0.5 * math.sqrt(joint.covariance_of(joint.selector((name,)))[0, 0]):
+            warnings.warn(
+                f"{what}: the carriers' velocity is {100.0 * part:.2g} % noise, which pulls the offset towards zero by "
+                f"about {1e3 * part * offset_s:.2g} ms, more than its standard deviation says; move faster, or take "
+                "denser poses",
+                WeightsWarning,
+                stacklevel=3,
+            )
+
+
+def _data(problem: Problem, variables: Variables, options: RefineOptions) -> list[PairData]:
+    """Of every pair; none for the chordal residual, which has moments."""
+    if options.residual == "chordal":
+        if problem.has_covariances:
+            raise OptionError(
+                "some measurements came with full covariances, which the chordal residual cannot hold; take "
+                "residual='geodesic', or add them with sigma and kappa"
+            )
+        return []
+    if not problem.has_measurements:
+        raise MeasurementsNotKeptError(
+            "the geodesic residual needs the raw measurements, and they were not kept (keep_measurements=False); make "
+            "the problem with keep_measurements=True, or refine with RefineOptions(residual='chordal')"
+        )
+    sensors = tuple(name.partition(":")[2] for name in variables.offsets)
+    paths = local_paths(problem, sensors, options.carrier_path)
+    return [PairData.of(problem, pair, options, paths.get(pair)) for pair in problem.pairs]
+
+
+def _check(problem: Problem, solution: Solution, options: RefineOptions) -> None:
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    if not isinstance(solution, Solution):
+        raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
+    if not isinstance(options, RefineOptions):
+        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.RefineOptions")
+    if solution.scale_mode != problem.scale:
+        raise ScaleError(
+            f"the solution is of a problem with scale={solution.scale_mode!r}, this one has scale={problem.scale!r}; "
+            "solve this problem first"
+        )
+    if not problem.pairs:
+        raise CountError("the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)")
+    try:
+        check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
+    except FrameError as error:
+        raise FrameError(f"the solution is of another problem; solve this one first ({error})") from error
+    if options.noise == "given" and problem.is_relative:
+        raise OptionError(
+            "noise='given', but some measurements were added without sigma or kappa, so that no noise was given; "
+            "take noise='estimate'"
+        )
+    if options.robust == "gnc" and not problem.has_measurements:
+        raise MeasurementsNotKeptError(
+            "robust='gnc' weighs each measurement, and they were not kept (keep_measurements=False); make the problem "
+            "with keep_measurements=True"
+        )
+
+
+def _sensors_with_offset(problem: Problem, options: RefineOptions) -> tuple[str, ...]:
+    if isinstance(options.time_offsets, bool):
+        return problem.sensors if options.time_offsets else ()
+    for name in options.time_offsets:
+        if name not in problem.sensors:
+            raise FrameError(
+                f"RefineOptions.time_offsets names {name!r}, which is no sensor; there are {', '.join(problem.sensors)}"
+            )
+    return tuple(options.time_offsets)
+
+
+def _scale(problem: Problem, state: State) -> float | dict[str, float]:
+    if problem.scale == "shared":
+        return state.scales["scale"]
+    if problem.scale == "known":
+        return 1.0
+    names = dict.fromkeys(target for target, _ in problem.pairs)
+    return {n: problem.fixed_scales[n] if n in problem.fixed_scales else state.scales[f"scale:{n}"] for n in names}
+
+
+def _noise(model: Model, settled: Fit, options: RefineOptions, estimates: bool) -> dict[Pair, PairNoise]:
+    result = {}
+    for pair, (rotation, translation) in model.given_noise.items():
+        factors = settled.factors.of[pair]
+        spare = (np.inf, np.inf)
+        if estimates:
+            group = group_of(pair, options.noise_groups)
+            spare = (settled.redundancy[group, "rotation"], settled.redundancy[group, "translation"])
+        result[pair] = PairNoise(rotation * math.sqrt(factors[0]), translation * math.sqrt(factors[1]), spare)
+    return result
+
+
+def _moved(start: Solution, state: State) -> dict[str, Movement]:
+    moved = {}
+    for before, after in ((start.X, state.X), (start.Y, state.Y)):
+        for name, pose in after.items():
+            difference = before[name].between(pose)
+            angle = float(np.linalg.norm(gtsam.Rot3.Logmap(difference.rotation())))
+            moved[name] = Movement(1e3 * float(np.linalg.norm(difference.translation())), float(np.degrees(angle)))
+    return moved
+
+
+def _silent(stage: str) -> None:
+    """Nobody wants to know."""

@@ -1,0 +1,70 @@
+"""A frame's pose by vote: each of its measurements proposes one, and the truncated cost of them all decides."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.certified_fit import Fit
+from gtsam_rwhec.refinement.squared_residuals import Measured, NoiseFactors
+
+#: Proposals of one frame; more measurements are sampled evenly in the order of their residuals.
+PROPOSALS = 50
+
+
+def by_vote(name: str, measured: Measured, fit: Fit, factors: NoiseFactors, threshold: float) -> tuple[Fit, float]:
+    """The fit with the frame where most of its measurements agree, the other frames staying; and what that saves.
+
+    Parameters
+    ----------
+    name : str
+        A target or sensor; it may lack a pose.
+    measured : Measured
+    fit : Fit
+    factors : NoiseFactors
+    threshold : float
+        c^2.
+
+    Returns
+    -------
+    fit : Fit
+        As given where no proposal is better.
+    saved : float
+        By how much sum min(d^2, c^2) went down.
+    """
+    own = measured.of_pairs([pair for pair in measured.pairs if name in pair and pair[0] != pair[1]])
+
+    def cost_of(candidate: Fit) -> tuple[float, Array]:
+        d = own.together(own.squares(candidate), factors)
+        return float(np.minimum(d, threshold).sum()), d
+
+    before, d = cost_of(fit)
+    best, least = fit, before
+    order = np.argsort(np.minimum(d, np.finfo(float).max), kind="stable")
+    for index in order[np.unique(np.linspace(0, len(order) - 1, PROPOSALS).astype(int))] if len(order) else []:
+        T = _proposed(name, int(index), own, fit)
+        if T is None:
+            continue
+        candidate = replace(fit, poses={**fit.poses, name: T})
+        cost, _ = cost_of(candidate)
+        if cost < least:
+            best, least = candidate, cost
+    return best, before - least
+
+
+def _proposed(name: str, index: int, own: Measured, fit: Fit) -> Array | None:
+    """X = A^-1 Y B or Y = A X B^-1 of one measurement, lengths true; None where the pair's other end has no pose."""
+    pair = own.pair_of(index)
+    other = pair[1] if pair[0] == name else pair[0]
+    alpha = fit.alpha.get(pair[0], np.nan)
+    if other not in fit.poses or not np.isfinite(alpha) or alpha == 0.0:
+        return None
+    A, B = own.A[index], own.B[index].copy()
+    B[:3, 3] /= alpha
+    if pair[0] == name:
+        X: Array = np.linalg.solve(A, fit.poses[other] @ B)
+        return X
+    Y: Array = np.linalg.solve(B.T, (A @ fit.poses[other]).T).T
+    return Y

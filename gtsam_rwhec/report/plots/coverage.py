@@ -1,0 +1,161 @@
+"""Where in each camera's image targets were seen, and how well their corners fit there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.report.plots.drawing import BLUE, picture, round_down, say, shortened
+from gtsam_rwhec.report.plots.plotted import PlottedCorners
+from gtsam_rwhec.vision.camera import Camera
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import PathCollection
+    from matplotlib.colors import Colormap
+
+#: Cells along the longer side of an image, for its coverage and for mean errors; corners that a mean is of at least.
+COVERAGE_CELLS, MEAN_CELLS, LEAST_CORNERS = 16, 10, 5
+#: An arrow of the largest mean error is as long as this share of a cell.
+ARROW_SHARE = 0.9
+
+
+def plot_coverage(corners: Mapping[str, PlottedCorners], cameras: Mapping[str, Camera], path: str | Path) -> None:
+    """Draw each camera's image with the corners seen, coloured by reprojection error, and mean errors as arrows.
+
+    Parameters
+    ----------
+    corners : dict of str to PlottedCorners
+        By sensor.
+    cameras : dict of str to Camera
+        By sensor, for the images' sizes; of a sensor that is not there, the size is taken from its corners.
+    path
+        The PNG; replaced if it is there.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written.
+    """
+    columns = min(max(len(corners), 1), 2 if len(corners) <= 4 else 3)
+    rows = -(-len(corners) // columns) or 1
+    sizes = {sensor: _size(seen, cameras.get(sensor)) for sensor, seen in corners.items()}
+    tallest = max((height / width for width, height in sizes.values()), default=0.75)
+    width_in = 12.0 if columns > 1 else 8.0
+    row_in = ((width_in - 1.2) / columns - 0.7) * min(tallest, 1.5) + 1.0
+    from matplotlib.lines import Line2D
+
+    with picture(path, width_in, rows * row_in + 0.5, "compressed") as figure:
+        if not corners:
+            say(figure.subplots(), "no corners")
+            return
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        errors = [np.linalg.norm(_finite(seen).errors_px, axis=1) for seen in corners.values()]
+        every = np.concatenate(errors)
+        # The colours are for most; the few that are larger have the last one.
+        largest = float(np.quantile(every, 0.98)) if len(every) else 0.0
+        largest = largest or 1.0
+        points = None
+        for axes, (sensor, seen) in zip(panels, corners.items(), strict=False):
+            points = _draw(axes, sensor, _finite(seen), sizes[sensor], largest)
+        for axes in panels[len(corners) :]:
+            axes.set_visible(False)
+        assert points is not None
+        bar = figure.colorbar(
+            points, ax=panels.tolist(), extend="max", extendfrac=0.03, aspect=40, shrink=0.8, pad=0.015
+        )
+        bar.set_label("reprojection error of a corner (px)")
+        words = f"mean error of {LEAST_CORNERS} or more neighbouring corners, as many times as long as the title says"
+        arrow = Line2D([], [], marker=">", markersize=5, lw=1.2, color=BLUE, label=words)
+        figure.legend(handles=[arrow], loc="outside lower left")
+
+
+class _Seen(NamedTuple):
+    pixels: Array
+    errors_px: Array
+
+
+def _finite(seen: PlottedCorners) -> _Seen:
+    pixels, errors = np.asarray(seen.pixels, dtype=float), np.asarray(seen.errors_px, dtype=float)
+    good = np.isfinite(pixels).all(axis=1) & np.isfinite(errors).all(axis=1)
+    return _Seen(pixels[good], errors[good])
+
+
+def _size(seen: PlottedCorners, camera: Camera | None) -> tuple[float, float]:
+    if camera is not None:
+        return float(camera.width), float(camera.height)
+    pixels = _finite(seen).pixels
+    if not len(pixels):
+        return 4.0, 3.0
+    width, height = np.maximum(np.ceil(pixels.max(axis=0)) + 1.0, 1.0)
+    return float(width), float(height)
+
+
+def _draw(axes: Axes, sensor: str, seen: _Seen, size: tuple[float, float], largest: float) -> PathCollection:
+    width, height = size
+    errors = np.linalg.norm(seen.errors_px, axis=1)
+    order = np.argsort(errors, kind="stable")  # the worst on top
+    points = axes.scatter(
+        seen.pixels[order, 0], seen.pixels[order, 1],
+        c=errors[order], s=6, lw=0, cmap=_colours(), vmin=0.0, vmax=largest, zorder=2,
+    )  # fmt: skip
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="u (px)", ylabel="v (px)")
+    axes.set_aspect("equal")
+    axes.spines[:].set_visible(True)
+    axes.grid(visible=False)
+    if not len(errors):
+        axes.set_title(f"{shortened(sensor)}: no corners")
+        return points
+    note = _draw_means(axes, seen, size)
+    rms = np.sqrt(np.mean(errors**2))
+    covered = _share(seen.pixels, size)
+    axes.set_title(f"{shortened(sensor)}: {len(errors)} corners, rms {rms:.2g} px\nin {covered:.0%} of the image{note}")
+    return points
+
+
+def _colours() -> Colormap:
+    """From pale orange to black, so that on white the worst are seen best; without what is too pale to see."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(colormaps["magma_r"](np.linspace(0.15, 1.0, 256)))
+
+
+def _share(pixels: Array, size: tuple[float, float]) -> float:
+    """Which share of the image's cells has corners in it."""
+    cells, count = _cells(pixels, size, COVERAGE_CELLS)
+    return len(np.unique(cells)) / count
+
+
+def _draw_means(axes: Axes, seen: _Seen, size: tuple[float, float]) -> str:
+    """Mean errors of cells as arrows: what noise does not do, but wrong intrinsics do. How large they are drawn."""
+    cells, _ = _cells(seen.pixels, size, MEAN_CELLS)
+    means = []
+    for cell in np.unique(cells):
+        at = cells == cell
+        if at.sum() >= LEAST_CORNERS:
+            means.append((*seen.pixels[at].mean(axis=0), *seen.errors_px[at].mean(axis=0)))
+    if not means:
+        return ""
+    u, v, du, dv = np.array(means).T
+    longest = float(np.hypot(du, dv).max())
+    if longest == 0.0:
+        return ""
+    times = round_down(ARROW_SHARE * max(size) / MEAN_CELLS / longest)
+    axes.quiver(
+        u, v, times * du, times * dv,
+        angles="xy", scale_units="xy", scale=1.0, color=BLUE, width=0.004, minlength=0.5, zorder=3,
+    )  # fmt: skip
+    return f"; arrows {times:,g}x"
+
+
+def _cells(pixels: Array, size: tuple[float, float], along: int) -> tuple[np.ndarray, int]:
+    """Index of each pixel's cell (N,), and how many cells there are; cells are nearly square."""
+    side = max(size) / along
+    columns, rows = (max(int(np.ceil(length / side - 1e-9)), 1) for length in size)
+    u, v = (np.clip(((pixels[:, k] + 0.5) / side).astype(int), 0, (columns, rows)[k] - 1) for k in range(2))
+    return v * columns + u, columns * rows

@@ -1,0 +1,108 @@
+"""What all pictures share: colours that everyone can tell apart, type, and how a file is made of a figure."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.files.atomic_write import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+#: Okabe and Ito's palette, which people with any form of colour blindness tell apart.
+BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
+SKY, PURPLE, BLACK, GREY, PALE = "#56B4E9", "#CC79A7", "#000000", "#777777", "#DDDDDD"
+#: The axes x, y, z of frames.
+AXIS_COLOURS = (VERMILLION, GREEN, BLUE)
+AXIS_NAMES = ("x", "y", "z")
+
+DPI = 120
+STYLE = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10.5,
+    "figure.dpi": DPI,
+    "figure.titlesize": 12,
+    "font.size": 9.5,
+    "grid.color": PALE,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "savefig.dpi": "figure",
+    # Reasons and names are text, whatever is in them.
+    "text.parse_math": False,
+}
+#: Characters of a reason, and of a name, that there is room for.
+LONGEST_REASON, LONGEST_NAME = 60, 28
+
+
+@contextmanager
+def picture(
+    path: str | Path, width_in: float, height_in: float, layout: Literal["constrained", "compressed"] = "constrained"
+) -> Iterator[Figure]:
+    """A figure that is written as a PNG when the block ends without an error; always the same bytes for the same.
+
+    The layout "compressed" is for panels whose sides have a fixed ratio.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written.
+    """
+    from matplotlib import style
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with style.context(["default", STYLE]):
+        figure = Figure(figsize=(width_in, height_in), layout=layout)
+        FigureCanvasAgg(figure)
+        yield figure
+        content = io.BytesIO()
+        figure.savefig(content, format="png", metadata={"Software": None})
+    try:
+        write_atomically(Path(path), content.getvalue())
+    except OSError as error:
+        raise FileFormatError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
+def say(axes: Axes, words: str) -> None:
+    """Words in place of what there is not."""
+    axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", color=GREY)
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+
+
+def shortened(text: str, most: int = LONGEST_NAME) -> str:
+    """One line of at most so many characters, which the font has; what is cut is cut from the middle."""
+    line = "".join(c if c.isprintable() else " " for c in text.encode("latin-1", "replace").decode("latin-1"))
+    line = " ".join(line.split())
+    if len(line) <= most:
+        return line
+    begin = (most - 3) // 2
+    return f"{line[:begin]}...{line[len(line) - (most - 3 - begin) :]}"
+
+
+def plain_decades(axis: Axis, low: float, high: float) -> None:
+    """Ticks of a logarithmic axis as people write numbers; between the decades too where there are few."""
+    few = high < 30.0 * low
+    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
+    for steps, minor in (((1.0, 2.0, 5.0) if few else (1.0,), False), (() if few else (2.0, 5.0), True)):
+        ticks = [step * power for power in powers for step in steps if low <= step * power <= high]
+        axis.set_ticks(ticks, ["" if minor else f"{tick:g}" for tick in ticks], minor=minor)
+
+
+def round_down(number: float) -> float:
+    """A positive number to 1, 2 or 5 times a power of ten, not above it."""
+    power = 10.0 ** np.floor(np.log10(number))
+    return float(max(step * power for step in (0.5, 1.0, 2.0, 5.0) if step * power <= number * (1.0 + 1e-12)))

@@ -1,0 +1,1 @@
+"""Calibrations in files: one schema, written and read."""

@@ -1,0 +1,35 @@
+"""The mirror image that planar motion cannot tell from the truth when the scale is unknown.
+
+Let every A turn about one axis, u_s in the sensor carrier, u_t in the target carrier, A u_t = u_s, and move across it.
+Then the parts of the residuals along the axis and across it are apart, and a half turn of all frames about the axis
+changes the sign of the parts across, as a change of the scale's sign does: (H R, -alpha) costs what (R, alpha) costs.
+Both have det R = 1, only one of them has a positive scale.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.moments import ONE, R_A
+from gtsam_rwhec.solver.parts import Part
+
+
+def mirrored(part: Part, R: Array) -> Array:
+    """Rotations (n, 3, 3) of the form's variables after a half turn of all frames about the motions' main axis."""
+    sums = part.moments.translation[:, R_A, ONE].reshape(-1, 3, 3).transpose(0, 2, 1)
+    still = ~part.moments.motion
+    if still.any():
+        U, _, Vt = np.linalg.svd(sums[still].sum(axis=0))
+        of_sensor, of_target = U[:, 0], Vt[0]
+    else:  # both ends of a motion are the sensor's carrier
+        turned = sums.sum(axis=0)
+        of_sensor = of_target = np.linalg.eigh(turned + turned.T)[1][:, -1]
+    half_turns = np.array(
+        [
+            2.0 * np.outer(axis, axis) - np.eye(3)
+            for axis in (of_target if name in part.targets else of_sensor for name in part.free)
+        ]
+    )
+    result: Array = half_turns @ R if part.kind == "direct" else R @ half_turns
+    return result

@@ -1,0 +1,236 @@
+"""From a Problem to the parts that are solved apart: who is connected, which side are the leaves, about which gauge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gtsam_rwhec.errors import CountError, FrameError, PoseError, PriorError, ScaleError, UnderdeterminedError
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.moments import Gauge, Moments, MomentStack
+from gtsam_rwhec.problem.priors import Prior
+from gtsam_rwhec.problem.problem import Problem, ScaleMode
+
+#: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" the equation turned round, B X^-1 = Y^-1 A, which
+#: a scale for each target needs (DESIGN fact 7).
+Kind = Literal["direct", "inverse"]
+#: Beyond this many times the translations' spread, moving the gauge costs digits (its square, of sixteen).
+FAR = 100.0
+
+
+@dataclass(frozen=True)
+class Part:
+    """One connected part of a problem, about its own gauge.
+
+    Attributes
+    ----------
+    leaves, centers : tuple of str
+        Free frames; leaves are the larger side, and are joined to centers only.
+    targets, sensors : tuple of str
+        All frames of the part, fixed ones too.
+    pairs : tuple of (str, str)
+        Its edges; (sensor, sensor) for motions.
+    moments : MomentStack
+        Of the pairs in their order, about ``gauge``.
+    fixed : dict of str to (4, 4) array
+        Known poses, about ``gauge``.
+    priors : dict of str to list of Prior
+        About ``gauge``.
+    """
+
+    leaves: tuple[str, ...]
+    centers: tuple[str, ...]
+    targets: tuple[str, ...]
+    sensors: tuple[str, ...]
+    pairs: tuple[Pair, ...]
+    moments: MomentStack
+    fixed: dict[str, Array]
+    priors: dict[str, list[Prior]]
+    fixed_scales: dict[str, float]
+    gauge: Gauge
+    kind: Kind
+    scale: ScaleMode
+    is_relative: bool
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Free frames in the order of the rotations: leaves, then centers."""
+        return self.leaves + self.centers
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All frames of the part."""
+        return self.targets + self.sensors
+
+    @property
+    def number_of_measurements(self) -> int:
+        """Of all pairs."""
+        return int(self.moments.count.sum())
+
+    @property
+    def scale_owners(self) -> tuple[str, ...]:
+        """With a scale per target: frames whose scale is unknown (targets, and sensors with motions of their own)."""
+        if self.scale != "per_target":
+            return ()
+        return tuple(dict.fromkeys(t for t, _ in self.pairs if t not in self.fixed_scales))
+
+    @property
+    def number_of_unknowns(self) -> int:
+        """Degrees of freedom: six a free frame, and the scales."""
+        return 6 * len(self.free) + (self.scale == "shared") + len(self.scale_owners)
+
+    def frame_shift(self, name: str) -> Array:
+        """What the gauge subtracted from a frame's translation, in metres."""
+        return self.gauge.target_carrier if name in self.targets else self.gauge.sensor_carrier
+
+
+def parts_of(problem: Problem) -> list[Part]:
+    """Split a problem into connected parts and check what only the whole can show.
+
+    With one scale shared by all targets the scale joins everything, so there is one part for the solver.
+
+    Raises
+    ------
+    CountError
+        No measurements.
+    FrameError
+        A fixed frame, prior or scale of a frame that no measurement mentions.
+    UnderdeterminedError
+        Fewer equations than unknowns in a part.
+    """
+    if not problem.pairs:
+        raise CountError("the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)")
+    frames = problem.targets + problem.sensors
+    for what, names in (("fixed", problem.fixed), ("given a prior", problem.priors), ("scaled", problem.fixed_scales)):
+        for name in names:
+            if name not in frames:
+                raise FrameError(f"{name!r} is {what}, but no measurement mentions it; there are {', '.join(frames)}")
+    components = connected_components(problem.pairs)
+    if problem.scale == "shared":
+        components = [[name for component in components for name in component]]
+    return [_part(problem, frozenset(component)) for component in components]
+
+
+def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
+    """Frames of each connected part of the graph, in order of first appearance."""
+    neighbours: dict[str, set[str]] = {}
+    for target, sensor in pairs:
+        neighbours.setdefault(target, set()).add(sensor)
+        neighbours.setdefault(sensor, set()).add(target)
+    components, seen = [], set()
+    for start in neighbours:
+        if start in seen:
+            continue
+        component, stack = [], [start]
+        seen.add(start)
+        while stack:
+            name = stack.pop()
+            component.append(name)
+            fresh = neighbours[name] - seen
+            seen |= fresh
+            stack.extend(sorted(fresh))
+        components.append(component)
+    return components
+
+
+def _part(problem: Problem, members: frozenset[str]) -> Part:
+    pairs = tuple(pair for pair in problem.pairs if pair[1] in members)
+    targets = tuple(name for name in problem.targets if name in members)
+    sensors = tuple(name for name in problem.sensors if name in members)
+    gauge, moments = _centred(problem, pairs)
+    priors = {name: problem.priors[name] for name in problem.priors if name in members}
+    turned_round = problem.scale == "per_target" or (
+        problem.scale == "shared" and any(p.sigma is not None for beliefs in priors.values() for p in beliefs)
+    )
+    shift = {name: gauge.target_carrier for name in targets} | {name: gauge.sensor_carrier for name in sensors}
+    leaves, centers = _sides(targets, sensors, pairs, problem.fixed)
+    part = Part(
+        leaves=leaves,
+        centers=centers,
+        targets=targets,
+        sensors=sensors,
+        pairs=pairs,
+        moments=moments,
+        fixed={name: _moved(T, shift[name]) for name, T in problem.fixed.items() if name in members},
+        priors={
+            name: [Prior(_moved(p.transform, shift[name]), p.sigma, p.kappa) for p in beliefs]
+            for name, beliefs in priors.items()
+        },
+        fixed_scales={name: s for name, s in problem.fixed_scales.items() if name in members},
+        gauge=gauge,
+        kind="inverse" if turned_round else "direct",
+        scale=problem.scale,
+        is_relative=problem.is_relative,
+    )
+    _check(part)
+    return part
+
+
+def _centred(problem: Problem, pairs: tuple[Pair, ...]) -> tuple[Gauge, MomentStack]:
+    """A part's moments about its own gauge (DESIGN fact 9).
+
+    Moving moments is exact in formula, but a move far beyond the spread of the translations cancels digits, as when
+    the first measurements were all but one pose. Then the raw measurements, where kept, are summed anew.
+    """
+    motion = [target == sensor for target, sensor in pairs]
+    moments = MomentStack.of([problem.moments(*pair) for pair in pairs], motion)
+    a, c = moments.best_shift()
+    gauge, centred = problem.gauge.moved_by(a, c), moments.shifted(a, c)
+    far = float(np.hypot(np.linalg.norm(a), np.linalg.norm(c)))
+    if far > FAR * centred.spread() and problem.has_measurements:
+        fresh = []
+        for pair, is_motion in zip(pairs, motion, strict=True):
+            raw = problem.measurements(*pair)
+            where = "-".join(dict.fromkeys(pair))
+            fresh.append(Moments.of(raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, gauge, is_motion, where))
+        centred = MomentStack.of(fresh, motion)
+    return gauge, centred
+
+
+def _moved(T: Array, origin: Array) -> Array:
+    moved = T.copy()
+    moved[:3, 3] -= origin
+    return moved
+
+
+def _sides(
+    targets: tuple[str, ...], sensors: tuple[str, ...], pairs: tuple[Pair, ...], fixed: dict[str, Array]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The larger side is eliminated first; a frame that only moves by itself has no pivot of its own: a center."""
+    paired = {name for target, sensor in pairs if target != sensor for name in (target, sensor)}
+    free_targets = tuple(name for name in targets if name not in fixed)
+    free_sensors = tuple(name for name in sensors if name not in fixed)
+    larger, smaller = (free_targets, free_sensors)
+    if len(free_sensors) > len(free_targets):
+        larger, smaller = free_sensors, free_targets
+    leaves = tuple(name for name in larger if name in paired)
+    return leaves, smaller + tuple(name for name in larger if name not in paired)
+
+
+def _check(part: Part) -> None:
+    equations = 6 * part.number_of_measurements
+    beliefs = [p for priors in part.priors.values() for p in priors]
+    equations += sum(3 * (p.sigma is not None) + 3 * (p.kappa is not None) for p in beliefs)
+    if equations < part.number_of_unknowns:
+        raise UnderdeterminedError(
+            f"{', '.join(part.names)}: {part.number_of_measurements} measurements give {equations} equations for "
+            f"{part.number_of_unknowns} unknowns; measure more, or fix a frame"
+        )
+    for name in part.scale_owners:
+        if name in part.fixed:
+            raise PriorError(
+                f"the pose of {name} is fixed and its scale is unknown, which the certified form cannot hold; "
+                f"fix the scale too (fix_scale), or give the pose as a tight prior (add_prior)"
+            )
+    for name in part.fixed_scales:
+        if name not in {target for target, _ in part.pairs}:
+            raise ScaleError(f"the scale of {name} is fixed, but nothing measures {name}'s size")
+    bad = np.flatnonzero(~np.isfinite(part.moments.translation).all(axis=(1, 2)))
+    if bad.size:
+        raise PoseError(
+            f"the translations of {'-'.join(part.pairs[bad[0]])} are so large that their squares overflow; "
+            "are they in metres?"
+        )

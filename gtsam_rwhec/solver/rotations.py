@@ -1,0 +1,120 @@
+"""SO(3) as the certificates see it: 21 quadratic constraints a rotation, tangents, projection, retraction.
+
+A stack of rotations is (n, 3, 3); as part of x = [vec R_1, ..., vec R_n, 1] each is its columns, one after the other.
+Constraints act on the ten numbers [vec R, h], h the homogenising entry.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+
+
+def _constraints() -> Array:
+    """The 21 homogeneous constraints of eq. 50, y' A y = 0, with integer entries."""
+    entry = np.arange(9).reshape(3, 3).T  # entry[i, j]: where R[i, j] is in vec R
+    matrices = []
+
+    def add(*terms: tuple[int, int, int]) -> None:
+        """Add the matrix A of y' A y = sum of value * (2 if p != q else 1) * y_p y_q."""
+        A = np.zeros((10, 10))
+        for p, q, value in terms:
+            A[p, q] += value
+            if p != q:
+                A[q, p] += value
+        matrices.append(A)
+
+    h = 9
+    pairs = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+    for a, b in pairs:  # eq. 50b: R'R = h^2 I (columns)
+        add(*[(entry[i, a], entry[i, b], 1) for i in range(3)], *([(h, h, -1)] if a == b else []))
+    rows = [(0, 1), (0, 2), (1, 2), (0, 0), (1, 1)]
+    # The traces of R'R and R R' coincide: one diagonal entry of R R' depends on the others and comes last.
+    for a, b in rows:  # eq. 50a: R R' = h^2 I (rows)
+        add(*[(entry[a, j], entry[b, j], 1) for j in range(3)], *([(h, h, -1)] if a == b else []))
+    for a, b, c in [(0, 1, 2), (1, 2, 0), (2, 0, 1)]:  # eq. 50c: R_a x R_b = h R_c
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            add((entry[j, a], entry[k, b], 1), (entry[k, a], entry[j, b], -1), (entry[i, c], h, -1))
+    add(*[(entry[2, j], entry[2, j], 1) for j in range(3)], (h, h, -1))
+    return np.array(matrices)
+
+
+#: All 21 constraints (21, 10, 10); the first 6 are R'R = I, the last depends on the others.
+ALL_CONSTRAINTS = _constraints()
+#: The 20 independent ones.
+CONSTRAINTS = ALL_CONSTRAINTS[:20]
+CONSTRAINTS_FLAT = CONSTRAINTS.reshape(20, 100)
+
+
+def vec(R: Array) -> Array:
+    """(n, 3, 3) to (n, 9), column after column."""
+    return R.transpose(0, 2, 1).reshape(-1, 9)
+
+
+def unvec(r: Array) -> Array:
+    """(n, 9) or (9 n,) to (n, 3, 3)."""
+    stack: Array = r.reshape(-1, 3, 3).transpose(0, 2, 1)
+    return stack
+
+
+def tangent_basis(R: Array) -> Array:
+    """(n, 9, 3): vec(R w^) = basis w, for right perturbations R exp(w^)."""
+    basis = np.zeros((len(R), 3, 3, 3))  # [rotation, column of R, row of R, k]
+    c0, c1, c2 = R[:, :, 0], R[:, :, 1], R[:, :, 2]
+    # Column b of R w^ is R (w x e_b).
+    basis[:, 0, :, 1], basis[:, 0, :, 2] = -c2, c1
+    basis[:, 1, :, 0], basis[:, 1, :, 2] = c2, -c0
+    basis[:, 2, :, 0], basis[:, 2, :, 1] = -c1, c0
+    return basis.reshape(-1, 9, 3)
+
+
+def retract(R: Array, w: Array) -> Array:
+    """R exp(w^), brought back to SO(3) by one Newton-Schulz step so that rounding does not add up."""
+    theta2 = (w * w).sum(axis=1)[:, None, None]
+    theta = np.sqrt(theta2)
+    W = np.zeros_like(R)
+    W[:, 0, 1], W[:, 0, 2], W[:, 1, 2] = -w[:, 2], w[:, 1], -w[:, 0]
+    W[:, 1, 0], W[:, 2, 0], W[:, 2, 1] = w[:, 2], -w[:, 1], w[:, 0]
+    first = np.sinc(theta / np.pi)
+    second = 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
+    S = R @ (np.eye(3) + first * W + second * (W @ W))
+    result: Array = 1.5 * S - 0.5 * S @ (S.transpose(0, 2, 1) @ S)
+    return result
+
+
+def project(M: Array) -> Array:
+    """The nearest rotation to each (3, 3) block, in the Frobenius norm (Kabsch)."""
+    U, _, Vt = np.linalg.svd(M)
+    sign = np.sign(np.linalg.det(U @ Vt))
+    U[:, :, 2] *= sign[:, None]
+    result: Array = U @ Vt
+    return result
+
+
+def random_rotations(count: int, generator: np.random.Generator) -> Array:
+    """(count, 3, 3) rotations, uniform on SO(3)."""
+    q = generator.standard_normal((count, 4))
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
+        ],
+        axis=1,
+    )
+
+
+def kkt_multipliers(R: Array, gradient: Array) -> Array:
+    """(n, 20) multipliers of the constraints at a critical point: S_i = sym(R_i' G_i) on R'R = I (DESIGN fact 3).
+
+    gradient is (n, 9), the rotations' part of Q'x.
+    """
+    S = R.transpose(0, 2, 1) @ unvec(gradient)
+    S = 0.5 * (S + S.transpose(0, 2, 1))
+    multipliers = np.zeros((len(R), 20))
+    for k, (a, b) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
+        multipliers[:, k] = S[:, a, b]
+    return multipliers

@@ -1,0 +1,146 @@
+"""The small dual (DESIGN fact 4a): better multipliers of all constraints at the same point.
+
+At a critical point x the multipliers of R'R = I are unique, those of all 20 independent constraints are not: each
+rotation has a family of combinations N with N x = 0, 14 of them. Adding them moves Z = Q' - Lambda without touching
+Z x = 0, and may make it positive semidefinite: maximise t subject to Z(y) >= t P across x. A log-barrier Newton method
+on (y, t); it stops as soon as t is safely positive, since any such y proves the same.
+
+P sets the measure: Q' itself, a little more on its diagonal. Weights of translations and rotations differ by powers of
+ten, and the directions in question are those in which Q' is smallest; against the identity they would drown.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.local_blocks import gram, scatter, traces
+from gtsam_rwhec.solver.reduced_form import ReducedForm
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, vec
+
+#: With Z above this much of P the verified test has room, whatever the rounding.
+ENOUGH = 1e-2
+
+
+def null_multipliers(R: Array) -> Array:
+    """(n, 14, 20): orthonormal combinations of the constraints whose matrix N has N x = 0 at x = [vec R, 1]."""
+    local = np.c_[vec(R), np.ones(len(R))]
+    # Column k is A_k x; its rank is 6, the normal space of SO(3) (Theorem 6). Rows of h follow from x'A_k x = 0.
+    columns = np.einsum("kpq,nq->npk", CONSTRAINTS, local)[:, :9]
+    _, _, Vt = np.linalg.svd(columns)
+    return Vt[:, 6:, :]
+
+
+def stationary_multipliers(form: ReducedForm, R: Array, multipliers: Array) -> Array:
+    """The multipliers (n, 20) nearest to the given ones with Z x = 0 at x = [vec R, 1], a critical point."""
+    local = np.c_[vec(R), np.ones(len(R))]
+    x = np.append(local[:, :9].ravel(), 1.0)
+    columns = np.einsum("kpq,nq->npk", CONSTRAINTS, local)[:, :9]
+    residual = form.apply(x)[:-1].reshape(-1, 9) - np.einsum("npk,nk->np", columns, multipliers)
+    correction = np.matmul(np.linalg.pinv(columns, rcond=1e-9), residual[:, :, None])[:, :, 0]
+    result: Array = multipliers + correction
+    return result
+
+
+def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int = 60) -> tuple[Array, float]:
+    """Maximise t with Z >= t P across x over the multipliers' freedom.
+
+    Parameters
+    ----------
+    form : ReducedForm
+    R : (n, 3, 3) array
+        A critical point.
+    multipliers : (n, 20) array
+        With Z x = 0.
+
+    Returns
+    -------
+    multipliers : (n, 20) array
+        Still with Z x = 0.
+    t : float
+        What they reach: Z - t P is positive definite across x. Positive: they prove x optimal. Minus infinity, with
+        the multipliers as given, where rounding has left Q' with a negative eigenvalue.
+    """
+    n = len(R)
+    null = null_multipliers(R)
+    family = np.einsum("nmk,kpq->nmpq", null, CONSTRAINTS)
+    x = np.append(vec(R).ravel(), 1.0)
+    Q = form.dense()
+    Z0 = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
+    Z0 = 0.5 * (Z0 + Z0.T)
+    Z0[-1, -1] -= float(x @ Z0 @ x)  # the multiplier of h^2 = 1: then Z x = 0 in h's row too
+    scale = float(np.abs(np.diagonal(Z0)).max()) or 1.0
+    Z0 /= scale
+    P = Q / scale
+    P[np.diag_indices_from(P)] += 1e-9 * np.abs(np.diagonal(P)) + 1e-12
+    try:
+        np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:  # an ill-conditioned reduction has rounded Q' below zero: there is no measure
+        return multipliers, -np.inf
+    # Added along P x it takes x out of the question and leaves what is across x, z'P x = 0, as it is.
+    along_x = P @ x / np.sqrt(float(x @ P @ x))
+    try:
+        t = float(scipy.linalg.eigh(Z0, P, eigvals_only=True, subset_by_index=[0, 0], check_finite=False)[0])
+    except np.linalg.LinAlgError:  # P is no measure: Q' is zero, or its entries differ by all of double precision
+        return multipliers, -np.inf
+    t -= 0.1 * max(abs(t), 1e-3)
+    Z0 += 10.0 * max(abs(t), 1.0) * np.outer(along_x, along_x)
+    y = np.zeros(14 * n)
+    weight = 0.0  # of the barrier
+    best = (multipliers, -np.inf)
+    for _ in range(max_iterations):
+        Z = Z0 + scatter(np.einsum("nm,nmpq->npq", y.reshape(n, 14), family))
+        try:
+            factor = scipy.linalg.cho_factor(Z - t * P, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            break
+        W = scipy.linalg.cho_solve(factor, np.eye(len(Z)), check_finite=False)
+        W = 0.5 * (W + W.T)
+        if t > best[1]:
+            added = np.einsum("nm,nmk->nk", y.reshape(n, 14), null)
+            best = (multipliers - scale * added, t)
+        if t > ENOUGH:
+            break
+        # Newton on -t - weight log det(Z(y) - t P).
+        WP = W @ P
+        weight = weight or 1.0 / float(np.trace(WP))  # so that at first the barrier holds t where it is
+        W2 = WP @ W
+        M = gram(family, W, W)
+        along = traces(family, W2).ravel()
+        gradient = np.r_[-weight * traces(family, W).ravel(), -1.0 + weight * np.trace(WP)]
+        H = np.empty((14 * n + 1, 14 * n + 1))
+        H[:-1, :-1] = M
+        H[:-1, -1] = H[-1, :-1] = -along
+        H[-1, -1] = float(np.vdot(WP, WP.T))
+        H *= weight
+        H[np.diag_indices_from(H)] *= 1.0 + 1e-12
+        try:
+            step = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(H, check_finite=False), gradient, check_finite=False)
+        except np.linalg.LinAlgError:
+            break
+        decrement = float(np.sqrt(max(-(gradient @ step), 0.0) / weight))
+        direction = scatter(np.einsum("nm,nmpq->npq", step[:-1].reshape(n, 14), family)) - step[-1] * P
+        # The damped step is safe and short; four times it mostly stays inside too.
+        length = 1.0 if decrement < 0.25 else 4.0 / (1.0 + decrement)
+        length = _stay_inside(Z - t * P, direction, length)
+        y = y + length * step[:-1]
+        t += length * step[-1]
+        if decrement < 0.5:
+            if weight * len(Z0) < 1e-9:
+                break
+            weight *= 0.2
+    return best
+
+
+def _stay_inside(S: Array, direction: Array, length: float) -> float:
+    """The first of length, length / 2, ... that keeps S + length * direction positive definite, a little shorter."""
+    while True:
+        try:
+            np.linalg.cholesky(S + length * direction)
+        except np.linalg.LinAlgError:
+            length *= 0.5
+            if length < 1e-12:
+                return 0.0
+        else:
+            return length if length == 1.0 else 0.9 * length

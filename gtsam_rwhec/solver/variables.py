@@ -1,0 +1,95 @@
+"""Between the form's variables and poses: X, Y and scales from rotations and eliminated translations, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.errors import ScaleError
+from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.solver.descent import homogeneous
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.reduced_form import ReducedForm
+from gtsam_rwhec.solver.rotations import vec
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Poses about a part's gauge, as the user's frames see them: X or Y, not inverted, in metres.
+
+    R (n, 3, 3) and t (n, 3) in the order of ``part.free``; own_scale (n,) with nan where a frame has none; scale the
+    shared one. A scale that the measurements leave open is set to 1.
+    """
+
+    R: Array
+    t: Array
+    own_scale: Array
+    scale: float
+
+
+def answer_of(part: Part, form: ReducedForm, R: Array) -> Answer:
+    """The optimal translations and scales for given rotations (eq. 47), the scale divided out."""
+    leaf, center, alpha = form.recover(homogeneous(R))
+    numbers = np.concatenate([leaf, center])
+    t, s = numbers[:, :3], numbers[:, 3]
+    owners = set(part.scale_owners)
+    own = np.array([name in owners for name in part.free], dtype=bool)
+    own_scale = np.full(len(R), np.nan)
+    if part.kind == "direct":
+        scale = float(alpha[0]) if part.scale == "shared" else 1.0
+        return Answer(R, t / scale if scale else t, own_scale, scale)
+    with np.errstate(divide="ignore"):
+        own_scale[own] = 1.0 / s[own]
+        scale = float(1.0 / alpha[0]) if part.scale == "shared" else 1.0
+    inverse_R = R.transpose(0, 2, 1)
+    return Answer(inverse_R, -np.einsum("nij,nj->ni", inverse_R, t), own_scale, scale)
+
+
+def as_variables(part: Part, answer: Answer) -> tuple[Array, Array, Array]:
+    """The form's leaf (L, 13), center (P, 13) and tail (2,) at an answer: the inverse of ``answer_of``."""
+    n, L = len(answer.R), len(part.leaves)
+    numbers = np.zeros((n, 13))
+    if part.kind == "direct":
+        alpha = answer.scale if part.scale == "shared" else 1.0
+        numbers[:, :3] = alpha * answer.t
+        numbers[:, 4:] = vec(answer.R)
+        tail = np.array([answer.scale, 1.0])
+    else:
+        inverse_R = answer.R.transpose(0, 2, 1)
+        numbers[:, :3] = -np.einsum("nij,nj->ni", inverse_R, answer.t)
+        has = np.isfinite(answer.own_scale)
+        numbers[has, 3] = 1.0 / answer.own_scale[has]
+        numbers[:, 4:] = vec(inverse_R)
+        tail = np.array([1.0 / answer.scale, 1.0])
+    return numbers[:L], numbers[L:], tail
+
+
+def rotations_as_variables(part: Part, R: Array) -> Array:
+    """Rotations of frames as the form's: transposed where frames are inverted."""
+    return R if part.kind == "direct" else np.ascontiguousarray(R.transpose(0, 2, 1))
+
+
+def given_answer(
+    part: Part, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float]
+) -> Answer:
+    """The user's poses about the part's gauge."""
+    transforms = []
+    for name in part.free:
+        poses, what = (X, "X") if name in part.targets else (Y, "Y")
+        transforms.append(one_transform(poses[name], f"{what}[{name!r}]"))
+    stacked = np.array(transforms).reshape(-1, 4, 4)
+    shift = np.array([part.frame_shift(name) for name in part.free]).reshape(-1, 3)
+    own = np.full(len(part.free), np.nan)
+    for i, name in enumerate(part.free):
+        if name in part.scale_owners:
+            own[i] = _positive(scale[name] if isinstance(scale, Mapping) and name in scale else scale, name)
+    shared = _positive(scale, "all targets") if part.scale == "shared" else 1.0
+    return Answer(np.ascontiguousarray(stacked[:, :3, :3]), stacked[:, :3, 3] - shift, own, shared)
+
+
+def _positive(scale: float | Mapping[str, float], name: str) -> float:
+    if isinstance(scale, Mapping) or not (np.isfinite(scale) and scale > 0.0):
+        raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number")
+    return float(scale)

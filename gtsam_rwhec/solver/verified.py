@@ -1,0 +1,74 @@
+"""Verified tests of positive definiteness in floating point (Rump 2006), on arrow matrices and on dense ones.
+
+A Cholesky factorisation that runs to its end in double precision proves that the matrix plus its backward error is
+positive definite. The backward error has an a-priori bound (Higham 2002, theorem 10.3, any order of summation; Rump
+2006, "Verification of positive definiteness", lemma 2.1), entry by entry::
+
+    |dA_ij| <= g / (1 - g) sqrt(a_ii a_jj),   g = gamma_{N+1} = (N + 1) u / (1 - (N + 1) u)
+
+so dA is dominated by the diagonal matrix N g / (1 - g) a_ii. Subtract that (and what forming the matrix may have
+rounded) from the diagonal first: if the factorisation then succeeds, the matrix as stated is positive definite. It is
+a sufficient test: a failure proves nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver import arrow
+
+#: Unit roundoff of double precision.
+UNIT = 2.0**-53
+_SAFETY = 1.0 + 1e-10  # covers the rounding of the bounds' own few operations
+_TINY = 1e-290  # covers underflow
+
+
+def gamma(terms: int, unit: float = UNIT) -> float:
+    """gamma_n = n u / (1 - n u): the relative error of n rounded operations (Higham 2002, section 3.1)."""
+    if terms * unit >= 0.5:
+        raise OverflowError(f"{terms} terms are too many for a rounding bound with unit {unit:g}")
+    return _SAFETY * terms * unit / (1.0 - terms * unit)
+
+
+def cholesky_allowance(diagonal: Array, size: int) -> Array:
+    """What the factorisation of a matrix of this size and diagonal may have rounded, as a diagonal matrix."""
+    g = gamma(size + 1)
+    allowance: Array = _SAFETY * size * g / (1.0 - g) * np.abs(diagonal) + _TINY
+    return allowance
+
+
+def is_positive_definite(matrix: Array) -> bool:
+    """Whether a symmetric matrix, exactly as stored, is proven positive definite. False proves nothing.
+
+    Parameters
+    ----------
+    matrix : (N, N) array
+        Its lower triangle counts.
+    """
+    size = len(matrix)
+    empty = np.zeros((0, 1, 1)), np.zeros((0, 1, size))
+    return arrow_is_positive_definite(*empty, matrix, np.zeros((0, 1)), np.zeros(size))
+
+
+def arrow_is_positive_definite(D: Array, C: Array, E: Array, leaf_margin: Array, border_margin: Array) -> bool:
+    """Whether arrow(D, C, E) - diag(margin) is proven positive definite.
+
+    Parameters
+    ----------
+    D, C, E : (L, m, m), (L, m, b), (b, b) arrays
+    leaf_margin, border_margin : (L, m), (b,) arrays
+        Subtracted from the diagonal; negative to ask for less.
+    """
+    size = D.shape[0] * D.shape[1] + len(E)
+    leaf_diagonal = np.einsum("lii->li", D)
+    border_diagonal = np.diagonal(E)
+    D_shifted, E_shifted = D.copy(), E.copy()
+    for shifted, diagonal, margin in (
+        (np.einsum("lii->li", D_shifted), leaf_diagonal, leaf_margin),
+        (np.einsum("ii->i", E_shifted), border_diagonal, border_margin),
+    ):
+        # The subtraction itself rounds by at most u times its result.
+        reach = np.abs(diagonal) + np.abs(margin)
+        shifted -= margin + cholesky_allowance(reach, size) + 4.0 * UNIT * reach
+    return arrow.cholesky(D_shifted, C, E_shifted) is not None

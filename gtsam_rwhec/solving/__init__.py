@@ -1,0 +1,1 @@
+"""The globally optimal calibration of a problem with its certificate, and the certificate of anybody's answer."""

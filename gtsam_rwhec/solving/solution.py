@@ -1,0 +1,76 @@
+"""What solving returns: poses, scale, cost, certificate, identifiability, residuals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import gtsam
+
+from gtsam_rwhec.identifiability.identification import Identifiability, PairIdentifiability
+from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.solver.certificate import Certificate, Status
+from gtsam_rwhec.solver.residuals import Residual
+
+
+@dataclass(frozen=True)
+class SolvedPart:
+    """The frames of one unconnected part and its own certificate."""
+
+    names: tuple[str, ...]
+    certificate: Certificate
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A calibration.
+
+    Attributes
+    ----------
+    X : dict of str to gtsam.Pose3
+        T_targetcarrier_target of each target, metres.
+    Y : dict of str to gtsam.Pose3
+        T_sensorcarrier_sensor of each sensor, metres.
+    scale : float or dict of str to float
+        t_B = scale * true length: 1 when known, one number when shared, one for each target otherwise (and for
+        each sensor with motions of its own).
+    scale_mode : "known", "shared" or "per_target"
+    cost : float
+        J; half a chi-square when the weights are true.
+    is_relative : bool
+        Whether unit weights were used, which makes costs (and covariances) relative.
+    certificate : Certificate
+    identifiability : Identifiability
+    residuals : dict of (target, sensor) to Residual
+    parts : tuple of SolvedPart
+        The unconnected parts that were solved apart; one when all is connected.
+    """
+
+    X: dict[str, gtsam.Pose3]
+    Y: dict[str, gtsam.Pose3]
+    scale: float | dict[str, float]
+    scale_mode: ScaleMode
+    cost: float
+    is_relative: bool
+    certificate: Certificate
+    identifiability: Identifiability
+    residuals: dict[Pair, Residual]
+    parts: tuple[SolvedPart, ...]
+
+    def write_json(self, path: str | Path) -> None:
+        """Write the documented JSON file (``gtsam_rwhec.results.solution_file``)."""
+        from gtsam_rwhec.results.solution_file import write_solution  # the file format imports this module
+
+        write_solution(self, path)
+
+
+__all__ = [
+    "Certificate",
+    "Identifiability",
+    "PairIdentifiability",
+    "Residual",
+    "Solution",
+    "SolvedPart",
+    "Status",
+]

@@ -1,0 +1,1 @@
+"""The carriers' motion over time."""

@@ -1,0 +1,268 @@
+"""What is seen in one image: tags and boards with their corners, and everything that is not used, with its reason."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.vision import boards
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.codes import identified, quadrangles, unlike
+from gtsam_rwhec.vision.dictionaries import WIDEST, detector_of, modules, tag_detector
+from gtsam_rwhec.vision.edges import refine_corners
+from gtsam_rwhec.vision.images import Gray
+from gtsam_rwhec.vision.options import DetectionOptions
+from gtsam_rwhec.vision.pose import PlanePoses, plane_poses
+from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
+
+SMALL, BLURRED, GRAZING = "small", "blurred", "grazing"
+FEW, TWICE, NO_EDGES = "too few corners", "id seen twice in one image", "edges not found"
+NO_POSE, REPROJECTION, AMBIGUOUS = "no pose", "reprojection error", "ambiguous"
+#: Family and border of tags; ids of tags and their corners (n, 4, 2) in pixels.
+_Kind: TypeAlias = tuple[str, int]
+_Tags: TypeAlias = tuple[list[int], Array]
+REASONS = (SMALL, BLURRED, GRAZING, FEW, TWICE, NO_EDGES, NO_POSE, REPROJECTION, AMBIGUOUS)
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """A target in an image.
+
+    Attributes
+    ----------
+    target : str
+    corners_px : (n, 2) array
+        Those of its corners that were seen.
+    indices : (n,) integers
+        Which they are, of ``Target.corners``.
+    T : (2, 4, 4) array
+        T_camera_target, metres: a plane's two candidates, the one of smaller reprojection error first; nan where there
+        is none.
+    squared_px, reprojection_px : (2,) arrays
+        Sum of squared reprojection errors, and their root mean square.
+    covariance : (2, 6, 6) array
+        From corner noise; right perturbation, rotation first.
+    side_px : float
+        The shortest side of a tag, of a board's bounding box.
+    blur_px : float
+        Standard deviation of the blur across a tag's edges; nan for boards.
+    reason : str
+        One of `REASONS` if it is not to be used, else empty.
+    """
+
+    target: str
+    corners_px: Array
+    indices: np.ndarray
+    T: Array
+    squared_px: Array
+    reprojection_px: Array
+    covariance: Array
+    side_px: float
+    blur_px: float
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Of one image: detections, and how many tags of no target, by family and id."""
+
+    detections: tuple[Detection, ...]
+    strangers: dict[tuple[str, int], int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sighting:
+    """A target's corners before its pose."""
+
+    target: Target
+    indices: np.ndarray
+    corners_px: Array
+    blur_px: float = np.nan
+    reason: str = ""
+
+
+class Detector:
+    """Finds a camera's targets in its images. Not for two threads at once.
+
+    Parameters
+    ----------
+    camera : Camera
+    targets : sequence of Target
+    options : DetectionOptions
+    """
+
+    def __init__(self, camera: Camera, targets: Sequence[Target], options: DetectionOptions | None = None) -> None:
+        self.camera = camera
+        self.options = DetectionOptions() if options is None else options
+        self._owners = {(*_kind(t), i) for t in targets for i in t.ids}
+        kinds = sorted({_kind(target) for target in targets if target.ids})
+        self._ids = {kind: sorted(i for *of, i in self._owners if tuple(of) == kind) for kind in kinds}
+        #: By border, as OpenCV has one for all families that it looks for at once.
+        self._detectors = {
+            border: detector_of({family: ids for (family, b), ids in self._ids.items() if b == border}, border)
+            for border in sorted({border for _, border in kinds})
+        }
+        self._tags = {(*_kind(t), t.id): t for t in targets if isinstance(t, Tag)}
+        self._boards = [t for t in targets if isinstance(t, (Charuco, AprilGrid))]
+        self._checkerboards = [t for t in targets if isinstance(t, Checkerboard)]
+        self._charuco = {t.name: boards.charuco_detector(t) for t in targets if isinstance(t, Charuco)}
+
+    def __call__(self, images: Sequence[Gray]) -> list[Seen]:
+        """Detect in images (height, width) of 8 bits.
+
+        Many at once cost less: OpenCV goes through them one by one, edges and poses are refined together.
+        """
+        sightings: list[list[_Sighting]] = [[] for _ in images]
+        tags = self._tags_in(images)
+        for kind, found in tags.items():
+            for k, (gray, (ids, corners)) in enumerate(zip(images, found, strict=True)):
+                for board in self._boards:
+                    if _kind(board) == kind:
+                        indices, seen_px = self._board(gray, board, ids, corners)
+                        if len(indices):
+                            kept = boards.on_one_plane(self.camera, board.corners()[indices], seen_px)
+                            sightings[k].append(_Sighting(board, indices[kept], seen_px[kept]))
+            for k, sighting in self._single_tags(images, kind, found):
+                sightings[k].append(sighting)
+        for checkerboard in self._checkerboards:
+            for k, gray in enumerate(images):
+                seen_px = boards.checkerboard_corners(gray, checkerboard)
+                if len(seen_px):
+                    sightings[k].append(_Sighting(checkerboard, np.arange(len(seen_px)), seen_px))
+        judged = iter(self._judged([sighting for of_image in sightings for sighting in of_image]))
+        return [
+            Seen(tuple(next(judged) for _ in of_image), strangers)
+            for of_image, strangers in zip(sightings, self._strangers(images, tags), strict=True)
+        ]
+
+    def _tags_in(self, images: Sequence[Gray]) -> dict[_Kind, list[_Tags]]:
+        """Targets' tags of each kind in each image, corners in pixels to about one."""
+        tags: dict[_Kind, list[_Tags]] = {kind: [] for kind in self._ids}
+        for gray in images:
+            for border, detector in self._detectors.items():
+                quads, places, _, families = detector.detectMarkersMultiDict(gray)
+                corners = np.array(quads, dtype=float).reshape(-1, 4, 2)
+                place_of = np.ravel(places if len(quads) else []).astype(int)
+                family_of = np.ravel(families if len(quads) else []).astype(int)
+                kinds = [kind for kind in self._ids if kind[1] == border]
+                for number, kind in enumerate(kinds):
+                    mine = np.flatnonzero(family_of == number)
+                    tags[kind].append(([self._ids[kind][i] for i in place_of[mine]], corners[mine]))
+        return tags
+
+    def _strangers(
+        self, images: Sequence[Gray], tags: dict[_Kind, list[_Tags]]
+    ) -> Iterator[dict[tuple[str, int], int]]:
+        """How many tags of the targets' families are no target's, in each image."""
+        for k, gray in enumerate(images):
+            quads = quadrangles(gray) if tags else np.zeros((0, 4, 2))
+            quads = unlike(quads, np.concatenate([quads[:0], *(found[k][1] for found in tags.values())]))
+            strange: Counter[tuple[str, int]] = Counter()
+            for kind in tags:
+                ids = identified(gray, quads, *kind)
+                strange.update((kind[0], int(i)) for i in ids[ids >= 0] if (*kind, int(i)) not in self._owners)
+            yield dict(strange)
+
+    def _single_tags(self, images: Sequence[Gray], kind: _Kind, found: list[_Tags]) -> Iterator[tuple[int, _Sighting]]:
+        """Targets that are one tag, with the number of their image."""
+        mine = [(k, j) for k, (ids, _) in enumerate(found) for j, i in enumerate(ids) if (*kind, i) in self._tags]
+        if not mine:
+            return
+        rough = np.array([found[k][1][j] for k, j in mine])
+        image_of = np.array([k for k, _ in mine])
+        refined = refine_corners(images, image_of, rough, self.camera, modules(*kind))
+        for (k, j), at_first, sharp, blur in zip(
+            mine, rough, refined.corners_px, refined.blur_px.tolist(), strict=True
+        ):
+            ids = found[k][0]
+            reason = TWICE if ids.count(ids[j]) > 1 else ""
+            if not np.isfinite(sharp).all():
+                reason, sharp = reason or NO_EDGES, at_first
+            elif blur > self.options.max_blur_px:
+                reason = reason or BLURRED
+            yield k, _Sighting(self._tags[(*kind, ids[j])], np.arange(4), sharp, blur, reason)
+
+    def _board(self, gray: Gray, board: Target, ids: list[int], corners: Array) -> tuple[np.ndarray, Array]:
+        mine = [k for k, i in enumerate(ids) if i in board.ids]
+        numbers = np.array([ids[k] for k in mine], dtype=int)
+        if isinstance(board, Charuco):
+            return boards.charuco_corners(gray, board, self._charuco[board.name], numbers, corners[mine])
+        assert isinstance(board, AprilGrid)
+        return boards.aprilgrid_corners(gray, board, numbers, corners[mine])
+
+    def _judged(self, sightings: list[_Sighting]) -> list[Detection]:
+        """Poses of all sightings: those of tags together, and those of boards, which have more corners."""
+        result: dict[int, Detection] = {}
+        for of_tags in (True, False):
+            places = [i for i, s in enumerate(sightings) if isinstance(s.target, Tag) == of_tags]
+            usable = [i for i in places if len(sightings[i].indices) >= 4]  # a plane's pose needs four points
+            poses = plane_poses(
+                self.camera,
+                [sightings[i].target.corners()[sightings[i].indices] for i in usable],
+                [sightings[i].corners_px for i in usable],
+                corner_px=self.options.corner_px,
+            )
+            row = {i: k for k, i in enumerate(usable)}
+            result |= {i: self._detection(sightings[i], poses, row.get(i)) for i in places}
+        return [result[i] for i in range(len(sightings))]
+
+    def _detection(self, sighting: _Sighting, poses: PlanePoses, place: int | None) -> Detection:
+        corners, options = sighting.corners_px, self.options
+        side = _shortest_side(sighting.target, corners)
+        T, squared, rms = np.full((2, 4, 4), np.nan), np.full(2, np.nan), np.full(2, np.nan)
+        covariance = np.full((2, 6, 6), np.nan)
+        if place is not None:
+            T, squared, rms = poses.T[place], poses.squared_px[place], poses.reprojection_px[place]
+            covariance = poses.covariance[place]
+        reason = sighting.reason
+        if not reason and not isinstance(sighting.target, Tag) and len(corners) < options.min_corners:
+            reason = FEW
+        if not reason and side < options.min_side_px:
+            reason = SMALL
+        if not reason and not np.isfinite(squared[0]):
+            reason = NO_POSE
+        if not reason and rms[0] > options.max_reprojection_px:
+            reason = REPROJECTION
+        if not reason and grazing_rad(T[0]) > np.radians(options.max_grazing_deg):
+            reason = GRAZING
+        name = sighting.target.name
+        return Detection(
+            name, corners, sighting.indices, T, squared, rms, covariance, side, float(sighting.blur_px), reason
+        )
+
+
+def grazing_rad(T_camera_target: Array) -> float:
+    """Angle between the line of sight to a target's origin and its normal; 0 is seen from the front."""
+    t = T_camera_target[:3, 3]
+    cosine = -float(T_camera_target[:3, 2] @ t) / float(np.linalg.norm(t))
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def seen(gray: Gray) -> dict[str, list[int]]:
+    """Every tag of every family in an image, AprilGrids' double borders included: family to ids, in order.
+
+    For a first look; small ArUco dictionaries give false positives now and then.
+    """
+    result: dict[str, list[int]] = {}
+    for family in WIDEST:
+        for border_bits in (1, 2) if family.startswith("tag36") else (1,):
+            _, ids, _ = tag_detector(family, border_bits).detectMarkers(gray)
+            if ids is not None:
+                result.setdefault(family, []).extend(int(i) for i in np.ravel(ids))
+    return {family: sorted(ids) for family, ids in result.items()}
+
+
+def _kind(target: Target) -> _Kind:
+    """Family and border of a target's tags: what one run of OpenCV's detector finds."""
+    return target.family, 2 if isinstance(target, AprilGrid) else 1
+
+
+def _shortest_side(target: Target, corners: Array) -> float:
+    if isinstance(target, Tag):
+        return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
+    return float(np.ptp(corners, axis=0).min())

@@ -1,0 +1,127 @@
+"""YAML with lines: what scalars become, where things are, and all that is refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.files.yaml_lines import MOST_BYTES, OPENCV_MATRIX, dotted, parse_yaml, read_yaml, shown
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1", 1), ("-12", -12), ("010", 10), ("1e-3", 1e-3), ("1.", 1.0), (".5", 0.5), ("+2.5E+2", 250.0),
+        ("9" * 5000, math.inf), ("1234567890123456789", 1234567890123456789.0), ("-.inf", -math.inf),
+        ("true", True), ("False", False), ("yes", "yes"), ("no", "no"), ("12:30", "12:30"), ("1_000", "1_000"),
+        ("0x10", "0x10"), ("2020-01-01", "2020-01-01"), ("null", None), ("~", None), ("", None), ("'1'", "1"),
+        ('"true"', "true"), ("120 mm", "120 mm"), ("[1, a]", (1, "a")), ("{}", {}), ("- 1\n- - 2\n", None),
+    ],
+)  # fmt: skip
+def test_scalars(text: str, value: object) -> None:
+    if text.startswith("- "):
+        text, value = "\n  " + text.replace("\n", "\n  "), (1, (2,))
+    read = parse_yaml(f"a: {text}", "f").data["a"]
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_not_a_number_is_read_and_left_to_be_refused() -> None:
+    assert math.isnan(parse_yaml("a: .NaN", "f").data["a"])
+
+
+def test_lines_are_those_of_keys_and_of_elements() -> None:
+    text = "# first\na:\n  b:\n    1\n  c: [1,\n    {d: 2}]\ne:\n- x\n- y\n"
+    file = parse_yaml(text, "f")
+    assert file.data == {"a": {"b": 1, "c": (1, {"d": 2})}, "e": ("x", "y")}
+    lines = {("a",): 2, ("a", "b"): 3, ("a", "c"): 5, ("a", "c", 1): 6, ("a", "c", 1, "d"): 6, ("e", 1): 9}
+    assert {path: file.line(path) for path in lines} == lines
+    assert file.line(("a", "z", "y")) == 2
+    assert file.line(()) == 2
+    assert file.fault(("a", "c", 1), "wrong") == "f, line 6: a.c[1]: wrong"
+    assert file.fault((), "wrong") == "f, line 2: wrong"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "f is empty"),
+        ("# only this\n", "f is empty"),
+        ("a: 1\nb: &x 2\n", "line 2: the anchor &x"),
+        ("a: 1\nb: *x\n", r"line 2: the alias \*x"),
+        ("a: &x [*x]", "line 1: the anchor &x"),
+        ("b: {<<: *x}", r"the alias \*x"),
+        ("\na: !!python/object/apply:os.system [ls]", "line 2: the tag '!!python/object/apply:os.system'"),
+        ("a: !!float 1", "the tag '!!float'"),
+        ("a: !mine {b: 1}", "the tag '!mine'"),
+        ("a: !!opencv-matrix {}", "the tag '!!opencv-matrix'"),
+        ("a: 1\nb: 2\na: 3", "line 3: a is there twice, first in line 1"),
+        ("x:\n  a: 1\n  a: 3", "line 3: x.a is there twice, first in line 2"),
+        ("'1': 1\n1: 3", "line 2: 1 is there twice"),
+        ("{[1]: 2}", "line 1: a key that is itself a list or a mapping"),
+        ("? {a: 1}\n: 2", "line 1: a key that is itself"),
+        ("a: 1\n---\nb: 1", "line 2: a second document"),
+        ("a: [1, 2\nb: 3", "line 2: not YAML"),
+        ("a:\n\tb: 3", "line 2: not YAML: .*indent with blanks, not tabs"),
+        ("a: 1\n b: 2", "line 2: not YAML"),
+        ("a: 1\nb: \x00", "line 2: a character that no YAML file has"),
+        ('a: "\\UFFFFFFFF"', "not YAML"),
+        ("a: " + "[" * 21 + "]" * 21, "line 1: more than 20"),
+        ("[" * 200_000, "line 1: more than 20"),
+        ("%YAML " + "1" * 5000 + ".0\n---\na: 1", "not YAML"),
+    ],
+)
+def test_refused(text: str, words: str) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        parse_yaml(text, "f")
+
+
+def test_depth_that_is_read() -> None:
+    assert parse_yaml("a: " + "[" * 19 + "]" * 19, "f").data
+
+
+def test_a_tag_that_is_passed_over() -> None:
+    assert parse_yaml("a: !!opencv-matrix {b: 1}", "f", tags=(OPENCV_MATRIX,)).data == {"a": {"b": 1}}
+
+
+def test_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    with pytest.raises(FileFormatError, match=r"a\.yaml cannot be read: No such file"):
+        read_yaml(path)
+    with pytest.raises(FileFormatError, match="cannot be read: Is a directory"):
+        read_yaml(tmp_path)
+    with pytest.raises(FileFormatError, match="cannot be read: embedded null"):
+        read_yaml("a\0b")
+    path.write_bytes(b"a: \xff\xfe")
+    with pytest.raises(FileFormatError, match=r"a\.yaml is not a text file in UTF-8 \(byte 3\)"):
+        read_yaml(path)
+    path.write_bytes(b"#" * (MOST_BYTES + 1))
+    with pytest.raises(FileFormatError, match="is larger than 1000000 bytes"):
+        read_yaml(path)
+    path.write_bytes(b"\xef\xbb\xbfa: 1")
+    assert read_yaml(path).data == {"a": 1}
+
+
+def test_paths_and_values_for_messages() -> None:
+    assert dotted(("a", "b/c", 2, "d e", "")) == "a.b/c[2].'d e'.''"
+    assert shown("\ud800") == r"'\ud800'"
+    assert shown(None) == "empty"
+    assert shown("x" * 100) == "'" + "x" * 59 + "..."
+    assert (shown((1, 2)), shown((1,) * 99), shown({"a": 1}), shown(True)) == (
+        "[1, 2]", "a list of 99", "a mapping of 1 keys", "true",
+    )  # fmt: skip
+
+
+@settings(deadline=None)
+@given(st.text(st.sampled_from("ab:-[]{}?,&*!|>'\"%@#\\\n \tU01.xF~<=é\x00\x85\ufeff\ud800"), max_size=60))
+def test_any_text_is_read_or_refused(text: str) -> None:
+    try:
+        file = parse_yaml(text, "f")
+    except FileFormatError:
+        return
+    assert all(1 <= line <= text.count("\n") + text.count("\x85") + 1 for line in file.lines.values())

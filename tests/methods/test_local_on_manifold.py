@@ -1,0 +1,203 @@
+"""LOM: the paper's residual and weights (Appendix C), and where it ends from close and from poor starts."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from refinement_problems import rig
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import (
+    FrameError,
+    MeasurementsNotKeptError,
+    NoiseError,
+    OptionError,
+    PriorError,
+    ScaleError,
+)
+from gtsam_rwhec.methods.local_on_manifold import (
+    FrameKeys,
+    LomOptions,
+    LomSolution,
+    local_on_manifold,
+    lom_factor,
+    standard_deviations,
+)
+from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, sphere
+from gtsam_rwhec.simulate.transforms import pose, random_directions, random_poses, rotations_of_vectors
+
+X, Y, SCALE = FrameKeys(0, 1), FrameKeys(2, 3), 4
+
+
+def from_near(simulation: Simulation, seed: int = 0, **options: Any) -> LomSolution:
+    """Started up to 10 cm and 10 degrees from the truth, with a scale of 1."""
+    generator = np.random.default_rng(seed)
+    starts = []
+    for frames in (simulation.X, simulation.Y):
+        truth = np.array([*frames.values()])
+        turns = random_directions(len(truth), generator) * generator.uniform(0.0, math.radians(10.0), (len(truth), 1))
+        moves = random_directions(len(truth), generator) * generator.uniform(0.0, 0.1, (len(truth), 1))
+        near = pose(truth[:, :3, :3] @ rotations_of_vectors(turns), truth[:, :3, 3] + moves)
+        starts.append(dict(zip(frames, near, strict=True)))
+    return local_on_manifold(simulation.problem, *starts, options=LomOptions(**options))
+
+
+def largest_distance(a: Any, b: Any) -> tuple[float, float]:
+    """Over all frames, in metres and rad."""
+    pairs = [(a.X[name], b.X[name]) for name in b.X] + [(a.Y[name], b.Y[name]) for name in b.Y]
+    distances = [frame_distance(p.matrix(), q.matrix()) for p, q in pairs]
+    return max(d.translation_m for d in distances), max(d.rotation_rad for d in distances)
+
+
+def test_weights_are_appendix_cs() -> None:
+    raw = sphere(Noise(0.03, 12.0), 0).problem.measurements("camera", "marker")
+    sigma_R, sigma_t = standard_deviations(raw, "paper")
+    np.testing.assert_allclose(sigma_R, 1.0 / math.sqrt(12.0))
+    np.testing.assert_allclose(sigma_t, 0.03)
+    sigma_R, sigma_t = standard_deviations(raw, "matched")
+    np.testing.assert_allclose(sigma_R, 1.0 / math.sqrt(24.0))
+    np.testing.assert_allclose(sigma_t, 0.03)
+    sigma_R, sigma_t = standard_deviations(raw, (0.5, 2.0))
+    assert sigma_R.shape == sigma_t.shape == (100,)
+    assert sigma_R[0] == 0.5
+    assert sigma_t[0] == 2.0
+
+
+@pytest.mark.parametrize("monocular", [False, True])
+def test_cost_is_half_of_equation_78(monocular: bool) -> None:
+    simulation = sphere(Noise(0.05, 12.0), 0, monocular=monocular, number_of_measurements=8)
+    T_X, T_Y = random_poses(2, 1.0, np.random.default_rng(1))
+    alpha = 0.7 if monocular else 1.0
+    found = local_on_manifold(simulation.problem, {"camera": T_X}, {"marker": T_Y}, alpha, LomOptions(max_iterations=1))
+    raw = simulation.problem.measurements("camera", "marker")
+    expected = 0.0
+    for A, B in zip(raw.A, raw.B, strict=True):
+        e_R = gtsam.Rot3.Logmap(gtsam.Rot3(T_X[:3, :3].T @ A[:3, :3].T @ T_Y[:3, :3] @ B[:3, :3]))
+        # eq. 76's t_X and t_Y are in B's unit
+        e_t = A[:3, :3] @ (alpha * T_X[:3, 3]) + alpha * A[:3, 3] - T_Y[:3, :3] @ B[:3, 3] - alpha * T_Y[:3, 3]
+        expected += 0.5 * (12.0 * e_R @ e_R + e_t @ e_t / 0.05**2)
+    assert found.initial_cost == pytest.approx(expected, rel=1e-12)
+    assert found.cost < found.initial_cost
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e-4])
+def test_jacobians(spread: float) -> None:
+    """At random poses and near a residual of zero; and the gradient is that of eq. 77, which lacks J_r^-1."""
+    generator = np.random.default_rng(2)
+    A = random_poses(5, 1.0, generator)
+    T_X, T_Y = random_poses(2, 1.0, generator)
+    B = np.linalg.inv(T_Y) @ A @ T_X
+    noise = generator.normal(0.0, spread, (5, 6))
+    B = B @ pose(rotations_of_vectors(noise[:, :3]), noise[:, 3:])
+    factor = lom_factor(X, Y, SCALE, A, B, np.linspace(0.5, 2.0, 5), np.linspace(0.1, 3.0, 5))
+    values = gtsam.Values()
+    for keys, T in ((X, T_X), (Y, T_Y)):
+        values.insert(keys.rotation, gtsam.Rot3(T[:3, :3]))
+        values.insert(keys.translation, T[:3, 3])
+    values.insert(SCALE, np.array([1.1]))
+
+    def moved(key: int, step: np.ndarray) -> np.ndarray:
+        delta = gtsam.VectorValues()
+        delta.insert(key, step)
+        return factor.unwhitenedError(values.retract(delta))
+
+    h = 1e-6
+    numeric = np.column_stack(
+        [
+            (moved(key, h * axis) - moved(key, -h * axis)) / (2.0 * h)
+            for key in (0, 1, 2, 3, 4)
+            for axis in np.eye(1 if key == SCALE else 3)
+        ]
+    )
+    jacobian, negative = factor.linearize(values).jacobian()
+    np.testing.assert_allclose(jacobian, numeric, atol=1e-7)
+
+    # eq. 77 by left perturbations, here turned to right ones: de_R / dpsi_Y = R_B' R_Y' R_Y
+    weight = 1.0 / np.linspace(0.5, 2.0, 5)
+    papers = (weight[:, None, None] * B[:, :3, :3].transpose(0, 2, 1)).reshape(-1, 3)
+    rows = np.arange(30).reshape(5, 6)[:, :3].ravel()
+    np.testing.assert_allclose(papers.T @ negative[rows], jacobian[rows][:, 6:9].T @ negative[rows], atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", ["known", "shared"])
+def test_close_start_ends_at_the_truth_without_noise(scale: str) -> None:
+    simulation = rig(3, 2, scale=scale, noise=None)
+    found = from_near(simulation)
+    errors = simulation.errors(found)
+    assert max(e.translation_m for e in [*errors.X.values(), *errors.Y.values()]) < 1e-7
+    assert max(e.rotation_rad for e in [*errors.X.values(), *errors.Y.values()]) < 1e-7
+    assert errors.relative_scale < 1e-7
+
+
+@pytest.mark.parametrize("monocular", [False, True])
+def test_close_start_ends_at_the_certified_answer_within_noise(monocular: bool) -> None:
+    """With kappa's own weights; the two noise models differ by the angle's third order."""
+    simulation = sphere(Noise(0.005, 0.5 / math.radians(1.0) ** 2), 3, monocular=monocular)
+    certified = rw.solve(simulation.problem)
+    refined = rw.refine(simulation.problem, certified, rw.RefineOptions(noise="given"))
+    found = from_near(simulation, weights="matched")
+    translation_m, rotation_rad = largest_distance(found, certified)
+    variances = [np.diag(refined.covariance(name)) for name in ("camera", "marker")]
+    assert rotation_rad < 0.05 * math.sqrt(min(v[:3].max() for v in variances))
+    assert translation_m < 0.05 * math.sqrt(min(v[3:].max() for v in variances))
+    # the paper's weights give another answer, as good
+    other_m, other_rad = largest_distance(from_near(simulation), certified)
+    assert other_rad > rotation_rad
+    assert other_m < 0.02
+    assert other_rad < math.radians(1.0)
+
+
+def test_papers_weights_are_matched_ones_of_half_the_kappa() -> None:
+    full, half = sphere(Noise(0.01, 50.0), 0).problem, rw.Problem()
+    raw = full.measurements("camera", "marker")
+    half.add(target="camera", sensor="marker", A=raw.A, B=raw.B, sigma=raw.sigma, kappa=raw.kappa / 2.0)
+    start = ({"camera": np.eye(4)}, {"marker": np.diag([-1.0, -1.0, 1.0, 1.0])})
+    papers = local_on_manifold(full, *start)
+    matched = local_on_manifold(half, *start, options=LomOptions("matched"))
+    assert papers.cost == pytest.approx(matched.cost, rel=1e-12)
+    assert max(largest_distance(papers, matched)) < 1e-9
+
+
+def test_poor_start_ends_in_a_local_minimum_of_negative_scale() -> None:
+    simulation = sphere(Noise(0.01, 125.0), 0, monocular=True)
+    good = from_near(simulation)
+    ends = []
+    for seed in range(12):
+        T_X, T_Y = random_poses(2, 1.0, np.random.default_rng(seed))
+        ends.append(local_on_manifold(simulation.problem, {"camera": T_X}, {"marker": T_Y}))
+    wrong = [end for end in ends if end.scale < 0.0]
+    assert 0 < len(wrong) < len(ends)
+    assert all(end.cost > 2.0 * good.cost for end in wrong)
+    assert all(simulation.errors(end).Y["marker"].rotation_deg > 90.0 for end in wrong)
+    assert min(end.cost for end in ends) == pytest.approx(good.cost, rel=1e-9)
+
+
+def test_bad_input() -> None:
+    simulation = rig()
+    start = (simulation.X, simulation.Y)
+    with pytest.raises(FrameError, match="start's Y has no sensor0; it has sensor1"):
+        local_on_manifold(simulation.problem, simulation.X, {"sensor1": simulation.Y["sensor1"]})
+    with pytest.raises(MeasurementsNotKeptError):
+        local_on_manifold(rig(keep_measurements=False).problem, *start)
+    with pytest.raises(ScaleError, match="one scale for all"):
+        local_on_manifold(rig(scale="per_target").problem, *start)
+    with pytest.raises(FrameError, match="has motions"):
+        local_on_manifold(rig(odometry=1).problem, *start)
+    fixed = rig().problem
+    fixed.fix("sensor0", simulation.Y["sensor0"])
+    with pytest.raises(PriorError, match="sensor0"):
+        local_on_manifold(fixed, *start)
+    full = rw.Problem()
+    raw = simulation.problem.measurements("target0", "sensor0")
+    full.add(target="target0", sensor="sensor0", A=raw.A, B=raw.B, covariances=np.eye(6))
+    with pytest.raises(NoiseError, match="covariances"):
+        local_on_manifold(full, *start)
+    for weights in ("ours", (1.0,), (0.0, 1.0), (1.0, math.inf)):
+        with pytest.raises(OptionError, match="weights"):
+            LomOptions(weights=weights)  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="max_iterations"):
+        LomOptions(max_iterations=0)

@@ -1,0 +1,96 @@
+"""Problems for the certified core's tests, and its forms and points on them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.simulate import Noise, Simulation, general
+from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
+from gtsam_rwhec.solver.full_form import FullForm
+from gtsam_rwhec.solver.options import SolveOptions
+from gtsam_rwhec.solver.parts import Part, parts_of
+from gtsam_rwhec.solver.reduced_form import ReducedForm
+from gtsam_rwhec.solver.rotations import kkt_multipliers, vec
+from gtsam_rwhec.solver.search import Forms, Search
+from gtsam_rwhec.solver.start import spectral_start
+
+#: One centimetre, and half a degree about each axis.
+SMALL_NOISE = Noise(0.01, 6500.0)
+#: Sixty degrees about each axis, and half a metre.
+GROSS_NOISE = Noise(0.5, 0.4)
+
+
+def simulated(targets: int = 2, sensors: int = 1, seed: int = 0, **options: Any) -> Simulation:
+    """A general problem with small noise and ten measurements a pair, unless told otherwise."""
+    return general(targets, sensors, seed=seed, **{"noise": SMALL_NOISE, "number_of_measurements": 10} | options)
+
+
+def part_of(problem: rw.Problem) -> Part:
+    """The one part of a connected problem."""
+    (part,) = parts_of(problem)
+    return part
+
+
+def reduced(problem: rw.Problem) -> ReducedForm:
+    """Q' of a connected problem."""
+    return Forms.of(part_of(problem)).reduced
+
+
+def searched(problem: rw.Problem, **options: Any) -> Search:
+    """A search that has not run."""
+    return Search(part_of(problem), SolveOptions(**options))
+
+
+def optimum(problem: rw.Problem) -> Descent:
+    """Where the descent from the spectral start ends."""
+    part = part_of(problem)
+    forms = Forms.of(part)
+    ends = [descend(forms.reduced, start, 200) for start in spectral_start(part, forms.rotation)]
+    return min(ends, key=lambda end: end.cost)
+
+
+def multipliers_at(form: ReducedForm, R: Array) -> Array:
+    """Those of R'R = I at a point."""
+    return kkt_multipliers(R, form.apply(homogeneous(R))[:-1].reshape(-1, 9))
+
+
+def gradient_norm(form: ReducedForm, R: Array) -> float:
+    """Of the Riemannian gradient, halved, over the size of the form."""
+    G = form.apply(homogeneous(R))[:-1].reshape(-1, 9)
+    skew = R.transpose(0, 2, 1) @ G.reshape(-1, 3, 3).transpose(0, 2, 1)
+    return float(np.linalg.norm(skew - skew.transpose(0, 2, 1))) / form.magnitude
+
+
+def true_rotations(simulation: Simulation) -> Array:
+    """The truth as the form's variables: leaves, then centers; inverted in the form turned round."""
+    part = part_of(simulation.problem)
+    frames = simulation.X | simulation.Y
+    R = np.array([frames[name][:3, :3] for name in part.free])
+    return R if part.kind == "direct" else R.transpose(0, 2, 1)
+
+
+def flat(R: Array) -> Array:
+    """vec R_1, ..., vec R_n, one after the other."""
+    return vec(R).ravel()
+
+
+def dense_full(form: FullForm) -> Array:
+    """Q over [leaf numbers (13 each), center numbers (13 each), alpha, h] as one array."""
+    L, P = form.leaves, form.centers
+    Q = np.zeros((13 * (L + P) + 2,) * 2)
+    for i in range(L + P):
+        at = slice(13 * i, 13 * i + 13)
+        Q[at, at] = form.leaf[i] if i < L else form.center[i - L]
+        Q[at, -2:] = form.leaf_tail[i] if i < L else form.center_tail[i - L]
+        Q[-2:, at] = Q[at, -2:].T
+    for i in range(L):
+        for p in range(P):
+            rows, columns = slice(13 * i, 13 * i + 13), slice(13 * (L + p), 13 * (L + p) + 13)
+            Q[rows, columns] = form.leaf_center[i, p]
+            Q[columns, rows] = form.leaf_center[i, p].T
+    Q[-2:, -2:] = form.tail
+    return Q

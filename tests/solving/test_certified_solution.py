@@ -1,0 +1,364 @@
+"""``solve`` and ``certify`` from outside: optimality against the measurements, anybody's answer, starts, reports."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from naive_cost import naive_cost
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import NotCertifiedWarning, RwhecWarning, WeightsWarning
+from gtsam_rwhec.simulate import Motion, Noise, Simulation, general
+from gtsam_rwhec.simulate.transforms import pose, random_poses
+from gtsam_rwhec.solver.parts import parts_of
+
+NOISE = Noise(0.02, 300.0)
+MODES: dict[str, dict[str, Any]] = {
+    "known": dict(scale="known"),
+    "shared": dict(scale="shared"),
+    "per_target": dict(scale="per_target", known_sizes=("target1",)),
+}
+
+
+def simulated(mode: str, seed: int = 1, **options: Any) -> Simulation:
+    return general(2, 2, seed=seed, **{"noise": NOISE, "number_of_measurements": 12, **MODES[mode], **options})
+
+
+def matrices(poses: Any) -> dict[str, np.ndarray]:
+    return {name: T.matrix() if isinstance(T, gtsam.Pose3) else T for name, T in poses.items()}
+
+
+def cost_of(problem: rw.Problem, X: Any, Y: Any, scale: Any) -> float:
+    """By plain loops over the measurements."""
+    part = parts_of(problem)[0]
+    return naive_cost(problem, matrices(X), matrices(Y), scale, part.kind, part.gauge)
+
+
+def perturbed(poses: Any, size: float, seed: int) -> dict[str, gtsam.Pose3]:
+    generator = np.random.default_rng(seed)
+    return {name: T.retract(size * generator.standard_normal(6)) for name, T in poses.items()}
+
+
+def scaled(scale: Any, factor: float, known: tuple[str, ...] = ()) -> Any:
+    """Every unknown scale times a factor."""
+    if isinstance(scale, dict):
+        return {name: value if name in known else value * factor for name, value in scale.items()}
+    return scale * factor
+
+
+# -- solve ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["auto", "sdp", "local"])
+@pytest.mark.parametrize("knowledge", ["none", "fixed", "priors", "motions"])
+@pytest.mark.parametrize("mode", MODES)
+def test_no_small_step_from_the_answer_costs_less(mode: str, knowledge: str, method: Any) -> None:
+    """The gradient of the measurements' own cost is zero at the answer, along every pose and every unknown scale."""
+    simulation = simulated(mode, **(dict(odometry=8, odometry_noise=NOISE) if knowledge == "motions" else {}))
+    problem = simulation.problem
+    if knowledge == "fixed":
+        problem.fix("sensor0", simulation.Y["sensor0"])
+        problem.fix("target1", simulation.X["target1"])
+    if knowledge == "priors":
+        problem.add_prior("sensor1", simulation.Y["sensor1"] @ pose(np.eye(3), [0.05, 0.0, 0.1]), sigma=0.02, kappa=1e3)
+        problem.add_prior("target0", simulation.X["target0"], kappa=30.0)
+    initial = (simulation.X, simulation.Y, simulation.scale) if method == "local" else None
+    solution = rw.solve(problem, method, initial=initial)
+    assert solution.certificate.is_certified
+    assert solution.cost == pytest.approx(cost_of(problem, solution.X, solution.Y, solution.scale), rel=1e-9)
+    assert solution.certificate.lower_bound <= solution.cost
+
+    step = 1e-5
+    for name, T in {**solution.X, **solution.Y}.items():
+        if name in problem.fixed:
+            np.testing.assert_allclose(T.matrix(), problem.fixed[name], atol=1e-15)
+            continue
+        for axis in np.eye(6):
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = {**solution.X, **solution.Y, name: T.retract(sign * step * axis)}
+                X, Y = ({key: moved[key] for key in side} for side in (solution.X, solution.Y))
+                ends.append(cost_of(problem, X, Y, solution.scale))
+            curvature = (ends[0] + ends[1] - 2.0 * solution.cost) / step**2
+            assert curvature > 0.0
+            # The minimum is within a tenth of a micrometre or microradian.
+            assert abs(ends[0] - ends[1]) / (2.0 * step) < 1e-7 * curvature
+    if mode != "known":
+        names = problem.targets if mode == "per_target" else ("all",)
+        for name in names:
+            if name in problem.fixed_scales:
+                continue
+            ends = []
+            for sign in (1.0, -1.0):
+                scale = solution.scale
+                if isinstance(scale, dict):
+                    scale = {**scale, name: scale[name] * (1.0 + sign * step)}
+                    ends.append(cost_of(problem, solution.X, solution.Y, scale))
+                else:
+                    ends.append(cost_of(problem, solution.X, solution.Y, scale * (1.0 + sign * step)))
+            curvature = (ends[0] + ends[1] - 2.0 * solution.cost) / step**2
+            assert abs(ends[0] - ends[1]) / (2.0 * step) < 1e-7 * curvature
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_methods_agree(mode: str) -> None:
+    problem = simulated(mode).problem
+    auto, sdp = rw.solve(problem), rw.solve(problem, method="sdp")
+    assert "relaxation" in sdp.certificate.path
+    assert sdp.cost == pytest.approx(auto.cost, rel=1e-9)
+    for name, T in {**auto.X, **auto.Y}.items():
+        np.testing.assert_allclose({**sdp.X, **sdp.Y}[name].matrix(), T.matrix(), atol=1e-7)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("size", [1e-3, 0.2])
+def test_local_descends_from_the_users_start(mode: str, size: float) -> None:
+    problem = simulated(mode).problem
+    best = rw.solve(problem)
+    known = tuple(problem.fixed_scales)
+    start = (
+        perturbed(best.X, size, 1),
+        perturbed(best.Y, size, 2),
+        scaled(best.scale, 1.2, known) if mode != "known" else 1.0,
+    )
+    local = rw.solve(problem, method="local", initial=start)
+    assert "given start" in local.certificate.path
+    assert local.certificate.is_certified
+    assert local.cost == pytest.approx(best.cost, rel=1e-9)
+    for name, T in {**best.X, **best.Y}.items():
+        np.testing.assert_allclose({**local.X, **local.Y}[name].matrix(), T.matrix(), atol=1e-7)
+
+
+def with_local_minimum() -> tuple[rw.Problem, rw.Solution, rw.Solution]:
+    """Five noisy measurements, the best answer, and where descent from a bad start ends."""
+    problem = general(
+        1, 1, seed=0, noise=Noise(0.05, 20.0), number_of_measurements=5, motion=Motion(max_angle_rad=1.0)
+    ).problem
+    best = rw.solve(problem)
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        X, Y = random_poses(2, 1.0, generator)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)
+            local = rw.solve(problem, method="local", initial=({"target0": X}, {"sensor0": Y}, 1.0))
+        if local.cost > 2.0 * best.cost:
+            return problem, best, local
+    raise AssertionError("no start led to a local minimum")
+
+
+def test_a_local_minimum_is_not_certified() -> None:
+    problem, best, local = with_local_minimum()
+    assert best.certificate.is_certified
+    assert local.certificate.status == "gap"
+    assert not local.certificate.is_certified
+    assert local.certificate.lower_bound <= best.cost < local.cost
+    assert "local minimum" in local.certificate.reason
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)
+        warnings.simplefilter("error", NotCertifiedWarning)
+        with pytest.raises(NotCertifiedWarning, match="not proven optimal"):
+            rw.solve(problem, method="local", initial=(local.X, local.Y, 1.0))
+
+
+def test_a_local_minimum_given_to_certify_is_beaten() -> None:
+    problem, best, local = with_local_minimum()
+    certificate = rw.certify(problem, X=local.X, Y=local.Y)
+    assert certificate.status == "gap"
+    assert certificate.cost == pytest.approx(local.cost, rel=1e-9)
+    assert certificate.lower_bound == pytest.approx(best.cost, rel=1e-6)
+    assert f"a better answer exists: {best.cost:.8g} against {local.cost:.8g}" in certificate.reason
+
+
+# -- certify ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_optimum_is_certified_as_given(mode: str) -> None:
+    problem = simulated(mode).problem
+    solution = rw.solve(problem)
+    for X, Y in ((solution.X, solution.Y), (matrices(solution.X), matrices(solution.Y))):
+        certificate = rw.certify(problem, X=X, Y=Y, scale=solution.scale)
+        assert certificate.status == "certified"
+        assert "as given" in certificate.reason
+        assert certificate.cost == pytest.approx(solution.cost, rel=1e-9)
+        assert certificate.lower_bound <= certificate.cost
+        assert certificate.relative_gap < 1e-6
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("size", [1e-3, 0.1])
+def test_an_answer_beside_the_optimum_is_not(mode: str, size: float) -> None:
+    problem = simulated(mode).problem
+    best = rw.solve(problem)
+    X, Y = perturbed(best.X, size, 3), perturbed(best.Y, size, 4)
+    certificate = rw.certify(problem, X=X, Y=Y, scale=best.scale)
+    assert certificate.status == "gap"
+    assert certificate.cost == pytest.approx(cost_of(problem, X, Y, best.scale), rel=1e-9)
+    assert certificate.cost > best.cost
+    assert certificate.lower_bound == pytest.approx(best.cost, rel=1e-6)
+    assert "a better answer exists" in certificate.reason
+    assert certificate.gap == pytest.approx(certificate.cost - certificate.lower_bound)
+    assert certificate.relative_gap == pytest.approx(certificate.gap / certificate.cost)
+
+
+@pytest.mark.parametrize("mode", ["shared", "per_target"])
+def test_the_optimum_with_another_scale_is_not(mode: str) -> None:
+    problem = simulated(mode).problem
+    best = rw.solve(problem)
+    wrong = scaled(best.scale, 1.05, tuple(problem.fixed_scales))
+    certificate = rw.certify(problem, X=best.X, Y=best.Y, scale=wrong)
+    assert certificate.status == "gap"
+    assert certificate.cost == pytest.approx(cost_of(problem, best.X, best.Y, wrong), rel=1e-9)
+    assert "a better answer exists" in certificate.reason
+
+
+def test_one_number_stands_for_all_unknown_scales() -> None:
+    simulation = general(2, 1, seed=1, noise=NOISE, scale="per_target", true_scale={"target0": 0.8, "target1": 0.8})
+    problem = simulation.problem
+    each = rw.certify(problem, X=simulation.X, Y=simulation.Y, scale={"target0": 0.8, "target1": 0.8})
+    assert rw.certify(problem, X=simulation.X, Y=simulation.Y, scale=0.8).cost == each.cost
+
+
+def test_the_truth_is_near_the_optimum_but_not_it() -> None:
+    """Noise takes the optimum away from the truth: its cost is above by about half the number of unknowns."""
+    simulation = simulated("known", number_of_measurements=50)
+    best = rw.solve(simulation.problem)
+    certificate = rw.certify(simulation.problem, X=simulation.X, Y=simulation.Y)
+    assert certificate.status == "gap"
+    assert 2.0 < certificate.cost - best.cost < 40.0  # half a chi-square of 24 degrees of freedom: 12 on average
+
+
+def test_parts_are_certified_together() -> None:
+    simulation = general(2, 2, seed=2, graph=[(0, 0), (1, 1)], noise=NOISE)
+    problem = simulation.problem
+    best = rw.solve(problem)
+    certificate = rw.certify(problem, X=best.X, Y=best.Y)
+    assert certificate.is_certified
+    assert certificate.cost == pytest.approx(sum(part.certificate.cost for part in best.parts), rel=1e-9)
+    worse = rw.certify(problem, X={**best.X, **perturbed({"target1": best.X["target1"]}, 0.01, 1)}, Y=best.Y)
+    assert worse.status == "gap"
+    assert worse.cost > certificate.cost
+    assert worse.lower_bound == pytest.approx(certificate.lower_bound, rel=1e-9)
+
+
+# -- what is reported -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_residuals_are_those_of_the_measurements(mode: str) -> None:
+    """Root mean squares in true metres and in radians, pair by pair."""
+    simulation = simulated(mode, odometry=6, odometry_noise=NOISE)
+    problem = simulation.problem
+    solution = rw.solve(problem)
+    poses = matrices({**solution.X, **solution.Y})
+    for target, sensor in problem.pairs:
+        data = problem.measurements(target, sensor)
+        alpha = solution.scale[target] if isinstance(solution.scale, dict) else solution.scale
+        translations, angles = [], []
+        for A, B in zip(data.A, data.B, strict=True):
+            left, right = A @ poses[target], poses[sensor] @ B
+            t_right = poses[sensor][:3, 3] + poses[sensor][:3, :3] @ B[:3, 3] / alpha
+            translations.append(np.linalg.norm(left[:3, 3] - t_right))
+            angles.append(gtsam.Rot3(left[:3, :3]).between(gtsam.Rot3(right[:3, :3])).axisAngle()[1])
+        residual = solution.residuals[target, sensor]
+        assert residual.number_of_measurements == len(data.A)
+        assert residual.translation_rms_m == pytest.approx(np.sqrt(np.mean(np.square(translations))), rel=1e-9)
+        # The chord's root mean square, turned to an angle: the angles' own to second order.
+        assert residual.rotation_rms_rad == pytest.approx(np.sqrt(np.mean(np.square(angles))), rel=1e-3)
+
+
+def test_solution_has_every_frame_in_order() -> None:
+    problem = rw.Problem("per_target")
+    A = random_poses(8, 1.0, np.random.default_rng(0))
+    for target, sensor in (("b", "y"), ("a", "y"), ("a", "x")):
+        problem.add(target, sensor, A, A, 0.1, 10.0)
+    problem.add_motion("x", A, A, 0.1, 10.0)
+    solution = rw.solve(problem)
+    assert list(solution.X) == ["b", "a"]
+    assert list(solution.Y) == ["y", "x"]
+    assert isinstance(solution.scale, dict)
+    assert list(solution.scale) == ["b", "a", "x"]
+    assert solution.scale_mode == "per_target"
+    assert list(solution.residuals) == list(problem.pairs) == list(solution.identifiability.pairs)
+
+
+def test_stages_are_told_and_timed() -> None:
+    stages: list[str] = []
+    solution = rw.solve(simulated("known").problem, progress=stages.append)
+    assert stages[0] == "quadratic form"
+    assert stages[-1] == "identifiability"
+    assert set(solution.certificate.seconds) == set(stages)
+    assert all(seconds >= 0.0 for seconds in solution.certificate.seconds.values())
+    stages.clear()
+    rw.certify(simulated("known").problem, solution.X, solution.Y, progress=stages.append)
+    assert "descent" in stages
+
+
+@pytest.mark.parametrize(
+    ("mode", "said"), [("known", "A X = Y B"), ("shared", "A X = Y B"), ("per_target", "turned round")]
+)
+def test_the_certificate_says_which_cost_it_is_about(mode: str, said: str) -> None:
+    certificate = rw.solve(simulated(mode).problem).certificate
+    assert said in certificate.objective
+    assert f"{certificate.cost:.8g}" in str(certificate)
+
+
+def test_solving_does_not_change_the_problem() -> None:
+    problem = simulated("shared").problem
+    before = pickle.dumps(problem)
+    solution = rw.solve(problem)
+    rw.certify(problem, solution.X, solution.Y, solution.scale)
+    assert pickle.dumps(problem) == before
+    assert rw.solve(problem).cost == solution.cost
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_true_weights_raise_no_alarm(mode: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", WeightsWarning)
+        for seed in range(10):
+            rw.solve(simulated(mode, seed=seed).problem)
+
+
+@pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "per_target"])  # its cost is no chi-square
+def test_weights_far_from_the_residuals_do(mode: str) -> None:
+    data, problem = simulated(mode).problem, rw.Problem(MODES[mode]["scale"])
+    for pair in data.pairs:
+        raw = data.measurements(*pair)
+        problem.add(*pair, raw.A, raw.B, 0.1 * raw.sigma, 100.0 * raw.kappa)
+    with pytest.warns(WeightsWarning, match=r"1?[0-9]{2}(\.[0-9])? times what sigma and kappa predict"):
+        rw.solve(problem)
+
+
+@pytest.mark.parametrize("weight", [1e-6, 1e6])
+def test_units_of_the_weights_do_not_matter(weight: float) -> None:
+    """Relative weights: the same answer, the cost times the weight."""
+    simulation = simulated("known")
+    heavy = rw.Problem()
+    for pair in simulation.problem.pairs:
+        data = simulation.problem.measurements(*pair)
+        heavy.add(*pair, data.A, data.B, data.sigma / np.sqrt(weight), data.kappa * weight)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)
+        first, second = rw.solve(simulation.problem), rw.solve(heavy)
+    assert second.certificate.is_certified
+    assert second.cost == pytest.approx(weight * first.cost, rel=1e-9)
+    for name, T in {**first.X, **first.Y}.items():
+        np.testing.assert_allclose({**second.X, **second.Y}[name].matrix(), T.matrix(), atol=1e-8)
+
+
+def test_a_known_size_carries_over_to_targets_of_unknown_size() -> None:
+    simulation = general(
+        3, 1, seed=3, noise=Noise(0.001, 1e5), scale="per_target", known_sizes=("target2",), number_of_measurements=40
+    )
+    solution = rw.solve(simulation.problem)
+    assert isinstance(solution.scale, dict)
+    assert solution.scale["target2"] == 1.0
+    errors = simulation.errors(solution)
+    assert isinstance(errors.relative_scale, dict)
+    assert max(errors.relative_scale.values()) < 0.005
