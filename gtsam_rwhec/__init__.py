@@ -18,8 +18,8 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.refinement.refining import refine
-from gtsam_rwhec.results.refined_file import read_refined
-from gtsam_rwhec.results.solution_file import read_solution
+from gtsam_rwhec.results.refined_file import read_refined, write_refined
+from gtsam_rwhec.results.solution_file import read_solution, write_solution
 from gtsam_rwhec.solver.certificate import Certificate, Status
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solving.certified_solution import certify, solve
@@ -59,6 +59,8 @@ __all__ = [
     "refine",
     "simulate",
     "solve",
+    "write_refined",
+    "write_solution",
 ]
 
 

@@ -38,8 +38,8 @@ from reports import (
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.handeye import METHODS
-from gtsam_rwhec.handeye.cost import squared_residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
+from gtsam_rwhec.handeye.motion_costs import squared_residuals
 
 COMPARED = ("DQNLOpt", "DQNLOptRnd", "DQ2ndOrd", "DQConvRlx", "DQ2Steps")
 TIMED = ("DQOpt", "DQ2ndOrd", "DQConvRlx", "DQ2Steps", "Dan")

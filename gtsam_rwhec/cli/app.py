@@ -27,7 +27,8 @@ from gtsam_rwhec.problem.csv_folder import read_csv
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
 from gtsam_rwhec.refinement.refining import refine
 from gtsam_rwhec.report import print_refined, print_solution, report_console
-from gtsam_rwhec.results.solution_file import read_solution
+from gtsam_rwhec.results.refined_file import write_refined
+from gtsam_rwhec.results.solution_file import read_solution, write_solution
 from gtsam_rwhec.solving.certified_solution import solve
 
 app = typer.Typer(
@@ -188,7 +189,10 @@ def calibrate(
                 solution = refined.solution  # that of the inliers, where outliers were left out
         try:
             if output is not None:
-                (solution if refined is None else refined).write_json(output)
+                if refined is None:
+                    write_solution(solution, output)
+                else:
+                    write_refined(refined, output)
                 typer.echo(f"Written to {output}.", err=True)
         finally:  # a result that cannot be written is shown all the same
             print_solution(solution)

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.handeye.cost import Moments, squared_residuals
+from gtsam_rwhec.handeye.cost import Moments
+from gtsam_rwhec.handeye.motion_costs import squared_residuals
 from gtsam_rwhec.handeye.motions import Motions
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
 from gtsam_rwhec.handeye.saddle import minimum

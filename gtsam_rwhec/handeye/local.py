@@ -16,10 +16,10 @@ from scipy.optimize import least_squares
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.chordal_form import chordal_moments, chordal_residuals
-from gtsam_rwhec.handeye.cost import squared_residuals
 from gtsam_rwhec.handeye.degenerate import free_directions
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms, left, right, to_transform
 from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.handeye.motion_costs import squared_residuals
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
 
 #: least_squares stops where a step changes cost or unknowns by less than this part of them: rounding.

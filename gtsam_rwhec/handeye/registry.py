@@ -13,12 +13,13 @@ from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, to_pos
 from gtsam_rwhec.handeye.alpha import estimate_alpha
 from gtsam_rwhec.handeye.approximate import dq2ndord, dq2ndord_lambda, dq2steps, dqconvrlx
 from gtsam_rwhec.handeye.certified import certified
-from gtsam_rwhec.handeye.cost import covariance_cost, moments_of, squared_mahalanobis, squared_residuals
+from gtsam_rwhec.handeye.cost import moments_of
 from gtsam_rwhec.handeye.daniilidis import daniilidis
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.iterative import dqitr
 from gtsam_rwhec.handeye.local import chvecopt, dqnlopt, dqnlopt_random, quatvecopt
 from gtsam_rwhec.handeye.method import Answer, HandEye, Method, Request, ScaleMode
+from gtsam_rwhec.handeye.motion_costs import covariance_cost, squared_mahalanobis, squared_residuals
 from gtsam_rwhec.handeye.motions import motions_of
 from gtsam_rwhec.handeye.optimal import dqopt
 from gtsam_rwhec.handeye.polynomial import dqoptpoly_resultant, dqoptpoly_sturm

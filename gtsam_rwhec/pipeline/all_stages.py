@@ -18,6 +18,7 @@ from gtsam_rwhec.pipeline.solution_plots import plot_all
 from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
 from gtsam_rwhec.pipeline.stage_output import check_not_onto, check_writable
+from gtsam_rwhec.results.refined_file import write_refined
 from gtsam_rwhec.rig import Rig
 
 Progress = Callable[[str], None]
@@ -106,7 +107,7 @@ def solve_into(
     """
     out = made_folder(out)
     calibrated = solve_log(clean_path, rig, progress=progress)
-    calibrated.write_json(out / RESULT)
+    write_refined(calibrated.refined, out / RESULT, calibrated.log)
     write_solved(clean_path, calibrated, out / CLEAN, images=images)
     return calibrated
 

@@ -22,7 +22,6 @@ from gtsam_rwhec.problem.problem import ScaleMode
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.refining import refine
-from gtsam_rwhec.results.refined_file import write_refined
 from gtsam_rwhec.results.stage_reports import (
     CleaningReport,
     DetectionReport,
@@ -68,10 +67,6 @@ class Calibrated:
     log: LogFields
     cameras: dict[str, Camera]
     rig: Rig
-
-    def write_json(self, path: str | Path) -> None:
-        """Write everything but the measurements (``gtsam_rwhec.read_refined``, ``read_solution``)."""
-        write_refined(self.refined, path, self.log)
 
 
 def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progress | None = None) -> Calibrated:

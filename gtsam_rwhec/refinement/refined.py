@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import gtsam
@@ -247,12 +246,6 @@ class Refined(RefinedPoses):
 
     def __reduce__(self) -> str:
         raise TypeError(
-            "a Refined holds a GTSAM graph with Python factors, which can be neither pickled nor copied; write_json "
-            "keeps everything but the graph (rw.read_refined)"
+            "a Refined holds a GTSAM graph with Python factors, which can be neither pickled nor copied; "
+            "rw.write_refined keeps everything but the graph"
         )
-
-    def write_json(self, path: str | Path) -> None:
-        """Write the certified solution and everything refined, but the graph (``gtsam_rwhec.read_refined``)."""
-        from gtsam_rwhec.results.refined_file import write_refined  # the file format imports this module
-
-        write_refined(self, path)

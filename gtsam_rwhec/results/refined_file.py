@@ -71,7 +71,7 @@ def _fields(refined: Refined, log: LogFields | None) -> ResultFile:
 
 
 def read_refined(path: str | Path) -> RefinedPoses:
-    """Read what ``Refined.write_json`` wrote: poses and covariances are the same doubles as before.
+    """Read what ``write_refined`` wrote: poses and covariances are the same doubles as before.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def refined_of(result: ResultFile, path: str | Path) -> RefinedPoses:
     if fields is None:
         raise FileFormatError(
             f"{path} holds a solution that was not refined; read it with read_solution, or refine and write that "
-            "(gtsam-rwhec calibrate --refine, or Refined.write_json)."
+            "(gtsam-rwhec calibrate --refine, or rw.write_refined)."
         )
     return RefinedPoses(
         X={pose.child: pose_from_file(pose) for pose in fields.targets},

@@ -7,6 +7,7 @@ every file. Poses carry the rotation twice: as a matrix, which is read back, and
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -158,13 +159,11 @@ def _in_words(error: ValidationError) -> str:
 
 def fields_of(solution: Solution) -> ResultFile:
     """A solution's fields."""
-    from gtsam_rwhec import __version__  # the package imports this module
-
     identifiability = solution.identifiability
     return ResultFile(
         format=FORMAT,
         format_version=UNREFINED_VERSION,
-        written_by=f"gtsam-rwhec {__version__}",
+        written_by=f"gtsam-rwhec {version('gtsam-rwhec')}",
         conventions=CONVENTIONS,
         targets=tuple(pose_to_file("targetcarrier", name, pose) for name, pose in solution.X.items()),
         sensors=tuple(pose_to_file("sensorcarrier", name, pose) for name, pose in solution.Y.items()),

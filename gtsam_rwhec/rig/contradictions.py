@@ -4,40 +4,42 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 from gtsam_rwhec.errors import OptionError, TargetError
 from gtsam_rwhec.files.yaml_lines import KeyPath, suggestion
+from gtsam_rwhec.rig.schema import Carriers, Sensor, TargetSection
 from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.targets import Checkerboard, Target
-
-if TYPE_CHECKING:
-    from gtsam_rwhec.rig.schema import RigFile
 
 Fault = tuple[KeyPath, str]
 
 
-def contradictions(rig: RigFile) -> Iterator[Fault]:
-    """Every fault: the path of the value, and what is wrong with it."""
-    yield from _carriers(rig)
-    yield from _sensors(rig)
-    targets = []
-    if not rig.targets:
+def contradictions(
+    carriers: Carriers,
+    sensors: Mapping[str, Sensor],
+    targets: Mapping[str, TargetSection],
+    detection: Mapping[str, Any],
+) -> Iterator[Fault]:
+    """Every fault of a rig file's sections: the path of the value, and what is wrong with it."""
+    yield from _carriers(carriers)
+    yield from _sensors(sensors)
+    printed = []
+    if not targets:
         yield ("targets",), "none; give one or more"
-    for name, section in rig.targets.items():
+    for name, section in targets.items():
         try:
-            targets.append(section.target(name))
+            printed.append(section.target(name))
         except TargetError as error:
             yield ("targets", name), str(error).removeprefix(f"target {name}: ")
-    yield from _names(rig)
-    yield from _detection(rig)
-    yield from _lookalikes(targets)
+    yield from _names(carriers, sensors, targets)
+    yield from _detection(detection)
+    yield from _lookalikes(printed)
 
 
-def _carriers(rig: RigFile) -> Iterator[Fault]:
-    carriers = rig.carriers
+def _carriers(carriers: Carriers) -> Iterator[Fault]:
     if carriers.sensors == carriers.targets:
         yield ("carriers", "targets"), f"{carriers.targets!r} carries the sensors too; name two different frames"
     elif set(carriers.poses.frames) != {carriers.sensors, carriers.targets}:
@@ -50,12 +52,12 @@ def _carriers(rig: RigFile) -> Iterator[Fault]:
         )
 
 
-def _sensors(rig: RigFile) -> Iterator[Fault]:
-    if not rig.sensors:
+def _sensors(sensors: Mapping[str, Sensor]) -> Iterator[Fault]:
+    if not sensors:
         yield ("sensors",), "none; give one or more"
     for key in ("images", "detections"):
         first: dict[str, str] = {}
-        for name, sensor in rig.sensors.items():
+        for name, sensor in sensors.items():
             topic = getattr(sensor, key)
             if topic is not None and first.setdefault(topic, name) != name:
                 yield (
@@ -64,26 +66,25 @@ def _sensors(rig: RigFile) -> Iterator[Fault]:
                 )
 
 
-def _names(rig: RigFile) -> Iterator[Fault]:
+def _names(carriers: Carriers, sensors: Mapping[str, Sensor], targets: Mapping[str, TargetSection]) -> Iterator[Fault]:
     """Frames that have one name, whatever they are of."""
-    carriers = rig.carriers
     named: list[tuple[str, KeyPath, str]] = [(carriers.sensors, ("carriers", "sensors"), "the sensors' carrier")]
     if carriers.targets != carriers.sensors:
         named.append((carriers.targets, ("carriers", "targets"), "the targets' carrier"))
-    for name, sensor in rig.sensors.items():
+    for name, sensor in sensors.items():
         named.append((name, ("sensors", name), f"sensor {name}"))
         if sensor.frame not in (None, name):
             named.append((str(sensor.frame), ("sensors", name, "frame"), f"the frame of sensor {name}"))
-    named += [(name, ("targets", name), f"target {name}") for name in rig.targets]
+    named += [(name, ("targets", name), f"target {name}") for name in targets]
     first: dict[str, str] = {}
     for name, path, what in named:
         if first.setdefault(name, what) != what:
             yield path, f"{name!r} is the name of {first[name]} already; each frame needs its own"
 
 
-def _detection(rig: RigFile) -> Iterator[Fault]:
+def _detection(detection: Mapping[str, Any]) -> Iterator[Fault]:
     known = [field.name for field in fields(DetectionOptions)]
-    for key, value in rig.detection.items():
+    for key, value in detection.items():
         if key not in known:
             yield ("detection", key), suggestion(key, known)
             continue

@@ -15,7 +15,7 @@ from pydantic_core import ErrorDetails
 from gtsam_rwhec.errors import FileFormatError, RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
 from gtsam_rwhec.rig import schema
-from gtsam_rwhec.rig.schema import Rig, RigFile
+from gtsam_rwhec.rig.rig import Rig, RigFile
 
 #: Faults that one message has, at most.
 MOST_FAULTS = 20

@@ -6,21 +6,18 @@ that is not here is an error.
 
 from __future__ import annotations
 
-from functools import cached_property
-from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, ValidationError, model_validator
-from pydantic import Tag as UnionTag
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from gtsam_rwhec.rig.contradictions import contradictions
 from gtsam_rwhec.rig.field_types import Length, Name, Positive, Text, TimeOffset, list_of
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
+from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """What all sections share: no key that is not listed, no conversion, nothing infinite."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
     def _given(self, *names: str) -> list[str]:
@@ -28,14 +25,14 @@ class _Section(BaseModel):
         return [name for name in names if getattr(self, name) is not None]
 
 
-class PoseNoise(_Section):
+class PoseNoise(Section):
     """Standard deviations about and along each axis."""
 
     rotation_deg: Positive = Field(description="standard deviation about each axis, degrees")
     translation_mm: Positive = Field(description="standard deviation along each axis, millimetres")
 
 
-class PoseSource(_Section):
+class PoseSource(Section):
     """Where the carriers' poses are: a pair of tf frames, or a topic whose poses are T_parent_child."""
 
     tf: Annotated[tuple[Name, Name], list_of(2, "two frames, [parent, child]")] | None = None
@@ -59,7 +56,7 @@ class PoseSource(_Section):
         return self
 
 
-class Carriers(_Section):
+class Carriers(Section):
     """What the sensors are mounted on, what the targets are, and where the log has the one's pose in the other."""
 
     sensors: Name = Field(description="the frame that carries the sensors, such as hand")
@@ -69,7 +66,7 @@ class Carriers(_Section):
     noise: PoseNoise | None = None
 
 
-class Intrinsics(_Section):
+class Intrinsics(Section):
     """Where a camera's intrinsics are: a topic, a Kalibr camchain, another YAML file, or right here."""
 
     topic: Text | None = None
@@ -106,7 +103,7 @@ class Intrinsics(_Section):
         Camera.of(self.width, self.height, self.model, K, self.D or (), "these numbers")
 
 
-class Sensor(_Section):
+class Sensor(Section):
     """A camera, or a detection driver behind one."""
 
     images: Text | None = Field(default=None, description="topic of the camera's images")
@@ -129,7 +126,7 @@ class Sensor(_Section):
         return self
 
 
-class TagTarget(_Section):
+class TagTarget(Section):
     """A single tag."""
 
     type: Literal["tag"]
@@ -142,7 +139,7 @@ class TagTarget(_Section):
         return Tag(name, self.family, self.id, self.size_m)
 
 
-class CharucoTarget(_Section):
+class CharucoTarget(Section):
     """A ChArUco board of columns x rows squares."""
 
     type: Literal["charuco"]
@@ -158,7 +155,7 @@ class CharucoTarget(_Section):
         return Charuco(name, self.family, self.columns, self.rows, self.square_m, self.marker_m, self.first_id)
 
 
-class AprilGridTarget(_Section):
+class AprilGridTarget(Section):
     """Kalibr's AprilGrid."""
 
     type: Literal["aprilgrid"]
@@ -174,7 +171,7 @@ class AprilGridTarget(_Section):
         return AprilGrid(name, self.family, self.columns, self.rows, self.tag_m, self.spacing, self.first_id)
 
 
-class CheckerboardTarget(_Section):
+class CheckerboardTarget(Section):
     """A checkerboard, counted by inner corners."""
 
     type: Literal["checkerboard"]
@@ -192,7 +189,7 @@ TargetSection: TypeAlias = Annotated[
 ]
 
 
-class Noise(_Section):
+class Noise(Section):
     """Of B: standard deviations about and along each axis, or that of a corner in pixels."""
 
     rotation_deg: Positive | None = None
@@ -210,7 +207,7 @@ class Noise(_Section):
         return self
 
 
-class Cleaning(_Section):
+class Cleaning(Section):
     """What is taken out before anything is solved; a limit that is left out (null) takes nothing out."""
 
     min_rotation_deg: Positive = 0.5
@@ -220,44 +217,3 @@ class Cleaning(_Section):
     consensus: bool = True
     thin: bool = True
     robust: Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "gnc"] = "gnc"
-
-
-class RigFile(_Section):
-    """What a rig file says."""
-
-    carriers: Carriers = Field(description="what carries the sensors, what the targets, and where their poses are")
-    sensors: dict[Name, Sensor] = Field(description="by name, each with images or detections")
-    targets: dict[Name, TargetSection] = Field(description="by name, each with type and sizes")
-    sizes: Literal["known", "check", "estimate"] = "check"
-    noise: Annotated[
-        Annotated[Noise, UnionTag("numbers")] | Annotated[Literal["estimate"], UnionTag("word")],
-        Discriminator(lambda given: "word" if isinstance(given, str) else "numbers"),
-    ] = "estimate"
-    detection: dict[str, Any] = Field(default={}, description="fields of vision's DetectionOptions")
-    cleaning: Cleaning = Cleaning()
-
-    @cached_property
-    def target_list(self) -> tuple[Target, ...]:
-        """The targets as the vision package has them, named, in the file's order."""
-        return tuple(section.target(name) for name, section in self.targets.items())
-
-    def frame_of(self, sensor: str) -> str:
-        """The name of a sensor's frame."""
-        return self.sensors[sensor].frame or sensor
-
-    @model_validator(mode="after")
-    def _is_consistent(self) -> RigFile:
-        # pydantic puts the faults of a ValidationError that is raised here under their own places.
-        faults = [
-            InitErrorDetails(type=PydanticCustomError("value_error", "{words}", {"words": words}), loc=path, input=None)
-            for path, words in contradictions(self)
-        ]
-        if faults:
-            raise ValidationError.from_exception_data("rig", faults)
-        return self
-
-
-class Rig(RigFile):
-    """A rig file that has been read: what it says, and the folder that its relative paths are relative to."""
-
-    folder: Path = Path()

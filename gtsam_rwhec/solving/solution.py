@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import gtsam
 
@@ -57,12 +56,6 @@ class Solution:
     identifiability: Identifiability
     residuals: dict[Pair, Residual]
     parts: tuple[SolvedPart, ...]
-
-    def write_json(self, path: str | Path) -> None:
-        """Write the documented JSON file (``gtsam_rwhec.results.solution_file``)."""
-        from gtsam_rwhec.results.solution_file import write_solution  # the file format imports this module
-
-        write_solution(self, path)
 
 
 __all__ = [

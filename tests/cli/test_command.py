@@ -252,7 +252,7 @@ def test_not_certified_is_status_4(tmp_path: Path) -> None:
     folder = write_csv(problem, tmp_path / "csv")
     earlier = rw.solve(rw.read_csv(folder))
     elsewhere = dataclasses.replace(earlier, X={"tag_0": gtsam.Pose3()}, Y={"cam_0": gtsam.Pose3()})
-    elsewhere.write_json(tmp_path / "start.json")
+    rw.write_solution(elsewhere, tmp_path / "start.json")
     done = run(
         "calibrate", folder, "--sigma", 1, "--kappa", 1, "--method", "local", "--initial", tmp_path / "start.json"
     )

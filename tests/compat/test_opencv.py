@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from gtsam_rwhec import handeye, simulate, solve
 from gtsam_rwhec.compat import opencv
 from gtsam_rwhec.errors import CountError, OptionError, PoseError, UnderdeterminedError
-from gtsam_rwhec.handeye.cost import squared_residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
+from gtsam_rwhec.handeye.motion_costs import squared_residuals
 
 OURS = {"dqopt": opencv.CALIB_HAND_EYE_DQOPT, "certified": opencv.CALIB_HAND_EYE_CERTIFIED}
 

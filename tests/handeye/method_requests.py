@@ -1,8 +1,8 @@
 """What a method is asked, made without ``solve``; and its answer as a pose."""
 
 from gtsam_rwhec.geometry.poses import to_pose3
-from gtsam_rwhec.handeye.cost import cost_of
 from gtsam_rwhec.handeye.method import Request
+from gtsam_rwhec.handeye.motion_costs import cost_of
 from gtsam_rwhec.handeye.motions import motions_of
 
 

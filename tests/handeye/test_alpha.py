@@ -6,8 +6,8 @@ from simulated import distance, hand_held, pair, poses
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.handeye import cost_of, motions_of, solve
-from gtsam_rwhec.handeye.cost import squared_residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
+from gtsam_rwhec.handeye.motion_costs import squared_residuals
 
 
 @pytest.mark.parametrize("ratio", [0.05, 1.0, 20.0])

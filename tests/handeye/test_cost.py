@@ -6,8 +6,9 @@ from simulated import hand_held
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.handeye import cost as cost_module
-from gtsam_rwhec.handeye.cost import cost_of, moments_of, residuals, squared_mahalanobis, squared_residuals
+from gtsam_rwhec.handeye.cost import moments_of, residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms, left, right
+from gtsam_rwhec.handeye.motion_costs import cost_of, squared_mahalanobis, squared_residuals
 from gtsam_rwhec.handeye.motions import Motions, motions_of
 
 

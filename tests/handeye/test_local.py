@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from simulated import distance, hand_held, planar
 
 from gtsam_rwhec.handeye.chordal_form import chordal_moments, chordal_residuals
-from gtsam_rwhec.handeye.cost import squared_residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.local import (
     chvecopt,
@@ -21,6 +20,7 @@ from gtsam_rwhec.handeye.local import (
     rotation_entries,
     rotation_slopes,
 )
+from gtsam_rwhec.handeye.motion_costs import squared_residuals
 from gtsam_rwhec.handeye.motions import motions_of
 from gtsam_rwhec.handeye.optimal import dqopt
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior

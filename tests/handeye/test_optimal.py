@@ -10,8 +10,9 @@ from simulated import distance, hand_held, pair, planar, poses
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.handeye import METHODS, DualQuaternionPrior, solve
-from gtsam_rwhec.handeye.cost import cost_of, residuals, squared_residuals
+from gtsam_rwhec.handeye.cost import residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms, to_transform
+from gtsam_rwhec.handeye.motion_costs import cost_of, squared_residuals
 from gtsam_rwhec.handeye.motions import Motions, motions_of
 from gtsam_rwhec.handeye.optimal import proven_bound
 from gtsam_rwhec.handeye.saddle import best_dual, bracket, minimum, search

@@ -159,5 +159,5 @@ def test_groups_of_pairs_are_not_confused_by_dashes() -> None:
 
 @pytest.mark.parametrize("copy_of", [pickle.dumps, copy.deepcopy])
 def test_copies_are_refused_in_words(copy_of: Callable[[object], object]) -> None:
-    with pytest.raises(TypeError, match="write_json"):
+    with pytest.raises(TypeError, match="write_refined"):
         copy_of(rw.refine(PROBLEM, SOLUTION))

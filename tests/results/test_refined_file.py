@@ -62,7 +62,7 @@ KINDS: dict[str, Callable[[], rw.Refined]] = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_poses_and_covariances_come_back(kind: str, tmp_path: Path) -> None:
     refined = KINDS[kind]()
-    refined.write_json(tmp_path / "refined.json")
+    rw.write_refined(refined, tmp_path / "refined.json")
     back = rw.read_refined(tmp_path / "refined.json")
     for poses, others in ((refined.X, back.X), (refined.Y, back.Y)):
         assert list(poses) == list(others)
@@ -97,10 +97,10 @@ def test_poses_and_covariances_come_back(kind: str, tmp_path: Path) -> None:
 
 def test_the_certified_solution_is_in_the_same_file(tmp_path: Path) -> None:
     refined = KINDS["outliers"]()
-    refined.write_json(tmp_path / "refined.json")
-    refined.solution.write_json(tmp_path / "solution.json")
+    rw.write_refined(refined, tmp_path / "refined.json")
+    rw.write_solution(refined.solution, tmp_path / "solution.json")
     back = rw.read_solution(tmp_path / "refined.json")
-    back.write_json(tmp_path / "again.json")
+    rw.write_solution(back, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "solution.json").read_bytes()
     assert json.loads((tmp_path / "refined.json").read_bytes())["format_version"] == 2
     assert refined.inlier_counts["target1", "sensor0"] == (22, 30)
@@ -108,7 +108,7 @@ def test_the_certified_solution_is_in_the_same_file(tmp_path: Path) -> None:
 
 def test_infinite_is_null(tmp_path: Path) -> None:
     refined = KINDS["something free"]()
-    refined.write_json(tmp_path / "refined.json")
+    rw.write_refined(refined, tmp_path / "refined.json")
     text = (tmp_path / "refined.json").read_text(encoding="utf-8")
     assert "Infinity" not in text
     assert "NaN" not in text
@@ -124,7 +124,7 @@ def test_infinite_is_null(tmp_path: Path) -> None:
 
 
 def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
-    rw.solve(general(1, 1, seed=5, noise=NOISE).problem).write_json(tmp_path / "solution.json")
+    rw.write_solution(rw.solve(general(1, 1, seed=5, noise=NOISE).problem), tmp_path / "solution.json")
     with pytest.raises(FileFormatError, match=r"was not refined; read it with read_solution, or refine"):
         rw.read_refined(tmp_path / "solution.json")
 
@@ -145,7 +145,7 @@ def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
 )
 def test_damage_is_refused_with_its_place(damage: Callable[[Any], object], said: str, tmp_path: Path) -> None:
     path = tmp_path / "refined.json"
-    KINDS["known scale"]().write_json(path)
+    rw.write_refined(KINDS["known scale"](), path)
     raw = json.loads(path.read_text(encoding="utf-8"))
     damage(raw)
     path.write_text(json.dumps(raw), encoding="utf-8")
@@ -156,4 +156,4 @@ def test_damage_is_refused_with_its_place(damage: Callable[[Any], object], said:
 
 def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="cannot be written"):
-        KINDS["known scale"]().write_json(tmp_path / "nowhere" / "refined.json")
+        rw.write_refined(KINDS["known scale"](), tmp_path / "nowhere" / "refined.json")

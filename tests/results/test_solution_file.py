@@ -55,8 +55,8 @@ def test_the_same_solution_comes_back(demo_solution: rw.Solution, written: Path)
     assert back.certificate.is_certified
 
 
-def test_write_json_is_the_same_file(demo_solution: rw.Solution, written: Path, tmp_path: Path) -> None:
-    demo_solution.write_json(tmp_path / "other.json")
+def test_writing_twice_gives_the_same_file(demo_solution: rw.Solution, written: Path, tmp_path: Path) -> None:
+    rw.write_solution(demo_solution, tmp_path / "other.json")
     assert (tmp_path / "other.json").read_bytes() == written.read_bytes()
 
 

@@ -1,0 +1,57 @@
+"""A rig file as a whole: its sections, checked against one another."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, ValidationError, model_validator
+from pydantic import Tag as UnionTag
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from gtsam_rwhec.rig.contradictions import contradictions
+from gtsam_rwhec.rig.field_types import Name
+from gtsam_rwhec.rig.schema import Carriers, Cleaning, Noise, Section, Sensor, TargetSection
+from gtsam_rwhec.vision.targets import Target
+
+
+class RigFile(Section):
+    """What a rig file says."""
+
+    carriers: Carriers = Field(description="what carries the sensors, what the targets, and where their poses are")
+    sensors: dict[Name, Sensor] = Field(description="by name, each with images or detections")
+    targets: dict[Name, TargetSection] = Field(description="by name, each with type and sizes")
+    sizes: Literal["known", "check", "estimate"] = "check"
+    noise: Annotated[
+        Annotated[Noise, UnionTag("numbers")] | Annotated[Literal["estimate"], UnionTag("word")],
+        Discriminator(lambda given: "word" if isinstance(given, str) else "numbers"),
+    ] = "estimate"
+    detection: dict[str, Any] = Field(default={}, description="fields of vision's DetectionOptions")
+    cleaning: Cleaning = Cleaning()
+
+    @cached_property
+    def target_list(self) -> tuple[Target, ...]:
+        """The targets as the vision package has them, named, in the file's order."""
+        return tuple(section.target(name) for name, section in self.targets.items())
+
+    def frame_of(self, sensor: str) -> str:
+        """The name of a sensor's frame."""
+        return self.sensors[sensor].frame or sensor
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> RigFile:
+        # pydantic puts the faults of a ValidationError that is raised here under their own places.
+        faults = [
+            InitErrorDetails(type=PydanticCustomError("value_error", "{words}", {"words": words}), loc=path, input=None)
+            for path, words in contradictions(self.carriers, self.sensors, self.targets, self.detection)
+        ]
+        if faults:
+            raise ValidationError.from_exception_data("rig", faults)
+        return self
+
+
+class Rig(RigFile):
+    """A rig file that has been read: what it says, and the folder that its relative paths are relative to."""
+
+    folder: Path = Path()
