@@ -7,12 +7,11 @@ from pathlib import Path
 
 import cv2
 import pytest
+from places import REPOSITORY
 
 #: Beside calls that OpenCV 5 lacks; with it these run where tests/vision/test_other_opencv.py brings OpenCV 4.
 BESIDE_OPENCV_4 = ["compat/test_beside_opencv4.py", "methods/test_opencv4.py"]
 collect_ignore = [] if hasattr(cv2, "calibrateRobotWorldHandEye") else BESIDE_OPENCV_4
-
-REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")

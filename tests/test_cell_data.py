@@ -7,20 +7,19 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from places import DATA
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import ImageRecord, IntrinsicsRecord, TfBuffer, open_log
 from gtsam_rwhec.rig import read_rig
 from gtsam_rwhec.vision.camera import Camera
 
-DATA = Path(__file__).resolve().parents[1] / "data"
 CELL = DATA / "cell"
 #: name of a log's rig file, of its truth, of its cameras' poses in it and of its targets'
 LOGS = {

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from places import EXAMPLES
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 #: Arguments that make it quick, and what must be in its output.
 RUNS = {
     "certify_a_rig": ([], "Certified globally optimal"),

@@ -19,11 +19,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from places import DEMO
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general
 
-DEMO = Path(__file__).resolve().parents[2] / "data" / "demo"
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
 COMMAND = (sys.executable, "-m", "gtsam_rwhec.cli")
 

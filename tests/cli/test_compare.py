@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-DEMO = Path(__file__).resolve().parents[2] / "data" / "demo"
+from places import DEMO
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:

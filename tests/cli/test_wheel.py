@@ -12,10 +12,10 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from places import REPOSITORY
 
 import gtsam_rwhec as rw
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 CELL = REPOSITORY / "data" / "cell"
 
 
@@ -37,7 +37,7 @@ def test_it_has_all_data_and_none_of_the_real_dataset(unpacked_wheel: Path) -> N
     assert sorted(path.name for path in shipped.iterdir()) == ["rig.yaml", "robot_cell.mcap"]
     for path in shipped.iterdir():  # the truth stays behind
         assert path.read_bytes() == (CELL / path.name).read_bytes()
-    assert (unpacked_wheel / "gtsam_rwhec" / "utias_files.txt").is_file()
+    assert (unpacked_wheel / "gtsam_rwhec" / "datasets" / "utias_files.txt").is_file()
     assert (unpacked_wheel / "gtsam_rwhec" / "py.typed").is_file()
     assert not list(unpacked_wheel.rglob("*.csv"))
 

@@ -8,10 +8,9 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from places import DATA
 
 import gtsam_rwhec as rw
-
-DATA = Path(__file__).resolve().parents[1] / "data"
 
 
 @pytest.fixture(scope="module")

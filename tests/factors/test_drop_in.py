@@ -13,8 +13,8 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from places import REPOSITORY
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 #: Runs the example, then says which top-level modules were imported from outside the standard library.
 RUN = """
 import json, runpy, sys

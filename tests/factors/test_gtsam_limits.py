@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 import rwhec_factors
 from gtsam.symbol_shorthand import S, Y
+from places import REPOSITORY
 from rwhec_factors import (
     direction_prior_factor,
     hand_eye_factor,
@@ -143,6 +143,6 @@ def test_an_error_of_a_factor_comes_out_of_the_optimiser_as_it_is() -> None:
 
 
 def test_the_readme_lists_every_factor() -> None:
-    text = (Path(__file__).resolve().parents[2] / "factors" / "README.md").read_text(encoding="utf-8")
+    text = (REPOSITORY / "factors" / "README.md").read_text(encoding="utf-8")
     listed = {name for name in rwhec_factors.__all__ if f"`{name}(" in text}
     assert listed == {name for name in rwhec_factors.__all__ if name.endswith("_factor")}

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from places import GOLDEN
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotUniqueWarning, RwhecWarning, ScaleError
 from gtsam_rwhec.simulate import Motion, Noise, carrier_poses, general, perturb, sphere
 from gtsam_rwhec.simulate.transforms import inverse, pose, random_poses
 
-GOLDEN_FIGURE_8 = Path(__file__).parent / "golden" / "utias_figure_8.txt"
+GOLDEN_FIGURE_8 = GOLDEN / "utias_figure_8.txt"
 NOISE = Noise(0.01, 1250.0)  # 1 cm, 0.02 rad
 MOCAP = Noise(0.001, 2e4)  # 1 mm, 0.005 rad
 FRAMES = random_poses(8, 1.0, np.random.default_rng(12))

@@ -12,8 +12,7 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer as Ros2Writer
-
-CELL = Path(__file__).resolve().parents[2] / "data" / "cell"
+from places import CELL
 
 
 def write_twins(json_path: Path, ros2_path: Path, images: int) -> None:

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import DEMO
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, NoiseError
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.problem.csv_folder import CsvWarning, read_pose_rows
 
-DEMO = Path(__file__).resolve().parents[1] / "data" / "demo"
 GOOD = "1,0,0,0,0.5,-0.25,2e0"
 
 

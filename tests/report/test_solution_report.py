@@ -11,6 +11,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from places import DEMO
 from rich.console import Console
 
 import gtsam_rwhec as rw
@@ -18,7 +19,6 @@ from gtsam_rwhec.report import certificate_sentence, print_solution, sensor_tabl
 from gtsam_rwhec.report.pose_table import pooled_residual
 from gtsam_rwhec.simulate import Noise, general
 
-DEMO = Path(__file__).resolve().parents[2] / "data" / "demo"
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
 
 

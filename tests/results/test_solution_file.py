@@ -12,6 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from places import DEMO
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
@@ -19,7 +20,6 @@ from gtsam_rwhec.results.schema import FORMAT_VERSION, ResultFile
 from gtsam_rwhec.results.solution_file import read_solution, write_solution
 from gtsam_rwhec.simulate import Noise, general
 
-DEMO = Path(__file__).resolve().parents[1] / "data" / "demo"
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import cv2
 import pytest
+from places import REPOSITORY
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 HERE = int(cv2.__version__.partition(".")[0])
 OTHER, WANTED = (4, "opencv-python-headless>=4.12,<5") if HERE >= 5 else (5, "opencv-python-headless>=5,<6")
 #: What pip says when there is no index to be reached.
