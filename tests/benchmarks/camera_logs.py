@@ -28,7 +28,7 @@ from gtsam_rwhec.rig import parse_rig, read_rig
 
 TESTS = Path(__file__).resolve().parents[1]
 CELL = TESTS.parent / "data" / "cell"
-sys.path.insert(0, str(TESTS / "pipeline"))
+sys.path[:0] = [str(TESTS), str(TESTS / "pipeline")]
 from ros2_twin import write_twins  # noqa: E402  (the tests' own)
 from utias_log import rig_text, write_utias_log  # noqa: E402
 
