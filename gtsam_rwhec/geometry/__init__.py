@@ -1,1 +1,5 @@
 """Poses as users give them, checked; and covariances of poses between frames and conventions."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,2 @@
+from . import pose_covariances as pose_covariances
+from . import poses as poses
