@@ -33,7 +33,7 @@ SCALES = ("known", "shared", "per_target")
 MEASUREMENTS = (5, 20)
 
 
-def outcome(scale: rw.problem.ScaleMode, degrees: float, measurements: int, seed: int) -> str:
+def outcome(scale: rw.ScaleMode, degrees: float, measurements: int, seed: int) -> str:
     """Simulate, solve, and say what proved the answer."""
     noise = Noise(sigma_m=0.05, kappa=1.0 / (2.0 * np.radians(degrees) ** 2))
     simulation = general(2, 1, seed=seed, number_of_measurements=measurements, noise=noise, scale=scale)

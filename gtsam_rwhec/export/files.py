@@ -8,7 +8,7 @@ from pathlib import Path
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.export.camchain import camchain_yaml
 from gtsam_rwhec.export.static_tf import static_tf_launch
-from gtsam_rwhec.export.tf_yaml import tf_yaml
+from gtsam_rwhec.export.tf_tree import tf_yaml
 from gtsam_rwhec.export.urdf import urdf_xacro
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.rig.calibrated_frames import RigFrames

@@ -1,5 +1,5 @@
 """A first rig file, made by looking at a log."""
 
-from gtsam_rwhec.first_rig.rig_from_look import first_rig
+import lazy_loader
 
-__all__ = ["first_rig"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,21 +5,6 @@ is from. The DQ paper is Dekel, Harenstam-Nielsen, Caccamo: Optimal least-square
 problem (CVPR 2020).
 """
 
-from gtsam_rwhec.handeye.cost import DualQuaternionCost
-from gtsam_rwhec.handeye.method import HandEye, Method
-from gtsam_rwhec.handeye.motion_costs import cost_of
-from gtsam_rwhec.handeye.motions import Motions, motions_of
-from gtsam_rwhec.handeye.prior import DualQuaternionPrior
-from gtsam_rwhec.handeye.registry import METHODS, solve
+import lazy_loader
 
-__all__ = [
-    "METHODS",
-    "DualQuaternionCost",
-    "DualQuaternionPrior",
-    "HandEye",
-    "Method",
-    "Motions",
-    "cost_of",
-    "motions_of",
-    "solve",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

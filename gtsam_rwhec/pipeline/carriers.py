@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.cleaning import Trajectory
 from gtsam_rwhec.errors import LogError, StampError, TransformError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer, Topic
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.trajectories import Trajectory
 
 #: Stamps that go back by more than this, in the order in which messages were logged: a clock was set meanwhile.
 BACKWARDS_S = 1.0

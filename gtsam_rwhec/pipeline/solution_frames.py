@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.export import RigFrames
 from gtsam_rwhec.pipeline.solved_log import Solved
+from gtsam_rwhec.rig import RigFrames
 
 
 def frames_of(solved: Solved) -> RigFrames:

@@ -1,35 +1,5 @@
 """Rig files: which sensors and targets there are, on which carriers, and where the log has what is needed of each."""
 
-from gtsam_rwhec.rig.rig import Rig
-from gtsam_rwhec.rig.rig_file import parse_rig, read_rig, rig_text
-from gtsam_rwhec.rig.schema import (
-    AprilGridTarget,
-    Carriers,
-    CharucoTarget,
-    CheckerboardTarget,
-    Cleaning,
-    Intrinsics,
-    Noise,
-    PoseNoise,
-    PoseSource,
-    Sensor,
-    TagTarget,
-)
+import lazy_loader
 
-__all__ = [
-    "AprilGridTarget",
-    "Carriers",
-    "CharucoTarget",
-    "CheckerboardTarget",
-    "Cleaning",
-    "Intrinsics",
-    "Noise",
-    "PoseNoise",
-    "PoseSource",
-    "Rig",
-    "Sensor",
-    "TagTarget",
-    "parse_rig",
-    "read_rig",
-    "rig_text",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,25 +5,6 @@ so there the camera is the ``target``; see their modules); :func:`general` makes
 and scale, with the noise on what the sensors see. Each returns a :class:`Simulation`.
 """
 
-from gtsam_rwhec.simulate.camera_on_sphere import sphere
-from gtsam_rwhec.simulate.fixed_cameras import cameras
-from gtsam_rwhec.simulate.motion import Motion, carrier_poses
-from gtsam_rwhec.simulate.noise import Noise, langevin_rotations, perturb
-from gtsam_rwhec.simulate.rig import general
-from gtsam_rwhec.simulate.simulation import Answer, CalibrationErrors, FrameDistance, Simulation, frame_distance
+import lazy_loader
 
-__all__ = [
-    "Answer",
-    "CalibrationErrors",
-    "FrameDistance",
-    "Motion",
-    "Noise",
-    "Simulation",
-    "cameras",
-    "carrier_poses",
-    "frame_distance",
-    "general",
-    "langevin_rotations",
-    "perturb",
-    "sphere",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -132,7 +132,7 @@ def differences(one: gtsam.NonlinearFactorGraph, other: gtsam.NonlinearFactorGra
     )
 
 
-def rows_of(scale: rw.problem.ScaleMode, repetitions: int) -> list[Row]:
+def rows_of(scale: rw.ScaleMode, repetitions: int) -> list[Row]:
     """Both rows for a known or shared scale."""
     problem = rw.read_csv(utias_folder(), scale=scale, sigma=SIGMA_M, kappa=KAPPA)
     with warnings.catch_warnings():

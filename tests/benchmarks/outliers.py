@@ -55,7 +55,7 @@ class Case:
     frames: tuple[int, int]
     measurements: int
     kind: Kind
-    scale: rw.problem.ScaleMode = "known"
+    scale: rw.ScaleMode = "known"
     noise_scale: NoiseScale = "given"
 
     @property

@@ -27,7 +27,7 @@ COST = 8.2812454
 SCALE = 1.0254
 
 
-def real_problem(scale: rw.problem.ScaleMode) -> rw.Problem:
+def real_problem(scale: rw.ScaleMode) -> rw.Problem:
     """All 73 pairs with sigma = kappa = 1."""
     return rw.read_csv(utias_folder(), scale=scale, sigma=1.0, kappa=1.0)
 

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 BEATEN = 1e-10
 
 
-def pair_alone(problem: rw.Problem, target: str, sensor: str, scale: rw.problem.ScaleMode) -> rw.Problem:
+def pair_alone(problem: rw.Problem, target: str, sensor: str, scale: rw.ScaleMode) -> rw.Problem:
     """A problem with one pair of another's."""
     measured = problem.measurements(target, sensor)
     alone = rw.Problem(scale=scale)
@@ -35,7 +35,7 @@ def pair_alone(problem: rw.Problem, target: str, sensor: str, scale: rw.problem.
     return alone
 
 
-def reduced_cost(A: Array, B: Array, scale: rw.problem.ScaleMode) -> Array:
+def reduced_cost(A: Array, B: Array, scale: rw.ScaleMode) -> Array:
     """(19, 19) form over [vec R_X, vec R_Y, 1] from (N, 4, 4) measurements with unit weights, the 1/2 included."""
     count = len(A)
     t_A = A[:, :3, 3] - A[:, :3, 3].mean(axis=0)  # moves t_Y alone, which is eliminated
@@ -117,7 +117,7 @@ def descend(Q: Array, R: Array, iterations: int = 300) -> Array:
     return cost
 
 
-def rows_of(scale: rw.problem.ScaleMode, starts: int) -> list[Row]:
+def rows_of(scale: rw.ScaleMode, starts: int) -> list[Row]:
     """Solve every pair alone and let the random starts try."""
     problem = rw.read_csv(utias_folder(), sigma=1.0, kappa=1.0)
     generator = np.random.default_rng(0)

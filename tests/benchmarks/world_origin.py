@@ -49,7 +49,7 @@ def difference(near: rw.Solution, far: rw.Solution) -> tuple[float, float]:
 def rows() -> list[Row]:
     """Both problems, both scales, both sides, both distances."""
     simulated = Noise(sigma_m=0.005, kappa=5e3)
-    problems: dict[str, Callable[[rw.problem.ScaleMode], rw.Problem]] = {
+    problems: dict[str, Callable[[rw.ScaleMode], rw.Problem]] = {
         "real dataset": lambda scale: rw.read_csv(utias_folder(), scale=scale, sigma=1.0, kappa=1.0),
         "simulated 3 x 3": lambda scale: general(3, 3, seed=1, noise=simulated, scale=scale).problem,
     }

@@ -7,7 +7,7 @@ import pytest
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cleaning import ConsensusOptions, consensus
-from gtsam_rwhec.cleaning.consensus import closed_form, distances
+from gtsam_rwhec.cleaning.pair_consensus import closed_form, distances
 from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
 

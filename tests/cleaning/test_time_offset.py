@@ -7,9 +7,10 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cleaning import Trajectory, coarse_time_offset
+from gtsam_rwhec.cleaning import coarse_time_offset
 from gtsam_rwhec.simulate import Noise, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.trajectories import Trajectory
 
 X, Y = random_poses(2, 1.0, np.random.default_rng(0))
 NOISE = Noise(0.005, 0.5 / np.radians(0.5) ** 2)

@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.export import RigFrames, camchain_yaml, export_all, static_tf_launch, tf_yaml, urdf_xacro
+from gtsam_rwhec.export import camchain_yaml, export_all, static_tf_launch, tf_yaml, urdf_xacro
 from gtsam_rwhec.export.written_poses import fixed_axis_angles, number, quaternion_xyzw
+from gtsam_rwhec.rig import RigFrames
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.intrinsics_files import read_kalibr_camchain
 

@@ -12,8 +12,8 @@ import pytest
 from refinement_problems import KAPPA, SIGMA_M, refined, rig
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cleaning import Trajectory
 from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.trajectories import Trajectory
 
 PROBLEM = rig(seed=1).problem
 SOLUTION = rw.solve(PROBLEM)

@@ -19,7 +19,7 @@ from gtsam_rwhec.solver.variables import given_answer
 NOISE = Noise(sigma_m=0.01, kappa=200.0)
 
 
-def problem_of(seed: int, scale: rw.problem.ScaleMode) -> rw.Problem:
+def problem_of(seed: int, scale: rw.ScaleMode) -> rw.Problem:
     simulation = general(
         2, 2, seed=seed, number_of_measurements=15, noise=NOISE, scale=scale, odometry=8, odometry_noise=NOISE
     )
@@ -33,7 +33,7 @@ def problem_of(seed: int, scale: rw.problem.ScaleMode) -> rw.Problem:
 
 @pytest.mark.parametrize("scale", ["per_target", "shared"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_gradient_and_hessian_numerically(seed: int, scale: rw.problem.ScaleMode) -> None:
+def test_gradient_and_hessian_numerically(seed: int, scale: rw.ScaleMode) -> None:
     problem = problem_of(seed, scale)
     (part,) = parts_of(problem)
     assert part.kind == "inverse"
@@ -54,7 +54,7 @@ def test_gradient_and_hessian_numerically(seed: int, scale: rw.problem.ScaleMode
 
 
 @pytest.mark.parametrize("scale", ["per_target", "shared"])
-def test_the_end_is_a_minimum_of_the_physical_cost(scale: rw.problem.ScaleMode) -> None:
+def test_the_end_is_a_minimum_of_the_physical_cost(scale: rw.ScaleMode) -> None:
     problem = problem_of(3, scale)
     (part,) = parts_of(problem)
     solution = rw.solve(problem)

@@ -24,7 +24,7 @@ def truth(simulation: Simulation) -> Fit:
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
-def test_half_their_sum_is_the_certified_cost(scale: rw.problem.ScaleMode) -> None:
+def test_half_their_sum_is_the_certified_cost(scale: rw.ScaleMode) -> None:
     problem = general(
         2, 2, seed=1, number_of_measurements=9, noise=NOISE, scale=scale, odometry=7, odometry_noise=NOISE
     ).problem
@@ -34,7 +34,7 @@ def test_half_their_sum_is_the_certified_cost(scale: rw.problem.ScaleMode) -> No
 
 
 @pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
-def test_at_the_truth_they_are_chi_square(scale: rw.problem.ScaleMode) -> None:
+def test_at_the_truth_they_are_chi_square(scale: rw.ScaleMode) -> None:
     simulation = general(2, 2, seed=2, number_of_measurements=2000, noise=NOISE, scale=scale)
     measured = Measured.of(simulation.problem)
     squares = measured.squares(truth(simulation))

@@ -64,7 +64,7 @@ def test_the_whole_fits_a_terminal_of_80_columns(demo_solution: rw.Solution) -> 
 
 @pytest.mark.parametrize("width", [20, 40, 60, 80, 120])
 @pytest.mark.parametrize("scale", ["known", "per_target"])
-def test_no_number_and_no_name_is_ever_cut(width: int, scale: rw.problem.ScaleMode) -> None:
+def test_no_number_and_no_name_is_ever_cut(width: int, scale: rw.ScaleMode) -> None:
     known = ["target0"] if scale == "per_target" else []
     solution = rw.solve(general(3, 2, seed=5, noise=NOISE, scale=scale, known_sizes=known).problem)
     text = printed(solution, width)

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cleaning import Trajectory, odometry_gates, synchronise, thin, without_fast
+from gtsam_rwhec.cleaning import odometry_gates, synchronise, thin, without_fast
+from gtsam_rwhec.trajectories import Trajectory
 
 TWIST = np.array([0.4, -0.2, 0.7, 0.3, 0.1, -0.5])
 

@@ -3,17 +3,6 @@
 matplotlib is imported when something is drawn, not before.
 """
 
-from gtsam_rwhec.report.plots.coverage import plot_coverage
-from gtsam_rwhec.report.plots.deviations import plot_deviations
-from gtsam_rwhec.report.plots.frames import plot_frames
-from gtsam_rwhec.report.plots.plotted import PlottedCorners, PlottedMeasurement
-from gtsam_rwhec.report.plots.residuals import plot_residuals
+import lazy_loader
 
-__all__ = [
-    "PlottedCorners",
-    "PlottedMeasurement",
-    "plot_coverage",
-    "plot_deviations",
-    "plot_frames",
-    "plot_residuals",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

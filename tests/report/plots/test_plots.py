@@ -16,7 +16,6 @@ from made_up import corners, covariances, measurements, rig
 from matplotlib.image import imread
 
 from gtsam_rwhec.errors import CountError, FileFormatError, NoiseError
-from gtsam_rwhec.export import RigFrames
 from gtsam_rwhec.report.plots import (
     PlottedCorners,
     PlottedMeasurement,
@@ -26,6 +25,7 @@ from gtsam_rwhec.report.plots import (
     plot_residuals,
 )
 from gtsam_rwhec.report.plots.frames import _Scene
+from gtsam_rwhec.rig import RigFrames
 
 FRAMES = rig(2)
 COVARIANCES = covariances(FRAMES)

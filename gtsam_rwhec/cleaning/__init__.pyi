@@ -1,0 +1,11 @@
+from .odometry import odometry_gates as odometry_gates
+from .pair_consensus import Consensus as Consensus
+from .pair_consensus import ConsensusOptions as ConsensusOptions
+from .pair_consensus import consensus as consensus
+from .removed import Kept as Kept
+from .removed import Removed as Removed
+from .synchronisation import synchronise as synchronise
+from .thinning import thin as thin
+from .thinning import without_fast as without_fast
+from .time_offset import TimeOffset as TimeOffset
+from .time_offset import coarse_time_offset as coarse_time_offset

@@ -1,0 +1,9 @@
+from .cost import DualQuaternionCost as DualQuaternionCost
+from .method import HandEye as HandEye
+from .method import Method as Method
+from .motion_costs import cost_of as cost_of
+from .motions import Motions as Motions
+from .motions import motions_of as motions_of
+from .prior import DualQuaternionPrior as DualQuaternionPrior
+from .registry import METHODS as METHODS
+from .registry import solve as solve

@@ -1,0 +1,2 @@
+from .identification import Identifiability as Identifiability
+from .identification import PairIdentifiability as PairIdentifiability

@@ -1,0 +1,11 @@
+from .comparison import Compared as Compared
+from .comparison import Comparison as Comparison
+from .comparison import compare as compare
+from .evaluation import cost_of_answer as cost_of_answer
+from .protocol import Calibration as Calibration
+from .protocol import Estimate as Estimate
+from .protocol import Method as Method
+from .protocol import MethodOptions as MethodOptions
+from .protocol import Properties as Properties
+from .registry import METHODS as METHODS
+from .registry import run as run

@@ -1,0 +1,10 @@
+from .all_stages import CLEAN as CLEAN
+from .all_stages import RESULT as RESULT
+from .all_stages import calibrate_log as calibrate_log
+from .all_stages import export_solved as export_solved
+from .all_stages import solve_into as solve_into
+from .cleaning_stage import clean_log as clean_log
+from .detection_stage import detect_log as detect_log
+from .detections_in_images import draw_log as draw_log
+from .solving_stage import Calibrated as Calibrated
+from .solving_stage import solve_log as solve_log

@@ -1,0 +1,17 @@
+from .calibrated_frames import Frame as Frame
+from .calibrated_frames import RigFrames as RigFrames
+from .rig import Rig as Rig
+from .rig_file import parse_rig as parse_rig
+from .rig_file import read_rig as read_rig
+from .rig_file import rig_text as rig_text
+from .schema import AprilGridTarget as AprilGridTarget
+from .schema import Carriers as Carriers
+from .schema import CharucoTarget as CharucoTarget
+from .schema import CheckerboardTarget as CheckerboardTarget
+from .schema import Cleaning as Cleaning
+from .schema import Intrinsics as Intrinsics
+from .schema import Noise as Noise
+from .schema import PoseNoise as PoseNoise
+from .schema import PoseSource as PoseSource
+from .schema import Sensor as Sensor
+from .schema import TagTarget as TagTarget

@@ -1,0 +1,13 @@
+from .camera_on_sphere import sphere as sphere
+from .fixed_cameras import cameras as cameras
+from .motion import Motion as Motion
+from .motion import carrier_poses as carrier_poses
+from .noise import Noise as Noise
+from .noise import langevin_rotations as langevin_rotations
+from .noise import perturb as perturb
+from .rig import general as general
+from .simulation import Answer as Answer
+from .simulation import CalibrationErrors as CalibrationErrors
+from .simulation import FrameDistance as FrameDistance
+from .simulation import Simulation as Simulation
+from .simulation import frame_distance as frame_distance

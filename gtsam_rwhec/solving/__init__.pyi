@@ -1,0 +1,5 @@
+from .certified_solution import certify as certify
+from .certified_solution import solve as solve
+from .solution import Residual as Residual
+from .solution import Solution as Solution
+from .solution import SolvedPart as SolvedPart
