@@ -7,6 +7,7 @@ import numpy as np
 from gtsam_rwhec.compat.stations import Stations, all_earlier
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.rotations import project
 
 #: An eigenvalue below this of the scaled normal equations is rounding.
 SINGULAR = 1e-15
@@ -71,7 +72,7 @@ def andreff(stations: Stations) -> tuple[Array, Array]:
     normal = normal * scale * scale[:, None]
     check_determined(normal, "Andreff's")
     x = scale * np.linalg.solve(normal, right * scale)
-    return nearest_rotations(x[:9].reshape(3, 3)), x[9:]
+    return project(x[:9].reshape(1, 3, 3))[0], x[9:]
 
 
 def check_determined(normal: Array, whose: str) -> None:
@@ -86,11 +87,3 @@ def check_determined(normal: Array, whose: str) -> None:
             f"{whose} linear system takes the rotation's length from the translations, and here they say nothing of "
             "it: the gripper only turned, or hardly moved beside the length unit; move it, or take another method"
         )
-
-
-def nearest_rotations(V: Array) -> Array:
-    """Rotations nearest to matrices (..., 3, 3) in the Frobenius norm."""
-    U, _, Wt = np.linalg.svd(V)
-    U[..., 2] *= np.linalg.det(U @ Wt)[..., None]
-    R: Array = U @ Wt
-    return R

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gtsam_rwhec.compat.stations import CONJUGATION, Stations, left_matrices, pair_blocks, products, quaternions
+from gtsam_rwhec.compat.stations import Stations, pair_blocks, products
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import conjugate, dual_parts, left, of_rotations
 from gtsam_rwhec.handeye.daniilidis import squared, unit_combination
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 
@@ -25,22 +26,15 @@ def daniilidis(stations: Stations) -> tuple[Array, Array]:
 
 def screws(stations: Stations) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
     """Dual quaternions of A and B of all pairs, block by block: q_A, q_B, q'_A, q'_B (4, J, I) and weights (J, I)."""
-    q_G, q_C = quaternions(stations.R_G), quaternions(stations.R_C)
+    q_G, q_C = of_rotations(stations.R_G), of_rotations(stations.R_C)
     d_G, d_C = dual_parts(q_G, stations.t_G), dual_parts(q_C, stations.t_C)
     # Q_G,j* (x) Q_G,i and Q_C,j (x) Q_C,i*: the dual part of a product is q p' + q' p, here one product of 8 columns.
-    left_G = np.concatenate([left_matrices(q_G * CONJUGATION), left_matrices(d_G * CONJUGATION)], axis=2)
+    left_G = np.concatenate([left(conjugate(q_G)), left(conjugate(d_G))], axis=2)
     right_G = np.concatenate([d_G, q_G], axis=1).T
-    left_C = np.concatenate([left_matrices(q_C), left_matrices(d_C)], axis=2)
-    right_C = np.concatenate([d_C * CONJUGATION, q_C * CONJUGATION], axis=1).T
+    left_C = np.concatenate([left(q_C), left(d_C)], axis=2)
+    right_C = np.concatenate([conjugate(d_C), conjugate(q_C)], axis=1).T
     for block in pair_blocks(stations):
         j, i = slice(block.first, block.last), slice(block.last)
         dual_a = products(left_G[j], right_G[:, i]) * block.signs[0]
         dual_b = products(left_C[j], right_C[:, i]) * block.signs[1]
         yield block.a, block.b, dual_a, dual_b, block.weight
-
-
-def dual_parts(q: Array, t: Array) -> Array:
-    """Dual parts 1/2 (t, 0) (x) q of poses (DQ paper, eq. 2), (N, 4)."""
-    pure = np.concatenate([t, np.zeros((len(t), 1))], axis=1)
-    d: Array = 0.5 * np.einsum("nab,nb->na", left_matrices(pure), q)
-    return d

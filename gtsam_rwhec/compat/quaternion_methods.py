@@ -10,9 +10,11 @@ import numpy as np
 
 from gtsam_rwhec.compat.inputs import PARALLEL
 from gtsam_rwhec.compat.pair_translations import translation_features, translation_of
-from gtsam_rwhec.compat.stations import Stations, left_matrices, pair_blocks
+from gtsam_rwhec.compat.stations import Stations, pair_blocks
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import ROTATION, to_rotations
+from gtsam_rwhec.solver.rotations import project
 
 #: Tsai's motions have 2 sin(angle / 2) between these, by both sensors; observed of OpenCV 4, to 1e-14, by bisection.
 TSAI_LEAST, TSAI_MOST = 0.3, 1.7
@@ -57,7 +59,7 @@ def tsai(stations: Stations) -> tuple[Array, Array]:
             "poses that turn about another axis, or take another method"
         )
     x = np.linalg.solve(normal, sums)
-    R = rotation_of(np.append(x, 1.0))
+    R = to_rotations(np.append(x, 1.0))
     return R, translation_of(stations, R, feature_sums)
 
 
@@ -66,8 +68,7 @@ def park(stations: Stations) -> tuple[Array, Array]:
     M = np.zeros((3, 3))
     for block in pair_blocks(stations):
         M += _moment(block.a[:3], _log_factor(block.a) * _log_factor(block.b) * block.weight, block.b[:3])
-    U, _, Vt = np.linalg.svd(M)  # M here is the sum of log(R_A) log(R_B)'
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = project(M[None])[0]  # M here is the sum of log(R_A) log(R_B)', and R the rotation nearest to it
     return R, translation_of(stations, R)
 
 
@@ -80,21 +81,9 @@ def horaud(stations: Stations) -> tuple[Array, Array]:
     for block in pair_blocks(stations):
         M += _moment(block.a[:3], block.weight, block.b[:3])
     # |v_A q - q v_B|^2 = |v_A|^2 + |v_B|^2 - 2 v_A . (R v_B): the quaternion of the nearest rotation (Horn 1987).
-    N = np.empty((4, 4))
-    N[:3, :3] = M + M.T - np.trace(M) * np.eye(3)
-    N[:3, 3] = N[3, :3] = M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]
-    N[3, 3] = np.trace(M)
-    R = rotation_of(np.linalg.eigh(N)[1][:, -1])
+    N = np.einsum("cdij,ij->cd", ROTATION, M)
+    R = to_rotations(np.linalg.eigh(N)[1][:, -1])
     return R, translation_of(stations, R)
-
-
-def rotation_of(q: Array) -> Array:
-    """Rotation (3, 3) of a quaternion xyzw of any length: q v q* / |q|^2."""
-    L = left_matrices(q[None])[0]
-    right = L.copy()  # R(q): L(q) with the cross product turned round; R(q*) is its transpose
-    right[:3, :3] = L[:3, :3].T
-    R: Array = (L @ right.T)[:3, :3] / (q @ q)
-    return R
 
 
 def _moment(a: Array, weight: Array, b: Array) -> Array:

@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gtsam_rwhec.compat.andreff import check_determined, nearest_rotations
+from gtsam_rwhec.compat.andreff import check_determined
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.rotations import project
 
 RobotWorld = tuple[Array, Array, Array, Array]
 
@@ -102,7 +103,7 @@ def li(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
     symmetric = np.triu(upper) + np.triu(upper, 1).T
     check_determined(symmetric, "Li's")
     z = scale * np.linalg.solve(symmetric, right * scale)
-    R_X, R_Z = nearest_rotations(np.stack([K @ z[:9], z[:9]]).reshape(2, 3, 3))
+    R_X, R_Z = project(np.stack([K @ z[:9], z[:9]]).reshape(2, 3, 3))
     return R_X, z[9:12], R_Z, z[12:]
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import conjugate, left, of_rotations
 
 #: Pairs in one block: a dozen arrays of this size stay within the processor's cache.
 BLOCK_PAIRS = 1 << 15
@@ -65,31 +66,6 @@ def all_earlier(features: Array) -> Array:
     return sums
 
 
-def quaternions(R: Array) -> Array:
-    """Unit quaternions (N, 4), xyzw, of rotations (N, 3, 3), from each one's largest component (Shepperd 1978)."""
-    trace = R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2]
-    P = np.empty((len(R), 4, 4))  # 4 q q', with I added to its scaling
-    for a in range(3):
-        P[:, a, a] = 1.0 - trace + 2.0 * R[:, a, a]
-        b, c = (a + 1) % 3, (a + 2) % 3
-        P[:, b, c] = P[:, c, b] = R[:, b, c] + R[:, c, b]
-        P[:, a, 3] = P[:, 3, a] = R[:, c, b] - R[:, b, c]
-    P[:, 3, 3] = 1.0 + trace
-    largest = np.einsum("naa->na", P).argmax(axis=1)
-    q = P[np.arange(len(R)), largest]
-    unit: Array = q / np.linalg.norm(q, axis=1)[:, None]
-    return unit
-
-
-def left_matrices(q: Array) -> Array:
-    """L(q) with L(q) p = q (x) p, (N, 4, 4), quaternions xyzw (DQ paper, before eq. 6)."""
-    x, y, z, w = q.T
-    return np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]]).transpose(2, 0, 1)
-
-
-CONJUGATION = np.array([-1.0, -1.0, -1.0, 1.0])
-
-
 @dataclass(frozen=True)
 class PairBlock:
     """Rotations of a block of pairs, as quaternions with scalar parts that are not negative.
@@ -116,9 +92,9 @@ class PairBlock:
 
 def pair_blocks(stations: Stations) -> Iterator[PairBlock]:
     """All pairs, block by block; q_A = q_G,j* (x) q_G,i and q_B = q_C,j (x) q_C,i*, each block by one GEMM."""
-    q_G, q_C = quaternions(stations.R_G), quaternions(stations.R_C)
-    left_G, left_C = left_matrices(q_G * CONJUGATION), left_matrices(q_C)
-    right_G, right_C = q_G.T, (q_C * CONJUGATION).T
+    q_G, q_C = of_rotations(stations.R_G), of_rotations(stations.R_C)
+    left_G, left_C = left(conjugate(q_G)), left(q_C)
+    right_G, right_C = q_G.T, conjugate(q_C).T
     for first, last in blocks_of(len(q_G)):
         a = products(left_G[first:last], right_G[:, :last])
         b = products(left_C[first:last], right_C[:, :last])
@@ -134,8 +110,8 @@ def blocks_of(count: int) -> Iterator[tuple[int, int]]:
         yield first, min(first + step, count)
 
 
-def products(left: Array, right: Array) -> Array:
-    """left_j right_i of matrices (J, 4, 4) and columns (4, I): (4, J, I)."""
-    stacked = np.ascontiguousarray(left.transpose(1, 0, 2)).reshape(-1, left.shape[2])
-    product: Array = stacked @ right
-    return product.reshape(4, len(left), -1)
+def products(matrices: Array, columns: Array) -> Array:
+    """The products of matrices (J, 4, k) with columns (k, I): (4, J, I)."""
+    stacked = np.ascontiguousarray(matrices.transpose(1, 0, 2)).reshape(-1, matrices.shape[2])
+    product: Array = stacked @ columns
+    return product.reshape(4, len(matrices), -1)

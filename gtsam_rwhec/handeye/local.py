@@ -15,9 +15,10 @@ from scipy.optimize import least_squares
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import ROTATION, left, right
 from gtsam_rwhec.handeye.chordal_form import chordal_moments, chordal_residuals
 from gtsam_rwhec.handeye.degenerate import free_directions
-from gtsam_rwhec.handeye.dual_quaternions import from_transforms, left, right, to_transform
+from gtsam_rwhec.handeye.dual_quaternions import from_transforms, to_transform
 from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.motion_costs import squared_residuals
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
@@ -169,20 +170,7 @@ def root(form: Array) -> Array:
 
 
 #: vec R (rows) of a unit quaternion is quadratic in it: entry k is q' _QUADRATIC[k] q.
-_QUADRATIC = np.zeros((9, 4, 4))
-for _row in range(3):
-    for _column in range(3):
-        _form = _QUADRATIC[3 * _row + _column]
-        _form[_row, _column] += 1.0
-        _form[_column, _row] += 1.0  # 2 v v'
-        if _row == _column:
-            _form[3, 3] += 1.0
-            _form[range(3), range(3)] -= 1.0  # (w^2 - v'v) I
-        else:
-            _sign = 1.0 if (_row - _column) % 3 == 1 else -1.0  # 2 w Skew(v)
-            _axis = 3 - _row - _column
-            _form[_axis, 3] += _sign
-            _form[3, _axis] += _sign
+_QUADRATIC = ROTATION.transpose(2, 3, 0, 1).reshape(9, 4, 4)
 
 
 def rotation_entries(q: Array) -> Array:

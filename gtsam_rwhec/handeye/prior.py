@@ -10,8 +10,9 @@ import numpy as np
 
 from gtsam_rwhec.errors import PriorError
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.geometry.quaternions import conjugate, left
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
-from gtsam_rwhec.handeye.dual_quaternions import conjugate, from_transforms, left
+from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.weights import LARGEST
 
 PriorForm = Literal["imaginary", "distance"]

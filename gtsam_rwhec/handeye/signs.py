@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import left, right
 from gtsam_rwhec.handeye.cost import moments_of, residuals
-from gtsam_rwhec.handeye.dual_quaternions import left, right
 from gtsam_rwhec.handeye.saddle import minimum
 
 #: Scalar parts whose sum is below this do not tell the sign: noise of 11 degrees could have swapped it.

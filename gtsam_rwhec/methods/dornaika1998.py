@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array, one_transform
-from gtsam_rwhec.methods import quaternions
+from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT, to_rotations
 from gtsam_rwhec.methods.absolute import Stack, linear_translations, nearest_rotations, poses_by_name
+from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.methods.plain_form import plain_form
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.starts import start_of
@@ -23,10 +24,10 @@ def closed_form(problem: Problem, options: MethodOptions) -> Calibration:
     the singular vectors of C's largest singular value.
     """
     stack = Stack.of(problem)
-    q_A, q_B = quaternions.paired_quaternions(stack)
-    C = np.einsum("cd,cji,djk->ik", q_A.T @ q_B, quaternions.LEFT, quaternions.RIGHT)
+    q_A, q_B = paired_quaternions(stack)
+    C = np.einsum("cd,cji,djk->ik", q_A.T @ q_B, LEFT, RIGHT)
     U, _, Vt = np.linalg.svd(C)
-    R_X, R_Y = quaternions.to_rotation(U[:, 0])[None], quaternions.to_rotation(Vt[0])[None]
+    R_X, R_Y = to_rotations(U[:, :1].T), to_rotations(Vt[:1])
     t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
     return Calibration(poses_by_name(stack.targets, R_X, t_X), poses_by_name(stack.sensors, R_Y, t_Y))
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.methods.quaternions import left, right
+from gtsam_rwhec.geometry.quaternions import dual_parts, left, of_vectors, right
 
 #: Frames up to which the relaxation is solved; a cone of 8 n takes a dense block of order 4 n (8 n + 1) squared.
 MOST_FRAMES = 10
@@ -77,15 +77,13 @@ def rounded(z: Array, frames: int) -> tuple[Array, Array]:
     parts = z.reshape(frames, 2, 4)
     lengths = np.linalg.norm(parts[:, 0], axis=1)[:, None]
     q, dual = parts[:, 0] / lengths, parts[:, 1] / lengths
-    t: Array = 2.0 * np.einsum("nij,ni->nj", right(q), dual)[:, 1:]  # t p = 2 p'
+    t: Array = 2.0 * np.einsum("nij,ni->nj", right(q), dual)[:, :3]  # t p = 2 p'
     return q, t
 
 
 def vector_of(q: Array, t: Array) -> Array:
     """z (8 n,) of unit quaternions and translations."""
-    of_translation = np.concatenate([np.zeros((len(t), 1)), t], axis=1)
-    dual = 0.5 * np.einsum("nij,nj->ni", left(of_translation), q)
-    z: Array = np.stack([q, dual], axis=1).ravel()
+    z: Array = np.stack([q, dual_parts(q, t)], axis=1).ravel()
     return z
 
 
@@ -121,15 +119,14 @@ def polished(Q: Array, q: Array, t: Array) -> tuple[Array, Array, float]:
 
 
 def _tangents(q: Array, t: Array) -> Array:
-    """dz (8 n, 6 n) of steps [w, v] a frame: p (1, w / 2), t + v."""
+    """dz (8 n, 6 n) of steps [w, v] a frame: p (w / 2, 1), t + v."""
     n = len(q)
-    turned = 0.5 * left(q)[:, :, 1:]  # (n, 4, 3)
-    of_translation = np.concatenate([np.zeros((n, 1)), t], axis=1)
+    turned = 0.5 * left(q)[:, :, :3]  # (n, 4, 3)
     basis = np.zeros((n, 8, n, 6))
     at = np.arange(n)
     basis[at, :4, at, :3] = turned
-    basis[at, 4:, at, :3] = 0.5 * left(of_translation) @ turned
-    basis[at, 4:, at, 3:] = 0.5 * right(q)[:, :, 1:]
+    basis[at, 4:, at, :3] = 0.5 * left(of_vectors(t)) @ turned
+    basis[at, 4:, at, 3:] = 0.5 * right(q)[:, :, :3]
     return basis.reshape(8 * n, 6 * n)
 
 
@@ -143,8 +140,8 @@ def _curvature(q: Array, t: Array, gradient_z: Array) -> Array:
     back = -0.25 * np.einsum("nij,nij->n", g, z)
     result[at, :3, at, :3] = back[:, None, None] * np.eye(3)
     # p' = t p / 2: v (p w / 2) / 2, from the right: R(p w / 2) v / 2
-    units = np.concatenate([np.zeros((3, 1)), np.eye(3)], axis=1)
-    turned = 0.5 * left(q)[:, :, 1:]  # columns p e_k / 2
+    units = np.eye(4)[:3]
+    turned = 0.5 * left(q)[:, :, :3]  # columns p e_k / 2
     mixed = np.zeros((n, 3, 3))  # [w_k, v_l] = <g', e_l (p e_k / 2)> / 2
     for axis in range(3):
         mixed[:, :, axis] = 0.5 * np.einsum("ni,ij,njk->nk", g[:, 1], left(units[axis]), turned)
@@ -155,7 +152,7 @@ def _curvature(q: Array, t: Array, gradient_z: Array) -> Array:
 
 def _moved(q: Array, t: Array, step: Array) -> tuple[Array, Array]:
     steps = step.reshape(-1, 6)
-    turn = np.concatenate([np.ones((len(q), 1)), 0.5 * steps[:, :3]], axis=1)
+    turn = np.concatenate([0.5 * steps[:, :3], np.ones((len(q), 1))], axis=1)
     moved = np.einsum("nij,nj->ni", left(q), turn)
     return moved / np.linalg.norm(moved, axis=1)[:, None], t + steps[:, 3:]
 

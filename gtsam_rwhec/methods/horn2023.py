@@ -24,10 +24,11 @@ import numpy as np
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import conjugate, dual_parts, left, of_rotations, right, to_rotations
 from gtsam_rwhec.methods.absolute import Stack, poses_by_name
 from gtsam_rwhec.methods.dual_quaternion_relaxation import Relaxed, multipliers_of, polished, relaxed
+from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
-from gtsam_rwhec.methods.quaternions import left, of_rotations, paired_quaternions, right, to_rotation
 from gtsam_rwhec.problem.problem import Problem
 
 #: How the quaternions of A and B get their signs.
@@ -59,7 +60,7 @@ class DualQuaternionAnswer:
         z'Qz, and what no z goes below with these signs, by the relaxation's multipliers. The cost is of these signs'
         problem: it says nothing of the others'.
     signs : (N,) array
-        Of each measurement's <p_a, p_b> times that of the quaternions with which ``quaternions.of_rotations`` answers:
+        Of each measurement's <p_a, p_b> times that of the quaternions with which ``of_rotations`` answers:
         two choices of signs can be compared by it, whatever the signs of a and b apart.
     contradicted : int
         Measurements whose sign the answer itself contradicts, the one that fits the frame as a whole being free.
@@ -147,7 +148,7 @@ def solve_dual_quaternions(
             break
         sign = np.where(whole * products < 0.0, -1.0, 1.0)
     return DualQuaternionAnswer(
-        np.array([to_rotation(one) for one in q]),
+        to_rotations(q),
         t,
         max(cost, 0.0),
         _bound(Q, q, t, cost, found),
@@ -159,7 +160,7 @@ def solve_dual_quaternions(
 
 
 def signed_quaternions(stack: Stack, signs: Signs, seed: int) -> tuple[Array, Array]:
-    """q_A and q_B (N, 4), scalar first, with a choice of signs.
+    """q_A and q_B (N, 4), scalar last, with a choice of signs.
 
     Raises
     ------
@@ -169,7 +170,7 @@ def signed_quaternions(stack: Stack, signs: Signs, seed: int) -> tuple[Array, Ar
         return paired_quaternions(stack)
     q_A, q_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])
     if signs == "scalar":
-        return _with(np.where(q_A[:, 0] < 0.0, -1.0, 1.0), q_A), _with(np.where(q_B[:, 0] < 0.0, -1.0, 1.0), q_B)
+        return _with(np.where(q_A[:, 3] < 0.0, -1.0, 1.0), q_A), _with(np.where(q_B[:, 3] < 0.0, -1.0, 1.0), q_B)
     if signs == "continuous":
         return _with(_continuous(q_A, stack.first), q_A), _with(_continuous(q_B, stack.first), q_B)
     if signs == "random":
@@ -230,7 +231,7 @@ class _Form:
         else:
             t_inverse = -np.einsum("nji,nj->ni", stack.A[:, :3, :3], stack.A[:, :3, 3])
             rows_X = np.tile(weight * np.eye(8), (len(stack.A), 1, 1))
-            rows_Y = weight * (_multiplication(q_A * (1.0, -1.0, -1.0, -1.0), t_inverse, left) @ rows_Y)
+            rows_Y = weight * (_multiplication(conjugate(q_A), t_inverse, left) @ rows_Y)
         edges = [slice(8 * i, 8 * j) for i, j in zip(stack.first[:-1], stack.first[1:], strict=True)]
         flat_X, flat_Y = rows_X.reshape(-1, 8), rows_Y.reshape(-1, 8)
         own_X = np.array([flat_X[edge].T @ flat_X[edge] for edge in edges])
@@ -254,11 +255,9 @@ class _Form:
 
 def _multiplication(q: Array, t: Array, side: Callable[[Array], Array]) -> Array:
     """(N, 8, 8): dual quaternion multiplication by q + eps t q / 2, from the left or from the right."""
-    of_translation = np.concatenate([np.zeros((len(t), 1)), t], axis=1)
-    dual = 0.5 * np.einsum("nij,nj->ni", left(of_translation), q)
     result = np.zeros((len(q), 8, 8))
     result[:, :4, :4] = result[:, 4:, 4:] = side(q)
-    result[:, 4:, :4] = side(dual)
+    result[:, 4:, :4] = side(dual_parts(q, t))
     return result
 
 

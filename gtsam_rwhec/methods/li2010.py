@@ -6,8 +6,9 @@ import numpy as np
 
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.methods import quaternions
+from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT, conjugate, dual_parts, left, to_rotations
 from gtsam_rwhec.methods.absolute import FREE, Stack, nearest_rotations, poses_by_name
+from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.methods.plain_form import plain_form
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.problem.problem import Problem
@@ -52,8 +53,8 @@ def _rows() -> Array:
     rows = np.zeros((16, 8, 16))
     real, dual = slice(0, 4), slice(4, 8)
     X, dual_X, Y, dual_Y = (slice(4 * i, 4 * i + 4) for i in range(4))
-    rows[0:4, real, X] = rows[0:4, dual, dual_X] = rows[4:8, dual, X] = quaternions.LEFT
-    rows[8:12, real, Y] = rows[8:12, dual, dual_Y] = rows[12:16, dual, Y] = -quaternions.RIGHT
+    rows[0:4, real, X] = rows[0:4, dual, dual_X] = rows[4:8, dual, X] = LEFT
+    rows[8:12, real, Y] = rows[8:12, dual, dual_Y] = rows[12:16, dual, Y] = -RIGHT
     return rows
 
 
@@ -68,8 +69,10 @@ def dual_quaternions(problem: Problem, options: MethodOptions) -> Calibration:
     larger real part), each frame then made a unit dual quaternion of its own.
     """
     stack = Stack.of(problem)
-    q_A, q_B = quaternions.paired_quaternions(stack)
-    features = np.concatenate([q_A, _dual(q_A, stack.A), q_B, _dual(q_B, stack.B)], axis=1)
+    q_A, q_B = paired_quaternions(stack)
+    features = np.concatenate(
+        [q_A, dual_parts(q_A, stack.A[:, :3, 3]), q_B, dual_parts(q_B, stack.B[:, :3, 3])], axis=1
+    )
     normal = np.einsum("fg,fri,grj->ij", features.T @ features, _ROWS, _ROWS, optimize=True)
     v = np.linalg.eigh(normal)[1][:, :2].T.reshape(2, 2, 2, 4)  # [vector, frame, real or dual, entry]
     # v_0 cos u + v_1 sin u: real . dual, over both frames, is a quadratic form P in (cos u, sin u)
@@ -81,17 +84,9 @@ def dual_quaternions(problem: Problem, options: MethodOptions) -> Calibration:
     length = np.linalg.norm(q, axis=1, keepdims=True)
     q, dual = q / length, dual / length
     dual = dual - np.einsum("fi,fi->f", q, dual)[:, None] * q
-    conjugate = q * (1.0, -1.0, -1.0, -1.0)
-    t = 2.0 * np.einsum("fij,fj->fi", quaternions.left(dual), conjugate)[:, 1:]
-    R = np.array([quaternions.to_rotation(one) for one in q])
+    t = 2.0 * np.einsum("fij,fj->fi", left(dual), conjugate(q))[:, :3]
+    R = to_rotations(q)
     return Calibration(poses_by_name(stack.targets, R[:1], t[:1]), poses_by_name(stack.sensors, R[1:], t[1:]))
-
-
-def _dual(q: Array, T: Array) -> Array:
-    """The dual part t q / 2 (N, 4) of poses whose real part is q."""
-    t = np.concatenate([np.zeros((len(T), 1)), T[:, :3, 3]], axis=1)
-    dual: Array = 0.5 * np.einsum("nij,nj->ni", quaternions.left(t), q)
-    return dual
 
 
 def _isotropic(P: Array) -> Array:

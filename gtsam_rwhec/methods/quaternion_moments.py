@@ -21,20 +21,20 @@ import numpy as np
 import scipy.sparse
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.methods.quaternions import LEFT, RIGHT, to_rotation
+from gtsam_rwhec.geometry.quaternions import ROTATION, to_rotations
 from gtsam_rwhec.solver.rotations import project, unvec
 
+#: The scalar first: the solver's last digits, and with them its bound, depend on the order.
+_ENTRIES = (3, 0, 1, 2)
 #: (a, b) of the ten products q_a q_b.
-PRODUCTS = [(a, b) for a in range(4) for b in range(a, 4)]
+PRODUCTS = [(_ENTRIES[i], _ENTRIES[j]) for i in range(4) for j in range(i, 4)]
 TOLERANCE = 1e-11
 STEPS = 200
 
 
 def products_to_rotation() -> Array:
-    """(9, 10): vec R = L [q_a q_b], from v -> q v q*, the product of left and right multiplication."""
-    table = np.einsum("cij,dkj->cdik", LEFT, RIGHT)[:, :, 1:, 1:]  # R = sum of q_c q_d table[c, d]
-    columns = [(table[a, b] + table[b, a] if a != b else table[a, a]).T.ravel() for a, b in PRODUCTS]
-    return np.array(columns).T
+    """(9, 10): vec R = L [q_a q_b]."""
+    return np.array([(1.0 + (a != b)) * ROTATION[a, b].T.ravel() for a, b in PRODUCTS]).T
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def _moments(frames: int) -> _Moments:
     y = [np.zeros(4 * frames, dtype=int)]
     y += [unit[4 * k + a] + unit[4 * k + b] for k in range(frames) for a, b in PRODUCTS]
     even = np.array([[index(p + q) for q in y] for p in y])
-    z = [unit[a] + unit[4 + b] for a in range(4) for b in range(4)] if frames == 2 else []
+    z = [unit[a] + unit[4 + b] for a in _ENTRIES for b in _ENTRIES] if frames == 2 else []
     odd = np.array([[index(p + q) for q in z] for p in z], dtype=int).reshape(len(z), len(z))
     rows = []
     for k in range(frames):
@@ -157,7 +157,7 @@ def _rounded(M: Array, frames: int) -> list[Array]:
         second = np.zeros((4, 4))
         for (a, b), moment in zip(PRODUCTS, M[0, 1 + 10 * k : 11 + 10 * k], strict=True):
             second[a, b] = second[b, a] = moment
-        by_quaternion[k] = to_rotation(np.linalg.eigh(second)[1][:, -1])
+        by_quaternion[k] = to_rotations(np.linalg.eigh(second)[1][:, -1])
     products = M[0, 1:].reshape(frames, 10)
     by_matrix = project(unvec(products @ products_to_rotation().T))
     return [by_quaternion, by_matrix]

@@ -21,9 +21,9 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import ROTATION, of_rotations, to_rotations
 from gtsam_rwhec.methods.absolute import Stack, linear_translations, poses_by_name
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
-from gtsam_rwhec.methods.quaternions import LEFT, RIGHT, of_rotations
 from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.methods.unit_weights import UnitForm, unit_weights
 from gtsam_rwhec.problem.problem import Problem
@@ -131,16 +131,13 @@ def from_rotation_vectors(p: Array) -> tuple[Array, Array]:
 
 
 def from_quaternions(p: Array) -> tuple[Array, Array]:
-    """Of quaternions (n, 4), scalar first, divided by their lengths."""
+    """Of quaternions (n, 4), scalar last, divided by their lengths."""
     length = np.linalg.norm(p, axis=1)[:, None]
     q = p / length
-    # v -> q v q*: L(q) R(q)', bilinear in q
-    halves = np.einsum("cij,dkj->cdik", LEFT, RIGHT)[:, :, 1:, 1:]
-    R = np.einsum("nc,nd,cdik->nik", q, q, halves)
-    by_q = np.einsum("nd,cdik->ncik", q, halves) + np.einsum("nd,dcik->ncik", q, halves)
+    by_q = 2.0 * np.einsum("nd,cdik->ncik", q, ROTATION)
     tangent = (np.eye(4) - q[:, :, None] * q[:, None, :]) / length[:, :, None]
     derivative = np.einsum("ncik,ncm->nkim", by_q, tangent).reshape(len(p), 9, 4)
-    return R, derivative
+    return to_rotations(q), derivative
 
 
 CHARTS: dict[str, tuple[Callable[[Array], Array], Chart]] = {

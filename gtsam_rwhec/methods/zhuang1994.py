@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.errors import UnderdeterminedError
-from gtsam_rwhec.methods import quaternions
+from gtsam_rwhec.geometry.quaternions import left, of_rotations, right, to_rotations
 from gtsam_rwhec.methods.absolute import FREE, Stack, linear_rotations, linear_translations, poses_by_name
+from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.problem.problem import Problem
 
@@ -25,14 +26,14 @@ def zhuang1994(problem: Problem, options: MethodOptions) -> Calibration:
         (s_A I + [v_A]x + v_A v_A'/s_A) v_X/s_Y - (s_B I - [v_B]x + v_A v_B'/s_A) v_Y/s_Y = v_B - (s_B/s_A) v_A.
     """
     stack = Stack.of(problem)
-    q_A, q_B = quaternions.paired_quaternions(stack)
-    usable = np.abs(q_A[:, 0]) > SMALLEST_SCALAR
-    s_A, v_A, s_B, v_B = q_A[usable, 0, None], q_A[usable, 1:], q_B[usable, 0, None], q_B[usable, 1:]
-    # L(q)'s lower right block is s I + [v]x, R(q)'s is s I - [v]x
-    of_X = quaternions.left(q_A[usable])[:, 1:, 1:] + (v_A / s_A)[:, :, None] * v_A[:, None, :]
-    of_Y = -quaternions.right(q_B[usable])[:, 1:, 1:] - (v_A / s_A)[:, :, None] * v_B[:, None, :]
+    q_A, q_B = paired_quaternions(stack)
+    usable = np.abs(q_A[:, 3]) > SMALLEST_SCALAR
+    v_A, s_A, v_B, s_B = q_A[usable, :3], q_A[usable, 3:], q_B[usable, :3], q_B[usable, 3:]
+    # L(q)'s upper left block is s I + [v]x, R(q)'s is s I - [v]x
+    of_X = left(q_A[usable])[:, :3, :3] + (v_A / s_A)[:, :, None] * v_A[:, None, :]
+    of_Y = -right(q_B[usable])[:, :3, :3] - (v_A / s_A)[:, :, None] * v_B[:, None, :]
     rows = np.concatenate([of_X, of_Y], axis=2).reshape(-1, 6)
-    right = (v_B - s_B / s_A * v_A).ravel()
+    constants = (v_B - s_B / s_A * v_A).ravel()
     normal = rows.T @ rows
     values = np.linalg.eigvalsh(normal)
     if not usable.any() or values[0] <= FREE * values[-1]:
@@ -41,17 +42,17 @@ def zhuang1994(problem: Problem, options: MethodOptions) -> Calibration:
             "of them is a half turn; or the rotations measured turn about parallel axes. Turn a carrier's frame by a "
             "known rotation, or use another method"
         )
-    ratio = np.linalg.solve(normal, rows.T @ right)
+    ratio = np.linalg.solve(normal, rows.T @ constants)
     s_Y = 1.0 / np.sqrt(1.0 + ratio[3:] @ ratio[3:])
     v_X, v_Y = s_Y * ratio[:3], s_Y * ratio[3:]
     scalar = s_Y * s_B[:, 0] - v_B @ v_Y + v_A @ v_X  # s_A s_X of each measurement
     s_X = s_A[:, 0] @ scalar / (s_A[:, 0] @ s_A[:, 0])
-    R_X = quaternions.to_rotation(np.array([s_X, *v_X]))[None]
-    R_Y = quaternions.to_rotation(np.array([s_Y, *v_Y]))[None]
+    R_X = to_rotations(np.array([[*v_X, s_X]]))
+    R_Y = to_rotations(np.array([[*v_Y, s_Y]]))
     t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
     notes = []
     # Noise pulls the ratios down, so that the system's own s_Y does not show that it should have been near 0.
-    scalar_of_Y = abs(quaternions.of_rotations(linear_rotations(stack)[1])[0, 0])
+    scalar_of_Y = abs(of_rotations(linear_rotations(stack)[1])[0, 3])
     if scalar_of_Y < NEAR_HALF_TURN:
         notes.append(f"Y is near a half turn (scalar part {scalar_of_Y:.3g}), by which it divides: a poor answer")
     if not usable.all():

@@ -5,9 +5,10 @@ import pytest
 from simulated import hand_held
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
+from gtsam_rwhec.geometry.quaternions import left, right
 from gtsam_rwhec.handeye import cost as cost_module
 from gtsam_rwhec.handeye.cost import moments_of, residuals
-from gtsam_rwhec.handeye.dual_quaternions import from_transforms, left, right
+from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.motion_costs import cost_of, squared_mahalanobis, squared_residuals
 from gtsam_rwhec.handeye.motions import Motions, motions_of
 

@@ -7,11 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from simulated import poses
 
+from gtsam_rwhec.geometry.quaternions import right
 from gtsam_rwhec.handeye.dual_quaternions import (
-    conjugate,
     from_transforms,
-    left,
-    right,
     times_vectors,
     to_transform,
 )
@@ -54,15 +52,9 @@ def test_products_of_poses_are_products_of_dual_quaternions() -> None:
     assert to_transform(product(q, p), product(q, p_dual) + product(q_dual, p)) == pytest.approx(T[0] @ T[1], abs=1e-14)
 
 
-def test_left_and_right_are_the_product() -> None:
-    rng = np.random.default_rng(2)
-    q, p = rng.normal(size=(2, 4))
-    assert left(q) @ p == pytest.approx(product(q, p))
-    assert right(p) @ q == pytest.approx(product(q, p))
-    assert left(np.array([q, p]))[1] == pytest.approx(left(p))
-    assert right(np.array([q, p]))[0] == pytest.approx(right(q))
+def test_a_turn_by_a_vector_is_a_product() -> None:
+    q = np.random.default_rng(2).normal(size=4)
     assert times_vectors(q) == pytest.approx(right(q)[:, :3])
-    assert product(q, conjugate(q)) == pytest.approx([0, 0, 0, q @ q])
 
 
 def test_nothing_is_no_rotation() -> None:

@@ -10,10 +10,10 @@ from test_wise2020 import cost_of, motions
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import OptionError, ScaleError
+from gtsam_rwhec.geometry.quaternions import of_rotations
 from gtsam_rwhec.methods import quaternion_moments, run
 from gtsam_rwhec.methods.heller2014 import Parameterisation, global_minimum
 from gtsam_rwhec.methods.quaternion_moments import PRODUCTS, _moments, products_to_rotation
-from gtsam_rwhec.methods.quaternions import of_rotations
 from gtsam_rwhec.methods.unit_weights import UnitForm
 from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.descent import descend
