@@ -46,7 +46,7 @@ def test_moments_of_one_pair_of_quaternions_fulfil_everything() -> None:
     q = generator.standard_normal((2, 4))
     q /= np.linalg.norm(q, axis=1)[:, None]
     y = np.concatenate([[1.0], *[[one[a] * one[b] for a, b in PRODUCTS] for one in q]])
-    z = np.outer(q[0], q[1]).ravel()
+    z = np.outer(*np.roll(q, 1, axis=1)).ravel()  # the scalar first, as in PRODUCTS
     mu = np.full(table.count, np.nan)
     mu[table.even] = np.outer(y, y)
     np.testing.assert_allclose(mu[table.even], np.outer(y, y), atol=1e-15)  # equal monomials have one place
