@@ -23,8 +23,8 @@ from gtsam_rwhec.errors import (
     UnderdeterminedError,
 )
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.options import RefineOptions
@@ -199,8 +199,8 @@ def cross_validate(
         number_of_folds=number,
         ordered_by="stamps" if all(one.stamps_ns is not None for one in raw.values()) else "order",
         overall=compare(list(raw)),
-        sensors={name: compare([pair for pair in raw if pair[1] == name]) for name in problem.sensors},
-        targets={name: compare([pair for pair in raw if pair[0] == name]) for name in problem.targets},
+        sensors={name: compare([pair for pair in raw if pair.sensor == name]) for name in problem.sensors},
+        targets={name: compare([pair for pair in raw if pair.target == name]) for name in problem.targets},
         pairs={pair: compare([pair]) for pair in raw},
         translation_errors_m={pair: values[0] for pair, values in errors.items()},
         rotation_errors_rad={pair: values[1] for pair, values in errors.items()},
@@ -252,12 +252,12 @@ def _blocks(raw: Mapping[Pair, Measurements], folds: int) -> Iterator[Fold]:
 
 def _pairs(raw: Mapping[Pair, Measurements]) -> Iterator[Fold]:
     for pair, one in raw.items():
-        yield "-".join(dict.fromkeys(pair)), {pair: np.ones(len(one.A), dtype=bool)}
+        yield pair.label, {pair: np.ones(len(one.A), dtype=bool)}
 
 
 def _halves(raw: Mapping[Pair, Measurements]) -> Iterator[Fold]:
     for sensor in dict.fromkeys(sensor for _, sensor in raw):
-        own = {pair: 2 * _in_time(one) < len(one.A) for pair, one in raw.items() if pair[1] == sensor}
+        own = {pair: 2 * _in_time(one) < len(one.A) for pair, one in raw.items() if pair.sensor == sensor}
         yield f"{sensor}, first half", own
         yield f"{sensor}, second half", {pair: ~mask for pair, mask in own.items()}
 
@@ -308,11 +308,9 @@ def _predict(
         predicted = _errors(problem, answer, pair, raw[pair])
         errors[pair][:, mask] = predicted[:, mask]
         if np.isnan(predicted).all():
-            unknown = [frame for frame in dict.fromkeys(pair) if not _is_known(problem, answer, frame)]
-            lacking = " and ".join(unknown) if unknown else f"the size of {pair[0]}"
-            notes.setdefault(
-                f"{'-'.join(dict.fromkeys(pair))} ({name}) is not predicted: nothing else measures {lacking}"
-            )
+            unknown = [frame for frame in pair.frames if not _is_known(problem, answer, frame)]
+            lacking = " and ".join(unknown) if unknown else f"the size of {pair.target}"
+            notes.setdefault(f"{pair} ({name}) is not predicted: nothing else measures {lacking}")
 
 
 def _is_known(problem: Problem, answer: Solution | Refined, frame: str) -> bool:
@@ -324,14 +322,14 @@ def _errors(problem: Problem, answer: Solution | Refined, pair: Pair, one: Measu
     poses: dict[str, Array] = {name: pose.matrix() for name, pose in (answer.X | answer.Y).items()}
     poses = {**problem.fixed, **poses}
     scales = answer.scale
-    scale = {**problem.fixed_scales, **scales}.get(pair[0]) if isinstance(scales, Mapping) else scales
+    scale = {**problem.fixed_scales, **scales}.get(pair.target) if isinstance(scales, Mapping) else scales
     if scale is None or any(name not in poses for name in pair):
         return np.full((2, len(one.A)), np.nan)
     A = one.A
-    offset = getattr(answer, "time_offsets_s", {}).get(pair[1], 0.0)
+    offset = getattr(answer, "time_offsets_s", {}).get(pair.sensor, 0.0)
     if offset and one.stamps_ns is not None:
-        A = A @ LocalPaths.of(A, one.stamps_ns, "-".join(dict.fromkeys(pair))).motion(offset)
-    predicted = np.linalg.inv(poses[pair[1]]) @ A @ poses[pair[0]]
+        A = A @ LocalPaths.of(A, one.stamps_ns, pair.label).motion(offset)
+    predicted = np.linalg.inv(poses[pair.sensor]) @ A @ poses[pair.target]
     translation = np.linalg.norm(one.B[:, :3, 3] / scale - predicted[:, :3, 3], axis=1)
     chord = np.linalg.norm(one.B[:, :3, :3] - predicted[:, :3, :3], axis=(1, 2))  # sqrt(8) sin(angle / 2)
     return np.stack([translation, 2.0 * np.arcsin(np.minimum(1.0, chord / np.sqrt(8.0)))])

@@ -6,6 +6,7 @@ import numpy as np
 
 from gtsam_rwhec.compat.stations import Stations
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
@@ -42,7 +43,7 @@ def certified(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> tuple[Array, Ar
     """
     unit = float(np.sqrt(t_A.var(axis=0).sum() + t_B.var(axis=0).sum())) or 1.0
     A, B = _transforms(R_A, t_A / unit), _transforms(R_B, t_B / unit)
-    residual = _solved(A, B).residuals["target", "camera"]
+    residual = _solved(A, B).residuals[Pair("target", "camera")]
     sigma = max(residual.translation_rms_m, LEAST_RESIDUAL) / np.sqrt(3.0)
     sigma_rad = max(residual.rotation_rms_rad, LEAST_RESIDUAL) / np.sqrt(3.0)
     solution = _solved(A, B, sigma, 0.5 / sigma_rad**2)

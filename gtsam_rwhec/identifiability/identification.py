@@ -34,8 +34,8 @@ from gtsam_rwhec.identifiability.information import (
     pair_information,
     prior_information,
 )
-from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.problem.moments import ONE, R_A, T_B
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses

@@ -149,8 +149,8 @@ def pair_information(part: Part, poses: PairPoses, noise: NoiseLevel) -> PairInf
     noise_translation[:, SHARED] = 3.0 * noise.translation * n
 
     used = np.zeros((E, 15), dtype=bool)
-    for e, (target, sensor) in enumerate(part.pairs):
-        if target == sensor:  # both ends are one frame: fold the first onto the second
+    for e, pair in enumerate(part.pairs):
+        if pair.is_motion:  # both ends are one frame: fold the first onto the second
             for full in (rotation[e], translation[e]):
                 full[7:14] += full[:7]
                 full[:, 7:14] += full[:, :7]
@@ -158,11 +158,11 @@ def pair_information(part: Part, poses: PairPoses, noise: NoiseLevel) -> PairInf
             noise_rotation[e, 7:14] += noise_rotation[e, :7]
             noise_translation[e, 7:14] += noise_translation[e, :7]
             noise_rotation[e, :7] = noise_translation[e, :7] = 0.0
-        used[e, :6] = target in free and target != sensor
-        used[e, 7:13] = sensor in free
+        used[e, :6] = pair.target in free and not pair.is_motion
+        used[e, 7:13] = pair.sensor in free
         used[e, SHARED] = part.scale == "shared"
-        if target in owners:
-            at = OWN_X if target != sensor else 13
+        if pair.target in owners:
+            at = 13 if pair.is_motion else OWN_X
             for full in (translation[e], translation[e].T):
                 full[at] += full[SHARED]
             translation[e, at, at] = alpha[e] ** 2 * square[e]
@@ -212,7 +212,7 @@ def information(part: Part, by_pair: Array, noise: Array, used: np.ndarray, prio
                 own = slice(7 * (i - L), 7 * (i - L) + 7)
                 border[own, own] += by_pair[e, at, at]
                 border[own, -1] += by_pair[e, at, 14]
-        if len(ends) == 2 and pair[0] != pair[1]:
+        if len(ends) == 2 and not pair.is_motion:
             (i, at_i), (j, at_j) = sorted(ends)
             coupling[i, :, 7 * (j - L) : 7 * (j - L) + 7] += by_pair[e, at_i, at_j]
     border[-1, :-1] = border[:-1, -1]

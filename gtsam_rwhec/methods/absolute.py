@@ -14,6 +14,7 @@ import numpy as np
 from gtsam_rwhec.errors import ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import Gauge
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.parts import connected_components
 from gtsam_rwhec.solver.rotations import project
@@ -124,7 +125,7 @@ def linear_rotations(stack: Stack) -> tuple[Array, Array]:
         H[j, :, n_X + k, :] -= product.T
     names = stack.targets + stack.sensors
     place = {name: i for i, name in enumerate(names)}
-    named_pairs = tuple((stack.targets[j], stack.sensors[k]) for j, k in stack.pairs)
+    named_pairs = tuple(Pair(stack.targets[j], stack.sensors[k]) for j, k in stack.pairs)
     R = np.empty((n_X + n_Y, 3, 3))
     for component in connected_components(named_pairs):
         at = np.array([place[name] for name in component])

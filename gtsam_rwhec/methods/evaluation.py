@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.identifiability.identification import identify
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.full_form import add_priors, assemble, edge_slots, forms_of_edges
 from gtsam_rwhec.solver.parts import parts_of

@@ -168,7 +168,7 @@ def check_problem(problem: Problem) -> None:
         raise PriorError(f"LOM has neither fixed frames nor priors, and there are some for {named}; use refine")
     if problem.has_covariances:
         raise NoiseError("LOM weighs by sigma and kappa, and there are covariances; use refine(residual='geodesic')")
-    motions = [sensor for target, sensor in problem.pairs if target == sensor]
+    motions = [pair.sensor for pair in problem.pairs if pair.is_motion]
     if motions:
         raise FrameError(f"LOM solves A X = Y B, and {motions[0]} has motions (A Y = Y B); use refine")
 

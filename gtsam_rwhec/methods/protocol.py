@@ -25,8 +25,9 @@ from gtsam_rwhec.errors import (
     ScaleError,
 )
 from gtsam_rwhec.geometry.poses import PoseLike
-from gtsam_rwhec.problem.accumulation import Pair
-from gtsam_rwhec.problem.problem import Problem, ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.residuals import Residual
 
 #: How many frames a method solves for at once (RWHEC paper, Table 1): one X and one Y; several of one side with one
@@ -212,7 +213,7 @@ class Method:
                 f"{self.name} takes scale={' or '.join(map(repr, scales))}, and this problem has "
                 f"scale={problem.scale!r}; " + ("it has one scale for all" if len(scales) > 1 else "it has no scale")
             )
-        motions = [sensor for target, sensor in problem.pairs if target == sensor]
+        motions = [pair.sensor for pair in problem.pairs if pair.is_motion]
         if motions and not self.takes_motions:
             raise FrameError(f"{self.name} solves A X = Y B, and {motions[0]} has motions of its own (A Y = Y B)")
         if (problem.fixed or problem.priors) and not self.takes_priors:

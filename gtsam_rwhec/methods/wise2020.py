@@ -91,7 +91,7 @@ def check_frames(problem: Problem) -> None:
     if len(problem.pairs) > 1:
         raise FrameError(
             f"one target and one sensor, or one sensor's motions, and here are {len(problem.pairs)} pairs of frames: "
-            f"{', '.join('-'.join(pair) for pair in problem.pairs)}"
+            f"{', '.join(map(str, problem.pairs))}"
         )
 
 

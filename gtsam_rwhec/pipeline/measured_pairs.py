@@ -12,8 +12,9 @@ from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, PairRecord
 from gtsam_rwhec.pipeline.cleaning_stage import PAIR_TOPIC
-from gtsam_rwhec.problem.accumulation import Pair
-from gtsam_rwhec.problem.problem import Problem, ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
@@ -58,7 +59,7 @@ def read_pairs(log: Log, rig: Rig) -> dict[Pair, MeasuredPairs]:
     found: dict[Pair, list[PairRecord]] = defaultdict(list)
     for record in log.records([topic for topic in topics if topic in there]):
         if isinstance(record, PairRecord) and record.target in rig.targets and record.sensor in rig.sensors:
-            found[record.target, record.sensor].append(record)
+            found[Pair(record.target, record.sensor)].append(record)
     return {pair: _stacked(sorted(found[pair], key=lambda r: r.stamp_ns)) for pair in sorted(found)}
 
 
@@ -101,7 +102,7 @@ def problem_of(
     """
     problem = Problem(scale)
     has_covariances = all(measured.covariance is not None for measured in pairs.values())
-    for (target, sensor), measured in pairs.items():
+    for pair, measured in pairs.items():
         used = measured.used
         if not used.any():
             continue
@@ -115,16 +116,15 @@ def problem_of(
             weights = {"covariances": measured.covariance[used]}
         elif noise != "estimate":
             raise NoiseError(
-                f"{target}-{sensor}: noise: {{corner_px: ...}} needs corners, and the detections of {sensor} are poses "
+                f"{pair}: noise: {{corner_px: ...}} needs corners, and the detections of {pair.sensor} are poses "
                 "without a covariance; give rotation_deg and translation_mm, or estimate"
             )
         try:
             problem.add(
-                target,
-                sensor,
+                *pair,
                 measured.A[used],
                 measured.B[used],
-                stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(sensor, 0.0)),
+                stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(pair.sensor, 0.0)),
                 source="the cleaned log",
                 **weights,  # type: ignore[arg-type]
             )

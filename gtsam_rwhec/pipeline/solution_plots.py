@@ -15,6 +15,7 @@ from gtsam_rwhec.pipeline.detection_stage import TOPIC
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solved_log import Solved
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.report.plots import (
     PlottedCorners,
     PlottedMeasurement,
@@ -57,15 +58,15 @@ def plot_all(solved: Solved, solved_path: str | Path, folder: Path) -> list[Path
     return written
 
 
-def plotted_residuals(solved: Solved) -> dict[tuple[str, str], PlottedMeasurement]:
+def plotted_residuals(solved: Solved) -> dict[Pair, PlottedMeasurement]:
     """Each measurement against what the answer predicts of it."""
     first = min(int(measured.stamps_ns.min()) for measured in solved.pairs.values() if len(measured.stamps_ns))
     result = {}
-    for (target, sensor), measured in solved.pairs.items():
-        if target not in solved.refined.X or sensor not in solved.refined.Y:
+    for pair, measured in solved.pairs.items():
+        if pair.target not in solved.refined.X or pair.sensor not in solved.refined.Y:
             continue  # nothing of this pair was used
-        degrees, millimetres = residuals_of(solved, target, sensor, measured)
-        result[target, sensor] = PlottedMeasurement(
+        degrees, millimetres = residuals_of(solved, pair, measured)
+        result[pair] = PlottedMeasurement(
             stamps_s=(measured.stamps_ns - first) * 1e-9,
             rotation_deg=degrees,
             translation_mm=millimetres,
@@ -75,18 +76,18 @@ def plotted_residuals(solved: Solved) -> dict[tuple[str, str], PlottedMeasuremen
     return result
 
 
-def residuals_of(solved: Solved, target: str, sensor: str, measured: MeasuredPairs) -> tuple[Array, Array]:
+def residuals_of(solved: Solved, pair: Pair, measured: MeasuredPairs) -> tuple[Array, Array]:
     """Degrees (N,) and millimetres (N,) between B and Y^-1 A X."""
-    predicted = predicted_B(solved, target, sensor, measured.A)
-    predicted[:, :3, 3] *= scale_of(solved, target)
+    predicted = predicted_B(solved, pair, measured.A)
+    predicted[:, :3, 3] *= scale_of(solved, pair.target)
     off = se3.inverse(predicted) @ measured.B
     degrees: Array = np.degrees(np.linalg.norm(se3.so3_logmap(off[:, :3, :3]), axis=1))
     return degrees, 1e3 * np.linalg.norm(off[:, :3, 3], axis=1)
 
 
-def predicted_B(solved: Solved, target: str, sensor: str, A: Array) -> Array:
+def predicted_B(solved: Solved, pair: Pair, A: Array) -> Array:
     """Y^-1 A X, (N, 4, 4), true metres."""
-    X, Y = solved.refined.X[target].matrix(), solved.refined.Y[sensor].matrix()
+    X, Y = solved.refined.X[pair.target].matrix(), solved.refined.Y[pair.sensor].matrix()
     predicted: Array = np.linalg.inv(Y) @ A @ X
     return predicted
 
@@ -120,11 +121,11 @@ def plotted_corners(solved: Solved, log: Log) -> dict[str, PlottedCorners]:
                 not isinstance(record, DetectionRecord)
                 or record.corners_px is None
                 or record.corner_indices is None
-                or ((record.id, sensor), record.stamp_ns) not in used
+                or (Pair(record.id, sensor), record.stamp_ns) not in used
             ):
                 continue
             A, _ = path.at(np.array([record.stamp_ns + round(1e9 * offsets.get(sensor, 0.0))]))
-            T = predicted_B(solved, record.id, sensor, A)[0]
+            T = predicted_B(solved, Pair(record.id, sensor), A)[0]
             points = targets[record.id].corners()[list(record.corner_indices)] / scale_of(solved, record.id)
             seen[sensor].append(record.corners_px)
             errors[sensor].append(record.corners_px - camera.project(points @ T[:3, :3].T + T[:3, 3]))

@@ -22,7 +22,7 @@ from gtsam_rwhec.pipeline.log_metadata import (
 )
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
 from gtsam_rwhec.pipeline.solving_stage import Calibrated
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.results.refined_file import refined_json, refined_of
 from gtsam_rwhec.results.solution_file import parse_result, solution_of

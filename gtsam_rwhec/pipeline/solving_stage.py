@@ -17,8 +17,8 @@ from gtsam_rwhec.pipeline.carriers import Carriers, read_carriers
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
 from gtsam_rwhec.pipeline.log_metadata import CLEANING, DETECTION, read_cameras, read_report
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, problem_of, read_pairs
-from gtsam_rwhec.problem.accumulation import Pair
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.refining import refine
@@ -124,7 +124,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         refined,
         time_offsets_s={name: offsets[name] for name in estimated},
         inlier_counts={
-            (count.target, count.sensor): (count.used, count.used + sum(count.removed.values()))
+            Pair(count.target, count.sensor): (count.used, count.used + sum(count.removed.values()))
             for count in outliers
             if rig.cleaning.robust == "gnc" and (count.used or count.removed)
         },
@@ -194,7 +194,9 @@ class _Run:
     def at(self, pairs: Pairs, offsets: Mapping[str, float]) -> Pairs:
         """A anew at time offsets, where these were estimated; the others as cleaning left them."""
         return {
-            pair: measured.at(self.carriers.trajectory, offsets[pair[1]]) if pair[1] in self.estimated else measured
+            pair: measured.at(self.carriers.trajectory, offsets[pair.sensor])
+            if pair.sensor in self.estimated
+            else measured
             for pair, measured in pairs.items()
         }
 
@@ -278,7 +280,7 @@ def _sigma(refined: Refined, name: str) -> float | None:
 
 
 def _is_used(pairs: Mapping[Pair, MeasuredPairs], sensor: str) -> bool:
-    return any(measured.used.any() for pair, measured in pairs.items() if pair[1] == sensor)
+    return any(measured.used.any() for pair, measured in pairs.items() if pair.sensor == sensor)
 
 
 def without_outliers(pairs: Pairs, inliers: Mapping[Pair, np.ndarray]) -> Pairs:
@@ -303,7 +305,7 @@ def _with_outliers(pairs: Pairs) -> Pairs:
 def _outlier_count(pair: Pair, measured: MeasuredPairs) -> TrackCount:
     out = measured.reasons.count(OUTLIER)
     return TrackCount(
-        target=pair[0], sensor=pair[1], used=int(measured.used.sum()), removed={OUTLIER: out} if out else {}
+        target=pair.target, sensor=pair.sensor, used=int(measured.used.sum()), removed={OUTLIER: out} if out else {}
     )
 
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
-
-Pair = tuple[str, str]
+from gtsam_rwhec.problem.pairs import Pair
 
 #: The gauge may move, and everything be summed anew, until this many measurements are there: a single one says nothing
 #: of where a trajectory is centred. Later ones are summed about the gauge as it then is.
@@ -28,18 +27,13 @@ class Batch:
     where: str
 
     @property
-    def is_motion(self) -> bool:
-        """Whether both ends are one sensor (AX = XB)."""
-        return self.pair[0] == self.pair[1]
-
-    @property
     def sample(self) -> Array:
         """At most a block of A, from all over the batch: logs begin at rest, which tells no centre."""
         return self.A[:: -(-len(self.A) // BLOCK)]
 
     def moments(self, gauge: Gauge) -> Moments:
         """Checked and summed about a gauge."""
-        return Moments.of(self.A, self.B, self.weight, self.kappa, gauge, self.is_motion, self.where)
+        return Moments.of(self.A, self.B, self.weight, self.kappa, gauge, self.pair.is_motion, self.where)
 
 
 class Accumulator:
@@ -60,7 +54,7 @@ class Accumulator:
         """
         if self._opening is None:
             gauge = self.gauge
-            if not batch.is_motion and not self._has_targets():
+            if not batch.pair.is_motion and not self._has_targets():
                 gauge = replace(gauge, target_carrier=Gauge.target_origin(batch.sample, gauge.sensor_carrier))
             fresh = batch.moments(gauge)
             known = self.moments.get(batch.pair)
@@ -68,7 +62,7 @@ class Accumulator:
         batches = [*self._opening, batch]
         gauge = Gauge.of(
             np.concatenate([b.sample for b in batches]),
-            np.concatenate([np.full(len(b.sample), b.is_motion) for b in batches]),
+            np.concatenate([np.full(len(b.sample), b.pair.is_motion) for b in batches]),
         )
         moments: dict[Pair, Moments] = {}
         fresh = Moments.none()
@@ -82,7 +76,7 @@ class Accumulator:
         return result, fresh.projected
 
     def _has_targets(self) -> bool:
-        return any(target != sensor for target, sensor in self.moments)
+        return any(not pair.is_motion for pair in self.moments)
 
     def merged(self, other: Accumulator) -> Accumulator:
         """Both together, about the gauge of the one that has settled."""
@@ -99,6 +93,6 @@ class Accumulator:
         c = gauge.target_carrier - rest.gauge.target_carrier if rest._has_targets() else np.zeros(3)
         moments = dict(settled.moments)
         for pair, edge in rest.moments.items():
-            moved = edge.shifted(a, a if pair[0] == pair[1] else c)
+            moved = edge.shifted(a, a if pair.is_motion else c)
             moments[pair] = moments[pair] + moved if pair in moments else moved
         return Accumulator(gauge, moments)

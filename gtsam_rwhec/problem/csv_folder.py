@@ -24,7 +24,9 @@ from numpy.typing import NDArray
 
 from gtsam_rwhec.errors import FileFormatError, RwhecWarning
 from gtsam_rwhec.files.natural_order import natural_key
-from gtsam_rwhec.problem.problem import Problem, ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
 
 COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 
@@ -206,12 +208,12 @@ def _check_words(targets: str, sensors: str) -> None:
         )
 
 
-def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[tuple[str, str], tuple[Path, Path]]:
+def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Path, Path]]:
     """Both files of every (target, sensor), in natural order; warn of everything else in the folder."""
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
         raise FileFormatError(f"{folder} {what}; expected a folder with files such as {_example(targets, sensors)}.")
-    found: dict[tuple[str, str], dict[str, Path]] = {}
+    found: dict[Pair, dict[str, Path]] = {}
     unknown = []
     for path in folder.iterdir():
         parsed = _parse_name(path.name, targets, sensors) if path.is_file() else None
@@ -219,7 +221,7 @@ def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[tuple[str, str
             unknown.append(path.name)
             continue
         target, sensor, side = parsed
-        sides = found.setdefault((target, sensor), {})
+        sides = found.setdefault(Pair(target, sensor), {})
         if side in sides:
             raise FileFormatError(f"{sides[side]} and {path} are both {side} of {target} and {sensor}; keep one.")
         sides[side] = path
@@ -261,8 +263,8 @@ def _parse_name(name: str, targets: str, sensors: str) -> tuple[str, str, str] |
     return None
 
 
-def _naturally_sorted(pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    return sorted(pairs, key=lambda pair: (natural_key(pair[0]), natural_key(pair[1])))
+def _naturally_sorted(pairs: Iterable[Pair]) -> list[Pair]:
+    return sorted(pairs, key=lambda pair: (natural_key(pair.target), natural_key(pair.sensor)))
 
 
 def _example(targets: str, sensors: str) -> str:

@@ -1,15 +1,15 @@
-"""Measurements of one pair as they are kept, and the checks of what comes with their poses."""
+"""Measurements of one pair: as users give them, as they are kept, and the checks in between."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CountError, NoiseError, UnitsWarning
-from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, as_transforms
 from gtsam_rwhec.problem.moments import BLOCK, Gauge
 
 #: sigma and kappa below this, or above its inverse, lose everything else in rounding.
@@ -37,11 +37,94 @@ class Measurements:
         covariance: Array = variances[:, :, None] * np.eye(6)
         return covariance
 
+    def kept(self) -> KeptMeasurements:
+        """Copied, since the caller's arrays may change; sigma and kappa are one for each measurement then."""
+        sigma, kappa = (np.broadcast_to(value, len(self.A)) for value in (self.sigma, self.kappa))
+        copied = replace(self, A=self.A.copy(), B=self.B.copy(), sigma=sigma, kappa=kappa)
+        return KeptMeasurements((copied,), self.covariances is not None)
 
-def weights_of(covariances: Array) -> tuple[Array, Array]:
-    """sigma (N,) in m and kappa (N,) with the mean variance of each block of covariances (N, 6, 6)."""
-    variances = np.einsum("nii->ni", covariances)
-    return np.sqrt(variances[:, 3:].mean(axis=1)), 0.5 / variances[:, :3].mean(axis=1)
+
+@dataclass(frozen=True)
+class KeptMeasurements:
+    """Raw measurements of a pair, batch by batch, as far as they are kept; whether covariances came with any."""
+
+    batches: tuple[Measurements, ...] = ()
+    has_covariances: bool = False
+
+    def __add__(self, other: KeptMeasurements) -> KeptMeasurements:
+        return KeptMeasurements(self.batches + other.batches, self.has_covariances or other.has_covariances)
+
+    @property
+    def count(self) -> int:
+        """How many are kept."""
+        return sum(len(batch.A) for batch in self.batches)
+
+    def joined(self) -> Measurements:
+        """All in one, in the order in which they were added."""
+        batches = self.batches
+        stamps = [b.stamps_ns for b in batches if b.stamps_ns is not None]
+        return Measurements(
+            np.concatenate([b.A for b in batches]),
+            np.concatenate([b.B for b in batches]),
+            np.concatenate([b.sigma for b in batches]),
+            np.concatenate([b.kappa for b in batches]),
+            np.concatenate(stamps) if len(stamps) == len(batches) else None,
+            np.concatenate([b.covariance_of_B() for b in batches]) if self.has_covariances else None,
+        )
+
+
+@dataclass(frozen=True)
+class GivenMeasurements:
+    """Measurements as ``Problem.add`` is given them: nothing is checked. Its documentation says what each is."""
+
+    A: PosesLike
+    B: PosesLike
+    sigma: ArrayLike | None
+    kappa: ArrayLike | None
+    order: QuaternionOrder | None
+    stamps_ns: ArrayLike | None
+    covariances: ArrayLike | None
+    source: str | None
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether the noise of both rotation and translation is stated."""
+        return self.covariances is not None or (self.sigma is not None and self.kappa is not None)
+
+    def checked(self, where: str) -> Measurements:
+        """The arrays that they are; one sigma or kappa for all stays one number.
+
+        Raises
+        ------
+        PoseError, CountError, NoiseError
+            For poses, stamps or noise that are none, that are not one for each measurement, or noise given twice.
+        """
+        A = as_transforms(self.A, self.order, f"A of {where}")
+        B = as_transforms(self.B, self.order, f"B of {where}")
+        if len(A) != len(B):
+            raise CountError(f"{where}: {len(A)} poses in A and {len(B)} in B; they come in pairs")
+        if len(A) == 0:
+            raise CountError(f"{where}: no measurements; leave the pair out instead")
+        stamps_ns = checked_stamps(self.stamps_ns, len(A), where)
+        covariances = checked_covariances(self.covariances, len(A), where)
+        sigma, kappa = self.sigma, self.kappa
+        if covariances is not None:
+            if sigma is not None or kappa is not None:
+                raise NoiseError(
+                    f"{where}: covariances and {'sigma' if sigma is not None else 'kappa'} are given, which may "
+                    "contradict one another; give the one or the other (of covariances, the certified solution takes "
+                    "the mean variance of each block)"
+                )
+            variances = np.einsum("nii->ni", covariances)
+            sigma, kappa = np.sqrt(variances[:, 3:].mean(axis=1)), 0.5 / variances[:, :3].mean(axis=1)
+        return Measurements(
+            A,
+            B,
+            positive_weights(sigma, len(A), "sigma", where),
+            positive_weights(kappa, len(A), "kappa", where),
+            stamps_ns,
+            covariances,
+        )
 
 
 def positive_weights(value: ArrayLike | None, count: int, name: str, where: str) -> Array:

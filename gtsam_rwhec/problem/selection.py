@@ -1,27 +1,23 @@
 """Part of a problem's measurements, or all of them weighed anew, under the same knowledge of frames and scales.
 
-Poses were checked when they were added; here moments are summed again, about the same gauge, and nothing is warned of.
-Of what is known (fixed frames, priors, fixed scales) only what concerns frames that keep a measurement stays: a frame
-that loses its last one is not in the problem that comes back, and the caller says what that means.
+A frame that loses its last measurement is not in the problem that comes back (``Problem.with_measurements``), and the
+caller says what that means.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gtsam_rwhec.errors import CountError, FrameError, NoiseError
-from gtsam_rwhec.problem.accumulation import Accumulator, Pair
+from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.problem.measurements import Measurements
-from gtsam_rwhec.problem.moments import Moments
-from gtsam_rwhec.problem.problem import Problem, _Edge
+from gtsam_rwhec.problem.pairs import ByPair, Pair
+from gtsam_rwhec.problem.problem import Problem
 
 
-def selected(problem: Problem, keep: Mapping[Pair, ArrayLike]) -> Problem:
+def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
     """The problem with only some of its measurements.
 
     Parameters
@@ -51,17 +47,15 @@ def selected(problem: Problem, keep: Mapping[Pair, ArrayLike]) -> Problem:
             continue
         raw, mask = problem.measurements(*pair), np.asarray(keep[pair])
         if mask.shape != (len(raw.A),) or mask.dtype != np.bool_:
-            raise CountError(
-                f"keep of {'-'.join(pair)} has shape {mask.shape} of {mask.dtype}; give {len(raw.A)} booleans"
-            )
+            raise CountError(f"keep of {pair} has shape {mask.shape} of {mask.dtype}; give {len(raw.A)} booleans")
         if mask.any():
             edges[pair] = raw if mask.all() else _taken(raw, mask)
-    return with_measurements(problem, edges)
+    return problem.with_measurements(edges)
 
 
 def reweighted(
     problem: Problem,
-    weights: Mapping[Pair, ArrayLike],
+    weights: ByPair[ArrayLike],
     *,
     rotation_factor: float = 1.0,
     translation_factor: float = 1.0,
@@ -101,20 +95,19 @@ def reweighted(
         if pair in weights:
             w = np.asarray(weights[pair], dtype=np.float64)
             if w.shape != (len(raw.A),):
-                raise CountError(f"weights of {'-'.join(pair)} have shape {w.shape}; give {len(raw.A)}")
+                raise CountError(f"weights of {pair} have shape {w.shape}; give {len(raw.A)}")
             if not (np.isfinite(w).all() and w.min() >= 0.0):
-                raise NoiseError(f"weights of {'-'.join(pair)} are not all finite and at least zero: {w.min():g}")
+                raise NoiseError(f"weights of {pair} are not all finite and at least zero: {w.min():g}")
         positive = w > 0.0
         if positive.any():
             kept, w = (raw, w) if positive.all() else (_taken(raw, positive), w[positive])
             edges[pair] = _weighed(kept, w, rotation_factor, translation_factor)
-    return with_measurements(problem, edges)
+    return problem.with_measurements(edges)
 
 
-def _check_pairs(problem: Problem, given: Mapping[Pair, ArrayLike]) -> None:
-    unknown = [pair for pair in given if pair not in problem.pairs]
-    if unknown:
-        raise FrameError(f"no measurements of the pair {unknown[0]}; there are {problem.pairs}")
+def _check_pairs(problem: Problem, given: ByPair[ArrayLike]) -> None:
+    for target, sensor in given:
+        problem.moments(target, sensor)
 
 
 def _taken(raw: Measurements, mask: np.ndarray) -> Measurements:
@@ -139,31 +132,3 @@ def _weighed(raw: Measurements, w: np.ndarray, rotation_factor: float, translati
         kappa=raw.kappa * w / rotation_factor,
         covariances=covariances,
     )
-
-
-def with_measurements(problem: Problem, edges: dict[Pair, Measurements]) -> Problem:
-    """The same knowledge with other measurements of the same frames."""
-    if not edges:
-        raise CountError(f"nothing is left of {problem}: no measurement was to be kept")
-    gauge = problem.gauge
-    moments = {
-        pair: Moments.of(
-            raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, gauge, pair[0] == pair[1], "-".join(dict.fromkeys(pair))
-        )
-        for pair, raw in edges.items()
-    }
-    left = {name for pair in edges for name in pair}
-    result = copy.copy(problem)
-    result._kind = {name: kind for name, kind in problem._kind.items() if name in left}
-    result._edges = {pair: _Edge([raw], raw.covariances is not None) for pair, raw in edges.items()}
-    result._accumulator = Accumulator(gauge, moments)
-    result.fixed = {name: T for name, T in problem.fixed.items() if name in left or name not in problem._kind}
-    result.priors = {
-        name: list(priors) for name, priors in problem.priors.items() if name in left or name not in problem._kind
-    }
-    owners = {target for target, _ in edges}  # a scale is of what its measurements' lengths are of
-    known_owners = {target for target, _ in problem.pairs}
-    result.fixed_scales = {
-        name: scale for name, scale in problem.fixed_scales.items() if name in owners or name not in known_owners
-    }
-    return result

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.graph import add_summary, summary_of
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.optimisation import information_of

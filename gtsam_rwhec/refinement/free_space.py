@@ -101,7 +101,7 @@ def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[str],
         sensor = name.partition(":")[2]
         squares, noise = np.zeros(2), np.zeros(2)
         for item in data:
-            if item.pair[1] != sensor or item.paths is None:
+            if item.pair.sensor != sensor or item.paths is None:
                 continue
             weight = 1.0 / np.einsum("nii->i", item.covariance).reshape(2, 3).mean(axis=1) * item.count
             squares += weight * (item.paths.twists() ** 2).sum(axis=0).reshape(2, 3).sum(axis=1)

@@ -13,7 +13,7 @@ from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.errors import NoiseError, WeightsWarning
 from gtsam_rwhec.geometry.poses import Array, to_pose3
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import NoiseGroups, RefineOptions, Robust
@@ -212,8 +212,8 @@ def linearized(data: list[PairData], variables: Variables, state: State) -> dict
         scale = variables.scale_of_pair.get(item.pair)
         offset_s = state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0)
         result[item.pair] = item.at(offset_s).linearize(
-            frames[item.pair[0]],
-            frames[item.pair[1]],
+            frames[item.pair.target],
+            frames[item.pair.sensor],
             1.0 if scale is None else state.scales[scale],
             offset_s,
         )

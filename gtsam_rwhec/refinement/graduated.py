@@ -24,7 +24,7 @@ from scipy.special import chdtri
 
 from gtsam_rwhec.errors import CountError, OptionError, OutlierError, OutliersWarning, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import reweighted
 from gtsam_rwhec.refinement.squared_residuals import NoiseFactors
@@ -202,7 +202,7 @@ def _warn(
         f"{name} ({good} of {total}{': left out' if name in left_out else ''})"
         for name, (good, total) in sorted(suspect.items(), key=lambda item: item[1][0] / item[1][1])
     ]
-    named += [f"{'-'.join(dict.fromkeys(pair))} ({good} of {total})" for pair, (good, total) in suspect_pairs.items()]
+    named += [f"{pair} ({good} of {total})" for pair, (good, total) in suspect_pairs.items()]
     if keep.sum() < SUSPECT * len(keep):
         message = (
             f"only {int(keep.sum())} of {len(keep)} measurements agree to within {np.sqrt(threshold):.3g} standard "

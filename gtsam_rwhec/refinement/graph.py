@@ -16,8 +16,8 @@ from rwhec_factors.shifted_pose_prior import shifted_pose_prior_factor
 
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.geometry.poses import Array, to_pose3
-from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.problem.moments import edge_forms
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import ResidualKind, Robust
 from gtsam_rwhec.refinement.pair_data import PairData
@@ -67,13 +67,13 @@ class CarrierVariables:
         covariance: list[Array] = []
         first: list[tuple[Pair, int]] = []
         for item in data:
-            if item.carrier is None or item.pair[0] == item.pair[1]:
+            if item.carrier is None or item.pair.is_motion:
                 continue
             of_pair = np.empty(item.count, dtype=np.int64)
             for i, pose in enumerate(item.residuals.A):
                 stamp = -1 if item.stamps_ns is None else int(item.stamps_ns[i])
                 # Rounded well below any noise: the same pose may come out of two interpolations.
-                clock = item.pair[1] if item.paths is not None else ""
+                clock = item.pair.sensor if item.paths is not None else ""
                 key = (stamp, np.round(pose[:3], 9).tobytes(), clock)
                 if key not in place:
                     place[key] = len(A)
@@ -82,7 +82,7 @@ class CarrierVariables:
                     first.append((item.pair, i))
                 elif not np.allclose(covariance[place[key]], item.carrier[i], rtol=1e-6, atol=0.0):
                     raise NoiseError(
-                        f"{'-'.join(first[place[key]][0])} and {'-'.join(item.pair)} saw one carrier pose (measurement "
+                        f"{first[place[key]][0]} and {item.pair} saw one carrier pose (measurement "
                         f"{i} of the latter), and CarrierNoise.covariances gives it two noises; one pose has one"
                     )
                 of_pair[i] = place[key]
@@ -119,7 +119,7 @@ def add_summary(graph: gtsam.NonlinearFactorGraph, variables: Variables, pair: P
     """One chordal factor for all measurements of a pair, from moments (DESIGN fact 2)."""
     target, sensor = variables.ends(pair)
     scale_key = variables.scale_key(pair)
-    if target == sensor:
+    if pair.is_motion:
         graph.add(hand_eye_summary_factor(sensor, summary, scale_key=scale_key))
     else:
         graph.add(edge_summary_factor(target, sensor, summary, scale_key=scale_key))

@@ -13,9 +13,8 @@ import dataclasses
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import with_measurements
 from gtsam_rwhec.refinement.geodesic import linearized
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import State, Variables
@@ -31,7 +30,7 @@ def under_worst_axis(problem: Problem, data: list[PairData], variables: Variable
     edges = {}
     for item in data:
         C = residual_covariance(item, at[item.pair], (1.0, 1.0), propagated=True)
-        scale = problem.fixed_scales.get(item.pair[0], 1.0)  # the data are in true metres there
+        scale = problem.fixed_scales.get(item.pair.target, 1.0)  # the data are in true metres there
         A = item.residuals.A
         if item.paths is not None:
             A = A @ item.paths.motion(state.offsets_s[f"time_offset:{item.pair[1]}"])
@@ -42,7 +41,7 @@ def under_worst_axis(problem: Problem, data: list[PairData], variables: Variable
             kappa=0.5 / np.linalg.eigvalsh(C[:, :3, :3])[:, -1],
             covariances=None,
         )
-    return with_measurements(problem, edges)
+    return problem.with_measurements(edges)
 
 
 def agreeing(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import NoiseError, OptionError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import ByPair
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 NoiseSource = Literal["auto", "given", "estimate"]
@@ -38,7 +37,7 @@ class CarrierNoise:
 
     rotation_rad: float = 0.0
     translation_m: float = 0.0
-    covariances: Mapping[Pair, Array] | None = None
+    covariances: ByPair[Array] | None = None
     about: About = "targetcarrier"
 
     def __post_init__(self) -> None:

@@ -10,8 +10,8 @@ from rwhec_factors.batch import BatchResiduals
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.problem.measurements import checked_covariances
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
 from gtsam_rwhec.trajectories.local_paths import SAME, LocalPaths
@@ -24,7 +24,7 @@ class PairData:
 
     Attributes
     ----------
-    pair : (str, str)
+    pair : Pair
     residuals : BatchResiduals
         Geodesic.
     covariance : (N, 6, 6) array
@@ -60,7 +60,7 @@ class PairData:
             For carrier covariances that lack this pair or have another count.
         """
         raw = problem.measurements(*pair)
-        scale = problem.fixed_scales.get(pair[0], 1.0)
+        scale = problem.fixed_scales.get(pair.target, 1.0)
         B = raw.B
         covariance = raw.covariance_of_B()
         if scale != 1.0:
@@ -117,17 +117,15 @@ def local_paths(
     OptionError
         For a sensor with motions of its own.
     """
-    pairs = [pair for pair in problem.pairs if pair[1] in sensors]
-    for target, sensor in pairs:
-        if target == sensor:
+    pairs = [pair for pair in problem.pairs if pair.sensor in sensors]
+    for pair in pairs:
+        if pair.is_motion:
             raise OptionError(
-                f"a time offset of {sensor} would move both ends of its motions (add_motion), which are not modelled; "
-                "leave it out of time_offsets"
+                f"a time offset would move both ends of {pair} (add_motion), which is not modelled; leave "
+                f"{pair.sensor} out of time_offsets"
             )
-        if problem.measurements(target, sensor).stamps_ns is None:
-            raise CountError(
-                f"{target}-{sensor}: a time offset needs stamps for every measurement; add them with stamps_ns="
-            )
+        if problem.measurements(*pair).stamps_ns is None:
+            raise CountError(f"{pair}: a time offset needs stamps for every measurement; add them with stamps_ns=")
     if not pairs:
         return {}
     if carrier_path is not None:
@@ -135,7 +133,7 @@ def local_paths(
         return {
             pair: LocalPaths.along(carrier_path, stamps) for pair, stamps in stamps_of.items() if stamps is not None
         }
-    telling = [problem.measurements(*pair) for pair in problem.pairs if pair[0] != pair[1]]
+    telling = [problem.measurements(*pair) for pair in problem.pairs if not pair.is_motion]
     telling = [raw for raw in telling if raw.stamps_ns is not None]
     A = np.concatenate([raw.A for raw in telling])
     stamps = np.concatenate([raw.stamps_ns for raw in telling])
@@ -153,7 +151,7 @@ def local_paths(
 def _paths_of_pair(problem: Problem, pair: Pair) -> LocalPaths:
     raw = problem.measurements(*pair)
     assert raw.stamps_ns is not None
-    return LocalPaths.of(raw.A, raw.stamps_ns, "-".join(pair))
+    return LocalPaths.of(raw.A, raw.stamps_ns, pair.label)
 
 
 def carrier_covariances(noise: CarrierNoise, pair: Pair, A: Array) -> Array:
@@ -169,10 +167,9 @@ def carrier_covariances(noise: CarrierNoise, pair: Pair, A: Array) -> Array:
         given = np.broadcast_to(np.diag(variances), (len(A), 6, 6))
     else:
         if pair not in noise.covariances:
-            raise NoiseError(
-                f"CarrierNoise.covariances has none for {pair}; it has {', '.join(map(str, noise.covariances))}"
-            )
-        checked = checked_covariances(noise.covariances[pair], len(A), f"CarrierNoise of {'-'.join(pair)}")
+            there = ", ".join(str(Pair(*known)) for known in noise.covariances)
+            raise NoiseError(f"CarrierNoise.covariances has none for {pair}; it has {there}")
+        checked = checked_covariances(noise.covariances[pair], len(A), f"CarrierNoise of {pair}")
         if checked is None:
             raise CountError(f"CarrierNoise.covariances of {pair} is None; give {len(A)} of 6 x 6")
         given = checked
@@ -192,9 +189,9 @@ def check_carriers(data: list[PairData], options: RefineOptions) -> None:
     OptionError
         For carrier variables with motions.
     """
-    motions = [item.pair[1] for item in data if item.pair[0] == item.pair[1]]
+    motions = [item.pair for item in data if item.pair.is_motion]
     if motions and options.carrier_model == "variables":
         raise OptionError(
-            f"carrier_model='variables' makes each A a pose, but the motions of {motions[0]} have a relative A; take "
+            f"carrier_model='variables' makes each A a pose, but {motions[0]} have a relative A; take "
             "carrier_model='propagated'"
         )

@@ -12,8 +12,8 @@ from scipy.special import chdtri, fdtri
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.geometry.pose_covariances import error_of, relative_jacobian, standard_deviations
 from gtsam_rwhec.geometry.poses import Array, PoseLike
-from gtsam_rwhec.problem.accumulation import Pair
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.solving.solution import Solution

@@ -22,7 +22,7 @@ from gtsam_rwhec.errors import (
     ScaleError,
     WeightsWarning,
 )
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.chordal import ChordalModel

@@ -10,7 +10,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.certified_fit import Fit
 
@@ -48,7 +48,7 @@ class Measured:
 
     Attributes
     ----------
-    pairs : tuple of (str, str)
+    pairs : tuple of Pair
     rows : tuple of slice
         Of each pair.
     A, B : (N, 4, 4) arrays

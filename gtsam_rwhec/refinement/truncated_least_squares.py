@@ -15,7 +15,7 @@ from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.errors import CountError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import reweighted
 from gtsam_rwhec.refinement.certified_fit import Fit, certified_fit

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec.errors import FrameError
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.solution import Solution
 
@@ -60,7 +60,9 @@ class Variables:
         if problem.scale == "shared":
             scale_of_pair = dict.fromkeys(problem.pairs, "scale")
         elif problem.scale == "per_target":
-            scale_of_pair = {pair: f"scale:{pair[0]}" for pair in problem.pairs if pair[0] not in problem.fixed_scales}
+            scale_of_pair = {
+                pair: f"scale:{pair[0]}" for pair in problem.pairs if pair.target not in problem.fixed_scales
+            }
         names = list(dict.fromkeys(scale_of_pair.values()))
         return Variables(
             targets={name: gtsam.symbol("x", i) for i, name in enumerate(problem.targets)},
@@ -89,7 +91,7 @@ class Variables:
 
     def ends(self, pair: Pair) -> tuple[int, int]:
         """Keys of a pair's target and sensor; of a motion's, twice the sensor's."""
-        return self.keys[pair[0]], self.keys[pair[1]]
+        return self.keys[pair.target], self.keys[pair.sensor]
 
     def scale_key(self, pair: Pair) -> int | None:
         """Key of the scale of a pair's translations."""

@@ -16,7 +16,7 @@ from rwhec_factors.batch import Linearization
 
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import NoiseGroups
 from gtsam_rwhec.refinement.pair_data import PairData
@@ -56,7 +56,7 @@ class _Sums:
 def jacobian_of(pair: Pair, at: Linearization, variables: Variables, joint: JointCovariance) -> tuple[Array, Array]:
     """A pair's Jacobian (N, m, u) by the unknowns that it touches, and their rows in ``joint``."""
     blocks: dict[str, Array] = {}
-    for name, block in ((pair[0], at.target), (pair[1], at.sensor)):
+    for name, block in ((pair.target, at.target), (pair.sensor, at.sensor)):
         if name in joint.slots:
             blocks[name] = blocks[name] + block if name in blocks else block
     scale = variables.scale_of_pair.get(pair)

@@ -34,7 +34,7 @@ def by_vote(name: str, measured: Measured, fit: Fit, factors: NoiseFactors, thre
     saved : float
         By how much sum min(d^2, c^2) went down.
     """
-    own = measured.of_pairs([pair for pair in measured.pairs if name in pair and pair[0] != pair[1]])
+    own = measured.of_pairs([pair for pair in measured.pairs if name in pair and not pair.is_motion])
 
     def cost_of(candidate: Fit) -> tuple[float, Array]:
         d = own.together(own.squares(candidate), factors)
@@ -57,13 +57,13 @@ def by_vote(name: str, measured: Measured, fit: Fit, factors: NoiseFactors, thre
 def _proposed(name: str, index: int, own: Measured, fit: Fit) -> Array | None:
     """X = A^-1 Y B or Y = A X B^-1 of one measurement, lengths true; None where the pair's other end has no pose."""
     pair = own.pair_of(index)
-    other = pair[1] if pair[0] == name else pair[0]
-    alpha = fit.alpha.get(pair[0], np.nan)
+    other = pair.sensor if pair.target == name else pair.target
+    alpha = fit.alpha.get(pair.target, np.nan)
     if other not in fit.poses or not np.isfinite(alpha) or alpha == 0.0:
         return None
     A, B = own.A[index], own.B[index].copy()
     B[:3, 3] /= alpha
-    if pair[0] == name:
+    if pair.target == name:
         X: Array = np.linalg.solve(A, fit.poses[other] @ B)
         return X
     Y: Array = np.linalg.solve(B.T, (A @ fit.poses[other]).T).T

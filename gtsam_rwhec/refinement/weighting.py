@@ -9,7 +9,7 @@ import numpy as np
 from rwhec_factors.batch import Linearization
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.options import NoiseGroups
 from gtsam_rwhec.refinement.pair_data import PairData
 
@@ -43,7 +43,7 @@ def group_of(pair: Pair, groups: NoiseGroups) -> Group:
     """The group whose residuals a pair's noise is estimated from."""
     if groups == "all":
         return ("all",)
-    return (pair[1],) if groups == "sensor" else pair
+    return (pair.sensor,) if groups == "sensor" else pair
 
 
 def measurement_covariance(data: PairData, factors: tuple[float, float]) -> Array:

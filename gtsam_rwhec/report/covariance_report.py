@@ -12,7 +12,7 @@ from rich.text import Text
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
 from gtsam_rwhec.report.solution_report import report_console
@@ -118,7 +118,7 @@ def _outlier_sentence(counts: Mapping[Pair, tuple[int, int]]) -> str:
     out = {pair: number - kept for pair, (kept, number) in counts.items() if kept < number}
     if not out:
         return f"Outliers: none of {total} measurements."
-    pairs = ", ".join(f"{_pair_name(pair)} {count} of {counts[pair][1]}" for pair, count in out.items())
+    pairs = ", ".join(f"{pair} {count} of {counts[pair][1]}" for pair, count in out.items())
     return f"Outliers: {sum(out.values())} of {total} measurements left out: {pairs}."
 
 
@@ -127,13 +127,13 @@ def noise_table(refined: Refined) -> FrameTable:
     noises = {pair: _noise_cells(noise) for pair, noise in refined.noise.items()}
     kinds: tuple[tuple[str, Callable[[Pair], str]], ...] = (
         ("", lambda pair: "all"),
-        ("sensor", lambda pair: pair[1]),
-        ("pair", _pair_name),
+        ("sensor", lambda pair: pair.sensor),
+        ("pair", str),
     )
     kind, label = next(
         (kind, label)
         for kind, label in kinds
-        if label is _pair_name
+        if label is str
         or len({(label(pair), cells) for pair, cells in noises.items()}) == len({label(pair) for pair in noises})
     )
     rows = {label(pair): cells for pair, cells in noises.items()}
@@ -145,10 +145,6 @@ def noise_table(refined: Refined) -> FrameTable:
 def _noise_cells(noise: PairNoise) -> tuple[str, ...]:
     size = (f"{math.degrees(noise.rotation_rad):.3g}", f"{1e3 * noise.translation_m:.3g}")
     return size + tuple(f"{spare:.0f}" for spare in noise.redundancy if np.isfinite(spare))
-
-
-def _pair_name(pair: Pair) -> str:
-    return "-".join(dict.fromkeys(pair))
 
 
 def _frame_table(title: str, kind: str, poses: Mapping[str, object], refined: Refined) -> FrameTable:

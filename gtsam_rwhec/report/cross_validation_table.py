@@ -36,7 +36,7 @@ def cross_validation_tables(result: CrossValidation, *, pairs: bool = False) -> 
     if result.targets:
         tables.append(FrameTable("Hold-out error by target", "target", HEADINGS, _rows(result.targets)))
     if pairs:
-        by_name = {"-".join(dict.fromkeys(pair)): comparison for pair, comparison in result.pairs.items()}
+        by_name = {pair.label: comparison for pair, comparison in result.pairs.items()}
         tables.append(FrameTable("Hold-out error by pair", "pair", HEADINGS, _rows(by_name)))
     return tables
 

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.identifiability.identification import Identifiability
+from gtsam_rwhec.problem.pairs import Pair
 
 
 @dataclass(frozen=True)
@@ -38,14 +39,14 @@ class PairGrid:
 
     def state(self, target: str, sensor: str) -> Symbol:
         """What is known of one pair."""
-        pair = self.identifiability.pairs.get((target, sensor))
+        pair = self.identifiability.pairs.get(Pair(target, sensor))
         if pair is None:
             return NOT_OBSERVED
         return DETERMINED if pair.is_unique else NOT_DETERMINED
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Print the grid, then what its symbols mean and how many there are of each."""
-        observed = [pair for pair in self.identifiability.pairs if pair[0] != pair[1]]
+        observed = [pair for pair in self.identifiability.pairs if not pair.is_motion]
         targets = sorted({target for target, _ in observed}, key=natural_key)
         sensors = sorted({sensor for _, sensor in observed}, key=natural_key)
         prefix, labels = _without_common_prefix(targets)
@@ -71,10 +72,10 @@ class PairGrid:
 
 def _motions(identifiability: Identifiability) -> Iterator[Text]:
     """The edges A Y = Y B have no target, and so no square."""
-    for (target, sensor), pair in identifiability.pairs.items():
-        if target == sensor:
-            verdict = "determined" if pair.is_unique else "not determined"
-            yield Text(f"{sensor} from its own motion: {verdict} on its own")
+    for pair, alone in identifiability.pairs.items():
+        if pair.is_motion:
+            verdict = "determined" if alone.is_unique else "not determined"
+            yield Text(f"{pair.sensor} from its own motion: {verdict} on its own")
 
 
 def _width(label: str) -> int:

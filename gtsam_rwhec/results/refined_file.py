@@ -9,6 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.refined import Movement, PairNoise, Refined, RefinedPoses
 from gtsam_rwhec.results.schema import (
@@ -102,12 +103,12 @@ def refined_of(result: ResultFile, path: str | Path) -> RefinedPoses:
         scale_mode=fields.scale.mode,
         time_offsets_s=dict(fields.time_offsets_s),
         noise_source=fields.noise_source,
-        noise={(p.target, p.sensor): PairNoise(p.noise_rad, p.noise_m, p.redundancy) for p in fields.pairs},
+        noise={Pair(p.target, p.sensor): PairNoise(p.noise_rad, p.noise_m, p.redundancy) for p in fields.pairs},
         cost=fields.cost,
         initial_cost=fields.initial_cost,
         iterations=fields.iterations,
         moved={frame.name: Movement(frame.moved_mm, frame.moved_deg) for frame in fields.frames},
-        inlier_counts={(p.target, p.sensor): p.inliers for p in fields.pairs if p.inliers is not None},
+        inlier_counts={Pair(p.target, p.sensor): p.inliers for p in fields.pairs if p.inliers is not None},
         free_directions=list(fields.free_directions),
         joint=_joint_from_file(fields.joint),
     )
@@ -129,8 +130,8 @@ def _to_file(refined: Refined) -> RefinedFields:
         frames=tuple(_frame_to_file(refined, name) for name in refined.moved),
         pairs=tuple(
             RefinedPair(
-                target=pair[0],
-                sensor=pair[1],
+                target=pair.target,
+                sensor=pair.sensor,
                 noise_rad=noise.rotation_rad,
                 noise_m=noise.translation_m,
                 redundancy=noise.redundancy,

@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.identifiability.identification import Identifiability, PairIdentifiability
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.results.schema import (
     CONVENTIONS,
     FORMAT,
@@ -181,8 +182,8 @@ def fields_of(solution: Solution) -> ResultFile:
         ),
         pairs=tuple(
             PairFields(
-                target=pair[0],
-                sensor=pair[1],
+                target=pair.target,
+                sensor=pair.sensor,
                 number_of_measurements=residual.number_of_measurements,
                 translation_rms_m=residual.translation_rms_m,
                 rotation_rms_rad=residual.rotation_rms_rad,
@@ -208,7 +209,7 @@ def solution_of(file: ResultFile) -> Solution:
         weakest=file.identifiability.weakest,
         threshold=file.identifiability.threshold,
         pairs={
-            (pair.target, pair.sensor): PairIdentifiability(
+            Pair(pair.target, pair.sensor): PairIdentifiability(
                 is_unique=pair.is_unique,
                 free_directions=list(pair.free_directions),
                 rotation_axes=pair.rotation_axes,
@@ -231,7 +232,7 @@ def solution_of(file: ResultFile) -> Solution:
         certificate=_certificate_from_file(file.certificate),
         identifiability=identifiability,
         residuals={
-            (pair.target, pair.sensor): Residual(
+            Pair(pair.target, pair.sensor): Residual(
                 pair.number_of_measurements, pair.translation_rms_m, pair.rotation_rms_rad
             )
             for pair in file.pairs

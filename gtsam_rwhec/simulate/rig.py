@@ -8,7 +8,9 @@ from typing import TypedDict, TypeVar
 import numpy as np
 
 from gtsam_rwhec.errors import OptionError
-from gtsam_rwhec.problem.problem import Problem, ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.pairs import ByPair, Pair
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate.graphs import Edge, GraphKind, bipartite_edges
 from gtsam_rwhec.simulate.motion import Motion, MotionKind, carrier_poses
 from gtsam_rwhec.simulate.noise import Noise, Seed, perturb
@@ -16,7 +18,6 @@ from gtsam_rwhec.simulate.scales import true_scales
 from gtsam_rwhec.simulate.simulation import Simulation
 from gtsam_rwhec.simulate.transforms import inverse, random_poses
 
-Pair = tuple[str, str]
 Value = TypeVar("Value")
 
 #: Largest coordinate of a target in the world, and of a sensor on the rig: a room, and a rig that a person can carry.
@@ -39,8 +40,8 @@ def general(
     graph: GraphKind | Iterable[Edge] = "complete",
     edge_probability: float = 0.3,
     motion: Motion | MotionKind = "general",
-    number_of_measurements: int | Mapping[Pair, int] = 20,
-    noise: Noise | Mapping[Pair, Noise] | None = None,
+    number_of_measurements: int | ByPair[int] = 20,
+    noise: Noise | ByPair[Noise] | None = None,
     noise_in_A: Noise | None = None,
     scale: ScaleMode = "known",
     true_scale: float | Mapping[str, float] | None = None,
@@ -107,7 +108,7 @@ def general(
     """
     frames, edges_random, path, choice, measuring, driving = np.random.default_rng(seed).spawn(6)
     edges = bipartite_edges(graph, targets, sensors, edges_random, edge_probability)
-    pairs = {(f"target{j}", f"sensor{k}"): (j, k) for j, k in edges}
+    pairs = [Pair(f"target{j}", f"sensor{k}") for j, k in edges]
     movers = [f"sensor{k}" for k in range(sensors)] if odometry > 0 else []
     if odometry < 0:
         raise OptionError(f"general: odometry is {odometry}, but cannot be negative")
@@ -123,8 +124,8 @@ def general(
 
     X = {f"target{j}": T for j, T in enumerate(random_poses(targets, TARGETS_WITHIN_M, frames))}
     Y = {f"sensor{k}": T for k, T in enumerate(random_poses(sensors, SENSORS_WITHIN_M, frames))}
-    X = {name: T for name, T in X.items() if any(name == target for target, _ in pairs)}
-    Y = {name: T for name, T in Y.items() if name in movers or any(name == sensor for _, sensor in pairs)}
+    X = {name: T for name, T in X.items() if any(name == pair.target for pair in pairs)}
+    Y = {name: T for name, T in Y.items() if name in movers or any(name == pair.sensor for pair in pairs)}
     known_sizes = tuple(known_sizes)
     alphas = true_scales([*X, *movers], scale, true_scale, known_sizes, frames)
     if not isinstance(motion, Motion):
@@ -134,14 +135,12 @@ def general(
 
     problem = Problem(scale=scale, keep_measurements=keep_measurements)
     for pair in pairs:
-        target, sensor = pair
         steps = np.sort(choice.permutation(len(T_rig_world))[: counts[pair]])
-        B = inverse(Y[sensor]) @ T_rig_world[steps] @ X[target]
-        B[:, :3, 3] *= alphas[target] if isinstance(alphas, dict) else alphas
+        B = inverse(Y[pair.sensor]) @ T_rig_world[steps] @ X[pair.target]
+        B[:, :3, 3] *= alphas[pair.target] if isinstance(alphas, dict) else alphas
         noise_of_pair = None if noise is None else _of_pair(noise, pair, "noise")
         problem.add(
-            target,
-            sensor,
+            *pair,
             noisy_T_rig_world[steps],
             perturb(B, noise_of_pair, measuring),
             **_weights(noise_of_pair),
@@ -165,7 +164,7 @@ def _weights(noise: Noise | None) -> _Weights:
     return {"sigma": None, "kappa": None} if noise is None else {"sigma": noise.sigma_m, "kappa": noise.kappa}
 
 
-def _of_pair(value: Value | Mapping[Pair, Value], pair: Pair, option: str) -> Value:
+def _of_pair(value: Value | ByPair[Value], pair: Pair, option: str) -> Value:
     """The option's value for one pair of names (target, sensor)."""
     if not isinstance(value, Mapping):
         return value

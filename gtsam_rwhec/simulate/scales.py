@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 
 from gtsam_rwhec.errors import OptionError, ScaleError
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate.noise import Seed
 
 #: The paper's monocular simulations use it too.

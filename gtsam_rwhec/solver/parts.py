@@ -9,10 +9,11 @@ import numpy as np
 
 from gtsam_rwhec.errors import CountError, FrameError, PoseError, PriorError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.moments import Gauge, Moments, MomentStack
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.priors import Prior
-from gtsam_rwhec.problem.problem import Problem, ScaleMode
+from gtsam_rwhec.problem.problem import Problem
 
 #: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" the equation turned round, B X^-1 = Y^-1 A, which
 #: a scale for each target needs (DESIGN fact 7).
@@ -31,8 +32,8 @@ class Part:
         Free frames; leaves are the larger side, and are joined to centers only.
     targets, sensors : tuple of str
         All frames of the part, fixed ones too.
-    pairs : tuple of (str, str)
-        Its edges; (sensor, sensor) for motions.
+    pairs : tuple of Pair
+        Its edges.
     moments : MomentStack
         Of the pairs in their order, about ``gauge``.
     fixed : dict of str to (4, 4) array
@@ -175,7 +176,7 @@ def _centred(problem: Problem, pairs: tuple[Pair, ...]) -> tuple[Gauge, MomentSt
     Moving moments is exact in formula, but a move far beyond the spread of the translations cancels digits, as when
     the first measurements were all but one pose. Then the raw measurements, where kept, are summed anew.
     """
-    motion = [target == sensor for target, sensor in pairs]
+    motion = [pair.is_motion for pair in pairs]
     moments = MomentStack.of([problem.moments(*pair) for pair in pairs], motion)
     a, c = moments.best_shift()
     gauge, centred = problem.gauge.moved_by(a, c), moments.shifted(a, c)
@@ -184,8 +185,7 @@ def _centred(problem: Problem, pairs: tuple[Pair, ...]) -> tuple[Gauge, MomentSt
         fresh = []
         for pair, is_motion in zip(pairs, motion, strict=True):
             raw = problem.measurements(*pair)
-            where = "-".join(dict.fromkeys(pair))
-            fresh.append(Moments.of(raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, gauge, is_motion, where))
+            fresh.append(Moments.of(raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, gauge, is_motion, pair.label))
         centred = MomentStack.of(fresh, motion)
     return gauge, centred
 
@@ -200,7 +200,7 @@ def _sides(
     targets: tuple[str, ...], sensors: tuple[str, ...], pairs: tuple[Pair, ...], fixed: dict[str, Array]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The larger side is eliminated first; a frame that only moves by itself has no pivot of its own: a center."""
-    paired = {name for target, sensor in pairs if target != sensor for name in (target, sensor)}
+    paired = {name for pair in pairs if not pair.is_motion for name in pair}
     free_targets = tuple(name for name in targets if name not in fixed)
     free_sensors = tuple(name for name in sensors if name not in fixed)
     larger, smaller = (free_targets, free_sensors)
@@ -231,6 +231,5 @@ def _check(part: Part) -> None:
     bad = np.flatnonzero(~np.isfinite(part.moments.translation).all(axis=(1, 2)))
     if bad.size:
         raise PoseError(
-            f"the translations of {'-'.join(part.pairs[bad[0]])} are so large that their squares overflow; "
-            "are they in metres?"
+            f"the translations of {part.pairs[bad[0]]} are so large that their squares overflow; are they in metres?"
         )

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
 from gtsam_rwhec.problem.moments import edge_forms
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.variables import Answer
 

@@ -22,7 +22,7 @@ from gtsam_rwhec.errors import (
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform, to_pose3
 from gtsam_rwhec.identifiability import identification as identifiability
 from gtsam_rwhec.identifiability.identification import Identifiability, identify
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.priors import difference
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver import certificate as certificates

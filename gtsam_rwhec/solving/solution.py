@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import gtsam
 
 from gtsam_rwhec.identifiability.identification import Identifiability, PairIdentifiability
-from gtsam_rwhec.problem.accumulation import Pair
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.solver.certificate import Certificate, Status
 from gtsam_rwhec.solver.residuals import Residual
 

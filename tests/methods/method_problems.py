@@ -8,7 +8,7 @@ import numpy as np
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.methods import Estimate
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise, Simulation, cameras, general, sphere
 
 NOISE = Noise(sigma_m=0.01, kappa=125.0, model="released")

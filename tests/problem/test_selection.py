@@ -146,7 +146,7 @@ def test_covariances_are_weighed_like_sigma_and_kappa(seed: int) -> None:
 
 def test_bad_input_is_refused_in_words() -> None:
     problem = rig()
-    with pytest.raises(FrameError, match="no measurements of the pair"):
+    with pytest.raises(FrameError, match="no measurements of"):
         selected(problem, {("target9", "sensor0"): np.ones(12, dtype=bool)})
     with pytest.raises(CountError, match="give 12 booleans"):
         selected(problem, {PAIR: np.ones(11, dtype=bool)})

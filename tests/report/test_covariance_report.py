@@ -15,6 +15,7 @@ import pytest
 from rich.console import Console
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import PairNoise
 from gtsam_rwhec.report import print_refined
 from gtsam_rwhec.report.covariance_report import deviation_cells, noise_table, refined_sentences
@@ -198,7 +199,7 @@ def test_it_says_whether_the_carriers_are_taken_for_exact(rig: rw.Refined) -> No
 def test_outliers_are_counted(rig: rw.Refined) -> None:
     counts = dict.fromkeys(rig.noise, (20, 20))
     assert "Outliers: none of 120 measurements." in refined_sentences(dataclasses.replace(rig, inlier_counts=counts))
-    counts |= {("target1", "sensor0"): (18, 20), ("target2", "sensor1"): (19, 20)}
+    counts |= {Pair("target1", "sensor0"): (18, 20), Pair("target2", "sensor1"): (19, 20)}
     assert (
         "Outliers: 3 of 120 measurements left out: target1-sensor0 2 of 20, target2-sensor1 1 of 20."
     ) in refined_sentences(dataclasses.replace(rig, inlier_counts=counts))
@@ -230,6 +231,7 @@ def test_a_file_gets_one_line_for_each_sentence(rig: rw.Refined, planar: rw.Refi
 
 
 def test_frame_names_are_not_taken_for_markup(rig: rw.Refined) -> None:
-    odd = dataclasses.replace(rig, noise={("[bold]t[/]", "[red]s[/]"): PairNoise(0.01, 0.01, (math.inf, math.inf))})
-    counts = {("[bold]t[/]", "[red]s[/]"): (1, 2)}
+    pair = Pair("[bold]t[/]", "[red]s[/]")
+    odd = dataclasses.replace(rig, noise={pair: PairNoise(0.01, 0.01, (math.inf, math.inf))})
+    counts = {pair: (1, 2)}
     assert "[bold]t[/]-[red]s[/] 1 of 2." in printed(dataclasses.replace(odd, inlier_counts=counts))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small_problems import flat, multipliers_at, optimum, reduced, simulated
 
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion, Noise
 from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.bound import lower_bound

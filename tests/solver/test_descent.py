@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_problems import GROSS_NOISE, gradient_norm, optimum, reduced, searched, simulated, true_rotations
 
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.descent import cost_of, descend
 from gtsam_rwhec.solver.reduced_form import ReducedForm

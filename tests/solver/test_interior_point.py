@@ -10,7 +10,7 @@ from small_problems import GROSS_NOISE, flat, multipliers_at, optimum, reduced, 
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion, Noise
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.interior_point import Relaxation, solve_by_blocks

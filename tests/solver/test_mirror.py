@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_problems import part_of, reduced, searched, simulated, true_rotations
 
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.solver.descent import cost_of
 from gtsam_rwhec.solver.mirror import mirrored
 from gtsam_rwhec.solver.rotations import random_rotations

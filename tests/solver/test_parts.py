@@ -7,7 +7,7 @@ import pytest
 from small_problems import part_of, simulated
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.solver.parts import connected_components, parts_of
 
 SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")

@@ -9,7 +9,7 @@ from small_problems import SMALL_NOISE, dense_full, flat, part_of, reduced, simu
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.reduced_form import ReducedForm, generalised_inverse_factor

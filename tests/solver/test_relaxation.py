@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_problems import GROSS_NOISE, optimum, reduced, simulated, true_rotations
 
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.solver.nonnegative import scale_row, scale_spread
 from gtsam_rwhec.solver.relaxation import (
     CLARABEL_SIZE,

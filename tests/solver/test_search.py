@@ -14,7 +14,7 @@ from small_problems import GROSS_NOISE, flat, optimum, reduced, searched, simula
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion, Noise
 from gtsam_rwhec.solver.certificate import Certificate, Status
 from gtsam_rwhec.solver.options import SolveOptions

@@ -10,7 +10,7 @@ import scipy.linalg
 from small_problems import GROSS_NOISE, flat, multipliers_at, optimum, reduced, simulated
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.descent import homogeneous

@@ -7,7 +7,7 @@ import pytest
 from small_problems import GROSS_NOISE, part_of, simulated, true_rotations
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.problem import ScaleMode
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Simulation
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.search import Forms

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.accumulation import Pair
+from gtsam_rwhec.problem.pairs import ByPair
 from gtsam_rwhec.report.plots.drawing import (
     BLACK,
     BLUE,
@@ -42,7 +41,7 @@ UNKNOWN_AT, UNKNOWN = 0.04, "(on the lower edge: residual not known)"
 NO_REASON = "not used"
 
 
-def plot_residuals(measurements: Mapping[Pair, PlottedMeasurement], path: str | Path) -> None:
+def plot_residuals(measurements: ByPair[PlottedMeasurement], path: str | Path) -> None:
     """Draw rotation and translation residuals over time, a row for each sensor.
 
     Parameters
@@ -56,7 +55,7 @@ def plot_residuals(measurements: Mapping[Pair, PlottedMeasurement], path: str | 
     FileFormatError
         The file cannot be written.
     """
-    sensors = {sensor: _joined(sensor, measurements) for sensor in dict.fromkeys(pair[1] for pair in measurements)}
+    sensors = {sensor: _joined(sensor, measurements) for sensor in dict.fromkeys(sensor for _, sensor in measurements)}
     reasons = Counter(reason for row in sensors.values() for reason in row.reason if reason)
     kinds = [reason for reason, _ in sorted(reasons.items(), key=lambda item: (-item[1], item[0]))]
     symbols = dict(zip(kinds, SYMBOLS, strict=False))
@@ -91,8 +90,8 @@ class _Row:
     reason: list[str]
 
 
-def _joined(sensor: str, measurements: Mapping[Pair, PlottedMeasurement]) -> _Row:
-    of_sensor = [measured for pair, measured in measurements.items() if pair[1] == sensor]
+def _joined(sensor: str, measurements: ByPair[PlottedMeasurement]) -> _Row:
+    of_sensor = [measured for (_, name), measured in measurements.items() if name == sensor]
     inlier = np.concatenate([np.asarray(measured.inlier, dtype=bool) for measured in of_sensor])
     words = [word for measured in of_sensor for word in measured.reason]
     return _Row(

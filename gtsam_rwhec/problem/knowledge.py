@@ -1,0 +1,122 @@
+"""What is known before anything is measured: fixed frames, priors of frames, known scales."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from numbers import Real
+from typing import Literal, get_args
+
+import numpy as np
+
+from gtsam_rwhec.errors import OptionError, PriorError, ScaleError
+from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.problem.measurements import positive_weights
+from gtsam_rwhec.problem.priors import Prior, check_agreement, difference
+
+ScaleMode = Literal["known", "shared", "per_target"]
+
+
+class Knowledge:
+    """Frames and scales that are known, exactly or by a belief; the part of a `Problem` that is not measured.
+
+    Attributes
+    ----------
+    scale : "known", "shared" or "per_target"
+    fixed : dict of str to (4, 4) array
+        Poses of frames on their carriers, metres.
+    priors : dict of str to list of Prior
+    fixed_scales : dict of str to float
+        Measured over true length, by target (or sensor with motions of its own).
+    """
+
+    def __init__(self, scale: ScaleMode) -> None:
+        if scale not in get_args(ScaleMode):
+            raise OptionError(f"scale={scale!r} is not one of {', '.join(map(repr, get_args(ScaleMode)))}")
+        self.scale: ScaleMode = scale
+        self.fixed: dict[str, Array] = {}
+        self.priors: dict[str, list[Prior]] = {}
+        self.fixed_scales: dict[str, float] = {}
+
+    def fix(self, name: str, T_carrier_frame: PoseLike) -> None:
+        """Say that a frame's pose on its carrier is known exactly.
+
+        Raises
+        ------
+        PriorError
+            When it is fixed at another pose already, or a prior contradicts it.
+        """
+        T = one_transform(T_carrier_frame, f"the pose at which {name} is fixed")
+        known = self.fixed.get(name)
+        if known is not None and np.abs(known - T).max() > 1e-9:
+            raise PriorError(
+                f"{name} is fixed already, at another pose ({difference(known, T)}); remove one of the two"
+            )
+        for prior in self.priors.get(name, []):
+            check_agreement(name, Prior(T, 0.0, np.inf), prior)
+        self.fixed[name] = T
+
+    def add_prior(
+        self, name: str, T_carrier_frame: PoseLike, sigma: float | None = None, kappa: float | None = None
+    ) -> None:
+        """Add a belief about a frame's pose on its carrier: a MAP estimate in place of a maximum-likelihood one.
+
+        Parameters
+        ----------
+        name : str
+        T_carrier_frame : pose
+        sigma : float, optional
+            Standard deviation of the translation, each axis, in metres; None leaves the translation free.
+        kappa : float, optional
+            Concentration of the rotation, 1 / (2 s^2) for s rad an axis; None leaves the rotation free.
+
+        Raises
+        ------
+        PriorError
+            When it contradicts what is known of the frame already, or says nothing.
+        """
+        where = f"the prior of {name}"
+        T = one_transform(T_carrier_frame, where)
+        if sigma is None and kappa is None:
+            raise PriorError(f"{where} has neither sigma nor kappa and says nothing; give one of them")
+        prior = Prior(
+            T,
+            None if sigma is None else float(positive_weights(sigma, 0, "sigma", where)),
+            None if kappa is None else float(positive_weights(kappa, 0, "kappa", where)),
+        )
+        if name in self.fixed:
+            check_agreement(name, Prior(self.fixed[name], 0.0, np.inf), prior)
+        for other in self.priors.get(name, []):
+            check_agreement(name, other, prior)
+        self.priors.setdefault(name, []).append(prior)
+
+    def fix_scale(self, name: str, scale: float = 1.0) -> None:
+        """Say that a target's size (or, for motions, a sensor's odometry scale) is known, with scale="per_target".
+
+        Raises
+        ------
+        ScaleError
+            When the scale is not positive, or the problem's scale is not "per_target".
+        """
+        if self.scale != "per_target":
+            raise ScaleError(f"fix_scale({name!r}) needs scale='per_target'; this problem has scale={self.scale!r}")
+        if not (isinstance(scale, Real) and np.isfinite(scale) and scale > 0):
+            raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number (measured / true length)")
+        if self.fixed_scales.get(name, scale) != scale:
+            raise ScaleError(f"the scale of {name} is fixed at {self.fixed_scales[name]} already, and now at {scale}")
+        self.fixed_scales[name] = float(scale)
+
+    def _learn(self, other: Knowledge) -> None:
+        """Take over what another problem knows, where the two agree."""
+        for name, T in other.fixed.items():
+            self.fix(name, T)
+        for name, priors in other.priors.items():
+            for prior in priors:
+                self.add_prior(name, prior.transform, prior.sigma, prior.kappa)
+        for name, scale in other.fixed_scales.items():
+            self.fix_scale(name, scale)
+
+    def _take_knowledge(self, other: Knowledge, *, frames: Collection[str] = (), scales: Collection[str] = ()) -> None:
+        """Have copies of what another problem knows, except of the frames and scales named."""
+        self.fixed = {name: T for name, T in other.fixed.items() if name not in frames}
+        self.priors = {name: list(priors) for name, priors in other.priors.items() if name not in frames}
+        self.fixed_scales = {name: scale for name, scale in other.fixed_scales.items() if name not in scales}
