@@ -7,7 +7,7 @@ a part is held out, the rest calibrated, and the part predicted: B = Y^-1 A X ag
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -22,6 +22,7 @@ from gtsam_rwhec.errors import (
     ScaleError,
     UnderdeterminedError,
 )
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
@@ -36,7 +37,6 @@ from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.trajectories.local_paths import LocalPaths
 
 Split = Literal["time", "pair", "sensor"]
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -174,11 +174,11 @@ def cross_validate(
     training = {pair: _errors(problem, everything, pair, one) for pair, one in raw.items()}
     errors = {pair: np.full((2, len(one.A)), np.nan) for pair, one in raw.items()}
     folds_by = {"time": lambda: _blocks(raw, folds), "pair": lambda: _pairs(raw), "sensor": lambda: _halves(raw)}
+    tell = progress or silent
     number = 0
     for name, held_out in folds_by[by]():
         number += 1
-        if progress is not None:
-            progress(f"held out: {name}")
+        tell(f"held out: {name}")
         _predict(problem, raw, name, held_out, calibrate, errors, notes)
     if not any(np.isfinite(values).any() for values in errors.values()):
         raise UnderdeterminedError(

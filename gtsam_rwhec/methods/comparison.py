@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.methods import certified
 from gtsam_rwhec.methods.protocol import Estimate, Method, MethodOptions
 from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
@@ -15,8 +16,6 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solving.solution import Solution
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)

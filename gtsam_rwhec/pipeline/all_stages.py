@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export import export_all
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.changed_rig import changes
@@ -21,7 +21,6 @@ from gtsam_rwhec.pipeline.stage_output import check_not_onto, check_writable
 from gtsam_rwhec.results.refined_file import write_refined
 from gtsam_rwhec.rig import Rig
 
-Progress = Callable[[str], None]
 DETECTED, CLEAN, RESULT, PLOTS = "detected.mcap", "clean.mcap", "result.json", "plots"
 
 

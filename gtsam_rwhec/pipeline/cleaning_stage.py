@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from gtsam_rwhec.cleaning import (
     without_fast,
 )
 from gtsam_rwhec.errors import LogError, StampError
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, PairRecord, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
@@ -39,7 +39,6 @@ from gtsam_rwhec.results.stage_reports import CleaningReport, DetectionReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-Progress = Callable[[str], None]
 PAIR_TOPIC = "/calibration/{sensor}/pairs"
 #: A single measurement of a pair: nothing can validate it.
 SINGLE = "a single measurement of the pair"
@@ -78,7 +77,7 @@ def clean_log(
         For a log without detections or carriers' poses, clocks that have nothing in common, motion that does not tell
         a time offset; and where nothing is left.
     """
-    tell = progress if progress is not None else _silent
+    tell = progress or silent
     check_writable(out_path)
     with open_log(detected_path) as log:
         rig = rig_for_cleaning(log, rig)
@@ -237,7 +236,3 @@ def _nothing(log: Log, report: CleaningReport) -> str:
 
 def _or_infinite(value: float | None, unit: float) -> float:
     return np.inf if value is None else value * unit
-
-
-def _silent(stage: str) -> None:
-    """No progress."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log, LogWriter, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
@@ -28,7 +29,6 @@ from gtsam_rwhec.vision.detection import AMBIGUOUS, Detection, Detector
 from gtsam_rwhec.vision.many_images import Looked, detect_in_images, measured_corner_px
 from gtsam_rwhec.vision.options import DetectionOptions
 
-Progress = Callable[[str], None]
 #: Under which the detections of a sensor are written.
 TOPIC = "/calibration/{sensor}/detections"
 #: Numbers of images after which a camera's stamps are looked at, so that nobody waits for what cannot be used.
@@ -67,7 +67,7 @@ def detect_log(
     LogError, StampError, TransformError, CameraError, FrameError
         For a log that lacks what the rig file names, the carriers' poses too, or in which nothing at all was detected.
     """
-    tell = progress if progress is not None else _silent
+    tell = progress or silent
     check_writable(out_path)
     with open_log(log_path) as log:
         check_not_onto(log, out_path)
@@ -279,7 +279,3 @@ def detection_options(rig: Rig) -> DetectionOptions:
         For a value that cannot be.
     """
     return replace(DetectionOptions(), **rig.detection)
-
-
-def _silent(stage: str) -> None:
-    """No progress."""

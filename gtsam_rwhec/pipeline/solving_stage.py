@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from gtsam_rwhec.errors import LogError, RwhecError, RwhecWarning, ScaleError
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carriers import Carriers, read_carriers
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
@@ -35,7 +36,6 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.vision.camera import Camera
 
-Progress = Callable[[str], None]
 Pairs = dict[Pair, MeasuredPairs]
 Stage = Literal["outliers", "clocks", "answer"]
 #: Why a measurement that came this far is not used.
@@ -87,7 +87,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     RwhecError
         What ``solve`` and ``refine`` raise.
     """
-    tell = progress if progress is not None else _silent
+    tell = progress or silent
     with open_log(clean_path) as log:
         rig = rig_for_solving(log, rig)
         cleaning = read_report(log, CLEANING, CleaningReport)
@@ -307,7 +307,3 @@ def _outlier_count(pair: Pair, measured: MeasuredPairs) -> TrackCount:
     return TrackCount(
         target=pair.target, sensor=pair.sensor, used=int(measured.used.sum()), removed={OUTLIER: out} if out else {}
     )
-
-
-def _silent(stage: str) -> None:
-    """No progress."""

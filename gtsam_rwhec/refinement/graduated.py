@@ -23,6 +23,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from gtsam_rwhec.errors import CountError, OptionError, OutlierError, OutliersWarning, UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -32,7 +33,6 @@ from gtsam_rwhec.refinement.truncated_least_squares import (
     DOF,
     Iteration,
     NoiseScale,
-    Progress,
     TruncatedLeastSquares,
     agreeing,
 )
@@ -133,12 +133,12 @@ def graduated(
         the rest.
     """
     _check_options(confidence, noise_scale, max_iterations)
-    work = TruncatedLeastSquares(problem, float(chdtri(DOF, 1.0 - confidence)), max_iterations, progress)
+    tell = progress or silent
+    work = TruncatedLeastSquares(problem, float(chdtri(DOF, 1.0 - confidence)), max_iterations, tell)
     try:
         fit, keep = work.run(noise_scale)
         weights = work.measured.by_pair(keep.astype(np.float64))
-        if progress is not None:
-            progress("certifying the inliers' solution")
+        tell("certifying the inliers' solution")
         solution = solve(
             reweighted(
                 problem,
@@ -146,7 +146,7 @@ def graduated(
                 rotation_factor=work.factors.rotation,
                 translation_factor=work.factors.translation,
             ),
-            progress=progress,
+            progress=tell,
         )
     except (UnderdeterminedError, CountError) as error:
         raise OutlierError(

@@ -14,7 +14,7 @@ from gtsam_rwhec.problem.measurements import checked_covariances
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
-from gtsam_rwhec.trajectories.local_paths import SAME, LocalPaths
+from gtsam_rwhec.trajectories.local_paths import SAME_POSE, LocalPaths
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 
@@ -139,7 +139,7 @@ def local_paths(
     stamps = np.concatenate([raw.stamps_ns for raw in telling])
     order = np.argsort(stamps, kind="stable")
     same = np.diff(stamps[order]) == 0
-    if (np.abs(np.diff(A[order], axis=0))[same] > SAME).any():
+    if (np.abs(np.diff(A[order], axis=0))[same] > SAME_POSE).any():
         return {pair: _paths_of_pair(problem, pair) for pair in pairs}
     # Of all stamps once, then each pair's own among them.
     unique, first = np.unique(stamps, return_index=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 
 import gtsam
@@ -22,6 +21,7 @@ from gtsam_rwhec.errors import (
     ScaleError,
     WeightsWarning,
 )
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -41,8 +41,6 @@ from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solving.certified_solution import check_against_knowledge, solve
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.trajectories.local_paths import WINDOW_S
-
-Progress = Callable[[str], None]
 
 #: Times that outliers are chosen anew under the noise as it is; two or three are usual.
 MAX_CHOICES = 10
@@ -92,7 +90,7 @@ def refine(
         Where iterations ended at their limit.
     """
     options = RefineOptions() if options is None else options
-    tell = progress if progress is not None else _silent
+    tell = progress or silent
     _check(problem, solution, options)
     estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)
     everything = Variables.of(problem, _sensors_with_offset(problem, options))
@@ -308,7 +306,3 @@ def _moved(start: Solution, state: State) -> dict[str, Movement]:
             angle = float(np.linalg.norm(gtsam.Rot3.Logmap(difference.rotation())))
             moved[name] = Movement(1e3 * float(np.linalg.norm(difference.translation())), float(np.degrees(angle)))
     return moved
-
-
-def _silent(stage: str) -> None:
-    """Nobody wants to know."""

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.errors import CountError, UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -22,7 +23,6 @@ from gtsam_rwhec.refinement.certified_fit import Fit, certified_fit
 from gtsam_rwhec.refinement.squared_residuals import Measured, NoiseFactors, Squares
 from gtsam_rwhec.refinement.voting import by_vote
 
-Progress = Callable[[str], None]
 NoiseScale = Literal["given", "estimate"]
 
 #: mu grows by this much an iteration (the paper's value).
@@ -69,7 +69,7 @@ class TruncatedLeastSquares:
     problem: Problem
     threshold: float
     max_iterations: int
-    progress: Progress | None
+    tell: Progress
     factors: NoiseFactors = field(default_factory=lambda: NoiseFactors(1.0, 1.0))
     history: list[Iteration] = field(default_factory=list)
 
@@ -154,8 +154,7 @@ class TruncatedLeastSquares:
         """Remember an iteration."""
         inliers = int((distances <= self.threshold).sum())
         self.history.append(Iteration(stage, mu, 0.5 * self.truncated(distances), inliers, fit.certified))
-        if self.progress is not None:
-            self.progress(f"rejecting outliers: {stage}, {inliers} of {len(distances)} agree")
+        self.tell(f"rejecting outliers: {stage}, {inliers} of {len(distances)} agree")
 
     def graduate(self, fit: Fit) -> Fit:
         """From least squares to truncated least squares, mu growing (Remark 5 and eq. 14 of the paper)."""

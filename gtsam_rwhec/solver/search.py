@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver import small_dual
 from gtsam_rwhec.solver.bound import Bound, exact_value, lower_bound
@@ -23,8 +24,6 @@ from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_relaxation
 from gtsam_rwhec.solver.rotations import kkt_multipliers, project, random_rotations, unvec, vec
 from gtsam_rwhec.solver.start import spectral_start, unconstrained_start
 from gtsam_rwhec.solver.variables import answer_of
-
-Progress = Callable[[str], None]
 
 #: A mirror image may cost this much more, relatively, and still be what the data mean; more is another answer.
 MIRROR_COST = 0.01

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import gtsam
 import numpy as np
@@ -19,6 +19,7 @@ from gtsam_rwhec.errors import (
     ScaleError,
     WeightsWarning,
 )
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform, to_pose3
 from gtsam_rwhec.identifiability import identification as identifiability
 from gtsam_rwhec.identifiability.identification import Identifiability, identify
@@ -37,10 +38,9 @@ from gtsam_rwhec.solving.solution import Solution, SolvedPart
 
 Poses = Mapping[str, PoseLike]
 Scale = float | Mapping[str, float]
-Progress = Callable[[str], None]
 
-#: An answer's known frames and scales may differ from the problem's by this much: rounding on the way through a file.
-SAME = 1e-9
+#: An answer's known frames (entries, rad and m) and scales may differ from the problem's by this much: files round.
+ROUNDING = 1e-9
 
 
 def solve(
@@ -358,13 +358,13 @@ def check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) 
         )
     if isinstance(scale, Mapping):
         for name, known in problem.fixed_scales.items():
-            if name in scale and not np.isclose(scale[name], known, rtol=SAME, atol=0.0):
+            if name in scale and not np.isclose(scale[name], known, rtol=ROUNDING, atol=0.0):
                 raise ScaleError(f"the answer's scale of {name} is {scale[name]!r}, but it is fixed at {known!r}")
     for name, T in problem.fixed.items():
         poses, what = (X, "X") if name in problem.targets else (Y, "Y")
         if name in poses:
             given = one_transform(poses[name], f"{what}[{name!r}]")
-            if not np.allclose(given, T, rtol=SAME, atol=SAME):
+            if not np.allclose(given, T, rtol=ROUNDING, atol=ROUNDING):
                 raise PriorError(
                     f"{what}[{name!r}] is not the pose at which {name} is fixed: {difference(given, T)}; leave it out, "
                     "or do not fix the frame"

@@ -22,8 +22,8 @@ WINDOW_S = 0.5
 NEAREST = 32
 #: Poses further apart than this say little of the motion in between.
 LONGEST_GAP_S = 1.0
-#: Poses of one stamp differ by no more than this, or they are of two carriers.
-SAME = 1e-6
+#: Entries (rad and m) of two poses of one stamp differ by no more than this, or the poses are of two carriers.
+SAME_POSE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class LocalPaths:
         stamps, first, place = np.unique(stamps_ns, return_index=True, return_inverse=True)
         poses = A[first]
         off = np.abs(A - poses[place]).max(axis=(1, 2))
-        if off.max() > SAME:
+        if off.max() > SAME_POSE:
             raise CountError(
                 f"{where}: two carrier poses have the stamp {stamps_ns[int(off.argmax())]} ns; a time offset needs one "
                 "for each stamp"

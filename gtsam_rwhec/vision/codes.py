@@ -26,8 +26,8 @@ LOOKS = np.array([0.3, 0.5, 0.7])
 LEAST_CONTRAST = 15.0
 #: Shares of wrong bits: of the border's, and of those that a family's distances allow to correct (OpenCV's).
 BORDER_ERRORS, CORRECTED = 0.35, 0.6
-#: Quadrangles whose middles are nearer than this share of their size are one tag.
-SAME = 0.25
+#: Quadrangles whose middles are nearer than this share of the smaller one are one tag.
+SAME_TAG = 0.25
 
 
 @cache
@@ -116,6 +116,6 @@ def unlike(quads: Array, others: Array) -> Array:
     everything = np.concatenate([others, quads])
     middles = everything.mean(axis=1)
     size = np.linalg.norm(everything - middles[:, None], axis=2).mean(axis=1)
-    near = np.linalg.norm(middles[:, None] - middles, axis=2) < SAME * np.minimum(size[:, None], size)
+    near = np.linalg.norm(middles[:, None] - middles, axis=2) < SAME_TAG * np.minimum(size[:, None], size)
     alone: Array = quads[~np.tril(near, -1).any(axis=1)[len(others) :]]
     return alone
