@@ -2,6 +2,7 @@ __version__: str
 
 # State a problem.
 from .problem import Measurements as Measurements
+from .problem import Pair as Pair
 from .problem import Prior as Prior
 from .problem import Problem as Problem
 from .problem import ScaleMode as ScaleMode
