@@ -12,7 +12,8 @@ from gtsam_rwhec.handeye import METHODS, motions_of
 from gtsam_rwhec.handeye.cost import moments_of
 from gtsam_rwhec.handeye.daniilidis import squared, unit_combination
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
-from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.handeye.request import Request
+from gtsam_rwhec.methods.estimate import Outcome
 
 #: The paper's names, in the order of its Table 2.
 NAMES = {
@@ -43,7 +44,7 @@ def requests(sample: Sample, alphas: Sequence[float] | Array, rng: int = 0) -> l
     ]
 
 
-def dan_rows(request: Request) -> Answer:
+def dan_rows(request: Request) -> Outcome[Array]:
     """Dan with alpha on the equations' lower rows only, not on the unknown q' too.
 
     Section 4.3 says that the translations are scaled, which is ``dan``: (q, alpha q') has length one. Table 2's Dan
@@ -56,10 +57,10 @@ def dan_rows(request: Request) -> Answer:
     form[:, 4:] *= request.alpha
     null = np.linalg.eigh(form)[1]
     q, q_dual = unit_combination(null[:4, :2], null[4:, :2])
-    return Answer(to_transform(q, q_dual))
+    return Outcome(to_transform(q, q_dual))
 
 
-def function_of(name: str) -> Callable[[Request], Answer]:
+def function_of(name: str) -> Callable[[Request], Outcome[Array]]:
     """The method behind a name of ``NAMES``."""
     return METHODS[NAMES[name]].function if NAMES[name] else dan_rows
 

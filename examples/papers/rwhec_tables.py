@@ -100,7 +100,7 @@ def key(level: Experiment) -> tuple[int, float, float]:
 def methods_of(level: Experiment) -> list[str]:
     """The paper's methods in its order, then the others that apply."""
     problem = simulated(level, "released", np.random.SeedSequence(0), keep=True).problem
-    applicable = [name for name, method in rw.methods.METHODS.items() if not method.applies(problem)]
+    applicable = [name for name, method in rw.methods.METHODS.items() if rw.methods.refusal(method, problem) is None]
     names = [*TITLES, *[name for name in applicable if name not in TITLES and name != "lom"]]
     if level.table in (3, 5):
         names.remove("lom wang")

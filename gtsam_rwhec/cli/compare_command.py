@@ -53,7 +53,7 @@ def compare(
     # Methods bring in more of SciPy than a calibration needs.
     from gtsam_rwhec.methods.comparison import compare as compare_methods
     from gtsam_rwhec.methods.comparison_file import write_comparison
-    from gtsam_rwhec.methods.protocol import MethodOptions
+    from gtsam_rwhec.methods.method import MethodOptions
     from gtsam_rwhec.report.comparison_report import print_comparison
 
     with failures_in_words():

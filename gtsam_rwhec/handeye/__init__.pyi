@@ -1,6 +1,6 @@
+# The methods, and one call for each of them. Records of methods and answers are those of gtsam_rwhec.methods.
+# The cost that the dual-quaternion methods minimise.
 from .cost import DualQuaternionCost as DualQuaternionCost
-from .method import HandEye as HandEye
-from .method import Method as Method
 from .motion_costs import cost_of as cost_of
 from .motions import Motions as Motions
 from .motions import motions_of as motions_of

@@ -15,11 +15,12 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.degenerate import free_directions, free_of_rotations_alone
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
-from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import SINGULAR, Z_pseudo, best_dual, is_singular
+from gtsam_rwhec.methods.estimate import Outcome
 
 
-def dq2steps(request: Request) -> Answer:
+def dq2steps(request: Request) -> Outcome[Array]:
     """DQ2Steps (Section 3.2.2, Algorithm 2): the rotation that fits the rotations best, then the translation.
 
     Raises
@@ -38,7 +39,7 @@ def dq2steps(request: Request) -> Answer:
     return replace(found, free_directions=free_of_rotations_alone(request.cost) or found.free_directions)
 
 
-def dqconvrlx(request: Request) -> Answer:
+def dqconvrlx(request: Request) -> Outcome[Array]:
     """DQConvRlx (Section 3.2.3, Algorithm 3): without the constraint q . q' = 0, then projected onto it.
 
     ``lower_bound`` is lambda_0 (below eq. 22): the gap is at most ``relaxation_gap``.
@@ -49,12 +50,12 @@ def dqconvrlx(request: Request) -> Answer:
     return replace(found, lower_bound=max(float(relaxed.values[0]) - relaxed.rounding, 0.0))
 
 
-def dq2ndord(request: Request) -> Answer:
+def dq2ndord(request: Request) -> Outcome[Array]:
     """DQ2ndOrd (Section 3.2.4, Algorithm 4): the second order in mu about the relaxation (eqs. 23 and 34)."""
     return dq_nth_order(request, 2)
 
 
-def dq_nth_order(request: Request, order: int) -> Answer:
+def dq_nth_order(request: Request, order: int) -> Outcome[Array]:
     """The expansion in mu to any order (Appendix A): q(mu) of eq. 32 where d lambda / d mu = 0 is nearest mu = 0.
 
     Parameters
@@ -75,7 +76,7 @@ def dq_nth_order(request: Request, order: int) -> Answer:
     return answer_of(request, relaxed.vectors @ in_eigenvectors)
 
 
-def dq2ndord_lambda(request: Request) -> Answer:
+def dq2ndord_lambda(request: Request) -> Outcome[Array]:
     """The second order in Delta lambda = lambda - lambda_0 (Section 3.2.4, Appendix A, eqs. 35 and 36, corrected)."""
     cost = request.cost
     relaxed = relaxation(cost)
@@ -184,7 +185,7 @@ def lambda_expansion(relaxed: Relaxation) -> Array | None:
     return q
 
 
-def answer_of(request: Request, q: Array) -> Answer:
+def answer_of(request: Request, q: Array) -> Outcome[Array]:
     """The pose of q (4,), not yet of length one, with the best q' (eq. 20).
 
     Algorithm 4 as printed normalises by q^2; a unit quaternion needs |q|.
@@ -193,4 +194,4 @@ def answer_of(request: Request, q: Array) -> Answer:
     X = to_transform(q, best_dual(request.cost, q))
     relaxed = relaxation(request.cost)
     free = free_directions(request.cost, q, relaxed.values, relaxed.vectors, request.noise_free_part)
-    return Answer(X, free_directions=free)
+    return Outcome(X, free_directions=free)

@@ -11,12 +11,14 @@ import warnings
 import numpy as np
 
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning
-from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.handeye.request import Request
+from gtsam_rwhec.methods.estimate import Outcome
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.certified_solution import solve
 
 
-def certified(request: Request) -> Answer:
+def certified(request: Request) -> Outcome[Array]:
     """Certified minimum of sum |R_C R - R R_H|^2 + alpha^2 |(R_C - 1) T - R T_H + T_C|^2 (eq. 30, first).
 
     The library's cost J is that with 1 / sigma^2 = 2 alpha^2 w and kappa = 2 w for a motion of weight w. With an
@@ -44,7 +46,7 @@ def certified(request: Request) -> Answer:
     Y, scale = solution.Y["c"], solution.scale
     if isinstance(scale, dict):
         scale = scale["c"]
-    return Answer(
+    return Outcome(
         X=(Y if known else Y.inverse()).matrix(),
         cost=solution.cost,
         cost_name="eq. 30, chordal" if known else "eq. 30, chordal, of X^-1 with t_C / scale",

@@ -20,7 +20,8 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import BLOCK, E
 from gtsam_rwhec.handeye.degenerate import free_of_rotations_alone
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
-from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.handeye.request import Request
+from gtsam_rwhec.methods.estimate import Outcome
 
 #: Squares of singular values below this, relative to the largest, are rounding.
 NULL = 1e-13
@@ -30,7 +31,7 @@ _VECTORS = [0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]
 _PRODUCTS = np.einsum("kji,ljm->klim", E[:6, :3], E[:6, :3]).reshape(36, 16)
 
 
-def daniilidis(request: Request) -> Answer:
+def daniilidis(request: Request) -> Outcome[Array]:
     """Dan, with translations multiplied by alpha as in Section 4.3.
 
     Raises
@@ -55,7 +56,7 @@ def daniilidis(request: Request) -> Answer:
         )
     q, q_dual = unit_combination(vectors[:4, :2], vectors[4:, :2])
     free = free_of_rotations_alone(request.cost)
-    return Answer(to_transform(q, q_dual / request.alpha), free_directions=free)
+    return Outcome(to_transform(q, q_dual / request.alpha), free_directions=free)
 
 
 def squared(gram: Array) -> Array:

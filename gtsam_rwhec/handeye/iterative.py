@@ -7,16 +7,18 @@ import warnings
 import numpy as np
 
 from gtsam_rwhec.errors import NotConvergedWarning
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.approximate import answer_of, relaxation
-from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import bracket, is_singular
+from gtsam_rwhec.methods.estimate import Outcome
 
 #: mu stands still when it changes by less than this part of the range that Appendix C gives it.
 STILL = 1e-13
 ITERATIONS = 200
 
 
-def dqitr(request: Request) -> Answer:
+def dqitr(request: Request) -> Outcome[Array]:
     """DQItr: mu <- q(mu)'Z1 q(mu) / (2 q(mu)'Z2 q(mu)) (eq. 24) until it stands still.
 
     With M singular (no noise), where the paper finds the iteration unstable, mu is 0 and nothing is iterated.

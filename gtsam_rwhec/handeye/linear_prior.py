@@ -16,16 +16,17 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.degenerate import free_directions
 from gtsam_rwhec.handeye.dual_quaternions import times_vectors, to_transform
-from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
 from gtsam_rwhec.handeye.proof import proven
+from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import Z_pseudo, best_dual, bracket, is_singular
+from gtsam_rwhec.methods.estimate import Outcome
 
 #: Newton steps that polish the multiplier of |q| = 1.
 POLISHING = 4
 
 
-def solve_with_linear_prior(request: Request, prior: DualQuaternionPrior) -> Answer:
+def solve_with_linear_prior(request: Request, prior: DualQuaternionPrior) -> Outcome[Array]:
     """DQOpt with eq. 25: ``request.cost`` has the prior's translation part, and its rotation part is added here."""
     cost = request.cost
     pull = prior.a * prior.dual_quaternion[0]
@@ -46,7 +47,7 @@ def solve_with_linear_prior(request: Request, prior: DualQuaternionPrior) -> Ans
     curvatures, turns = np.linalg.eigh(V.T @ (Z - candidates[0][1] * np.eye(4)) @ V)
     noise = max(float(np.linalg.eigvalsh(Z)[0]), 0.0)
     values, vectors = np.append(noise, noise + curvatures), np.column_stack([q, V @ turns])
-    return Answer(
+    return Outcome(
         X=to_transform(q, q_dual),
         lower_bound=_proven_bound(cost, pull, prior.a, mu, candidates[0]),
         free_directions=free_directions(cost, q, values, vectors, request.noise_free_part),

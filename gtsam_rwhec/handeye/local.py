@@ -19,9 +19,10 @@ from gtsam_rwhec.geometry.quaternions import ROTATION, left, right
 from gtsam_rwhec.handeye.chordal_form import chordal_moments, chordal_residuals
 from gtsam_rwhec.handeye.degenerate import free_directions
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms, to_transform
-from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.motion_costs import squared_residuals
+from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
+from gtsam_rwhec.methods.estimate import Outcome
 
 #: least_squares stops where a step changes cost or unknowns by less than this part of them: rounding.
 STOP = 1e-15
@@ -30,13 +31,13 @@ ROUNDING = float(np.finfo(np.float64).eps)
 Vector = Callable[[Array], Array]
 
 
-def dqnlopt(request: Request) -> Answer:
+def dqnlopt(request: Request) -> Outcome[Array]:
     """DQNLOpt: descent on the cost (8) from DQOpt's answer, which it should not leave (Section 4.4)."""
     found = minimum(request.cost)
-    return Answer(descend_dual_quaternion(request, found.q, found.q_dual), free_directions=_free(request, found))
+    return Outcome(descend_dual_quaternion(request, found.q, found.q_dual), free_directions=_free(request, found))
 
 
-def dqnlopt_random(request: Request) -> Answer:
+def dqnlopt_random(request: Request) -> Outcome[Array]:
     """DQNLOptRnd: descent on the cost (8) from a random pose; ends in local minima now and then (Table 1).
 
     The rotation is uniform; the translation normal, with the root mean square of the motions' own.
@@ -52,10 +53,10 @@ def dqnlopt_random(request: Request) -> Answer:
     q /= np.linalg.norm(q)
     t = rng.normal(size=3) * _length(request)
     q_dual = 0.5 * left(np.append(t, 0.0)) @ q
-    return Answer(descend_dual_quaternion(request, q, q_dual), free_directions=_free(request, minimum(request.cost)))
+    return Outcome(descend_dual_quaternion(request, q, q_dual), free_directions=_free(request, minimum(request.cost)))
 
 
-def chvecopt(request: Request) -> Answer:
+def chvecopt(request: Request) -> Outcome[Array]:
     """ChVecOpt: |R_C R - R R_H|^2 + alpha^2 |(R_C - 1) T - R T_H + T_C|^2 (eq. 30, first), from DQOpt's answer.
 
     The paper leaves the start open. The cost is the certified one's, which proves its minimum (``certified``).
@@ -64,10 +65,12 @@ def chvecopt(request: Request) -> Answer:
     found = minimum(request.cost)
     X = _descend_vector(rotation, translation, request.alpha, found, quaternion_cost=False)
     of_R, of_T = chordal_residuals(request.motions, X, request.weights)
-    return Answer(X, of_R + request.alpha**2 * of_T, "eq. 30, chordal", free_directions=_free(request, found))
+    return Outcome(
+        X, cost=of_R + request.alpha**2 * of_T, cost_name="eq. 30, chordal", free_directions=_free(request, found)
+    )
 
 
-def quatvecopt(request: Request) -> Answer:
+def quatvecopt(request: Request) -> Outcome[Array]:
     """QuatVecOpt: |q_C q - q q_H|^2 + alpha^2 |(R_C - 1) T - R T_H + T_C|^2 (eq. 30, second), from DQOpt's answer."""
     _, translation = chordal_moments(request.motions, request.weights)
     found = minimum(request.cost)
@@ -76,7 +79,9 @@ def quatvecopt(request: Request) -> Answer:
     (q,), (q_dual,) = from_transforms(X[None])
     of_q, _ = squared_residuals(request.motions, q, q_dual, request.weights)
     _, of_T = chordal_residuals(request.motions, X, request.weights)
-    return Answer(X, of_q + request.alpha**2 * of_T, "eq. 30, quaternion", free_directions=_free(request, found))
+    return Outcome(
+        X, cost=of_q + request.alpha**2 * of_T, cost_name="eq. 30, quaternion", free_directions=_free(request, found)
+    )
 
 
 def descend_dual_quaternion(request: Request, q: Array, q_dual: Array) -> Array:

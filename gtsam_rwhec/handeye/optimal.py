@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.degenerate import free_directions
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.linear_prior import solve_with_linear_prior
-from gtsam_rwhec.handeye.method import Answer, Request
 from gtsam_rwhec.handeye.proof import HIDDEN, proven
+from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import SINGULAR, Minimum, is_singular, minimum
+from gtsam_rwhec.methods.estimate import Outcome
 
 
-def dqopt(request: Request) -> Answer:
+def dqopt(request: Request) -> Outcome[Array]:
     """DQOpt: the least of all costs (8), and lambda* as the proof."""
     cost = request.cost
     if request.prior is not None and request.prior.form == "distance":
         return solve_with_linear_prior(request, request.prior)
     found = minimum(cost)
-    return Answer(
+    return Outcome(
         X=to_transform(found.q, found.q_dual),
         lower_bound=proven_bound(cost, found),
         free_directions=free_directions(cost, found.q, found.values, found.vectors, request.noise_free_part),

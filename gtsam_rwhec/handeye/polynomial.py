@@ -22,8 +22,9 @@ from scipy.optimize import brentq
 from gtsam_rwhec.errors import NotConvergedWarning, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.approximate import Relaxation, answer_of, relaxation, relaxation_gap
-from gtsam_rwhec.handeye.method import Answer, Request
+from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import is_singular
+from gtsam_rwhec.methods.estimate import Outcome
 
 #: lambda* is looked for up to this many times eq. 22's gap, an upper bound that rounding may have touched.
 BEYOND = 1.25
@@ -175,7 +176,7 @@ def double_root(of: Curve, y: float) -> float:
     return float(x[(np.abs(powers @ p) / (np.abs(powers) @ np.abs(p))).argmin()]) * of.mu_scale
 
 
-def dqoptpoly_resultant(request: Request) -> Answer:
+def dqoptpoly_resultant(request: Request) -> Outcome[Array]:
     """DQOptPoly by the resultant.
 
     Raises
@@ -186,7 +187,7 @@ def dqoptpoly_resultant(request: Request) -> Answer:
     return _solve(request, by_resultant, "dqoptpoly_resultant")
 
 
-def dqoptpoly_sturm(request: Request) -> Answer:
+def dqoptpoly_sturm(request: Request) -> Outcome[Array]:
     """DQOptPoly by counting real roots.
 
     Raises
@@ -197,7 +198,7 @@ def dqoptpoly_sturm(request: Request) -> Answer:
     return _solve(request, by_sturm, "dqoptpoly_sturm")
 
 
-def _solve(request: Request, search: Callable[[Curve], float], name: str) -> Answer:
+def _solve(request: Request, search: Callable[[Curve], float], name: str) -> Outcome[Array]:
     if is_singular(request.cost):
         raise UnderdeterminedError(
             f"M = alpha^2 sum A'A is singular (no noise, no rotation, or parallel axes), and {name!r} needs "

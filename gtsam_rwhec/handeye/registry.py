@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Literal
 
+import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -18,49 +20,76 @@ from gtsam_rwhec.handeye.daniilidis import daniilidis
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.iterative import dqitr
 from gtsam_rwhec.handeye.local import chvecopt, dqnlopt, dqnlopt_random, quatvecopt
-from gtsam_rwhec.handeye.method import Answer, HandEye, Method, Request, ScaleMode
 from gtsam_rwhec.handeye.motion_costs import covariance_cost, squared_mahalanobis, squared_residuals
 from gtsam_rwhec.handeye.motions import motions_of
 from gtsam_rwhec.handeye.optimal import dqopt
 from gtsam_rwhec.handeye.polynomial import dqoptpoly_resultant, dqoptpoly_sturm
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
+from gtsam_rwhec.handeye.request import Request, ScaleMode
 from gtsam_rwhec.handeye.weights import check_alpha, check_covariances, check_weights
+from gtsam_rwhec.methods.estimate import Estimate, Outcome, Proof
+from gtsam_rwhec.methods.method import Method, Properties, Takes
 
 _DQ = "Dekel et al., Optimal least-squares solution to the hand-eye calibration problem"
 _NEAR = "DQOpt's answer in the basin of the best minimum"
-METHODS: dict[str, Method] = {
+_WEIGHED = frozenset({Takes.WEIGHTS})
+_QUADRATIC = frozenset({Takes.WEIGHTS, Takes.COVARIANCES})
+_WITH_PRIOR = _QUADRATIC | {Takes.PRIORS}
+
+
+def _of_dq_paper(
+    name: str,
+    function: Callable[[Request], Outcome[Array]],
+    section: str,
+    assumes: str,
+    takes: frozenset[Takes] = _WITH_PRIOR,
+    *,
+    joint: bool = True,
+    certifiable: bool = False,
+) -> Method[[Request]]:
+    properties = Properties("dual quaternions", joint=joint, certifiable=certifiable)
+    return Method(name, function, properties, f"{_DQ}, {section}", assumes, takes)
+
+
+METHODS: dict[str, Method[[Request]]] = {
     method.name: method
     for method in (
-        Method(
-            "dqopt", "nothing; its optimum is proven", f"{_DQ}, Section 3.2.1, Algorithm 1", dqopt, linear_prior=True
+        _of_dq_paper(
+            "dqopt",
+            dqopt,
+            "Section 3.2.1, Algorithm 1",
+            "nothing; its optimum is proven",
+            _WITH_PRIOR | {Takes.LINEAR_PRIORS},
+            certifiable=True,
         ),
-        Method("dq2steps", "axes that are not parallel", f"{_DQ}, Section 3.2.2, Algorithm 2", dq2steps, prior=False),
-        Method("dqconvrlx", "little noise: q . q' = 0 nearly without asking", f"{_DQ}, Section 3.2.3", dqconvrlx),
-        Method("dq2ndord", "mu small, as with little noise", f"{_DQ}, Section 3.2.4, Algorithm 4", dq2ndord),
-        Method("dq2ndord_lambda", "lambda near the relaxation's", f"{_DQ}, Appendix A", dq2ndord_lambda),
-        Method("dqitr", "a fixed point that attracts; some noise", f"{_DQ}, Section 3.2.5, Algorithm 5", dqitr),
-        Method("dqoptpoly_resultant", "some noise: M is not singular", f"{_DQ}, Appendix B", dqoptpoly_resultant),
-        Method("dqoptpoly_sturm", "some noise: M is not singular", f"{_DQ}, Appendix B", dqoptpoly_sturm),
+        _of_dq_paper(
+            "dq2steps", dq2steps, "Section 3.2.2, Algorithm 2", "axes that are not parallel", _QUADRATIC, joint=False
+        ),
+        _of_dq_paper("dqconvrlx", dqconvrlx, "Section 3.2.3", "little noise: q . q' = 0 nearly without asking"),
+        _of_dq_paper("dq2ndord", dq2ndord, "Section 3.2.4, Algorithm 4", "mu small, as with little noise"),
+        _of_dq_paper("dq2ndord_lambda", dq2ndord_lambda, "Appendix A", "lambda near the relaxation's"),
+        _of_dq_paper("dqitr", dqitr, "Section 3.2.5, Algorithm 5", "a fixed point that attracts; some noise"),
+        _of_dq_paper("dqoptpoly_resultant", dqoptpoly_resultant, "Appendix B", "some noise: M is not singular"),
+        _of_dq_paper("dqoptpoly_sturm", dqoptpoly_sturm, "Appendix B", "some noise: M is not singular"),
         Method(
             "dan",
-            "two axes that are not parallel, and little noise: it minimises nothing",
-            "Daniilidis, Hand-eye calibration using dual quaternions (IJRR 1999)",
             daniilidis,
-            prior=False,
-            covariances=False,
+            Properties("dual quaternions"),
+            "Daniilidis, Hand-eye calibration using dual quaternions (IJRR 1999)",
+            "two axes that are not parallel, and little noise: it minimises nothing",
+            _WEIGHED,
         ),
-        Method("dqnlopt", "nothing: it starts at DQOpt's answer", f"{_DQ}, Section 4.4", dqnlopt),
-        Method("dqnloptrnd", "a random start in the best minimum's basin", f"{_DQ}, Section 4.4", dqnlopt_random),
-        Method("chvecopt", _NEAR, f"{_DQ}, eq. 30, first", chvecopt, prior=False, covariances=False),
-        Method("quatvecopt", _NEAR, f"{_DQ}, eq. 30, second", quatvecopt, prior=False, covariances=False),
+        _of_dq_paper("dqnlopt", dqnlopt, "Section 4.4", "nothing: it starts at DQOpt's answer"),
+        _of_dq_paper("dqnloptrnd", dqnlopt_random, "Section 4.4", "a random start in the best minimum's basin"),
+        _of_dq_paper("chvecopt", chvecopt, "eq. 30, first", _NEAR, _WEIGHED),
+        _of_dq_paper("quatvecopt", quatvecopt, "eq. 30, second", _NEAR, _WEIGHED),
         Method(
             "certified",
-            "nothing; its bound says whether the optimum is proven",
-            "this library's certified solver, on eq. 30's first cost",
             certified,
-            prior=False,
-            covariances=False,
-            unknown_scale=True,
+            Properties("SE(3)", certifiable=True, monocular=True),
+            "this library's certified solver, on eq. 30's first cost",
+            "nothing; its bound says whether the optimum is proven",
+            _WEIGHED | {Takes.SHARED_SCALE},
         ),
     )
 }
@@ -68,7 +97,7 @@ METHODS: dict[str, Method] = {
 #: A cost below this part of all squares is zero.
 NOTHING = 1e-28
 #: The cost's name with a prior.
-_WITH_PRIOR = {"imaginary": "eq. 26", "distance": "eq. 25"}
+_COST_WITH_PRIOR = {"imaginary": "eq. 26", "distance": "eq. 25"}
 #: A gap is closed at this part of the cost.
 CLOSED = 1e-9
 #: Rounding of a cost, as a part of the squares that cancel in it.
@@ -87,7 +116,7 @@ def solve(
     order: QuaternionOrder | None = None,
     rng: np.random.Generator | int | None = None,
     scale: ScaleMode = "known",
-) -> HandEye:
+) -> Estimate[gtsam.Pose3]:
     """Solve C_i X = X H_i.
 
     Parameters
@@ -113,7 +142,8 @@ def solve(
 
     Returns
     -------
-    HandEye
+    Estimate
+        With the one pose X, and alpha.
 
     Raises
     ------
@@ -141,31 +171,30 @@ def solve(
     if prior is not None:
         cost = prior.added_to(cost)
     request = Request(motions, cost, number, w, information, prior, scale, rng)
-    return result(request, chosen.function(request), method, start)
+    return evaluated(request, chosen.function(request), method, start)
 
 
-def result(request: Request, answer: Answer, method: str, start: float) -> HandEye:
-    """A method's answer with its cost, computed afresh from the pose that is handed out, and its gap."""
-    X = answer.X
-    (q,), (q_dual,) = from_transforms(X[None])
-    cost = cost_of_pose(request, q, q_dual) if answer.cost is None else answer.cost
-    gap = is_optimal = None
-    if answer.lower_bound is not None:
-        gap = cost - answer.lower_bound
+def evaluated(request: Request, found: Outcome[Array], method: str, start: float) -> Estimate[gtsam.Pose3]:
+    """A method's outcome with its cost, computed afresh from the pose that is handed out, and its proof."""
+    (q,), (q_dual,) = from_transforms(found.X[None])
+    cost = cost_of_pose(request, q, q_dual) if found.cost is None else found.cost
+    name = (found.cost_name or "eq. 8") if request.prior is None else _COST_WITH_PRIOR[request.prior.form]
+    proof = None
+    if found.lower_bound is not None:
         squares = request.cost.S.diagonal() @ (q * q) + request.cost.M.diagonal() @ (q_dual * q_dual)
-        is_optimal = bool(gap <= max(CLOSED * cost, ROUNDING * squares, NOTHING * float(np.trace(request.cost.S))))
-    return HandEye(
-        X=to_pose3(X[:3, :3], X[:3, 3]),
-        cost=cost,
-        cost_name=answer.cost_name if request.prior is None else _WITH_PRIOR[request.prior.form],
-        lower_bound=answer.lower_bound,
-        gap=gap,
-        is_optimal=is_optimal,
-        alpha=request.alpha,
+        closed = max(CLOSED * cost, ROUNDING * squares, NOTHING * float(np.trace(request.cost.S)))
+        proof = Proof(cost, name, found.lower_bound, bool(cost - found.lower_bound <= closed))
+    return Estimate(
         method=method,
-        scale=answer.scale,
+        X=to_pose3(found.X[:3, :3], found.X[:3, 3]),
+        Y={},
+        scale=found.scale if isinstance(found.scale, float) else dict(found.scale),
+        cost=cost,
+        cost_name=name,
+        proof=proof,
+        free_directions=found.free_directions,
         seconds=time.perf_counter() - start,
-        free_directions=answer.free_directions,
+        alpha=request.alpha,
     )
 
 
@@ -184,7 +213,7 @@ def _estimated(alpha: object) -> bool:
 
 
 def _check_options(
-    method: Method,
+    method: Method[[Request]],
     weights: ArrayLike | None,
     covariances: ArrayLike | None,
     prior: DualQuaternionPrior | None,
@@ -196,16 +225,12 @@ def _check_options(
         raise OptionError("weights and covariances are both given; put the weights into the covariances")
     if prior is not None and not isinstance(prior, DualQuaternionPrior):
         raise PriorError(f"the prior is a {type(prior).__name__}; give a gtsam_rwhec.handeye.DualQuaternionPrior")
-    for given, can, what in (
-        (weights is not None, method.weights, "weights"),
-        (covariances is not None, method.covariances, "covariances"),
-        (prior is not None, method.prior, "a prior"),
-        (
-            prior is not None and prior.form == "distance",
-            method.linear_prior,
-            "a prior of the form 'distance' (eq. 25; 'imaginary', eq. 26, makes the cost one of eq. 8's kind)",
-        ),
-        (scale == "unknown", method.unknown_scale, "scale='unknown'"),
+    for given, needed in (
+        (weights is not None, Takes.WEIGHTS),
+        (covariances is not None, Takes.COVARIANCES),
+        (prior is not None, Takes.PRIORS),
+        (prior is not None and prior.form == "distance", Takes.LINEAR_PRIORS),
+        (scale == "unknown", Takes.SHARED_SCALE),
     ):
-        if given and not can:
-            raise OptionError(f"method={method.name!r} cannot take {what}; leave it out, or use another method")
+        if given and needed not in method.takes:
+            raise OptionError(f"method={method.name!r} cannot take {needed.value}; leave it out, or use another method")

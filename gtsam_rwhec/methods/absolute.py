@@ -7,12 +7,14 @@ measurements are matrix products; loops are over pairs.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from gtsam_rwhec.errors import ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.problem.moments import Gauge
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -77,6 +79,20 @@ class Stack:
         centred: Array = self.A[:, :3, 3] + self.A[:, :3, :3] @ self.gauge.target_carrier - self.gauge.sensor_carrier
         return centred
 
+    def outcome(
+        self,
+        R_X: Array,
+        t_X: Array,
+        R_Y: Array,
+        t_Y: Array,
+        *,
+        starts_from: str | None = None,
+        notes: Iterable[str] = (),
+    ) -> Outcome[Poses]:
+        """Rotations (n, 3, 3) and translations (n, 3), metres, of targets and of sensors, by name; of known scale."""
+        X, Y = poses_by_name(self.targets, R_X, t_X), poses_by_name(self.sensors, R_Y, t_Y)
+        return Outcome(X, Y, starts_from=starts_from, notes=tuple(notes))
+
     def sums(self, rows: Array) -> Array:
         """(E, ...) sums of (N, ...) rows over each pair's measurements."""
         summed: Array = np.add.reduceat(rows, self.first[:-1], axis=0)
@@ -136,14 +152,20 @@ def linear_rotations(stack: Stack) -> tuple[Array, Array]:
                 f"the rotations of {', '.join(sorted(component))} are not determined: the rotations measured are all "
                 "the same, turn about parallel axes or by half turns alone; turn about a second axis"
             )
-        R[at] = nearest_rotations(vectors[:, 0].reshape(-1, 3, 3).transpose(0, 2, 1))
+        R[at] = rotations_up_to_sign(vectors[:, 0].reshape(-1, 3, 3).transpose(0, 2, 1))
     return R[:n_X], R[n_X:]
 
 
-def nearest_rotations(V: Array) -> Array:
+def rotations_up_to_sign(V: Array) -> Array:
     """Matrices (n, 3, 3), known up to a factor of either sign, as the nearest right-handed rotations."""
     signs = np.where(np.linalg.det(V) < 0.0, -1.0, 1.0)
     return project(signs[:, None, None] * V)
+
+
+def linear_outcome(stack: Stack, R_X: Array, R_Y: Array, notes: Iterable[str] = ()) -> Outcome[Poses]:
+    """The outcome of a method that finds rotations first: with the ``linear_translations`` for them."""
+    t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
+    return stack.outcome(R_X, t_X, R_Y, t_Y, notes=notes)
 
 
 def linear_translations(

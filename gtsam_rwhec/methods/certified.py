@@ -5,16 +5,17 @@ from __future__ import annotations
 import warnings
 
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, WeightsWarning
-from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
 
-def certified(problem: Problem, options: MethodOptions) -> Calibration:
+def certified(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """``gtsam_rwhec.solve``; what it would warn of is in the notes."""
-    return calibration_of(quiet_solution(problem, options))
+    return outcome_of(quiet_solution(problem, options))
 
 
 def quiet_solution(problem: Problem, options: MethodOptions) -> Solution:
@@ -25,28 +26,27 @@ def quiet_solution(problem: Problem, options: MethodOptions) -> Solution:
         return solve(problem, options=SolveOptions(seed=options.seed))
 
 
-def calibration_of(solution: Solution) -> Calibration:
+def outcome_of(solution: Solution) -> Outcome[Poses]:
     """A solution as a method's answer."""
     notes = () if solution.certificate.is_certified else (str(solution.certificate),)
-    return Calibration(solution.X, solution.Y, solution.scale, notes=notes)
+    return Outcome(
+        solution.X,
+        solution.Y,
+        solution.scale,
+        cost=solution.cost,
+        cost_name=solution.certificate.objective,
+        lower_bound=solution.certificate.lower_bound,
+        is_optimal=solution.certificate.is_certified,
+        notes=notes,
+    )
 
 
 METHOD = Method(
     name="certified",
-    properties=Properties(
-        joint=True,
-        probabilistic=True,
-        certifiable=True,
-        multiple="Xs and Ys",
-        monocular=True,
-        representation="SE(3)",
-    ),
+    properties=Properties("SE(3)", probabilistic=True, certifiable=True, multiple="Xs and Ys", monocular=True),
     source="E. Wise et al., A certifiably correct algorithm for generalized robot-world and hand-eye calibration, "
     "arXiv 2507.23045",
     assumes="Isotropic noise on B, exact A. A proof says so when another answer could be better.",
     function=certified,
-    scales=("known", "shared", "per_target"),
-    takes_motions=True,
-    takes_priors=True,
-    takes_moments=True,
+    takes=frozenset({Takes.SHARED_SCALE, Takes.SCALE_PER_TARGET, Takes.MOTIONS, Takes.PRIORS, Takes.MOMENTS}),
 )

@@ -7,10 +7,14 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import gtsam
+
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.methods import certified
-from gtsam_rwhec.methods.protocol import Estimate, Method, MethodOptions
+from gtsam_rwhec.methods.applicability import check_problem, refusal
+from gtsam_rwhec.methods.estimate import Estimate
+from gtsam_rwhec.methods.method import Method, MethodOptions
 from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Certificate
@@ -20,11 +24,11 @@ from gtsam_rwhec.solving.solution import Solution
 
 @dataclass(frozen=True)
 class Compared:
-    """One method's line: its estimate, or the reason why there is none."""
+    """One method's line: its estimate, or the error for which there is none."""
 
-    method: Method
-    estimate: Estimate | None
-    reason: str = ""
+    method: Method[[Problem, MethodOptions]]
+    estimate: Estimate[dict[str, gtsam.Pose3]] | None = None
+    error: RwhecError | None = None
 
     @property
     def translation_rms_m(self) -> float:
@@ -55,13 +59,13 @@ class Comparison:
     rows : tuple of Compared
     solution : Solution or None
         The certified one, whose certificate's bound holds for every answer; None when there is none.
-    no_solution : str
+    error : RwhecError or None
         Why there is none.
     """
 
     rows: tuple[Compared, ...]
     solution: Solution | None
-    no_solution: str = ""
+    error: RwhecError | None = None
 
     @property
     def certificate(self) -> Certificate | None:
@@ -108,34 +112,38 @@ def compare(
     """
     chosen = [method_of(name) for name in (METHODS if methods is None else methods)]
     options = options or MethodOptions()
-    METHODS["certified"].check_problem(problem)
+    check_problem(certified.METHOD, problem)
     if progress is not None:
         progress("certified")
     start = time.perf_counter()
-    solution, no_solution = None, ""
+    solution, error = None, None
     try:
         solution = certified.quiet_solution(problem, options)
-    except RwhecError as error:
-        no_solution = str(error)
+    except RwhecError as raised:
+        error = raised
     seconds = time.perf_counter() - start
     rows = []
     for method in dict.fromkeys(chosen):
-        if method.name == "certified":
-            if solution is None:
-                rows.append(Compared(method, None, no_solution))
-            else:
-                found = certified.calibration_of(solution)
-                rows.append(Compared(method, estimate_of(method, problem, found, seconds)))
-            continue
-        reason = method.applies(problem)
-        if reason:
-            rows.append(Compared(method, None, reason))
-            continue
-        if progress is not None:
-            progress(method.name)
-        try:
-            rows.append(Compared(method, run(method.name, problem, options)))
-        except RwhecError as error:
-            rows.append(Compared(method, None, str(error)))
+        if method is not certified.METHOD:
+            rows.append(_compared(method, problem, options, progress))
+        elif solution is None:
+            rows.append(Compared(method, error=error))
+        else:
+            outcome = certified.outcome_of(solution)
+            rows.append(Compared(method, estimate_of(method.name, problem, outcome, seconds)))
     rows.sort(key=lambda row: math.inf if row.estimate is None else row.estimate.cost)
-    return Comparison(tuple(rows), solution, no_solution)
+    return Comparison(tuple(rows), solution, error)
+
+
+def _compared(
+    method: Method[[Problem, MethodOptions]], problem: Problem, options: MethodOptions, progress: Progress | None
+) -> Compared:
+    error = refusal(method, problem)
+    if error is not None:
+        return Compared(method, error=error)
+    if progress is not None:
+        progress(method.name)
+    try:
+        return Compared(method, run(method.name, problem, options))
+    except RwhecError as raised:
+        return Compared(method, error=raised)

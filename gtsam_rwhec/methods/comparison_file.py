@@ -30,7 +30,7 @@ def comparison_fields(comparison: Comparison) -> dict[str, Any]:
         "conventions": {name: CONVENTIONS[name] for name in ("pose", "model", "scale", "units")},
         "objective": None if certificate is None else certificate.objective,
         "certificate": None if certificate is None else str(certificate),
-        "no_certificate": comparison.no_solution or None,
+        "no_certificate": None if comparison.error is None else str(comparison.error),
         "lower_bound": None if certificate is None else _finite(certificate.lower_bound),
         "tolerance": None if certificate is None else certificate.tolerance,
         "methods": [_row(comparison, row) for row in comparison.rows],
@@ -59,7 +59,7 @@ def _row(comparison: Comparison, row: Compared) -> dict[str, Any]:
         "source": method.source,
         "assumes": method.assumes,
         "properties": dataclasses.asdict(method.properties),
-        "reason": row.reason or None,
+        "reason": None if row.error is None else str(row.error),
     }
     if estimate is None:
         return fields | {"answer": None}

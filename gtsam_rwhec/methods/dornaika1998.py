@@ -6,10 +6,11 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT, to_rotations
-from gtsam_rwhec.methods.absolute import Stack, linear_translations, nearest_rotations, poses_by_name
+from gtsam_rwhec.methods.absolute import Stack, linear_outcome, rotations_up_to_sign
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.methods.plain_form import plain_form
-from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.problem.problem import Problem
 
@@ -17,7 +18,7 @@ from gtsam_rwhec.problem.problem import Problem
 PENALTY = 1e6
 
 
-def closed_form(problem: Problem, options: MethodOptions) -> Calibration:
+def closed_form(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """q_A q_X = q_Y q_B in least squares over two unit quaternions, then the translations.
 
     The sum of |L(q_A) q_X - R(q_B) q_Y|^2 is 2 N - 2 q_X' C q_Y with C = sum of L(q_A)' R(q_B): q_X and q_Y are
@@ -27,12 +28,10 @@ def closed_form(problem: Problem, options: MethodOptions) -> Calibration:
     q_A, q_B = paired_quaternions(stack)
     C = np.einsum("cd,cji,djk->ik", q_A.T @ q_B, LEFT, RIGHT)
     U, _, Vt = np.linalg.svd(C)
-    R_X, R_Y = to_rotations(U[:, :1].T), to_rotations(Vt[:1])
-    t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
-    return Calibration(poses_by_name(stack.targets, R_X, t_X), poses_by_name(stack.sensors, R_Y, t_Y))
+    return linear_outcome(stack, to_rotations(U[:, :1].T), to_rotations(Vt[:1]))
 
 
-def nonlinear(problem: Problem, options: MethodOptions) -> Calibration:
+def nonlinear(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """Least |R_A R_X - R_Y R_B|^2 + |R_A t_X + t_A - R_Y t_B - t_Y|^2 + 1e6 (|R_X R_X' - I|^2 + |R_Y R_Y' - I|^2).
 
     Over the 24 entries, by Levenberg-Marquardt. The first two sums are one quadratic form in them, so an iteration's
@@ -79,35 +78,23 @@ def nonlinear(problem: Problem, options: MethodOptions) -> Calibration:
         residual, start, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=options.max_iterations
     )
     x = found.x
-    R = nearest_rotations(x[6:24].reshape(2, 3, 3).transpose(0, 2, 1))
-    return Calibration(
-        poses_by_name((target,), R[:1], x[None, :3] + gauge.target_carrier),
-        poses_by_name((sensor,), R[1:], x[None, 3:6] + gauge.sensor_carrier),
-        starts_from=starts_from,
-    )
+    R = rotations_up_to_sign(x[6:24].reshape(2, 3, 3).transpose(0, 2, 1))
+    t_X, t_Y = x[None, :3] + gauge.target_carrier, x[None, 3:6] + gauge.sensor_carrier
+    return stack.outcome(R[:1], t_X, R[1:], t_Y, starts_from=starts_from)
 
 
 _SOURCE = "F. Dornaika and R. Horaud, Simultaneous robot-world and hand-eye calibration, IEEE T-RA 14(4), 1998"
 
 CLOSED = Method(
     name="dornaika1998_closed",
-    properties=Properties(
-        joint=False,
-        probabilistic=False,
-        certifiable=False,
-        multiple="",
-        monocular=False,
-        representation="unit quaternions",
-    ),
+    properties=Properties("unit quaternions", joint=False),
     source=_SOURCE,
     assumes="Rotations without the translations' help, all measurements alike; quaternions whose signs fit together.",
     function=closed_form,
 )
 NONLINEAR = Method(
     name="dornaika1998",
-    properties=Properties(
-        joint=True, probabilistic=True, certifiable=False, multiple="", monocular=False, representation="matrices"
-    ),
+    properties=Properties("matrices", probabilistic=True),
     source=_SOURCE,
     assumes="A start near the answer; a radian weighs as much as a metre (times the square root of two), whatever the "
     "noise.",

@@ -9,15 +9,16 @@ block of moments the two relaxations are one, and with it that over quaternions 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes
 from gtsam_rwhec.methods.quaternion_moments import STEPS, solve_moments
-from gtsam_rwhec.methods.unit_weights import UnitForm
+from gtsam_rwhec.methods.unit_weights import COST, UnitForm
 from gtsam_rwhec.methods.wise2020 import certified_rotations, check_frames
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.descent import descend
@@ -43,7 +44,7 @@ class PolynomialMinimum:
 
 def heller2014(
     problem: Problem, options: MethodOptions, parameterisation: Parameterisation = "quaternion"
-) -> Calibration:
+) -> Outcome[Poses]:
     """One X and one Y, or one sensor's motions; known scale."""
     form = UnitForm.of(problem)
     found = global_minimum(form, parameterisation)
@@ -56,7 +57,13 @@ def heller2014(
             f"the relaxation of {order} is not tight: cost {found.cost:.6g}, bound {gap:.2g} below it; the next order "
             "was not tried"
         )
-    return form.calibration(found.R, notes=(note,))
+    return replace(
+        form.outcome(found.R, notes=(note,)),
+        cost=found.cost,
+        cost_name=COST,
+        lower_bound=found.lower_bound,
+        is_optimal=found.is_tight,
+    )
 
 
 def global_minimum(form: UnitForm, parameterisation: Parameterisation = "quaternion") -> PolynomialMinimum:
@@ -87,22 +94,15 @@ _SOURCE = (
 )
 
 
-def _method(name: str, parameterisation: Parameterisation, representation: str) -> Method:
+def _method(name: str, parameterisation: Parameterisation, representation: str) -> Method[[Problem, MethodOptions]]:
     return Method(
         name=name,
-        properties=Properties(
-            joint=True,
-            probabilistic=False,
-            certifiable=True,
-            multiple="",
-            monocular=False,
-            representation=representation,
-        ),
+        properties=Properties(representation, certifiable=True),
         source=_SOURCE,
         assumes="Errors alike in all measurements, a radian as bad as a metre. Proves its answer, or says that it has "
         "not.",
         function=partial(heller2014, parameterisation=parameterisation),
-        takes_motions=True,
+        takes=frozenset({Takes.MOTIONS}),
         check=check_frames,
     )
 

@@ -17,7 +17,7 @@ Section 8.1's.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -25,10 +25,11 @@ import numpy as np
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import conjugate, dual_parts, left, of_rotations, right, to_rotations
-from gtsam_rwhec.methods.absolute import Stack, poses_by_name
+from gtsam_rwhec.methods.absolute import Stack
 from gtsam_rwhec.methods.dual_quaternion_relaxation import Relaxed, multipliers_of, polished, relaxed
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
-from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.problem.problem import Problem
 
 #: How the quaternions of A and B get their signs.
@@ -41,6 +42,8 @@ Signs = Literal["aligned", "continuous", "scalar", "random"]
 #: What is squared. Multiplying by a dual quaternion changes the norm, so these are different costs: "a x - y b", or
 #: "x - a* y b", X against what each measurement makes of Y. The RWHEC paper's rows "Horn" are those of the second.
 Residual = Literal["a x - y b", "x - a* y b"]
+#: A relative gap up to which the relaxation's bound proves the answer: what its solver's tolerance leaves.
+CLOSED = 1e-6
 #: Rounds of choosing signs by the answer.
 ROUNDS = 10
 #: A quarter of a squared metre is what the dual part makes of a unit translation; beside it a rotation of an angle
@@ -85,7 +88,7 @@ class DualQuaternionAnswer:
         return (self.cost - self.lower_bound) / max(self.cost, 1e-300)
 
 
-def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned") -> Calibration:
+def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned") -> Outcome[Poses]:
     """Several Xs or several Ys, known scale."""
     stack = Stack.of(problem)
     found = solve_dual_quaternions(stack, signs, options.seed)
@@ -98,10 +101,13 @@ def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned")
         )
     if found.smallest_margin < np.cos(0.5 * np.radians(150.0)):
         notes.append("a measurement is off by more than 150 degrees: its sign cannot be told")
-    return Calibration(
-        poses_by_name(stack.targets, found.R[:n_X], found.t[:n_X]),
-        poses_by_name(stack.sensors, found.R[n_X:], found.t[n_X:]),
-        notes=tuple(notes),
+    outcome = stack.outcome(found.R[:n_X], found.t[:n_X], found.R[n_X:], found.t[n_X:], notes=notes)
+    return replace(
+        outcome,
+        cost=found.cost,
+        cost_name="|a x - y b|^2 of dual quaternions, with the signs chosen",
+        lower_bound=found.lower_bound,
+        is_optimal=found.contradicted == 0 and found.gap <= CLOSED,
     )
 
 
@@ -271,14 +277,7 @@ def _bound(Q: Array, q: Array, t: Array, cost: float, found: Relaxed) -> float:
 
 METHOD = Method(
     name="horn2023",
-    properties=Properties(
-        joint=True,
-        probabilistic=False,
-        certifiable=True,
-        multiple="Xs or Ys",
-        monocular=False,
-        representation="dual quaternions",
-    ),
+    properties=Properties("dual quaternions", certifiable=True, multiple="Xs or Ys"),
     source="M. Horn, T. Wodtko, M. Buchholz and K. Dietmayer, Extrinsic infrastructure calibration using the hand-eye "
     "robot-world formulation, IEEE Intelligent Vehicles Symposium 2023",
     assumes="Errors alike in all measurements, a radian as bad as a metre; a cost that changes with the origins of the "

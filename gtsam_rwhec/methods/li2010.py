@@ -7,10 +7,11 @@ import numpy as np
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT, conjugate, dual_parts, left, to_rotations
-from gtsam_rwhec.methods.absolute import FREE, Stack, nearest_rotations, poses_by_name
+from gtsam_rwhec.methods.absolute import FREE, Stack, rotations_up_to_sign
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.methods.plain_form import plain_form
-from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.problem.problem import Problem
 
 _SOURCE = (
@@ -19,7 +20,7 @@ _SOURCE = (
 )
 
 
-def kronecker(problem: Problem, options: MethodOptions) -> Calibration:
+def kronecker(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """A X = Y B in least squares over all entries of X and Y, linear; then the matrices are projected to rotations.
 
     The translations are those of the linear system, which belong to the matrices before their projection.
@@ -37,12 +38,9 @@ def kronecker(problem: Problem, options: MethodOptions) -> Calibration:
             "about a second axis, and change the distance"
         )
     x = scaling * np.linalg.solve(equilibrated, scaling * right)
-    R = nearest_rotations(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
+    R = rotations_up_to_sign(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
     gauge = stack.gauge
-    return Calibration(
-        poses_by_name(stack.targets, R[:1], x[None, :3] + gauge.target_carrier),
-        poses_by_name(stack.sensors, R[1:], x[None, 3:6] + gauge.sensor_carrier),
-    )
+    return stack.outcome(R[:1], x[None, :3] + gauge.target_carrier, R[1:], x[None, 3:6] + gauge.sensor_carrier)
 
 
 def _rows() -> Array:
@@ -61,7 +59,7 @@ def _rows() -> Array:
 _ROWS = _rows()
 
 
-def dual_quaternions(problem: Problem, options: MethodOptions) -> Calibration:
+def dual_quaternions(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """The homogeneous linear system of two dual quaternions, 8 equations a measurement.
 
     Exact data leave two dimensions, (q, q') and (0, q) of both frames, so the answer is sought among the combinations
@@ -86,7 +84,7 @@ def dual_quaternions(problem: Problem, options: MethodOptions) -> Calibration:
     dual = dual - np.einsum("fi,fi->f", q, dual)[:, None] * q
     t = 2.0 * np.einsum("fij,fj->fi", left(dual), conjugate(q))[:, :3]
     R = to_rotations(q)
-    return Calibration(poses_by_name(stack.targets, R[:1], t[:1]), poses_by_name(stack.sensors, R[1:], t[1:]))
+    return stack.outcome(R[:1], t[:1], R[1:], t[1:])
 
 
 def _isotropic(P: Array) -> Array:
@@ -104,9 +102,7 @@ def _isotropic(P: Array) -> Array:
 # have both in them, and translations move the rotations found: joint, by its mathematics.
 KRONECKER = Method(
     name="li2010_kronecker",
-    properties=Properties(
-        joint=True, probabilistic=False, certifiable=False, multiple="", monocular=False, representation="matrices"
-    ),
+    properties=Properties("matrices"),
     source=_SOURCE,
     assumes="All measurements alike, a radian as much as a metre. X and Y are any matrices until the end, so a target "
     "must not be seen in the same place all the time (a camera that turns about it tells 24 entries nothing).",
@@ -114,14 +110,7 @@ KRONECKER = Method(
 )
 DUAL_QUATERNIONS = Method(
     name="li2010_dq",
-    properties=Properties(
-        joint=True,
-        probabilistic=False,
-        certifiable=False,
-        multiple="",
-        monocular=False,
-        representation="dual quaternions",
-    ),
+    properties=Properties("dual quaternions"),
     source=_SOURCE,
     assumes="All measurements alike, a radian as much as a metre; quaternions whose signs fit together; carriers' "
     "origins near the data, as the dual parts' errors grow with the distance.",

@@ -18,8 +18,12 @@ import gtsam
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.errors import FrameError, NoiseError, OptionError, PriorError, ScaleError
+from gtsam_rwhec.errors import NoiseError, OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.methods.applicability import check_problem
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes, checked_start
+from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.problem import Problem
 
@@ -109,19 +113,17 @@ def local_on_manifold(
         When there are moments only.
     """
     chosen = LomOptions() if options is None else options
-    check_problem(problem)
+    check_problem(METHOD, problem)
+    X, Y, scale = checked_start(problem, (X, Y, scale))
     scale_key = gtsam.symbol("s", 0) if problem.scale == "shared" else None
-    alpha = 1.0 if scale_key is None else float(scale)
+    alpha = 1.0 if scale_key is None else scale
     frames = {name: FrameKeys(gtsam.symbol("x", i), gtsam.symbol("u", i)) for i, name in enumerate(problem.targets)}
     frames |= {name: FrameKeys(gtsam.symbol("y", i), gtsam.symbol("v", i)) for i, name in enumerate(problem.sensors)}
     values = gtsam.Values()
-    for names, start, what in ((problem.targets, X, "X"), (problem.sensors, Y, "Y")):
-        for name in names:
-            if name not in start:
-                raise FrameError(f"the start's {what} has no {name}; it has {', '.join(start) or 'none'}")
-            T = one_transform(start[name], f"start of {name}")
-            values.insert(frames[name].rotation, gtsam.Rot3(T[:3, :3]))
-            values.insert(frames[name].translation, alpha * T[:3, 3])
+    for name, keys in frames.items():
+        T = one_transform((X if name in problem.targets else Y)[name], f"start of {name}")
+        values.insert(keys.rotation, gtsam.Rot3(T[:3, :3]))
+        values.insert(keys.translation, alpha * T[:3, 3])
     if scale_key is not None:
         values.insert(scale_key, np.array([alpha]))
 
@@ -154,23 +156,15 @@ def local_on_manifold(
     )
 
 
-def check_problem(problem: Problem) -> None:
-    """Refuse what Problem 9 has no place for.
+def refuse_covariances(problem: Problem) -> None:
+    """Refuse what Problem 9 cannot weigh by.
 
     Raises
     ------
-    FrameError, ScaleError, NoiseError, PriorError
+    NoiseError
     """
-    if problem.scale == "per_target":
-        raise ScaleError("LOM has one scale for all targets; make the problem with scale='shared' or 'known'")
-    if problem.fixed or problem.priors:
-        named = ", ".join([*problem.fixed, *problem.priors])
-        raise PriorError(f"LOM has neither fixed frames nor priors, and there are some for {named}; use refine")
     if problem.has_covariances:
         raise NoiseError("LOM weighs by sigma and kappa, and there are covariances; use refine(residual='geodesic')")
-    motions = [pair.sensor for pair in problem.pairs if pair.is_motion]
-    if motions:
-        raise FrameError(f"LOM solves A X = Y B, and {motions[0]} has motions (A Y = Y B); use refine")
 
 
 def standard_deviations(raw: Measurements, weights: LomWeights | tuple[float, float]) -> tuple[Array, Array]:
@@ -230,3 +224,27 @@ def _stacked(rotation: Array, translation: Array, weight: Array) -> Array:
     """Rows of e_R over those of e_t, measurement by measurement, weighed: (6 N, d) as GTSAM takes it."""
     stacked = np.concatenate([rotation, translation], axis=1) * weight[:, :, None]
     return np.asfortranarray(stacked.reshape(-1, stacked.shape[2]))
+
+
+def lom(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
+    """Problem 9 with the paper's weights, from a start or from a closed form's answer."""
+    X, Y, scale, starts_from = start_of(problem, options)
+    found = local_on_manifold(problem, X, Y, scale, LomOptions(max_iterations=options.max_iterations))
+    if found.scale <= 0.0:
+        raise ScaleError(
+            f"LOM, started from {starts_from}, ended at scale {found.scale:.6g}: a local minimum that is no "
+            "calibration; give another start"
+        )
+    return Outcome(found.X, found.Y, found.scale, starts_from=starts_from)
+
+
+METHOD = Method(
+    name="lom",
+    function=lom,
+    properties=Properties("SE(3)", probabilistic=True, multiple="Xs and Ys", monocular=True),
+    source="E. Wise et al., A certifiably correct algorithm for generalized robot-world and hand-eye calibration, "
+    "arXiv 2507.23045, Appendix C",
+    assumes="A start near the answer; isotropic noise on B, exact A.",
+    takes=frozenset({Takes.SHARED_SCALE}),
+    check=refuse_covariances,
+)

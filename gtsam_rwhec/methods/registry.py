@@ -11,51 +11,54 @@ from gtsam_rwhec.geometry.poses import PoseLike, one_transform
 from gtsam_rwhec.methods import (
     certified,
     dornaika1998,
-    evangelista2023,
     heller2014,
     horn2023,
+    image_methods,
     li2010,
-    lom,
-    shah2013,
+    linear_methods,
+    local_on_manifold,
     strobl2006,
     tabb2017,
-    wang2022,
     wise2020,
     zhuang1994,
 )
+from gtsam_rwhec.methods.applicability import check_problem
+from gtsam_rwhec.methods.estimate import Estimate, Outcome, Poses, Proof
 from gtsam_rwhec.methods.evaluation import evaluate
-from gtsam_rwhec.methods.protocol import Calibration, Estimate, Method, MethodOptions
+from gtsam_rwhec.methods.method import Method, MethodOptions
 from gtsam_rwhec.problem.problem import Problem
 
+#: The cost by which all answers are compared.
+COST_NAME = "J (RWHEC paper, eq. 18)"
 #: In the order in which ``gtsam-rwhec compare`` shows them: closed forms, iterations, global methods.
-METHODS: dict[str, Method] = {
+METHODS: dict[str, Method[[Problem, MethodOptions]]] = {
     method.name: method
     for method in (
         zhuang1994.METHOD,
         dornaika1998.CLOSED,
         li2010.KRONECKER,
         li2010.DUAL_QUATERNIONS,
-        shah2013.METHOD,
-        wang2022.METHOD,
+        linear_methods.SHAH,
+        linear_methods.WANG,
         dornaika1998.NONLINEAR,
-        lom.METHOD,
+        local_on_manifold.METHOD,
         strobl2006.METHOD,
         horn2023.METHOD,
         tabb2017.C1,
         tabb2017.C2,
         tabb2017.C1_SEPARABLE,
         tabb2017.C2_SEPARABLE,
-        tabb2017.RP1,
+        image_methods.RP1,
         wise2020.METHOD,
         heller2014.METHOD,
         heller2014.MATRIX,
-        evangelista2023.METHOD,
+        image_methods.EVANGELISTA,
         certified.METHOD,
     )
 }
 
 
-def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Estimate:
+def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Estimate[dict[str, gtsam.Pose3]]:
     """Solve a problem by a published method.
 
     Parameters
@@ -77,14 +80,14 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
     method = method_of(name)
     if options is not None and not isinstance(options, MethodOptions):
         raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.methods.MethodOptions")
-    method.check_problem(problem)
+    check_problem(method, problem)
     start = time.perf_counter()
     found = method.function(problem, options or MethodOptions())
     seconds = time.perf_counter() - start
-    return estimate_of(method, problem, found, seconds)
+    return estimate_of(method.name, problem, found, seconds)
 
 
-def method_of(name: str) -> Method:
+def method_of(name: str) -> Method[[Problem, MethodOptions]]:
     """A method by its name.
 
     Raises
@@ -97,16 +100,21 @@ def method_of(name: str) -> Method:
         raise OptionError(f"method {name!r} is not one of {', '.join(METHODS)}") from None
 
 
-def estimate_of(method: Method, problem: Problem, found: Calibration, seconds: float) -> Estimate:
+def estimate_of(name: str, problem: Problem, found: Outcome[Poses], seconds: float) -> Estimate[dict[str, gtsam.Pose3]]:
     """A method's answer under the certified objective."""
     scale = found.scale if isinstance(found.scale, float) else dict(found.scale)
     evaluation = evaluate(problem, found.X, found.Y, scale)
+    proof = None
+    if found.cost is not None and found.lower_bound is not None:
+        proof = Proof(found.cost, found.cost_name, found.lower_bound, bool(found.is_optimal))
     return Estimate(
-        method=method.name,
+        method=name,
         X={name: _pose3(found.X[name], name) for name in problem.targets},
         Y={name: _pose3(found.Y[name], name) for name in problem.sensors},
         scale=scale,
         cost=evaluation.cost,
+        cost_name=COST_NAME,
+        proof=proof,
         residuals=evaluation.residuals,
         seconds=seconds,
         starts_from=found.starts_from,

@@ -17,7 +17,8 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, TargetError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms, checked_rows, one_transform, rows_to_transforms
-from gtsam_rwhec.methods.protocol import MethodOptions, Poses
+from gtsam_rwhec.methods.estimate import Poses
+from gtsam_rwhec.methods.method import MethodOptions
 from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.vision.camera import Camera

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from gtsam_rwhec.methods.absolute import Stack, linear_rotations, linear_translations, poses_by_name
-from gtsam_rwhec.methods.protocol import MethodOptions, Poses, checked_start
+from gtsam_rwhec.methods.estimate import Poses
+from gtsam_rwhec.methods.method import MethodOptions, checked_start
 from gtsam_rwhec.problem.problem import Problem
 
 

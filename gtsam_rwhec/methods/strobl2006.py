@@ -13,8 +13,9 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array, one_transform
-from gtsam_rwhec.methods.absolute import Stack, linear_rotations, linear_translations, poses_by_name
-from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties, checked_start
+from gtsam_rwhec.methods.absolute import Stack, linear_outcome, linear_rotations
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, checked_start
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.rotations import retract
 
@@ -37,24 +38,22 @@ class Weighed:
     settled: bool
 
 
-def strobl2006(problem: Problem, options: MethodOptions) -> Calibration:
+def strobl2006(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """One X, one Y: reweighed until the weights rest."""
     stack = Stack.of(problem)
     target, sensor = stack.targets[0], stack.sensors[0]
     if options.start is None:
-        R_X, R_Y = linear_rotations(stack)
-        t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
-        X, Y = poses_by_name((target,), R_X, t_X)[target], poses_by_name((sensor,), R_Y, t_Y)[sensor]
-        starts_from = "shah2013"
+        start = linear_outcome(stack, *linear_rotations(stack))
+        of_X, of_Y, starts_from = start.X, start.Y, "shah2013"
     else:
         of_X, of_Y, _ = checked_start(problem, options.start)
-        X, Y = one_transform(of_X[target], f"start of {target}"), one_transform(of_Y[sensor], f"start of {sensor}")
         starts_from = "the given start"
+    X, Y = one_transform(of_X[target], f"start of {target}"), one_transform(of_Y[sensor], f"start of {sensor}")
     found = reweighed(stack, X, Y, options.max_iterations)
     notes = [f"estimated errors: {np.degrees(found.sigma_R):.3g} deg and {1e3 * found.sigma_t:.3g} mm an axis"]
     if not found.settled:
         notes.append(f"the weights had not come to rest after {found.rounds} rounds")
-    return Calibration({target: found.X}, {sensor: found.Y}, starts_from=starts_from, notes=tuple(notes))
+    return Outcome({target: found.X}, {sensor: found.Y}, starts_from=starts_from, notes=tuple(notes))
 
 
 def reweighed(stack: Stack, X: Array, Y: Array, max_iterations: int) -> Weighed:
@@ -134,9 +133,7 @@ def _descended(
 
 METHOD = Method(
     name="strobl2006",
-    properties=Properties(
-        joint=True, probabilistic=True, certifiable=False, multiple="", monocular=False, representation="SE(3)"
-    ),
+    properties=Properties("SE(3)", probabilistic=True),
     source="K. Strobl and G. Hirzinger, Optimal hand-eye calibration, IROS 2006",
     assumes="Errors alike in all measurements, whose sizes it finds itself (sigma and kappa are not used); a start "
     "near the answer.",

@@ -13,17 +13,19 @@ Their third kind, reprojection errors (rp1), needs images: see ``reprojection``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, of_rotations, to_rotations
-from gtsam_rwhec.methods.absolute import Stack, linear_translations, poses_by_name
-from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
+from gtsam_rwhec.methods.absolute import Stack, linear_translations
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.methods.unit_weights import UnitForm, unit_weights
 from gtsam_rwhec.problem.problem import Problem
@@ -44,7 +46,7 @@ def tabb2017(
     cost: Cost = "c1",
     mode: Mode = "simultaneous",
     parameterisation: Parameterisation = "axis-angle",
-) -> Calibration:
+) -> Outcome[Poses]:
     """One of the method's variants, from a start, by Levenberg-Marquardt.
 
     Raises
@@ -61,17 +63,18 @@ def tabb2017(
     R = form.rotations_of(X, Y)
     if mode == "simultaneous":
         R = least(form.reduced, R, parameterisation, options.max_iterations)
-        return form.calibration(R, starts_from)
+        return form.outcome(R, starts_from)
     R = least(form.rotations_alone, R, parameterisation, options.max_iterations)
     stack = Stack.of(unit_weights(problem, turned=True) if turned else problem)
     by_name = dict(zip(form.part.free, R, strict=True))
     R_X = np.array([by_name[name] for name in stack.targets])
     R_Y = np.array([by_name[name] for name in stack.sensors])
     t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
-    found_X, found_Y = poses_by_name(stack.targets, R_X, t_X), poses_by_name(stack.sensors, R_Y, t_Y)
-    if turned:
-        found_X, found_Y = ({name: np.linalg.inv(T) for name, T in poses.items()} for poses in (found_X, found_Y))
-    return Calibration(found_X, found_Y, starts_from=starts_from)
+    found = stack.outcome(R_X, t_X, R_Y, t_Y, starts_from=starts_from)
+    if not turned:
+        return found
+    X, Y = ({name: np.linalg.inv(np.asarray(T)) for name, T in poses.items()} for poses in (found.X, found.Y))
+    return replace(found, X=X, Y=Y)
 
 
 def least(form: ReducedForm, R: Array, parameterisation: Parameterisation, max_iterations: int) -> Array:
@@ -147,38 +150,21 @@ CHARTS: dict[str, tuple[Callable[[Array], Array], Chart]] = {
 }
 
 
-def _without_images(problem: Problem) -> None:
-    raise FrameError(
-        "tabb2017_rp1 minimises reprojection errors, and a Problem has poses, not images; give corners in pixels to "
-        "gtsam_rwhec.methods.reprojection.calibrate"
-    )
-
-
-def _refuse(problem: Problem, options: MethodOptions) -> Calibration:
-    _without_images(problem)
-    raise AssertionError  # never reached: what is checked first has raised
-
-
-_SOURCE = (
+SOURCE = (
     "A. Tabb and K. Ahmad Yousef, Solving the robot-world hand-eye(s) calibration problem with iterative methods, "
     "Machine Vision and Applications 28, 2017"
 )
 _PLAIN = "Errors alike in all measurements, a radian as bad as a metre; a start near the answer."
 
 
-def _method(cost: Cost, mode: Mode) -> Method:
+def _method(cost: Cost, mode: Mode) -> Method[[Problem, MethodOptions]]:
     separable = mode == "separable"
     return Method(
         name=f"tabb2017_{cost}" + ("_separable" if separable else ""),
         properties=Properties(
-            joint=not separable,
-            probabilistic=False,
-            certifiable=False,
-            multiple="Xs or Ys",
-            monocular=False,
-            representation="Euler angles, rotation vectors or quaternions",
+            "Euler angles, rotation vectors or quaternions", joint=not separable, multiple="Xs or Ys"
         ),
-        source=_SOURCE,
+        source=SOURCE,
         assumes=_PLAIN,
         function=partial(tabb2017, cost=cost, mode=mode),
     )
@@ -188,18 +174,3 @@ C1 = _method("c1", "simultaneous")
 C2 = _method("c2", "simultaneous")
 C1_SEPARABLE = _method("c1", "separable")
 C2_SEPARABLE = _method("c2", "separable")
-RP1 = Method(
-    name="tabb2017_rp1",
-    properties=Properties(
-        joint=True,
-        probabilistic=False,
-        certifiable=False,
-        multiple="Xs or Ys",
-        monocular=False,
-        representation="rotation vectors",
-    ),
-    source=_SOURCE,
-    assumes="Images: corners in pixels, with cameras whose intrinsics are known; a start near the answer.",
-    function=_refuse,
-    check=_without_images,
-)

@@ -13,13 +13,16 @@ import numpy as np
 
 from gtsam_rwhec.errors import FrameError, ScaleError
 from gtsam_rwhec.geometry.poses import Array, one_transform
-from gtsam_rwhec.methods.protocol import Calibration, Poses
+from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.reduced_form import ReducedForm, reduce
 from gtsam_rwhec.solver.search import Forms
 from gtsam_rwhec.solver.start import spectral_start
 from gtsam_rwhec.solver.variables import answer_of
+
+#: The cost of all methods that have this form.
+COST = "J with all weights 1"
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ class UnitForm:
         )
         return np.ascontiguousarray(R.transpose(0, 2, 1)) if self.turned else R
 
-    def calibration(self, R: Array, starts_from: str | None = None, notes: tuple[str, ...] = ()) -> Calibration:
+    def outcome(self, R: Array, starts_from: str | None = None, notes: tuple[str, ...] = ()) -> Outcome[Poses]:
         """Poses with the best translations (and scale) for rotations R (n, 3, 3).
 
         Raises
@@ -96,7 +99,7 @@ class UnitForm:
         poses = dict(zip(self.part.free, T, strict=True))
         X = {name: poses[name] for name in self.part.targets}
         Y = {name: poses[name] for name in self.part.sensors}
-        return Calibration(X, Y, answer.scale, starts_from, notes)
+        return Outcome(X, Y, answer.scale, starts_from=starts_from, notes=notes)
 
 
 def unit_weights(problem: Problem, *, turned: bool = False) -> Problem:

@@ -7,14 +7,15 @@ quadratic constraints a rotation, solved as a semidefinite program. Its dual is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
-from gtsam_rwhec.methods.unit_weights import UnitForm
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes
+from gtsam_rwhec.methods.unit_weights import COST, UnitForm
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.descent import descend
@@ -47,15 +48,21 @@ class CertifiedRotations:
         return (self.cost - self.lower_bound) / max(self.cost, 1e-300)
 
 
-def wise2020(problem: Problem, options: MethodOptions) -> Calibration:
+def wise2020(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """One X and one Y, or one sensor's motions; known or shared scale."""
     form = UnitForm.of(problem)
     found = certified_rotations(form)
-    if found.eigenvalue_ratio < RANK_ONE:
-        proof = "the relaxation is tight"
-    else:
+    is_tight = found.eigenvalue_ratio < RANK_ONE
+    proof = "the relaxation is tight"
+    if not is_tight:
         proof = f"the relaxation is not tight (eigenvalues' ratio {found.eigenvalue_ratio:.1e}): nothing is proven"
-    return form.calibration(found.R, notes=(f"{proof}; relative gap {found.gap:.1e}",))
+    return replace(
+        form.outcome(found.R, notes=(f"{proof}; relative gap {found.gap:.1e}",)),
+        cost=found.cost,
+        cost_name=COST,
+        lower_bound=found.lower_bound,
+        is_optimal=is_tight,
+    )
 
 
 def certified_rotations(form: UnitForm) -> CertifiedRotations:
@@ -97,13 +104,11 @@ def check_frames(problem: Problem) -> None:
 
 METHOD = Method(
     name="wise2020",
-    properties=Properties(
-        joint=True, probabilistic=False, certifiable=True, multiple="", monocular=True, representation="SE(3)"
-    ),
+    properties=Properties("SE(3)", certifiable=True, monocular=True),
     source="E. Wise, M. Giamou, S. Khoubyarian, A. Grebe and J. Kelly, Certifiably optimal monocular hand-eye "
     "calibration, IEEE MFI 2020",
     assumes="Errors alike in all measurements, a radian as bad as a metre. Proves its answer, or says that it has not.",
     function=wise2020,
-    takes_motions=True,
+    takes=frozenset({Takes.SHARED_SCALE, Takes.MOTIONS}),
     check=check_frames,
 )

@@ -6,9 +6,10 @@ import numpy as np
 
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.quaternions import left, of_rotations, right, to_rotations
-from gtsam_rwhec.methods.absolute import FREE, Stack, linear_rotations, linear_translations, poses_by_name
+from gtsam_rwhec.methods.absolute import FREE, Stack, linear_outcome, linear_rotations
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
-from gtsam_rwhec.methods.protocol import Calibration, Method, MethodOptions, Properties
 from gtsam_rwhec.problem.problem import Problem
 
 #: A's with a smaller scalar part, half turns, are left out: the equations divide by it.
@@ -17,7 +18,7 @@ SMALLEST_SCALAR = 1e-3
 NEAR_HALF_TURN = 0.1
 
 
-def zhuang1994(problem: Problem, options: MethodOptions) -> Calibration:
+def zhuang1994(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """q_A q_X = q_Y q_B with q_X's scalar eliminated and q_Y's divided out; six unknowns.
 
     With q = (s, v), the equation's scalar part gives s_X = (s_Y s_B - v_Y.v_B + v_A.v_X) / s_A, and the vector part,
@@ -49,7 +50,6 @@ def zhuang1994(problem: Problem, options: MethodOptions) -> Calibration:
     s_X = s_A[:, 0] @ scalar / (s_A[:, 0] @ s_A[:, 0])
     R_X = to_rotations(np.array([[*v_X, s_X]]))
     R_Y = to_rotations(np.array([[*v_Y, s_Y]]))
-    t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
     notes = []
     # Noise pulls the ratios down, so that the system's own s_Y does not show that it should have been near 0.
     scalar_of_Y = abs(of_rotations(linear_rotations(stack)[1])[0, 3])
@@ -57,21 +57,12 @@ def zhuang1994(problem: Problem, options: MethodOptions) -> Calibration:
         notes.append(f"Y is near a half turn (scalar part {scalar_of_Y:.3g}), by which it divides: a poor answer")
     if not usable.all():
         notes.append(f"{np.sum(~usable)} measurements were left out: A is a half turn, by whose scalar part it divides")
-    return Calibration(
-        poses_by_name(stack.targets, R_X, t_X), poses_by_name(stack.sensors, R_Y, t_Y), notes=tuple(notes)
-    )
+    return linear_outcome(stack, R_X, R_Y, notes)
 
 
 METHOD = Method(
     name="zhuang1994",
-    properties=Properties(
-        joint=False,
-        probabilistic=False,
-        certifiable=False,
-        multiple="",
-        monocular=False,
-        representation="unit quaternions",
-    ),
+    properties=Properties("unit quaternions", joint=False),
     source="H. Zhuang, Z. S. Roth and R. Sudhakar, Simultaneous robot/world and tool/flange calibration by solving "
     "homogeneous transformation equations of the form AX = YB, IEEE T-RA 10(4), 1994",
     assumes="Neither Y nor any A is a half turn, nor near one: it divides by their quaternions' scalar parts.",

@@ -48,11 +48,11 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
     if without:
         console.print(Text("No answer:", style="bold"))
         for row in without:
-            reason = row.reason.removeprefix(f"{row.method.name} ").removeprefix(f"{row.method.name}: ")
+            reason = str(row.error).removeprefix(f"{row.method.name} ").removeprefix(f"{row.method.name}: ")
             console.print(Text(f"  - {row.method.name}: {reason}"), soft_wrap=wrap)
         console.print()
     if comparison.certificate is None:
-        console.print(Text(f"No bound on the cost: {comparison.no_solution}", style="bold red"), soft_wrap=wrap)
+        console.print(Text(f"No bound on the cost: {comparison.error}", style="bold red"), soft_wrap=wrap)
         return
     style = "bold green" if comparison.certificate.is_certified else "bold red"
     sentence = certificate_sentence(comparison.certificate).replace("this answer", "the certified answer", 1)

@@ -1,9 +1,9 @@
 """What a method is asked, made without ``solve``; and its answer as a pose."""
 
 from gtsam_rwhec.geometry.poses import to_pose3
-from gtsam_rwhec.handeye.method import Request
 from gtsam_rwhec.handeye.motion_costs import cost_of
 from gtsam_rwhec.handeye.motions import motions_of
+from gtsam_rwhec.handeye.request import Request
 
 
 def request_of(C, H, alpha=1.0, weights=None, covariances=None, prior=None, scale="known", rng=None):

@@ -14,7 +14,7 @@ from gtsam_rwhec.handeye.approximate import (
     relaxation,
     relaxation_gap,
 )
-from gtsam_rwhec.handeye.method import Request
+from gtsam_rwhec.handeye.request import Request
 
 APPROXIMATE = ["dq2steps", "dqconvrlx", "dq2ndord", "dq2ndord_lambda", "dqitr"]
 

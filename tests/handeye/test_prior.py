@@ -8,9 +8,10 @@ from scipy.optimize import minimize
 from simulated import distance, hand_held, pair, poses
 
 from gtsam_rwhec.errors import OptionError, PoseError, PriorError
-from gtsam_rwhec.handeye import DualQuaternionPrior, HandEye, cost_of, motions_of, solve
+from gtsam_rwhec.handeye import DualQuaternionPrior, cost_of, motions_of, solve
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.linear_prior import on_sphere
+from gtsam_rwhec.methods import Estimate
 
 FORMS = ["imaginary", "distance"]
 
@@ -45,7 +46,9 @@ def test_eq_29_is_eq_26() -> None:
     assert with_prior.value(q, q_dual) == pytest.approx(cost.value(q, q_dual) + prior.value(q, q_dual))
 
 
-def total(result: HandEye, C: np.ndarray, H: np.ndarray, prior: DualQuaternionPrior, xi: np.ndarray) -> float:
+def total(
+    result: Estimate[gtsam.Pose3], C: np.ndarray, H: np.ndarray, prior: DualQuaternionPrior, xi: np.ndarray
+) -> float:
     X = result.X.retract(xi)
     motions = motions_of(C, H)
     (q,), (q_dual,) = from_transforms(X.matrix()[None])

@@ -12,7 +12,6 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, TargetError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import MethodOptions, run
-from gtsam_rwhec.methods.evangelista2023 import evangelista2023
 from gtsam_rwhec.methods.reprojection import Observations, calibrate, linearised
 from gtsam_rwhec.simulate.simulation import frame_distance
 from gtsam_rwhec.vision.camera import Camera
@@ -99,7 +98,7 @@ def test_gradient_and_hessian_are_the_derivatives() -> None:
 
 def test_exact_corners_give_the_truth() -> None:
     observations, X, Y = seen(0.0, 3)
-    answer = evangelista2023(observations)
+    answer = calibrate(observations)
     assert answer.converged
     assert answer.rms_px < 1e-6
     for found, truth in ((answer.X, X), (answer.Y, Y)):

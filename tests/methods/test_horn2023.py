@@ -30,7 +30,7 @@ from gtsam_rwhec.methods.horn2023 import (
     signed_quaternions,
     solve_dual_quaternions,
 )
-from gtsam_rwhec.methods.protocol import MethodOptions
+from gtsam_rwhec.methods.method import MethodOptions
 from gtsam_rwhec.simulate import Noise, Simulation
 
 LARGE = Noise(0.01, 12.0, "released")

@@ -18,11 +18,11 @@ from gtsam_rwhec.errors import (
     ScaleError,
     UnderdeterminedError,
 )
-from gtsam_rwhec.methods import METHODS, MethodOptions, cost_of_answer, run
+from gtsam_rwhec.methods import METHODS, MethodOptions, Takes, cost_of_answer, refusal, run
 from gtsam_rwhec.simulate import Noise, general
 
 #: All but those that need images.
-FOR_A_PAIR = [name for name, method in METHODS.items() if not method.applies(general_pair(None).problem)]
+FOR_A_PAIR = [name for name, method in METHODS.items() if refusal(method, general_pair(None).problem) is None]
 
 
 @pytest.mark.parametrize("name", FOR_A_PAIR)
@@ -44,10 +44,10 @@ def test_joint_methods_alone_let_translations_move_rotations(name: str) -> None:
 @pytest.mark.parametrize("name", METHODS)
 def test_monocular_methods_recover_a_scale_of_a_half(name: str) -> None:
     simulation = general_pair(scale="shared")
-    if METHODS[name].properties.monocular and not METHODS[name].applies(simulation.problem):
+    if METHODS[name].properties.monocular and refusal(METHODS[name], simulation.problem) is None:
         assert run(name, simulation.problem).scale == pytest.approx(0.5, rel=0.02)
     else:
-        assert METHODS[name].applies(simulation.problem)
+        assert refusal(METHODS[name], simulation.problem) is not None
         with pytest.raises(RwhecError):
             run(name, simulation.problem)
 
@@ -60,12 +60,12 @@ def test_methods_for_several_frames_give_them_all(name: str) -> None:
         (many_X, multiple in ("Xs", "Xs or Ys", "Xs and Ys")),
         (exchanged(many_X), multiple in ("Xs or Ys", "Xs and Ys")),
     ):
-        if can and not METHODS[name].applies(simulation.problem):
+        if can and refusal(METHODS[name], simulation.problem) is None:
             metres, radians = largest_errors(simulation, run(name, simulation.problem))
             assert metres < 1e-5
             assert radians < 1e-5
         else:
-            assert METHODS[name].applies(simulation.problem)
+            assert refusal(METHODS[name], simulation.problem) is not None
             with pytest.raises(RwhecError):
                 run(name, simulation.problem)
 
@@ -90,7 +90,7 @@ def test_every_method_says_what_it_assumes_and_where_it_is_from(name: str) -> No
     assert any(character.isdigit() for character in method.source)  # a year
 
 
-@pytest.mark.parametrize("name", [name for name in FOR_A_PAIR if not METHODS[name].takes_priors])
+@pytest.mark.parametrize("name", [name for name in FOR_A_PAIR if Takes.PRIORS not in METHODS[name].takes])
 def test_what_a_method_cannot_hold_is_refused_in_words(name: str) -> None:
     simulation = general_pair()
     raw = simulation.problem.measurements("target0", "sensor0")
@@ -113,11 +113,11 @@ def test_what_a_method_cannot_hold_is_refused_in_words(name: str) -> None:
         (per_target, ScaleError, "per_target"),
         (rw.Problem(), CountError, "empty"),
     ):
-        if word == "motions" and METHODS[name].takes_motions:
+        if word == "motions" and Takes.MOTIONS in METHODS[name].takes:
             continue
         with pytest.raises(error, match=word):
             run(name, problem)
-        assert word in METHODS[name].applies(problem)
+        assert word in str(refusal(METHODS[name], problem))
 
 
 def planar(noise: Noise | None) -> rw.Problem:

@@ -10,7 +10,8 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods import run
-from gtsam_rwhec.methods.protocol import Calibration, MethodOptions
+from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.method import MethodOptions
 from gtsam_rwhec.methods.tabb2017 import C1, CHARTS, Cost, Mode, Parameterisation, tabb2017
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate import Noise
@@ -32,7 +33,7 @@ def cost_of(problem: Problem, X: dict[str, Array], Y: dict[str, Array], cost: Co
 
 
 def nearby(
-    found: Calibration, generator: np.random.Generator, size: float
+    found: Outcome[Poses], generator: np.random.Generator, size: float
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     def moved(poses: dict[str, Array]) -> dict[str, Array]:
         return {name: T @ se3.expmap(size * generator.standard_normal((1, 6)))[0] for name, T in poses.items()}

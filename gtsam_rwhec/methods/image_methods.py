@@ -1,0 +1,49 @@
+"""Methods that minimise reprojection errors: Evangelista et al. 2023, and rp1 of Tabb and Ahmad Yousef 2017.
+
+They take corners in pixels in place of measured poses, so there is no ``Problem`` to run them on: ``reprojection``
+has what they take, and ``reprojection.calibrate`` solves it. Here are their records, for the table of methods.
+"""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
+from gtsam_rwhec.methods.tabb2017 import SOURCE
+from gtsam_rwhec.problem.problem import Problem
+
+
+def refuse_poses(problem: Problem, options: MethodOptions | None = None) -> NoReturn:
+    """Refuse what has poses in place of images.
+
+    Raises
+    ------
+    FrameError
+        Always.
+    """
+    raise FrameError(
+        f"this method minimises reprojection errors, and the problem's {problem.number_of_measurements} measurements "
+        "are poses; give corners in pixels, as gtsam_rwhec.methods.reprojection.Observations, to "
+        "gtsam_rwhec.methods.reprojection.calibrate"
+    )
+
+
+EVANGELISTA = Method(
+    name="evangelista2023",
+    function=refuse_poses,
+    properties=Properties("SE(3)", multiple="Xs"),
+    source="D. Evangelista, E. Olivastri, D. Allegri, E. Menegatti and A. Pretto, A graph-based optimization framework "
+    "for hand-eye calibration for multi-camera setups, ICRA 2023",
+    assumes="Images: corners in pixels, alike in all of them, with cameras whose intrinsics are known; a start near "
+    "the answer.",
+    check=refuse_poses,
+)
+RP1 = Method(
+    name="tabb2017_rp1",
+    function=refuse_poses,
+    properties=Properties("rotation vectors", multiple="Xs or Ys"),
+    source=SOURCE,
+    assumes="Images: corners in pixels, with cameras whose intrinsics are known; a start near the answer.",
+    check=refuse_poses,
+)
