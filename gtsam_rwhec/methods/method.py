@@ -31,7 +31,7 @@ class Takes(Enum):
     SHARED_SCALE = "an unknown scale"
     SCALE_PER_TARGET = "an unknown scale for each target"
     MOTIONS = "a sensor's own motions, A Y = Y B, in a problem"
-    PRIORS = "fixed frames and priors"
+    PRIORS = "a prior"
     LINEAR_PRIORS = "a prior of the form 'distance' (DQ paper, eq. 25)"
     MOMENTS = "a problem whose raw measurements were not kept"
     WEIGHTS = "weights of the motions"
