@@ -51,7 +51,7 @@ def main() -> None:
 def draw(path: Path) -> Figure:
     """Frames in three dimensions at the instant of an image; that image with what was seen in it."""
     with open_log(path) as log:
-        transforms = [t.name for t in log.topics() if t.name.rpartition("/")[2] in ("tf", "tf_static")]
+        transforms = [topic.name for topic in log.topics() if topic.is_tf]
         buffer = TfBuffer(log.records(transforms))
         cameras = read_cameras(log)
         images: dict[str, list[ImageRecord]] = {name: [] for name in CAMERAS}

@@ -1,15 +1,16 @@
-"""Gates for odometry (DQ paper, Appendix D.1): steps that no sensor makes, stamps that do not belong together."""
+"""Limits for odometry (DQ paper, Appendix D.1): steps that no sensor can make, stamps too far apart for one instant."""
 
 from __future__ import annotations
 
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.cleaning.removed import Kept
+from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.geometry.poses import Array
 
 #: The paper's: 10 cm or 11.5 degrees between two consecutive frames indicate a tracking error.
-MAX_STEP_M, MAX_STEP_RAD = 0.10, float(np.radians(11.5))
+MAX_STEP_M = 0.10
+MAX_STEP_RAD = float(np.radians(11.5))
 #: The paper's: further apart than this, two sensors' poses are not of one instant.
 MAX_APART_S = 0.1
 
@@ -39,13 +40,14 @@ def odometry_gates(
         A pose after a step too large is removed; the next is compared with it all the same, as the paper does.
     """
     apart = np.abs(stamps_first_ns - stamps_second_ns) * 1e-9
-    kept = Kept.of(apart > max_apart_s, "stamps apart (s)", stamps_first_ns, apart, max_apart_s)
-    for name, T in (("first", T_first), ("second", T_second)):
+    kept = Kept.of(apart > max_apart_s, RemovalReason.STAMPS_APART, stamps_first_ns, apart, max_apart_s)
+    for T, too_far, too_turned in (
+        (T_first, RemovalReason.FIRST_SENSOR_STEP_M, RemovalReason.FIRST_SENSOR_STEP_RAD),
+        (T_second, RemovalReason.SECOND_SENSOR_STEP_M, RemovalReason.SECOND_SENSOR_STEP_RAD),
+    ):
         step = se3.inverse(T[:-1]) @ T[1:]
         metres = np.r_[0.0, np.linalg.norm(step[:, :3, 3], axis=1)]
         radians = np.r_[0.0, np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1)]
-        for values, limit, unit in ((metres, max_step_m, "m"), (radians, max_step_rad, "rad")):
-            bad = (values > limit) & kept.mask
-            more = Kept.of(bad, f"step of the {name} sensor ({unit})", stamps_first_ns, values, limit)
-            kept = Kept(kept.mask & more.mask, kept.removed + more.removed)
-    return Kept(kept.mask, tuple(sorted(kept.removed, key=lambda item: item.index)))
+        kept = kept.and_of(metres > max_step_m, too_far, stamps_first_ns, metres, max_step_m)
+        kept = kept.and_of(radians > max_step_rad, too_turned, stamps_first_ns, radians, max_step_rad)
+    return kept

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.cleaning.removed import Kept, Removed
+from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
 
@@ -67,7 +67,7 @@ class Consensus:
     scale: float
 
 
-def consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: ConsensusOptions | None = None) -> Consensus:
+def find_consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: ConsensusOptions | None = None) -> Consensus:
     """Sort out a pair's measurements.
 
     Parameters
@@ -86,8 +86,8 @@ def consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: ConsensusOptio
     options = options or ConsensusOptions()
     N = len(A)
     if N < 2:
-        removed = tuple(Removed("a single measurement of the pair", 0, int(s), 1.0, 2.0) for s in stamps_ns)
-        return Consensus(Kept(np.zeros(N, dtype=bool), removed), 0.0, np.eye(4), np.eye(4), 1.0)
+        kept = Kept.of(np.ones(N, dtype=bool), RemovalReason.SINGLE, stamps_ns, np.ones(N), 2.0)
+        return Consensus(kept, 0.0, np.eye(4), np.eye(4), 1.0)
     generator = np.random.default_rng(options.seed)
     size = min(options.sample_size, N)
     # Each row a sample without repetition: the first of a random order.
@@ -108,25 +108,13 @@ def consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: ConsensusOptio
     X_best, Y_best, s_best = hypothesis
     metres, radians = (v[0] for v in distances(A, B, X_best[None], Y_best[None], np.array([s_best])))
     if share < options.min_inlier_share:
-        kept = Kept.of(
-            np.ones(N, dtype=bool),
-            "the pair has no consensus (share that agrees)",
-            stamps_ns,
-            np.full(N, share),
-            options.min_inlier_share,
-        )
+        everything = np.ones(N, dtype=bool)
+        kept = Kept.of(everything, RemovalReason.NO_CONSENSUS, stamps_ns, np.full(N, share), options.min_inlier_share)
         return Consensus(kept, share, X_best, Y_best, s_best)
-    turned = Kept.of(
-        radians > options.max_rotation_rad,
-        "rotation off the pair's consensus (rad)",
-        stamps_ns,
-        radians,
-        options.max_rotation_rad,
-    )
-    far = (metres > options.max_translation_m) & turned.mask
-    moved = Kept.of(far, "translation off the pair's consensus (m)", stamps_ns, metres, options.max_translation_m)
-    removed = tuple(sorted(turned.removed + moved.removed, key=lambda item: item.index))
-    return Consensus(Kept(turned.mask & moved.mask, removed), share, X_best, Y_best, s_best)
+    turned, moved = radians > options.max_rotation_rad, metres > options.max_translation_m
+    kept = Kept.of(turned, RemovalReason.ROTATION_OFF, stamps_ns, radians, options.max_rotation_rad)
+    kept = kept.and_of(moved, RemovalReason.TRANSLATION_OFF, stamps_ns, metres, options.max_translation_m)
+    return Consensus(kept, share, X_best, Y_best, s_best)
 
 
 def closed_form(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, Array, Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gtsam_rwhec.cleaning.removed import Kept, Removed
+from gtsam_rwhec.cleaning.removed import Kept, RemovalReason, Removed
 from gtsam_rwhec.errors import StampError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.trajectories.trajectory import Trajectory
@@ -59,14 +59,13 @@ def synchronise(
             f"{stamps.max() * 1e-9 + time_offset_s:.3f} s; are they of different clocks? If their difference is "
             "constant and known, it goes into the sensor's time offset"
         )
-    far = ~outside & (gap_s > max_gap_s)
-    removed = [
-        Removed("outside the carrier's trajectory (s)", int(i), int(stamps[i]), float(stamps[i]) * 1e-9, limit)
+    begins = carrier.stamps_ns[0]
+    removed = tuple(
+        Removed(
+            RemovalReason.OUTSIDE_TRAJECTORY, int(i), int(stamps[i]), float(stamps[i]) * 1e-9,
+            carrier.span_s[int(stamps[i] > begins)],
+        )
         for i in np.flatnonzero(outside)
-        for limit in [carrier.span_s[int(stamps[i] > carrier.stamps_ns[0])]]
-    ]
-    removed += [
-        Removed("gap in the carrier's poses (s)", int(i), int(stamps[i]), float(gap_s[i]), max_gap_s)
-        for i in np.flatnonzero(far)
-    ]
-    return A, Kept(~(outside | far), tuple(sorted(removed, key=lambda item: item.index)))
+    )  # fmt: skip
+    kept = Kept(~outside, removed)
+    return A, kept.and_of(gap_s > max_gap_s, RemovalReason.GAP, stamps, gap_s, max_gap_s)

@@ -1,10 +1,10 @@
-"""Standstill thinned, fast motion kept out."""
+"""Measurements at standstill, of which few are kept, and in fast motion, which are removed."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from gtsam_rwhec.cleaning.removed import Kept
+from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.geometry.poses import Array
 
 #: A carrier that has moved less than this since the last measurement that was kept has stood still.
@@ -38,7 +38,7 @@ def thin(
             bad[i] = True
         else:
             last = i
-    return Kept.of(bad, "standstill (m moved)", stamps_ns, moved, min_translation_m)
+    return Kept.of(bad, RemovalReason.STANDSTILL, stamps_ns, moved, min_translation_m)
 
 
 def without_fast(
@@ -58,10 +58,7 @@ def without_fast(
     stamps_ns : (N,) integers
     max_turning_rad_s, max_moving_m_s : float
     """
-    turned = Kept.of(
-        turning_rad_s > max_turning_rad_s, "turning fast (rad/s)", stamps_ns, turning_rad_s, max_turning_rad_s
+    kept = Kept.of(
+        turning_rad_s > max_turning_rad_s, RemovalReason.TURNING_FAST, stamps_ns, turning_rad_s, max_turning_rad_s
     )
-    too_fast = (moving_m_s > max_moving_m_s) & turned.mask  # each is removed for one reason
-    moved = Kept.of(too_fast, "moving fast (m/s)", stamps_ns, moving_m_s, max_moving_m_s)
-    both = sorted(turned.removed + moved.removed, key=lambda item: item.index)
-    return Kept(turned.mask & moved.mask, tuple(both))
+    return kept.and_of(moving_m_s > max_moving_m_s, RemovalReason.MOVING_FAST, stamps_ns, moving_m_s, max_moving_m_s)

@@ -20,10 +20,11 @@ from gtsam_rwhec.files.printable import printable
 from gtsam_rwhec.first_rig import first_rig
 from gtsam_rwhec.logs import convert_ros_bag, open_log, write_image_folder
 from gtsam_rwhec.logs.image_folder import is_image_folder
-from gtsam_rwhec.pipeline.all_stages import CLEAN, RESULT, calibrate_log, export_solved, solve_into
+from gtsam_rwhec.pipeline.all_stages import calibrate_log, export_solved, solve_into
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
 from gtsam_rwhec.pipeline.detections_in_images import draw_log
+from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, RESULT_FILE
 from gtsam_rwhec.pipeline.solving_stage import Calibrated
 from gtsam_rwhec.report import print_refined, print_solution, report_console
 from gtsam_rwhec.report.log_report import print_log
@@ -141,7 +142,7 @@ def solve(
         with StageDisplay() as stage, _said_in_the_report():
             calibrated = solve_into(cleaned, None if rig is None else read_rig(rig), output, progress=stage)
         _print(calibrated)
-        typer.echo(f"Written: {output / RESULT}, {output / CLEAN}.", err=True)
+        typer.echo(f"Written: {output / RESULT_FILE}, {output / CLEAN_LOG}.", err=True)
         raise typer.Exit(_status(calibrated))
 
 

@@ -1,3 +1,5 @@
+# Read a log.
+# Write a log, or make one of something else.
 from .image_folder import is_image_folder as is_image_folder
 from .image_folder import write_image_folder as write_image_folder
 from .mcap_reader import Log as Log
@@ -5,6 +7,8 @@ from .mcap_reader import PoseSeries as PoseSeries
 from .mcap_reader import Topic as Topic
 from .mcap_reader import open_log as open_log
 from .mcap_writer import LogWriter as LogWriter
+
+# What its messages are read as.
 from .records import DetectionRecord as DetectionRecord
 from .records import ImageRecord as ImageRecord
 from .records import IntrinsicsRecord as IntrinsicsRecord

@@ -17,6 +17,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import MessageError
 from gtsam_rwhec.logs.checked_poses import LARGEST_M, transforms
+from gtsam_rwhec.logs.message_kinds import MEASURED_PAIR, TAG_DETECTIONS
 from gtsam_rwhec.logs.records import (
     Array,
     DetectionRecord,
@@ -306,7 +307,7 @@ _OTHERS: dict[str, Callable[[Any, Access, str, int], Read]] = {
     "foxglove.CompressedImage": _compressed_image,
     "foxglove.RawImage": _raw_image,
     "foxglove.CameraCalibration": _camera_calibration,
-    "gtsam_rwhec.TagDetections": _tag_detections,
-    "gtsam_rwhec.MeasuredPair": _measured_pair,
+    TAG_DETECTIONS: _tag_detections,
+    MEASURED_PAIR: _measured_pair,
 }
 SCHEMAS = frozenset(_POSES) | frozenset(_OTHERS)

@@ -25,12 +25,17 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs.mcap_reader import Log
+from gtsam_rwhec.logs.message_kinds import (
+    IMAGE_SCHEMAS,
+    MEASURED_PAIR,
+    TAG_DETECTIONS,
+    VIDEO_SCHEMAS,
+    schema_word,
+)
 from gtsam_rwhec.logs.records import Array, DetectionRecord, IntrinsicsRecord, PairRecord
 from gtsam_rwhec.logs.written_schemas import json_schema
 
 Images = Literal["copy", "leave_out"]
-#: Schemas' last words; such messages are left out of a copy without images.
-IMAGE_SCHEMAS = ("Image", "CompressedImage", "RawImage", "CompressedVideo")
 #: foxglove.PointsAnnotation's number for a closed line
 _LINE_LOOP = 2
 _GREEN = {"r": 0.0, "g": 1.0, "b": 0.0, "a": 1.0}
@@ -210,7 +215,7 @@ class LogWriter:
                 part["reason"] = tag.reason
             parts.append(part)
         message = {"timestamp": _time(stamp_ns), "frame_id": frame, "detections": parts}
-        self._write(topic, "gtsam_rwhec.TagDetections", stamp_ns, message)
+        self._write(topic, TAG_DETECTIONS, stamp_ns, message)
 
     def pair(self, pair: PairRecord) -> None:
         """Write a ``gtsam_rwhec.MeasuredPair`` to its topic; numbers come back as they were, to the last bit."""
@@ -221,7 +226,7 @@ class LogWriter:
         }  # fmt: skip
         if pair.covariance is not None:
             message["covariance"] = np.ravel(pair.covariance).tolist()
-        self._write(pair.topic, "gtsam_rwhec.MeasuredPair", pair.stamp_ns, message)
+        self._write(pair.topic, MEASURED_PAIR, pair.stamp_ns, message)
 
     def metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Write a metadata record."""
@@ -248,11 +253,7 @@ class LogWriter:
         if channel is None or (wanted is not None and channel.topic not in wanted):
             return None
         schema = file.schemas.get(channel.schema_id)
-        if (
-            images == "leave_out"
-            and schema is not None
-            and schema.name.replace("/", ".").split(".")[-1] in IMAGE_SCHEMAS
-        ):
+        if images == "leave_out" and schema is not None and schema_word(schema.name) in IMAGE_SCHEMAS + VIDEO_SCHEMAS:
             return None
         schema_id = 0 if schema is None else self._schema(schema.name, schema.encoding, schema.data)
         return self._channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)

@@ -108,6 +108,11 @@ class DetectionRecord:
     reason: str = ""
     corner_indices: tuple[int, ...] | None = None
 
+    @property
+    def label(self) -> str:
+        """What stands beside it in a picture."""
+        return f"{self.id}: {self.reason}" if self.reason else self.id
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairRecord:

@@ -16,6 +16,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from gtsam_rwhec.logs.message_kinds import MEASURED_PAIR, TAG_DETECTIONS
+
 _NUMBER = {"type": "number"}
 _INTEGER = {"type": "integer"}
 _STRING = {"type": "string"}
@@ -96,8 +98,8 @@ _SCHEMAS = {
         R=_several(_NUMBER),
         P=_several(_NUMBER),
     ),
-    "gtsam_rwhec.TagDetections": _message(timestamp=_TIME, frame_id=_STRING, detections=_several(_DETECTION)),
-    "gtsam_rwhec.MeasuredPair": _message(
+    TAG_DETECTIONS: _message(timestamp=_TIME, frame_id=_STRING, detections=_several(_DETECTION)),
+    MEASURED_PAIR: _message(
         timestamp=_TIME,
         target=_STRING,
         sensor=_STRING,

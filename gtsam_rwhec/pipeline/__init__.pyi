@@ -1,10 +1,20 @@
-from .all_stages import CLEAN as CLEAN
-from .all_stages import RESULT as RESULT
+# All stages in a row.
 from .all_stages import calibrate_log as calibrate_log
+
+# Stage by stage.
 from .all_stages import export_solved as export_solved
 from .all_stages import solve_into as solve_into
 from .cleaning_stage import clean_log as clean_log
 from .detection_stage import detect_log as detect_log
 from .detections_in_images import draw_log as draw_log
+
+# What comes out, and what a log that a stage wrote holds.
+from .log_metadata import LogMetadata as LogMetadata
+from .log_metadata import read_cameras as read_cameras
+from .log_metadata import read_metadata as read_metadata
+from .measured_pairs import MeasuredPairs as MeasuredPairs
+from .measured_pairs import read_pairs as read_pairs
+from .solved_log import Solved as Solved
+from .solved_log import read_solved as read_solved
 from .solving_stage import Calibrated as Calibrated
 from .solving_stage import solve_log as solve_log

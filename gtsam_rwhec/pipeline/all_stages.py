@@ -1,4 +1,4 @@
-"""All stages in a row: from a log and a rig file to a folder with everything that people take away."""
+"""All stages in a row: from a log and a rig file to a folder with the calibration in every form."""
 
 from __future__ import annotations
 
@@ -6,22 +6,28 @@ from pathlib import Path
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export import export_all
-from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.changed_rig import changes
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
-from gtsam_rwhec.pipeline.log_metadata import CLEANING, DETECTION, read_embedded_rig
+from gtsam_rwhec.pipeline.log_contract import (
+    CLEAN_LOG,
+    CLEANING_METADATA,
+    DETECTED_LOG,
+    PLOTS_FOLDER,
+    RESULT_FILE,
+    is_from_stage,
+)
+from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig
+from gtsam_rwhec.pipeline.output_paths import check_is_not_read, made_folder
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solution_plots import plot_all
 from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
-from gtsam_rwhec.pipeline.stage_output import check_not_onto, check_writable
 from gtsam_rwhec.results.refined_file import write_refined
 from gtsam_rwhec.rig import Rig
-
-DETECTED, CLEAN, RESULT, PLOTS = "detected.mcap", "clean.mcap", "result.json", "plots"
 
 
 def calibrate_log(
@@ -36,9 +42,9 @@ def calibrate_log(
     """Detect, clean, solve and export.
 
     Writes ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``, ``camchain.yaml``
-    and ``plots/`` into a folder. While it works there is a ``detected.mcap``, from which an interrupted run goes on:
-    give that as the log. A log that a stage of this library wrote is taken up where that stage ended; or cleaned anew,
-    where `rig` has other settings for that than the log was cleaned with.
+    and ``plots/`` into a folder. While it works the folder has a ``detected.mcap`` too; after an interruption, give
+    that as the log to go on from there. With a log that a stage wrote, the stages after it run. A cleaned log is
+    cleaned anew where `rig` has other settings for cleaning than the log was cleaned with.
 
     Parameters
     ----------
@@ -51,7 +57,7 @@ def calibrate_log(
     images : "copy" or "leave_out"
         Whether ``clean.mcap`` has the images too.
     workers : int, optional
-        Threads for detection; left out, one for each core.
+        Threads, and for long logs processes, for detection; left out, one for each core.
     progress : callable, optional
 
     Raises
@@ -59,23 +65,25 @@ def calibrate_log(
     RwhecError
         As each stage does.
     """
-    detected, clean = Path(out) / DETECTED, Path(out) / CLEAN
+    detected, clean = Path(out) / DETECTED_LOG, Path(out) / CLEAN_LOG
     with open_log(log_path) as log:
         source = log.files[0].path
-        stages = set(log.metadata()) & {DETECTION, CLEANING}
-        if stages and len(log.files) > 1:
+        is_raw = not is_from_stage(log)
+        if not is_raw and len(log.files) > 1:
             raise LogError(
                 f"{', '.join(str(file.path) for file in log.files[:10])}: of several files one or more were written by "
                 "a stage; give that one alone, or the raw ones"
             )
-        is_cleaned = CLEANING in stages and (rig is None or not changes(read_embedded_rig(log), rig).cleaning)
-        if not stages:
+        is_cleaned = CLEANING_METADATA in log.metadata() and (
+            rig is None or not changes(read_embedded_rig(log), rig).cleaning
+        )
+        if is_raw:
             if rig is None:
                 raise LogError(f"{source}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
-            check_not_onto(log, detected)
-            check_not_onto(log, clean)
+            check_is_not_read(log, detected)
+            check_is_not_read(log, clean)
     out = made_folder(out)
-    if not stages:
+    if is_raw:
         assert rig is not None
         detect_log(log_path, rig, detected, images=images, workers=workers, progress=progress)
         source = detected
@@ -83,8 +91,8 @@ def calibrate_log(
         clean_log(source, clean, rig, images=images, progress=progress)
         source = clean
     calibrated = solve_into(source, rig, out, images=images, progress=progress)
-    export_solved(out / CLEAN, out, progress=progress)
-    if not stages:
+    export_solved(out / CLEAN_LOG, out, progress=progress)
+    if is_raw:
         detected.unlink(missing_ok=True)  # all of it is in clean.mcap
     return calibrated
 
@@ -106,8 +114,8 @@ def solve_into(
     """
     out = made_folder(out)
     calibrated = solve_log(clean_path, rig, progress=progress)
-    write_refined(calibrated.refined, out / RESULT, calibrated.log)
-    write_solved(clean_path, calibrated, out / CLEAN, images=images)
+    write_refined(calibrated.refined, out / RESULT_FILE, calibrated.log)
+    write_solved(clean_path, calibrated, out / CLEAN_LOG, images=images)
     return calibrated
 
 
@@ -122,27 +130,9 @@ def export_solved(solved_path: str | Path, out: str | Path, *, progress: Progres
         A file cannot be written.
     """
     out = made_folder(out)
-    if progress is not None:
-        progress("exporting")
+    tell = progress or silent
+    tell("exporting")
     solved = read_solved(solved_path)
     written = export_all(frames_of(solved), out)
-    if progress is not None:
-        progress("plotting")
-    return written + plot_all(solved, solved_path, made_folder(out / PLOTS))
-
-
-def made_folder(path: str | Path) -> Path:
-    """The folder, made if it is not there.
-
-    Raises
-    ------
-    LogError
-        It cannot be made, or not be written into.
-    """
-    path = Path(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogError(f"{path} cannot be made a folder: {error.strerror}.") from error
-    check_writable(path / CLEAN)
-    return path
+    tell("plotting")
+    return written + plot_all(solved, solved_path, made_folder(out / PLOTS_FOLDER))

@@ -86,7 +86,7 @@ def _of_detection(made_with: Rig, rig: Rig) -> Iterator[str]:
         yield from (f"sensors.{name}.{key}" for key in DETECTED_BY if getattr(old, key) != getattr(sensor, key))
     if made_with.detection != rig.detection:
         yield "detection"
-    if _corner_px(made_with) != _corner_px(rig):
+    if made_with.corner_px != rig.corner_px:
         yield "noise.corner_px"
 
 
@@ -103,10 +103,6 @@ def _of_cleaning(made_with: Rig, rig: Rig) -> Iterator[str]:
     cleaned, cleaning = made_with.cleaning, rig.cleaning
     if cleaned.model_copy(update={"robust": cleaning.robust}) != cleaning:
         yield "cleaning"
-
-
-def _corner_px(rig: Rig) -> float | None:
-    return None if rig.noise == "estimate" else rig.noise.corner_px
 
 
 def _named(places: Iterable[str]) -> str:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 
 from gtsam_rwhec.errors import ImageError, LogError
 from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, open_log
-from gtsam_rwhec.pipeline.all_stages import made_folder
-from gtsam_rwhec.pipeline.detection_stage import TOPIC
+from gtsam_rwhec.pipeline.log_contract import detections_topic
 from gtsam_rwhec.pipeline.log_metadata import read_cameras, read_embedded_rig
+from gtsam_rwhec.pipeline.output_paths import made_folder
 from gtsam_rwhec.vision.drawn_detections import draw
 from gtsam_rwhec.vision.images import decode_gray
 
@@ -23,7 +23,7 @@ def draw_log(
     detected_path: str | Path,
     folder: str | Path,
     *,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> int:
     """Draw every image that can be decoded: ``<sensor>_<stamp>.png``; how many.
 
@@ -42,6 +42,7 @@ def draw_log(
     LogError
         A log cannot be read, or a file cannot be written.
     """
+    tell = progress or silent
     folder = made_folder(folder)
     count = 0
     with open_log(detected_path) as detected, open_log(log_path) as log:
@@ -51,7 +52,7 @@ def draw_log(
             if source.images is None:
                 continue
             of_stamp: dict[int, list[DetectionRecord]] = defaultdict(list)
-            topic = TOPIC.format(sensor=sensor)
+            topic = detections_topic(sensor)
             for record in detected.records([topic] if topic in there else []):
                 if isinstance(record, DetectionRecord):
                     of_stamp[record.stamp_ns].append(record)
@@ -70,6 +71,5 @@ def draw_log(
                 except OSError as error:
                     raise LogError(f"{path} cannot be written: {error.strerror}.") from error
                 count += 1
-                if progress is not None:
-                    progress(f"drawing: image {count}")
+                tell(f"drawing: image {count}")
     return count

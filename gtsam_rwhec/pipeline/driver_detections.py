@@ -9,18 +9,24 @@ import numpy as np
 
 from gtsam_rwhec.errors import CameraError, LogError
 from gtsam_rwhec.logs import DetectionRecord, Log
-from gtsam_rwhec.pipeline.carriers import check_order
+from gtsam_rwhec.pipeline.carrier_motion import check_order
+from gtsam_rwhec.pipeline.image_detections import message_count
+from gtsam_rwhec.pipeline.sensor_detections import SensorDetections
 from gtsam_rwhec.pipeline.tracks import target_of
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.pose import plane_poses
+from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import Target
 
+#: Drivers do not say how well they find corners; as for our own, only proportions count with estimated noise.
+CORNER_PX = 0.1
+#: Sizes as near as this, of their length, are one: some messages have them in single precision.
+SAME_SIZE = 1e-4
 
-def from_driver(
-    log: Log, rig: Rig, sensor: str, camera: Camera | None
-) -> tuple[list[DetectionRecord], Counter[tuple[str, str]]]:
-    """Records of a sensor's targets, none where none was seen; and how often other tags were, by family and id.
+
+def read_driver_detections(log: Log, rig: Rig, sensor: str, camera: Camera | None) -> SensorDetections:
+    """Read the detections of a sensor from the topic of its driver.
 
     With intrinsics, poses are made anew from the corners and the rig file's sizes (a driver's may be configured to
     others); of the two that a plane has, the one nearer to the driver's where it has one, else the one of smaller
@@ -50,7 +56,8 @@ def from_driver(
             continue
         result.append(_made(record, target, camera, sensor))
     check_order(np.array([stamp for _, stamp in messages], dtype=np.int64), f"topic {source.detections}")
-    return result, strangers
+    count = message_count(log, source.detections)
+    return SensorDetections(result, count, strangers)
 
 
 def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor: str) -> DetectionRecord:
@@ -77,19 +84,13 @@ def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor
         which = int(np.argmax([abs(float(T[:3, 2] @ normal)) for T in np.nan_to_num(poses.T[0])]))
     T = poses.T[0, which]
     if not np.isfinite(T).all() or not np.isfinite(poses.covariance[0, which]).all():
-        return replace(record, T_camera_tag=None, covariance=None, reason="no pose")
+        return replace(record, T_camera_tag=None, covariance=None, reason=Rejection.NO_POSE)
     return replace(
         record,
         T_camera_tag=T,
         covariance=poses.covariance[0, which],
         reprojection_px=float(poses.reprojection_px[0, which]),
     )
-
-
-#: Drivers do not say how well they find corners; as for our own, only proportions count with estimated noise.
-CORNER_PX = 0.1
-#: Sizes as near as this, of their length, are one: some messages have them in single precision.
-SAME_SIZE = 1e-4
 
 
 def _in_our_order(corners_px: np.ndarray) -> np.ndarray:

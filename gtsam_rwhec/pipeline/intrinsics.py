@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from gtsam_rwhec.errors import CameraError, LogError
 from gtsam_rwhec.logs import IntrinsicsRecord, Log
+from gtsam_rwhec.logs.message_kinds import INTRINSICS_SCHEMAS
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.intrinsics_files import read_calibration_yaml, read_kalibr_camchain
 
 #: Topics that an error lists, at most.
 MOST_NAMED = 50
-INTRINSICS_SCHEMAS = ("sensor_msgs/msg/CameraInfo", "sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 
 
-def cameras_of(log: Log, rig: Rig) -> dict[str, Camera]:
-    """Cameras by sensor; a sensor whose driver gives poses may have none.
+def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
+    """Read the intrinsics of every sensor; a sensor whose driver gives poses may have none.
 
     Raises
     ------
     CameraError
-        There are none for a sensor with images, they contradict one another, or are those of no camera.
+        A sensor with images has none, they change within the log, or no camera can have them.
     LogError, FileFormatError
         A topic or file that is not there or cannot be read.
     """
@@ -69,7 +69,7 @@ def _from_topic(log: Log, topic: str, sensor: str) -> Camera:
         camera = Camera.of(record.width, record.height, record.model, record.K, record.D, f"topic {topic}")
         if first is None:
             first = camera
-        elif not same(first, camera):
+        elif not _is_same(first, camera):
             raise CameraError(
                 f"sensor {sensor}, topic {topic}: intrinsics change at {record.stamp_ns} ns (K from "
                 f"{first.K.tolist()} to {camera.K.tolist()}); a camera whose zoom or resolution changes is several: "
@@ -80,7 +80,7 @@ def _from_topic(log: Log, topic: str, sensor: str) -> Camera:
     return first
 
 
-def same(first: Camera, second: Camera) -> bool:
+def _is_same(first: Camera, second: Camera) -> bool:
     """Whether two are the same camera, to the last digit."""
     return (
         (first.width, first.height, first.model) == (second.width, second.height, second.model)

@@ -1,68 +1,111 @@
-"""What the stages leave in a log for the next one: the rig file, the cameras and their reports, as metadata."""
+"""What the stages know of a log beside its messages, kept in its metadata: rig file, intrinsics and reports."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log, LogWriter
+from gtsam_rwhec.pipeline.log_contract import CAMERAS_METADATA, CLEANING_METADATA, DETECTION_METADATA, RIG_METADATA
+from gtsam_rwhec.results.stage_reports import CleaningReport, DetectionReport
 from gtsam_rwhec.rig import Rig, parse_rig, rig_text
 from gtsam_rwhec.vision.camera import Camera
-
-RIG, CAMERAS = "gtsam_rwhec.rig", "gtsam_rwhec.cameras"
-DETECTION, CLEANING = "gtsam_rwhec.detection", "gtsam_rwhec.cleaning"
 
 Report = TypeVar("Report", bound=BaseModel)
 
 
-def write_rig(out: LogWriter, rig: Rig) -> None:
-    """Embed a rig file."""
-    out.metadata(RIG, {"yaml": rig_text(rig)})
+@dataclass(frozen=True, eq=False)
+class LogMetadata:
+    """What a log of detections or of pairs says of itself.
+
+    Attributes
+    ----------
+    rig : Rig
+        The rig file that the last stage worked with.
+    cameras : dict of sensor to Camera
+    detection : DetectionReport
+    cleaning : CleaningReport or None
+        None before cleaning.
+    """
+
+    rig: Rig
+    cameras: Mapping[str, Camera]
+    detection: DetectionReport
+    cleaning: CleaningReport | None = None
+
+    def write(self, out: LogWriter) -> None:
+        """Write it into a log."""
+        out.metadata(RIG_METADATA, {"yaml": rig_text(self.rig)})
+        entries = {
+            sensor: json.dumps(
+                {"width": c.width, "height": c.height, "model": c.model, "K": c.K.tolist(), "D": c.D.tolist()}
+            )
+            for sensor, c in self.cameras.items()
+        }
+        out.metadata(CAMERAS_METADATA, entries)
+        out.metadata(DETECTION_METADATA, {"json": self.detection.model_dump_json()})
+        if self.cleaning is not None:
+            out.metadata(CLEANING_METADATA, {"json": self.cleaning.model_dump_json()})
+
+
+def read_metadata(log: Log) -> LogMetadata:
+    """Read what the stages so far wrote.
+
+    Raises
+    ------
+    LogError
+        No stage wrote it, or it is damaged.
+    """
+    rig, cameras = read_embedded_rig(log), read_cameras(log)
+    detection = _report(log, DETECTION_METADATA, DetectionReport)
+    cleaning = _report(log, CLEANING_METADATA, CleaningReport) if CLEANING_METADATA in log.metadata() else None
+    return LogMetadata(rig, cameras, detection, cleaning)
+
+
+def read_cleaning_report(log: Log) -> CleaningReport:
+    """The report of cleaning.
+
+    Raises
+    ------
+    LogError
+        The log was not cleaned, or the report is damaged.
+    """
+    return _report(log, CLEANING_METADATA, CleaningReport)
 
 
 def read_embedded_rig(log: Log) -> Rig:
-    """The rig file that an earlier stage embedded.
+    """The rig file that the last stage worked with.
 
     Raises
     ------
     LogError
         There is none.
     """
-    found = log.metadata().get(RIG)
+    found = log.metadata().get(RIG_METADATA)
     if found is None or "yaml" not in found:
         raise LogError(
             f"{log.files[0].path} has no rig file in it: it was not written by gtsam-rwhec detect or clean, or is not "
             "whole. Begin with detect (again)"
         )
-    return parse_rig(found["yaml"], f"{log.files[0].path}, metadata {RIG}")
-
-
-def write_cameras(out: LogWriter, cameras: Mapping[str, Camera]) -> None:
-    """Embed intrinsics, by sensor."""
-    entries = {
-        sensor: json.dumps(
-            {"width": c.width, "height": c.height, "model": c.model, "K": c.K.tolist(), "D": c.D.tolist()}
-        )
-        for sensor, c in cameras.items()
-    }
-    out.metadata(CAMERAS, entries)
+    return parse_rig(found["yaml"], f"{log.files[0].path}, metadata {RIG_METADATA}")
 
 
 def read_cameras(log: Log) -> dict[str, Camera]:
-    """Intrinsics that an earlier stage embedded, by sensor.
+    """The intrinsics that detection used, by sensor.
 
     Raises
     ------
     LogError
         They are damaged.
     """
-    where = f"{log.files[0].path}, metadata {CAMERAS}"
+    where = f"{log.files[0].path}, metadata {CAMERAS_METADATA}"
     cameras = {}
-    for sensor, text in log.metadata().get(CAMERAS, {}).items():
+    for sensor, text in log.metadata().get(CAMERAS_METADATA, {}).items():
         try:
             fields = json.loads(text)
             numbers = fields["width"], fields["height"], fields["model"], fields["K"], fields["D"]
@@ -72,19 +115,7 @@ def read_cameras(log: Log) -> dict[str, Camera]:
     return cameras
 
 
-def write_report(out: LogWriter, name: str, report: BaseModel) -> None:
-    """Embed a stage's report."""
-    out.metadata(name, {"json": report.model_dump_json()})
-
-
-def read_report(log: Log, name: str, kind: type[Report]) -> Report:
-    """A stage's report.
-
-    Raises
-    ------
-    LogError
-        It is not there, or damaged.
-    """
+def _report(log: Log, name: str, kind: type[Report]) -> Report:
     found = log.metadata().get(name)
     where = f"{log.files[0].path}, metadata {name}"
     if found is None or "json" not in found:

@@ -1,76 +1,81 @@
-"""The pairs (A, B) of a cleaned log as arrays, and the problem that they make."""
+"""Measured pairs (A, B): written into a cleaned log, read from it as arrays, and stated as a problem."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import Log, PairRecord
-from gtsam_rwhec.pipeline.cleaning_stage import PAIR_TOPIC
-from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.logs import Log, LogWriter, PairRecord
+from gtsam_rwhec.pipeline.log_contract import pairs_topic
+from gtsam_rwhec.pipeline.tracks import Track
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
+from gtsam_rwhec.vision.rejection import Rejection
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredPairs:
-    """All measurements of one target by one sensor, those that are not used too.
+class MeasuredPairs(Track):
+    """A track with the carriers' pose at each stamp: A (N, 4, 4), T_sensorcarrier_targetcarrier, metres."""
 
-    Attributes
-    ----------
-    stamps_ns : (N,) integers
-        The sensor's.
-    A, B : (N, 4, 4) arrays
-        T_sensorcarrier_targetcarrier, T_sensor_target; metres.
-    covariance : (N, 6, 6) array or None
-        Of B.
-    reasons : tuple of N str
-        Empty for those that are used.
-    """
-
-    stamps_ns: np.ndarray
     A: Array
-    B: Array
-    covariance: Array | None
-    reasons: tuple[str, ...]
-
-    @property
-    def used(self) -> np.ndarray:
-        """(N,) booleans."""
-        return np.array([not reason for reason in self.reasons], dtype=bool)
 
     def at(self, path: Trajectory, offset_s: float) -> MeasuredPairs:
-        """With A taken anew from the carriers' path, the sensor's clock being off by `offset_s`."""
+        """With A taken anew from the carriers' path; the sensor's stamp t is the carriers' t + offset."""
         A, _ = path.at(self.stamps_ns + round(1e9 * offset_s))
         return replace(self, A=A)
 
 
+def write_pairs(out: LogWriter, pairs: Iterable[MeasuredPairs]) -> None:
+    """Write every measurement that has a pose, in order of time."""
+    records = [
+        PairRecord(
+            logged_ns=stamp,
+            stamp_ns=stamp,
+            topic=pairs_topic(measured.sensor),
+            target=measured.target,
+            sensor=measured.sensor,
+            A=measured.A[i],
+            B=measured.B[i],
+            is_inlier=not reason,
+            reason=reason,
+            covariance=None if measured.covariance is None else measured.covariance[i],
+        )
+        for measured in pairs
+        for i, (stamp, reason) in enumerate(zip(measured.stamps_ns.tolist(), measured.reasons, strict=True))
+        if reason != Rejection.NO_POSE
+    ]
+    for record in sorted(records, key=lambda record: record.stamp_ns):
+        out.pair(record)
+
+
 def read_pairs(log: Log, rig: Rig) -> dict[Pair, MeasuredPairs]:
-    """Pairs of a cleaned log by (target, sensor), each in order of time; of those that the rig file has."""
+    """Read the pairs of a cleaned log by (target, sensor), in order of time; those that the rig file has."""
     there = {topic.name for topic in log.topics()}
-    topics = [PAIR_TOPIC.format(sensor=sensor) for sensor in rig.sensors]
+    topics = [topic for topic in map(pairs_topic, rig.sensors) if topic in there]
     found: dict[Pair, list[PairRecord]] = defaultdict(list)
-    for record in log.records([topic for topic in topics if topic in there]):
+    for record in log.records(topics):
         if isinstance(record, PairRecord) and record.target in rig.targets and record.sensor in rig.sensors:
             found[Pair(record.target, record.sensor)].append(record)
-    return {pair: _stacked(sorted(found[pair], key=lambda r: r.stamp_ns)) for pair in sorted(found)}
+    return {pair: _stacked(pair, sorted(found[pair], key=lambda r: r.stamp_ns)) for pair in sorted(found)}
 
 
-def _stacked(records: list[PairRecord]) -> MeasuredPairs:
+def _stacked(pair: Pair, records: list[PairRecord]) -> MeasuredPairs:
     covariances = [record.covariance for record in records]
     return MeasuredPairs(
-        np.array([record.stamp_ns for record in records], dtype=np.int64),
-        np.array([record.A for record in records]),
-        np.array([record.B for record in records]),
-        None if any(c is None for c in covariances) else np.array(covariances),
-        tuple(record.reason for record in records),
+        target=pair.target,
+        sensor=pair.sensor,
+        stamps_ns=np.array([record.stamp_ns for record in records], dtype=np.int64),
+        A=np.array([record.A for record in records]),
+        B=np.array([record.B for record in records]),
+        covariance=None if any(c is None for c in covariances) else np.array(covariances),
+        reasons=tuple(record.reason for record in records),
     )
 
 
@@ -78,11 +83,9 @@ def problem_of(
     pairs: Mapping[Pair, MeasuredPairs],
     rig: Rig,
     offsets_s: Mapping[str, float],
-    *,
-    scale: ScaleMode,
-    known_sizes: tuple[str, ...] = (),
+    free_sizes: Collection[str] = (),
 ) -> Problem:
-    """The problem of the pairs that are used.
+    """The problem that the used pairs state.
 
     Parameters
     ----------
@@ -91,16 +94,15 @@ def problem_of(
         For its noise.
     offsets_s : dict of sensor to float
         What A was taken with: the problem's stamps are the carriers'.
-    scale : "known", "shared" or "per_target"
-    known_sizes : tuple of str
-        Targets whose size is known, with scale="per_target".
+    free_sizes : collection of str
+        Targets whose size is estimated.
 
     Raises
     ------
     NoiseError
         Where ``noise: {corner_px: ...}`` is asked for and a measurement has no covariance; covariances that are none.
     """
-    problem = Problem(scale)
+    problem = Problem("per_target" if free_sizes else "known")
     has_covariances = all(measured.covariance is not None for measured in pairs.values())
     for pair, measured in pairs.items():
         used = measured.used
@@ -133,7 +135,8 @@ def problem_of(
                 f"{error}. These are the log's: noise: {{rotation_deg: ..., translation_mm: ...}} in the rig file "
                 "takes their place"
             ) from error
-    for target in known_sizes:
-        if target in problem.targets:
-            problem.fix_scale(target)
+    if free_sizes:
+        for target in problem.targets:
+            if target not in free_sizes:
+                problem.fix_scale(target)
     return problem

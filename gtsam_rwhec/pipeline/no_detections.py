@@ -6,7 +6,7 @@ from collections import Counter
 
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs import ImageRecord, Log
-from gtsam_rwhec.pipeline.stage_output import message_count
+from gtsam_rwhec.pipeline.image_detections import message_count
 from gtsam_rwhec.results.stage_reports import DetectionReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.images import decode_gray
@@ -18,17 +18,14 @@ IMAGES = 3
 MOST_NAMED = 20
 
 
-def nothing_seen(log: Log, rig: Rig, report: DetectionReport) -> str:
+def no_detections(log: Log, rig: Rig, report: DetectionReport) -> str:
     """The message: how much was looked at, why detections were rejected, which tags there are instead."""
     parts = [f"{count} images or messages of {sensor}" for sensor, count in report.images.items()]
     said = [f"looked at {', '.join(parts)}"]
     said += [
         f"{len(faults)} of {sensor} not decoded, the first: {faults[0]}" for sensor, faults in report.undecoded.items()
     ]
-    said += [
-        f"{track.target} in {track.sensor}: {', '.join(f'{count} {why}' for why, count in track.removed.items())}"
-        for track in report.tracks
-    ]
+    said += map(str, report.tracks)
     if report.strangers:
         said.append(f"tags that are no target were seen: {_named(report.strangers)}")
     else:

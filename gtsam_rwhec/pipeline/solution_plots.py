@@ -10,8 +10,8 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log, open_log
-from gtsam_rwhec.pipeline.carriers import read_carriers
-from gtsam_rwhec.pipeline.detection_stage import TOPIC
+from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
+from gtsam_rwhec.pipeline.log_contract import detections_topic
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solved_log import Solved
@@ -100,7 +100,7 @@ def scale_of(solved: Solved, target: str) -> float:
 
 def plotted_corners(solved: Solved, log: Log) -> dict[str, PlottedCorners]:
     """By camera: corners of the detections that were used, and their distance from where the calibration has them."""
-    path = read_carriers(log, solved.rig).trajectory
+    path = read_carrier_motion(log, solved.rig).trajectory
     targets = {target.name: target for target in solved.rig.target_list}
     offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
     there = {topic.name for topic in log.topics()}
@@ -112,7 +112,7 @@ def plotted_corners(solved: Solved, log: Log) -> dict[str, PlottedCorners]:
         for stamp in measured.stamps_ns[measured.used].tolist()
     }
     for sensor in solved.refined.Y:
-        topic = TOPIC.format(sensor=sensor)
+        topic = detections_topic(sensor)
         if topic not in there or sensor not in solved.cameras:
             continue
         camera = solved.cameras[sensor]

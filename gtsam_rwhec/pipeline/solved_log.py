@@ -5,22 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs import Log, LogWriter, PairRecord, PoseRecord, open_log
+from gtsam_rwhec.logs import Log, LogWriter, PoseRecord, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
-from gtsam_rwhec.pipeline.cleaning_stage import PAIR_TOPIC
-from gtsam_rwhec.pipeline.log_metadata import (
-    CLEANING,
-    DETECTION,
-    read_cameras,
-    read_embedded_rig,
-    write_cameras,
-    write_report,
-    write_rig,
+from gtsam_rwhec.pipeline.log_contract import (
+    CERTIFICATE_METADATA,
+    RESULT_FILE,
+    SOLUTION_TOPIC,
+    topics_up_to_detection,
 )
-from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
+from gtsam_rwhec.pipeline.log_metadata import LogMetadata, read_cameras, read_embedded_rig
+from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs, write_pairs
 from gtsam_rwhec.pipeline.solving_stage import Calibrated
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import RefinedPoses
@@ -31,10 +26,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.vision.camera import Camera
 
-#: Transforms that never change, so that viewers show every frame at any time.
-SOLUTION_TOPIC = "/calibration/tf_static"
-CERTIFICATE, RESULT = "gtsam_rwhec.certificate", "result.json"
-#: Added to a frame's name where the raw log has another opinion of where it is.
+#: Added to the name of a calibrated frame where the raw log has transforms of a frame of that name.
 CALIBRATED = "_calibrated"
 
 
@@ -78,28 +70,22 @@ def write_solved(
     LogError
         A file cannot be read or written.
     """
-    rig, refined = calibrated.rig, calibrated.refined
-    replaced = {PAIR_TOPIC.format(sensor=sensor) for sensor in rig.sensors} | {SOLUTION_TOPIC}
+    rig, refined, pairs = calibrated.rig, calibrated.refined, calibrated.pairs.values()
     with open_log(clean_path) as log, LogWriter(out_path) as out:
-        topics = [topic.name for topic in log.topics() if topic.name not in replaced]
-        out.copy(log, topics, images)
-        stamps = [int(stamp) for measured in calibrated.pairs.values() for stamp in measured.stamps_ns]
-        for record in _records(calibrated.pairs):
-            out.pair(record)
+        out.copy(log, topics_up_to_detection(log), images)
+        write_pairs(out, pairs)
+        first_ns = min(int(measured.stamps_ns.min()) for measured in pairs)
         taken = _raw_children(log)
         frames = [
             (rig.carriers.sensors, free_name(rig.frame_of(name), taken), pose.matrix())
             for name, pose in refined.Y.items()
         ]
         frames += [(rig.carriers.targets, free_name(name, taken), pose.matrix()) for name, pose in refined.X.items()]
-        out.transforms(SOLUTION_TOPIC, min(stamps), frames)
-        write_rig(out, rig)
-        write_cameras(out, calibrated.cameras)
-        write_report(out, DETECTION, calibrated.log.detection)
-        write_report(out, CLEANING, calibrated.log.cleaning)
+        out.transforms(SOLUTION_TOPIC, first_ns, frames)
+        LogMetadata(rig, calibrated.cameras, calibrated.log.detection, calibrated.log.cleaning).write(out)
         certificate = refined.solution.certificate
         out.metadata(
-            CERTIFICATE,
+            CERTIFICATE_METADATA,
             {
                 "status": certificate.status.value,
                 "objective": certificate.objective,
@@ -109,7 +95,7 @@ def write_solved(
                 "free_directions": "; ".join(refined.free_directions),
             },
         )
-        out.attachment(RESULT, "application/json", refined_json(refined, calibrated.log), min(stamps))
+        out.attachment(RESULT_FILE, "application/json", refined_json(refined, calibrated.log), first_ns)
 
 
 def read_solved(path: str | Path) -> Solved:
@@ -121,12 +107,14 @@ def read_solved(path: str | Path) -> Solved:
         It has no result in it, or not the one of its measurements.
     """
     with open_log(path) as log:
-        content = log.attachment(RESULT)
+        content = log.attachment(RESULT_FILE)
         if content is None:
-            raise LogError(f"{path} has no {RESULT} attached: it was not written by gtsam-rwhec solve or calibrate")
-        result = parse_result(content, f"{path}, attachment {RESULT}")
+            raise LogError(
+                f"{path} has no {RESULT_FILE} attached: it was not written by gtsam-rwhec solve or calibrate"
+            )
+        result = parse_result(content, f"{path}, attachment {RESULT_FILE}")
         if result.log is None:
-            raise LogError(f"{path}, attachment {RESULT}: it does not say which log it is of")
+            raise LogError(f"{path}, attachment {RESULT_FILE}: it does not say which log it is of")
         rig = read_embedded_rig(log)
         refined, pairs = refined_of(result, path), read_pairs(log, rig)
     strangers = [*(set(refined.X) - set(rig.targets)), *(set(refined.Y) - set(rig.sensors))]
@@ -134,7 +122,7 @@ def read_solved(path: str | Path) -> Solved:
         why = (
             f"frames that its rig file has not: {', '.join(sorted(strangers)[:10])}" if strangers else "no measurements"
         )
-        raise LogError(f"{path} has a {RESULT}, and {why}: its parts are not of one calibration")
+        raise LogError(f"{path} has a {RESULT_FILE}, and {why}: its parts are not of one calibration")
     return Solved(refined, solution_of(result), pairs, result.log, read_cameras(log), rig)
 
 
@@ -144,22 +132,8 @@ def free_name(frame: str, taken: set[str]) -> str:
 
 
 def _raw_children(log: Log) -> set[str]:
-    """Frames that the raw log says where they are."""
-    topics = [t.name for t in log.topics() if not t.unreadable and t.name.rpartition("/")[2] in ("tf", "tf_static")]
-    raw = [name for name in topics if name != SOLUTION_TOPIC]
+    """Child frames of the raw log's transforms."""
+    raw = [
+        topic.name for topic in log.topics() if topic.is_tf and not topic.unreadable and topic.name != SOLUTION_TOPIC
+    ]
     return {record.child for record in log.records(raw) if isinstance(record, PoseRecord)} if raw else set()
-
-
-def _records(pairs: dict[Pair, MeasuredPairs]) -> list[PairRecord]:
-    records = []
-    for (target, sensor), measured in pairs.items():
-        topic = PAIR_TOPIC.format(sensor=sensor)
-        for i, stamp in enumerate(measured.stamps_ns.tolist()):
-            covariance = None if measured.covariance is None else np.asarray(measured.covariance[i])
-            reason = measured.reasons[i]
-            records.append(
-                PairRecord(
-                    stamp, stamp, topic, target, sensor, measured.A[i], measured.B[i], not reason, reason, covariance
-                )
-            )
-    return sorted(records, key=lambda record: record.stamp_ns)

@@ -1,29 +1,30 @@
-"""A target in a sensor over time: its measurements from the log; each that is not used says why."""
+"""Tracks: all measurements of one target by one sensor, in order of time; each that is not used has a reason."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import Self
 
 import numpy as np
 
+from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord
-from gtsam_rwhec.pipeline.carriers import check_order
+from gtsam_rwhec.logs import DetectionRecord, Log
+from gtsam_rwhec.pipeline.carrier_motion import check_order
+from gtsam_rwhec.pipeline.log_contract import detections_topic
 from gtsam_rwhec.results.stage_reports import TrackCount
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import Tag, Target
-
-#: Of one target in one message: two of its measurements cannot both be true.
-TWICE = "seen twice at one stamp"
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One target in one sensor.
+    """All measurements of one target by one sensor.
 
     Attributes
     ----------
@@ -35,7 +36,7 @@ class Track:
     covariance : (N, 6, 6) array or None
         None where not every measurement has one.
     reasons : tuple of N str
-        Why each is not used; empty where it is.
+        Why each is not used (`Rejection`, `RemovalReason`); empty where it is used.
     """
 
     target: str
@@ -56,15 +57,17 @@ class Track:
         removed = Counter(reason for reason in self.reasons if reason)
         return TrackCount(target=self.target, sensor=self.sensor, used=int(self.used.sum()), removed=dict(removed))
 
-    def without(self, bad: np.ndarray, reasons: Iterable[str]) -> Track:
-        """Mark those of `bad` (N,) booleans as not used; `reasons` of those, in order."""
-        given = iter(reasons)
-        marked = tuple(next(given) if is_bad else old for old, is_bad in zip(self.reasons, bad, strict=True))
-        return Track(self.target, self.sensor, self.stamps_ns, self.B, self.covariance, marked)
+    def marked(self, kept: Kept, at: np.ndarray) -> Self:
+        """With what a step of cleaning removed of the measurements `at`; what has a reason already keeps it."""
+        reasons = list(self.reasons)
+        for item in kept.removed:
+            i = int(at[item.index])
+            reasons[i] = reasons[i] or item.reason
+        return replace(self, reasons=tuple(reasons))
 
 
-def tracks_of(records: Iterable[DetectionRecord], rig: Rig, sensor: str) -> list[Track]:
-    """Sort a sensor's detections by target; those of no target are left out.
+def read_tracks(log: Log, rig: Rig, sensor: str) -> list[Track]:
+    """Read the detections of a sensor, one track for each target; detections of no target are left out.
 
     Raises
     ------
@@ -76,7 +79,10 @@ def tracks_of(records: Iterable[DetectionRecord], rig: Rig, sensor: str) -> list
     of_target: dict[str, list[DetectionRecord]] = defaultdict(list)
     stamps = []
     targets = rig.target_list
-    for record in records:
+    topic = detections_topic(sensor)
+    for record in log.records([topic] if topic in {t.name for t in log.topics()} else []):
+        if not isinstance(record, DetectionRecord):
+            continue
         stamps.append(record.stamp_ns)
         target = target_of(record, targets)
         if target is not None:
@@ -90,9 +96,13 @@ def _track(target: str, sensor: str, records: list[DetectionRecord]) -> Track:
     records = sorted(records, key=lambda record: record.stamp_ns)
     stamps = np.array([record.stamp_ns for record in records], dtype=np.int64)
     poses = [record.T_camera_tag for record in records]
-    reasons = [r.reason or ("no pose" if r.T_camera_tag is None else "") for r in records]
+    reasons = [r.reason or (Rejection.NO_POSE if r.T_camera_tag is None else "") for r in records]
     usable = Counter(stamp for stamp, reason in zip(stamps.tolist(), reasons, strict=True) if not reason)
-    reasons = [TWICE if not why and usable[s] > 1 else why for s, why in zip(stamps.tolist(), reasons, strict=True)]
+    # Of two measurements of one target in one message one at least is wrong.
+    reasons = [
+        RemovalReason.SEEN_TWICE if not why and usable[s] > 1 else why
+        for s, why in zip(stamps.tolist(), reasons, strict=True)
+    ]
     known = [r.covariance for r, why in zip(records, reasons, strict=True) if not why]
     covariance = None
     if known and all(c is not None for c in known):

@@ -29,6 +29,9 @@ class TrackCount(_Report):
     used: int = Field(description="measurements that went on")
     removed: dict[str, int] = Field(default={}, description="those that did not, by reason")
 
+    def __str__(self) -> str:
+        return f"{self.target} in {self.sensor}: {', '.join(f'{count} {why}' for why, count in self.removed.items())}"
+
 
 class DetectionReport(_Report):
     """Of the detection stage."""

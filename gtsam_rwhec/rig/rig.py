@@ -35,6 +35,11 @@ class RigFile(Section):
         """The targets as the vision package has them, named, in the file's order."""
         return tuple(section.target(name) for name, section in self.targets.items())
 
+    @property
+    def corner_px(self) -> float | None:
+        """Standard deviation of a corner along each axis, pixels; None where the rig file does not give it."""
+        return None if self.noise == "estimate" else self.noise.corner_px
+
     def frame_of(self, sensor: str) -> str:
         """The name of a sensor's frame."""
         return self.sensors[sensor].frame or sensor

@@ -1,4 +1,4 @@
-"""What is seen in one image: tags and boards with their corners, and everything that is not used, with its reason."""
+"""Detection of targets in images: corners, poses, and for each detection that is not used the reason."""
 
 from __future__ import annotations
 
@@ -13,20 +13,17 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision import boards
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.codes import identified, quadrangles, unlike
-from gtsam_rwhec.vision.dictionaries import WIDEST, detector_of, modules, tag_detector
+from gtsam_rwhec.vision.dictionaries import detector_of, modules
 from gtsam_rwhec.vision.edges import refine_corners
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.pose import PlanePoses, plane_poses
+from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
 
-SMALL, BLURRED, GRAZING = "small", "blurred", "grazing"
-FEW, TWICE, NO_EDGES = "too few corners", "id seen twice in one image", "edges not found"
-NO_POSE, REPROJECTION, AMBIGUOUS = "no pose", "reprojection error", "ambiguous"
 #: Family and border of tags; ids of tags and their corners (n, 4, 2) in pixels.
 _Kind: TypeAlias = tuple[str, int]
 _Tags: TypeAlias = tuple[list[int], Array]
-REASONS = (SMALL, BLURRED, GRAZING, FEW, TWICE, NO_EDGES, NO_POSE, REPROJECTION, AMBIGUOUS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +48,8 @@ class Detection:
         The shortest side of a tag, of a board's bounding box.
     blur_px : float
         Standard deviation of the blur across a tag's edges; nan for boards.
-    reason : str
-        One of `REASONS` if it is not to be used, else empty.
+    rejection : Rejection or None
+        Why it is not to be used; None if it is.
     """
 
     target: str
@@ -64,12 +61,12 @@ class Detection:
     covariance: Array
     side_px: float
     blur_px: float
-    reason: str = ""
+    rejection: Rejection | None = None
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Of one image: detections, and how many tags of no target, by family and id."""
+class ImageDetections:
+    """What was detected in one image: targets, and how many tags of no target, by family and id."""
 
     detections: tuple[Detection, ...]
     strangers: dict[tuple[str, int], int]
@@ -83,7 +80,7 @@ class _Sighting:
     indices: np.ndarray
     corners_px: Array
     blur_px: float = np.nan
-    reason: str = ""
+    rejection: Rejection | None = None
 
 
 class Detector:
@@ -112,7 +109,7 @@ class Detector:
         self._checkerboards = [t for t in targets if isinstance(t, Checkerboard)]
         self._charuco = {t.name: boards.charuco_detector(t) for t in targets if isinstance(t, Charuco)}
 
-    def __call__(self, images: Sequence[Gray]) -> list[Seen]:
+    def __call__(self, images: Sequence[Gray]) -> list[ImageDetections]:
         """Detect in images (height, width) of 8 bits.
 
         Many at once cost less: OpenCV goes through them one by one, edges and poses are refined together.
@@ -136,7 +133,7 @@ class Detector:
                     sightings[k].append(_Sighting(checkerboard, np.arange(len(seen_px)), seen_px))
         judged = iter(self._judged([sighting for of_image in sightings for sighting in of_image]))
         return [
-            Seen(tuple(next(judged) for _ in of_image), strangers)
+            ImageDetections(tuple(next(judged) for _ in of_image), strangers)
             for of_image, strangers in zip(sightings, self._strangers(images, tags), strict=True)
         ]
 
@@ -180,12 +177,12 @@ class Detector:
             mine, rough, refined.corners_px, refined.blur_px.tolist(), strict=True
         ):
             ids = found[k][0]
-            reason = TWICE if ids.count(ids[j]) > 1 else ""
+            rejection = Rejection.SEEN_TWICE if ids.count(ids[j]) > 1 else None
             if not np.isfinite(sharp).all():
-                reason, sharp = reason or NO_EDGES, at_first
+                rejection, sharp = rejection or Rejection.NO_EDGES, at_first
             elif blur > self.options.max_blur_px:
-                reason = reason or BLURRED
-            yield k, _Sighting(self._tags[(*kind, ids[j])], np.arange(4), sharp, blur, reason)
+                rejection = rejection or Rejection.BLURRED
+            yield k, _Sighting(self._tags[(*kind, ids[j])], np.arange(4), sharp, blur, rejection)
 
     def _board(self, gray: Gray, board: Target, ids: list[int], corners: Array) -> tuple[np.ndarray, Array]:
         mine = [k for k, i in enumerate(ids) if i in board.ids]
@@ -212,28 +209,30 @@ class Detector:
         return [result[i] for i in range(len(sightings))]
 
     def _detection(self, sighting: _Sighting, poses: PlanePoses, place: int | None) -> Detection:
-        corners, options = sighting.corners_px, self.options
+        corners = sighting.corners_px
         side = _shortest_side(sighting.target, corners)
         T, squared, rms = np.full((2, 4, 4), np.nan), np.full(2, np.nan), np.full(2, np.nan)
         covariance = np.full((2, 6, 6), np.nan)
         if place is not None:
             T, squared, rms = poses.T[place], poses.squared_px[place], poses.reprojection_px[place]
             covariance = poses.covariance[place]
-        reason = sighting.reason
-        if not reason and not isinstance(sighting.target, Tag) and len(corners) < options.min_corners:
-            reason = FEW
-        if not reason and side < options.min_side_px:
-            reason = SMALL
-        if not reason and not np.isfinite(squared[0]):
-            reason = NO_POSE
-        if not reason and rms[0] > options.max_reprojection_px:
-            reason = REPROJECTION
-        if not reason and grazing_rad(T[0]) > np.radians(options.max_grazing_deg):
-            reason = GRAZING
-        name = sighting.target.name
+        rejection = sighting.rejection or self._rejection(sighting, side, T[0], float(rms[0]))
         return Detection(
-            name, corners, sighting.indices, T, squared, rms, covariance, side, float(sighting.blur_px), reason
-        )
+            sighting.target.name, corners, sighting.indices, T, squared, rms, covariance, side,
+            float(sighting.blur_px), rejection,
+        )  # fmt: skip
+
+    def _rejection(self, sighting: _Sighting, side_px: float, T: Array, rms_px: float) -> Rejection | None:
+        options = self.options
+        if not isinstance(sighting.target, Tag) and len(sighting.corners_px) < options.min_corners:
+            return Rejection.FEW_CORNERS
+        if side_px < options.min_side_px:
+            return Rejection.SMALL
+        if not np.isfinite(rms_px):
+            return Rejection.NO_POSE
+        if rms_px > options.max_reprojection_px:
+            return Rejection.REPROJECTION
+        return Rejection.GRAZING if grazing_rad(T) > np.radians(options.max_grazing_deg) else None
 
 
 def grazing_rad(T_camera_target: Array) -> float:
@@ -241,20 +240,6 @@ def grazing_rad(T_camera_target: Array) -> float:
     t = T_camera_target[:3, 3]
     cosine = -float(T_camera_target[:3, 2] @ t) / float(np.linalg.norm(t))
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def seen(gray: Gray) -> dict[str, list[int]]:
-    """Every tag of every family in an image, AprilGrids' double borders included: family to ids, in order.
-
-    For a first look; small ArUco dictionaries give false positives now and then.
-    """
-    result: dict[str, list[int]] = {}
-    for family in WIDEST:
-        for border_bits in (1, 2) if family.startswith("tag36") else (1,):
-            _, ids, _ = tag_detector(family, border_bits).detectMarkers(gray)
-            if ids is not None:
-                result.setdefault(family, []).extend(int(i) for i in np.ravel(ids))
-    return {family: sorted(ids) for family, ids in result.items()}
 
 
 def _kind(target: Target) -> _Kind:

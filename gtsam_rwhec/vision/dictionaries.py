@@ -7,12 +7,10 @@ from functools import cache
 
 import cv2
 
-from gtsam_rwhec.vision.targets import FAMILIES
-
 
 @cache
 def dictionary(family: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a family (a key of `FAMILIES`)."""
+    """OpenCV's dictionary of a family (a key of `targets.FAMILIES`)."""
     if family.startswith("tag"):
         name = f"DICT_APRILTAG_{family[3:]}"
     else:
@@ -48,9 +46,3 @@ def _parameters(border_bits: int) -> cv2.aruco.DetectorParameters:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # done by us, from the edges
     parameters.markerBorderBits = border_bits
     return parameters
-
-
-#: One dictionary of each kind, the largest: ArUco's smaller ones are its beginnings.
-WIDEST = tuple(
-    family for family in FAMILIES if family.startswith("tag") or family.endswith(("_1000", "original", "36h12"))
-)

@@ -50,10 +50,9 @@ def draw(gray: Gray, detections: Iterable[DetectionRecord], camera: Camera) -> N
                 cv2.circle(picture, tuple(corner.tolist()), 3 << SHIFT, colour, 1, cv2.LINE_AA, SHIFT)
         if record.T_camera_tag is not None and not record.reason:
             _draw_axes(picture, record.T_camera_tag, camera)
-        said = record.id if not record.reason else f"{record.id}: {record.reason}"
         place = np.rint(corners[np.argmin(corners[:, 1])] + [0.0, -6.0]).astype(int).tolist()
-        cv2.putText(picture, said, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 3, cv2.LINE_AA)
-        cv2.putText(picture, said, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+        cv2.putText(picture, record.label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 3, cv2.LINE_AA)
+        cv2.putText(picture, record.label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
     return picture
 
 

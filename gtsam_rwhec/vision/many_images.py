@@ -1,7 +1,7 @@
-"""Detection in all images of a log, on all cores; memory stays that of the few images that are being looked at.
+"""Detection in all images of a log, on all cores; only the few images in work are held in memory.
 
-A few images are looked at by threads. Threads share Python's lock, though, and half of the work is NumPy's: with many
-images processes are worth their start, which takes a second or two.
+Threads begin at once, and work on all of a short log. They share Python's lock, and half of the work is NumPy's: in a
+long log processes take over, whose start takes a second or two.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from loky import ProcessPoolExecutor, cpu_count
 
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs.records import ImageRecord
-from gtsam_rwhec.vision.detection import Detector, Seen
+from gtsam_rwhec.vision.detection import Detector, ImageDetections
 from gtsam_rwhec.vision.images import Gray, decode_gray
 
 #: Images that are looked at together: enough for the refinement to be cheap, few enough to hold.
@@ -33,12 +33,12 @@ _ONE_THREAD = dict.fromkeys(
 
 
 @dataclass(frozen=True)
-class Looked:
-    """One image: what was seen, or why it could not be looked at."""
+class DetectedImage:
+    """One image: what was detected in it, or why nothing could be."""
 
     topic: str
     stamp_ns: int
-    seen: Seen | None
+    found: ImageDetections | None
     fault: str = ""
 
 
@@ -49,7 +49,7 @@ def detect_in_images(
     workers: int | None = None,
     few: int = FEW,
     progress: Callable[[int], None] | None = None,
-) -> Iterator[Looked]:
+) -> Iterator[DetectedImage]:
     """Decode and detect.
 
     Parameters
@@ -67,19 +67,19 @@ def detect_in_images(
 
     Yields
     ------
-    Looked
+    DetectedImage
         One for each image, in batches of a topic.
     """
     count = workers or cpu_count()
     local = threading.local()
 
-    def look(batch: list[ImageRecord]) -> list[Looked]:
+    def look(batch: list[ImageRecord]) -> list[DetectedImage]:
         detectors = local.__dict__.setdefault("detectors", {})
         return _look(batch, _kept(detectors, batch[0].topic, make_detector[batch[0].topic]))
 
     done = 0
 
-    def results(future: Future[list[Looked]]) -> list[Looked]:
+    def results(future: Future[list[DetectedImage]]) -> list[DetectedImage]:
         nonlocal done
         of_batch = future.result()
         done += len(of_batch)
@@ -88,7 +88,7 @@ def detect_in_images(
         return of_batch
 
     with _quiet_on_one_thread(), ThreadPoolExecutor(count) as threads, _Processes(count) as processes:
-        waiting: deque[Future[list[Looked]]] = deque()
+        waiting: deque[Future[list[DetectedImage]]] = deque()
         try:
             for number, batch in enumerate(_batches(images)):
                 if count > 1 and number * BATCH >= few and processes.are_ready():
@@ -119,9 +119,9 @@ class _Processes:
             self._starting = [self._pool.submit(_nothing) for _ in range(self.count)]
         return all(future.done() for future in self._starting)
 
-    def submit(self, batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> Future[list[Looked]]:
+    def submit(self, batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> Future[list[DetectedImage]]:
         assert self._pool is not None
-        future: Future[list[Looked]] = self._pool.submit(_look_in_process, batch, make_detector)
+        future: Future[list[DetectedImage]] = self._pool.submit(_look_in_process, batch, make_detector)
         return future
 
     def __enter__(self) -> _Processes:
@@ -141,7 +141,7 @@ def _nothing() -> int:
 _detectors: dict[str, Detector] = {}
 
 
-def _look_in_process(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> list[Looked]:
+def _look_in_process(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> list[DetectedImage]:
     with _quiet_on_one_thread():
         return _look(batch, _kept(_detectors, batch[0].topic, make_detector))
 
@@ -152,7 +152,7 @@ def _kept(detectors: dict[str, Detector], topic: str, make_detector: Callable[[]
     return detectors[topic]
 
 
-def _look(batch: list[ImageRecord], detector: Detector) -> list[Looked]:
+def _look(batch: list[ImageRecord], detector: Detector) -> list[DetectedImage]:
     grays: list[Gray | None] = []
     faults: list[str] = []
     wanted = detector.camera.height, detector.camera.width
@@ -172,7 +172,7 @@ def _look(batch: list[ImageRecord], detector: Detector) -> list[Looked]:
         faults.append(fault)
     found = iter(detector([gray for gray in grays if gray is not None]))
     return [
-        Looked(image.topic, image.stamp_ns, None if gray is None else next(found), fault)
+        DetectedImage(image.topic, image.stamp_ns, None if gray is None else next(found), fault)
         for image, gray, fault in zip(batch, grays, faults, strict=True)
     ]
 

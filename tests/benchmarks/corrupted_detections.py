@@ -22,19 +22,11 @@ from bars import Row, print_rows
 
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
-from gtsam_rwhec.pipeline.detection_stage import TOPIC, detect_log
-from gtsam_rwhec.pipeline.log_metadata import (
-    DETECTION,
-    read_cameras,
-    read_embedded_rig,
-    read_report,
-    write_cameras,
-    write_report,
-    write_rig,
-)
+from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.log_contract import detections_topic
+from gtsam_rwhec.pipeline.log_metadata import read_metadata
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
 from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.results.stage_reports import DetectionReport
 from gtsam_rwhec.rig import read_rig
 
 CELL = Path(__file__).resolve().parents[2] / "data" / "cell"
@@ -75,8 +67,8 @@ def corrupt(detected: Path, path: Path, share: float, seed: int, *, leave_out: b
     generator = np.random.default_rng(seed)
     wrong = 0
     with open_log(detected) as log, LogWriter(path) as out:
-        rig = read_embedded_rig(log)
-        topics = {TOPIC.format(sensor=sensor) for sensor in rig.sensors}
+        metadata = read_metadata(log)
+        topics = set(map(detections_topic, metadata.rig.sensors))
         out.copy(log, [topic.name for topic in log.topics() if topic.name not in topics])
         for topic in sorted(topics):
             records = [record for record in log.records([topic]) if isinstance(record, DetectionRecord)]
@@ -90,9 +82,7 @@ def corrupt(detected: Path, path: Path, share: float, seed: int, *, leave_out: b
             for stamp in sorted({record.stamp_ns for record in made}):
                 tags = [record for record in made if record.stamp_ns == stamp]
                 out.detections(topic, stamp, tags[0].frame, tags)
-        write_rig(out, rig)
-        write_cameras(out, read_cameras(log))
-        write_report(out, DETECTION, read_report(log, DETECTION, DetectionReport))
+        metadata.write(out)
     return wrong
 
 

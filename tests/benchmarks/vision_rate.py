@@ -102,7 +102,7 @@ def rows(repetitions: int) -> list[Row]:
 
         def ours(count: int = workers) -> int:
             looked = detect_in_images(images, makers, workers=count)
-            return sum(len(one.seen.detections) for one in looked if one.seen is not None)
+            return sum(len(one.found.detections) for one in looked if one.found is not None)
 
         def bare(count: int = workers) -> int:
             return bare_loop(images, count)

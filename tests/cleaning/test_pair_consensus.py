@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cleaning import ConsensusOptions, consensus
+from gtsam_rwhec.cleaning import ConsensusOptions, find_consensus
 from gtsam_rwhec.cleaning.pair_consensus import closed_form, distances
 from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
@@ -41,7 +41,7 @@ def test_gross_outliers_are_found(share: float, scale: float) -> None:
     bad = generator.random(80) < share
     B[bad] = random_poses(int(bad.sum()), 3.0, generator)
     options = ConsensusOptions(scale_known=scale == 1.0, max_translation_m=0.2, max_rotation_rad=np.radians(15))
-    found = consensus(A, B, stamps, options)
+    found = find_consensus(A, B, stamps, options)
     assert found.kept.mask[~bad].all()
     assert not found.kept.mask[bad].any()
     assert len(found.kept.removed) == bad.sum()
@@ -56,14 +56,14 @@ def test_gross_outliers_are_found(share: float, scale: float) -> None:
 def test_nothing_agrees() -> None:
     A, _, stamps = pair(40)
     B = random_poses(40, 3.0, np.random.default_rng(1))
-    found = consensus(A, B, stamps, ConsensusOptions(max_translation_m=0.1, max_rotation_rad=0.1))
+    found = find_consensus(A, B, stamps, ConsensusOptions(max_translation_m=0.1, max_rotation_rad=0.1))
     assert not found.kept.mask.any()
     assert found.kept.counts == {"the pair has no consensus (share that agrees)": 40}
 
 
 def test_a_single_measurement_is_named() -> None:
     A, B, stamps = pair(1)
-    found = consensus(A, B, stamps)
+    found = find_consensus(A, B, stamps)
     assert found.kept.counts == {"a single measurement of the pair": 1}
 
 
@@ -72,8 +72,8 @@ def test_the_order_of_samples_does_not_matter() -> None:
     B = perturb(B, NOISE, 1)
     B[::4] = random_poses(15, 3.0, np.random.default_rng(2))
     options = ConsensusOptions(max_translation_m=0.2, max_rotation_rad=0.3)
-    straight = consensus(A, B, stamps, options).kept.mask
-    turned = consensus(A[::-1], B[::-1], stamps[::-1], options).kept.mask
+    straight = find_consensus(A, B, stamps, options).kept.mask
+    turned = find_consensus(A[::-1], B[::-1], stamps[::-1], options).kept.mask
     np.testing.assert_array_equal(straight, turned[::-1])
 
 
@@ -91,6 +91,6 @@ def test_on_the_real_dataset_the_papers_limits_keep_nearly_all(utias_folder: obj
         raw = problem.measurements(*names)
         if len(raw.A) < 2:
             continue
-        found = consensus(raw.A, raw.B, np.arange(len(raw.A)))
+        found = find_consensus(raw.A, raw.B, np.arange(len(raw.A)))
         kept, total = kept + int(found.kept.mask.sum()), total + len(raw.A)
     assert kept / total > 0.98

@@ -34,7 +34,7 @@ from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.pipeline.all_stages import calibrate_log, solve_into
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
-from gtsam_rwhec.pipeline.log_metadata import DETECTION, RIG
+from gtsam_rwhec.pipeline.log_contract import DETECTION_METADATA, RIG_METADATA
 
 try:
     import resource
@@ -398,8 +398,8 @@ def test_a_rig_files_names_are_no_paths(pieces: dict[str, str], words: str) -> N
 
 def test_the_names_in_an_embedded_rig_file_are_no_paths(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "detected.mcap") as out:
-        out.metadata(RIG, {"yaml": made.rig_text().replace("tag_0:", f"{ELSEWHERE}:")})
-        out.metadata(DETECTION, {"json": "{}"})
+        out.metadata(RIG_METADATA, {"yaml": made.rig_text().replace("tag_0:", f"{ELSEWHERE}:")})
+        out.metadata(DETECTION_METADATA, {"json": "{}"})
     with pytest.raises(RigError, match=r"detected\.mcap, metadata gtsam_rwhec\.rig, line 12.*'\.\./\.\./x' cannot"):
         calibrate_log(tmp_path / "detected.mcap", None, tmp_path / "a" / "b" / "out")
     assert {path.name for path in tmp_path.rglob("*")} <= {"detected.mcap", "a", "b", "out"}
@@ -433,7 +433,7 @@ def check_whole(folder: Path) -> None:
             with open_log(path) as log:
                 assert not log.losses
                 assert sum(1 for _ in log.records(["/tf"])) == len(MOVING)
-                assert set(log.metadata()) & {DETECTION}
+                assert set(log.metadata()) & {DETECTION_METADATA}
         elif path.name == "result.json":
             assert set(rw.read_refined(path).Y) == set(made.CAMERAS)
         elif path.suffix == ".png":

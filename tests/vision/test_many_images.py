@@ -16,7 +16,7 @@ from rendered import BARREL, PINHOLE, pose, printed, render
 
 from gtsam_rwhec.logs.records import ImageRecord
 from gtsam_rwhec.vision.detection import Detector
-from gtsam_rwhec.vision.many_images import BATCH, Looked, detect_in_images, measured_corner_px
+from gtsam_rwhec.vision.many_images import BATCH, DetectedImage, detect_in_images, measured_corner_px
 from gtsam_rwhec.vision.targets import Tag
 
 TAG = Tag("tag", "tag36h11", 7, 0.08)
@@ -50,7 +50,7 @@ def images() -> list[ImageRecord]:
     ]
 
 
-def by_image(looked: Iterator[Looked]) -> dict[tuple[str, int], Looked]:
+def by_image(looked: Iterator[DetectedImage]) -> dict[tuple[str, int], DetectedImage]:
     found = {}
     for one in looked:
         assert (one.topic, one.stamp_ns) not in found
@@ -58,17 +58,17 @@ def by_image(looked: Iterator[Looked]) -> dict[tuple[str, int], Looked]:
     return found
 
 
-def assert_same(a: dict[tuple[str, int], Looked], b: dict[tuple[str, int], Looked]) -> None:
+def assert_same(a: dict[tuple[str, int], DetectedImage], b: dict[tuple[str, int], DetectedImage]) -> None:
     assert a.keys() == b.keys()
     for key, one in a.items():
         other = b[key]
         assert one.fault == other.fault
-        if one.seen is None or other.seen is None:
-            assert one.seen is other.seen
+        if one.found is None or other.found is None:
+            assert one.found is other.found
             continue
-        assert one.seen.strangers == other.seen.strangers
-        for x, y in zip(one.seen.detections, other.seen.detections, strict=True):
-            assert (x.target, x.reason) == (y.target, y.reason)
+        assert one.found.strangers == other.found.strangers
+        for x, y in zip(one.found.detections, other.found.detections, strict=True):
+            assert (x.target, x.rejection) == (y.target, y.rejection)
             np.testing.assert_allclose(x.corners_px, y.corners_px, atol=1e-9)
             np.testing.assert_allclose(x.T, y.T, atol=1e-6)
             np.testing.assert_allclose(x.covariance, y.covariance, rtol=1e-4, atol=1e-15)
@@ -77,7 +77,7 @@ def assert_same(a: dict[tuple[str, int], Looked], b: dict[tuple[str, int], Looke
 def test_the_same_on_any_number_of_cores_and_in_any_order(images: list[ImageRecord]) -> None:
     one = by_image(detect_in_images(images, MAKERS, workers=1))
     assert len(one) == len(images)
-    assert all(looked.seen is not None and len(looked.seen.detections) == 1 for looked in one.values())
+    assert all(looked.found is not None and len(looked.found.detections) == 1 for looked in one.values())
     assert_same(one, by_image(detect_in_images(images, MAKERS, workers=3)))
     assert_same(one, by_image(detect_in_images(iter(images[::-1]), MAKERS)))
 
@@ -114,12 +114,12 @@ def test_faults_are_said_and_the_others_go_on(images: list[ImageRecord]) -> None
         "topic /left, image at 7 ns: 640 x 480 pixels, but the intrinsics are for 320 x 240"
     )
     assert "'mono9' is not supported" in found["/left", 9].fault
-    assert all(found["/left", stamp].seen is None for stamp in (5, 7, 9))
+    assert all(found["/left", stamp].found is None for stamp in (5, 7, 9))
     for image in good:
         one = found["/left", image.stamp_ns]
         assert one.fault == ""
-        assert one.seen is not None
-        assert [d.target for d in one.seen.detections] == ["tag"]
+        assert one.found is not None
+        assert [d.target for d in one.found.detections] == ["tag"]
 
 
 def test_raw_images_need_no_copy(images: list[ImageRecord]) -> None:
@@ -186,7 +186,7 @@ def test_a_script_needs_no_main(tmp_path: Path, images: list[ImageRecord]) -> No
         "data = (Path(__file__).parent / 'image.png').read_bytes()\n"
         "images = [ImageRecord(k, k, '/left', 'cam', 'png', data) for k in range(40)]\n"
         f"make = {{'/left': partial(Detector, camera, [Tag('tag', 'tag36h11', {TAG.id}, 0.08)])}}\n"
-        "print(sum(len(one.seen.detections) for one in detect_in_images(images, make, workers=2, few=0)))\n"
+        "print(sum(len(one.found.detections) for one in detect_in_images(images, make, workers=2, few=0)))\n"
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)
     assert (done.stdout, done.stderr) == ("begins\n40\n", "")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from gtsam_rwhec.errors import TargetError
-from gtsam_rwhec.vision.dictionaries import WIDEST, dictionary, modules
+from gtsam_rwhec.vision.dictionaries import dictionary, modules
+from gtsam_rwhec.vision.tag_survey import BY_TRUST
 from gtsam_rwhec.vision.targets import FAMILIES, AprilGrid, Charuco, Checkerboard, Tag, Target
 
 TAG = Tag("tag", "tag36h11", 3, 0.12)
@@ -87,10 +88,10 @@ def test_opencv_has_every_family_with_as_many_tags(family: str) -> None:
 
 def test_the_widest_dictionaries_begin_with_the_others() -> None:
     for family in FAMILIES:
-        if family in WIDEST:
+        if family in BY_TRUST:
             continue
         stem = family.rpartition("_")[0]
-        (wide,) = (other for other in WIDEST if other.startswith(stem + "_"))
+        (wide,) = (other for other in BY_TRUST if other.startswith(stem + "_"))
         np.testing.assert_array_equal(dictionary(wide).bytesList[: FAMILIES[family]], dictionary(family).bytesList)
 
 

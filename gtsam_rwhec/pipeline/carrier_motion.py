@@ -1,8 +1,9 @@
-"""The carriers' motion in a log: A = T_sensorcarrier_targetcarrier over time."""
+"""The motion of the carriers in a log: A = T_sensorcarrier_targetcarrier over time."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from rwhec_factors import se3
@@ -12,28 +13,31 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer, Topic
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.trajectories import Trajectory
+from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: Stamps that go back by more than this, in the order in which messages were logged: a clock was set meanwhile.
 BACKWARDS_S = 1.0
 #: Stamps from here on (the year 2116) are none; so differences and time offsets stay within 64 bits.
 LATEST_NS = 1 << 62
-TF_TOPICS = ("tf", "tf_static")
-_TRANSFORM_SCHEMAS = ("foxglove.FrameTransforms", "foxglove.FrameTransform")
 #: Topics that an error lists, at most: a stranger's log may have thousands.
 MOST_NAMED = 50
 
 
-@dataclass(frozen=True)
-class Carriers:
-    """A over time (stamps, T_sensorcarrier_targetcarrier), and its noise as the rig file has it."""
+@dataclass(frozen=True, eq=False)
+class CarrierMotion:
+    """The carriers' motion: A over time, T_sensorcarrier_targetcarrier, and its noise as the rig file has it."""
 
     trajectory: Trajectory
     noise: CarrierNoise | None
 
+    def A_where_known(self, stamps_ns: np.ndarray, max_gap_s: float) -> Array:
+        """A (N, 4, 4) at stamps (N,); nan outside the trajectory and in gaps of more than `max_gap_s`."""
+        A, gap_s = self.trajectory.at(stamps_ns)
+        return np.where((gap_s > max_gap_s)[:, None, None], np.nan, A)
 
-def read_carriers(log: Log, rig: Rig) -> Carriers:
-    """Read them as the rig file says where they are.
+
+def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
+    """Read the carriers' motion from where the rig file says it is.
 
     Raises
     ------
@@ -42,7 +46,7 @@ def read_carriers(log: Log, rig: Rig) -> Carriers:
     TransformError
         Frames that no chain of transforms joins, or that never move against each other.
     StampError
-        Stamps that are all one, or of a clock that was set back meanwhile.
+        Stamps that are all the same, or of a clock that was set back meanwhile.
     """
     source = rig.carriers.poses
     parent, child = source.frames
@@ -53,25 +57,20 @@ def read_carriers(log: Log, rig: Rig) -> Carriers:
         where = f"topic {source.topic}"
         stamps, T = _from_topic(log, source.topic)
     child_carries_sensors = child == rig.carriers.sensors
-    noise = rig.carriers.noise
-    if child_carries_sensors:  # T_targetcarrier_sensorcarrier is what was logged
+    if child_carries_sensors:  # the log has T_targetcarrier_sensorcarrier
         T = se3.inverse(T)
-    return Carriers(
-        Trajectory.of(stamps, T, where),
-        None
-        if noise is None
-        else CarrierNoise(
-            float(np.radians(noise.rotation_deg)),
-            1e-3 * noise.translation_mm,
-            # What is reported of a child frame is off in the child's own axes.
-            about="sensorcarrier" if child_carries_sensors else "targetcarrier",
-        ),
-    )
+    noise = rig.carriers.noise
+    if noise is None:
+        return CarrierMotion(Trajectory.of(stamps, T, where), None)
+    # What is reported of a child frame is off in the child's own axes.
+    about: Literal["sensorcarrier", "targetcarrier"] = "sensorcarrier" if child_carries_sensors else "targetcarrier"
+    carrier_noise = CarrierNoise(float(np.radians(noise.rotation_deg)), 1e-3 * noise.translation_mm, about=about)
+    return CarrierMotion(Trajectory.of(stamps, T, where), carrier_noise)
 
 
 def _from_tf(log: Log, parent: str, child: str) -> tuple[np.ndarray, Array]:
     where = f"{log.files[0].path}, tf {parent} to {child}"
-    topics = [t for t in log.topics() if t.name.rpartition("/")[2] in TF_TOPICS or t.schema in _TRANSFORM_SCHEMAS]
+    topics = [topic for topic in log.topics() if topic.is_tf]
     readable = [t.name for t in topics if not t.unreadable]
     try:
         buffer = TfBuffer(log.records(readable)) if readable else TfBuffer()

@@ -1,0 +1,198 @@
+"""Solving in rounds: outliers and time offsets by turns until neither changes, and the targets' sizes."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from gtsam_rwhec.cleaning.removed import RemovalReason
+from gtsam_rwhec.errors import RwhecError, RwhecWarning, ScaleError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion
+from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, problem_of
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.results.stage_reports import SizeFields
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.solving.certified_solution import solve
+
+Pairs = dict[Pair, MeasuredPairs]
+#: What a solution is for: to find outliers, to estimate time offsets, or to be the answer.
+Purpose = Literal["outliers", "time offsets", "answer"]
+#: Rounds, at most: of outliers and time offsets by turns, and of A taken anew at the time offsets.
+ROUNDS = 6
+#: A change of all time offsets below this (s) ends the rounds.
+SETTLED_S = 2e-5
+#: A change of all time offsets below this (s) does not change which measurements are outliers.
+SAME_OUTLIERS_S = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class SynchronisedPairs:
+    """Measured pairs by (target, sensor), with A at the time offsets of their sensors (s)."""
+
+    pairs: Pairs
+    offsets_s: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SolvingRounds:
+    """Solves and refines again and again; what stays the same from one solution to the next.
+
+    Attributes
+    ----------
+    rig : Rig
+    motion : CarrierMotion
+    estimated : tuple of str
+        Sensors whose time offset is estimated.
+    progress : callable
+    """
+
+    rig: Rig
+    motion: CarrierMotion
+    estimated: tuple[str, ...]
+    progress: Progress
+
+    @property
+    def targets(self) -> frozenset[str]:
+        """Names of all targets."""
+        return frozenset(self.rig.targets)
+
+    def settled(self, given: SynchronisedPairs, free_sizes: Collection[str]) -> SynchronisedPairs:
+        """Mark outliers and estimate time offsets until neither changes.
+
+        By turns: outliers with the time offsets as they are, then time offsets without the outliers.
+        """
+        outliers: dict[Pair, np.ndarray] = {}
+        everything = marked = given
+        for _ in range(ROUNDS):
+            before = everything.offsets_s
+            is_same = True
+            if self.rig.cleaning.robust == "gnc":
+                inliers = self.refined(everything, free_sizes, "outliers").inliers
+                is_same = outliers.keys() == inliers.keys() and all(
+                    np.array_equal(outliers[pair], mask) for pair, mask in inliers.items()
+                )
+                outliers = inliers
+                marked = SynchronisedPairs(with_outliers_marked(everything.pairs, inliers), before)
+            for _ in range(ROUNDS if self.estimated else 0):
+                change = self.refined(marked, free_sizes, "time offsets").time_offsets_s
+                offsets = marked.offsets_s | {name: marked.offsets_s[name] + value for name, value in change.items()}
+                everything, marked = self.at(everything.pairs, offsets), self.at(marked.pairs, offsets)
+                if max(abs(value) for value in change.values()) < SETTLED_S:
+                    break
+            moved = max((abs(marked.offsets_s[name] - before[name]) for name in self.estimated), default=0.0)
+            if is_same or moved < SAME_OUTLIERS_S:
+                break
+        return marked
+
+    def at(self, pairs: Pairs, offsets_s: Mapping[str, float]) -> SynchronisedPairs:
+        """Take A anew at the estimated time offsets; other sensors' pairs stay as cleaning left them."""
+        path = self.motion.trajectory
+        moved = {
+            pair: measured.at(path, offsets_s[measured.sensor]) if measured.sensor in self.estimated else measured
+            for pair, measured in pairs.items()
+        }
+        return SynchronisedPairs(moved, dict(offsets_s))
+
+    def refined(self, given: SynchronisedPairs, free_sizes: Collection[str], purpose: Purpose) -> Refined:
+        """One certified solution, refined.
+
+        On the way to the answer, the noise of A is propagated into each measurement on its own. In the answer,
+        measurements of one instant share it, which is slow and makes the covariances right.
+        """
+        problem = problem_of(given.pairs, self.rig, given.offsets_s, free_sizes)
+        robust = self.rig.cleaning.robust
+        if robust == "gnc" and purpose != "outliers":
+            robust = "none"  # the outliers are marked already
+        estimated = self.estimated if purpose != "outliers" else ()
+        options = RefineOptions(
+            noise="estimate" if self.rig.noise == "estimate" else "given",
+            robust=robust,
+            carrier_noise=self.motion.noise,
+            carrier_model="auto" if purpose == "answer" else "propagated",
+            time_offsets=estimated,
+            carrier_path=self.motion.trajectory if estimated else None,
+        )
+        with warnings.catch_warnings():
+            if purpose != "answer":
+                warnings.simplefilter("ignore", RwhecWarning)
+            solution = solve(problem, progress=self.progress)
+            return refine(problem, solution, options, progress=self.progress)
+
+    def sizes(self, given: SynchronisedPairs) -> tuple[tuple[SizeFields, ...], SynchronisedPairs]:
+        """Estimate all targets' sizes: what is found of each, and the time offsets that go with them.
+
+        A size is free in the answer where it is to be estimated, or where the measurements contradict it.
+        """
+        self.progress("looking at the targets' sizes")
+        is_check = self.rig.sizes == "check"
+        marked = given
+        try:
+            with warnings.catch_warnings():
+                if is_check:  # only the warnings of the answer are told
+                    warnings.simplefilter("ignore", RwhecWarning)
+                marked = self.settled(given, self.targets)
+                refined = self.refined(marked, self.targets, "time offsets")
+        except ScaleError:
+            if not is_check:
+                raise
+            return (), self.at(given.pairs, marked.offsets_s)
+        sizes = self._sizes_in(refined)
+        sizes = tuple(size.model_copy(update={"is_free": size.is_doubted or not is_check}) for size in sizes)
+        return sizes, self.at(given.pairs, marked.offsets_s)
+
+    def sizes_as_seen(self, given: SynchronisedPairs) -> tuple[SizeFields, ...]:
+        """What the used measurements say of sizes that were taken as known; nothing where they cannot tell."""
+        self.progress("looking at the targets' sizes")
+        try:
+            return self._sizes_in(self.refined(given, self.targets, "time offsets"))
+        except RwhecError:
+            return ()  # with free sizes there is no answer, and none was asked for
+
+    def _sizes_in(self, refined: Refined) -> tuple[SizeFields, ...]:
+        assert not isinstance(refined.scale, float)
+        stated = {target.name: target.length_m for target in self.rig.target_list}
+        return tuple(
+            SizeFields(
+                target=target,
+                stated_m=stated[target],
+                scale=scale,
+                sigma=sigma_of(refined, f"scale:{target}"),
+                is_free=False,
+            )
+            for target, scale in refined.scale.items()
+        )
+
+
+def sigma_of(refined: Refined, name: str) -> float | None:
+    """The standard deviation of a scalar; None where it is infinite."""
+    variance = float(refined.covariance(name)[0, 0])
+    return math.sqrt(variance) if math.isfinite(variance) else None
+
+
+def with_outliers_marked(pairs: Pairs, inliers: Mapping[Pair, np.ndarray]) -> Pairs:
+    """Mark the outliers; `inliers` has a boolean for each measurement of a pair that was used."""
+    result = {}
+    for pair, measured in pairs.items():
+        reasons = list(measured.reasons)
+        if pair in inliers:
+            for i in np.flatnonzero(measured.used)[~inliers[pair]].tolist():
+                reasons[i] = RemovalReason.OUTLIER
+        result[pair] = replace(measured, reasons=tuple(reasons))
+    return result
+
+
+def without_outlier_marks(pairs: Pairs) -> Pairs:
+    """Take the marks of outliers away: a log that was solved before is solved anew."""
+    return {
+        pair: replace(measured, reasons=tuple("" if why == RemovalReason.OUTLIER else why for why in measured.reasons))
+        for pair, measured in pairs.items()
+    }

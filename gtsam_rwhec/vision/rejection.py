@@ -1,0 +1,22 @@
+"""Why a detection is not used."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Rejection(StrEnum):
+    """Why a detection is not used; the values are the words in logs, reports and pictures.
+
+    `DetectionOptions` has the limits.
+    """
+
+    SMALL = "small"
+    BLURRED = "blurred"
+    GRAZING = "grazing"
+    FEW_CORNERS = "too few corners"
+    SEEN_TWICE = "id seen twice in one image"
+    NO_EDGES = "edges not found"
+    NO_POSE = "no pose"
+    REPROJECTION = "reprojection error"
+    AMBIGUOUS = "ambiguous"
