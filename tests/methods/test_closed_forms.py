@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from counted_calls import counted_calls
 from method_problems import exchanged, four_targets, general_pair, largest_errors, one_pair
 
 import gtsam_rwhec as rw
@@ -87,14 +88,16 @@ def test_a_world_origin_far_away_takes_no_more_than_its_digits(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", CLOSED)
-def test_time_is_linear_and_no_loop_over_measurements(name: str) -> None:
+def test_no_loop_over_measurements(name: str) -> None:
+    """Hardly more calls of functions for 30,000 measurements than for 60: large arrays go through in blocks."""
     simulation = general_pair()
     raw = simulation.problem.measurements("target0", "sensor0")
     many = rw.Problem()
     many.add("target0", "sensor0", np.tile(raw.A, (500, 1, 1)), np.tile(raw.B, (500, 1, 1)), 0.01, 1250.0)
-    estimate = run(name, many)
-    assert estimate.seconds < 1.0  # 30,000 measurements; 0.05 s or less on an idle core
-    once = run(name, simulation.problem)
+    run(name, simulation.problem)  # what is made once is made here
+    once, calls_once = counted_calls(lambda: run(name, simulation.problem))
+    estimate, calls = counted_calls(lambda: run(name, many))
+    assert calls - calls_once < 3_000
     np.testing.assert_allclose(estimate.X["target0"].matrix(), once.X["target0"].matrix(), atol=1e-8)
 
 

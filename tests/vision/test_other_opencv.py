@@ -32,9 +32,13 @@ def other_opencv(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_other_opencv(other_opencv: Path) -> None:
+@pytest.mark.parametrize("share", ["a few", pytest.param("all", marks=pytest.mark.engine)])
+def test_the_other_opencv(share: str, other_opencv: Path) -> None:
     tests = sorted(path for path in Path(__file__).parent.glob("test_*.py") if path.name != Path(__file__).name)
     assert len(tests) >= 8
+    if share == "a few":
+        tests = [path for path in tests if path.stem in ("test_codes", "test_intrinsics_files", "test_targets")]
+        assert len(tests) == 3
     if OTHER == 4:
         tests += [REPOSITORY / "tests" / "compat" / "test_beside_opencv4.py"]
         tests += [REPOSITORY / "tests" / "methods" / "test_opencv4.py"]
