@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from gtsam_rwhec.solving.solution import Solution, Status
+import gtsam_rwhec as rw
 
 
 class ExitStatus(IntEnum):
     """Exit statuses of every subcommand."""
 
-    CERTIFIED = 0
+    DONE = CERTIFIED = 0
     """Done; a calibration is certified and determined by the measurements."""
     BAD_INPUT = 2
     """An argument, a file or a measurement cannot be used; the message says which."""
@@ -32,10 +32,14 @@ HELP = (
 )
 
 
-def exit_status(solution: Solution) -> ExitStatus:
-    """The exit status that a solution leads to."""
-    if solution.certificate.status is Status.CERTIFIED_NOT_UNIQUE:
+def exit_status(solution: rw.Solution, refined: rw.Refined | None = None, *, contradictions: int = 0) -> ExitStatus:
+    """The exit status of a calibration; `contradictions` counts frames that most measurements contradict."""
+    if solution.certificate.status is rw.Status.CERTIFIED_NOT_UNIQUE:
         return ExitStatus.NOT_UNIQUE
     if not solution.certificate.is_certified:
         return ExitStatus.NOT_CERTIFIED
-    return ExitStatus.CERTIFIED if solution.identifiability.is_unique else ExitStatus.NOT_UNIQUE
+    if not solution.identifiability.is_unique:
+        return ExitStatus.NOT_UNIQUE
+    if contradictions:
+        return ExitStatus.CONTRADICTED
+    return ExitStatus.NOT_UNIQUE if refined is not None and refined.free_directions else ExitStatus.CERTIFIED

@@ -5,14 +5,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TextIO
 
 import typer
-from rich.console import Console
-from rich.text import Text
 
 from gtsam_rwhec.cli.exit_status import ExitStatus
-from gtsam_rwhec.errors import FetchError, RwhecError, RwhecWarning
+from gtsam_rwhec.errors import (
+    FetchError,
+    FileFormatError,
+    NotCertifiedWarning,
+    NotUniqueWarning,
+    RwhecError,
+    RwhecWarning,
+)
 from gtsam_rwhec.files.printable import printable
 
 
@@ -25,6 +31,10 @@ def failures_in_words() -> Iterator[None]:
     typer.Exit
         With the status of `ExitStatus`. Errors of any other kind are faults of the program and pass with a traceback.
     """
+    # Imported here: completion in a shell starts faster without.
+    from rich.console import Console
+    from rich.text import Text
+
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     told: set[str] = set()
     with warnings.catch_warnings():
@@ -57,3 +67,24 @@ def failures_in_words() -> Iterator[None]:
         except KeyboardInterrupt as error:
             console.print("Interrupted.")
             raise typer.Exit(ExitStatus.INTERRUPTED) from error
+
+
+@contextmanager
+def said_in_the_report() -> Iterator[None]:
+    """Show no warning of what the report says in more detail: not certified, or not unique."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotUniqueWarning)
+        warnings.simplefilter("ignore", NotCertifiedWarning)
+        yield
+
+
+def check_folder_of(output: Path | None) -> None:
+    """Check, before a long calculation, that the folder of its result is there.
+
+    Raises
+    ------
+    FileFormatError
+        It is not.
+    """
+    if output is not None and not output.absolute().parent.is_dir():
+        raise FileFormatError(f"{output} cannot be written: there is no folder {output.parent}.")

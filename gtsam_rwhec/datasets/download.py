@@ -17,7 +17,7 @@ import requests
 from requests.adapters import HTTPAdapter
 from urllib3.util.retry import Retry
 
-from gtsam_rwhec.errors import FetchError
+from gtsam_rwhec.errors import FetchError, FileFormatError
 from gtsam_rwhec.files.atomic_write import write_atomically
 
 UTIAS_URL = "https://raw.githubusercontent.com/utiasSTARS/certifiable-rwhe-calibration/main/data/real-world/combined/"
@@ -91,9 +91,8 @@ def fetch_utias(
             content = _download(session, base_url.rstrip("/") + "/" + file.name, file)
             try:
                 write_atomically(folder / file.name, content)
-            except OSError as error:
-                message = f"{folder / file.name} cannot be written: {error.strerror}. What is complete stays."
-                raise FetchError(message) from error
+            except FileFormatError as error:
+                raise FetchError(f"{error} What is complete stays.") from error
     if progress is not None:
         progress(len(remote_files), len(remote_files), "")
     return Fetched(folder, tuple(file.name for file in missing), there)

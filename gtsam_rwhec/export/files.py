@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.export.camchain import camchain_yaml
 from gtsam_rwhec.export.static_tf import static_tf_launch
 from gtsam_rwhec.export.tf_tree import tf_yaml
@@ -43,10 +42,7 @@ def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
     # All texts first: what cannot be written leaves no half of it.
     texts = {Path(folder) / name: _warned(text(frames), frames.warnings, name) for name, text in FILES.items()}
     for path, text in texts.items():
-        try:
-            write_atomically(path, text.encode())
-        except OSError as error:
-            raise FileFormatError(f"{path} cannot be written: {error.strerror or error}.") from error
+        write_atomically(path, text.encode())
     return list(texts)
 
 

@@ -13,7 +13,7 @@ import base64
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -24,6 +24,7 @@ from mcap.writer import Writer as McapWriter
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.atomic_write import atomic_stream
 from gtsam_rwhec.logs.mcap_reader import Log
 from gtsam_rwhec.logs.message_kinds import (
     IMAGE_SCHEMAS,
@@ -58,18 +59,13 @@ class LogWriter:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(os.path.realpath(path))
-        self._temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
+        self._file = atomic_stream(self.path)
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[str, str, int, tuple[tuple[str, str], ...]], int] = {}
-        with self._saying():
-            self._stream = open(self._temporary, "wb")  # noqa: SIM115  (closed by __exit__)
-        try:
-            self._writer = McapWriter(self._stream, compression=CompressionType.ZSTD)
-            with self._saying():
-                self._writer.start(profile="", library="gtsam-rwhec")
-        except BaseException:
-            self._abandon()
-            raise
+        with self._saying(), ExitStack() as on_error:
+            self._writer = McapWriter(on_error.enter_context(self._file), compression=CompressionType.ZSTD)
+            self._writer.start(profile="", library="gtsam-rwhec")
+            on_error.pop_all()  # __exit__ closes the file
 
     def __enter__(self) -> LogWriter:
         return self
@@ -77,16 +73,12 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if kind is None:
-                with self._saying():
-                    self._writer.finish()  # type: ignore[no-untyped-call]
-                    self._stream.flush()
-                    os.fsync(self._stream.fileno())
-                    self._stream.close()
-                    os.replace(self._temporary, self.path)
-        finally:
-            self._abandon()
+        if kind is not None:
+            self._file.__exit__(kind, error, trace)
+            return
+        with self._saying(), ExitStack() as closing:
+            closing.push(self._file)
+            self._writer.finish()  # type: ignore[no-untyped-call]
 
     def copy(self, log: Log, topics: Iterable[str] | None = None, images: Images = "copy") -> int:
         """Copy messages byte for byte, with their schemas, channels and times; metadata and attachments stay behind.
@@ -278,15 +270,6 @@ class LogWriter:
             yield
         except OSError as error:
             raise LogError(f"{self.path} cannot be written: {error.strerror}.") from error
-
-    def _abandon(self) -> None:
-        """Close, whatever state the file is in, and let nothing lie about."""
-        try:
-            self._stream.close()
-        except OSError:
-            # What is still buffered does not fit the full disk either; the first error has been raised.
-            self._stream.raw.close()
-        self._temporary.unlink(missing_ok=True)
 
 
 def _time(stamp_ns: int) -> dict[str, int]:

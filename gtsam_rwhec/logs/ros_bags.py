@@ -5,13 +5,13 @@ ROS 1 messages are re-encoded as CDR, the same fields and numbers; ROS 2's are c
 
 from __future__ import annotations
 
-import os
 import struct
 from pathlib import Path
 
 from mcap.writer import Writer as McapWriter
 
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.atomic_write import atomic_stream
 
 #: Bytes of messages kept before they are compressed and written.
 CHUNK_BYTES = 1 << 20
@@ -52,11 +52,10 @@ def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
         AnyReaderError, Ros1Error, Ros2Error, SerdeError, TypesysError, apsw.Error,
         AssertionError, ValueError, KeyError, IndexError, struct.error,
     )  # fmt: skip
-    bag, path = Path(bag), Path(os.path.realpath(path))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    bag, path = Path(bag), Path(path)
     count = 0
     try:
-        with AnyReader([bag]) as reader, open(temporary, "wb") as stream:
+        with AnyReader([bag]) as reader, atomic_stream(path) as stream:
             writer = McapWriter(stream, CHUNK_BYTES)
             writer.start(profile="ros2", library="gtsam-rwhec")
             # ROS 2's Header lacks ROS 1's seq; with it, the rest of the definitions are the bag's own.
@@ -78,14 +77,9 @@ def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
                 writer.add_message(channels[id(connection)], stamp_ns, data, stamp_ns)
                 count += 1
             writer.finish()  # type: ignore[no-untyped-call]
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
     except faults as error:
         what = str(error) or type(error).__name__
         raise LogError(f"{bag} cannot be read as a ROS bag: {what}") from error
     except OSError as error:
         raise LogError(f"{bag} could not be made {path}: {error.strerror or error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
     return count

@@ -11,7 +11,6 @@ from typing import Any
 
 import gtsam
 
-from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.methods.comparison import Compared, Comparison
 from gtsam_rwhec.results.schema import CONVENTIONS
@@ -46,10 +45,7 @@ def write_comparison(comparison: Comparison, path: str | Path) -> None:
         The file cannot be written; the message says why.
     """
     content = json.dumps(comparison_fields(comparison), indent=2, allow_nan=False) + "\n"
-    try:
-        write_atomically(Path(path), content.encode("utf-8"))
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be written: {error.strerror}.") from error
+    write_atomically(path, content.encode("utf-8"))
 
 
 def _row(comparison: Comparison, row: Compared) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from gtsam_rwhec.errors import ImageError, LogError
+from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, open_log
@@ -40,7 +40,9 @@ def draw_log(
     Raises
     ------
     LogError
-        A log cannot be read, or a file cannot be written.
+        A log cannot be read.
+    FileFormatError
+        A picture cannot be written.
     """
     tell = progress or silent
     folder = made_folder(folder)
@@ -66,10 +68,7 @@ def draw_log(
                 picture = draw(gray, of_stamp[image.stamp_ns], cameras[sensor])
                 path = folder / f"{sensor.replace('/', '_')}_{image.stamp_ns}.png"
                 _, data = cv2.imencode(".png", picture)
-                try:
-                    write_atomically(path, data.tobytes())
-                except OSError as error:
-                    raise LogError(f"{path} cannot be written: {error.strerror}.") from error
+                write_atomically(path, data.tobytes())
                 count += 1
                 tell(f"drawing: image {count}")
     return count

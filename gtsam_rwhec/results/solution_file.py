@@ -72,11 +72,7 @@ def write_result(path: str | Path, make: Callable[[], ResultFile]) -> None:
     FileFormatError
         The file cannot be written (the message says why), or ``make`` meets a number that is none.
     """
-    content = result_json(make, path)
-    try:
-        write_atomically(Path(path), content)
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be written: {error.strerror}.") from error
+    write_atomically(path, result_json(make, path))
 
 
 def result_json(make: Callable[[], ResultFile], path: str | Path) -> bytes:

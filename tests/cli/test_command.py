@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import http.server
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -25,7 +26,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
-COMMAND = (sys.executable, "-m", "gtsam_rwhec.cli")
+COMMAND = (sys.executable, "-m", "gtsam_rwhec")
 
 
 def run(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -34,6 +35,11 @@ def run(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProc
     return subprocess.run(
         [*COMMAND, *map(str, arguments)], capture_output=True, text=True, encoding="utf-8", cwd=cwd, env=environment
     )
+
+
+def without_stages(stderr: str) -> list[str]:
+    """The lines that a fast machine prints; a slow one prints how far it is as well."""
+    return [line for line in stderr.splitlines() if not re.match(r"\[\d+ s\] ", line)]
 
 
 def write_csv(problem: rw.Problem, folder: Path) -> Path:
@@ -145,7 +151,8 @@ def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
     done = run("calibrate", folder)
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr == f"Error: {folder}/tag_0_cam_1_B.csv, line 17: not a finite number: tx is 'oops'.\n"
+    error = f"Error: {folder}/tag_0_cam_1_B.csv, line 17: not a finite number: tx is 'oops'."
+    assert without_stages(done.stderr) == [error]
 
 
 @pytest.mark.parametrize(
@@ -157,7 +164,7 @@ def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
         (["calibrate", DEMO, "--method", "local"], "--initial"),
         (["calibrate", DEMO, "--initial", "x.json"], "--method local"),
         (["calibrate", DEMO, "-o", "/nowhere/result.json"], "there is no folder /nowhere"),
-        (["calibrate", DEMO, "--robust", "gnc"], "without --refine"),
+        (["calibrate", DEMO, "--robust", "gnc"], "--robust"),
         (["calibrate", DEMO, "--refine", "estimate", "--carrier-noise-mm", "2"], "go together"),
         (["calibrate", DEMO, "--refine", "given"], "noise='estimate'"),
         (["calibrate"], "source"),
@@ -177,9 +184,9 @@ def test_files_that_are_not_read_are_warned_of(tmp_path: Path) -> None:
     (folder / "README.txt").touch()
     done = run("calibrate", folder)
     assert done.returncode == 0
-    assert done.stderr.startswith("Warning: ")
-    assert "README.txt" in done.stderr
-    assert done.stderr.count("\n") == 1
+    (warning,) = without_stages(done.stderr)
+    assert warning.startswith("Warning: ")
+    assert "README.txt" in warning
 
 
 def test_not_unique_is_status_3(tmp_path: Path) -> None:
@@ -233,7 +240,7 @@ def test_refined_and_free_is_status_3(tmp_path: Path) -> None:
     folder = write_csv(general(2, 2, seed=5, motion="planar", noise=NOISE).problem, tmp_path)
     done = run("calibrate", folder, "--sigma", 0.005, "--kappa", 6000, "--refine", "given", "-o", tmp_path / "r.json")
     assert done.returncode == 3
-    assert done.stderr == f"Written to {tmp_path / 'r.json'}.\n"
+    assert without_stages(done.stderr) == [f"Written to {tmp_path / 'r.json'}."]
     assert " free " in done.stdout
     assert done.stdout.count("Not determined: ") == 4
     assert np.isinf(rw.read_refined(tmp_path / "r.json").covariance("cam_0")).any()
@@ -258,7 +265,7 @@ def test_not_certified_is_status_4(tmp_path: Path) -> None:
     )
     assert done.returncode == 4, done.stderr
     assert "Not certified: this answer costs" in done.stdout
-    assert done.stderr == ""
+    assert without_stages(done.stderr) == []
 
 
 def test_a_log_gets_a_line_for_what_takes_long(slow_address: str, tmp_path: Path) -> None:

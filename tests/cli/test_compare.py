@@ -11,7 +11,7 @@ from places import DEMO
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "gtsam_rwhec.cli", "compare", *map(str, arguments)]
+    command = [sys.executable, "-m", "gtsam_rwhec", "compare", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, encoding="utf-8")
 
 

@@ -44,7 +44,7 @@ def test_it_has_all_data_and_none_of_the_real_dataset(unpacked_wheel: Path) -> N
 
 def test_the_demo_runs_from_it_and_meets_the_truth(unpacked_wheel: Path, tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "gtsam_rwhec.cli", "demo"],
+        [sys.executable, "-m", "gtsam_rwhec", "demo"],
         capture_output=True,
         text=True,
         encoding="utf-8",

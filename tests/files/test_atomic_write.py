@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 import threading
 from pathlib import Path
 
 import pytest
+from places import REPOSITORY
 
-from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.files.atomic_write import atomic_stream, write_atomically
 
 
 def test_writes_and_replaces_with_ordinary_permissions(tmp_path: Path) -> None:
@@ -24,13 +27,13 @@ def test_writes_and_replaces_with_ordinary_permissions(tmp_path: Path) -> None:
 
 def test_a_folder_in_the_way_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "result.json").mkdir()
-    with pytest.raises(OSError, match="directory"):
+    with pytest.raises(FileFormatError, match="directory"):
         write_atomically(tmp_path / "result.json", b"new")
     assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
 
 
 def test_a_missing_folder_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FileFormatError, match=r"result.json cannot be written: No such file"):
         write_atomically(tmp_path / "nowhere" / "result.json", b"new")
 
 
@@ -51,3 +54,24 @@ def test_a_pipe_is_written_to(tmp_path: Path) -> None:
     write_atomically(pipe, b"new")
     reader.join(timeout=10)
     assert received == [b"new"]
+
+
+def test_an_error_in_the_block_leaves_what_was_there(tmp_path: Path) -> None:
+    (tmp_path / "log.mcap").write_bytes(b"old")
+    with pytest.raises(TypeError), atomic_stream(tmp_path / "log.mcap") as stream:
+        stream.write("new")  # type: ignore[arg-type]
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("log.mcap", b"old")]
+
+
+def test_nothing_else_in_the_package_writes_files() -> None:
+    """What opens a file to write, or hands a path to a library that does, goes through the functions above."""
+    writing = re.compile(
+        r"""open\([^)\n]*["'][wax]b?\+?["']|\.write_(text|bytes)\(|imwrite\(|\.to_csv\(|np\.save|json\.dump\("""
+    )
+    found = {
+        str(path.relative_to(REPOSITORY))
+        for package in ("gtsam_rwhec", "factors")
+        for path in (REPOSITORY / package).rglob("*.py")
+        if writing.search(path.read_text(encoding="utf-8"))
+    }
+    assert found == {"gtsam_rwhec/files/atomic_write.py"}

@@ -21,7 +21,7 @@ IMAGES = 12
 def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
     """Run the command to its end."""
     done = subprocess.run(
-        [sys.executable, "-m", "gtsam_rwhec.cli", *map(str, arguments)],
+        [sys.executable, "-m", "gtsam_rwhec", *map(str, arguments)],
         capture_output=True,
         text=True,
         encoding="utf-8",
@@ -104,6 +104,8 @@ def plain(text: str) -> str:
 def test_what_does_not_go_together_is_refused(log: Path, tmp_path: Path) -> None:
     assert "-o FOLDER" in plain(run("calibrate", log, "--rig", CELL / "rig.yaml", status=2).stderr)
     told = run("calibrate", log, "--rig", CELL / "rig.yaml", "-o", tmp_path, "--sigma", "0.1", status=2)
-    assert "--sigma: of a log, the rig file says this" in plain(told.stderr)
+    assert "--sigma: only for a folder of CSV files. For a log, the rig file says this: write it there." in plain(
+        told.stderr
+    )
     assert "needs a rig file" in run("calibrate", log, "-o", tmp_path / "out", status=2).stderr
     assert not (tmp_path / "out").exists()

@@ -44,7 +44,7 @@ def test_what_contradicts_is_named_with_its_exit_status_and_in_all_that_is_writt
         [
             sys.executable,
             "-m",
-            "gtsam_rwhec.cli",
+            "gtsam_rwhec",
             "calibrate",
             log,
             "--rig",

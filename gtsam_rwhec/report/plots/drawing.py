@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.atomic_write import write_atomically
 
 if TYPE_CHECKING:
@@ -70,10 +69,7 @@ def picture(
         yield figure
         content = io.BytesIO()
         figure.savefig(content, format="png", metadata={"Software": None})
-    try:
-        write_atomically(Path(path), content.getvalue())
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be written: {error.strerror or error}.") from error
+    write_atomically(path, content.getvalue())
 
 
 def say(axes: Axes, words: str) -> None:

@@ -1,0 +1,56 @@
+"""``gtsam-rwhec compare``: published methods side by side on one set of measurements."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
+from gtsam_rwhec.cli.failures import check_folder_of
+from gtsam_rwhec.cli.options import FOLDER_OF_CSV, KappaOption, ScaleOption, SensorsOption, SigmaOption, TargetsOption
+from gtsam_rwhec.cli.stage_display import StageDisplay
+
+
+def _names_of_methods(beginning: str) -> list[str]:
+    return [name for name in rw.methods.METHODS if name.startswith(beginning)]
+
+
+def compare(
+    folder: Annotated[Path, typer.Argument(help=f"A {FOLDER_OF_CSV}.")],
+    scale: ScaleOption = "known",
+    sigma: SigmaOption = None,
+    kappa: KappaOption = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A method to compare; give it again for each.", show_default="all", autocompletion=_names_of_methods
+        ),
+    ] = None,
+    targets: TargetsOption = "tag",
+    sensors: SensorsOption = "cam",
+    seed: Annotated[int, typer.Option(help="Seed of the methods that draw random numbers.")] = 0,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="File for all results (JSON).")] = None,
+) -> ExitStatus:
+    """Solve by every published method that applies; print cost, residuals, time and the gap to the certified bound."""
+    check_folder_of(output)
+    with StageDisplay() as stage, warnings.catch_warnings():
+        stage(f"reading {folder}")
+        problem = rw.read_csv(folder, scale, sigma, kappa, targets, sensors)
+        warnings.simplefilter("ignore", rw.errors.RwhecWarning)  # the methods' own words are in the report
+        comparison = rw.methods.compare(
+            problem,
+            rw.methods.MethodOptions(seed=seed),
+            methods=method,
+            progress=lambda name: stage(f"solving by {name}"),
+        )
+    try:
+        if output is not None:
+            rw.methods.write_comparison(comparison, output)
+            typer.echo(f"Written to {output}.", err=True)
+    finally:
+        rw.report.print_comparison(comparison)
+    return ExitStatus.NOT_CERTIFIED if comparison.solution is None else exit_status(comparison.solution)

@@ -1,0 +1,23 @@
+"""``gtsam-rwhec export``: the last stage of a log's calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.cli.stage_display import StageDisplay
+
+
+def export(
+    solved: Annotated[Path, typer.Argument(help="The clean.mcap that solve or calibrate wrote.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")],
+) -> ExitStatus:
+    """Last stage: launch file, tf, URDF, Kalibr camchain and plots from a solved log."""
+    with StageDisplay() as stage:
+        for path in rw.pipeline.export_solved(solved, output, progress=stage):
+            typer.echo(str(path))
+    return ExitStatus.DONE

@@ -1,0 +1,38 @@
+"""``gtsam-rwhec fetch``: public measurements to calibrate from."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.cli.stage_display import StageDisplay
+
+
+def utias(
+    destination: Annotated[Path, typer.Argument(help="Folder to write to; made if it is not there.")] = Path("utias"),
+    base_url: Annotated[
+        str | None,
+        typer.Option(help="Address of a mirror of the files.", show_default="the authors' repository on GitHub"),
+    ] = None,
+) -> ExitStatus:
+    """Download the real dataset of the RWHEC paper: 16 tags, 8 cameras, 3230 measurements, 1.4 MB.
+
+    Call it again to go on with an interrupted download; files that are there are verified and kept.
+    """
+    with StageDisplay() as stage:
+        fetched = rw.datasets.fetch_utias(
+            destination,
+            rw.datasets.UTIAS_URL if base_url is None else base_url,
+            lambda done, total, name: stage(f"downloading file {done + 1} of {total}: {name}"),
+        )
+    typer.echo(
+        f"{len(fetched.downloaded)} files downloaded to {fetched.folder}, {len(fetched.already_there)} were there; "
+        "all verified."
+    )
+    typer.echo(f"Next: gtsam-rwhec calibrate {shlex.quote(str(fetched.folder))} --scale shared")
+    return ExitStatus.DONE

@@ -1,0 +1,30 @@
+"""``gtsam-rwhec solve``: the third stage of a log's calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.cli.failures import said_in_the_report
+from gtsam_rwhec.cli.log_result import show
+from gtsam_rwhec.cli.options import RigOption
+from gtsam_rwhec.cli.stage_display import StageDisplay
+
+
+def solve(
+    cleaned: Annotated[Path, typer.Argument(help="The log that clean wrote.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for result.json and clean.mcap.")],
+    rig: RigOption = None,
+) -> ExitStatus:
+    """Third stage: the certified solution, refined, with covariances."""
+    with StageDisplay() as stage, said_in_the_report():
+        calibrated = rw.pipeline.solve_into(
+            cleaned, None if rig is None else rw.rig.read_rig(rig), output, progress=stage
+        )
+    status = show(calibrated)
+    typer.echo(f"Written: {output / rw.pipeline.RESULT_FILE}, {output / rw.pipeline.CLEAN_LOG}.", err=True)
+    return status
