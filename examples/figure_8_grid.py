@@ -30,10 +30,11 @@ def main() -> None:
     solution = rw.solve(problem)
     known = solution.identifiability
     print(solution.certificate)
-    print(f"The whole is {'' if known.is_unique else 'not '}determined. {known.explanation}")
+    print(f"The whole is {'' if known.is_unique else 'not '}determined. {known}")
     for (target, sensor), pair in known.pairs.items():
         if not pair.is_unique:
-            print(f"{target}-{sensor}, {pair.number_of_measurements} measurements: {'; '.join(pair.free_directions)}")
+            free = "; ".join(map(str, pair.free_directions))
+            print(f"{target}-{sensor}, {pair.number_of_measurements} measurements: {free}")
 
     targets = sorted(problem.targets, key=natural_key)
     sensors = sorted(problem.sensors, key=natural_key)

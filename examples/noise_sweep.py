@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solver import Multipliers, Start
 
 LOOKS = {
     "dual": BLUE,
@@ -41,14 +42,13 @@ def outcome(scale: rw.ScaleMode, degrees: float, measurements: int, seed: int) -
         c = rw.solve(simulation.problem).certificate
     except rw.errors.ScaleError:
         return "scale <= 0"
-    if "negative scale" in c.reason:  # a mirror image fits better than the best answer with a positive scale
+    if c.cause is rw.Cause.MIRROR_IMAGE:  # a mirror image fits better than the best answer with a positive scale
         return "scale <= 0"
     if not c.is_optimal:
-        return "not tight" if "not tight" in c.reason else "not decided"
-    for path in ("relaxation", "better start", "small dual"):
-        if path in c.path:
-            return path
-    return "dual"
+        return "not tight" if c.cause is rw.Cause.NOT_TIGHT else "not decided"
+    if c.path.start is not Start.SPECTRAL:
+        return "better start" if c.path.start is Start.BETTER else "relaxation"
+    return "dual" if c.path.multipliers is Multipliers.KKT else "small dual"
 
 
 def main() -> None:

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Motion, general
+from gtsam_rwhec.solver import Multipliers
 
 CASES = {
     "5 measurements": (5, Motion("general"), VERMILLION),
@@ -37,7 +38,7 @@ def tight(A: np.ndarray, B: np.ndarray, axes: np.ndarray, shifts: np.ndarray, ra
     problem = rw.Problem(scale="known", keep_measurements=False)
     problem.add("target", "sensor", A, perturbed, sigma=1.0, kappa=1.0)
     c = rw.solve(problem).certificate
-    return c.is_optimal and c.path.endswith(", dual"), c.is_optimal
+    return c.is_optimal and c.path.multipliers is Multipliers.KKT, c.is_optimal
 
 
 def widths(measurements: int, motion: Motion, degrees: np.ndarray, seed: int) -> list[float]:

@@ -9,12 +9,14 @@ from .problem import ScaleMode as ScaleMode
 from .problem import read_csv as read_csv
 
 # Solve it, or certify somebody's answer.
+from .identifiability import FreeDirection as FreeDirection
 from .identifiability import Identifiability as Identifiability
 from .identifiability import PairIdentifiability as PairIdentifiability
+from .solver import Cause as Cause
 from .solver import Certificate as Certificate
+from .solver import Residual as Residual
 from .solver import SolveOptions as SolveOptions
 from .solver import Status as Status
-from .solving import Residual as Residual
 from .solving import Solution as Solution
 from .solving import SolvedPart as SolvedPart
 from .solving import certify as certify

@@ -17,9 +17,9 @@ from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
 from gtsam_rwhec.simulate.transforms import inverse, pose, random_poses, rotations_of_vectors
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.descent import homogeneous
+from gtsam_rwhec.solver.forms import Forms
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations, vec
-from gtsam_rwhec.solver.search import Forms
 
 NOISE = Noise(0.01, 500.0)
 SEEDS = st.integers(0, 2**31 - 1)
@@ -243,7 +243,7 @@ def test_any_multipliers_bound_the_cost_at_any_rotations(mode: str, seed: int, s
     others = random_rotations(20 * form.rotations, generator).reshape(20, form.rotations, 3, 3)
     for rotations in (R, *others):
         x = homogeneous(rotations)
-        assert bound.lower <= x @ form.apply(x)
+        assert bound.lower_bound <= x @ form.apply(x)
 
 
 # -- exact data -------------------------------------------------------------------------------------

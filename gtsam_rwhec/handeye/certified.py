@@ -51,6 +51,6 @@ def certified(request: Request) -> Outcome[Array]:
         cost=solution.cost,
         cost_name="eq. 30, chordal" if known else "eq. 30, chordal, of X^-1 with t_C / scale",
         lower_bound=solution.certificate.lower_bound,
-        free_directions=tuple(solution.identifiability.free_directions),
+        free_directions=tuple(map(str, solution.identifiability.free_directions)),
         scale=scale,
     )

@@ -1,2 +1,5 @@
-from .identification import Identifiability as Identifiability
-from .identification import PairIdentifiability as PairIdentifiability
+from .free_directions import FreeDirection as FreeDirection
+from .free_directions import FreeKind as FreeKind
+from .free_directions import FreeReason as FreeReason
+from .verdicts import Identifiability as Identifiability
+from .verdicts import PairIdentifiability as PairIdentifiability

@@ -1,48 +1,165 @@
-"""Free directions in words: which frame, which axis, and why."""
+"""Free directions: how an answer may move while the measurements fit as well, up to their noise."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 
-#: A frame's share of a direction below this (of the largest share, radians weighed by a typical length) goes unsaid.
+#: A frame's share of a direction below this part of the largest share goes unsaid; directions of length 1 that turn the
+#: frames by less than this are called translations.
 SHARE = 0.05
+#: A sentence names this many frames and counts the others.
+NAMED = 4
 #: An axis within this angle of a coordinate axis is called by its name.
 AXIS_COSINE = np.cos(np.radians(8.0))
-
-#: A motion that turned by this much (rms) and is still lost in the noise did turn: it is the residuals that are large.
+#: Motion that turned by this much (root mean square) did turn, even where the residuals are as large as its turning.
 TURNED_RAD = np.radians(3.0)
 
+Twist = tuple[float, float, float, float, float, float]
 
-def reason_for(axes: int, turned_rad: float, residual_rad: float) -> str:
-    """Why something of a pair is free, in words.
+
+class FreeKind(StrEnum):
+    """What moves along a free direction."""
+
+    #: A frame turns; its translation, or another frame, may move along.
+    ROTATION = "rotation"
+    #: Frames translate, and nothing turns.
+    TRANSLATION = "translation"
+    #: A scale changes; frames may translate along.
+    SCALE = "scale"
+    #: A sensor's time offset changes.
+    TIME_OFFSET = "time_offset"
+    #: No direction at the answer: another answer, elsewhere, costs as little.
+    TWIN = "twin"
+    #: Read from a file whose format has words only; ``FreeDirection.words`` are those.
+    WORDS = "words"
+
+
+class FreeReason(StrEnum):
+    """Why a direction is free."""
+
+    #: Residuals as large as the motion: the poses contradict each other.
+    CONTRADICTION = "contradiction"
+    NO_ROTATION = "no_rotation"
+    ONE_AXIS = "one_axis"
+    #: The motion turned enough, and still the information is no more than noise alone would create.
+    NOISE = "noise"
+    #: Translations of the frames make up for a change of the scale.
+    COMPENSATED = "compensated"
+    #: The carriers stood still, as far as the noise of their poses lets tell.
+    STANDSTILL = "standstill"
+    #: Half turns, or a symmetric motion, fit two answers.
+    SYMMETRY = "symmetry"
+
+
+_BECAUSE = {
+    FreeReason.CONTRADICTION: "the rotation residuals are as large as the motion: check whether A or B is inverted and "
+    "the order of the quaternions",
+    FreeReason.NO_ROTATION: "the motion did not turn",
+    FreeReason.ONE_AXIS: "the motion turned about one axis only",
+    FreeReason.NOISE: "the measurements say no more about it than their noise would",
+    FreeReason.COMPENSATED: "with these motions, translations of the frames make up for it",
+    FreeReason.STANDSTILL: "the carriers moved no faster than the noise of their poses makes it seem",
+    FreeReason.SYMMETRY: "half turns, or a symmetric motion, fit both",
+}
+
+
+@dataclass(frozen=True)
+class FreeDirection:
+    """One direction in which the answer may move while the measurements fit as well, up to their noise.
+
+    The direction has length 1 where a rotation of 1 rad, a translation of ``length_m``, a scale times e, and a time
+    offset of 1 s each count as 1. Its sign is arbitrary. ``str()`` says it in a sentence.
+
+    Attributes
+    ----------
+    kind : FreeKind
+    frames : dict of str to (omega_x, omega_y, omega_z, v_x, v_y, v_z)
+        How each frame that takes part moves: the right perturbation T Expmap(xi), in GTSAM's order, in rad and m, in
+        the frame's own axes.
+    scale : float
+        Change of the logarithm of the shared scale.
+    own_scales : dict of str to float
+        Change of the logarithm of each target's own scale.
+    time_offsets_s : dict of str to float
+        Change of each sensor's time offset, in s.
+    length_m : float
+        How many metres count as one radian.
+    reason : FreeReason or None
+        None only for ``FreeKind.WORDS``.
+    words : str
+        The sentence in a file of format version 3 or older, which has nothing else; empty otherwise.
+    """
+
+    kind: FreeKind
+    reason: FreeReason | None
+    frames: dict[str, Twist] = field(default_factory=dict)
+    scale: float = 0.0
+    own_scales: dict[str, float] = field(default_factory=dict)
+    time_offsets_s: dict[str, float] = field(default_factory=dict)
+    length_m: float = 1.0
+    words: str = ""
+
+    def __str__(self) -> str:
+        if self.reason is None:
+            return self.words
+        because = _BECAUSE[self.reason]
+        if self.kind is FreeKind.TWIN:
+            return f"another answer, far from this one, costs the same: {because}"
+        first, *others = self._movements()
+        what = {FreeKind.ROTATION: "rotation of ", FreeKind.TRANSLATION: "translation of "}.get(self.kind, "change of ")
+        more = len(others) + 1 - NAMED
+        named = others[: NAMED - 1] + ([f"{more} more"] if more > 0 else [])
+        together = f", together with {_listed(named)}" if named else ""
+        return f"{what}{first}{together}: {because}"
+
+    def _movements(self) -> Iterator[str]:
+        """What moves, that of the direction's kind first."""
+        twists = {name: np.array(twist) / np.repeat([1.0, self.length_m], 3) for name, twist in self.frames.items()}
+        turns = {name: twist[:3] for name, twist in twists.items()}
+        shifts = {name: twist[3:] for name, twist in twists.items()}
+        changes = {"the scale": self.scale} | {f"the scale of {name}": x for name, x in self.own_scales.items()}
+        changes |= {f"the time offset of {name}": x for name, x in self.time_offsets_s.items()}
+        vectors = [*turns.values(), *shifts.values(), *changes.values()]
+        least = SHARE * max((float(np.linalg.norm(vector)) for vector in vectors), default=0.0)
+        turning = [name for name, omega in turns.items() if np.linalg.norm(omega) > least]
+        yield from (what for what, change in changes.items() if abs(change) > least)
+        for name in turning:
+            moves = " (its origin moves too)" if np.linalg.norm(shifts[name]) > least else ""
+            yield f"{name} about {_axis(turns[name])}{moves}"
+        for name, v in shifts.items():
+            if name not in turning and np.linalg.norm(v) > least:
+                yield f"{name} along {_axis(v)}"
+
+
+def reason_for(axes: int, turned_rad: float, residual_rad: float) -> FreeReason:
+    """Why something of a pair is free.
 
     Parameters
     ----------
     axes : int
         About how many axes its motion turned, beyond the noise: 0, 1, or 2 for two and more.
     turned_rad : float
-        Root mean square of its turning, noise or not.
+        Root mean square of its turning, noise included.
     residual_rad : float
         Root mean square of its rotation residuals.
     """
     if axes < 2 and turned_rad > TURNED_RAD and residual_rad > 0.5 * turned_rad:
-        return (
-            f"the residuals ({np.degrees(residual_rad):.0f} deg) are as large as the motion: is A or B inverted, "
-            "is the quaternions' order right?"
-        )
-    if axes == 0:
-        return "the motion did not turn"
-    if axes == 1:
-        return "the motion turned about one axis only"
-    return "the measurements say no more about it than their noise would"
+        return FreeReason.CONTRADICTION
+    return (FreeReason.NO_ROTATION, FreeReason.ONE_AXIS, FreeReason.NOISE)[axes]
 
 
-def describe(
-    names: tuple[str, ...], basis: Array, length_m: float, reasons: dict[str, str], scale_mode: str
-) -> list[str]:
-    """One sentence for each frame, and for each scale, that the directions move.
+def free_directions_of(
+    names: tuple[str, ...], basis: Array, length_m: float, reasons: Mapping[str, FreeReason]
+) -> tuple[FreeDirection, ...]:
+    """Records of the free directions that a basis spans: as many as it has columns, each as sparse as can be.
+
+    Rotations come first, apart from directions that turn nothing; of these, changes of scales come first.
 
     Parameters
     ----------
@@ -51,66 +168,93 @@ def describe(
     basis : (7 n + 1, k) array
         Free directions: [omega (rad), v (m), log own scale] for each frame, then the shared scale's logarithm.
     length_m : float
-        How many metres count as much as a radian.
-    reasons : dict of str to str
-        Why, for each frame (``reason_for``).
-    scale_mode : str
+        How many metres count as one radian.
+    reasons : dict of str to FreeReason
+        Of each frame (``reason_for``).
     """
-    n = len(names)
-    metric = np.r_[np.tile(np.r_[np.full(3, length_m), np.ones(3), length_m], n), length_m]
-    weighed, _ = np.linalg.qr(basis * metric[:, None])
-    frames = weighed[:-1].reshape(n, 7, basis.shape[1])
+    if basis.shape[1] == 0:
+        return ()
+    unit = np.r_[np.tile(np.r_[np.ones(3), np.full(3, length_m), 1.0], len(names)), 1.0]
+    weighed, _ = np.linalg.qr(basis / unit[:, None])
+    row = np.tile(np.arange(7), len(names))
+    is_turn, is_scale = np.r_[row < 3, False], np.r_[row == 6, True]
     # Directions that turn nothing come apart from those that do: the right singular vectors of the rotations' rows.
-    turning = frames[:, :3].reshape(3 * n, basis.shape[1])
-    _, s, Vt = np.linalg.svd(turning, full_matrices=True)
+    _, s, Vt = np.linalg.svd(weighed[is_turn], full_matrices=True)
     turns = np.zeros(len(Vt), dtype=bool)
     turns[: len(s)] = s > SHARE
-    still, turned = weighed @ Vt[~turns].T, weighed @ Vt[turns].T
-    sentences = []
-    for i, name in enumerate(names):
-        rows = slice(7 * i, 7 * i + 7)
-        words = []
-        axis = _axes(turned[rows][:3])
-        if axis:
-            moves = bool(np.linalg.norm(turned[rows][3:6]) > SHARE)
-            words.append(f"rotation about {axis}" + (" (its translation moves along)" if moves else ""))
-        axis = _axes(still[rows][3:6])
-        if axis:
-            words.append(f"translation along {axis}")
-        own = bool(np.abs(weighed[rows][6]).max(initial=0.0) > SHARE)
-        if own:
-            words.append("its scale")
-        if words:
-            of_frame = " of its own frame" if axis or "rotation" in words[0] else ""
-            sentences.append(f"{name}: {' and '.join(words)}{of_frame}; {reasons[name]}")
-    if scale_mode == "shared" and np.abs(weighed[-1]).max(initial=0.0) > SHARE:
-        sentences.append("scale: a change of it is made up for by the frames' translations on these motions")
-    if not sentences:
-        sentences.append("a combination of small changes of all frames; the measurements are hardly more than noise")
-    return sentences
+    turned = _sparse(weighed @ Vt[turns].T, [is_turn])
+    still = _sparse(weighed @ Vt[~turns].T, [is_scale, ~is_turn])
+    return tuple(
+        _record(names, column, length_m, reasons, is_turn, is_scale) for column in np.hstack([turned, still]).T
+    )
 
 
-def _axes(block: Array) -> str:
-    """Words for the span of a (3, k) block's columns: "z", "x and y", "(0.60, 0.80, 0.00)", "every axis"; or ""."""
-    if block.shape[1] == 0:
-        return ""
-    U, s, _ = np.linalg.svd(block)
-    rank = int((s > SHARE).sum())
-    if rank == 0:
-        return ""
-    if rank == 3:
-        return "every axis"
-    if rank == 2:
-        normal = U[:, 2]
-        k = int(np.abs(normal).argmax())
-        if abs(normal[k]) > AXIS_COSINE:
-            return " and ".join("xyz"[i] for i in range(3) if i != k)
-        return f"every axis but {_vector(normal)}"
-    direction = U[:, 0]
+def _sparse(columns: Array, rows_first: list[np.ndarray]) -> Array:
+    """Another basis (d, k) of the columns' span, by elimination: each column has a row that the others lack.
+
+    ``rows_first``: masks (d,) of rows among which to look for such a row, one mask after the other. The same span gives
+    the same basis, whatever ``columns`` it is told by.
+    """
+    done: dict[int, Array] = {}
+    for rows in rows_first:
+        while columns.shape[1]:
+            size = np.where(rows, np.linalg.norm(columns, axis=1), 0.0)
+            if size.max() <= SHARE:
+                break
+            pivot = int(np.argmax(size > 0.9 * size.max()))  # the first of several that are as large
+            along = np.linalg.svd(columns[pivot : pivot + 1])[2].T  # the first column is that row's, others lack it
+            new, columns = columns @ along[:, 0], columns @ along[:, 1:]
+            done = {row: column - new * (column[pivot] / new[pivot]) for row, column in done.items()} | {pivot: new}
+    return np.column_stack([*done.values(), columns]) if done else columns
+
+
+def _record(
+    names: tuple[str, ...],
+    column: Array,
+    length_m: float,
+    reasons: Mapping[str, FreeReason],
+    is_turn: np.ndarray,
+    is_scale: np.ndarray,
+) -> FreeDirection:
+    column = column / np.linalg.norm(column)
+    column = np.where(np.abs(column) < 1e-12, 0.0, column)  # rounding
+    column *= np.sign(column[np.abs(column).argmax()])
+    of_frame = column[:-1].reshape(-1, 7)
+    least = SHARE * np.abs(column).max()
+    if np.abs(column[is_turn]).max() > least:
+        kind = FreeKind.ROTATION
+    else:
+        kind = FreeKind.SCALE if np.abs(column[is_scale]).max() > least else FreeKind.TRANSLATION
+    taking_part = [reasons[name] for name, part in zip(names, of_frame, strict=True) if np.abs(part).max() > least]
+    reason = min(taking_part, key=list(FreeReason).index, default=FreeReason.NOISE)
+    if kind is FreeKind.SCALE and reason is FreeReason.NOISE:
+        reason = FreeReason.COMPENSATED
+    metric = np.repeat([1.0, length_m], 3)
+    frames = {name: part[:6] * metric for name, part in zip(names, of_frame, strict=True) if part[:6].any()}
+    return FreeDirection(
+        kind=kind,
+        reason=reason,
+        frames={name: _twist(xi) for name, xi in frames.items()},
+        scale=float(column[-1]) + 0.0,
+        own_scales={name: float(part[6]) for name, part in zip(names, of_frame, strict=True) if part[6]},
+        length_m=length_m,
+    )
+
+
+def _twist(xi: Array) -> Twist:
+    a, b, c, d, e, f = (xi + 0.0).tolist()  # no -0.0
+    return a, b, c, d, e, f
+
+
+def _axis(direction: Array) -> str:
+    """Words for an axis: "its own z axis", "(0.60, 0.80, 0.00) in its own frame"."""
+    direction = direction / np.linalg.norm(direction)
     k = int(np.abs(direction).argmax())
-    return "xyz"[k] if abs(direction[k]) > AXIS_COSINE else _vector(direction)
+    if abs(direction[k]) > AXIS_COSINE:
+        return f"its own {'xyz'[k]} axis"
+    rounded = np.round(direction * np.sign(direction[k]), 2) + 0.0  # no -0.00
+    return "(" + ", ".join(f"{x:.2f}" for x in rounded) + ") in its own frame"
 
 
-def _vector(direction: Array) -> str:
-    direction = direction * np.sign(direction[np.abs(direction).argmax()])
-    return "(" + ", ".join(f"{x + 0.0:.2f}" for x in np.round(direction, 2)) + ")"
+def _listed(words: list[str]) -> str:
+    return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))

@@ -25,7 +25,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.free_directions import describe, reason_for
+from gtsam_rwhec.identifiability.free_directions import FreeReason, free_directions_of, reason_for
 from gtsam_rwhec.identifiability.information import (
     Information,
     PairInformation,
@@ -34,6 +34,7 @@ from gtsam_rwhec.identifiability.information import (
     pair_information,
     prior_information,
 )
+from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiability
 from gtsam_rwhec.problem.moments import ONE, R_A, T_B
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.solver import arrow
@@ -44,61 +45,6 @@ from gtsam_rwhec.solver.residuals import PairPoses
 SIGNIFICANCE = 1e-3
 #: Above this many parameters the weakest directions are found by Lanczos on the arrow factor, not densely.
 DENSE_PARAMETERS = 400
-
-
-@dataclass(frozen=True)
-class PairIdentifiability:
-    """What one pair determines on its own.
-
-    Attributes
-    ----------
-    is_unique : bool
-    free_directions : list of str
-        In words.
-    rotation_axes : int
-        About how many axes its motion turned: 0, 1, or 2 for two and more (Corollary 2).
-    number_of_measurements : int
-    weakest : float
-        Information of the weakest direction, in units of what noise alone would create.
-    threshold : float
-        Up to which ``weakest`` counts as free.
-    """
-
-    is_unique: bool
-    free_directions: list[str]
-    rotation_axes: int
-    number_of_measurements: int
-    weakest: float
-    threshold: float
-
-
-@dataclass(frozen=True)
-class Identifiability:
-    """What a problem's measurements determine.
-
-    Attributes
-    ----------
-    is_unique : bool
-        Whether every frame and scale is determined.
-    free_directions : list of str
-        Each frame's free directions, in words.
-    weakest, threshold : float
-        As in ``PairIdentifiability``, for the whole.
-    pairs : dict of (target, sensor) to PairIdentifiability
-        Each pair on its own: the grid of the paper's Figure 8.
-    parts : tuple of tuple of str
-        Frames of each unconnected part.
-    explanation : str
-        How what a pair determines spreads, in words.
-    """
-
-    is_unique: bool
-    free_directions: list[str]
-    weakest: float
-    threshold: float
-    pairs: dict[Pair, PairIdentifiability]
-    parts: tuple[tuple[str, ...], ...]
-    explanation: str
 
 
 @dataclass(frozen=True)
@@ -137,20 +83,18 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
     noise = noise_level(part, J_t, J_R)
     pairs = pair_information(part, poses, noise)
     length = typical_length(part)
-    axes, turned = _rotation_axes(part, pairs.carrier_noise, noise.redundancy)
+    axes, turned = _rotation_axes(part, pairs.carrier_noise, noise.degrees_of_freedom)
     residual = np.sqrt(J_R / part.moments.kappa)  # J_R is sum kappa theta^2
     reasons = [reason_for(*of_pair) for of_pair in zip(axes, turned, residual, strict=True)]
-    of_each = _pairs(part, pairs, noise.redundancy, axes, reasons, length)
-    weak = _weakest_of_part(part, pairs, noise.redundancy)
-    free: list[str] = []
-    if weak.free.any():
-        # The pair that turned most speaks for a frame.
-        speaks = {
-            name: max((a, e) for e, (a, pair) in enumerate(zip(axes, part.pairs, strict=True)) if name in pair)
-            for name in part.free
-        }
-        seen = {name: reasons[e] for name, (_, e) in speaks.items()}
-        free = describe(part.free, weak.directions[:, weak.free], length, seen, part.scale)
+    of_each = _pairs(part, pairs, noise.degrees_of_freedom, axes, reasons, length)
+    weak = _weakest_of_part(part, pairs, noise.degrees_of_freedom)
+    # The pair that turned most speaks for a frame.
+    speaks = {
+        name: max((a, e) for e, (a, pair) in enumerate(zip(axes, part.pairs, strict=True)) if name in pair)
+        for name in part.free
+    }
+    seen = {name: reasons[e] for name, (_, e) in speaks.items()}
+    free = free_directions_of(part.free, weak.directions[:, weak.free], length, seen)
     return Identifiability(
         is_unique=not free,
         free_directions=free,
@@ -158,22 +102,10 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
         threshold=float(weak.thresholds[0]) if len(weak.values) else 0.0,
         pairs=of_each,
         parts=(part.names,),
-        explanation=_explanation(of_each, not free),
     )
 
 
-def free_directions_of(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Array:
-    """What ``identify`` puts in words, as numbers: a basis (7 n + 1, k) of the directions that are free at an answer.
-
-    [omega (rad), v (m), log own scale] for each of ``part.free``, then the shared scale's logarithm.
-    """
-    noise = noise_level(part, J_t, J_R)
-    weak = _weakest_of_part(part, pair_information(part, poses, noise), noise.redundancy)
-    directions: Array = weak.directions[:, weak.free]
-    return directions
-
-
-def _weakest_of_part(part: Part, pairs: PairInformation, redundancy: int) -> _Weak:
+def _weakest_of_part(part: Part, pairs: PairInformation, degrees_of_freedom: int) -> _Weak:
     """Rotations first; where they are all determined, the rest at those rotations, and else everything together."""
     index = {name: i for i, name in enumerate(part.free)}
     counts = np.zeros(len(index) + 1)
@@ -184,7 +116,7 @@ def _weakest_of_part(part: Part, pairs: PairInformation, redundancy: int) -> _We
     rotation_prior, translation_prior = prior_information(part)
     rotation_only = pairs.used & _IS_ROTATION
     turning = information(part, pairs.rotation, pairs.noise_rotation, rotation_only, rotation_prior)
-    tests = [_weakest(turning, counts, redundancy)]
+    tests = [_weakest(turning, counts, degrees_of_freedom)]
     if tests[0].free.any():
         everything = information(
             part,
@@ -193,26 +125,12 @@ def _weakest_of_part(part: Part, pairs: PairInformation, redundancy: int) -> _We
             pairs.used,
             rotation_prior + translation_prior,
         )
-        tests = [_weakest(everything, counts, redundancy)]
+        tests = [_weakest(everything, counts, degrees_of_freedom)]
     else:
         rest = pairs.used & ~_IS_ROTATION
         moving = information(part, pairs.translation, pairs.noise_translation, rest, translation_prior)
-        tests.append(_weakest(moving, counts, redundancy))
+        tests.append(_weakest(moving, counts, degrees_of_freedom))
     return min(tests, key=lambda test: test.ratio)
-
-
-def combined(results: list[Identifiability], components: tuple[tuple[str, ...], ...]) -> Identifiability:
-    """One result for parts that were solved apart."""
-    weakest = min(results, key=lambda r: r.weakest / max(r.threshold, 1e-300))
-    return Identifiability(
-        is_unique=all(r.is_unique for r in results),
-        free_directions=[direction for r in results for direction in r.free_directions],
-        weakest=weakest.weakest,
-        threshold=weakest.threshold,
-        pairs={pair: value for r in results for pair, value in r.pairs.items()},
-        parts=components,
-        explanation=" ".join(dict.fromkeys(r.explanation for r in results)),
-    )
 
 
 def typical_length(part: Part) -> float:
@@ -221,15 +139,15 @@ def typical_length(part: Part) -> float:
     return float(np.sqrt(max(square / float(part.moments.weight.sum()), 1e-12)))
 
 
-def _threshold(squares: Array | float, redundancy: int) -> Array:
-    if redundancy <= 0:  # the weights tell the noise, and nothing else does
+def _threshold(squares: Array | float, degrees_of_freedom: int) -> Array:
+    if degrees_of_freedom <= 0:  # the weights tell the noise, and nothing else does
         known: Array = np.asarray(chdtri(squares, SIGNIFICANCE) / squares)
         return known
-    result: Array = np.asarray(fdtri(squares, 0.5 * redundancy, 1.0 - SIGNIFICANCE))
+    result: Array = np.asarray(fdtri(squares, 0.5 * degrees_of_freedom, 1.0 - SIGNIFICANCE))
     return result
 
 
-def _rotation_axes(part: Part, noise: Array, redundancy: int) -> tuple[list[int], Array]:
+def _rotation_axes(part: Part, noise: Array, degrees_of_freedom: int) -> tuple[list[int], Array]:
     """About how many axes each pair's A turned (Corollary 2, tested against A's noise, (E,) rad^2): 0, 1 or 2;
     and by how much, root mean square, in rad.
 
@@ -240,11 +158,11 @@ def _rotation_axes(part: Part, noise: Array, redundancy: int) -> tuple[list[int]
     counts = part.moments.count
     s = np.linalg.svd(means, compute_uv=False)
     ratio = (1.0 - s**2) / (2.0 * noise[:, None])
-    excited = (ratio > _threshold(2.0 * counts, redundancy)[:, None]).sum(axis=1)
+    excited = (ratio > _threshold(2.0 * counts, degrees_of_freedom)[:, None]).sum(axis=1)
     return [(0, 1, 1, 2)[k] for k in excited], np.sqrt(np.maximum(1.0 - s[:, -1] ** 2, 0.0))
 
 
-def _weakest(info: Information, counts: Array, redundancy: int) -> _Weak:
+def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak:
     """The directions with the least information in units of noise; all that are free are among them."""
     leaf_unit = _unit(info.leaf_noise, info.used_leaf)
     border_unit = _unit(info.border_noise, info.used_border)
@@ -259,7 +177,7 @@ def _weakest(info: Information, counts: Array, redundancy: int) -> _Weak:
         values, reduced = _all(D, C, E, used)
     else:
         # No direction sums fewer than two squares, and the fewer, the higher its threshold.
-        values, reduced = _weakest_by_lanczos(D, C, E, used, float(_threshold(2.0, redundancy)))
+        values, reduced = _weakest_by_lanczos(D, C, E, used, float(_threshold(2.0, degrees_of_freedom)))
     vectors = np.zeros((len(used), len(values)))
     vectors[used] = reduced
     # Satterthwaite: a direction spread over frames sums as many squares as its shares of their measurements tell.
@@ -267,7 +185,7 @@ def _weakest(info: Information, counts: Array, redundancy: int) -> _Weak:
     share[:-1] = (vectors[:-1] ** 2).reshape(len(counts) - 1, 7, len(values)).sum(axis=1)
     share[-1] = vectors[-1] ** 2
     squares = 1.0 / np.maximum((share**2 / (2.0 * counts[:, None])).sum(axis=0), 1e-300)
-    thresholds = _threshold(squares, redundancy)
+    thresholds = _threshold(squares, degrees_of_freedom)
     order = np.argsort(values / thresholds)
     unit = np.r_[leaf_unit.ravel(), border_unit]
     return _Weak(values[order], thresholds[order], vectors[:, order] * unit[:, None])
@@ -315,11 +233,16 @@ def _all(D: Array, C: Array, E: Array, used: np.ndarray) -> tuple[Array, Array]:
 
 
 def _pairs(
-    part: Part, pairs: PairInformation, redundancy: int, axes: list[int], reasons: list[str], length: float
+    part: Part,
+    pairs: PairInformation,
+    degrees_of_freedom: int,
+    axes: list[int],
+    reasons: list[FreeReason],
+    length: float,
 ) -> dict[Pair, PairIdentifiability]:
     """Every pair on its own, all in one stack of 15 x 15 problems, asked as the whole is."""
     counts = part.moments.count
-    threshold = _threshold(2.0 * counts, redundancy)
+    threshold = _threshold(2.0 * counts, degrees_of_freedom)
     rotations = pairs.used & _IS_ROTATION
     turning, _ = _weakest_of_each(pairs.rotation, pairs.noise_rotation, rotations)
     settled = np.all(turning > threshold[:, None], axis=1, keepdims=False)
@@ -335,15 +258,13 @@ def _pairs(
         ends = {name: 7 * end for end, name in enumerate(pair) if name not in part.fixed}
         if not free.any() and axes[e] < 2 and len(ends) == 2:
             free[rest[e].argmin()] = True  # Corollary 4: about one axis a pair alone leaves a direction open
-        sentences: list[str] = []
-        if free.any():
-            rows = [first + k for first in ends.values() for k in range(7)] + [14]
-            sentences = describe(
-                tuple(ends), directions[e][rows][:, free], length, dict.fromkeys(ends, reasons[e]), part.scale
-            )
+        rows = [first + k for first in ends.values() for k in range(7)] + [14]
+        directions_free = free_directions_of(
+            tuple(ends), directions[e][rows][:, free], length, dict.fromkeys(ends, reasons[e])
+        )
         weakest = float(min(rest[e].min(), turning[e].min())) if settled[e] else float(rest[e].min())
         result[pair] = PairIdentifiability(
-            not free.any(), sentences, axes[e], int(counts[e]), weakest, float(threshold[e])
+            not free.any(), directions_free, axes[e], int(counts[e]), weakest, float(threshold[e])
         )
     return result
 
@@ -358,17 +279,3 @@ def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array
     values, vectors = np.linalg.eigh(matrix)
     foreign = (vectors**2 * ~used[:, :, None]).sum(axis=1) > 0.5
     return np.where(foreign, np.inf, values), vectors * unit[:, :, None]
-
-
-def _explanation(pairs: dict[Pair, PairIdentifiability], unique: bool) -> str:
-    alone = sum(pair.is_unique for pair in pairs.values())
-    if unique and len(pairs) == 1:
-        return "The pair's measurements determine both of its frames."
-    if unique and alone:
-        return (
-            f"{alone} of {len(pairs)} pairs determine their frames on their own; along the graph that determines "
-            "every frame (Theorem 3)."
-        )
-    if unique:
-        return "No pair determines its frames on its own; together the pairs determine every frame."
-    return "The measurements leave some directions free; see free_directions."

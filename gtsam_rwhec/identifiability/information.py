@@ -34,12 +34,12 @@ _UPPER = np.triu_indices(15, 1)
 class NoiseLevel:
     """Variance factors of each pair's residuals, (E,): 1 where the weights are true.
 
-    ``redundancy`` is equations minus unknowns of the whole part.
+    ``degrees_of_freedom`` is equations minus unknowns of the whole part.
     """
 
     translation: Array
     rotation: Array
-    redundancy: int
+    degrees_of_freedom: int
 
 
 def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
@@ -55,10 +55,10 @@ def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
         Of each pair, in the physical model.
     """
     counts, N = part.moments.count, part.number_of_measurements
-    redundancy = 6 * N - part.number_of_unknowns
-    if redundancy <= 0:  # nothing tells the noise but the weights
-        return NoiseLevel(np.ones(len(counts)), np.ones(len(counts)), redundancy)
-    correction = 6.0 * N / redundancy
+    degrees_of_freedom = 6 * N - part.number_of_unknowns
+    if degrees_of_freedom <= 0:  # nothing tells the noise but the weights
+        return NoiseLevel(np.ones(len(counts)), np.ones(len(counts)), degrees_of_freedom)
+    correction = 6.0 * N / degrees_of_freedom
     lengths = np.einsum("eii->e", part.moments.translation[:, T_B, T_B])
     factors = []
     for J, floor in (
@@ -67,7 +67,7 @@ def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
     ):
         of_part = correction * float(J.sum()) / (1.5 * N)
         factors.append(np.maximum(np.maximum(J / (1.5 * counts), of_part), floor))
-    return NoiseLevel(factors[0], factors[1], redundancy)
+    return NoiseLevel(factors[0], factors[1], degrees_of_freedom)
 
 
 @dataclass(frozen=True)

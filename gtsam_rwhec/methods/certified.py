@@ -34,7 +34,7 @@ def outcome_of(solution: Solution) -> Outcome[Poses]:
         solution.Y,
         solution.scale,
         cost=solution.cost,
-        cost_name=solution.certificate.objective,
+        cost_name=str(solution.certificate.objective),
         lower_bound=solution.certificate.lower_bound,
         is_optimal=solution.certificate.is_certified,
         notes=notes,

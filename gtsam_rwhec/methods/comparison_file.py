@@ -27,7 +27,7 @@ def comparison_fields(comparison: Comparison) -> dict[str, Any]:
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "conventions": {name: CONVENTIONS[name] for name in ("pose", "model", "scale", "units")},
-        "objective": None if certificate is None else certificate.objective,
+        "objective": None if certificate is None else str(certificate.objective),
         "certificate": None if certificate is None else str(certificate),
         "no_certificate": None if comparison.error is None else str(comparison.error),
         "lower_bound": None if certificate is None else _finite(certificate.lower_bound),

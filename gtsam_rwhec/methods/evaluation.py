@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.identifiability.identification import identify
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -13,7 +14,7 @@ from gtsam_rwhec.solver.full_form import add_priors, assemble, edge_slots, forms
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
 from gtsam_rwhec.solver.variables import as_variables, given_answer
-from gtsam_rwhec.solving.certified_solution import check_against_knowledge
+from gtsam_rwhec.solving.arguments import check_against_knowledge
 
 
 @dataclass(frozen=True)
@@ -25,14 +26,14 @@ class Evaluation:
     cost : float
         J (eq. 18), priors included; turned round where the certified solver turns it round.
     residuals : dict of (target, sensor) to Residual
-    free_directions : tuple of str
-        What the measurements leave undetermined, in words, judged by this answer's residuals: where they are far larger
+    free_directions : tuple of FreeDirection
+        What the measurements leave undetermined, judged by this answer's residuals: where they are far larger
         than the noise, more counts as free.
     """
 
     cost: float
     residuals: dict[Pair, Residual]
-    free_directions: tuple[str, ...]
+    free_directions: tuple[FreeDirection, ...]
 
 
 def evaluate(
@@ -56,7 +57,7 @@ def evaluate(
     check_against_knowledge(problem, X, Y, scale)
     cost = 0.0
     residuals: dict[Pair, Residual] = {}
-    free: list[str] = []
+    free: list[FreeDirection] = []
     for part in parts:
         answer = given_answer(part, X, Y, scale)
         translation, rotation = forms_of_edges(part)

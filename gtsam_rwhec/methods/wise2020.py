@@ -74,7 +74,7 @@ def certified_rotations(form: UnitForm) -> CertifiedRotations:
     best = min(ends, key=lambda end: end.cost)
     r = vec(best.R).ravel()
     of_answer = kkt_multipliers(best.R, reduced.apply(np.append(r, 1.0))[:-1].reshape(-1, 9))
-    bounds = [lower_bound(reduced, multipliers, r).lower for multipliers in (relaxation.multipliers, of_answer)]
+    bounds = [lower_bound(reduced, multipliers, r).lower_bound for multipliers in (relaxation.multipliers, of_answer)]
     bounds.append(_relaxation_bound(Q, relaxation))
     values = np.linalg.eigvalsh(relaxation.X)
     return CertifiedRotations(best.R, best.cost, max(bounds), float(max(values[-2], 0.0) / values[-1]))

@@ -34,5 +34,5 @@ def _warnings(solved: Solved) -> tuple[str, ...]:
     if not certificate.is_certified:
         said.append(f"not certified: {' '.join(certificate.reason.split())}")
     if solved.refined.free_directions:
-        said.append(f"the motion does not determine {'; '.join(solved.refined.free_directions)}")
+        said.append(f"the motion does not determine {'; '.join(map(str, solved.refined.free_directions))}")
     return tuple(said)

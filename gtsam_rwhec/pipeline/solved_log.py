@@ -88,11 +88,11 @@ def write_solved(
             CERTIFICATE_METADATA,
             {
                 "status": certificate.status.value,
-                "objective": certificate.objective,
+                "objective": str(certificate.objective),
                 "cost": repr(certificate.cost),
                 "lower_bound": repr(certificate.lower_bound),
                 "relative_gap": repr(certificate.relative_gap),
-                "free_directions": "; ".join(refined.free_directions),
+                "free_directions": "; ".join(map(str, refined.free_directions)),
             },
         )
         out.attachment(RESULT_FILE, "application/json", refined_json(refined, calibrated.log), first_ns)

@@ -9,9 +9,10 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.exact_scales import with_exact_scales
+from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.search import Found, Search
+from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables
 
 #: Above this many free frames a gap is left open on the way: the semidefinite relaxation would take most of the time,
@@ -57,18 +58,14 @@ def certified_fit(problem: Problem, previous: Fit | None) -> Fit:
 
 
 def _solve(part: Part, previous: Fit | None) -> tuple[Answer, bool]:
-    search = Search(part, SolveOptions(max_dense_frames=FRAMES_RELAXED))
+    search = Search.of(part, SolveOptions(max_dense_frames=FRAMES_RELAXED))
     found: Found | None = None
     if previous is not None and all(name in previous.poses for name in part.free):
         start = np.array([previous.poses[name][:3, :3] for name in part.free]).reshape(-1, 3, 3)
         found = search.run("local", rotations_as_variables(part, start))
-    if found is None or not _is_closed(search, found):
+    if found is None or not found.is_closed:
         again = search.run("auto", None)
         if found is None or again.cost < found.cost:
             found = again
     found = search.with_positive_scale(found)
-    return with_exact_scales(part, answer_of(part, search.form, found.R)), _is_closed(search, found)
-
-
-def _is_closed(search: Search, found: Found) -> bool:
-    return found.cost - found.lower <= search.tolerance(found.cost)
+    return with_exact_scales(part, answer_of(part, search.form, found.R)), found.is_closed

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.identification import free_directions_of, identify, typical_length
+from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind, FreeReason
+from gtsam_rwhec.identifiability.identification import identify, typical_length
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.weighting import VarianceFactors
@@ -21,13 +22,13 @@ MOVED = 4.0
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Free directions: basis (d, k) over ``Variables.unknown``; sentences; unit (d,): what counts as one of each.
+    """Free directions: basis (d, k) over ``Variables.unknown`` and as records; unit (d,): what counts as one of each.
 
     ``shrinkage``: see ``free_offsets``.
     """
 
     basis: Array
-    sentences: list[str]
+    directions: tuple[FreeDirection, ...]
     unit: Array
     shrinkage: dict[str, float]
 
@@ -47,7 +48,7 @@ def free_space_of(
     place = dict(zip(unknown, np.cumsum([0, *unknown.values()])[:-1], strict=True))
     size = sum(unknown.values())
     unit = np.ones(size)
-    columns, sentences = [], []
+    directions: list[FreeDirection] = []
     for part in parts:
         scale = _scales_of(part, state)
         answer = given_answer(part, state.X, state.Y, scale)
@@ -56,32 +57,29 @@ def free_space_of(
         if fitted is not None:  # what these factors predict, 3 / 2 a measurement
             factors = np.array([fitted.of[pair] for pair in part.pairs])
             J_R, J_t = 1.5 * part.moments.count * factors[:, 0], 1.5 * part.moments.count * factors[:, 1]
+        directions += identify(part, poses, J_t, J_R).free_directions
         length = typical_length(part)
-        basis = free_directions_of(part, poses, J_t, J_R)
-        mapped = np.zeros((size, basis.shape[1]))
-        for i, name in enumerate(part.free):
-            rows = slice(place[name], place[name] + 6)
-            mapped[rows] = basis[7 * i : 7 * i + 6]
-            unit[rows] = np.r_[np.ones(3), np.full(3, length)]
-            own = f"scale:{name}"
-            if own in place:  # d alpha = alpha d log alpha
-                mapped[place[own]] = state.scales[own] * basis[7 * i + 6]
-                unit[place[own]] = state.scales[own]
-        if "scale" in place:
-            mapped[place["scale"]] = state.scales["scale"] * basis[-1]
-            unit[place["scale"]] = state.scales["scale"]
-        columns.append(mapped)
-        if basis.shape[1]:
-            sentences += identify(part, poses, J_t, J_R).free_directions
-    still, more, shrinkage = free_offsets(data, variables)
-    for name in still:
-        columns.append(np.zeros((size, 1)))
-        columns[-1][place[name]] = 1.0
-    sentences += more
-    return FreeSpace(np.hstack(columns) if columns else np.zeros((size, 0)), sentences, unit, shrinkage)
+        for name in part.free:
+            unit[place[name] : place[name] + 6] = np.r_[np.ones(3), np.full(3, length)]
+    offsets, shrinkage = free_offsets(data, variables)
+    directions += offsets
+    for name, scale in state.scales.items():
+        if name in place:
+            unit[place[name]] = scale
+    basis = np.zeros((size, len(directions)))
+    for direction, column in zip(directions, basis.T, strict=True):
+        for name, xi in direction.frames.items():
+            column[place[name] : place[name] + 6] = xi
+        changes = {"scale": direction.scale} | {f"scale:{name}": x for name, x in direction.own_scales.items()}
+        for name, change in changes.items():
+            if name in place:  # d alpha = alpha d log alpha
+                column[place[name]] = state.scales[name] * change
+        for sensor, change_s in direction.time_offsets_s.items():
+            column[place[f"time_offset:{sensor}"]] = change_s
+    return FreeSpace(basis, tuple(directions), unit, shrinkage)
 
 
-def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[str], list[str], dict[str, float]]:
+def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[FreeDirection], dict[str, float]]:
     """Time offsets that the carriers' motion does not tell.
 
     An offset shows as far as the carrier moves while the sensor looks. Its velocity comes from noisy poses: where its
@@ -90,13 +88,12 @@ def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[str],
 
     Returns
     -------
-    names : list of str
-        Of the offsets that are free.
-    sentences : list of str
+    free : list of FreeDirection
     shrinkage : dict of str to float
         Of the others: by what part noise in the velocity pulls the offset towards zero.
     """
-    names, sentences, shrinkage = [], [], {}
+    free: list[FreeDirection] = []
+    shrinkage: dict[str, float] = {}
     for name in variables.offsets:
         sensor = name.partition(":")[2]
         squares, noise = np.zeros(2), np.zeros(2)
@@ -112,13 +109,10 @@ def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[str],
                 )
             noise += weight * item.paths.leverage.sum() * variance
         if (squares <= MOVED * noise + 1e-18 * np.maximum(squares.max(), 1.0)).all():
-            names.append(name)
-            sentences.append(
-                f"{name.replace(':', ' of ')}: the carriers moved no faster than the noise of their poses makes it seem"
-            )
+            free.append(FreeDirection(FreeKind.TIME_OFFSET, FreeReason.STANDSTILL, time_offsets_s={sensor: 1.0}))
         else:
             shrinkage[name] = float(noise.sum() / squares.sum())
-    return names, sentences, shrinkage
+    return free, shrinkage
 
 
 def _scales_of(part: Part, state: State) -> float | dict[str, float]:

@@ -12,6 +12,7 @@ from scipy.special import chdtri, fdtri
 from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.geometry.pose_covariances import error_of, relative_jacobian, standard_deviations
 from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
@@ -64,8 +65,8 @@ class RefinedPoses:
     moved : dict of str to Movement
     inlier_counts : dict of (target, sensor) to (int, int)
         Inliers, and measurements, with robust="gnc"; else empty.
-    free_directions : list of str
-        In words; empty where everything is determined.
+    free_directions : tuple of FreeDirection
+        Empty where everything is determined.
     """
 
     X: dict[str, gtsam.Pose3]
@@ -80,7 +81,7 @@ class RefinedPoses:
     iterations: int
     moved: dict[str, Movement]
     inlier_counts: dict[Pair, tuple[int, int]]
-    free_directions: list[str]
+    free_directions: tuple[FreeDirection, ...]
     joint: JointCovariance = field(repr=False)
 
     def covariance(self, *names: str) -> Array:

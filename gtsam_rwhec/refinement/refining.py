@@ -38,7 +38,8 @@ from gtsam_rwhec.refinement.refined import Movement, PairNoise, Refined
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.weighting import group_of
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solving.certified_solution import check_against_knowledge, solve
+from gtsam_rwhec.solving.arguments import check_against_knowledge
+from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.trajectories.local_paths import WINDOW_S
 
@@ -135,9 +136,10 @@ def refine(
             start = solve(selected(whole, inliers))
     tell("covariances")
     space = free_space_of(parts, variables, state, kept, None if options.robust in ("none", "gnc") else settled.factors)
-    if space.sentences:
+    if space.directions:
         warnings.warn(
-            "the measurements do not determine everything; variances are infinite along: " + "; ".join(space.sentences),
+            "the measurements do not determine everything; variances are infinite along: "
+            + "; ".join(map(str, space.directions)),
             NotUniqueWarning,
             stacklevel=2,
         )
@@ -162,7 +164,7 @@ def refine(
         moved=_moved(solution, state),
         inlier_counts={pair: (int(kept.sum()), len(kept)) for pair, kept in inliers.items()},
         inliers=inliers,
-        free_directions=space.sentences,
+        free_directions=space.directions,
         solution=start,
         options=options,
         joint=joint,

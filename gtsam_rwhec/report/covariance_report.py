@@ -52,8 +52,8 @@ def print_refined(refined: Refined, console: Console | None = None) -> None:
         console.print(noise)
     for sentence in refined_sentences(refined):
         console.print(Text(sentence), soft_wrap=not console.is_terminal)
-    for sentence in refined.free_directions:
-        console.print(Text(f"Not determined: {sentence}", style="bold red"), soft_wrap=not console.is_terminal)
+    for direction in refined.free_directions:
+        console.print(Text(f"Not determined: {direction}", style="bold red"), soft_wrap=not console.is_terminal)
 
 
 def refined_sentences(refined: Refined) -> list[str]:

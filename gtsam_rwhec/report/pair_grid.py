@@ -11,7 +11,7 @@ from rich.style import Style
 from rich.text import Text
 
 from gtsam_rwhec.files.natural_order import natural_key
-from gtsam_rwhec.identifiability.identification import Identifiability
+from gtsam_rwhec.identifiability.verdicts import Identifiability
 from gtsam_rwhec.problem.pairs import Pair
 
 

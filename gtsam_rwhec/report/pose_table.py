@@ -14,7 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from gtsam_rwhec.files.natural_order import natural_key
-from gtsam_rwhec.solving.solution import Residual, Solution
+from gtsam_rwhec.solver.residuals import Residual
+from gtsam_rwhec.solving.solution import Solution
 
 POSE_LEGEND = (
     "Translations in metres; rotations as roll, pitch, yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll). Residuals: root "

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from gtsam_rwhec.files.natural_order import natural_key
-from gtsam_rwhec.solving.solution import Certificate, Solution, Status
+from gtsam_rwhec.solver.cause import Status
+from gtsam_rwhec.solver.certificate import Certificate
+from gtsam_rwhec.solving.solution import Solution
 
 
 def summary_sentence(solution: Solution) -> str:
@@ -32,7 +34,7 @@ def certificate_sentence(certificate: Certificate) -> str:
         return f"Certified, but not unique: {proof}, yet others cost as little, up to noise."
     if certificate.status is Status.GAP:
         return f"Not certified: {proof}; {certificate.reason}."
-    return f"Not certified: this answer costs {certificate.cost:.10g}, and no bound was found; {certificate.reason}."
+    return f"Not certified: this answer costs {certificate.cost:.10g}; {certificate.reason}."
 
 
 def identifiability_sentences(solution: Solution) -> Iterator[str]:
@@ -73,8 +75,8 @@ def weights_sentence(solution: Solution) -> str:
     """What the cost may be compared with."""
     if solution.is_relative:
         return "Weights: sigma or kappa was not given; 1 (m) stood in for it, and costs and covariances are relative."
-    if solution.certificate.objective.startswith("the equation turned round"):
-        return "Weights: as given; the cost is of the equation turned round, and no chi-square."
+    if solution.certificate.objective.form == "inverse":
+        return "Weights: as given; the cost is that of the inverse equation B X^-1 = Y^-1 A, which is no chi-square."
     return "Weights: as given; if they are true, the cost is half a chi-square."
 
 

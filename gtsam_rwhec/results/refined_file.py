@@ -26,6 +26,7 @@ from gtsam_rwhec.results.schema import (
 )
 from gtsam_rwhec.results.solution_file import (
     fields_of,
+    in_words,
     pose_from_file,
     pose_to_file,
     read_result,
@@ -109,7 +110,7 @@ def refined_of(result: ResultFile, path: str | Path) -> RefinedPoses:
         iterations=fields.iterations,
         moved={frame.name: Movement(frame.moved_mm, frame.moved_deg) for frame in fields.frames},
         inlier_counts={Pair(p.target, p.sensor): p.inliers for p in fields.pairs if p.inliers is not None},
-        free_directions=list(fields.free_directions),
+        free_directions=in_words(fields.free_directions),
         joint=_joint_from_file(fields.joint),
     )
 
@@ -126,7 +127,7 @@ def _to_file(refined: Refined) -> RefinedFields:
         cost=refined.cost,
         initial_cost=refined.initial_cost,
         iterations=refined.iterations,
-        free_directions=tuple(refined.free_directions),
+        free_directions=tuple(map(str, refined.free_directions)),
         frames=tuple(_frame_to_file(refined, name) for name in refined.moved),
         pairs=tuple(
             RefinedPair(

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
 
 from gtsam_rwhec.results.stage_reports import LogFields
-from gtsam_rwhec.solver.certificate import Status
+from gtsam_rwhec.solver.cause import Status
 
 FORMAT: Final = "gtsam-rwhec result"
 FORMAT_VERSION: Final = 3

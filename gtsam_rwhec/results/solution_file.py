@@ -17,7 +17,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.identifiability.identification import Identifiability, PairIdentifiability
+from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind
+from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiability
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.results.schema import (
@@ -33,7 +34,11 @@ from gtsam_rwhec.results.schema import (
     ResultFile,
     Scale,
 )
-from gtsam_rwhec.solving.solution import Certificate, Residual, Solution, SolvedPart
+from gtsam_rwhec.solver.cause import Cause, SearchPath
+from gtsam_rwhec.solver.certificate import Certificate, Objective
+from gtsam_rwhec.solver.parts import Kind
+from gtsam_rwhec.solver.residuals import Residual
+from gtsam_rwhec.solving.solution import Solution, SolvedPart
 
 
 class _Header(BaseModel):
@@ -170,10 +175,10 @@ def fields_of(solution: Solution) -> ResultFile:
         certificate=_certificate_to_file(solution.certificate),
         identifiability=IdentifiabilityFields(
             is_unique=identifiability.is_unique,
-            free_directions=tuple(identifiability.free_directions),
+            free_directions=tuple(map(str, identifiability.free_directions)),
             weakest=identifiability.weakest,
             threshold=identifiability.threshold,
-            explanation=identifiability.explanation,
+            explanation=str(identifiability),
             parts=identifiability.parts,
         ),
         pairs=tuple(
@@ -184,7 +189,7 @@ def fields_of(solution: Solution) -> ResultFile:
                 translation_rms_m=residual.translation_rms_m,
                 rotation_rms_rad=residual.rotation_rms_rad,
                 is_unique=identifiability.pairs[pair].is_unique,
-                free_directions=tuple(identifiability.pairs[pair].free_directions),
+                free_directions=tuple(map(str, identifiability.pairs[pair].free_directions)),
                 rotation_axes=identifiability.pairs[pair].rotation_axes,
                 weakest=identifiability.pairs[pair].weakest,
                 threshold=identifiability.pairs[pair].threshold,
@@ -201,13 +206,13 @@ def solution_of(file: ResultFile) -> Solution:
     """The certified solution among a file's fields."""
     identifiability = Identifiability(
         is_unique=file.identifiability.is_unique,
-        free_directions=list(file.identifiability.free_directions),
+        free_directions=in_words(file.identifiability.free_directions),
         weakest=file.identifiability.weakest,
         threshold=file.identifiability.threshold,
         pairs={
             Pair(pair.target, pair.sensor): PairIdentifiability(
                 is_unique=pair.is_unique,
-                free_directions=list(pair.free_directions),
+                free_directions=in_words(pair.free_directions),
                 rotation_axes=pair.rotation_axes,
                 number_of_measurements=pair.number_of_measurements,
                 weakest=pair.weakest,
@@ -216,7 +221,6 @@ def solution_of(file: ResultFile) -> Solution:
             for pair in file.pairs
         },
         parts=file.identifiability.parts,
-        explanation=file.identifiability.explanation,
     )
     return Solution(
         X={pose.child: pose_from_file(pose) for pose in file.targets},
@@ -235,6 +239,11 @@ def solution_of(file: ResultFile) -> Solution:
         },
         parts=tuple(SolvedPart(part.names, _certificate_from_file(part.certificate)) for part in file.parts),
     )
+
+
+def in_words(sentences: tuple[str, ...]) -> tuple[FreeDirection, ...]:
+    """Free directions of a format that has them in words only."""
+    return tuple(FreeDirection(FreeKind.WORDS, None, words=words) for words in sentences)
 
 
 def scale_to_file(mode: ScaleMode, scale: float | Mapping[str, float]) -> Scale:
@@ -267,12 +276,30 @@ def pose_from_file(pose: Pose) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3(np.array(pose.rotation_matrix)), np.array(pose.translation_m))
 
 
+#: The objectives as formats up to version 3 have them.
+_FORMS: tuple[tuple[Kind, str], ...] = (
+    (
+        "direct",
+        "Problem 3: half the squared residuals of A X = Y B, R_A t_X + alpha t_A - t_Y - R_Y t_B over sigma and "
+        "R_A R_X - R_Y R_B times the square root of kappa",
+    ),
+    (
+        "inverse",
+        "the equation turned round: half the squared residuals of B X^-1 = Y^-1 A, with each t_B divided by its "
+        "scale (refine for the exact per-target model)",
+    ),
+)
+_OBJECTIVES = {
+    text + priors: Objective(form, bool(priors)) for form, text in _FORMS for priors in ("", ", and the priors")
+}
+
+
 def _certificate_to_file(certificate: Certificate) -> CertificateFields:
     return CertificateFields(
         status=certificate.status,
         reason=certificate.reason,
-        objective=certificate.objective,
-        path=certificate.path,
+        objective=next(text for text, objective in _OBJECTIVES.items() if objective == certificate.objective),
+        path=str(certificate.path),
         cost=certificate.cost,
         lower_bound=certificate.lower_bound,
         float_bound=certificate.float_bound,
@@ -286,9 +313,9 @@ def _certificate_to_file(certificate: Certificate) -> CertificateFields:
 def _certificate_from_file(fields: CertificateFields) -> Certificate:
     return Certificate(
         status=fields.status,
-        reason=fields.reason,
-        objective=fields.objective,
-        path=fields.path,
+        cause=Cause.NOT_RECORDED,
+        objective=_OBJECTIVES[fields.objective],
+        path=SearchPath.parse(fields.path),
         cost=fields.cost,
         lower_bound=fields.lower_bound,
         float_bound=fields.float_bound,
@@ -296,4 +323,5 @@ def _certificate_from_file(fields: CertificateFields) -> Certificate:
         tolerance=fields.tolerance,
         is_relative=fields.is_relative,
         seconds=dict(fields.seconds),
+        words=fields.reason,
     )

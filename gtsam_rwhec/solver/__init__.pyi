@@ -1,3 +1,9 @@
+from .cause import Cause as Cause
+from .cause import Multipliers as Multipliers
+from .cause import SearchPath as SearchPath
+from .cause import Start as Start
+from .cause import Status as Status
 from .certificate import Certificate as Certificate
-from .certificate import Status as Status
+from .certificate import Objective as Objective
 from .options import SolveOptions as SolveOptions
+from .residuals import Residual as Residual

@@ -48,7 +48,7 @@ class Bound:
 
     Attributes
     ----------
-    lower : float
+    lower_bound : float
         Never above the optimum of the stored reduced form.
     value : float
         x' Z x, without any allowance: what the bound would be in exact arithmetic with Z_rr positive definite.
@@ -62,7 +62,7 @@ class Bound:
         Where Z_rr is negative: an eigenvector, for a better start.
     """
 
-    lower: float
+    lower_bound: float
     value: float
     definite: bool
     semidefinite: bool

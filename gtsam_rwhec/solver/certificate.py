@@ -3,20 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import StrEnum
+
+from gtsam_rwhec.solver.cause import Cause, SearchPath, Status
+from gtsam_rwhec.solver.parts import Kind
 
 
-class Status(StrEnum):
-    """What a certificate says."""
+@dataclass(frozen=True)
+class Objective:
+    """Which cost a certificate is about.
 
-    #: The answer is proven optimal, and the measurements determine it.
-    CERTIFIED = "certified"
-    #: The cost is proven optimal, but other answers cost the same, up to noise: some direction is free.
-    CERTIFIED_NOT_UNIQUE = "certified_not_unique"
-    #: The bound is true but below the cost: the answer may or may not be optimal.
-    GAP = "gap"
-    #: No bound, or no critical point, was found.
-    FAILED = "failed"
+    Attributes
+    ----------
+    form : "direct" or "inverse"
+        "direct" is the cost of A X = Y B (eq. 18). "inverse" is the cost of B X^-1 = Y^-1 A, which a scale for each
+        target, and priors on translations with an unknown scale, need (DESIGN facts 7 and 11): half of it is no
+        chi-square, and refining finds the exact model's optimum from there.
+    has_priors : bool
+        Whether priors are part of it.
+    """
+
+    form: Kind
+    has_priors: bool
+
+    def __str__(self) -> str:
+        return _OBJECTIVES[self.form] + (", and the priors" if self.has_priors else "")
+
+
+_OBJECTIVES: dict[Kind, str] = {
+    "direct": "Problem 3: half the squared residuals of A X = Y B, R_A t_X + alpha t_A - t_Y - R_Y t_B over sigma and "
+    "R_A R_X - R_Y R_B times the square root of kappa",
+    "inverse": "half the squared residuals of the inverse equation B X^-1 = Y^-1 A, with each t_B divided by its scale "
+    "(refine for the exact per-target model)",
+}
 
 
 @dataclass(frozen=True)
@@ -26,13 +44,14 @@ class Certificate:
     Attributes
     ----------
     status : Status
-    reason : str
-        Why there is no certificate, or what the certificate needed, in words.
-    objective : str
-        Which cost it is about, in words.
-    path : str
-        What gave it: "dual" (the multipliers of R'R = I at a critical point), "small dual" (those of all 20
-        independent constraints), each possibly after "better start" or "relaxation".
+    cause : Cause
+        Why it is proven, or why not.
+    figures : dict of str to float
+        The numbers behind the cause, by name, as its sentence has them.
+    objective : Objective
+        Which cost it is about.
+    path : SearchPath
+        From which start the answer came, and which multipliers gave the bound.
     cost : float
         J at the answer (eq. 18; half a chi-square when the weights are true).
     lower_bound : float
@@ -47,12 +66,14 @@ class Certificate:
         Whether unit weights were used: the cost then has no statistical meaning.
     seconds : dict of str to float
         Time of each stage.
+    words : str
+        The reason in a file of format version 3 or older, which has no cause; empty otherwise.
     """
 
     status: Status
-    reason: str
-    objective: str
-    path: str
+    cause: Cause
+    objective: Objective
+    path: SearchPath
     cost: float
     lower_bound: float
     float_bound: float
@@ -60,6 +81,15 @@ class Certificate:
     tolerance: float
     is_relative: bool
     seconds: dict[str, float] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
+    words: str = ""
+
+    @property
+    def reason(self) -> str:
+        """The cause in a sentence."""
+        parts = int(self.figures.get("parts", 1))
+        apart = f"{parts} unconnected parts, solved apart; " if parts > 1 else ""
+        return self.words or apart + self.cause.sentence({"cost": self.cost} | self.figures)
 
     @property
     def is_certified(self) -> bool:
@@ -98,35 +128,31 @@ class Certificate:
             f"relative gap {self.relative_gap:.1e}; {self.reason}"
         )
 
-
-OBJECTIVES = {
-    "direct": "Problem 3: half the squared residuals of A X = Y B, R_A t_X + alpha t_A - t_Y - R_Y t_B over sigma and "
-    "R_A R_X - R_Y R_B times the square root of kappa",
-    "inverse": "the equation turned round: half the squared residuals of B X^-1 = Y^-1 A, with each t_B divided by "
-    "its scale (refine for the exact per-target model)",
-}
-
-
-def combined(certificates: list[Certificate]) -> Certificate:
-    """One certificate for parts that were solved apart: costs and bounds add, the worst status counts."""
-    if len(certificates) == 1:
-        return certificates[0]
-    order = list(Status)
-    worst = max(certificates, key=lambda c: order.index(c.status))
-    seconds: dict[str, float] = {}
-    for certificate in certificates:
-        for stage, duration in certificate.seconds.items():
-            seconds[stage] = seconds.get(stage, 0.0) + duration
-    return Certificate(
-        status=worst.status,
-        reason=f"{len(certificates)} unconnected parts, solved apart; {worst.reason}",
-        objective=worst.objective,
-        path=", ".join(dict.fromkeys(c.path for c in certificates)),
-        cost=sum(c.cost for c in certificates),
-        lower_bound=sum(c.lower_bound for c in certificates),
-        float_bound=sum(c.float_bound for c in certificates),
-        min_eigenvalue=min(c.min_eigenvalue for c in certificates),
-        tolerance=sum(c.tolerance for c in certificates),
-        is_relative=worst.is_relative,
-        seconds=seconds,
-    )
+    @staticmethod
+    def merged(certificates: list[Certificate]) -> Certificate:
+        """One certificate for parts that were solved apart: costs and bounds add, the worst cause counts."""
+        if len(certificates) == 1:
+            return certificates[0]
+        statuses, causes = list(Status), list(Cause)
+        worst = max(certificates, key=lambda c: (statuses.index(c.status), causes.index(c.cause)))
+        seconds: dict[str, float] = {}
+        for certificate in certificates:
+            for stage, duration in certificate.seconds.items():
+                seconds[stage] = seconds.get(stage, 0.0) + duration
+        return Certificate(
+            status=worst.status,
+            cause=worst.cause,
+            objective=Objective(
+                "inverse" if any(c.objective.form == "inverse" for c in certificates) else "direct",
+                any(c.objective.has_priors for c in certificates),
+            ),
+            path=worst.path,
+            cost=sum(c.cost for c in certificates),
+            lower_bound=sum(c.lower_bound for c in certificates),
+            float_bound=sum(c.float_bound for c in certificates),
+            min_eigenvalue=min(c.min_eigenvalue for c in certificates),
+            tolerance=sum(c.tolerance for c in certificates),
+            is_relative=worst.is_relative,
+            seconds=seconds,
+            figures={"cost": worst.cost} | worst.figures | {"parts": float(len(certificates))},
+        )

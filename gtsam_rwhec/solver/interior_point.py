@@ -21,6 +21,7 @@ import numpy as np
 import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.cause import Start
 from gtsam_rwhec.solver.local_blocks import gram, scatter, traces
 from gtsam_rwhec.solver.rotations import CONSTRAINTS
 
@@ -39,8 +40,8 @@ class Relaxation:
     primal, dual : float
         <Q', X> and gamma.
     iterations : int
-    solver : str
-        "interior point (blocks)" or "Clarabel".
+    solver : Start
+        Which method solved it.
     """
 
     X: Array
@@ -49,7 +50,7 @@ class Relaxation:
     primal: float
     dual: float
     iterations: int
-    solver: str
+    solver: Start
 
 
 def solve_by_blocks(
@@ -97,7 +98,7 @@ def solve_by_blocks(
         scale * float(np.vdot(C, X)),
         scale * point.gamma,
         iteration,
-        "interior point (blocks)",
+        Start.INTERIOR_POINT,
     )
 
 

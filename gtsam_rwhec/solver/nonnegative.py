@@ -19,12 +19,14 @@ import numpy as np
 from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.bound import Bound, lower_bound
+from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import Descent, descend
+from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.interior_point import Relaxation
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_with_scale
 from gtsam_rwhec.solver.rotations import random_rotations, vec
-from gtsam_rwhec.solver.search import Found, Search
+from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.small_dual import stationary_multipliers
 from gtsam_rwhec.solver.variables import answer_of
 from gtsam_rwhec.solver.verified import gamma
@@ -77,7 +79,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
             f"{search.form.rotations}, and the unconstrained optimum has a negative scale"
         )
     options, form = search.options, search.form
-    with search.stage("semidefinite relaxation"):
+    with search.stages.of("semidefinite relaxation"):
         relaxation = solve_with_scale(
             form.dense(),
             scale_row(form),
@@ -85,7 +87,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
             options.relaxation_tolerance,
             options.max_relaxation_iterations,
         )
-    with search.stage("descent"):
+    with search.stages.of("descent"):
         generator = np.random.default_rng(options.seed)
         starts = round_to_rotations(relaxation)
         starts += [random_rotations(form.rotations, generator) for _ in range(options.random_starts)]
@@ -93,9 +95,9 @@ def run_with_nonnegative_scale(search: Search) -> Found:
         # From where the scale is held at zero the cost may fall to the positive side.
         ends = _descend(form, starts + [end.R for end in at_zero], options.max_descent_iterations)
     positive = [end for end in ends if answer_of(search.part, form, end.R).scale > 0.0]
-    with search.stage("dual certificate"):
-        bound = max(_bounds(form, relaxation, at_zero[0].R), key=lambda each: each.lower)
-    lower = max(bound.lower, found.lower)  # more constraints, no lower optimum
+    with search.stages.of("dual certificate"):
+        bound = max(_bounds(form, relaxation, at_zero[0].R), key=lambda each: each.lower_bound)
+    lower = max(bound.lower_bound, found.lower_bound)  # more constraints, no lower optimum
     if not positive or positive[0].cost > at_zero[0].cost:
         proven = at_zero[0].cost - lower <= search.tolerance(at_zero[0].cost)
         raise ScaleError(
@@ -104,17 +106,21 @@ def run_with_nonnegative_scale(search: Search) -> Found:
             "negative scale): the noise drowns the scale"
         )
     best = positive[0]
-    return Found(
-        best.R,
-        best.cost,
-        min(lower, best.cost),
-        bound.value,
-        bound.definite,
-        bound.eigenvalue,
-        best.converged,
-        "relaxation with alpha >= 0",
-        "the unconstrained optimum has a negative scale; bounded by the relaxation with alpha >= 0",
+    constrained = Found(
+        R=best.R,
+        cost=best.cost,
+        lower_bound=min(lower, best.cost),
+        float_bound=bound.value,
+        is_definite=bound.definite,
+        eigenvalue=bound.eigenvalue,
+        tolerance=search.tolerance(best.cost),
+        path=SearchPath(Start.NONNEGATIVE_SCALE, Multipliers.RELAXATION),
+        cause=Cause.NOT_TIGHT,
+        figures={"relaxation_cost": relaxation.dual},
     )
+    if constrained.is_closed:
+        return dataclasses.replace(constrained, cause=Cause.PROVEN_WITH_NONNEGATIVE_SCALE, figures={})
+    return constrained
 
 
 def without_scale(form: ReducedForm) -> ReducedForm:
@@ -143,7 +149,7 @@ def _bounds(form: ReducedForm, relaxation: Relaxation, at_zero: Array) -> list[B
         if point is r:
             multipliers = stationary_multipliers(held, at_zero, multipliers)
         bound = lower_bound(held, multipliers, point)
-        bounds.append(dataclasses.replace(bound, lower=bound.lower - _rounding(form, nu)))
+        bounds.append(dataclasses.replace(bound, lower_bound=bound.lower_bound - _rounding(form, nu)))
     return bounds
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.cause import Start
 from gtsam_rwhec.solver.interior_point import Relaxation, solve_by_blocks
 from gtsam_rwhec.solver.local_blocks import local_indices
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, project, unvec
@@ -82,7 +83,7 @@ def _relaxation(Q: Array, X: Array, y: Array, scale: float, nu: float, iteration
         float(np.vdot(Q, X)),
         scale * float(y[20 * n]),
         iterations,
-        "Clarabel",
+        Start.CLARABEL,
     )
 
 

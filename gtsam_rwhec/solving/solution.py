@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import gtsam
 
-from gtsam_rwhec.identifiability.identification import Identifiability, PairIdentifiability
+from gtsam_rwhec.identifiability.verdicts import Identifiability
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.solver.certificate import Certificate, Status
+from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.residuals import Residual
 
 
@@ -56,14 +56,3 @@ class Solution:
     identifiability: Identifiability
     residuals: dict[Pair, Residual]
     parts: tuple[SolvedPart, ...]
-
-
-__all__ = [
-    "Certificate",
-    "Identifiability",
-    "PairIdentifiability",
-    "Residual",
-    "Solution",
-    "SolvedPart",
-    "Status",
-]

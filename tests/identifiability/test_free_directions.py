@@ -1,4 +1,4 @@
-"""What is free, said in words."""
+"""What is free: records, and their words."""
 
 from __future__ import annotations
 
@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.identifiability.free_directions import describe, reason_for
+from gtsam_rwhec.identifiability.free_directions import (
+    FreeDirection,
+    FreeKind,
+    FreeReason,
+    free_directions_of,
+    reason_for,
+)
 from gtsam_rwhec.simulate import Motion, Noise, carrier_poses, perturb
 from gtsam_rwhec.simulate.transforms import inverse, pose, rotations_of_vectors
 
 NOISE = Noise(0.005, 5000.0)
-WHY = {"cam0": "because", "tag0": "because"}
 
 
 def direction(frame: int, frames: int, **entries: Any) -> np.ndarray:
@@ -28,100 +33,123 @@ def direction(frame: int, frames: int, **entries: Any) -> np.ndarray:
     return column
 
 
+def directions(*columns: np.ndarray, names: tuple[str, ...] = ("cam0",), length_m: float = 1.0) -> list[FreeDirection]:
+    reasons = dict.fromkeys(names, FreeReason.ONE_AXIS)
+    return list(free_directions_of(names, np.array(columns).T, length_m, reasons))
+
+
 @pytest.mark.parametrize(
     ("vector", "said"),
     [
-        ([0, 0, 1], "z"),
-        ([0, -2, 0], "y"),
-        ([0.999, 0.03, 0.0], "x"),
-        ([0.6, 0.8, 0.0], "(0.60, 0.80, 0.00)"),
-        ([-0.6, -0.8, 0.0], "(0.60, 0.80, 0.00)"),
+        ([0, 0, 1], "its own z axis"),
+        ([0, -2, 0], "its own y axis"),
+        ([0.999, 0.03, 0.0], "its own x axis"),
+        ([0.6, 0.8, 0.0], "(0.60, 0.80, 0.00) in its own frame"),
+        ([-0.6, -0.8, 0.0], "(0.60, 0.80, 0.00) in its own frame"),
     ],
 )
 def test_one_axis_has_a_name_or_numbers(vector: list[float], said: str) -> None:
-    for entries, words in (
-        ({"v": vector}, f"cam0: translation along {said} of its own frame; because"),
-        ({"omega": vector}, f"cam0: rotation about {said} of its own frame; because"),
+    because = "the motion turned about one axis only"
+    for entries, kind, words in (
+        ({"v": vector}, FreeKind.TRANSLATION, f"translation of cam0 along {said}: {because}"),
+        ({"omega": vector}, FreeKind.ROTATION, f"rotation of cam0 about {said}: {because}"),
     ):
-        assert describe(("cam0",), direction(0, 1, **entries)[:, None], 1.0, WHY, "known") == [words]
+        (found,) = directions(direction(0, 1, **entries))
+        assert found.kind is kind
+        assert str(found) == words
 
 
-def test_two_axes_and_three() -> None:
-    x, y, z = (direction(0, 1, v=axis) for axis in np.eye(3))
-    for basis, said in (
-        ([x, y], "x and y"),
-        (
-            [
-                y + x,
-                z,
-            ],
-            "every axis but (0.71, -0.71, 0.00)",
-        ),
-        ([x, y, z], "every axis"),
-        ([x + y, x - y, x + z], "every axis"),
-    ):
-        (sentence,) = describe(("cam0",), np.array(basis).T, 1.0, WHY, "known")
-        assert sentence.removeprefix("cam0: translation along ").split(" of its own")[0] in (
-            said,
-            said.replace("0.71, -0.71", "-0.71, 0.71"),
-        )
+def test_a_direction_has_length_one_in_its_own_units() -> None:
+    """A radian counts as much as 0.5 m, and the components are rad and m all the same."""
+    (found,) = directions(direction(0, 1, omega=[0.0, 0.0, 3.0], v=[2.0, 0.0, 0.0]), length_m=0.5)
+    assert found.length_m == 0.5
+    np.testing.assert_allclose(found.frames["cam0"], np.array([0, 0, 3, 2, 0, 0]) / 5.0)
+
+
+@pytest.mark.parametrize(
+    "basis",
+    [
+        [[1, 0, 0], [0, 1, 0]],
+        [[1, 1, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [[1, 1, 0], [1, -1, 0], [1, 0, 1]],
+    ],
+)
+def test_as_many_records_as_directions_and_the_same_span(basis: list[list[float]]) -> None:
+    found = directions(*(direction(0, 1, v=axis) for axis in basis))
+    spanned = np.array([np.array(each.frames["cam0"])[3:] for each in found])
+    assert np.linalg.matrix_rank(spanned) == np.linalg.matrix_rank(np.vstack([spanned, basis])) == len(basis)
+    if len(basis) == 3:  # whatever the basis, each axis by its name
+        assert {str(each).split(":")[0] for each in found} == {
+            f"translation of cam0 along its own {axis} axis" for axis in "xyz"
+        }
 
 
 def test_turning_and_shifting_come_apart() -> None:
     """Two directions however mixed: a turn about z that takes the translation along, and a shift along x."""
     turn, shift = direction(0, 1, omega=[0, 0, 1], v=[0, 1, 0]), direction(0, 1, v=[1, 0, 0])
     expected = [
-        "cam0: rotation about z (its translation moves along) and translation along x of its own frame; because"
+        "rotation of cam0 about its own z axis (its origin moves too): the motion turned about one axis only",
+        "translation of cam0 along its own x axis: the motion turned about one axis only",
     ]
-    assert describe(("cam0",), np.array([turn, shift]).T, 1.0, WHY, "known") == expected
-    assert describe(("cam0",), np.array([turn + 3 * shift, 2 * turn - shift]).T, 1.0, WHY, "known") == expected
+    assert [str(each) for each in directions(turn, shift)] == expected
+    assert [str(each) for each in directions(turn + 3 * shift, 2 * turn - shift)] == expected
 
 
-def test_frames_that_do_not_move_are_not_named() -> None:
-    basis = direction(1, 2, v=[0, 0, 1])[:, None]
-    assert describe(("tag0", "cam0"), basis, 1.0, WHY, "known") == [
-        "cam0: translation along z of its own frame; because"
-    ]
+def test_frames_that_do_not_move_take_no_part() -> None:
+    (found,) = directions(direction(1, 2, v=[0, 0, 1]), names=("tag0", "cam0"))
+    assert list(found.frames) == ["cam0"]
+
+
+def test_frames_that_move_together_are_one_direction() -> None:
+    together = direction(0, 2, v=[0, 0, 1]) + direction(1, 2, v=[1, 0, 0])
+    (found,) = directions(together, names=("tag0", "cam0"))
+    said = "translation of tag0 along its own z axis, together with cam0 along its own x axis"
+    assert str(found).startswith(said)
 
 
 def test_scales_are_named() -> None:
-    own = describe(("tag0",), direction(0, 1, own=1.0)[:, None], 1.0, WHY, "per_target")
-    assert len(own) == 1
-    assert own[0].startswith("tag0: ")
-    assert "scale" in own[0]
-    assert "of its own frame" not in own[0]
-    shared = describe(("tag0",), direction(0, 1, v=[0, 0, 1], shared=1.0)[:, None], 1.0, WHY, "shared")
-    assert len(shared) == 2
-    assert shared[0].startswith("tag0: translation along z")
-    assert shared[1].startswith("scale: ")
+    (own,) = directions(direction(0, 1, own=1.0), names=("tag0",))
+    assert (own.kind, own.own_scales) == (FreeKind.SCALE, {"tag0": 1.0})
+    assert str(own).startswith("change of the scale of tag0: ")
+    (shared,) = directions(direction(0, 1, v=[0, 0, 1], shared=1.0), names=("tag0",))
+    assert shared.kind is FreeKind.SCALE
+    assert shared.scale == pytest.approx(np.sqrt(0.5))
+    assert str(shared).startswith("change of the scale, together with tag0 along its own z axis: ")
 
 
 def test_a_direction_is_never_left_unsaid() -> None:
-    """Spread thinly over sixty frames, no frame has a share that says much; something is said all the same."""
+    """Spread thinly over six hundred frames, which all move as much: some are named, and the others counted."""
     names = tuple(f"tag{i}" for i in range(600))
     basis = np.tile(np.r_[0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0], 600)
-    sentences = describe(names, np.r_[basis, 0.0][:, None], 1.0, dict.fromkeys(names, "because"), "known")
-    assert sentences
+    (found,) = directions(np.r_[basis, 0.0], names=names)
+    assert set(found.frames) == set(names)
+    assert str(found).startswith("translation of tag0 along its own z axis, together with tag1 along ")
+    assert "and 596 more: " in str(found)
 
 
 def test_many_directions_of_one_frame() -> None:
     """All that a frame has: rotations, translations, its scale and the shared one."""
-    (sentence, *_) = describe(("cam0",), np.eye(8), 1.0, WHY, "shared")
-    assert sentence.startswith("cam0: rotation about every axis")
+    found = directions(*np.eye(8))
+    assert [each.kind for each in found] == [FreeKind.ROTATION] * 3 + [FreeKind.SCALE] * 2 + [FreeKind.TRANSLATION] * 3
+
+
+def test_words_of_an_old_file_are_kept() -> None:
+    assert str(FreeDirection(FreeKind.WORDS, None, words="cam0: translation along z")) == "cam0: translation along z"
 
 
 @pytest.mark.parametrize(
     ("axes", "turned_deg", "residual_deg", "said"),
     [
-        (0, 0.1, 0.1, "the motion did not turn"),
-        (1, 40.0, 1.0, "the motion turned about one axis only"),
-        (2, 40.0, 1.0, "the measurements say no more about it than their noise would"),
-        (0, 40.0, 60.0, "is A or B inverted"),
-        (1, 40.0, 60.0, "is A or B inverted"),
+        (0, 0.1, 0.1, FreeReason.NO_ROTATION),
+        (1, 40.0, 1.0, FreeReason.ONE_AXIS),
+        (2, 40.0, 1.0, FreeReason.NOISE),
+        (0, 40.0, 60.0, FreeReason.CONTRADICTION),
+        (1, 40.0, 60.0, FreeReason.CONTRADICTION),
     ],
 )
-def test_reasons(axes: int, turned_deg: float, residual_deg: float, said: str) -> None:
-    assert said in reason_for(axes, np.radians(turned_deg), np.radians(residual_deg))
+def test_reasons(axes: int, turned_deg: float, residual_deg: float, said: FreeReason) -> None:
+    assert reason_for(axes, np.radians(turned_deg), np.radians(residual_deg)) is said
 
 
 # -- from motion to words ---------------------------------------------------------------------------
@@ -129,7 +157,7 @@ def test_reasons(axes: int, turned_deg: float, residual_deg: float, said: str) -
 QUARTER_ABOUT_Y = rotations_of_vectors([0.0, np.pi / 2, 0.0])  # its z axis is the carrier's x axis
 
 
-def sentences_of(motion: Motion, R_cam: np.ndarray, noise: Noise | None, scale: Any = "known") -> list[str]:
+def free_of(motion: Motion, R_cam: np.ndarray, noise: Noise | None, scale: Any = "known") -> tuple[FreeDirection, ...]:
     X, Y = pose(np.eye(3), [0.3, 0.2, 1.5]), pose(R_cam, [0.1, -0.1, 0.2])
     A = inverse(carrier_poses(motion, 20, 5))
     B = perturb(inverse(Y) @ A @ X, noise, 6)
@@ -140,39 +168,44 @@ def sentences_of(motion: Motion, R_cam: np.ndarray, noise: Noise | None, scale: 
         warnings.simplefilter("ignore", rw.errors.RwhecWarning)
         solution = rw.solve(problem)
     # The pair alone and the whole are the same here.
-    assert solution.identifiability.pairs["tag0", "cam0"].free_directions == solution.identifiability.free_directions
-    return solution.identifiability.free_directions
+    alone, whole = (
+        solution.identifiability.pairs["tag0", "cam0"].free_directions,
+        solution.identifiability.free_directions,
+    )
+    assert list(map(str, alone)) == list(map(str, whole))
+    return whole
 
 
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["exact", "noise"])
 @pytest.mark.parametrize("kind", ["planar", "single_axis"])
 def test_one_axis_leaves_the_translation_along_it(kind: Any, noise: Any) -> None:
-    said = sentences_of(Motion(kind, (1.0, 0.0, 0.0)), QUARTER_ABOUT_Y, noise)
-    assert said == [
-        "tag0: translation along x of its own frame; the motion turned about one axis only",
-        "cam0: translation along z of its own frame; the motion turned about one axis only",
-    ]
+    (found,) = free_of(Motion(kind, (1.0, 0.0, 0.0)), QUARTER_ABOUT_Y, noise)
+    assert str(found) == (
+        "translation of tag0 along its own x axis, together with cam0 along its own z axis: "
+        "the motion turned about one axis only"
+    )
+    tag, cam = (np.array(found.frames[name]) for name in ("tag0", "cam0"))
+    assert np.linalg.norm(tag[3:]) == pytest.approx(np.linalg.norm(cam[3:]), rel=1e-2)
 
 
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["exact", "noise"])
 def test_without_turning_every_translation_is_free(noise: Any) -> None:
-    said = sentences_of(Motion("none"), QUARTER_ABOUT_Y, noise)
-    assert said == [
-        "tag0: translation along every axis of its own frame; the motion did not turn",
-        "cam0: translation along every axis of its own frame; the motion did not turn",
-    ]
+    found = free_of(Motion("none"), QUARTER_ABOUT_Y, noise)
+    assert [(each.kind, each.reason) for each in found] == [(FreeKind.TRANSLATION, FreeReason.NO_ROTATION)] * 3
+    for each in found:  # both frames move as far: the target in its own frame, the camera in its
+        shifts = [np.linalg.norm(np.array(each.frames[name])[3:]) for name in ("tag0", "cam0")]
+        assert shifts[0] == pytest.approx(shifts[1], rel=0.05)
 
 
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["exact", "noise"])
 def test_turning_on_the_spot_leaves_the_rotation_about_the_axis_too(noise: Any) -> None:
     """Nothing shifts A, so that both frames may turn about its axis together."""
-    said = sentences_of(Motion("single_axis", (0.0, 0.0, 1.0), extent_m=0.0), np.eye(3), noise)
-    assert len(said) == 2
-    for name, sentence in zip(("tag0", "cam0"), said, strict=True):
-        assert sentence.startswith(f"{name}: rotation about z")
-        assert "translation along z" in sentence
-        assert sentence.endswith("the motion turned about one axis only")
+    turn, shift = free_of(Motion("single_axis", (0.0, 0.0, 1.0), extent_m=0.0), np.eye(3), noise)
+    assert str(turn).startswith("rotation of tag0 about its own z axis")
+    assert "cam0 about its own z axis" in str(turn)
+    assert str(shift).startswith("translation of tag0 along its own z axis, together with cam0 along its own z axis")
+    assert turn.reason is shift.reason is FreeReason.ONE_AXIS
 
 
 def test_excited_motion_leaves_nothing_to_say() -> None:
-    assert sentences_of(Motion(), QUARTER_ABOUT_Y, NOISE) == []
+    assert free_of(Motion(), QUARTER_ABOUT_Y, NOISE) == ()

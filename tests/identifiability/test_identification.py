@@ -12,6 +12,7 @@ from places import GOLDEN
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotUniqueWarning, RwhecWarning, ScaleError
+from gtsam_rwhec.identifiability import FreeKind, FreeReason
 from gtsam_rwhec.simulate import Motion, Noise, carrier_poses, general, perturb, sphere
 from gtsam_rwhec.simulate.transforms import inverse, pose, random_poses
 
@@ -59,7 +60,7 @@ def test_one_pair_needs_two_axes(kind: Any, axes: int, noise: Any, noise_in_A: A
     (pair,) = known.pairs.values()
     assert pair.rotation_axes == axes
     assert known.is_unique is pair.is_unique is (axes == 2)
-    assert (known.free_directions == []) is (pair.free_directions == []) is (axes == 2)
+    assert bool(known.free_directions) is bool(pair.free_directions) is (axes != 2)
     assert pair.number_of_measurements == count
     assert (known.weakest > known.threshold) is (axes == 2)
     assert (pair.weakest > pair.threshold) is (axes == 2)
@@ -71,8 +72,9 @@ def test_one_pair_needs_two_axes(kind: Any, axes: int, noise: Any, noise_in_A: A
 def test_axes_are_told_whatever_their_direction(axis: Any, noise: Any) -> None:
     known = identify(of_motions({(0, 0): (Motion("single_axis", axis), 20)}, noise))
     assert next(iter(known.pairs.values())).rotation_axes == 1
-    assert all("the motion turned about one axis only" in sentence for sentence in known.free_directions)
-    assert [sentence.split(":")[0] for sentence in known.free_directions] == ["tag0", "cam0"]
+    (direction,) = known.free_directions
+    assert (direction.kind, direction.reason) == (FreeKind.TRANSLATION, FreeReason.ONE_AXIS)
+    assert list(direction.frames) == ["tag0", "cam0"]
 
 
 def test_two_measurements_are_one_axis() -> None:
@@ -103,7 +105,7 @@ def test_monocular_on_one_sphere_is_not_unique(noise: Any) -> None:
     assert not solution.certificate.is_certified
     assert solution.certificate.is_optimal
     assert not solution.identifiability.is_unique
-    assert any(sentence.startswith("scale") for sentence in solution.identifiability.free_directions)
+    assert any(direction.kind is FreeKind.SCALE for direction in solution.identifiability.free_directions)
     # Not for want of turning: the pair itself turned about all axes.
     assert solution.identifiability.pairs["camera", "marker"].rotation_axes == 2
 
@@ -125,7 +127,7 @@ def test_without_translations_the_scale_is_free() -> None:
     problem.add("tag0", "cam0", A, B, 0.001, 1e5)
     known = identify(problem)
     assert not known.is_unique
-    assert any("scale" in sentence for sentence in known.free_directions)
+    assert any(direction.kind is FreeKind.SCALE for direction in known.free_directions)
 
 
 # -- along the graph, and together ------------------------------------------------------------------
@@ -139,8 +141,8 @@ def test_what_one_pair_determines_spreads(noise: Any) -> None:
     known = identify(of_motions(motions, noise))
     assert known.is_unique
     assert {pair for pair, value in known.pairs.items() if value.is_unique} == {("tag0", "cam0")}
-    assert "1 of 5 pairs determine their frames on their own" in known.explanation
-    assert "Theorem 3" in known.explanation
+    assert "1 of 5 pairs determine their frames on their own" in str(known)
+    assert "Theorem 3" in str(known)
 
 
 def test_single_measurements_alone_spread_nothing() -> None:
@@ -169,7 +171,7 @@ def test_pairs_that_only_together_determine(noise: Any, noise_in_A: Any) -> None
     assert known.is_unique
     assert not any(pair.is_unique for pair in known.pairs.values())
     assert {pair.rotation_axes for pair in known.pairs.values()} == {1}
-    assert known.explanation.startswith("No pair determines its frames on its own; together")
+    assert str(known).startswith("No pair determines its frames on its own; together")
     if noise is None:
         for j, k in CROSSED:
             np.testing.assert_allclose(solution.X[f"tag{j}"].matrix(), FRAMES[j], atol=1e-8)
@@ -189,7 +191,9 @@ def test_parallel_axes_do_not_determine_together() -> None:
     parallel = {pair: (Motion("single_axis"), 12) for pair in CROSSED}
     known = identify(of_motions(parallel, NOISE))
     assert not known.is_unique
-    assert [sentence.split(":")[0] for sentence in known.free_directions] == ["tag0", "tag1", "cam0", "cam1"]
+    (direction,) = known.free_directions
+    assert direction.kind is FreeKind.TRANSLATION
+    assert set(direction.frames) == {"tag0", "tag1", "cam0", "cam1"}
 
 
 def test_unconnected_parts_are_solved_apart_and_named() -> None:
@@ -203,7 +207,8 @@ def test_unconnected_parts_are_solved_apart_and_named() -> None:
     assert solution.certificate.status == "certified_not_unique"
     assert "2 unconnected parts, solved apart" in solution.certificate.reason
     assert solution.cost == pytest.approx(sum(part.certificate.cost for part in solution.parts))
-    assert {sentence.split(":")[0] for sentence in known.free_directions} == {"tag1", "tag2", "cam1"}
+    (direction,) = known.free_directions
+    assert set(direction.frames) == {"tag1", "tag2", "cam1"}
     # Each part is what it would be alone.
     alone = rw.solve(of_motions({(0, 0): (Motion(), 10)}, NOISE))
     np.testing.assert_allclose(solution.X["tag0"].matrix(), alone.X["tag0"].matrix(), atol=1e-10)
@@ -216,8 +221,11 @@ def test_unconnected_parts_are_solved_apart_and_named() -> None:
 def test_many_frames_are_asked_without_a_dense_matrix(kind: Any, noise: Any) -> None:
     known = identify(general(70, 1, seed=1, motion=kind, noise=noise, number_of_measurements=6).problem)
     assert known.is_unique is (kind == "general")
-    assert len(known.free_directions) == (0 if known.is_unique else 71)
-    assert all("translation along" in sentence for sentence in known.free_directions)
+    assert len(known.free_directions) == (0 if known.is_unique else 1)
+    for direction in known.free_directions:
+        assert direction.kind is FreeKind.TRANSLATION
+        assert len(direction.frames) == 71
+        assert "and 67 more: the motion turned about one axis only" in str(direction)
 
 
 def test_every_one_of_many_free_directions_is_said() -> None:
@@ -227,9 +235,12 @@ def test_every_one_of_many_free_directions_is_said() -> None:
     )
     simulation.problem.fix("sensor0", simulation.Y["sensor0"])
     known = identify(simulation.problem)
-    assert [sentence.split(":")[0] for sentence in known.free_directions] == list(simulation.X)
-    assert all("translation along" in sentence for sentence in known.free_directions)
-    assert all("scale" in sentence for sentence in known.free_directions)
+    assert len(known.free_directions) == len(simulation.X)
+    for direction in known.free_directions:
+        assert direction.kind is FreeKind.SCALE
+        (name,) = direction.frames
+        assert str(direction).startswith(f"change of the scale of {name}, together with {name} along ")
+    assert {name for direction in known.free_directions for name in direction.own_scales} == set(simulation.X)
 
 
 # -- known frames and priors ------------------------------------------------------------------------
@@ -398,7 +409,7 @@ def test_the_real_dataset_is_unique(real: rw.Solution) -> None:
     known = real.identifiability
     assert real.certificate.status == "certified"
     assert known.is_unique
-    assert known.free_directions == []
+    assert known.free_directions == ()
     assert known.weakest > 10.0 * known.threshold
     assert len(known.parts) == 1
 
@@ -431,7 +442,7 @@ def test_nothing_that_was_not_seen_is_in_the_grid(real: rw.Solution) -> None:
     assert set(real.identifiability.pairs) == set(real.residuals)
     for pair, value in real.identifiability.pairs.items():
         assert value.number_of_measurements == real.residuals[pair].number_of_measurements
-        assert value.is_unique is (value.free_directions == [])
+        assert value.is_unique is (value.free_directions == ())
 
 
 def test_pose_of_the_far_frames_is_not_needed_for_the_verdict() -> None:

@@ -200,7 +200,7 @@ def test_true_weights_make_variance_factors_of_one(scale: Any, count: int) -> No
     # Apart, they share the correction for what was fitted, which is not quite half and half.
     assert abs(rotation - 1.0) < 2.0 * allowed + 1.0 / count
     assert abs(translation - 1.0) < 2.0 * allowed + 1.0 / count
-    assert levels[0].redundancy == 6 * count - 12 - (scale != "known")
+    assert levels[0].degrees_of_freedom == 6 * count - 12 - (scale != "known")
 
 
 def test_weights_too_small_make_variance_factors_to_match() -> None:

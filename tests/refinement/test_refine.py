@@ -320,7 +320,8 @@ def test_two_measurements() -> None:
     """No equation to spare, one turn only: nothing estimates the noise, and no pose is determined."""
     problem = rig(1, 1, seed=5, number_of_measurements=2).problem
     r = refined(problem)
-    assert len(r.free_directions) == 2
+    assert len(r.free_directions) >= 1
+    assert {name for direction in r.free_directions for name in direction.frames} == {"target0", "sensor0"}
     assert np.isinf(np.diag(r.covariance("sensor0"))).all()
     assert np.linalg.matrix_rank(r.information("sensor0")) == 4
 

@@ -135,7 +135,7 @@ def test_losses_do_not_call_free_what_outliers_only_blur(loss: str) -> None:
         B = raw.B.copy()
         B[:8] = random_poses(8, 2.0, generator)
         problem = copied(simulation.problem, B=lambda pair, raw, B=B: B)
-        assert refined(problem, robust=loss).free_directions == []
+        assert refined(problem, robust=loss).free_directions == ()
 
 
 @pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")

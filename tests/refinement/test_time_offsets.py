@@ -114,7 +114,7 @@ def test_stop_and_go_does_not_tell_an_offset(noise_of_A: float) -> None:
     problem.add("tag", "cam0", A, B, SIGMA_M, KAPPA, stamps_ns=stamps)
     r = refined(problem, time_offsets=True)
     assert r.covariance("time_offset:cam0")[0, 0] == np.inf
-    assert any("time_offset of cam0: the carriers moved no faster" in sentence for sentence in r.free_directions)
+    assert any(direction.time_offsets_s == {"cam0": 1.0} for direction in r.free_directions)
     assert r.contains("cam0", Y["cam0"], 0.9999)
 
 

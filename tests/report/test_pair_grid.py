@@ -6,15 +6,15 @@ import io
 
 from rich.console import Console
 
-from gtsam_rwhec.identifiability.identification import Identifiability, PairIdentifiability
+from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiability
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.report import PairGrid
 
 
 def grid(pairs: dict[tuple[str, str], bool]) -> PairGrid:
     """A grid of pairs that are determined on their own, or not."""
-    found = {Pair(*pair): PairIdentifiability(unique, [], 2, 10, 1.0, 1.0) for pair, unique in pairs.items()}
-    return PairGrid(Identifiability(True, [], 1.0, 1.0, found, (), ""))
+    found = {Pair(*pair): PairIdentifiability(unique, (), 2, 10, 1.0, 1.0) for pair, unique in pairs.items()}
+    return PairGrid(Identifiability(True, (), 1.0, 1.0, found, ()))
 
 
 def lines_of(grid: PairGrid, width: int = 80, encoding: str = "utf-8", *, color: bool = False) -> list[str]:

@@ -18,6 +18,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.report import certificate_sentence, print_solution, sensor_table
 from gtsam_rwhec.report.pose_table import pooled_residual
 from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solver import Cause
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
 
@@ -110,20 +111,24 @@ def test_free_directions_are_printed_as_not_to_be_used() -> None:
 
 def test_a_gap_is_printed_with_its_reason(demo_solution: rw.Solution) -> None:
     certificate = dataclasses.replace(
-        demo_solution.certificate, status=rw.Status.GAP, lower_bound=300.0, reason="the relaxation is not tight"
+        demo_solution.certificate,
+        status=rw.Status.GAP,
+        lower_bound=300.0,
+        cause=Cause.NOT_TIGHT,
+        figures={"relaxation_cost": 300.0},
     )
     sentence = certificate_sentence(certificate)
     assert sentence.startswith("Not certified: this answer costs 368.6")
     assert "cannot" not in sentence or "less than 300 " in sentence
-    assert sentence.endswith("the relaxation is not tight.")
+    assert "the relaxation is not tight: its own optimum is 300, below the best answer's 368.6" in sentence
 
 
 def test_a_failure_claims_no_bound(demo_solution: rw.Solution) -> None:
     certificate = dataclasses.replace(
-        demo_solution.certificate, status=rw.Status.FAILED, lower_bound=-math.inf, reason="no critical point"
+        demo_solution.certificate, status=rw.Status.FAILED, lower_bound=-math.inf, cause=Cause.NO_BOUND
     )
     assert "inf" not in certificate_sentence(certificate)
-    assert certificate_sentence(certificate).endswith("no bound was found; no critical point.")
+    assert certificate_sentence(certificate).endswith("; no finite lower bound was found.")
 
 
 def test_a_shared_scale_is_explained(utias_folder: Path) -> None:

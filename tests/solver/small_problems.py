@@ -10,12 +10,13 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, Simulation, general
 from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
+from gtsam_rwhec.solver.forms import Forms
 from gtsam_rwhec.solver.full_form import FullForm
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import kkt_multipliers, vec
-from gtsam_rwhec.solver.search import Forms, Search
+from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.start import spectral_start
 
 #: One centimetre, and half a degree about each axis.
@@ -42,7 +43,7 @@ def reduced(problem: rw.Problem) -> ReducedForm:
 
 def searched(problem: rw.Problem, **options: Any) -> Search:
     """A search that has not run."""
-    return Search(part_of(problem), SolveOptions(**options))
+    return Search.of(part_of(problem), SolveOptions(**options))
 
 
 def optimum(problem: rw.Problem) -> Descent:

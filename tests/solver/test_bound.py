@@ -25,7 +25,7 @@ from gtsam_rwhec.solver.rotations import CONSTRAINTS, random_rotations
 
 
 def assert_below(bound: Bound, cost: Fraction) -> None:
-    assert bound.lower == -np.inf or Fraction(bound.lower) <= cost
+    assert bound.lower_bound == -np.inf or Fraction(bound.lower_bound) <= cost
 
 
 def badly_scaled(seed: int, scale: str) -> rw.Problem:
@@ -87,11 +87,11 @@ def test_kkt_bound_is_below_the_polished_optimum_and_close(name: str, seed: int)
     bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
     assert_below(bound, cost)
     if bound.definite:
-        assert float(cost - Fraction(bound.lower)) <= 1e-14 * form.magnitude
+        assert float(cost - Fraction(bound.lower_bound)) <= 1e-14 * form.magnitude
         assert bound.eigenvalue > 0.0
         assert bound.direction is None
     if bound.semidefinite:
-        assert float(cost - Fraction(bound.lower)) <= 1e-10 * form.magnitude
+        assert float(cost - Fraction(bound.lower_bound)) <= 1e-10 * form.magnitude
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -159,7 +159,7 @@ class TestBranches:
         bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
         assert bound.definite
         assert bound.semidefinite
-        assert bound.lower < bound.value
+        assert bound.lower_bound < bound.value
 
     @pytest.mark.parametrize("name", ["shared", "joined by scale", "badly scaled, shared"])
     def test_pinned(self, name: str) -> None:
@@ -215,8 +215,8 @@ def test_large_problems_find_their_negative_eigenvalue_by_lanczos(scale: str) ->
     kkt = multipliers_at(form, R)
     bound = lower_bound(form, kkt, flat(R))
     Z = dense_curvature(form, kkt)
-    assert np.isfinite(bound.lower)
-    assert bound.lower < optimum(simulation.problem).cost
+    assert np.isfinite(bound.lower_bound)
+    assert bound.lower_bound < optimum(simulation.problem).cost
     assert bound.direction is not None
     assert bound.direction @ Z @ bound.direction == pytest.approx(np.linalg.eigvalsh(Z)[0], rel=1e-3)
 
@@ -229,7 +229,7 @@ def test_numbers_that_are_none_prove_nothing() -> None:
         lower_bound(form, multipliers, flat(end.R)),
         lower_bound(form, multipliers_at(form, end.R), np.full(9 * form.rotations, np.inf)),
     ):
-        assert bound.lower == -np.inf
+        assert bound.lower_bound == -np.inf
         assert not bound.definite
 
 

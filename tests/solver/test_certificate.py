@@ -6,13 +6,14 @@ from dataclasses import FrozenInstanceError, replace
 
 import pytest
 
-from gtsam_rwhec.solver.certificate import Certificate, Status, combined
+from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start, Status
+from gtsam_rwhec.solver.certificate import Certificate, Objective
 
 CERTIFIED = Certificate(
     status=Status.CERTIFIED,
-    reason="proven globally optimal",
-    objective="Problem 3",
-    path="spectral start, dual",
+    cause=Cause.PROVEN,
+    objective=Objective("direct", has_priors=False),
+    path=SearchPath(Start.SPECTRAL, Multipliers.KKT),
     cost=100.0,
     lower_bound=100.0 - 1e-6,
     float_bound=100.0 - 1e-12,
@@ -73,17 +74,26 @@ def test_nothing_can_be_changed_afterwards() -> None:
         CERTIFIED.cost = 0.0  # type: ignore[misc]
 
 
-class TestCombined:
+class TestMerged:
     def test_one_is_itself(self) -> None:
-        assert combined([CERTIFIED]) is CERTIFIED
+        assert Certificate.merged([CERTIFIED]) is CERTIFIED
 
-    @pytest.mark.parametrize("worst", list(Status))
-    def test_costs_and_bounds_add_and_the_worst_status_counts(self, worst: Status) -> None:
+    @pytest.mark.parametrize(
+        ("worst", "cause"),
+        [
+            (Status.CERTIFIED, Cause.PROVEN_WITH_REDUNDANT_CONSTRAINTS),
+            (Status.CERTIFIED_NOT_UNIQUE, Cause.TWIN),
+            (Status.GAP, Cause.NOT_TIGHT),
+            (Status.FAILED, Cause.NO_BOUND),
+        ],
+    )
+    def test_costs_and_bounds_add_and_the_worst_cause_counts(self, worst: Status, cause: Cause) -> None:
         other = replace(
             CERTIFIED,
             status=worst,
-            reason="another reason",
-            path="relaxation, small dual",
+            cause=cause,
+            figures={"relaxation_cost": 40.0} if cause is Cause.NOT_TIGHT else {},
+            path=SearchPath(Start.CLARABEL, Multipliers.ALL_CONSTRAINTS),
             cost=50.0,
             lower_bound=40.0,
             float_bound=45.0,
@@ -91,7 +101,7 @@ class TestCombined:
             seconds={"descent": 0.5, "small dual": 2.0},
         )
         for order in ([CERTIFIED, other], [other, CERTIFIED]):
-            both = combined(order)
+            both = Certificate.merged(order)
             assert both.status is worst
             assert both.cost == 150.0
             assert both.lower_bound == pytest.approx(140.0 - 1e-6)
@@ -99,6 +109,5 @@ class TestCombined:
             assert both.min_eigenvalue == -3.0
             assert both.tolerance == pytest.approx(2e-4)
             assert both.seconds == {"descent": 1.5, "small dual": 2.0}
-            assert set(both.path.split(", ")) == {"spectral start", "dual", "relaxation", "small dual"}
-            assert "2 unconnected parts, solved apart" in both.reason
-            assert (other.reason in both.reason) == (worst is not Status.CERTIFIED) or order[0] is other
+            assert (both.cause, both.path) == (other.cause, other.path)
+            assert both.reason == f"2 unconnected parts, solved apart; {other.reason}"

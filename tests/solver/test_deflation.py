@@ -76,7 +76,7 @@ def test_free_answers_lose_next_to_nothing(seed: int, scale: str) -> None:
     bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
     assert bound.semidefinite
     assert not bound.definite
-    assert end.cost - bound.lower <= 1e-14 * form.magnitude
+    assert end.cost - bound.lower_bound <= 1e-14 * form.magnitude
 
 
 @pytest.mark.parametrize("last", [0.0, 1.0])

@@ -85,7 +85,7 @@ def test_tight_relaxations_reach_the_certified_optimum(frames: int, scale: Scale
         problem = problem_of(frames, scale, seed)
         form, end = reduced(problem), optimum(problem)
         bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
-        assert end.cost - bound.lower < 1e-6 * end.cost
+        assert end.cost - bound.lower_bound < 1e-6 * end.cost
         relaxation = solve_by_blocks(form.dense(), 1e-9, 100)
         assert relaxation.dual == pytest.approx(end.cost, abs=accuracy(form.dense()))
         # Rank one, and its h column is x: with unknown scale too, since the handedness couples to h.

@@ -38,8 +38,8 @@ def test_the_search_returns_the_image_with_positive_scales(motion: str, scale: S
         own = answer.own_scale[np.isfinite(answer.own_scale)]
         assert answer.scale > 0.0
         assert (own > 0.0).all()
-        assert found.cost - found.lower <= search.tolerance(found.cost)
-        mirrored_ones += found.path.endswith("mirrored")
+        assert found.is_closed
+        mirrored_ones += found.path.is_mirrored
     assert (mirrored_ones > 0) == (motion == "planar")
 
 

@@ -25,7 +25,10 @@ from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.bound import lower_bound
+from gtsam_rwhec.solver.cause import Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import cost_of, descend
+from gtsam_rwhec.solver.forms import Forms
+from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.nonnegative import (
     run_with_nonnegative_scale,
     scale_row,
@@ -35,7 +38,6 @@ from gtsam_rwhec.solver.nonnegative import (
 )
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.rotations import random_rotations
-from gtsam_rwhec.solver.search import Forms, Found
 from gtsam_rwhec.solver.variables import answer_of
 
 HELD = SolveOptions(nonnegative_scale=True)
@@ -70,7 +72,7 @@ def outcome(seed: int) -> tuple[Found | None, float, float]:
     except ScaleError as error:
         cost, lower = re.search(r"\(cost (\S+), no answer below (\S+);", str(error)).groups()
         return None, float(cost), float(lower)
-    return found, found.cost, found.lower
+    return found, found.cost, found.lower_bound
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -117,7 +119,7 @@ def test_multipliers_bounds_hold_in_exact_arithmetic() -> None:
         for nu in (1e-2, 1.0, 30.0):
             held = with_scale_multiplier(form, nu)
             bound = lower_bound(held, multipliers_at(held, end.R), flat(end.R))
-            assert Fraction(bound.lower) <= min(costs)
+            assert Fraction(bound.lower_bound) <= min(costs)
 
 
 class TestSolving:
@@ -127,7 +129,7 @@ class TestSolving:
             held, free = rw.solve(problem, options=HELD), rw.solve(problem)
             assert held.cost == pytest.approx(free.cost, rel=1e-12)
             assert held.certificate.is_certified
-            assert held.certificate.path == "spectral start, dual"
+            assert held.certificate.path == SearchPath(Start.SPECTRAL, Multipliers.KKT)
 
     def test_outcomes_where_the_noise_drowns_the_scale(self) -> None:
         """Against random starts on each side: no positive scale, and no scale zero, costs less than what is found."""
@@ -141,10 +143,10 @@ class TestSolving:
             found, cost, lower = outcome(seed)
             outcomes[found is not None] += 1
             proven += cost - lower < 1e-4 * cost
-            assert free.lower - 1e-9 <= lower <= cost * (1.0 + 1e-4)
+            assert free.lower_bound - 1e-9 <= lower <= cost * (1.0 + 1e-4)
             if found is not None:
                 assert answer_of(search.part, search.form, found.R).scale > 0.0
-                assert found.path == "relaxation with alpha >= 0"
+                assert found.path.start is Start.NONNEGATIVE_SCALE
             generator = np.random.default_rng(seed)
             for _ in range(8):
                 start = random_rotations(2, generator)

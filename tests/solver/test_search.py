@@ -16,12 +16,14 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion, Noise
-from gtsam_rwhec.solver.certificate import Certificate, Status
+from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start, Status
+from gtsam_rwhec.solver.certificate import Certificate
+from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.relaxation import solve_by_clarabel
 from gtsam_rwhec.solver.rotations import random_rotations, retract, tangent_basis, vec
-from gtsam_rwhec.solver.search import Found, Search
+from gtsam_rwhec.solver.search import Search
 
 SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")
 
@@ -63,8 +65,8 @@ def lowest_of_random_starts(form: ReducedForm, count: int, seed: int = 0) -> flo
 
 def assert_never_beaten(search: Search, found: Found, starts: int) -> None:
     lowest = lowest_of_random_starts(search.form, starts)
-    assert lowest >= found.lower - 1e-13 * search.form.magnitude
-    if search.tolerance(found.cost) >= found.cost - found.lower:
+    assert lowest >= found.lower_bound - 1e-13 * search.form.magnitude
+    if found.is_closed:
         assert lowest >= found.cost - max(1e-9 * found.cost, 1e-13 * search.form.magnitude)
 
 
@@ -73,7 +75,7 @@ class TestEasyProblems:
     @pytest.mark.parametrize("sides", [(1, 1), (3, 2), (2, 5), (1, 8)])
     def test_the_first_multipliers_suffice(self, sides: tuple[int, int], scale: ScaleMode) -> None:
         certificate = solved(simulated(*sides, 1, scale=scale).problem).certificate
-        assert certificate.path == "spectral start, dual"
+        assert certificate.path == SearchPath(Start.SPECTRAL, Multipliers.KKT)
         assert certificate.status is Status.CERTIFIED
         assert certificate.relative_gap < 1e-9
         assert "small dual" not in certificate.seconds
@@ -121,18 +123,14 @@ def gross(scale: ScaleMode) -> list[tuple[Search, Found]]:
     return results
 
 
-def is_closed(search: Search, found: Found) -> bool:
-    return found.cost - found.lower <= search.tolerance(found.cost)
-
-
 class TestGrossNoise:
     @pytest.mark.parametrize("scale", ["known", "shared"])
     def test_every_path_is_taken(self, scale: ScaleMode) -> None:
-        paths = Counter(found.path for _, found in gross(scale))
+        paths = Counter(str(found.path) for _, found in gross(scale))
         for path in ("spectral start, small dual", "better start, small dual"):
             assert paths[path] >= 2
-        assert any("spectral start, dual" in path for path in paths)
-        assert any(not is_closed(*result) for result in gross(scale))
+        assert paths["spectral start, dual"]
+        assert any(not found.is_closed for _, found in gross(scale))
 
     @pytest.mark.parametrize("scale", ["known", "shared"])
     def test_no_answer_is_beaten_by_random_starts(self, scale: ScaleMode) -> None:
@@ -143,12 +141,13 @@ class TestGrossNoise:
     def test_what_is_not_tight_has_the_relaxations_own_bound(self, scale: ScaleMode) -> None:
         """By Clarabel, apart from the search: the gap is the relaxation's, no lack of effort."""
         for search, found in gross(scale):
-            if is_closed(search, found):
+            if found.is_closed:
                 continue
             bound = solve_by_clarabel(search.form.dense(), 1e-9, 200).dual
-            assert "the relaxation is not tight" in found.reason
-            assert found.lower == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))
-            assert found.lower < found.cost - 1e-5
+            assert found.cause is Cause.NOT_TIGHT
+            assert found.figures["relaxation_cost"] == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))
+            assert found.lower_bound == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))
+            assert found.lower_bound < found.cost - 1e-5
 
     def test_a_gap_is_said_to_be_one(self) -> None:
         """Known from the draws above: rotation noise of sixty degrees about each axis and four measurements."""
@@ -166,6 +165,7 @@ class TestGrossNoise:
             gaps += 1
             assert certificate.lower_bound < certificate.cost
             assert certificate.relative_gap > 1e-6
+            assert certificate.cause is Cause.NOT_TIGHT
             assert "the relaxation is not tight: its own optimum is" in certificate.reason
             assert certificate.min_eigenvalue < 0.0
         assert gaps >= 1
@@ -177,8 +177,8 @@ class TestGrossNoise:
             problem = simulated(1, 1, seed, noise=GROSS_NOISE, number_of_measurements=4).problem
             search = searched(problem, random_starts=0)
             found = search.run("auto", None)
-            if found.path.startswith("relaxation") and is_closed(search, found):
-                led += "the relaxation to the optimum" in found.reason
+            if found.path.start is Start.CLARABEL and found.is_closed:
+                led += found.cause is Cause.PROVEN_AFTER_LOCAL_MINIMUM
                 assert_never_beaten(search, found, 60)
         assert led >= 1
 
@@ -187,7 +187,7 @@ class TestGrossNoise:
         problem = simulated(2, 1, 3, noise=GROSS_NOISE, number_of_measurements=4).problem
         first, second = (searched(problem).run(method, None) for _ in range(2))
         np.testing.assert_array_equal(first.R, second.R)
-        assert (first.cost, first.lower, first.path) == (second.cost, second.lower, second.path)
+        assert (first.cost, first.lower_bound, first.path) == (second.cost, second.lower_bound, second.path)
 
 
 def pair_alone(problem: rw.Problem, target: str, sensor: str) -> rw.Problem:
@@ -209,13 +209,13 @@ class TestRealDataset:
         assert certificate.cost == pytest.approx(8.2812454, abs=5e-8)
         assert certificate.relative_gap < 1e-10
         assert certificate.float_gap < 1e-12
-        assert certificate.path == "spectral start, dual"
+        assert certificate.path == SearchPath(Start.SPECTRAL, Multipliers.KKT)
 
     def test_sdp_finds_the_same(self, utias_folder: Path) -> None:
         certificate = solved(real_dataset(utias_folder), "sdp").certificate
         assert certificate.status is Status.CERTIFIED
         assert certificate.cost == pytest.approx(8.2812454, abs=5e-8)
-        assert certificate.path.startswith("relaxation (interior point (blocks))")
+        assert certificate.path.start is Start.INTERIOR_POINT
 
     @pytest.mark.parametrize("share", range(4))
     def test_each_pair_alone_is_proven_and_none_is_beaten(self, utias_folder: Path, share: int) -> None:
@@ -230,18 +230,19 @@ class TestRealDataset:
             assert solution.certificate.is_optimal
 
     def test_nine_pairs_need_more_than_the_first_multipliers(self, utias_folder: Path) -> None:
-        paths = Counter[str]()
+        causes = Counter[Cause]()
         problem = real_dataset(utias_folder)
         for target, sensor in problem.pairs:
-            paths[searched(pair_alone(problem, target, sensor)).run("auto", None).path] += 1
-        assert paths["spectral start, dual"] == 64
-        assert paths["spectral start, small dual"] == 8
-        assert paths.total() == 73
+            causes[searched(pair_alone(problem, target, sensor)).run("auto", None).cause] += 1
+        assert causes[Cause.PROVEN] == 64
+        assert causes[Cause.PROVEN_WITH_REDUNDANT_CONSTRAINTS] == 8
+        assert causes[Cause.PROVEN_AFTER_LOCAL_MINIMUM] == 1
+        assert causes.total() == 73
 
     def test_one_pair_has_a_local_minimum(self, utias_folder: Path) -> None:
         alone = pair_alone(real_dataset(utias_folder), "tag_22", "cam_6")
         certificate = solved(alone).certificate
-        assert certificate.path.startswith("better start")
+        assert certificate.path.start is Start.BETTER
         assert certificate.is_optimal
         assert "local minimum" in certificate.reason
         from_spectral = optimum(alone)
@@ -250,7 +251,7 @@ class TestRealDataset:
         # certify() says of that local minimum what it is.
         stuck = searched(alone).run("local", from_spectral.R)
         assert stuck.cost == pytest.approx(from_spectral.cost)
-        assert stuck.lower < stuck.cost
+        assert stuck.lower_bound < stuck.cost
 
 
 class TestMethods:
@@ -259,7 +260,7 @@ class TestMethods:
     def test_sdp_agrees_with_auto(self, sides: tuple[int, int], scale: ScaleMode) -> None:
         problem = simulated(*sides, 2, scale=scale).problem
         auto, sdp = solved(problem), solved(problem, "sdp")
-        assert sdp.certificate.path.startswith("relaxation (Clarabel" if sum(sides) <= 5 else "relaxation (interior")
+        assert sdp.certificate.path.start is (Start.CLARABEL if sum(sides) <= 5 else Start.INTERIOR_POINT)
         assert "semidefinite relaxation" in sdp.certificate.seconds
         assert sdp.certificate.is_certified
         assert sdp.cost == pytest.approx(auto.cost, rel=1e-10)
@@ -269,7 +270,7 @@ class TestMethods:
         for method_of_start in (simulation, solved(simulation.problem)):
             initial = (method_of_start.X, method_of_start.Y, 1.0)
             solution = rw.solve(simulation.problem, method="local", initial=initial)
-            assert solution.certificate.path.startswith("given start")
+            assert solution.certificate.path.start is Start.GIVEN
             assert solution.certificate.is_certified
             assert "spectral start" not in solution.certificate.seconds
 
@@ -283,9 +284,9 @@ class TestMethods:
             (search.run("local", random_rotations(2, generator)) for _ in range(20)), key=lambda found: found.cost
         )
         assert stuck.cost > best.cost + 1e-3
-        assert stuck.lower <= best.cost
-        assert not is_closed(search, stuck)
-        assert "method='auto' looks further" in stuck.reason
+        assert stuck.lower_bound <= best.cost
+        assert not stuck.is_closed
+        assert stuck.cause is Cause.LOCAL_MINIMUM_POSSIBLE
 
     @pytest.mark.parametrize("scale", SCALES)
     def test_certify_proves_the_optimum_and_finds_worse_answers_out(self, scale: ScaleMode) -> None:
@@ -293,12 +294,13 @@ class TestMethods:
         solution = solved(simulation.problem)
         optimal = rw.certify(simulation.problem, solution.X, solution.Y, solution.scale)
         assert optimal.is_certified
-        assert "as given" in optimal.reason
+        assert optimal.cause is Cause.PROVEN
         assert optimal.cost == pytest.approx(solution.cost, rel=1e-9)
         truth = rw.certify(simulation.problem, simulation.X, simulation.Y, simulation.scale)
         assert truth.status is Status.GAP
         assert truth.cost > solution.cost
-        assert "a better answer exists" in truth.reason
+        assert truth.cause is Cause.BETTER_ANSWER
+        assert truth.figures["better_cost"] == pytest.approx(solution.cost)
         assert truth.lower_bound <= solution.cost
 
     def test_many_frames_skip_the_dense_stages_and_say_so(self) -> None:
@@ -310,6 +312,8 @@ class TestMethods:
             assert "small dual" not in certificate.seconds
             assert "semidefinite relaxation" not in certificate.seconds
             if not certificate.is_optimal:
+                assert certificate.cause is Cause.TOO_LARGE
+                assert "3 unknown frames" in certificate.reason
                 assert "max_dense_frames = 2" in certificate.reason
             seen[certificate.status] += 1
             allowed = solved(problem, max_dense_frames=3).certificate
@@ -388,14 +392,14 @@ class TestWhatCertifiedMeans:
         problem = simulated(12, 6, 1, motion="planar", noise=noise, scale=scale).problem
         certificate = solved(problem).certificate
         assert certificate.status is Status.CERTIFIED_NOT_UNIQUE
-        assert "leave the answer free" in certificate.reason
+        assert certificate.cause is Cause.FREE_DIRECTIONS
 
     def test_a_certificate_is_about_the_optimum_not_about_the_truth(self) -> None:
         simulation = simulated(2, 1, 8, noise=Noise(0.05, 300.0))
         search = searched(simulation.problem)
         found = search.run("auto", None)
         x = np.append(flat(true_rotations(simulation)), 1.0)
-        assert found.lower <= x @ search.form.apply(x)
+        assert found.lower_bound <= x @ search.form.apply(x)
 
 
 def peak_memory(problem: rw.Problem) -> int:
@@ -404,7 +408,7 @@ def peak_memory(problem: rw.Problem) -> int:
     found = search.run("auto", None)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert is_closed(search, found)
+    assert found.is_closed
     return peak
 
 

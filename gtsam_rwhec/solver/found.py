@@ -1,0 +1,51 @@
+"""What a search found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.cause import Cause, SearchPath
+
+
+@dataclass(frozen=True)
+class Found:
+    """The best rotations of a part and the best bound on what any answer costs.
+
+    Attributes
+    ----------
+    R : (n, 3, 3) array
+        In the order of ``part.free``, as the form has them.
+    cost : float
+        x'Q'x there.
+    lower_bound : float
+        Rigorous; at most ``cost``.
+    float_bound : float
+        The same without the allowance for rounding: x'Zx.
+    is_definite : bool
+        Whether Z is proven positive definite, so that no other answer costs the same.
+    eigenvalue : float
+        A proven lower bound on the smallest eigenvalue of Z.
+    tolerance : float
+        The absolute gap up to which the answer counts as proven optimal.
+    path : SearchPath
+    cause : Cause
+    figures : dict of str to float
+        The numbers behind the cause, as in ``Certificate``.
+    """
+
+    R: Array
+    cost: float
+    lower_bound: float
+    float_bound: float
+    is_definite: bool
+    eigenvalue: float
+    tolerance: float
+    path: SearchPath
+    cause: Cause
+    figures: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the gap is within the tolerance: the answer is proven optimal."""
+        return self.cost - self.lower_bound <= self.tolerance
