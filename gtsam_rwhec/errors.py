@@ -82,6 +82,10 @@ class ImageError(RwhecError):
 class TargetError(RwhecError):
     """A target that cannot be printed: an unknown family, an id that it lacks, a size that is none."""
 
+    def __init__(self, fault: str, target: str = "") -> None:
+        super().__init__(f"target {target}: {fault}" if target else fault)
+        self.fault = fault
+
 
 class ResultVersionError(FileFormatError):
     """A result file that another version of the format wrote."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from gtsam_rwhec.first_rig.look import Poses
 from gtsam_rwhec.rig.field_types import is_name
-from gtsam_rwhec.rig.schema import PoseSource
+from gtsam_rwhec.rig.sections import PoseSource
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,10 @@ from gtsam_rwhec.first_rig.targets import Guess, targets_seen
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig.field_types import is_name, is_text
 from gtsam_rwhec.rig.rig import Rig
-from gtsam_rwhec.rig.rig_file import parse_rig, rig_text
-from gtsam_rwhec.rig.schema import Carriers, Intrinsics, PoseNoise, Sensor, TagTarget, TargetSection
+from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseNoise, Sensor
+from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
+from gtsam_rwhec.rig.written_rig import rig_text
 
 #: Words of topics that say what is published and not by which camera.
 _COMMON = frozenset({

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 from gtsam_rwhec.first_rig.look import Driver, Images
-from gtsam_rwhec.rig.schema import AprilGridTarget, CharucoTarget, TagTarget
+from gtsam_rwhec.rig.target_sections import AprilGridTarget, CharucoTarget, TagTarget
 from gtsam_rwhec.vision.targets import FAMILIES
 
 #: Lengths that stand in a first rig file until someone measures.

@@ -1,17 +1,21 @@
-from .calibrated_frames import Frame as Frame
+# Rig files, read and written.
+# A calibrated rig, for export and for plots.
+from .calibrated_frames import CalibratedFrame as CalibratedFrame
 from .calibrated_frames import RigFrames as RigFrames
 from .rig import Rig as Rig
 from .rig_file import parse_rig as parse_rig
 from .rig_file import read_rig as read_rig
-from .rig_file import rig_text as rig_text
-from .schema import AprilGridTarget as AprilGridTarget
-from .schema import Carriers as Carriers
-from .schema import CharucoTarget as CharucoTarget
-from .schema import CheckerboardTarget as CheckerboardTarget
-from .schema import Cleaning as Cleaning
-from .schema import Intrinsics as Intrinsics
-from .schema import Noise as Noise
-from .schema import PoseNoise as PoseNoise
-from .schema import PoseSource as PoseSource
-from .schema import Sensor as Sensor
-from .schema import TagTarget as TagTarget
+
+# The sections of a rig file.
+from .sections import Carriers as Carriers
+from .sections import Cleaning as Cleaning
+from .sections import DetectionNoise as DetectionNoise
+from .sections import Intrinsics as Intrinsics
+from .sections import PoseNoise as PoseNoise
+from .sections import PoseSource as PoseSource
+from .sections import Sensor as Sensor
+from .target_sections import AprilGridTarget as AprilGridTarget
+from .target_sections import CharucoTarget as CharucoTarget
+from .target_sections import CheckerboardTarget as CheckerboardTarget
+from .target_sections import TagTarget as TagTarget
+from .written_rig import rig_text as rig_text

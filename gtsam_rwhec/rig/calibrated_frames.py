@@ -13,7 +13,7 @@ from gtsam_rwhec.rig.field_types import NAME
 from gtsam_rwhec.vision.camera import Camera
 
 
-class Frame(NamedTuple):
+class CalibratedFrame(NamedTuple):
     """One frame and its parent: names, and T_parent_child (4, 4) in metres."""
 
     parent: str
@@ -98,12 +98,12 @@ class RigFrames:
         for what in ("cameras", "time_offsets_s", "topics"):
             object.__setattr__(self, what, dict(getattr(self, what)))
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Iterator[CalibratedFrame]:
         """Each sensor on its carrier, then each target on its own."""
         for name, T in self.sensors.items():
-            yield Frame(self.sensor_carrier, name, T)
+            yield CalibratedFrame(self.sensor_carrier, name, T)
         for name, T in self.targets.items():
-            yield Frame(self.target_carrier, name, T)
+            yield CalibratedFrame(self.target_carrier, name, T)
 
 
 def _list(names: Mapping[str, Array]) -> str:

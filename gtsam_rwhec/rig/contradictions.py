@@ -1,4 +1,4 @@
-"""What is wrong with a rig file although each of its values is right: names given twice, targets that look alike."""
+"""Faults between the values of a rig file: names given twice, targets that look alike."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any
 
 from gtsam_rwhec.errors import OptionError, TargetError
 from gtsam_rwhec.files.yaml_lines import KeyPath, suggestion
-from gtsam_rwhec.rig.schema import Carriers, Sensor, TargetSection
+from gtsam_rwhec.rig.sections import Carriers, Sensor
+from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.targets import Checkerboard, Target
 
@@ -33,7 +34,7 @@ def contradictions(
         try:
             printed.append(section.target(name))
         except TargetError as error:
-            yield ("targets", name), str(error).removeprefix(f"target {name}: ")
+            yield ("targets", name), error.fault
     yield from _names(carriers, sensors, targets)
     yield from _detection(detection)
     yield from _lookalikes(printed)

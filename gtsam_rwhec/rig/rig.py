@@ -12,7 +12,8 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from gtsam_rwhec.rig.contradictions import contradictions
 from gtsam_rwhec.rig.field_types import Name
-from gtsam_rwhec.rig.schema import Carriers, Cleaning, Noise, Section, Sensor, TargetSection
+from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Section, Sensor
+from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.targets import Target
 
 
@@ -24,7 +25,7 @@ class RigFile(Section):
     targets: dict[Name, TargetSection] = Field(description="by name, each with type and sizes")
     sizes: Literal["known", "check", "estimate"] = "check"
     noise: Annotated[
-        Annotated[Noise, UnionTag("numbers")] | Annotated[Literal["estimate"], UnionTag("word")],
+        Annotated[DetectionNoise, UnionTag("numbers")] | Annotated[Literal["estimate"], UnionTag("word")],
         Discriminator(lambda given: "word" if isinstance(given, str) else "numbers"),
     ] = "estimate"
     detection: dict[str, Any] = Field(default={}, description="fields of vision's DetectionOptions")

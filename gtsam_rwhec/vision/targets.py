@@ -70,7 +70,8 @@ class Charuco:
         _check(self.name, self.family, self.ids, {"square_m": self.square_m, "marker_m": self.marker_m})
         if not self.marker_m < self.square_m:
             raise TargetError(
-                f"target {self.name}: marker_m = {self.marker_m:g} must be less than square_m = {self.square_m:g}"
+                f"marker_m = {self.marker_m:g} must be less than square_m = {self.square_m:g}",
+                self.name,
             )
 
     @property
@@ -108,7 +109,8 @@ class AprilGrid:
         _check(self.name, self.family, self.ids, {"tag_m": self.tag_m})
         if not 0.0 < self.spacing <= 10.0:
             raise TargetError(
-                f"target {self.name}: spacing = {self.spacing!r}; Kalibr's is gap / tag size, 0.3 as a rule"
+                f"spacing = {self.spacing!r}; Kalibr's is gap / tag size, 0.3 as a rule",
+                self.name,
             )
 
     @property
@@ -147,8 +149,9 @@ class Checkerboard:
         _check(self.name, None, (), {"square_m": self.square_m})
         if (self.columns + self.rows) % 2 == 0:
             raise TargetError(
-                f"target {self.name}: a checkerboard of {self.columns} x {self.rows} inner corners looks the same "
-                "after half a turn; take one with an odd and an even number, or a ChArUco board"
+                f"a checkerboard of {self.columns} x {self.rows} inner corners looks the same "
+                "after half a turn; take one with an odd and an even number, or a ChArUco board",
+                self.name,
             )
 
     @property
@@ -188,16 +191,17 @@ def _grid(columns: int, rows: int, step_m: float) -> Array:
 def _check(name: str, family: str | None, ids: tuple[int, ...], lengths: dict[str, float]) -> None:
     if family is not None:
         if family not in FAMILIES:
-            raise TargetError(f"target {name}: there is no family {family!r}; there are {', '.join(FAMILIES)}")
+            raise TargetError(f"there is no family {family!r}; there are {', '.join(FAMILIES)}", name)
         if min(ids) < 0 or max(ids) >= FAMILIES[family]:
             raise TargetError(
-                f"target {name}: ids {min(ids)} to {max(ids)} are not in {family}: 0 to {FAMILIES[family] - 1}"
+                f"ids {min(ids)} to {max(ids)} are not in {family}: 0 to {FAMILIES[family] - 1}",
+                name,
             )
     for word, length in lengths.items():
         if not 0.0 < length < LARGEST_M:
-            raise TargetError(f"target {name}: {word} = {length!r}; give metres, above 0 and below {LARGEST_M:g}")
+            raise TargetError(f"{word} = {length!r}; give metres, above 0 and below {LARGEST_M:g}", name)
 
 
 def _check_grid(name: str, columns: int, rows: int, least: int) -> None:
     if not (least <= columns <= 100 and least <= rows <= 100):
-        raise TargetError(f"target {name}: {columns} columns and {rows} rows; each must be {least} to 100")
+        raise TargetError(f"{columns} columns and {rows} rows; each must be {least} to 100", name)

@@ -20,8 +20,8 @@ from gtsam_rwhec.rig import (
     CharucoTarget,
     CheckerboardTarget,
     Cleaning,
+    DetectionNoise,
     Intrinsics,
-    Noise,
     PoseNoise,
     PoseSource,
     Rig,
@@ -81,15 +81,15 @@ def test_what_is_left_out() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "noise"),
     [
-        ("noise: estimate", "noise: {corner_px: 0.3}", Noise(corner_px=0.3)),
+        ("noise: estimate", "noise: {corner_px: 0.3}", DetectionNoise(corner_px=0.3)),
         (
             "noise: estimate",
             "noise: {rotation_deg: 1, translation_mm: 2}",
-            Noise(rotation_deg=1.0, translation_mm=2.0),
+            DetectionNoise(rotation_deg=1.0, translation_mm=2.0),
         ),
     ],
 )
-def test_noise_given(old: str, new: str, noise: Noise) -> None:
+def test_noise_given(old: str, new: str, noise: DetectionNoise) -> None:
     assert parse_rig(FULL.replace(old, new), "rig.yaml").noise == noise
 
 
@@ -175,7 +175,11 @@ def rigs(draw: st.DrawFn) -> Rig:
         sensors=sensors,
         targets={name: target for name, target in targets.items() if name in some},
         sizes=draw(st.sampled_from(["known", "check", "estimate"])),
-        noise=draw(st.sampled_from(["estimate", Noise(corner_px=0.3), Noise(rotation_deg=1e-7, translation_mm=1.0)])),
+        noise=draw(
+            st.sampled_from(
+                ["estimate", DetectionNoise(corner_px=0.3), DetectionNoise(rotation_deg=1e-7, translation_mm=1.0)]
+            )
+        ),
         detection=draw(st.dictionaries(st.sampled_from(["min_side_px", "max_blur_px"]), st.floats(1e-300, 1e300))),
         cleaning=Cleaning(
             min_rotation_deg=draw(POSITIVE), max_translation_m_s=draw(st.none() | POSITIVE), thin=draw(st.booleans())

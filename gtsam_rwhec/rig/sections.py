@@ -1,18 +1,16 @@
-"""The sections of a rig file, field by field: what there is, in which units, and what contradicts what.
+"""The sections of a rig file, field by field, with units; those of targets are in `target_sections`.
 
-Read and written by `gtsam_rwhec.rig.rig_file`; made in Python as any pydantic model is. Nothing is converted, and a key
-that is not here is an error.
+Nothing is converted, and a key that is not here is an error.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from gtsam_rwhec.rig.field_types import Length, Name, Positive, Text, TimeOffset, list_of
+from gtsam_rwhec.rig.field_types import Name, Positive, Text, TimeOffset, list_of
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag
 
 
 class Section(BaseModel):
@@ -126,78 +124,15 @@ class Sensor(Section):
         return self
 
 
-class TagTarget(Section):
-    """A single tag."""
-
-    type: Literal["tag"]
-    family: str = Field(description="such as tag36h11")
-    id: int = Field(description="the number of the tag")
-    size_m: Length = Field(description="side of the black square, metres")
-
-    def target(self, name: str) -> Tag:
-        """Named."""
-        return Tag(name, self.family, self.id, self.size_m)
-
-
-class CharucoTarget(Section):
-    """A ChArUco board of columns x rows squares."""
-
-    type: Literal["charuco"]
-    family: str = Field(description="such as aruco_5x5_100")
-    columns: int = Field(description="squares across")
-    rows: int = Field(description="squares down")
-    square_m: Length = Field(description="side of a square, metres")
-    marker_m: Length = Field(description="side of a marker, metres")
-    first_id: int = 0
-
-    def target(self, name: str) -> Charuco:
-        """Named."""
-        return Charuco(name, self.family, self.columns, self.rows, self.square_m, self.marker_m, self.first_id)
-
-
-class AprilGridTarget(Section):
-    """Kalibr's AprilGrid."""
-
-    type: Literal["aprilgrid"]
-    family: str = Field(description="tag36h11 as a rule")
-    columns: int = Field(description="tags across")
-    rows: int = Field(description="tags down")
-    tag_m: Length = Field(description="side of a tag's black square, metres (Kalibr's tagSize)")
-    spacing: Positive = Field(description="gap between tags / side of a tag (Kalibr's tagSpacing)")
-    first_id: int = 0
-
-    def target(self, name: str) -> AprilGrid:
-        """Named."""
-        return AprilGrid(name, self.family, self.columns, self.rows, self.tag_m, self.spacing, self.first_id)
-
-
-class CheckerboardTarget(Section):
-    """A checkerboard, counted by inner corners."""
-
-    type: Literal["checkerboard"]
-    columns: int = Field(description="inner corners across")
-    rows: int = Field(description="inner corners down")
-    square_m: Length = Field(description="side of a square, metres")
-
-    def target(self, name: str) -> Checkerboard:
-        """Named."""
-        return Checkerboard(name, self.columns, self.rows, self.square_m)
-
-
-TargetSection: TypeAlias = Annotated[
-    TagTarget | CharucoTarget | AprilGridTarget | CheckerboardTarget, Field(discriminator="type")
-]
-
-
-class Noise(Section):
-    """Of B: standard deviations about and along each axis, or that of a corner in pixels."""
+class DetectionNoise(Section):
+    """Noise of the detections (B): standard deviations about and along each axis, or that of a corner in pixels."""
 
     rotation_deg: Positive | None = None
     translation_mm: Positive | None = None
     corner_px: Positive | None = None
 
     @model_validator(mode="after")
-    def _is_one(self) -> Noise:
+    def _is_one(self) -> DetectionNoise:
         given = self._given("rotation_deg", "translation_mm", "corner_px")
         if given not in (["rotation_deg", "translation_mm"], ["corner_px"]):
             raise ValueError(
