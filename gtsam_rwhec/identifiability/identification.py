@@ -21,7 +21,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.geometry.poses import Array
@@ -212,6 +211,8 @@ def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray, enough: 
     def solve(v: Array) -> Array:
         leaf, border = factor.solve(v[: L * m].reshape(L, m, 1), v[L * m :].reshape(-1, 1))
         return np.concatenate([leaf.ravel(), border.ravel()])
+
+    from scipy.sparse.linalg import LinearOperator, eigsh  # slow to import, and few problems need it
 
     size = len(used)
     operator = LinearOperator((size, size), matvec=solve, dtype=np.float64)

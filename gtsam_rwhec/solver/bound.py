@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver import arrow
@@ -188,6 +187,8 @@ def _smallest_eigenpair(D: Array, C: Array, E: Array, form: ReducedForm) -> tupl
         matrix = arrow.dense(D, C, E) - G.T @ G
         values, vectors = scipy.linalg.eigh(matrix, subset_by_index=[0, 0], check_finite=False)
         return float(values[0]), vectors[:, 0]
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh  # slow to import, few problems need it
+
     split = 9 * form.leaves
     wide = C.reshape(split, -1)
 

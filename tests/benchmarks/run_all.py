@@ -27,6 +27,7 @@ import opencv_hand_eye
 import outliers
 import real_dataset
 import single_pairs
+import start_time
 import vision_rate
 import world_origin
 from bars import Row, print_rows
@@ -44,6 +45,7 @@ def main() -> int:
     parser.add_argument("--corrupted-seeds", type=int, default=8, help="of wrong detections; 0: none")
     arguments = parser.parse_args()
     parts = {
+        "start": lambda: start_time.rows(repetitions=15),
         "answers on the real dataset": real_dataset.answers,
         "real dataset against SCS": lambda: [] if arguments.no_scs else real_dataset.speed(repetitions=15),
         "the pairs alone": lambda: single_pairs.rows_of("known", 100) + single_pairs.rows_of("shared", 100),
