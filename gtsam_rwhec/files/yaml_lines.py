@@ -117,12 +117,8 @@ def parse_yaml(text: str, where: str, *, tags: Collection[str] = ()) -> YamlFile
     FileFormatError
         It is not YAML, is empty, or has what is refused here (see the module); with the line.
     """
-    builder = _Builder(where, frozenset(tags))
-    for event in _events(text, where):
-        builder.take(event)
-    if builder.documents == 0 or (builder.data is None and not builder.lines):
-        raise FileFormatError(f"{where} is empty; a YAML mapping was expected.")
-    return YamlFile(where, builder.data, builder.lines)
+    reader = _Reader(where, frozenset(tags), _events(text, where))
+    return YamlFile(where, reader.document(), reader.lines)
 
 
 def dotted(path: KeyPath) -> str:
@@ -177,87 +173,69 @@ def _events(text: str, where: str) -> Iterator[Any]:
 
 
 @dataclass
-class _Open:
-    """A mapping or list that is being filled; `key` waits for its value."""
+class _Reader:
+    """Takes the events of one document in their order; `lines` as in `YamlFile`."""
 
-    items: dict[str, Any] | list[Any]
-    path: KeyPath
-    key: str | None = None
-
-
-@dataclass
-class _Builder:
     where: str
     tags: frozenset[str]
-    data: Any = None
-    documents: int = 0
+    events: Iterator[Any]
     lines: dict[KeyPath, int] = field(default_factory=dict)
-    stack: list[_Open] = field(default_factory=list)
 
-    def take(self, event: Any) -> None:
-        line = event.start_mark.line + 1
-        if isinstance(event, yaml.DocumentStartEvent):
-            self.documents += 1
-            if self.documents > 1:
-                self._refuse(line, "a second document begins ('---'); one is read")
-        elif isinstance(event, yaml.AliasEvent):
-            self._refuse(line, f"the alias *{event.anchor}: aliases are not read; write the value out")
-        elif isinstance(event, yaml.NodeEvent):
-            self._take_node(event, line)
-        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
-            done = self.stack.pop()
-            self._place(done.items if isinstance(done.items, dict) else tuple(done.items))
+    def document(self) -> Any:
+        next(self.events)  # the stream begins
+        if isinstance(next(self.events), yaml.StreamEndEvent):
+            raise FileFormatError(f"{self.where} is empty; a YAML mapping was expected.")
+        data = self._value(self._node(), (), 0)
+        next(self.events)  # the document ends
+        after = next(self.events)
+        if isinstance(after, yaml.DocumentStartEvent):
+            self._refuse(after, "a second document begins ('---'); one is read")
+        return data
 
-    def _take_node(self, event: Any, line: int) -> None:
-        if event.anchor is not None:
-            self._refuse(line, f"the anchor &{event.anchor}: anchors are not read; write values out where they are")
-        if event.tag is not None and event.tag not in self.tags:
-            tag = event.tag.replace("tag:yaml.org,2002:", "!!")
-            self._refuse(line, f"the tag {shown(tag)}: tags are not read; write a plain value")
-        top = self.stack[-1] if self.stack else None
-        if top is not None and isinstance(top.items, dict) and top.key is None:
-            self._take_key(top, event, line)
-            return
-        path = self._path()
-        # In a mapping the key's line stands already.
-        self.lines.setdefault(path, line)
+    def _value(self, event: Any, path: KeyPath, depth: int) -> Any:
+        """The value that begins with `event`, inside `depth` mappings and lists."""
+        self.lines.setdefault(path, _line(event))  # in a mapping the key's line stands already
         if isinstance(event, yaml.ScalarEvent):
-            self._place(_scalar(event.value) if event.style is None else event.value)
-            return
-        if len(self.stack) == DEEPEST:
-            self._refuse(line, f"more than {DEEPEST} mappings and lists inside one another")
-        self.stack.append(_Open({} if isinstance(event, yaml.MappingStartEvent) else [], path))
+            return _scalar(event.value) if event.style is None else event.value
+        if depth == DEEPEST:
+            self._refuse(event, f"more than {DEEPEST} mappings and lists inside one another")
+        if isinstance(event, yaml.SequenceStartEvent):
+            items: list[Any] = []
+            while not isinstance(event := self._node(), yaml.SequenceEndEvent):
+                items.append(self._value(event, (*path, len(items)), depth + 1))
+            return tuple(items)
+        mapping: dict[str, Any] = {}
+        while not isinstance(event := self._node(), yaml.MappingEndEvent):
+            if not isinstance(event, yaml.ScalarEvent):
+                self._refuse(event, "a key that is itself a list or a mapping; is a {, [ or ? too many there?")
+            under = (*path, event.value)
+            if event.value in mapping:
+                self._refuse(event, f"{dotted(under)} is there twice, first in line {self.lines[under]}; keep one")
+            self.lines[under] = _line(event)
+            mapping[event.value] = self._value(self._node(), under, depth + 1)
+        return mapping
 
-    def _take_key(self, mapping: _Open, event: Any, line: int) -> None:
-        if not isinstance(event, yaml.ScalarEvent):
-            self._refuse(line, "a key that is itself a list or a mapping; is a {, [ or ? too many there?")
-        key = event.value
-        path = (*mapping.path, key)
-        if key in mapping.items:
-            self._refuse(line, f"{dotted(path)} is there twice, first in line {self.lines[path]}; keep one")
-        mapping.key = key
-        self.lines[path] = line
+    def _node(self) -> Any:
+        """The next event: a node without alias, anchor and tag, or the end of a list or mapping."""
+        event = next(self.events)
+        if isinstance(event, yaml.AliasEvent):
+            self._refuse(event, f"the alias *{event.anchor}: aliases are not read; write the value out")
+        if isinstance(event, yaml.NodeEvent):
+            if event.anchor is not None:
+                self._refuse(
+                    event, f"the anchor &{event.anchor}: anchors are not read; write values out where they are"
+                )
+            if event.tag is not None and event.tag not in self.tags:
+                tag = event.tag.replace("tag:yaml.org,2002:", "!!")
+                self._refuse(event, f"the tag {shown(tag)}: tags are not read; write a plain value")
+        return event
 
-    def _path(self) -> KeyPath:
-        """Of the next value."""
-        if not self.stack:
-            return ()
-        top = self.stack[-1]
-        return (*top.path, len(top.items) if top.key is None else top.key)
+    def _refuse(self, event: Any, words: str) -> NoReturn:
+        raise FileFormatError(f"{self.where}, line {_line(event)}: {words}.")
 
-    def _place(self, value: Any) -> None:
-        if not self.stack:
-            self.data = value
-            return
-        top = self.stack[-1]
-        if isinstance(top.items, list):
-            top.items.append(value)
-        elif top.key is not None:
-            top.items[top.key] = value
-            top.key = None
 
-    def _refuse(self, line: int, words: str) -> NoReturn:
-        raise FileFormatError(f"{self.where}, line {line}: {words}.")
+def _line(event: Any) -> int:
+    return int(event.start_mark.line) + 1
 
 
 def _scalar(text: str) -> str | int | float | bool | None:
