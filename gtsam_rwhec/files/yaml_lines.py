@@ -220,7 +220,7 @@ class _Reader:
         event = next(self.events)
         if isinstance(event, yaml.AliasEvent):
             self._refuse(event, f"the alias *{event.anchor}: aliases are not read; write the value out")
-        if isinstance(event, yaml.NodeEvent):
+        if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
             if event.anchor is not None:
                 self._refuse(
                     event, f"the anchor &{event.anchor}: anchors are not read; write values out where they are"

@@ -19,7 +19,8 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Footer, Schema, Statistics
+from mcap.records import Channel, Chunk, ChunkIndex, Footer, McapRecord, Schema, Statistics
+from mcap.stream_reader import StreamReader
 
 from gtsam_rwhec.errors import LogError
 
@@ -30,15 +31,14 @@ LARGEST_CHUNK = 1 << 29
 LOOSE_BLOCK = 1 << 22
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<QQQII")
 _FOOTER_BYTES = 9 + 20
 #: What the records' readers raise for bytes that are none.
-_FAULTS = (McapError, struct.error, UnicodeDecodeError, ValueError)
+_FAULTS = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError)
 
 
 @dataclass(frozen=True)
 class Block:
-    """Where messages are: a chunk's record, or records outside chunks; and the span of their log times.
+    """Where messages are: a chunk's record, or records outside chunks; and the first of their log times.
 
     `is_cut`: the file ends inside the chunk.
     """
@@ -47,7 +47,6 @@ class Block:
     length: int
     is_chunk: bool
     start_ns: int
-    end_ns: int
     is_cut: bool = False
 
 
@@ -142,23 +141,15 @@ class McapFile:
         footer_at = self.size - len(MAGIC) - _FOOTER_BYTES
         if footer_at < len(MAGIC):
             return False
-        tail = self._read(footer_at, _FOOTER_BYTES + len(MAGIC))
-        if tail[-len(MAGIC) :] != MAGIC or _RECORD.unpack_from(tail) != (Opcode.FOOTER, 20):
-            return False
-        start = Footer.read(_stream(tail[9:])).summary_start
+        footer = self._records(footer_at)[0]
+        start = footer.summary_start if isinstance(footer, Footer) else 0
         if not len(MAGIC) <= start < footer_at:
             return False
-        summary, at = self._read(start, footer_at - start), 0
-        statistics, chunks = None, []
-        while at + _RECORD.size <= len(summary):
-            opcode, length = _RECORD.unpack_from(summary, at)
-            body = summary[at + _RECORD.size : at + _RECORD.size + length]
-            at += _RECORD.size + length
-            self._note(opcode, body)
-            if opcode == Opcode.STATISTICS:
-                statistics = Statistics.read(_stream(body))
-            elif opcode == Opcode.CHUNK_INDEX:
-                chunks.append(ChunkIndex.read(_stream(body)))
+        records = self._records(start)
+        for record in records:
+            self._note(record)
+        statistics = next((record for record in records if isinstance(record, Statistics)), None)
+        chunks = [record for record in records if isinstance(record, ChunkIndex)]
         if (
             statistics is None
             or statistics.chunk_count != len(chunks)
@@ -171,11 +162,7 @@ class McapFile:
             inside = len(MAGIC) <= chunk.chunk_start_offset <= start - chunk.chunk_length
             if not inside or chunk.message_start_time > chunk.message_end_time:
                 return False
-            self.blocks.append(
-                Block(
-                    chunk.chunk_start_offset, chunk.chunk_length, True, chunk.message_start_time, chunk.message_end_time
-                )
-            )
+            self.blocks.append(Block(chunk.chunk_start_offset, chunk.chunk_length, True, chunk.message_start_time))
         self.seen = {channel: Seen(count) for channel, count in statistics.channel_message_counts.items()}
         # Without the messages' own indexes, a channel's span is that of the chunks that have it.
         for chunk in chunks:
@@ -183,13 +170,16 @@ class McapFile:
                 _widen(self.seen.setdefault(channel, Seen()), chunk.message_start_time, chunk.message_end_time)
         return True
 
-    def _note(self, opcode: int, body: bytes) -> None:
-        if opcode == Opcode.SCHEMA:
-            schema = Schema.read(_stream(body))
-            self.schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = Channel.read(_stream(body))
-            self.channels[channel.id] = channel
+    def _records(self, start: int) -> list[McapRecord]:
+        """Those from a place in the file to its end; read from memory, where no stated length takes more."""
+        stream = io.BytesIO(self._read(start, self.size - start))
+        return list(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
+
+    def _note(self, record: McapRecord) -> None:
+        if isinstance(record, Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self.channels[record.id] = record
 
     def _read_through(self) -> None:
         """Find the blocks of a file without an index, and where it stops making sense."""
@@ -210,12 +200,12 @@ class McapFile:
                 self._count_loose(loose_at, at)
                 loose_at = at if is_loose else 0
             if opcode == Opcode.CHUNK:
-                self._count(Block(at, whole, True, 0, 0))
+                self._count(Block(at, whole, True, 0))
             at += whole
         self._count_loose(loose_at, at)
         before = sum(seen.count for seen in self.seen.values())
         if is_cut:
-            self._count(Block(at, self.size - at, True, 0, 0, is_cut=True))
+            self._count(Block(at, self.size - at, True, 0, is_cut=True))
         saved = sum(seen.count for seen in self.seen.values()) - before
         self.losses.append(
             f"{self.path} ends too early, or is damaged, at byte {at} of {self.size}: the last {self.size - at} bytes "
@@ -224,7 +214,7 @@ class McapFile:
 
     def _count_loose(self, start: int, end: int) -> None:
         if start:
-            self._count(Block(start, end - start, False, 0, 0))
+            self._count(Block(start, end - start, False, 0))
 
     def _count(self, block: Block) -> None:
         """Open a block once, for its schemas, channels, counts and span."""
@@ -241,27 +231,24 @@ class McapFile:
                 seen = self.seen[channel] = Seen()
             seen.count += 1
             _widen(seen, log_time, log_time)
-        start, end = min(messages.log_time), max(messages.log_time)
-        self.blocks.append(replace(block, start_ns=start, end_ns=end))
+        self.blocks.append(replace(block, start_ns=min(messages.log_time)))
 
     def _opened(self, raw: bytes, block: Block) -> bytes:
         """What a chunk record holds; as much as there is of one that is cut."""
         where = f"{self.path}, chunk at byte {block.offset}"
+        stream = _stream(raw)
         try:
-            opcode, _ = _RECORD.unpack_from(raw)
-            _, _, size, crc, name_length = _CHUNK.unpack_from(raw, _RECORD.size)
-            at = _RECORD.size + _CHUNK.size + name_length
-            compression = raw[at - name_length : at].decode()
-            (length,) = struct.unpack_from("<Q", raw, at)
-        except (struct.error, UnicodeDecodeError) as error:
+            opcode, length = _RECORD.unpack(stream.read(_RECORD.size))
+            chunk = Chunk.read(stream)
+        except _FAULTS as error:
             raise LogError(f"{where}: no chunk can be read there ({error}); its messages are lost") from error
-        data = raw[at + 8 : at + 8 + length]
-        if opcode != Opcode.CHUNK or (len(data) != length and not block.is_cut):
+        if opcode != Opcode.CHUNK or (_RECORD.size + length != len(raw) and not block.is_cut):
             raise LogError(f"{where}: no whole chunk is there; its messages are lost")
+        size = chunk.uncompressed_size
         if size > LARGEST_CHUNK:
             raise LogError(f"{where}: {size} bytes when opened, beyond the limit of {LARGEST_CHUNK}; not opened")
         try:
-            data = _decompressed(compression, data, size)
+            data = _decompressed(chunk)
         except (zstandard.ZstdError, RuntimeError, EOFError) as error:
             raise LogError(f"{where}: does not decompress ({error}); its messages are lost") from error
         except KeyError as error:
@@ -270,13 +257,13 @@ class McapFile:
             return data
         if len(data) != size:
             raise LogError(f"{where}: opens to other than the {size} bytes that it states; its messages are lost")
-        if crc and zlib.crc32(data) != crc:
+        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
             raise LogError(f"{where}: wrong checksum; its messages are lost")
         return data
 
     def _split(self, data: bytes, offset: int) -> Messages:
         channel, sequence = array("H"), array("I")
-        times = log_time, publish_time = array("Q"), array("Q")
+        log_time, publish_time = array("Q"), array("Q")
         starts, ends = array("Q"), array("Q")
         at = 0
         unpack_record, unpack_message = _RECORD.unpack_from, _MESSAGE.unpack_from
@@ -286,17 +273,17 @@ class McapFile:
             at = start + length
             if at > len(data):
                 break
-            if opcode == 5 and length >= 22:
-                channel_id, number, *stamps = unpack_message(data, start)
+            if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
+                channel_id, number, logged, published = unpack_message(data, start)
                 channel.append(channel_id)
                 sequence.append(number)
-                for column, stamp in zip(times, stamps, strict=True):
-                    column.append(stamp)
-                starts.append(start + 22)
+                log_time.append(logged)
+                publish_time.append(published)
+                starts.append(start + _MESSAGE.size)
                 ends.append(at)
-            elif opcode in (3, 4):
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 try:
-                    self._note(opcode, data[start:at])
+                    self._note((Schema if opcode == Opcode.SCHEMA else Channel).read(_stream(data[start:at])))
                 except _FAULTS as error:
                     raise LogError(
                         f"{self.path}, byte {offset}: a schema or channel cannot be read: {error}"
@@ -304,15 +291,16 @@ class McapFile:
         return Messages(data, channel, sequence, log_time, publish_time, starts, ends)
 
 
-def _decompressed(compression: str, data: bytes, size: int) -> bytes:
-    """At most one byte more than `size`, whatever the data would become."""
-    if compression == "zstd":
+def _decompressed(chunk: Chunk) -> bytes:
+    """At most one byte more than the chunk states, whatever its data would become."""
+    most = chunk.uncompressed_size + 1
+    if chunk.compression == "zstd":
         decompressor = zstandard.ZstdDecompressor(max_window_size=1 << 27)
-        with decompressor.stream_reader(data, read_across_frames=True) as stream:
-            return bytes(stream.read(size + 1))
-    if compression == "lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
-    return {"": data, "none": data}[compression]
+        with decompressor.stream_reader(chunk.data, read_across_frames=True) as stream:
+            return bytes(stream.read(most))
+    if chunk.compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
+    return {"": chunk.data, "none": chunk.data}[chunk.compression]
 
 
 def _stream(data: bytes) -> ReadDataStream:

@@ -88,10 +88,6 @@ class TfBuffer:
         """Every frame, by name."""
         return tuple(sorted(set(self._links) | {link.parent for link in self._links.values()}))
 
-    def children(self) -> tuple[str, ...]:
-        """Every frame that hangs on another, by name."""
-        return tuple(sorted(self._links))
-
     def chain(self, parent: str, child: str) -> tuple[str, ...]:
         """The frames on the way from `parent` to `child`, both included.
 

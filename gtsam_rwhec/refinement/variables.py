@@ -101,19 +101,6 @@ class Variables:
         """Key of the time offset of a pair's sensor."""
         return self.offsets.get(f"time_offset:{pair[1]}")
 
-    def key_of(self, name: str) -> int:
-        """The key of one name.
-
-        Raises
-        ------
-        FrameError
-            For a name that there is not.
-        """
-        try:
-            return self.keys[name]
-        except KeyError:
-            raise FrameError(f"there is no {name!r} in the refinement; there are {', '.join(self.keys)}") from None
-
     def values(self, state: State) -> gtsam.Values:
         """An estimate as GTSAM's."""
         values = gtsam.Values()
