@@ -19,6 +19,7 @@ from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.stage_reports import SizeFields
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.certified_solution import solve
@@ -165,16 +166,16 @@ class SolvingRounds:
                 target=target,
                 stated_m=stated[target],
                 scale=scale,
-                sigma=sigma_of(refined, f"scale:{target}"),
+                sigma=sigma_of(refined, Unknown(UnknownKind.SCALE, target)),
                 is_free=False,
             )
             for target, scale in refined.scale.items()
         )
 
 
-def sigma_of(refined: Refined, name: str) -> float | None:
+def sigma_of(refined: Refined, unknown: Unknown) -> float | None:
     """The standard deviation of a scalar; None where it is infinite."""
-    variance = float(refined.covariance(name)[0, 0])
+    variance = float(refined.covariance(unknown)[0, 0])
     return math.sqrt(variance) if math.isfinite(variance) else None
 
 

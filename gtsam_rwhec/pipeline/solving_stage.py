@@ -17,6 +17,7 @@ from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, sigma_of, without_outlier_marks
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.stage_reports import LogFields, SizeFields, TimeOffsetFields, TrackCount, contradicted
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
@@ -111,7 +112,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
             TimeOffsetFields(
                 sensor=name,
                 offset_s=offsets[name],
-                sigma_s=sigma_of(refined, f"time_offset:{name}") if name in estimated else None,
+                sigma_s=sigma_of(refined, Unknown(UnknownKind.TIME_OFFSET, name)) if name in estimated else None,
             )
             for name in rig.sensors
             if name in offsets
@@ -125,7 +126,7 @@ def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:
     """A free size as the answer has it, with the others known."""
     assert not isinstance(refined.scale, float)
     scale = refined.scale[size.target]
-    return size.model_copy(update={"scale": scale, "sigma": sigma_of(refined, f"scale:{size.target}")})
+    return size.model_copy(update={"scale": scale, "sigma": sigma_of(refined, Unknown(UnknownKind.SCALE, size.target))})
 
 
 def _outlier_count(measured: MeasuredPairs) -> TrackCount:

@@ -15,6 +15,7 @@ from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import ByPair, Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.variance_factors import AS_STATED, VarianceFactors
 
 
 def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
@@ -56,9 +57,7 @@ def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
 def reweighted(
     problem: Problem,
     weights: ByPair[ArrayLike],
-    *,
-    rotation_factor: float = 1.0,
-    translation_factor: float = 1.0,
+    factors: VarianceFactors = AS_STATED,
 ) -> Problem:
     """The problem with each measurement's squared residual multiplied by a weight.
 
@@ -69,8 +68,8 @@ def reweighted(
     weights : dict of (target, sensor) to (N,) array
         At least zero; a measurement of weight w has sigma / sqrt(w) and w kappa, and with w = 0 it is left out. Pairs
         that it lacks keep their weights.
-    rotation_factor, translation_factor : float
-        Variance factors of the noise: every kappa is divided by the one, every sigma^2 multiplied by the other.
+    factors : VarianceFactors
+        Every kappa is divided by the rotation's, every sigma^2 multiplied by the translation's.
 
     Returns
     -------
@@ -85,9 +84,8 @@ def reweighted(
         For a pair that the problem does not have, weights of another number or below zero, or when nothing is left.
     """
     _check_pairs(problem, weights)
-    for name, factor in (("rotation_factor", rotation_factor), ("translation_factor", translation_factor)):
-        if not (np.isfinite(factor) and factor > 0.0):
-            raise NoiseError(f"{name} is {factor!r}; a variance factor is positive and finite")
+    if not all(np.isfinite(factor) and factor > 0.0 for factor in factors):
+        raise NoiseError(f"{factors}: a variance factor is positive and finite")
     edges: dict[Pair, Measurements] = {}
     for pair in problem.pairs:
         raw = problem.measurements(*pair)
@@ -101,7 +99,7 @@ def reweighted(
         positive = w > 0.0
         if positive.any():
             kept, w = (raw, w) if positive.all() else (_taken(raw, positive), w[positive])
-            edges[pair] = _weighed(kept, w, rotation_factor, translation_factor)
+            edges[pair] = _weighed(kept, w, factors)
     return problem.with_measurements(edges)
 
 
@@ -121,14 +119,14 @@ def _taken(raw: Measurements, mask: np.ndarray) -> Measurements:
     )
 
 
-def _weighed(raw: Measurements, w: np.ndarray, rotation_factor: float, translation_factor: float) -> Measurements:
+def _weighed(raw: Measurements, w: np.ndarray, factors: VarianceFactors) -> Measurements:
     covariances = raw.covariances
     if covariances is not None:
-        deviation = np.sqrt(np.repeat([rotation_factor, translation_factor], 3))
+        deviation = np.sqrt(np.repeat(factors, 3))
         covariances = covariances * deviation[:, None] * deviation / w[:, None, None]
     return replace(
         raw,
-        sigma=raw.sigma * np.sqrt(translation_factor / w),
-        kappa=raw.kappa * w / rotation_factor,
+        sigma=raw.sigma * np.sqrt(factors.translation / w),
+        kappa=raw.kappa * w / factors.rotation,
         covariances=covariances,
     )

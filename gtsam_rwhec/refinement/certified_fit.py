@@ -21,7 +21,7 @@ FRAMES_RELAXED = 12
 
 
 @dataclass(frozen=True)
-class Fit:
+class CertifiedFit:
     """Poses (4, 4) of the frames that had a measurement, metres; alpha by target (or mover); whether all was certified.
 
     A scale is as it was found, negative too: outliers may do that on the way.
@@ -32,7 +32,7 @@ class Fit:
     certified: bool
 
 
-def certified_fit(problem: Problem, previous: Fit | None) -> Fit:
+def certified_fit(problem: Problem, previous: CertifiedFit | None) -> CertifiedFit:
     """The global optimum; from the previous poses where they lead to it, which the certificate tells.
 
     Raises
@@ -54,10 +54,10 @@ def certified_fit(problem: Problem, previous: Fit | None) -> Fit:
         alpha |= dict.fromkeys(part.names, answer.scale if part.scale != "per_target" else 1.0)
         own = dict(zip(part.free, answer.own_scale, strict=True))
         alpha |= part.fixed_scales | {name: float(own[name]) for name in part.scale_owners}
-    return Fit(poses, alpha, certified)
+    return CertifiedFit(poses, alpha, certified)
 
 
-def _solve(part: Part, previous: Fit | None) -> tuple[Answer, bool]:
+def _solve(part: Part, previous: CertifiedFit | None) -> tuple[Answer, bool]:
     search = Search.of(part, SolveOptions(max_dense_frames=FRAMES_RELAXED))
     found: Found | None = None
     if previous is not None and all(name in previous.poses for name in part.free):

@@ -8,13 +8,14 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.variance_factors import AS_STATED
 from gtsam_rwhec.refinement.graph import add_summary, summary_of
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.optimisation import information_of
 from gtsam_rwhec.refinement.options import NoiseGroups
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.variance_components import VarianceComponents, from_moments
-from gtsam_rwhec.refinement.weighting import COMPONENTS, VarianceFactors
+from gtsam_rwhec.refinement.weighting import COMPONENTS, FactorsByPair
 from gtsam_rwhec.solver.parts import Part
 
 
@@ -42,28 +43,28 @@ class ChordalModel:
             for e, pair in enumerate(part.pairs)
         }
 
-    def graph(self, state: State, factors: VarianceFactors) -> gtsam.NonlinearFactorGraph:
+    def graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
         """The measurements' factors."""
         graph = gtsam.NonlinearFactorGraph()
         for part in self.parts:
             for e, pair in enumerate(part.pairs):
-                add_summary(graph, self.variables, pair, summary_of(part, e, factors.of[pair]))
+                add_summary(graph, self.variables, pair, summary_of(part, e, factors[pair]))
         return graph
 
     def values(self, state: State) -> gtsam.Values:
         """An estimate as GTSAM's."""
         return self.variables.values(state)
 
-    def information_graph(self, state: State, factors: VarianceFactors) -> gtsam.NonlinearFactorGraph:
+    def information_graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
         """The graph itself: there is no loss in it."""
         return self.graph(state, factors)
 
-    def inefficiency(self, state: State, factors: VarianceFactors) -> float:
+    def inefficiency(self, state: State, factors: FactorsByPair) -> float:
         """None: least squares."""
         return 1.0
 
     def next_factors(
-        self, state: State, joint: JointCovariance, factors: VarianceFactors, groups: NoiseGroups
+        self, state: State, joint: JointCovariance, factors: FactorsByPair, groups: NoiseGroups
     ) -> VarianceComponents:
         """Variance factors from the residuals at an estimate."""
         values = self.variables.values(state)
@@ -74,9 +75,9 @@ class ChordalModel:
                 cost, used = [], []
                 for i, component in enumerate(COMPONENTS):
                     alone = gtsam.NonlinearFactorGraph()
-                    add_summary(alone, self.variables, pair, summary_of(part, e, (1.0, 1.0), component))
+                    add_summary(alone, self.variables, pair, summary_of(part, e, AS_STATED, component))
                     cost.append(alone.error(values))
                     information = information_of(alone, values, self.variables)
-                    used.append(float(np.sum(joint.finite * information)) / factors.of[pair][i])
+                    used.append(float(np.sum(joint.finite * information)) / factors[pair][i])
                 costs[pair], fitted[pair] = (cost[0], cost[1]), (used[0], used[1])
         return from_moments(self.parts, costs, fitted, groups)

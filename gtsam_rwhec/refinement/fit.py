@@ -11,6 +11,7 @@ import numpy as np
 from gtsam_rwhec.errors import NotConvergedWarning
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.variance_factors import AS_STATED
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.chordal import ChordalModel
 from gtsam_rwhec.refinement.geodesic import GeodesicModel
@@ -18,7 +19,7 @@ from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.optimisation import Optimum, information_of, optimise
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.variables import State, Variables
-from gtsam_rwhec.refinement.weighting import Group, VarianceFactors
+from gtsam_rwhec.refinement.weighting import FactorsByPair, Group, group_label, largest_change
 
 Model = GeodesicModel | ChordalModel
 
@@ -31,13 +32,13 @@ OFFSET_SETTLED_S = 1e-6
 
 
 @dataclass(frozen=True)
-class Fit:
+class SettledFit:
     """The settled optimum: the graph, the information of the unknowns, and what the noise came to."""
 
     graph: gtsam.NonlinearFactorGraph
     optimum: Optimum
     information: Array
-    factors: VarianceFactors
+    factors: FactorsByPair
     redundancy: dict[tuple[Group, str], float]
     initial_cost: float
     iterations: int
@@ -45,9 +46,9 @@ class Fit:
 
 def fit(
     problem: Problem, model: Model, variables: Variables, start: State, options: RefineOptions, estimates: bool
-) -> Fit:
+) -> SettledFit:
     """Optimise, and where weights depend on the answer or on the residuals, again until they are settled."""
-    factors = VarianceFactors.ones(problem.pairs)
+    factors: FactorsByPair = dict.fromkeys(problem.pairs, AS_STATED)
     redundancy: dict[tuple[Group, str], float] = {}
     state, values = start, model.values(start)
     iterations = 0
@@ -69,9 +70,9 @@ def fit(
         )
         if estimates:
             size = len(information)
-            joint = JointCovariance.of(variables.unknown, information, np.zeros((size, 0)), np.ones(size))
+            joint = JointCovariance.of(variables.unknowns, information, np.zeros((size, 0)), np.ones(size))
             components = model.next_factors(state, joint, factors, options.noise_groups)
-            change = components.factors.distance(factors)
+            change = largest_change(factors, components.factors)
             settled = settled and change < SETTLED
             redundancy = components.redundancy
             if not settled:
@@ -81,7 +82,7 @@ def fit(
     else:
         few = sorted(redundancy, key=lambda key: redundancy[key])[:3]
         where = ", ".join(
-            f"{'-'.join(group)}, {component}: {redundancy[group, component]:.2g}" for group, component in few
+            f"the {component} of {group_label(group)}: {redundancy[group, component]:.2g}" for group, component in few
         )
         warnings.warn(
             f"the estimated noise did not settle in {MAX_ROUNDS} rounds; the fewest equations to spare have {where}. "
@@ -100,7 +101,7 @@ def fit(
             NotConvergedWarning,
             stacklevel=3,
         )
-    return Fit(graph, optimum, information, factors, redundancy, graph.error(model.values(start)), iterations)
+    return SettledFit(graph, optimum, information, factors, redundancy, graph.error(model.values(start)), iterations)
 
 
 def _with_knowledge(
@@ -117,7 +118,7 @@ def _information(
     variables: Variables,
     options: RefineOptions,
     state: State,
-    factors: VarianceFactors,
+    factors: FactorsByPair,
     values: gtsam.Values,
 ) -> Array:
     graph = model.information_graph(state, factors)

@@ -10,8 +10,9 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind, FreeReason
 from gtsam_rwhec.identifiability.identification import identify, typical_length
 from gtsam_rwhec.refinement.pair_data import PairData
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind, slots_of
 from gtsam_rwhec.refinement.variables import State, Variables
-from gtsam_rwhec.refinement.weighting import VarianceFactors
+from gtsam_rwhec.refinement.weighting import FactorsByPair
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses, costs_of_pairs
 from gtsam_rwhec.solver.variables import given_answer
@@ -19,10 +20,13 @@ from gtsam_rwhec.solver.variables import given_answer
 #: A velocity's mean square, in units of what noise makes of it, up to which a carrier counts as standing still.
 MOVED = 4.0
 
+#: The one scale of all targets.
+SHARED = Unknown(UnknownKind.SCALE)
+
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Free directions: basis (d, k) over ``Variables.unknown`` and as records; unit (d,): what counts as one of each.
+    """Free directions: basis (d, k) over ``Variables.unknowns`` and as records; unit (d,): what counts as one of each.
 
     ``shrinkage``: see ``free_offsets``.
     """
@@ -38,44 +42,41 @@ def free_space_of(
     variables: Variables,
     state: State,
     data: list[PairData],
-    fitted: VarianceFactors | None = None,
+    fitted: FactorsByPair | None = None,
 ) -> FreeSpace:
     """Tested as the certified solution's are (``identifiability``), at the refined answer.
 
     The residuals tell the noise; where a loss holds outliers off, which are among them, the noise as ``fitted`` does.
     """
-    unknown = variables.unknown
-    place = dict(zip(unknown, np.cumsum([0, *unknown.values()])[:-1], strict=True))
-    size = sum(unknown.values())
+    slots = slots_of(variables.unknowns)
+    size = sum(unknown.dimension for unknown in slots)
     unit = np.ones(size)
     directions: list[FreeDirection] = []
     for part in parts:
-        scale = _scales_of(part, state)
-        answer = given_answer(part, state.X, state.Y, scale)
+        answer = given_answer(part, state.X, state.Y, _scales_of(part, state))
         poses = PairPoses.of(part, answer)
         J_t, J_R = costs_of_pairs(part, poses)
         if fitted is not None:  # what these factors predict, 3 / 2 a measurement
-            factors = np.array([fitted.of[pair] for pair in part.pairs])
+            factors = np.array([fitted[pair] for pair in part.pairs])
             J_R, J_t = 1.5 * part.moments.count * factors[:, 0], 1.5 * part.moments.count * factors[:, 1]
         directions += identify(part, poses, J_t, J_R).free_directions
         length = typical_length(part)
         for name in part.free:
-            unit[place[name] : place[name] + 6] = np.r_[np.ones(3), np.full(3, length)]
+            unit[slots[Unknown(UnknownKind.FRAME, name)]] = np.r_[np.ones(3), np.full(3, length)]
     offsets, shrinkage = free_offsets(data, variables)
     directions += offsets
-    for name, scale in state.scales.items():
-        if name in place:
-            unit[place[name]] = scale
+    for scale, value in state.scales.items():
+        unit[slots[scale]] = value
     basis = np.zeros((size, len(directions)))
     for direction, column in zip(directions, basis.T, strict=True):
         for name, xi in direction.frames.items():
-            column[place[name] : place[name] + 6] = xi
-        changes = {"scale": direction.scale} | {f"scale:{name}": x for name, x in direction.own_scales.items()}
-        for name, change in changes.items():
-            if name in place:  # d alpha = alpha d log alpha
-                column[place[name]] = state.scales[name] * change
+            column[slots[Unknown(UnknownKind.FRAME, name)]] = xi
+        for owner, change in ({SHARED.owner: direction.scale} | direction.own_scales).items():
+            scale = Unknown(UnknownKind.SCALE, owner)
+            if scale in slots:  # d alpha = alpha d log alpha
+                column[slots[scale]] = state.scales[scale] * change
         for sensor, change_s in direction.time_offsets_s.items():
-            column[place[f"time_offset:{sensor}"]] = change_s
+            column[slots[Unknown(UnknownKind.TIME_OFFSET, sensor)]] = change_s
     return FreeSpace(basis, tuple(directions), unit, shrinkage)
 
 
@@ -90,12 +91,11 @@ def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[FreeD
     -------
     free : list of FreeDirection
     shrinkage : dict of str to float
-        Of the others: by what part noise in the velocity pulls the offset towards zero.
+        Of the other sensors: by what part noise in the velocity pulls the offset towards zero.
     """
     free: list[FreeDirection] = []
     shrinkage: dict[str, float] = {}
-    for name in variables.offsets:
-        sensor = name.partition(":")[2]
+    for sensor in variables.offsets:
         squares, noise = np.zeros(2), np.zeros(2)
         for item in data:
             if item.pair.sensor != sensor or item.paths is None:
@@ -111,11 +111,11 @@ def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[FreeD
         if (squares <= MOVED * noise + 1e-18 * np.maximum(squares.max(), 1.0)).all():
             free.append(FreeDirection(FreeKind.TIME_OFFSET, FreeReason.STANDSTILL, time_offsets_s={sensor: 1.0}))
         else:
-            shrinkage[name] = float(noise.sum() / squares.sum())
+            shrinkage[sensor] = float(noise.sum() / squares.sum())
     return free, shrinkage
 
 
 def _scales_of(part: Part, state: State) -> float | dict[str, float]:
     if part.scale == "per_target":
-        return {name: state.scales[f"scale:{name}"] for name in part.scale_owners}
-    return state.scales.get("scale", 1.0)
+        return {name: state.scales[Unknown(UnknownKind.SCALE, name)] for name in part.scale_owners}
+    return state.scales.get(SHARED, 1.0)

@@ -14,6 +14,7 @@ from scipy.special import chdtr, chdtri
 from gtsam_rwhec.errors import NoiseError, WeightsWarning
 from gtsam_rwhec.geometry.poses import Array, to_pose3
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import NoiseGroups, RefineOptions, Robust
@@ -22,8 +23,8 @@ from gtsam_rwhec.refinement.variables import State, Variables, carrier_key
 from gtsam_rwhec.refinement.variance_components import SMALLEST, VarianceComponents, from_measurements
 from gtsam_rwhec.refinement.weighting import (
     COMPONENTS,
+    FactorsByPair,
     Group,
-    VarianceFactors,
     group_of,
     residual_covariance,
     square_root_information,
@@ -90,17 +91,17 @@ class GeodesicModel:
         """Residuals and Jacobians of every pair at an estimate."""
         return linearized(self.data, self.variables, state)
 
-    def covariances(self, state: State, factors: VarianceFactors) -> dict[Pair, Array]:
+    def covariances(self, state: State, factors: FactorsByPair) -> dict[Pair, Array]:
         """(N, 6, 6) of every pair's residuals at an estimate."""
         at = self.linearize(state)
-        return {i.pair: residual_covariance(i, at[i.pair], factors.of[i.pair], propagated=True) for i in self.data}
+        return {i.pair: residual_covariance(i, at[i.pair], factors[i.pair], propagated=True) for i in self.data}
 
-    def graph(self, state: State, factors: VarianceFactors, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
+    def graph(self, state: State, factors: FactorsByPair, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
         """The measurements' factors, weighed as of an estimate; in another loss than the options', if told."""
         loss = self.options.robust if robust is None else robust
         graph = gtsam.NonlinearFactorGraph()
         here = [
-            dataclasses.replace(item, residuals=item.at(state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0)))
+            dataclasses.replace(item, residuals=item.at(state.offsets_s.get(item.pair.sensor, 0.0)))
             for item in self.data
         ]
         rest = here
@@ -128,11 +129,11 @@ class GeodesicModel:
                 values.insert(carrier_key(i), to_pose3(A[:3, :3], A[:3, 3]))
         return values
 
-    def information_graph(self, state: State, factors: VarianceFactors) -> gtsam.NonlinearFactorGraph:
+    def information_graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
         """The measurements' factors without a loss: what the information is of, up to ``inefficiency``."""
         return self.graph(state, factors, "none")
 
-    def inefficiency(self, state: State, factors: VarianceFactors) -> float:
+    def inefficiency(self, state: State, factors: FactorsByPair) -> float:
         """By what a loss widens the covariance of least squares: Huber's E psi^2 / (E psi')^2, for 6 dimensions.
 
         (Huber and Ronchetti, Robust Statistics, eq. 7.87, whose psi' is here the divergence of w(|u|) u over 6.)
@@ -146,7 +147,7 @@ class GeodesicModel:
         slope = np.array([(loss.weight(d + step) - loss.weight(max(d - step, 0.0))) for d in lengths]) / (
             step + np.minimum(lengths, step)
         )
-        unknowns = sum(self.variables.unknown.values())
+        unknowns = sum(unknown.dimension for unknown in self.variables.unknowns)
         spare = max(6 * len(lengths) - unknowns, 1)
         square = float(np.sum((weight * lengths) ** 2)) / spare
         gain = float(np.mean(weight + slope * lengths / 6.0))
@@ -160,7 +161,7 @@ class GeodesicModel:
         return square / gain**2
 
     def next_factors(
-        self, state: State, joint: JointCovariance, factors: VarianceFactors, groups: NoiseGroups
+        self, state: State, joint: JointCovariance, factors: FactorsByPair, groups: NoiseGroups
     ) -> VarianceComponents:
         """Variance factors from the residuals at an estimate."""
         at = self.linearize(state)
@@ -171,22 +172,22 @@ class GeodesicModel:
             return components
         return VarianceComponents(self._median_factors(state, factors, groups, components), components.redundancy)
 
-    def _whitened(self, state: State, factors: VarianceFactors) -> dict[Pair, Array]:
+    def _whitened(self, state: State, factors: FactorsByPair) -> dict[Pair, Array]:
         at = self.linearize(state)
         result = {}
         for item in self.data:
-            covariance = residual_covariance(item, at[item.pair], factors.of[item.pair], propagated=True)
+            covariance = residual_covariance(item, at[item.pair], factors[item.pair], propagated=True)
             result[item.pair] = np.einsum("nij,nj->ni", square_root_information(covariance), at[item.pair].residual)
         return result
 
     def _median_factors(
-        self, state: State, factors: VarianceFactors, groups: NoiseGroups, components: VarianceComponents
-    ) -> VarianceFactors:
+        self, state: State, factors: FactorsByPair, groups: NoiseGroups, components: VarianceComponents
+    ) -> FactorsByPair:
         """Where outliers are expected: medians of squared residuals against a chi-square's, 3 dimensions each."""
         at = self.linearize(state)
         squares: dict[tuple[Group, int], list[Array]] = {}
         for item in self.data:
-            covariance = residual_covariance(item, at[item.pair], factors.of[item.pair], propagated=True)
+            covariance = residual_covariance(item, at[item.pair], factors[item.pair], propagated=True)
             for i, block in enumerate((slice(0, 3), slice(3, 6))):
                 r = at[item.pair].residual[:, block]
                 square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(covariance[:, block, block]), r)
@@ -196,12 +197,10 @@ class GeodesicModel:
             all_squares = np.concatenate(values)
             spare = components.redundancy[group, COMPONENTS[i]] / (3.0 * len(all_squares))
             ratios[group, i] = max(float(np.median(all_squares)) / float(chdtri(3, 0.5)) / spare, SMALLEST)
-        return VarianceFactors(
-            {
-                pair: (old[0] * ratios[group_of(pair, groups), 0], old[1] * ratios[group_of(pair, groups), 1])
-                for pair, old in factors.of.items()
-            }
-        )
+        return {
+            pair: VarianceFactors(*(factor * ratios[group_of(pair, groups), i] for i, factor in enumerate(old)))
+            for pair, old in factors.items()
+        }
 
 
 def linearized(data: list[PairData], variables: Variables, state: State) -> dict[Pair, Linearization]:
@@ -210,7 +209,7 @@ def linearized(data: list[PairData], variables: Variables, state: State) -> dict
     result = {}
     for item in data:
         scale = variables.scale_of_pair.get(item.pair)
-        offset_s = state.offsets_s.get(f"time_offset:{item.pair[1]}", 0.0)
+        offset_s = state.offsets_s.get(item.pair.sensor, 0.0)
         result[item.pair] = item.at(offset_s).linearize(
             frames[item.pair.target],
             frames[item.pair.sensor],

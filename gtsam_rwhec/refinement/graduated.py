@@ -6,7 +6,7 @@
 a quantile of the chi-square distribution with 6 degrees of freedom, which d^2 has at the truth.) For given weights the
 problem is a calibration problem again, solved to its global optimum from moments of the re-weighted measurements; so
 the scheme has no start to depend on. Graduating is a heuristic all the same: afterwards, frames with outliers are put
-to the vote of their own measurements (``consensus``).
+to the vote of their own measurements (``voting``).
 
 With noise unknown, d^2 has no unit to begin with: the worst of all measurements would make everything an inlier. Least
 trimmed squares, which keep the better half of each pair, give a first one, the inliers the next. With more than half
@@ -28,13 +28,13 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import reweighted
-from gtsam_rwhec.refinement.squared_residuals import NoiseFactors
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement.truncated_least_squares import (
     DOF,
     Iteration,
     NoiseScale,
     TruncatedLeastSquares,
-    agreeing,
+    inlier_count,
 )
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
@@ -54,12 +54,12 @@ class Graduated:
     Attributes
     ----------
     solution : Solution
-        Of the inliers, certified in full, under the noise factors.
+        Of the inliers, certified in full, under the variance factors.
     weights : dict of (target, sensor) to (N,) array
         0 or 1, in the order of ``problem.measurements``.
     inliers : dict of (target, sensor) to (N,) booleans
-    noise_factors : NoiseFactors
-        Variances of the noise over those that were given, (rotation, translation); 1 unless estimated.
+    variance_factors : VarianceFactors
+        Of the noise as given; 1 unless estimated.
     threshold : float
         c^2, which inliers' squared residuals do not exceed.
     truncated_cost : float
@@ -78,7 +78,7 @@ class Graduated:
     solution: Solution
     weights: dict[Pair, Array]
     inliers: dict[Pair, np.ndarray]
-    noise_factors: NoiseFactors
+    variance_factors: VarianceFactors
     threshold: float
     truncated_cost: float
     left_out: tuple[str, ...]
@@ -139,15 +139,7 @@ def graduated(
         fit, keep = work.run(noise_scale)
         weights = work.measured.by_pair(keep.astype(np.float64))
         tell("certifying the inliers' solution")
-        solution = solve(
-            reweighted(
-                problem,
-                weights,
-                rotation_factor=work.factors.rotation,
-                translation_factor=work.factors.translation,
-            ),
-            progress=tell,
-        )
+        solution = solve(reweighted(problem, weights, work.factors), progress=tell)
     except (UnderdeterminedError, CountError) as error:
         raise OutlierError(
             f"too few of the {problem.number_of_measurements} measurements agree for an answer ({error}). With "
@@ -156,7 +148,7 @@ def graduated(
             "and B are of the same instant, and the names of targets"
         ) from error
     inliers = work.measured.by_pair(keep)
-    counts = {name: agreeing(name, inliers) for name in problem.targets + problem.sensors}
+    counts = {name: inlier_count(name, inliers) for name in problem.targets + problem.sensors}
     left_out = tuple(name for name, (good, _) in counts.items() if good == 0)
     suspect = {name: (good, total) for name, (good, total) in counts.items() if good < SUSPECT * total}
     suspect_pairs = {
@@ -178,7 +170,7 @@ def graduated(
         solution=solution,
         weights=weights,
         inliers=inliers,
-        noise_factors=work.factors,
+        variance_factors=work.factors,
         threshold=work.threshold,
         truncated_cost=0.5 * work.truncated(work.distances(fit)),
         left_out=left_out,

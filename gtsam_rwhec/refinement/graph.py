@@ -19,12 +19,13 @@ from gtsam_rwhec.geometry.poses import Array, to_pose3
 from gtsam_rwhec.problem.moments import edge_forms
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement.options import ResidualKind, Robust
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import Variables, carrier_key
 from gtsam_rwhec.refinement.weighting import (
     Component,
-    VarianceFactors,
+    FactorsByPair,
     measurement_covariance,
 )
 from gtsam_rwhec.solver.parts import Part
@@ -91,7 +92,7 @@ class CarrierVariables:
 
 
 def summary_of(
-    part: Part, pair_index: int, factors: tuple[float, float], component: Component | None = None
+    part: Part, pair_index: int, factors: VarianceFactors, component: Component | None = None
 ) -> EdgeSummary:
     """A pair's moments as one summary, its variances multiplied by the factors; or of one component alone."""
     moments = part.moments
@@ -99,9 +100,9 @@ def summary_of(
     translation, rotation = edge_forms(moments.translation[one], moments.rotation[one], moments.kappa[one])
     form = np.zeros((25, 25))
     if component != "translation":
-        form += rotation[0] / factors[0]
+        form += rotation[0] / factors.rotation
     if component != "rotation":
-        form += translation[0] / factors[1]
+        form += translation[0] / factors.translation
     target, sensor = part.pairs[pair_index]
     scale = part.fixed_scales.get(target, 1.0)
     if scale != 1.0:  # the form's variables are measured lengths, the factor's true ones
@@ -193,7 +194,7 @@ def add_with_carriers(
     variables: Variables,
     data: list[PairData],
     carriers: CarrierVariables,
-    factors: VarianceFactors,
+    factors: FactorsByPair,
     robust: Robust,
 ) -> None:
     """Carrier poses as variables, each with a prior at what was measured; one factor for each measurement.
@@ -213,7 +214,7 @@ def add_with_carriers(
         if item.pair not in carriers.index:
             continue
         target, sensor = variables.ends(item.pair)
-        covariance = measurement_covariance(item, factors.of[item.pair])
+        covariance = measurement_covariance(item, factors[item.pair])
         for i, B in enumerate(item.residuals.B):
             graph.add(
                 pose_robot_world_hand_eye_factor(

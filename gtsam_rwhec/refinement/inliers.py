@@ -15,10 +15,11 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.variance_factors import AS_STATED
 from gtsam_rwhec.refinement.geodesic import linearized
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.variables import State, Variables
-from gtsam_rwhec.refinement.weighting import VarianceFactors, residual_covariance
+from gtsam_rwhec.refinement.weighting import FactorsByPair, residual_covariance
 
 
 def under_worst_axis(problem: Problem, data: list[PairData], variables: Variables, state: State) -> Problem:
@@ -29,11 +30,11 @@ def under_worst_axis(problem: Problem, data: list[PairData], variables: Variable
     at = linearized(data, variables, state)
     edges = {}
     for item in data:
-        C = residual_covariance(item, at[item.pair], (1.0, 1.0), propagated=True)
+        C = residual_covariance(item, at[item.pair], AS_STATED, propagated=True)
         scale = problem.fixed_scales.get(item.pair.target, 1.0)  # the data are in true metres there
         A = item.residuals.A
         if item.paths is not None:
-            A = A @ item.paths.motion(state.offsets_s[f"time_offset:{item.pair[1]}"])
+            A = A @ item.paths.motion(state.offsets_s[item.pair.sensor])
         edges[item.pair] = dataclasses.replace(
             problem.measurements(*item.pair),
             A=A,
@@ -44,18 +45,18 @@ def under_worst_axis(problem: Problem, data: list[PairData], variables: Variable
     return problem.with_measurements(edges)
 
 
-def agreeing(
-    data: list[PairData], variables: Variables, state: State, factors: VarianceFactors, threshold: float
+def inliers_of(
+    data: list[PairData], variables: Variables, state: State, factors: FactorsByPair, threshold: float
 ) -> dict[Pair, np.ndarray]:
     """Of every pair (N,) booleans: r' C^-1 r is within the threshold. Of frames that the estimate lacks: none."""
     known = set(state.X) | set(state.Y)
     present = [item for item in data if known.issuperset(item.pair)]
     at = linearized(present, variables, state)
     result = {item.pair: np.zeros(item.count, dtype=bool) for item in data}
-    everywhere = next(iter(factors.of.values()))
+    everywhere = next(iter(factors.values()))
     for item in present:
         r = at[item.pair].residual
-        C = residual_covariance(item, at[item.pair], factors.of.get(item.pair, everywhere), propagated=True)
+        C = residual_covariance(item, at[item.pair], factors.get(item.pair, everywhere), propagated=True)
         square: Array = np.einsum("ni,ni->n", r, np.linalg.solve(C, r[:, :, None])[:, :, 0])
         result[item.pair] = square <= threshold
     return result

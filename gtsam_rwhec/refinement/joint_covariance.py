@@ -18,6 +18,7 @@ from scipy.linalg import block_diag
 
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.unknowns import Unknown, rows_of, slots_of
 
 #: A linear function whose share along the free directions is below this is called determined (the share below which a
 #: free direction's sentence leaves a frame out).
@@ -34,8 +35,8 @@ class JointCovariance:
 
     Attributes
     ----------
-    slots : dict of str to slice
-        Rows of each name.
+    slots : dict of Unknown to slice
+        Rows of each.
     finite : (d, d) array
         Q (Q' Lambda Q)^-1 Q'.
     free : (d, k) array
@@ -44,32 +45,28 @@ class JointCovariance:
         What counts as one: 1 rad, the typical length, ...
     """
 
-    slots: dict[str, slice]
+    slots: dict[Unknown, slice]
     finite: Array
     free: Array
     unit: Array
 
     @staticmethod
-    def of(dimensions: dict[str, int], information: Array, free: Array, unit: Array) -> JointCovariance:
+    def of(unknowns: tuple[Unknown, ...], information: Array, free: Array, unit: Array) -> JointCovariance:
         """Invert.
 
         Parameters
         ----------
-        dimensions : dict of str to int
-            Of each name, in order.
+        unknowns : tuple of Unknown
+            What the rows are of, in order.
         information : (d, d) array
         free : (d, k) array
             Directions that the measurements leave free, in the parameters' own units; k may be 0.
         unit : (d,) array
         """
-        slots, first = {}, 0
-        for name, dimension in dimensions.items():
-            slots[name] = slice(first, first + dimension)
-            first += dimension
         scaled = information * unit[:, None] * unit
         scaled = 0.5 * (scaled + scaled.T)
         basis = _orthonormal(free / unit[:, None])
-        Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if basis.shape[1] else np.eye(first)
+        Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if basis.shape[1] else np.eye(len(unit))
         inside = Q.T @ scaled @ Q
         # Equilibrated, so that rounding is judged by each parameter's own information.
         size = np.sqrt(np.maximum(np.diagonal(inside), 1e-300))
@@ -77,28 +74,28 @@ class JointCovariance:
         lost = values <= ROUNDING * values.max(initial=0.0)
         if lost.any():  # no measurement speaks of these at all
             more = Q @ (vectors[:, lost] / size[:, None])
-            return JointCovariance.of(dimensions, information, np.hstack([free, more * unit[:, None]]), unit)
+            return JointCovariance.of(unknowns, information, np.hstack([free, more * unit[:, None]]), unit)
         root = Q @ (vectors / np.sqrt(values) / size[:, None])
         finite = (root @ root.T) * np.outer(unit, unit)
-        return JointCovariance(slots, finite, basis, unit)
+        return JointCovariance(slots_of(unknowns), finite, basis, unit)
 
-    def rows(self, names: tuple[str, ...]) -> Array:
-        """Indices of names, in the order given.
+    def rows(self, unknowns: tuple[Unknown, ...]) -> np.ndarray:
+        """Indices of some unknowns, in the order given.
 
         Raises
         ------
         FrameError
-            For a name that is not among the unknowns.
+            For what is not among the unknowns.
         """
-        for name in names:
-            if name not in self.slots:
-                raise FrameError(f"there is no {name!r} among the unknowns; there are {', '.join(self.slots)}")
-        indices: Array = np.concatenate([np.arange(self.slots[n].start, self.slots[n].stop) for n in names])
-        return indices
+        for unknown in unknowns:
+            if unknown not in self.slots:
+                there = ", ".join(map(str, self.slots))
+                raise FrameError(f"there is no {str(unknown)!r} among the unknowns; there are {there}")
+        return rows_of(self.slots, unknowns)
 
-    def selector(self, names: tuple[str, ...]) -> Array:
-        """(m, d): picks the names' rows."""
-        selected: Array = np.eye(len(self.unit))[self.rows(names)]
+    def selector(self, unknowns: tuple[Unknown, ...]) -> Array:
+        """(m, d): picks their rows."""
+        selected: Array = np.eye(len(self.unit))[self.rows(unknowns)]
         return selected
 
     def reach(self, G: Array) -> Array:
@@ -128,15 +125,15 @@ class JointCovariance:
         covariance[reached] = np.inf * np.sign(along[reached])
         return covariance
 
-    def information_of(self, names: tuple[str, ...]) -> Array:
+    def information_of(self, unknowns: tuple[Unknown, ...]) -> Array:
         """(m, m) marginal information: the inverse of the covariance where it is finite, 0 along free directions."""
-        chosen = self.selector(names)
-        unit = self.unit[self.rows(names)]
+        chosen = self.selector(unknowns)
+        unit = self.unit[self.rows(unknowns)]
         moved = self.reach(chosen) / unit[:, None]
-        # Directions within these names that a free one reaches, strongest first; the rest of them counts as displaced.
+        # Directions among these that a free one reaches, strongest first; the rest of them counts as displaced.
         U, s, _ = np.linalg.svd(moved, full_matrices=True)
         rank = int((s > SHARE).sum())
-        turned = block_diag(*(self.turned(name) for name in names))
+        turned = block_diag(*(self.turned(unknown) for unknown in unknowns))
         finite = (chosen @ self.finite @ chosen.T + turned) / unit[:, None] / unit
         finite += DISPLACED**2 * moved @ moved.T
         Q = U[:, rank:]
@@ -144,16 +141,16 @@ class JointCovariance:
         marginal: Array = inside / unit[:, None] / unit
         return marginal
 
-    def turned(self, name: str) -> Array:
+    def turned(self, unknown: Unknown) -> Array:
         """(m, m): what a rotation's error does to a frame that is displaced along a free direction.
 
         The direction is known as well as the rotation is: displaced by f, an error omega moves the frame across it by
         omega x f. Second order, but f is no small perturbation.
         """
-        rows = np.arange(self.slots[name].start, self.slots[name].stop)
+        rows = self.rows((unknown,))
         result = np.zeros((len(rows), len(rows)))
         if len(rows) == 6:
-            for f in DISPLACED * self.reach(self.selector((name,)))[3:].T:
+            for f in DISPLACED * self.reach(self.selector((unknown,)))[3:].T:
                 across = se3.hat(f)
                 result[3:, 3:] += across @ self.finite[np.ix_(rows[:3], rows[:3])] @ across.T
         return result

@@ -9,6 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.unknowns import rows_of, slots_of
 from gtsam_rwhec.refinement.variables import Variables
 
 
@@ -35,12 +36,12 @@ def optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, max_iterat
 
 
 def information_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, variables: Variables) -> Array:
-    """Gauss-Newton information (d, d) of ``variables.unknown`` in their order, everything else marginalised.
+    """Gauss-Newton information (d, d) of ``variables.unknowns`` in their order, everything else marginalised.
 
     ``graph`` is without the constraints of fixed frames: known means that their rows are struck out.
     """
     linear = graph.linearize(values)
-    keys = {name: variables.keys[name] for name in variables.keys}
+    keys = variables.keys
     present = set(linear.keyVector())
     others = present - set(keys.values())
     if others:  # carrier poses
@@ -52,22 +53,15 @@ def information_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, vari
                 "given about, moves what is far from it by far more than it says. Give it about the other carrier "
                 "(CarrierNoise.about), or refer the world to an origin nearby"
             ) from error
-    names = [name for name, key in keys.items() if key in present]
+    seen = slots_of(unknown for unknown, key in keys.items() if key in present)
     ordering = gtsam.Ordering()
-    for name in names:
-        ordering.push_back(keys[name])
-    dense = linear.hessian(ordering)[0] if names else np.zeros((0, 0))
-    unknown = variables.unknown
-    place = dict(zip(unknown, np.cumsum([0, *unknown.values()])[:-1], strict=True))
-    information = np.zeros((sum(unknown.values()),) * 2)
-    rows: list[int] = []
-    columns: list[int] = []
-    first = 0
-    for name in names:
-        dimension = 6 if name in variables.frames else 1
-        if name in unknown:
-            rows.extend(range(place[name], place[name] + dimension))
-            columns.extend(range(first, first + dimension))
-        first += dimension
+    for unknown in seen:
+        ordering.push_back(keys[unknown])
+    dense = linear.hessian(ordering)[0] if seen else np.zeros((0, 0))
+    slots = slots_of(variables.unknowns)
+    size = sum(unknown.dimension for unknown in slots)
+    information = np.zeros((size, size))
+    both = [unknown for unknown in slots if unknown in seen]
+    rows, columns = rows_of(slots, both), rows_of(seen, both)
     information[np.ix_(rows, rows)] = dense[np.ix_(columns, columns)]
     return information

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal
 
 import gtsam
@@ -17,6 +18,7 @@ from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.solving.solution import Solution
 
 
@@ -84,12 +86,12 @@ class RefinedPoses:
     free_directions: tuple[FreeDirection, ...]
     joint: JointCovariance = field(repr=False)
 
-    def covariance(self, *names: str) -> Array:
+    def covariance(self, *names: str | Unknown) -> Array:
         """Joint covariance of frames, scales and time offsets, in the order given.
 
         Parameters
         ----------
-        names : str
+        names : str or Unknown
             Frames (six rows each), "scale" or "scale:NAME", "time_offset:SENSOR" (one row each). None: everything
             that was unknown, in the order of ``names``.
 
@@ -103,23 +105,26 @@ class RefinedPoses:
         FrameError
             For a name that there is not.
         """
-        if not (names or self.names):  # everything is fixed
+        asked = [Unknown.of(name) for name in names] or list(self.unknowns)
+        if not asked:  # everything is fixed
             return np.zeros((0, 0))
-        rows = [self._rows_of(name) for name in (names or self.names)]
-        covariance = self.joint.covariance_of(np.concatenate(rows))
-        first = 0
-        for name, of_name in zip(names or self.names, rows, strict=True):
-            if name in self.joint.slots:
-                covariance[first : first + len(of_name), first : first + len(of_name)] += self.joint.turned(name)
-            first += len(of_name)
+        covariance = self.joint.covariance_of(np.concatenate([self._rows_of(unknown) for unknown in asked]))
+        for unknown, (first, end) in zip(asked, pairwise(np.cumsum([0, *(u.dimension for u in asked)])), strict=True):
+            if unknown in self.joint.slots:
+                covariance[first:end, first:end] += self.joint.turned(unknown)
         return covariance
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def unknowns(self) -> tuple[Unknown, ...]:
         """Everything that was unknown."""
         return tuple(self.joint.slots)
 
-    def information(self, *names: str) -> Array:
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of everything that was unknown."""
+        return tuple(map(str, self.unknowns))
+
+    def information(self, *names: str | Unknown) -> Array:
         """Marginal information (m, m) of unknowns: the covariance's inverse, and zero along free directions.
 
         Unlike the covariance it holds everything that is known where a free direction is oblique to the axes.
@@ -129,10 +134,10 @@ class RefinedPoses:
         FrameError
             For a name that is not among the unknowns.
         """
-        names = names or self.names
-        if len(set(names)) != len(names):
-            raise FrameError(f"the information of {', '.join(names)}: name each once, or it is singular")
-        return self.joint.information_of(names)
+        asked = tuple(Unknown.of(name) for name in names) or self.unknowns
+        if len(set(asked)) != len(asked):
+            raise FrameError(f"the information of {', '.join(map(str, asked))}: name each once, or it is singular")
+        return self.joint.information_of(asked)
 
     def relative(self, first: str, second: str) -> tuple[gtsam.Pose3, Array]:
         """T_first_second of two frames on one carrier, and the covariance (6, 6) of its right perturbation.
@@ -147,7 +152,7 @@ class RefinedPoses:
         poses = next((p for p in (self.X, self.Y) if first in p and second in p), None)
         if poses is None:
             for name in (first, second):
-                self._rows_of(name)
+                self._rows_of(Unknown.of(name))
             raise FrameError(
                 f"{first!r} and {second!r} are on two carriers, which move against one another: they have no relative "
                 "pose; ask for two sensors or two targets"
@@ -155,7 +160,7 @@ class RefinedPoses:
         if first == second:
             raise FrameError(f"{first!r} has no pose relative to itself; ask for two frames")
         J = relative_jacobian(poses[first], poses[second])
-        G = J @ np.concatenate([self._rows_of(first), self._rows_of(second)])
+        G = J @ np.concatenate([self._rows_of(Unknown.of(name)) for name in (first, second)])
         return poses[first].between(poses[second]), self.joint.covariance_of(G)
 
     def standard_deviations(self, name: str) -> tuple[Array, Array]:
@@ -195,21 +200,21 @@ class RefinedPoses:
         if name not in poses:
             raise FrameError(f"there is no frame {name!r}; there are {', '.join(poses)}")
         xi = error_of(poses[name], T_carrier_frame)
-        if name not in self.joint.slots:
+        if name not in self.names:
             return bool(np.abs(xi).max() < 1e-9)
         return bool(xi @ self.information(name) @ xi <= self.squared_radius(6, confidence))
 
-    def _rows_of(self, name: str) -> Array:
-        """(m, d): a name's rows of the unknowns; zero for a fixed frame."""
-        if name not in self.joint.slots:
-            known = dict.fromkeys((*self.X, *self.Y, *self.joint.slots))
-            if name == "scale":
+    def _rows_of(self, unknown: Unknown) -> Array:
+        """(m, d): its rows of the unknowns; zero for a fixed frame."""
+        if unknown not in self.joint.slots:
+            if unknown == Unknown(UnknownKind.SCALE):
                 why = "it is known, 1" if self.scale_mode == "known" else "each target has its own: 'scale:NAME'"
                 raise FrameError(f"there is no one scale to ask for; {why}")
-            if name not in known:
-                raise FrameError(f"there is no {name!r}; there are {', '.join(known)}")
+            known = dict.fromkeys((*self.X, *self.Y, *self.names))
+            if str(unknown) not in known:
+                raise FrameError(f"there is no {str(unknown)!r}; there are {', '.join(known)}")
             return np.zeros((6, len(self.joint.unit)))
-        return self.joint.selector((name,))
+        return self.joint.selector((unknown,))
 
 
 @dataclass(frozen=True, repr=False)

@@ -26,15 +26,16 @@ from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.chordal import ChordalModel
-from gtsam_rwhec.refinement.fit import Fit, Model, fit
+from gtsam_rwhec.refinement.fit import Model, SettledFit, fit
 from gtsam_rwhec.refinement.free_space import FreeSpace, free_space_of
 from gtsam_rwhec.refinement.geodesic import GeodesicModel
 from gtsam_rwhec.refinement.graduated import graduated
-from gtsam_rwhec.refinement.inliers import agreeing, under_worst_axis
+from gtsam_rwhec.refinement.inliers import inliers_of, under_worst_axis
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.pair_data import PairData, local_paths
 from gtsam_rwhec.refinement.refined import Movement, PairNoise, Refined
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.weighting import group_of
 from gtsam_rwhec.solver.parts import parts_of
@@ -127,7 +128,7 @@ def refine(
         if judged is whole:
             break
         threshold = float(chdtri(6, 1.0 - options.inlier_confidence))
-        again = agreeing(data, variables, state, settled.factors, threshold)
+        again = inliers_of(data, variables, state, settled.factors, threshold)
         if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
             break
         inliers = again
@@ -145,17 +146,17 @@ def refine(
         )
     if not estimates:
         _warn_of_weights(problem, variables, settled, options)
-    joint = JointCovariance.of(variables.unknown, settled.information, space.basis, space.unit)
+    joint = JointCovariance.of(variables.unknowns, settled.information, space.basis, space.unit)
     _warn_of_offsets(space, joint, state)
     return Refined(
         X=state.X,
         Y=state.Y,
         scale=_scale(problem, state),
         scale_mode=problem.scale,
-        time_offsets_s={name.partition(":")[2]: value for name, value in state.offsets_s.items()},
+        time_offsets_s=state.offsets_s,
         graph=settled.graph,
         values=settled.optimum.values,
-        keys=variables.keys,
+        keys={str(unknown): key for unknown, key in variables.keys.items()},
         noise_source="estimated" if estimates else "given",
         noise=_noise(model, settled, options, estimates),
         cost=settled.optimum.cost,
@@ -175,7 +176,7 @@ def refine(
 UNLIKELY = 2.0
 
 
-def _warn_of_weights(problem: Problem, variables: Variables, settled: Fit, options: RefineOptions) -> None:
+def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit, options: RefineOptions) -> None:
     """Compare the residuals with what the noise as given predicts: half the equations to spare."""
     if options.robust not in ("none", "gnc"):  # a loss makes another cost
         return
@@ -183,7 +184,7 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: Fit, optio
     equations = 6 * problem.number_of_measurements + sum(
         3 * (p.sigma is not None) + 3 * (p.kappa is not None) for p in beliefs
     )
-    spare = equations - sum(variables.unknown.values())
+    spare = equations - sum(unknown.dimension for unknown in variables.unknowns)
     if spare <= 0:
         return
     # Beyond doubt, too: a chi-square of few degrees of freedom may well be twice its mean.
@@ -200,8 +201,9 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: Fit, optio
 
 def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> None:
     """Where a time offset is biased by more than its standard deviation says, or beyond what poses nearby tell."""
-    for name, part in space.shrinkage.items():
-        offset_s, what = abs(state.offsets_s[name]), name.replace(":", " of ")
+    for sensor, part in space.shrinkage.items():
+        offset_s, what = abs(state.offsets_s[sensor]), f"the time offset of {sensor}"
+        unknown = Unknown(UnknownKind.TIME_OFFSET, sensor)
         if offset_s > WINDOW_S:
             warnings.warn(
                 f"{what} is {offset_s:.3g} s, beyond the {WINDOW_S:g} s about each stamp in which the carriers' motion "
@@ -209,7 +211,7 @@ def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> 
                 NotConvergedWarning,
                 stacklevel=3,
             )
-        elif part * offset_s > 0.5 * math.sqrt(joint.covariance_of(joint.selector((name,)))[0, 0]):
+        elif part * offset_s > 0.5 * math.sqrt(joint.covariance_of(joint.selector((unknown,)))[0, 0]):
             warnings.warn(
                 f"{what}: the carriers' velocity is {100.0 * part:.2g} % noise, which pulls the offset towards zero by "
                 f"about {1e3 * part * offset_s:.2g} ms, more than its standard deviation says; move faster, or take "
@@ -233,8 +235,7 @@ def _data(problem: Problem, variables: Variables, options: RefineOptions) -> lis
             "the geodesic residual needs the raw measurements, and they were not kept (keep_measurements=False); make "
             "the problem with keep_measurements=True, or refine with RefineOptions(residual='chordal')"
         )
-    sensors = tuple(name.partition(":")[2] for name in variables.offsets)
-    paths = local_paths(problem, sensors, options.carrier_path)
+    paths = local_paths(problem, tuple(variables.offsets), options.carrier_path)
     return [PairData.of(problem, pair, options, paths.get(pair)) for pair in problem.pairs]
 
 
@@ -280,23 +281,25 @@ def _sensors_with_offset(problem: Problem, options: RefineOptions) -> tuple[str,
 
 
 def _scale(problem: Problem, state: State) -> float | dict[str, float]:
-    if problem.scale == "shared":
-        return state.scales["scale"]
     if problem.scale == "known":
         return 1.0
-    names = dict.fromkeys(target for target, _ in problem.pairs)
-    return {n: problem.fixed_scales[n] if n in problem.fixed_scales else state.scales[f"scale:{n}"] for n in names}
+    found = {unknown.owner: value for unknown, value in state.scales.items()}
+    if problem.scale == "shared":
+        return found[""]
+    names = dict.fromkeys(pair.target for pair in problem.pairs)
+    return {name: (problem.fixed_scales | found)[name] for name in names}
 
 
-def _noise(model: Model, settled: Fit, options: RefineOptions, estimates: bool) -> dict[Pair, PairNoise]:
+def _noise(model: Model, settled: SettledFit, options: RefineOptions, estimates: bool) -> dict[Pair, PairNoise]:
     result = {}
     for pair, (rotation, translation) in model.given_noise.items():
-        factors = settled.factors.of[pair]
+        factors = settled.factors[pair]
+        rotation, translation = rotation * math.sqrt(factors.rotation), translation * math.sqrt(factors.translation)
         spare = (np.inf, np.inf)
         if estimates:
             group = group_of(pair, options.noise_groups)
             spare = (settled.redundancy[group, "rotation"], settled.redundancy[group, "translation"])
-        result[pair] = PairNoise(rotation * math.sqrt(factors[0]), translation * math.sqrt(factors[1]), spare)
+        result[pair] = PairNoise(rotation, translation, spare)
     return result
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from rwhec_factors import se3
@@ -12,14 +11,8 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.certified_fit import Fit
-
-
-class NoiseFactors(NamedTuple):
-    """Variances of the noise over those that the measurements state."""
-
-    rotation: float
-    translation: float
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
+from gtsam_rwhec.refinement.certified_fit import CertifiedFit
 
 
 @dataclass(frozen=True)
@@ -113,7 +106,7 @@ class Measured:
         """(N,) values, pair by pair."""
         return {pair: values[rows] for pair, rows in zip(self.pairs, self.rows, strict=True)}
 
-    def squares(self, fit: Fit) -> Squares:
+    def squares(self, fit: CertifiedFit) -> Squares:
         """At an answer."""
         R = np.empty((len(self.A), 3, 3))
         t = np.empty((len(self.A), 3))
@@ -148,7 +141,7 @@ class Measured:
             error[~known] = np.inf
         return Squares(np.where(known, rotation, np.inf), np.where(known, translation, np.inf), error)
 
-    def together(self, squares: Squares, factors: NoiseFactors) -> Array:
+    def together(self, squares: Squares, factors: VarianceFactors) -> Array:
         """(N,) both together, about chi-square with 6 degrees of freedom at the truth."""
         if squares.error is None or self.whitening is None:
             return squares.rotation / factors.rotation + squares.translation / factors.translation

@@ -19,8 +19,9 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import reweighted
-from gtsam_rwhec.refinement.certified_fit import Fit, certified_fit
-from gtsam_rwhec.refinement.squared_residuals import Measured, NoiseFactors, Squares
+from gtsam_rwhec.problem.variance_factors import AS_STATED, VarianceFactors
+from gtsam_rwhec.refinement.certified_fit import CertifiedFit, certified_fit
+from gtsam_rwhec.refinement.squared_residuals import Measured, Squares
 from gtsam_rwhec.refinement.voting import by_vote
 
 NoiseScale = Literal["given", "estimate"]
@@ -70,17 +71,17 @@ class TruncatedLeastSquares:
     threshold: float
     max_iterations: int
     tell: Progress
-    factors: NoiseFactors = field(default_factory=lambda: NoiseFactors(1.0, 1.0))
+    factors: VarianceFactors = AS_STATED
     history: list[Iteration] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.measured = Measured.of(self.problem)
-        self.smallest_factors = NoiseFactors(
+        self.smallest_factors = VarianceFactors(
             2.0 * float(np.median(self.measured.kappa)) * QUIETEST**2,
             QUIETEST**2 / float(np.median(self.measured.sigma)) ** 2,
         )
 
-    def run(self, noise_scale: NoiseScale) -> tuple[Fit, np.ndarray]:
+    def run(self, noise_scale: NoiseScale) -> tuple[CertifiedFit, np.ndarray]:
         """The best answer and its inliers (N,)."""
         everything = self.fit(np.ones(len(self.measured.A)), None)
         if noise_scale == "given":
@@ -90,9 +91,9 @@ class TruncatedLeastSquares:
         fit, _ = self.best([lambda: self.graduate(everything), lambda: fit])
         return self.settle(fit, estimates=True)
 
-    def best(self, starts: list[Callable[[], Fit]]) -> tuple[Fit, np.ndarray]:
+    def best(self, starts: list[Callable[[], CertifiedFit]]) -> tuple[CertifiedFit, np.ndarray]:
         """Each settled to weights of 0 and 1; the smallest truncated cost. A start that ends with too few is none."""
-        ends: list[tuple[float, Fit, np.ndarray]] = []
+        ends: list[tuple[float, CertifiedFit, np.ndarray]] = []
         failure: UnderdeterminedError | CountError | None = None
         for start in starts:
             try:
@@ -106,11 +107,11 @@ class TruncatedLeastSquares:
         _, fit, keep = min(ends, key=lambda end: end[0])
         return self.vote(fit, keep)
 
-    def vote(self, fit: Fit, keep: np.ndarray) -> tuple[Fit, np.ndarray]:
+    def vote(self, fit: CertifiedFit, keep: np.ndarray) -> tuple[CertifiedFit, np.ndarray]:
         """Move single frames to where more of their measurements agree, as long as that pays."""
         least = self.truncated(self.distances(fit))
         for name in self.problem.targets + self.problem.sensors:
-            good, total = agreeing(name, self.measured.by_pair(keep))
+            good, total = inlier_count(name, self.measured.by_pair(keep))
             if good >= VOTED * total or name in self.problem.fixed:
                 continue
             moved, saved = by_vote(name, self.measured, fit, self.factors, self.threshold)
@@ -123,26 +124,18 @@ class TruncatedLeastSquares:
                     fit, keep, least = candidate, kept, cost
         return fit, keep
 
-    def complete(self, fit: Fit) -> Fit:
+    def complete(self, fit: CertifiedFit) -> CertifiedFit:
         """With poses by vote of the frames that lost their last measurement, so that they may come back."""
         for name in self.problem.targets + self.problem.sensors:
             if name not in fit.poses and name not in self.problem.fixed:
                 fit, _ = by_vote(name, self.measured, fit, self.factors, self.threshold)
         return fit
 
-    def fit(self, weights: Array, previous: Fit | None) -> Fit:
+    def fit(self, weights: Array, previous: CertifiedFit | None) -> CertifiedFit:
         """The certified optimum of weighted measurements."""
-        return certified_fit(
-            reweighted(
-                self.problem,
-                self.measured.by_pair(weights),
-                rotation_factor=self.factors.rotation,
-                translation_factor=self.factors.translation,
-            ),
-            previous,
-        )
+        return certified_fit(reweighted(self.problem, self.measured.by_pair(weights), self.factors), previous)
 
-    def distances(self, fit: Fit) -> Array:
+    def distances(self, fit: CertifiedFit) -> Array:
         """d^2 (N,)."""
         return self.measured.together(self.measured.squares(fit), self.factors)
 
@@ -150,13 +143,13 @@ class TruncatedLeastSquares:
         """sum min(d^2, c^2)."""
         return float(np.minimum(distances, self.threshold).sum())
 
-    def record(self, stage: str, mu: float, fit: Fit, distances: Array) -> None:
+    def record(self, stage: str, mu: float, fit: CertifiedFit, distances: Array) -> None:
         """Remember an iteration."""
         inliers = int((distances <= self.threshold).sum())
         self.history.append(Iteration(stage, mu, 0.5 * self.truncated(distances), inliers, fit.certified))
         self.tell(f"rejecting outliers: {stage}, {inliers} of {len(distances)} agree")
 
-    def graduate(self, fit: Fit) -> Fit:
+    def graduate(self, fit: CertifiedFit) -> CertifiedFit:
         """From least squares to truncated least squares, mu growing (Remark 5 and eq. 14 of the paper)."""
         d = self.distances(fit)
         c2 = self.threshold
@@ -176,7 +169,7 @@ class TruncatedLeastSquares:
                 break
         return fit
 
-    def trim(self, fit: Fit) -> Fit:
+    def trim(self, fit: CertifiedFit) -> CertifiedFit:
         """Least trimmed squares: the better half of each pair, by the noise of the median, until it stays the same."""
         keep = np.zeros(len(self.measured.A), dtype=bool)
         for _ in range(self.max_iterations):
@@ -194,7 +187,7 @@ class TruncatedLeastSquares:
             self.record("trimming", np.nan, fit, self.distances(fit))
         return fit
 
-    def settle(self, fit: Fit, *, estimates: bool = False) -> tuple[Fit, np.ndarray]:
+    def settle(self, fit: CertifiedFit, *, estimates: bool = False) -> tuple[CertifiedFit, np.ndarray]:
         """Weights of 0 and 1 until they stay the same: a local minimum of the truncated cost."""
         keep = np.zeros(len(self.measured.A), dtype=bool)
         for _ in range(self.max_iterations):
@@ -214,13 +207,13 @@ class TruncatedLeastSquares:
             self.record("settling", np.nan, fit, self.distances(fit))
         return fit, keep
 
-    def _from_median(self, squares: Squares) -> NoiseFactors:
+    def _from_median(self, squares: Squares) -> VarianceFactors:
         median = float(chdtri(DOF // 2, 0.5))
         return self._factors(
             float(np.median(squares.rotation)) / median, float(np.median(squares.translation)) / median
         )
 
-    def _from_inliers(self, squares: Squares, inliers: np.ndarray) -> NoiseFactors:
+    def _from_inliers(self, squares: Squares, inliers: np.ndarray) -> VarianceFactors:
         """Mean squares of the inliers, over the share of its variance that a cut chi-square keeps.
 
         E[chi^2_k; chi^2_k <= c^2] = k F_(k+2)(c^2), F the distribution function.
@@ -235,8 +228,8 @@ class TruncatedLeastSquares:
             float(squares.rotation[inliers].sum()) / freedom, float(squares.translation[inliers].sum()) / freedom
         )
 
-    def _factors(self, rotation: float, translation: float) -> NoiseFactors:
-        return NoiseFactors(
+    def _factors(self, rotation: float, translation: float) -> VarianceFactors:
+        return VarianceFactors(
             max(rotation, self.smallest_factors.rotation), max(translation, self.smallest_factors.translation)
         )
 
@@ -255,7 +248,7 @@ def _half(count: int) -> int:
     return min(count, count // 2 + 2)
 
 
-def agreeing(name: str, inliers: dict[Pair, np.ndarray]) -> tuple[int, int]:
+def inlier_count(name: str, inliers: dict[Pair, np.ndarray]) -> tuple[int, int]:
     """How many of a frame's measurements agree, of how many."""
     masks = [mask for pair, mask in inliers.items() if name in pair]
     return sum(int(mask.sum()) for mask in masks), sum(len(mask) for mask in masks)

@@ -17,14 +17,17 @@ from rwhec_factors.batch import Linearization
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import NoiseGroups
 from gtsam_rwhec.refinement.pair_data import PairData
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.refinement.variables import Variables
 from gtsam_rwhec.refinement.weighting import (
     COMPONENTS,
+    FactorsByPair,
     Group,
-    VarianceFactors,
+    group_label,
     group_of,
     measurement_covariance,
     residual_covariance,
@@ -39,7 +42,7 @@ SMALLEST = 1e-20
 class VarianceComponents:
     """Factors, and by group and component how many equations to spare they rest on."""
 
-    factors: VarianceFactors
+    factors: FactorsByPair
     redundancy: dict[tuple[Group, str], float]
 
 
@@ -55,16 +58,16 @@ class _Sums:
 
 def jacobian_of(pair: Pair, at: Linearization, variables: Variables, joint: JointCovariance) -> tuple[Array, Array]:
     """A pair's Jacobian (N, m, u) by the unknowns that it touches, and their rows in ``joint``."""
-    blocks: dict[str, Array] = {}
+    blocks: dict[Unknown, Array] = {}
     for name, block in ((pair.target, at.target), (pair.sensor, at.sensor)):
-        if name in joint.slots:
-            blocks[name] = blocks[name] + block if name in blocks else block
+        frame = Unknown(UnknownKind.FRAME, name)
+        if frame in joint.slots:
+            blocks[frame] = blocks[frame] + block if frame in blocks else block
     scale = variables.scale_of_pair.get(pair)
     if scale is not None:
         blocks[scale] = at.scale[:, :, None]
-    offset = f"time_offset:{pair[1]}"
-    if offset in variables.offsets:
-        blocks[offset] = at.offset[:, :, None]
+    if pair.sensor in variables.offsets:
+        blocks[Unknown(UnknownKind.TIME_OFFSET, pair.sensor)] = at.offset[:, :, None]
     if not blocks:
         return np.zeros((len(at.residual), at.residual.shape[1], 0)), np.zeros(0, dtype=np.int64)
     return np.concatenate(list(blocks.values()), axis=2), joint.rows(tuple(blocks))
@@ -75,7 +78,7 @@ def from_measurements(
     at: dict[Pair, Linearization],
     variables: Variables,
     joint: JointCovariance,
-    factors: VarianceFactors,
+    factors: FactorsByPair,
     groups: NoiseGroups,
     consistency: float = 1.0,
 ) -> VarianceComponents:
@@ -97,11 +100,11 @@ def from_measurements(
     sums: dict[Group, _Sums] = {}
     for item in data:
         pair, linear = item.pair, at[item.pair]
-        C = residual_covariance(item, linear, factors.of[pair], propagated=True)
+        C = residual_covariance(item, linear, factors[pair], propagated=True)
         inverse = np.linalg.inv(C)
         J, rows = jacobian_of(pair, linear, variables, joint)
         left = C - J @ joint.finite[np.ix_(rows, rows)] @ J.transpose(0, 2, 1)  # expected r r'
-        whole = measurement_covariance(item, factors.of[pair])
+        whole = measurement_covariance(item, factors[pair])
         whitened = np.einsum("nij,nj->ni", inverse, linear.residual)
         total = sums.setdefault(group_of(pair, groups), _Sums())
         scaled = []
@@ -119,14 +122,14 @@ def from_measurements(
     steps = {group: _step(group, total, consistency) for group, total in sums.items()}
     updated = {}
     for item in data:
-        old, step = factors.of[item.pair], steps[group_of(item.pair, groups)]
-        updated[item.pair] = (max(old[0] * step[0], SMALLEST), max(old[1] * step[1], SMALLEST))
+        old, step = factors[item.pair], steps[group_of(item.pair, groups)]
+        updated[item.pair] = VarianceFactors(*(max(float(factor), SMALLEST) for factor in old * step))
     redundancy: dict[tuple[Group, str], float] = {
         (group, component): float(total.expected[k])
         for group, total in sums.items()
         for k, component in enumerate(COMPONENTS)
     }
-    return VarianceComponents(VarianceFactors(updated), redundancy)
+    return VarianceComponents(updated, redundancy)
 
 
 def _step(group: Group, total: _Sums, consistency: float) -> Array:
@@ -183,12 +186,10 @@ def from_moments(
         ratios[group, kind] = max(found / expected, SMALLEST)
     pairs = [pair for part in parts for pair in part.pairs]
     return VarianceComponents(
-        VarianceFactors(
-            {
-                pair: (ratios[group_of(pair, groups), "rotation"], ratios[group_of(pair, groups), "translation"])
-                for pair in pairs
-            }
-        ),
+        {
+            pair: VarianceFactors(*(ratios[group_of(pair, groups), component] for component in COMPONENTS))
+            for pair in pairs
+        },
         {key: expected for key, (_, expected) in sums.items()},
     )
 
@@ -197,7 +198,7 @@ def _check(group: Group, component: str, spare: float, weighed: float) -> None:
     """Refuse to estimate from nothing; ``weighed``: how much of the residuals' variance the factors make up."""
     if spare > 0.5:
         return
-    where = "the measurements" if group == ("all",) else "-".join(group)
+    where = group_label(group)
     if weighed < 0.5:
         raise NoiseError(
             f"the {component} noise of {where} cannot be estimated: the noise given for A already explains the "

@@ -7,14 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.certified_fit import Fit
-from gtsam_rwhec.refinement.squared_residuals import Measured, NoiseFactors
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
+from gtsam_rwhec.refinement.certified_fit import CertifiedFit
+from gtsam_rwhec.refinement.squared_residuals import Measured
 
 #: Proposals of one frame; more measurements are sampled evenly in the order of their residuals.
 PROPOSALS = 50
 
 
-def by_vote(name: str, measured: Measured, fit: Fit, factors: NoiseFactors, threshold: float) -> tuple[Fit, float]:
+def by_vote(
+    name: str, measured: Measured, fit: CertifiedFit, factors: VarianceFactors, threshold: float
+) -> tuple[CertifiedFit, float]:
     """The fit with the frame where most of its measurements agree, the other frames staying; and what that saves.
 
     Parameters
@@ -22,21 +25,21 @@ def by_vote(name: str, measured: Measured, fit: Fit, factors: NoiseFactors, thre
     name : str
         A target or sensor; it may lack a pose.
     measured : Measured
-    fit : Fit
-    factors : NoiseFactors
+    fit : CertifiedFit
+    factors : VarianceFactors
     threshold : float
         c^2.
 
     Returns
     -------
-    fit : Fit
+    fit : CertifiedFit
         As given where no proposal is better.
     saved : float
         By how much sum min(d^2, c^2) went down.
     """
     own = measured.of_pairs([pair for pair in measured.pairs if name in pair and not pair.is_motion])
 
-    def cost_of(candidate: Fit) -> tuple[float, Array]:
+    def cost_of(candidate: CertifiedFit) -> tuple[float, Array]:
         d = own.together(own.squares(candidate), factors)
         return float(np.minimum(d, threshold).sum()), d
 
@@ -54,7 +57,7 @@ def by_vote(name: str, measured: Measured, fit: Fit, factors: NoiseFactors, thre
     return best, before - least
 
 
-def _proposed(name: str, index: int, own: Measured, fit: Fit) -> Array | None:
+def _proposed(name: str, index: int, own: Measured, fit: CertifiedFit) -> Array | None:
     """X = A^-1 Y B or Y = A X B^-1 of one measurement, lengths true; None where the pair's other end has no pose."""
     pair = own.pair_of(index)
     other = pair.sensor if pair.target == name else pair.target

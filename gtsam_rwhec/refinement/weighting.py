@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -10,6 +9,7 @@ from rwhec_factors.batch import Linearization
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement.options import NoiseGroups
 from gtsam_rwhec.refinement.pair_data import PairData
 
@@ -18,21 +18,14 @@ Component = Literal["rotation", "translation"]
 COMPONENTS: tuple[Component, Component] = ("rotation", "translation")
 
 
-@dataclass(frozen=True)
-class VarianceFactors:
-    """By what the given variances of B are multiplied: (rotation, translation) of each pair; 1 as given."""
+#: Of each pair.
+FactorsByPair = dict[Pair, VarianceFactors]
 
-    of: dict[Pair, tuple[float, float]]
 
-    @staticmethod
-    def ones(pairs: tuple[Pair, ...]) -> VarianceFactors:
-        """As given."""
-        return VarianceFactors(dict.fromkeys(pairs, (1.0, 1.0)))
-
-    def distance(self, other: VarianceFactors) -> float:
-        """Largest change of a logarithm."""
-        mine, theirs = np.array(list(self.of.values())), np.array([other.of[pair] for pair in self.of])
-        return float(np.abs(np.log(mine / theirs)).max(initial=0.0))
+def largest_change(before: FactorsByPair, after: FactorsByPair) -> float:
+    """Of a factor's logarithm."""
+    ratios = np.array([after[pair] for pair in before]) / np.array(list(before.values()))
+    return float(np.abs(np.log(ratios)).max(initial=0.0))
 
 
 #: Whose residuals share a variance factor: ("all",), (sensor,) or (target, sensor).
@@ -46,14 +39,21 @@ def group_of(pair: Pair, groups: NoiseGroups) -> Group:
     return (pair.sensor,) if groups == "sensor" else pair
 
 
-def measurement_covariance(data: PairData, factors: tuple[float, float]) -> Array:
+def group_label(group: Group) -> str:
+    """How messages write it."""
+    if group == ("all",):
+        return "the measurements"
+    return str(Pair(*group)) if len(group) == 2 else group[0]
+
+
+def measurement_covariance(data: PairData, factors: VarianceFactors) -> Array:
     """(N, 6, 6) of B: D Sigma D, with the square roots of the factors on D's diagonal."""
     d = np.sqrt(np.repeat(factors, 3))
     scaled: Array = data.covariance * d[:, None] * d
     return scaled
 
 
-def residual_covariance(data: PairData, at: Linearization, factors: tuple[float, float], propagated: bool) -> Array:
+def residual_covariance(data: PairData, at: Linearization, factors: VarianceFactors, propagated: bool) -> Array:
     """(N, 6, 6) of the geodesic residual: that of B, and A's through de/dA, to first order."""
     covariance = measurement_covariance(data, factors)
     if propagated and data.carrier is not None:

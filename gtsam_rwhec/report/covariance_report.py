@@ -14,6 +14,7 @@ from gtsam_rwhec.geometry.pose_covariances import standard_deviations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import PairNoise, Refined
+from gtsam_rwhec.refinement.unknowns import UnknownKind
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
 from gtsam_rwhec.report.solution_report import report_console
 
@@ -59,12 +60,12 @@ def print_refined(refined: Refined, console: Console | None = None) -> None:
 def refined_sentences(refined: Refined) -> list[str]:
     """What the tables do not hold: scale, time offsets, noise, cost, outliers."""
     sentences = []
-    for name in refined.names:
-        if name in refined.X or name in refined.Y:
+    for unknown in refined.unknowns:
+        if unknown.kind is UnknownKind.FRAME:
             continue
-        deviation = math.sqrt(refined.covariance(name)[0, 0])
-        kind, _, owner = name.partition(":")
-        if kind == "scale":
+        deviation = math.sqrt(refined.covariance(unknown)[0, 0])
+        owner = unknown.owner
+        if unknown.kind is UnknownKind.SCALE:
             value = refined.scale[owner] if isinstance(refined.scale, Mapping) else refined.scale
             of = f" of {owner}" if owner else ""
             sentences.append(f"Scale{of} (measured / true length): {value:.6f} ± {_cell(deviation, 6)}.")

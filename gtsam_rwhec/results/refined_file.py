@@ -10,6 +10,7 @@ import numpy as np
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.refinement import unknowns
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.refined import Movement, PairNoise, Refined, RefinedPoses
 from gtsam_rwhec.results.schema import (
@@ -164,9 +165,7 @@ def _null_where_infinite(matrix: Array) -> tuple[tuple[float | None, ...], ...]:
 def _joint_to_file(joint: JointCovariance) -> Joint:
     symmetric = joint.finite
     return Joint(
-        unknowns=tuple(
-            Unknown(name=name, rows=6 if slot.stop - slot.start == 6 else 1) for name, slot in joint.slots.items()
-        ),
+        unknowns=tuple(Unknown(name=str(unknown), rows=6 if unknown.dimension == 6 else 1) for unknown in joint.slots),
         units=tuple(joint.unit.tolist()),
         finite=tuple(tuple(row[: i + 1]) for i, row in enumerate(symmetric.tolist())),
         free=tuple(tuple(direction) for direction in joint.free.T.tolist()),
@@ -179,7 +178,9 @@ def _joint_from_file(fields: Joint) -> JointCovariance:
     finite = np.zeros((size, size))
     finite[np.tril_indices(size)] = [value for row in fields.finite for value in row]
     return JointCovariance(
-        slots={u.name: slice(end - u.rows, end) for u, end in zip(fields.unknowns, ends, strict=True)},
+        slots={
+            unknowns.Unknown.of(u.name): slice(end - u.rows, end) for u, end in zip(fields.unknowns, ends, strict=True)
+        },
         finite=finite + np.tril(finite, -1).T,
         free=np.array(fields.free).reshape(len(fields.free), size).T,
         unit=np.array(fields.units),

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, NoiseError
 from gtsam_rwhec.problem.selection import reweighted, selected
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.simulate import Noise, general
 
 NOISE = Noise(sigma_m=0.01, kappa=500.0)
@@ -115,7 +116,7 @@ def test_weights_multiply_squared_residuals() -> None:
     twice = {pair: np.full(problem.moments(*pair).count, 2.0) for pair in problem.pairs}
     solution = rw.solve(problem)
     assert rw.certify(reweighted(problem, twice), solution.X, solution.Y).cost == pytest.approx(2.0 * solution.cost)
-    factors = reweighted(problem, {}, rotation_factor=4.0, translation_factor=9.0)
+    factors = reweighted(problem, {}, VarianceFactors(4.0, 9.0))
     raw, other = problem.measurements(*PAIR), factors.measurements(*PAIR)
     np.testing.assert_allclose(other.sigma, 3.0 * raw.sigma)
     np.testing.assert_allclose(other.kappa, raw.kappa / 4.0)
@@ -133,7 +134,7 @@ def test_covariances_are_weighed_like_sigma_and_kappa(seed: int) -> None:
     problem.add(*PAIR, raw.A, raw.B, covariances=1e-4 * (root @ root.transpose(0, 2, 1) + np.eye(6)))
     w = generator.uniform(0.1, 3.0, 24)
     rotation, translation = generator.uniform(0.2, 5.0, 2)
-    got = reweighted(problem, {PAIR: w}, rotation_factor=rotation, translation_factor=translation).measurements(*PAIR)
+    got = reweighted(problem, {PAIR: w}, VarianceFactors(rotation, translation)).measurements(*PAIR)
     whole = problem.measurements(*PAIR)
     block_rotation = whole.covariance_of_B()[:, :3, :3] * rotation / w[:, None, None]
     np.testing.assert_allclose(got.covariance_of_B()[:, :3, :3], block_rotation, rtol=1e-12)
@@ -159,8 +160,8 @@ def test_bad_input_is_refused_in_words() -> None:
     for bad in (-1.0, np.nan, np.inf):
         with pytest.raises(NoiseError, match="target0-sensor0"):
             reweighted(problem, {PAIR: np.full(12, bad)})
-    with pytest.raises(NoiseError, match="rotation_factor"):
-        reweighted(problem, {}, rotation_factor=0.0)
+    with pytest.raises(NoiseError, match=r"rotation=0\.0"):
+        reweighted(problem, {}, VarianceFactors(0.0, 1.0))
     with pytest.raises(MeasurementsNotKeptError, match="keep_measurements=True"):
         selected(rig(keep_measurements=False), {PAIR: np.ones(12, dtype=bool)})
 

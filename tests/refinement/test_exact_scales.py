@@ -7,10 +7,11 @@ import pytest
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.moments import edge_forms
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement import exact_scales
-from gtsam_rwhec.refinement.certified_fit import Fit
+from gtsam_rwhec.refinement.certified_fit import CertifiedFit
 from gtsam_rwhec.refinement.exact_scales import with_exact_scales
-from gtsam_rwhec.refinement.squared_residuals import Measured, NoiseFactors
+from gtsam_rwhec.refinement.squared_residuals import Measured
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.residuals import PairPoses
@@ -68,7 +69,7 @@ def test_the_end_is_a_minimum_of_the_physical_cost(scale: rw.ScaleMode) -> None:
     # The same cost from every measurement by itself.
     poses = PairPoses.of(part, end)
     names = {name: part.free.index(name) for name in part.free}
-    fit = Fit({}, {}, certified=True)
+    fit = CertifiedFit({}, {}, certified=True)
     for name, i in names.items():
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = end.R[i], end.t[i] + part.frame_shift(name)
@@ -76,7 +77,7 @@ def test_the_end_is_a_minimum_of_the_physical_cost(scale: rw.ScaleMode) -> None:
     for e, pair in enumerate(part.pairs):
         fit.alpha[pair[0]] = float(poses.alpha[e])
     measured = Measured.of(problem)
-    total = 0.5 * measured.together(measured.squares(fit), NoiseFactors(1.0, 1.0)).sum()
+    total = 0.5 * measured.together(measured.squares(fit), VarianceFactors(1.0, 1.0)).sum()
     for name, beliefs in problem.priors.items():
         for prior in beliefs:
             if prior.kappa is not None:

@@ -75,9 +75,9 @@ def test_forty_percent_of_outliers_are_found(
     for pair, mask in found.inliers.items():
         np.testing.assert_array_equal(found.weights[pair], mask.astype(float))
     if noise_scale == "given":
-        assert found.noise_factors == (1.0, 1.0)
+        assert found.variance_factors == (1.0, 1.0)
     else:
-        rotation, translation = found.noise_factors
+        rotation, translation = found.variance_factors
         assert rotation == pytest.approx(1.0 / NOISE.kappa, rel=0.5)
         assert translation == pytest.approx(NOISE.sigma_m**2, rel=0.5)
 
@@ -98,7 +98,7 @@ def test_noise_that_claims_three_times_too_much_is_estimated() -> None:
     problem, good = corrupted(simulation, 0.3, "random", 5, NOISE, weights="three_times_too_small")
     found = graduated(problem, noise_scale="estimate")
     assert wrongly_classed(found, good)[0] == 0
-    assert np.sqrt(found.noise_factors) == pytest.approx([3.0, 3.0], rel=0.15)
+    assert np.sqrt(found.variance_factors) == pytest.approx([3.0, 3.0], rel=0.15)
     with pytest.warns(OutliersWarning, match="noise='estimate'"):
         graduated(problem)
 

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.unknowns import Unknown
 
-DIMENSIONS = {"a": 6, "b": 6, "scale": 1}
+A, B, SCALE = (Unknown.of(name) for name in ("a", "b", "scale"))
 
 
 def information(seed: int, free: np.ndarray) -> np.ndarray:
@@ -23,11 +24,11 @@ def information(seed: int, free: np.ndarray) -> np.ndarray:
 
 def test_without_free_directions_it_is_the_inverse() -> None:
     Lambda = information(0, np.zeros((13, 0)))
-    joint = JointCovariance.of(DIMENSIONS, Lambda, np.zeros((13, 0)), np.ones(13))
+    joint = JointCovariance.of((A, B, SCALE), Lambda, np.zeros((13, 0)), np.ones(13))
     np.testing.assert_allclose(joint.covariance_of(np.eye(13)), np.linalg.inv(Lambda), rtol=1e-10)
     inverse = np.linalg.inv(Lambda)
-    np.testing.assert_allclose(joint.covariance_of(joint.selector(("b", "scale"))), inverse[6:, 6:], rtol=1e-10)
-    np.testing.assert_allclose(joint.information_of(("b",)), np.linalg.inv(inverse[6:12, 6:12]), rtol=1e-9)
+    np.testing.assert_allclose(joint.covariance_of(joint.selector((B, SCALE))), inverse[6:, 6:], rtol=1e-10)
+    np.testing.assert_allclose(joint.information_of((B,)), np.linalg.inv(inverse[6:12, 6:12]), rtol=1e-9)
 
 
 @settings(max_examples=30, deadline=None)
@@ -39,13 +40,13 @@ def test_one_axis_of_one_frame_is_infinite_and_the_rest_is_the_limit(seed: int, 
     Lambda = information(seed, free)
     told = free if given_to_it else np.zeros((13, 0))
     unit = np.random.default_rng(seed).uniform(0.1, 10.0, 13)
-    joint = JointCovariance.of(DIMENSIONS, Lambda, told, unit)
+    joint = JointCovariance.of((A, B, SCALE), Lambda, told, unit)
     covariance = joint.covariance_of(np.eye(13))
     assert covariance[axis, axis] == np.inf
     rest = np.delete(np.arange(13), axis)
     expected = np.linalg.inv(Lambda[np.ix_(rest, rest)])
     np.testing.assert_allclose(covariance[np.ix_(rest, rest)], expected, rtol=1e-7, atol=1e-9)
-    marginal = joint.information_of(("a",))
+    marginal = joint.information_of((A,))
     assert np.abs(marginal[axis]).max() < 1e-9
     limit = Lambda + 1e-9 * free @ free.T  # a prior so weak that it is none
     limit = np.linalg.inv(np.linalg.inv(limit)[:6, :6])
@@ -58,18 +59,18 @@ def test_one_axis_of_one_frame_is_infinite_and_the_rest_is_the_limit(seed: int, 
 def test_frames_that_move_together_have_a_finite_difference() -> None:
     free = np.zeros((13, 1))
     free[5] = free[11] = 1.0
-    joint = JointCovariance.of(DIMENSIONS, information(3, free), free, np.ones(13))
-    both = joint.covariance_of(joint.selector(("a", "b")))
+    joint = JointCovariance.of((A, B, SCALE), information(3, free), free, np.ones(13))
+    both = joint.covariance_of(joint.selector((A, B)))
     assert both[5, 5] == both[11, 11] == both[5, 11] == np.inf
     assert np.isfinite(np.delete(np.delete(both, [5, 11], 0), [5, 11], 1)).all()
-    difference = joint.selector(("b",)) - joint.selector(("a",))
+    difference = joint.selector((B,)) - joint.selector((A,))
     assert np.isfinite(joint.covariance_of(difference)).all()
 
 
 def test_opposite_movements_have_minus_infinite_covariance() -> None:
     free = np.zeros((13, 1))
     free[5], free[11] = 1.0, -1.0
-    joint = JointCovariance.of(DIMENSIONS, information(4, free), free, np.ones(13))
+    joint = JointCovariance.of((A, B, SCALE), information(4, free), free, np.ones(13))
     assert joint.covariance_of(np.eye(13))[5, 11] == -np.inf
 
 
@@ -77,17 +78,17 @@ def test_noise_that_feigns_information_along_a_free_direction_is_not_believed() 
     free = np.zeros((13, 1))
     free[5] = 1.0
     Lambda = information(5, free) + 1e-3 * free @ free.T
-    covariance = JointCovariance.of(DIMENSIONS, Lambda, free, np.ones(13)).covariance_of(np.eye(13))
+    covariance = JointCovariance.of((A, B, SCALE), Lambda, free, np.ones(13)).covariance_of(np.eye(13))
     assert covariance[5, 5] == np.inf
 
 
 def test_nothing_measured_is_infinite_everywhere() -> None:
-    joint = JointCovariance.of({"a": 6}, np.zeros((6, 6)), np.zeros((6, 0)), np.ones(6))
+    joint = JointCovariance.of((A,), np.zeros((6, 6)), np.zeros((6, 0)), np.ones(6))
     np.testing.assert_array_equal(np.diag(joint.covariance_of(np.eye(6))), np.inf)
-    np.testing.assert_allclose(joint.information_of(("a",)), 0.0)
+    np.testing.assert_allclose(joint.information_of((A,)), 0.0)
 
 
 def test_unknown_names_are_refused() -> None:
-    joint = JointCovariance.of({"a": 6}, np.eye(6), np.zeros((6, 0)), np.ones(6))
+    joint = JointCovariance.of((A,), np.eye(6), np.zeros((6, 0)), np.ones(6))
     with pytest.raises(rw.errors.FrameError, match="no 'b' among the unknowns; there are a"):
-        joint.rows(("b",))
+        joint.rows((B,))

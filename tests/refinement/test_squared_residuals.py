@@ -8,19 +8,20 @@ from rwhec_factors import se3
 from scipy.stats import chi2
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.refinement.certified_fit import Fit, certified_fit
-from gtsam_rwhec.refinement.squared_residuals import Measured, NoiseFactors
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
+from gtsam_rwhec.refinement.certified_fit import CertifiedFit, certified_fit
+from gtsam_rwhec.refinement.squared_residuals import Measured
 from gtsam_rwhec.simulate import Noise, Simulation, general
 
 NOISE = Noise(sigma_m=0.01, kappa=500.0)
-ONE = NoiseFactors(1.0, 1.0)
+ONE = VarianceFactors(1.0, 1.0)
 
 
-def truth(simulation: Simulation) -> Fit:
+def truth(simulation: Simulation) -> CertifiedFit:
     scale = simulation.scale
     names = [*simulation.X, *simulation.Y]
     alpha = scale if isinstance(scale, dict) else dict.fromkeys(names, scale)
-    return Fit({**simulation.X, **simulation.Y}, alpha, certified=False)
+    return CertifiedFit({**simulation.X, **simulation.Y}, alpha, certified=False)
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
@@ -43,7 +44,7 @@ def test_at_the_truth_they_are_chi_square(scale: rw.ScaleMode) -> None:
         assert values.mean() == pytest.approx(degrees, abs=4.0 * np.sqrt(2.0 * degrees / count))
         beyond = float((values > chi2.ppf(0.95, degrees)).mean())
         assert beyond == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / count))
-    factors = NoiseFactors(4.0, 9.0)
+    factors = VarianceFactors(4.0, 9.0)
     np.testing.assert_allclose(
         measured.together(squares, factors), squares.rotation / 4.0 + squares.translation / 9.0, rtol=1e-12
     )
@@ -65,7 +66,7 @@ def test_full_covariances_are_used_whole() -> None:
     for values, degrees in ((squares.rotation, 3), (squares.translation, 3), (measured.together(squares, ONE), 6)):
         assert values.mean() == pytest.approx(degrees, rel=0.06)
         assert float((values > chi2.ppf(0.95, degrees)).mean()) == pytest.approx(0.05, abs=0.015)
-    twice = measured.together(squares, NoiseFactors(2.0, 2.0))
+    twice = measured.together(squares, VarianceFactors(2.0, 2.0))
     np.testing.assert_allclose(twice, 0.5 * measured.together(squares, ONE), rtol=1e-12)
 
 
@@ -73,7 +74,9 @@ def test_frames_without_a_pose_are_infinitely_far() -> None:
     simulation = general(2, 1, seed=4, noise=NOISE, number_of_measurements=5)
     measured = Measured.of(simulation.problem)
     fit = truth(simulation)
-    squares = measured.squares(Fit({n: T for n, T in fit.poses.items() if n != "target1"}, fit.alpha, certified=True))
+    squares = measured.squares(
+        CertifiedFit({n: T for n, T in fit.poses.items() if n != "target1"}, fit.alpha, certified=True)
+    )
     by_pair = measured.by_pair(measured.together(squares, ONE))
     assert np.isfinite(by_pair["target0", "sensor0"]).all()
     assert np.isinf(by_pair["target1", "sensor0"]).all()

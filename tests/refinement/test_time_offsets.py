@@ -178,7 +178,7 @@ def test_motions_have_two_stamps() -> None:
     problem = problem_with({"cam0": 0.0}, count=20)
     raw = problem.measurements("tag", "cam0")
     problem.add_motion("cam0", raw.A, raw.A, SIGMA_M, KAPPA, stamps_ns=raw.stamps_ns)
-    with pytest.raises(rw.errors.OptionError, match="both ends of its motions"):
+    with pytest.raises(rw.errors.OptionError, match="both ends of the motions of cam0"):
         refined(problem, time_offsets=True)
 
 

@@ -12,13 +12,14 @@ from outlier_problems import corrupted
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.problem.selection import selected
-from gtsam_rwhec.refinement.certified_fit import Fit, certified_fit
-from gtsam_rwhec.refinement.squared_residuals import Measured, NoiseFactors
+from gtsam_rwhec.problem.variance_factors import VarianceFactors
+from gtsam_rwhec.refinement.certified_fit import CertifiedFit, certified_fit
+from gtsam_rwhec.refinement.squared_residuals import Measured
 from gtsam_rwhec.refinement.voting import by_vote
 from gtsam_rwhec.simulate import Noise, general, perturb
 
 NOISE = Noise(sigma_m=0.01, kappa=2000.0)
-ONE = NoiseFactors(1.0, 1.0)
+ONE = VarianceFactors(1.0, 1.0)
 THRESHOLD = 20.0
 
 
@@ -32,7 +33,7 @@ def test_a_frame_goes_where_most_of_its_measurements_agree(scale: Any, name: str
     measured = Measured.of(problem)
     names = [*simulation.X, *simulation.Y]
     alpha = simulation.scale if isinstance(simulation.scale, dict) else dict.fromkeys(names, simulation.scale)
-    truth = Fit({**simulation.X, **simulation.Y}, alpha, certified=True)
+    truth = CertifiedFit({**simulation.X, **simulation.Y}, alpha, certified=True)
     wrong = {**truth.poses, name: np.eye(4)}
     if missing:
         del wrong[name]
@@ -48,7 +49,9 @@ def test_a_frame_goes_where_most_of_its_measurements_agree(scale: Any, name: str
 
 def test_where_the_other_end_is_missing_too_nothing_is_proposed() -> None:
     simulation = general(1, 1, seed=2, number_of_measurements=5, noise=NOISE)
-    fit, saved = by_vote("target0", Measured.of(simulation.problem), Fit({}, {}, certified=True), ONE, THRESHOLD)
+    fit, saved = by_vote(
+        "target0", Measured.of(simulation.problem), CertifiedFit({}, {}, certified=True), ONE, THRESHOLD
+    )
     assert saved == 0.0
     assert not fit.poses
 
