@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.text import Text
 
-from gtsam_rwhec.calibration.cross_validation import Comparison, CrossValidation
+from gtsam_rwhec.calibration.cross_validation import CrossValidation
+from gtsam_rwhec.calibration.prediction_errors import HoldOutError
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.solution_report import report_console
@@ -69,11 +70,11 @@ def split_sentence(result: CrossValidation) -> str:
     return SPLITS[result.by].format(folds=result.number_of_folds, time=time)
 
 
-def _rows(comparisons: Mapping[str, Comparison]) -> dict[str, tuple[str, ...]]:
+def _rows(comparisons: Mapping[str, HoldOutError]) -> dict[str, tuple[str, ...]]:
     return {name: _cells(comparisons[name]) for name in sorted(comparisons, key=natural_key)}
 
 
-def _cells(comparison: Comparison) -> tuple[str, ...]:
+def _cells(comparison: HoldOutError) -> tuple[str, ...]:
     held, seen = comparison.held_out, comparison.training
     total = held.count + comparison.not_predicted
     return (
