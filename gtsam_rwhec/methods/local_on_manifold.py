@@ -131,7 +131,7 @@ def local_on_manifold(
     for pair in problem.pairs:
         raw = problem.measurements(*pair)
         sigma_R, sigma_t = standard_deviations(raw, chosen.weights)
-        graph.add(lom_factor(frames[pair[0]], frames[pair[1]], scale_key, raw.A, raw.B, sigma_R, sigma_t))
+        graph.add(lom_factor(frames[pair.target], frames[pair.sensor], scale_key, raw.A, raw.B, sigma_R, sigma_t))
 
     # Ceres' trust region (radius 1e4, Nielsen's rule, damping by the Hessian's diagonal) and the paper's tolerance.
     parameters = gtsam.LevenbergMarquardtParams.CeresDefaults()

@@ -15,7 +15,6 @@ from gtsam_rwhec.pipeline.log_contract import CLEANING_METADATA
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, sigma_of, without_outlier_marks
-from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.stage_reports import LogFields, SizeFields, TimeOffsetFields, TrackCount, contradicted
@@ -96,7 +95,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         refined,
         time_offsets_s={name: offsets[name] for name in estimated},
         inlier_counts={
-            Pair(count.target, count.sensor): (count.used, count.used + sum(count.removed.values()))
+            count.pair: (count.used, count.used + sum(count.removed.values()))
             for count in outliers
             if rig.cleaning.robust == "gnc" and (count.used or count.removed)
         },

@@ -94,7 +94,7 @@ class GeodesicModel:
     def covariances(self, state: State, factors: FactorsByPair) -> dict[Pair, Array]:
         """(N, 6, 6) of every pair's residuals at an estimate."""
         at = self.linearize(state)
-        return {i.pair: residual_covariance(i, at[i.pair], factors[i.pair], propagated=True) for i in self.data}
+        return {i.pair: residual_covariance(i, at[i.pair], factors[i.pair]) for i in self.data}
 
     def graph(self, state: State, factors: FactorsByPair, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
         """The measurements' factors, weighed as of an estimate; in another loss than the options', if told."""
@@ -176,7 +176,7 @@ class GeodesicModel:
         at = self.linearize(state)
         result = {}
         for item in self.data:
-            covariance = residual_covariance(item, at[item.pair], factors[item.pair], propagated=True)
+            covariance = residual_covariance(item, at[item.pair], factors[item.pair])
             result[item.pair] = np.einsum("nij,nj->ni", square_root_information(covariance), at[item.pair].residual)
         return result
 
@@ -187,7 +187,7 @@ class GeodesicModel:
         at = self.linearize(state)
         squares: dict[tuple[Group, int], list[Array]] = {}
         for item in self.data:
-            covariance = residual_covariance(item, at[item.pair], factors[item.pair], propagated=True)
+            covariance = residual_covariance(item, at[item.pair], factors[item.pair])
             for i, block in enumerate((slice(0, 3), slice(3, 6))):
                 r = at[item.pair].residual[:, block]
                 square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(covariance[:, block, block]), r)

@@ -30,7 +30,7 @@ def under_worst_axis(problem: Problem, data: list[PairData], variables: Variable
     at = linearized(data, variables, state)
     edges = {}
     for item in data:
-        C = residual_covariance(item, at[item.pair], AS_STATED, propagated=True)
+        C = residual_covariance(item, at[item.pair], AS_STATED)
         scale = problem.fixed_scales.get(item.pair.target, 1.0)  # the data are in true metres there
         A = item.residuals.A
         if item.paths is not None:
@@ -56,7 +56,7 @@ def inliers_of(
     everywhere = next(iter(factors.values()))
     for item in present:
         r = at[item.pair].residual
-        C = residual_covariance(item, at[item.pair], factors.get(item.pair, everywhere), propagated=True)
+        C = residual_covariance(item, at[item.pair], factors.get(item.pair, everywhere))
         square: Array = np.einsum("ni,ni->n", r, np.linalg.solve(C, r[:, :, None])[:, :, 0])
         result[item.pair] = square <= threshold
     return result

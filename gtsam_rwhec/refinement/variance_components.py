@@ -100,7 +100,7 @@ def from_measurements(
     sums: dict[Group, _Sums] = {}
     for item in data:
         pair, linear = item.pair, at[item.pair]
-        C = residual_covariance(item, linear, factors[pair], propagated=True)
+        C = residual_covariance(item, linear, factors[pair])
         inverse = np.linalg.inv(C)
         J, rows = jacobian_of(pair, linear, variables, joint)
         left = C - J @ joint.finite[np.ix_(rows, rows)] @ J.transpose(0, 2, 1)  # expected r r'

@@ -53,10 +53,10 @@ def measurement_covariance(data: PairData, factors: VarianceFactors) -> Array:
     return scaled
 
 
-def residual_covariance(data: PairData, at: Linearization, factors: VarianceFactors, propagated: bool) -> Array:
+def residual_covariance(data: PairData, at: Linearization, factors: VarianceFactors) -> Array:
     """(N, 6, 6) of the geodesic residual: that of B, and A's through de/dA, to first order."""
     covariance = measurement_covariance(data, factors)
-    if propagated and data.carrier is not None:
+    if data.carrier is not None:
         covariance = covariance + at.carrier @ data.carrier @ at.carrier.transpose(0, 2, 1)
     return covariance
 

@@ -98,7 +98,7 @@ def doubts(log: LogFields) -> list[str]:
 def _unused(log: LogFields) -> list[str]:
     """Sensors and targets that the rig file has and the answer has not."""
     said = []
-    used = {name for track in log.outliers if track.used for name in (track.target, track.sensor)}
+    used = {name for track in log.outliers if track.used for name in track.pair}
     for sensor, count in log.detection.images.items():
         if sensor not in used:
             seen = sum(track.used for track in log.detection.tracks if track.sensor == sensor)
@@ -119,10 +119,10 @@ def _table(log: LogFields) -> Table:
         table.add_column(heading)
     for heading in ("seen", "usable", "after cleaning", "used"):
         table.add_column(heading, justify="right")
-    cleaned = {(t.target, t.sensor): t for t in log.cleaning.tracks}
-    used = {(t.target, t.sensor): t for t in log.outliers}
+    cleaned = {track.pair: track for track in log.cleaning.tracks}
+    used = {track.pair: track for track in log.outliers}
     for track in log.detection.tracks:
-        pair = track.target, track.sensor
+        pair = track.pair
         table.add_row(
             *pair,
             str(track.used + sum(track.removed.values())),

@@ -10,6 +10,8 @@ from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from gtsam_rwhec.problem.pairs import Pair
+
 #: A stated size is doubted when it is off by this many standard deviations, and by this share: printers, calipers and
 #: intrinsics are seldom better.
 SIZE_SIGMAS, SIZE_SHARE = 5.0, 0.004
@@ -31,6 +33,11 @@ class TrackCount(_Report):
 
     def __str__(self) -> str:
         return f"{self.target} in {self.sensor}: {', '.join(f'{count} {why}' for why, count in self.removed.items())}"
+
+    @property
+    def pair(self) -> Pair:
+        """Of whom it is."""
+        return Pair(self.target, self.sensor)
 
 
 class DetectionReport(_Report):
@@ -129,7 +136,7 @@ def _counted(tracks: Sequence[TrackCount]) -> dict[str, tuple[int, int]]:
     """How many measurements were used and left out, of each sensor and target."""
     counts: dict[str, tuple[int, int]] = {}
     for track in tracks:
-        for name in (track.target, track.sensor):
+        for name in track.pair:
             used, out = counts.get(name, (0, 0))
             counts[name] = used + track.used, out + sum(track.removed.values())
     return counts

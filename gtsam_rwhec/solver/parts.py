@@ -138,7 +138,7 @@ def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
 
 
 def _part(problem: Problem, members: frozenset[str]) -> Part:
-    pairs = tuple(pair for pair in problem.pairs if pair[1] in members)
+    pairs = tuple(pair for pair in problem.pairs if pair.sensor in members)
     targets = tuple(name for name in problem.targets if name in members)
     sensors = tuple(name for name in problem.sensors if name in members)
     gauge, moments = _centred(problem, pairs)
