@@ -26,7 +26,7 @@ def init(
     with StageDisplay() as stage:
         stage(f"looking at {log}")
         with rw.logs.open_log(log) as opened:
-            text, notes = rw.first_rig.first_rig(opened, output)
+            text, notes = rw.first_rig.propose_rig(opened, output)
     write_atomically(output, text.encode())
     for note in notes:
         typer.echo(printable(note))

@@ -1,1 +1,1 @@
-from .rig_from_look import first_rig as first_rig
+from .proposal import propose_rig as propose_rig

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gtsam_rwhec.first_rig.look import Poses
+from gtsam_rwhec.first_rig.log_contents import PoseTopic
 from gtsam_rwhec.rig.field_types import is_name
 from gtsam_rwhec.rig.sections import PoseSource
 
@@ -30,7 +30,7 @@ class MovingPair:
     on_parent: int = 0
 
 
-def moving_pairs(poses: Iterable[Poses], camera_frames: Iterable[str]) -> tuple[list[MovingPair], list[str]]:
+def moving_pairs(poses: Iterable[PoseTopic], camera_frames: Iterable[str]) -> tuple[list[MovingPair], list[str]]:
     """Pairs of frames that could be the carriers, the likeliest first; and remarks on what cannot be used.
 
     Frames of tf that do not move against each other are one body. Of each body that moves and carries no further one,
@@ -39,7 +39,7 @@ def moving_pairs(poses: Iterable[Poses], camera_frames: Iterable[str]) -> tuple[
     poses = list(poses)
     cameras = list(camera_frames)
     pairs, remarks = _of_tf([p for p in poses if p.is_tf and p.child and p.child != p.parent], cameras)
-    by_topic: dict[str, list[Poses]] = {}
+    by_topic: dict[str, list[PoseTopic]] = {}
     for series in poses:
         if not series.is_tf:
             by_topic.setdefault(series.topic, []).append(series)
@@ -49,8 +49,8 @@ def moving_pairs(poses: Iterable[Poses], camera_frames: Iterable[str]) -> tuple[
     return pairs, remarks
 
 
-def _of_tf(series: list[Poses], cameras: list[str]) -> tuple[list[MovingPair], list[str]]:
-    links: dict[str, Poses] = {}
+def _of_tf(series: list[PoseTopic], cameras: list[str]) -> tuple[list[MovingPair], list[str]]:
+    links: dict[str, PoseTopic] = {}
     for link in series:
         links.setdefault(link.child, link)
     moving = {child for child, link in links.items() if link.is_moving}
@@ -84,7 +84,7 @@ def _of_tf(series: list[Poses], cameras: list[str]) -> tuple[list[MovingPair], l
     return pairs, remarks
 
 
-def _of_topic(series: Poses) -> MovingPair:
+def _of_topic(series: PoseTopic) -> MovingPair:
     child = frame_name(series.child) or frame_name(series.topic) or "moving"
     parent = frame_name(series.parent) or "world"
     if parent == child:
@@ -92,7 +92,7 @@ def _of_topic(series: Poses) -> MovingPair:
     return MovingPair(PoseSource(topic=series.topic, parent=parent, child=child), _words(series, series.topic))
 
 
-def _words(series: Poses, where: str) -> str:
+def _words(series: PoseTopic, where: str) -> str:
     moved, turned = series.motion()
     return f"{where}: {series.count} poses, up to {moved:.2f} m and {math.degrees(turned):.0f} degrees"
 

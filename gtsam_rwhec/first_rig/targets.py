@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
-from gtsam_rwhec.first_rig.look import Driver, Images
+from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic
 from gtsam_rwhec.rig.target_sections import AprilGridTarget, CharucoTarget, TagTarget
 from gtsam_rwhec.vision.targets import FAMILIES
 
@@ -28,7 +28,7 @@ class Guess:
     remark: str
 
 
-def targets_seen(images: Iterable[Images], drivers: Iterable[Driver]) -> tuple[list[Guess], list[str]]:
+def targets_seen(images: Iterable[ImageTopic], drivers: Iterable[DriverTopic]) -> tuple[list[Guess], list[str]]:
     """Targets, and remarks on tags that were left out."""
     images = list(images)
     looked_at = sum(topic.looked_at for topic in images)
@@ -99,7 +99,7 @@ def _aprilgrid(family: str, ids: list[int]) -> Guess:
     return Guess(f"grid_{family}", section, f"TODO count columns and rows, measure: a guess from tags {_listed(ids)}")
 
 
-def _of_drivers(drivers: Iterable[Driver], already: Iterable[Guess]) -> Iterator[Guess]:
+def _of_drivers(drivers: Iterable[DriverTopic], already: Iterable[Guess]) -> Iterator[Guess]:
     """Tags that only a driver saw; with the driver's size where it says one."""
     have = {(g.section.family, g.section.id) for g in already if isinstance(g.section, TagTarget)}
     for driver in drivers:

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from gtsam_rwhec.errors import RigError
-from gtsam_rwhec.first_rig import first_rig
+from gtsam_rwhec.first_rig import propose_rig
 from gtsam_rwhec.first_rig.carriers import frame_name
-from gtsam_rwhec.first_rig.look import Images, Tags
+from gtsam_rwhec.first_rig.log_contents import ImageTopic, Tags
 from gtsam_rwhec.first_rig.targets import family_named, targets_seen
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.rig import AprilGridTarget, CharucoTarget, Rig, parse_rig
@@ -104,7 +104,7 @@ class Scene:
                 writer.add_message(channel, i, json.dumps(message).encode(), i)
             writer.finish()
         with open_log([self.folder / "run.mcap", self.folder / "others.mcap"]) as log:
-            text, notes = first_rig(log, self.folder / "rig.yaml")
+            text, notes = propose_rig(log, self.folder / "rig.yaml")
         return parse_rig(text, "rig.yaml"), text, notes
 
 
@@ -286,8 +286,8 @@ def test_an_empty_log(scene: Scene) -> None:
         scene.first()
 
 
-def look(tags: dict[str, Tags], looked_at: int = 8) -> list[Images]:
-    return [Images("/image", "", looked_at, looked_at=looked_at, tags=tags)]
+def look(tags: dict[str, Tags], looked_at: int = 8) -> list[ImageTopic]:
+    return [ImageTopic("/image", "", looked_at, looked_at=looked_at, tags=tags)]
 
 
 def counts(ids: Iterable[int], number: int = 8) -> Counter[int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from gtsam_rwhec.errors import CameraError
@@ -70,6 +70,7 @@ def test_project_is_pixels_of_what_is_in_front(lens: str) -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(st.sampled_from([4, 5, 8]).flatmap(coefficients), st.booleans())
+@example(np.array([0.1875, 0.0, 0.0, 0.0, -0.26078869, 0.24708576, -0.29433361, -0.11132812]), False)
 def test_the_ring_is_where_the_radius_turns_back(D: np.ndarray, is_fisheye: bool) -> None:
     D = D[:4] if is_fisheye else np.concatenate([D[:2], [0.0, 0.0], D[4:]])
     camera = Camera.of(640, 480, "equidistant" if is_fisheye else "rational_polynomial", K, D, "test")
@@ -81,8 +82,8 @@ def test_the_ring_is_where_the_radius_turns_back(D: np.ndarray, is_fisheye: bool
         assume(abs(np.polyval([*D[[4, 1, 0]], 1.0], camera.ring**2)) > 1e-2)
     if camera.ring < furthest:  # at once beyond it
         beyond = np.array([[camera.ring * 1.0001, 0.0]])
-        at_a_pole = np.abs(camera.pixels(beyond)).max() > 1e4
-        assert at_a_pole or camera.pixel_jacobian(beyond)[1][0, 0, 0] < 1e-6
+        slope = camera.pixel_jacobian(beyond)[1][0, 0, 0]
+        assert slope < 1e-6 or slope > 1e6 or np.abs(camera.pixels(beyond)).max() > 1e4  # the last two: at a pole
         points = np.array([[0.999 * camera.ring, 0.0, 1.0], [1.001 * camera.ring, 0.0, 1.0]])
         assert np.isnan(camera.project(points)).any(axis=1).tolist() == [False, True]
 

@@ -1,4 +1,4 @@
-"""A first rig file, made by looking at a log: what a person must fill in is marked TODO."""
+"""A first rig file, proposed from what a log holds; what a person must fill in is marked TODO."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.first_rig.carriers import MovingPair, frame_name, moving_pairs
-from gtsam_rwhec.first_rig.look import Images, Look, look_through
+from gtsam_rwhec.first_rig.log_contents import ImageTopic, LogContents, read_contents
 from gtsam_rwhec.first_rig.targets import Guess, targets_seen
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig.field_types import is_name, is_text
@@ -41,8 +41,8 @@ class _Camera:
     remarks: dict[str, str]
 
 
-def first_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
-    """Write a first rig file for a log, to be completed by a person.
+def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
+    """Propose a rig file for a log; a person completes it.
 
     Parameters
     ----------
@@ -62,24 +62,25 @@ def first_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     RigError
         The log has neither images nor detections, or no poses that move; with the topics that there are.
     """
-    look = look_through(log)
+    contents = read_contents(log)
     notes: list[str] = []
-    cameras = _cameras(look, notes)
+    cameras = _cameras(contents, notes)
     if not cameras:
-        raise RigError(f"{_where(log)}: no images and no detections that can be read; {_topics(look)}")
-    pairs, remarks = moving_pairs(look.poses.values(), [camera.frame for camera in cameras])
+        raise RigError(f"{_where(log)}: no images and no detections that can be read; {_topics(contents)}")
+    pairs, remarks = moving_pairs(contents.poses.values(), [camera.frame for camera in cameras])
     notes += remarks
     if not pairs:
         raise RigError(
             f"{_where(log)}: no poses of anything that moves, and without the carriers' motion nothing can be "
-            f"calibrated (or record it together with what poses the robot or the motion capture has); {_topics(look)}"
+            "calibrated (or record it together with what poses the robot or the motion capture has); "
+            f"{_topics(contents)}"
         )
     pair = pairs[0]
     notes.append(f"moving: {_pair_words(pair)}")
     notes += [f"moves too, not used: {_pair_words(other)}" for other in pairs[1:6]]
     carriers, carrier_remark = _carriers(pair)
-    used = [look.images[c.section.images] for c in cameras if c.section.images is not None]
-    drivers = [look.drivers[c.section.detections] for c in cameras if c.section.detections is not None]
+    used = [contents.images[c.section.images] for c in cameras if c.section.images is not None]
+    drivers = [contents.drivers[c.section.detections] for c in cameras if c.section.detections is not None]
     guesses, remarks = targets_seen(used, drivers)
     notes += remarks
     looked_at = sum(images.looked_at for images in used)
@@ -138,13 +139,13 @@ def _carriers(pair: MovingPair) -> tuple[Carriers, str]:
     return Carriers(sensors=child, targets=parent, poses=pair.source, noise=_GUESSED_NOISE), remark
 
 
-def _cameras(look: Look, notes: list[str]) -> list[_Camera]:
+def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:
     """Sensors with images; and drivers' detections where no images are of the same camera."""
     taken: set[str] = set()
     cameras = []
-    for images in _without_copies(look, notes):
+    for images in _without_copies(contents, notes):
         remarks = {}
-        intrinsics, remark = _intrinsics(images.topic, images.frame, look.intrinsics, len(look.images))
+        intrinsics, remark = _intrinsics(images.topic, images.frame, contents.intrinsics, len(contents.images))
         if remark:
             remarks["intrinsics"] = remark
         if intrinsics is None:
@@ -154,11 +155,11 @@ def _cameras(look: Look, notes: list[str]) -> list[_Camera]:
         cameras.append(_Camera(name, Sensor(images=images.topic, intrinsics=intrinsics), images.frame, remarks))
         notes.append(f"camera {name}: {images.count} images in {images.topic}, {images.looked_at} looked at")
     with_images = {camera.frame for camera in cameras if camera.frame}
-    for driver in look.drivers.values():
+    for driver in contents.drivers.values():
         if driver.frame in with_images:
             notes.append(f"not used: detections in {driver.topic}, whose camera's images are in the log")
             continue
-        intrinsics, remark = _intrinsics(driver.topic, driver.frame, look.intrinsics, len(look.drivers))
+        intrinsics, remark = _intrinsics(driver.topic, driver.frame, contents.intrinsics, len(contents.drivers))
         remarks = {"intrinsics": remark} if remark else {}
         if intrinsics is None and not driver.has_poses:
             intrinsics = Intrinsics(file="camera.yaml")
@@ -169,10 +170,10 @@ def _cameras(look: Look, notes: list[str]) -> list[_Camera]:
     return cameras
 
 
-def _without_copies(look: Look, notes: list[str]) -> list[Images]:
+def _without_copies(contents: LogContents, notes: list[str]) -> list[ImageTopic]:
     """One topic for each camera: the one with most images, raw rather than compressed; none of depth."""
-    best: dict[tuple[str, str], Images] = {}
-    ranked = sorted(look.images.values(), key=lambda images: ("Compressed" in images.schema, images.topic))
+    best: dict[tuple[str, str], ImageTopic] = {}
+    ranked = sorted(contents.images.values(), key=lambda images: ("Compressed" in images.schema, images.topic))
     for images in sorted(ranked, key=lambda images: -images.looked_at):
         key = _name(images.topic, images.frame), images.frame
         if "depth" in images.topic.lower():
@@ -228,6 +229,6 @@ def _where(log: Log) -> str:
     return ", ".join(str(file.path) for file in log.files[:3]) + (", ..." if len(log.files) > 3 else "")
 
 
-def _topics(look: Look) -> str:
-    listed = ", ".join(f"{topic.name} ({topic.schema}, {topic.count} messages)" for topic in look.topics)
+def _topics(contents: LogContents) -> str:
+    listed = ", ".join(f"{topic.name} ({topic.schema}, {topic.count} messages)" for topic in contents.topics)
     return f"topics: {listed or 'none'}"

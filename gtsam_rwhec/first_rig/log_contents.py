@@ -1,4 +1,4 @@
-"""What a log holds that a rig file could name: cameras and the tags in a few of their images, drivers, what moves."""
+"""What a log holds that a rig file could name: cameras, the tags in some of their images, drivers, and what moves."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
+from gtsam_rwhec.logs.message_kinds import IMAGE_SCHEMAS, schema_word
 from gtsam_rwhec.rig.field_types import is_text
 from gtsam_rwhec.vision.images import decode_gray
 from gtsam_rwhec.vision.tag_survey import BY_TRUST, tags_in_image
 
-#: Images that are looked at, of each topic, evenly from all of them; and those in which all families are looked for.
+#: In so many images of each topic tags are looked for; they are taken evenly from all.
 IMAGES = 8
+#: In the first few of them tags of all families are looked for, which takes a second each.
 IMAGES_FOR_ALL = 3
 #: Poses that are kept of each pair of frames, to see whether it moves.
 POSES = 1000
-#: Less is taken for standing still.
-STILL_M, STILL_RAD = 0.01, math.radians(1.0)
-#: Schemas' last words.
-IMAGE_SCHEMAS = ("Image", "CompressedImage", "RawImage")
+#: A frame that moves and turns by less stands still.
+STILL_M = 0.01
+STILL_RAD = math.radians(1.0)
 
 
 @dataclass
@@ -36,7 +37,7 @@ class Tags:
 
 
 @dataclass
-class Images:
+class ImageTopic:
     """A topic of images: its frame, and what was in those that were looked at."""
 
     topic: str
@@ -51,7 +52,7 @@ class Images:
 
 
 @dataclass
-class Driver:
+class DriverTopic:
     """A topic of detections: frame, ids by family in how many messages each, sizes, whether there are poses."""
 
     topic: str
@@ -63,7 +64,7 @@ class Driver:
 
 
 @dataclass
-class Poses:
+class PoseTopic:
     """Poses of one pair of frames in one topic: how many, and some of them."""
 
     topic: str
@@ -84,7 +85,7 @@ class Poses:
         self.count += 1
 
     def motion(self) -> tuple[float, float]:
-        """How far (m) and by how much (rad) it gets from where it begins."""
+        """The largest distance (m) and turn (rad) from the first pose."""
         step = se3.inverse(self.kept[0][None]) @ np.stack(self.kept)
         return (
             float(np.linalg.norm(step[:, :3, 3], axis=1).max()),
@@ -93,7 +94,7 @@ class Poses:
 
     @property
     def is_moving(self) -> bool:
-        """Whether it does."""
+        """Whether the child moves against the parent."""
         if self.is_static or len(self.kept) < 2:
             return False
         moved, turned = self.motion()
@@ -101,57 +102,46 @@ class Poses:
 
 
 @dataclass
-class Look:
-    """All of it, by topic; poses by topic, parent and child."""
+class LogContents:
+    """What a log holds, by topic; poses by topic, parent and child."""
 
     topics: tuple[Topic, ...]
-    images: dict[str, Images] = field(default_factory=dict)
+    images: dict[str, ImageTopic] = field(default_factory=dict)
     intrinsics: dict[str, str] = field(default_factory=dict)
-    drivers: dict[str, Driver] = field(default_factory=dict)
-    poses: dict[tuple[str, str, str], Poses] = field(default_factory=dict)
+    drivers: dict[str, DriverTopic] = field(default_factory=dict)
+    poses: dict[tuple[str, str, str], PoseTopic] = field(default_factory=dict)
 
 
-def look_through(log: Log) -> Look:
-    """Go through a log once."""
+def read_contents(log: Log) -> LogContents:
+    """Read a log once, and look for tags in some of its images."""
     topics = log.topics()
-    look = Look(topics)
+    contents = LogContents(topics)
     readable = {topic.name for topic in topics if is_text(topic.name)}
     # Several poses in a message are of several things (of targets, as a rule): no carrier's.
-    readable -= {topic.name for topic in topics if topic.unreadable or last_word(topic.schema) == "PosesInFrame"}
-    transforms = {topic.name for topic in topics if _is_tf(topic)}
+    readable -= {topic.name for topic in topics if topic.unreadable or schema_word(topic.schema) == "PosesInFrame"}
+    transforms = {topic.name for topic in topics if topic.is_tf}
     for topic in topics:
-        if topic.name in readable and last_word(topic.schema) in IMAGE_SCHEMAS:
+        if topic.name in readable and schema_word(topic.schema) in IMAGE_SCHEMAS:
             wanted = np.linspace(0, max(topic.count - 1, 0), IMAGES).round().astype(int)
-            look.images[topic.name] = Images(topic.name, topic.schema, topic.count, wanted=frozenset(wanted.tolist()))
+            contents.images[topic.name] = ImageTopic(
+                topic.name, topic.schema, topic.count, wanted=frozenset(wanted.tolist())
+            )
     for record in log.records(sorted(readable)):
         if isinstance(record, PoseRecord):
             key = record.topic, record.parent, record.child
-            if key not in look.poses:
-                look.poses[key] = Poses(*key, is_tf=record.topic in transforms, is_static=record.is_static)
-            look.poses[key].add(record.T)
+            if key not in contents.poses:
+                contents.poses[key] = PoseTopic(*key, is_tf=record.topic in transforms, is_static=record.is_static)
+            contents.poses[key].add(record.T)
         elif isinstance(record, ImageRecord):
-            _look_at(look.images[record.topic], record)
+            _look_at(contents.images[record.topic], record)
         elif isinstance(record, IntrinsicsRecord):
-            look.intrinsics.setdefault(record.topic, record.frame)
+            contents.intrinsics.setdefault(record.topic, record.frame)
         elif isinstance(record, DetectionRecord):
-            _take_detection(look.drivers.setdefault(record.topic, Driver(record.topic)), record)
-    return look
+            _take_detection(contents.drivers.setdefault(record.topic, DriverTopic(record.topic)), record)
+    return contents
 
 
-def last_word(schema: str) -> str:
-    """``Image`` of ``sensor_msgs/msg/Image`` and ``foxglove.Image``."""
-    return schema.replace("/", ".").rpartition(".")[2]
-
-
-def _is_tf(topic: Topic) -> bool:
-    """Whether the pipeline takes its transforms together, as tf's."""
-    return topic.name.rpartition("/")[2] in ("tf", "tf_static") or topic.schema in (
-        "foxglove.FrameTransforms",
-        "foxglove.FrameTransform",
-    )
-
-
-def _look_at(images: Images, record: ImageRecord) -> None:
+def _look_at(images: ImageTopic, record: ImageRecord) -> None:
     images.frame = images.frame or record.frame
     place, images.passed = images.passed, images.passed + 1
     if place not in images.wanted:
@@ -170,7 +160,7 @@ def _look_at(images: Images, record: ImageRecord) -> None:
         (found.double if is_double else found.single)[number] += 1
 
 
-def _take_detection(driver: Driver, record: DetectionRecord) -> None:
+def _take_detection(driver: DriverTopic, record: DetectionRecord) -> None:
     driver.frame = driver.frame or record.frame
     driver.count += 1
     driver.has_poses &= record.T_camera_tag is not None

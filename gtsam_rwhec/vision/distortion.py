@@ -1,0 +1,141 @@
+"""Lens distortion in normalised coordinates, as OpenCV defines it, and its inverse."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.polynomial import Polynomial
+
+from gtsam_rwhec.geometry.poses import Array
+
+Model = Literal["pinhole", "radtan", "equidistant"]
+
+#: Newton's steps, at most.
+STEPS = 30
+#: A step of less than this, normalised, ends them.
+NEAR = 1e-10
+
+
+def distorted(model: Model, D: Array, x: Array) -> tuple[Array, Array]:
+    """Distorted coordinates (..., 2) of x (..., 2), and their derivatives (..., 2, 2) by x."""
+    if model == "equidistant":
+        return _equidistant(x, D)
+    if model == "radtan":
+        return _radtan(x, D)
+    return x, np.broadcast_to(np.eye(2), (*x.shape[:-1], 2, 2))
+
+
+def undistorted(model: Model, D: Array, wanted: Array, ring: float) -> Array:
+    """x (..., 2) whose distorted coordinates are `wanted`, by Newton; nan where there is none within `ring`."""
+    if model == "pinhole":
+        return wanted
+    if model == "equidistant":
+        return _undistorted_fisheye(D, wanted, ring)
+    x = wanted.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(STEPS):
+            bent, J = distorted(model, D, x)
+            det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+            off = wanted - bent
+            step = np.stack(
+                [
+                    J[..., 1, 1] * off[..., 0] - J[..., 0, 1] * off[..., 1],
+                    J[..., 0, 0] * off[..., 1] - J[..., 1, 0] * off[..., 0],
+                ],
+                axis=-1,
+            )
+            step /= det[..., None]
+            # Beyond the ring where distortion folds back (det <= 0) nothing is seen.
+            x = np.where(det[..., None] > 0.0, x + step, np.nan)
+            if not np.nanmax(np.abs(step), initial=0.0) > NEAR:
+                break
+        reached = (np.abs(distorted(model, D, x)[0] - wanted) < 1e-8).all(axis=-1, keepdims=True)
+        within = np.linalg.norm(x, axis=-1, keepdims=True) < ring
+    return np.where(reached & within, x, np.nan)
+
+
+def _undistorted_fisheye(D: Array, wanted: Array, ring: float) -> Array:
+    """As `undistorted`, by Newton on the angle, since tan runs away."""
+    k1, k2, k3, k4 = D
+    curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4])
+    slope = curve.deriv()
+    furthest = float(np.arctan(ring))
+    theta_d = np.linalg.norm(wanted, axis=-1, keepdims=True)
+    theta = np.minimum(theta_d, furthest)
+    with np.errstate(all="ignore"):
+        for _ in range(STEPS):
+            before = theta
+            theta = np.clip(theta + (theta_d - curve(theta)) / slope(theta), 0.0, furthest)
+            if not np.nanmax(np.abs(theta - before), initial=0.0) > NEAR:
+                break
+        seen = (np.abs(curve(theta) - theta_d) < 1e-9) & (theta < furthest)
+        return np.where(seen, wanted * np.where(theta_d > 0.0, np.tan(theta) / theta_d, 1.0), np.nan)
+
+
+def folding_radius(model: Model, D: Array) -> float:
+    """The radius |x| at which the radial distortion folds back (or has a pole); infinite where it never does."""
+    if model == "pinhole":
+        return float("inf")
+    if model == "equidistant":
+        # d theta_d / d theta, in theta^2
+        squared = _first_root(Polynomial([1.0, *(D * [3.0, 5.0, 7.0, 9.0])]))
+        return float(np.tan(np.sqrt(squared))) if squared < (0.5 * np.pi) ** 2 else float("inf")
+    k1, k2, _, _, k3, k4, k5, k6 = np.pad(D, (0, 8))[:8]
+    above, below = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
+    # d(r above / below) / dr, times below^2, in r^2
+    slope = above * below + Polynomial([0.0, 2.0]) * (above.deriv() * below - above * below.deriv())
+    return float(np.sqrt(min(_first_root(slope), _first_root(below))))
+
+
+def _first_root(polynomial: Polynomial) -> float:
+    """Smallest real root above 0 of a polynomial that is 1 at 0; infinite if it has none."""
+    # Of its reciprocals: the last coefficients may be next to nothing, the first is not.
+    roots = np.roots(polynomial.coef)
+    inverse = float(roots[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)].real.max(initial=0.0))
+    return 1.0 / inverse if inverse > 1e-12 else float("inf")
+
+
+def _radtan(x: Array, D: Array) -> tuple[Array, Array]:
+    """OpenCV's calib3d, "Detailed Description": x g(r^2) + tangential + thin prism, g rational."""
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = np.pad(D, (0, 14))[:12]
+    a, b = x[..., 0], x[..., 1]
+    r2 = a * a + b * b
+    above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    g = above / below
+    # dg / d(r^2)
+    dg = (k1 + r2 * (2 * k2 + 3 * k3 * r2) - g * (k4 + r2 * (2 * k5 + 3 * k6 * r2))) / below
+    ab = a * b
+    distorted = np.stack(
+        [
+            a * g + 2 * p1 * ab + p2 * (r2 + 2 * a * a) + r2 * (s1 + s2 * r2),
+            b * g + p1 * (r2 + 2 * b * b) + 2 * p2 * ab + r2 * (s3 + s4 * r2),
+        ],
+        axis=-1,
+    )
+    J = np.empty((*x.shape, 2))
+    mixed = 2 * ab * dg + 2 * p1 * a + 2 * p2 * b
+    prism_a, prism_b = s1 + 2 * s2 * r2, s3 + 2 * s4 * r2
+    J[..., 0, 0] = g + 2 * a * a * dg + 2 * p1 * b + 6 * p2 * a + 2 * a * prism_a
+    J[..., 0, 1] = mixed + 2 * b * prism_a
+    J[..., 1, 0] = mixed + 2 * a * prism_b
+    J[..., 1, 1] = g + 2 * b * b * dg + 6 * p1 * b + 2 * p2 * a + 2 * b * prism_b
+    return distorted, J
+
+
+def _equidistant(x: Array, D: Array) -> tuple[Array, Array]:
+    """OpenCV's fisheye: theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8), x theta_d / r, r = tan theta."""
+    r2 = np.einsum("...i,...i->...", x, x)
+    r = np.sqrt(r2)
+    theta = np.arctan(r)
+    t2 = theta * theta
+    k1, k2, k3, k4 = D
+    theta_d = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    small = r < 1e-6
+    safe = np.where(small, 1.0, r)
+    g = np.where(small, 1.0 + (k1 - 1.0 / 3.0) * r2, theta_d / safe)
+    # (1/r) dg/dr, with dtheta/dr = 1 / (1 + r^2)
+    dg = np.where(small, 2.0 * (k1 - 1.0 / 3.0), (slope / (1.0 + r2) - g) / (safe * safe))
+    J = g[..., None, None] * np.eye(2) + dg[..., None, None] * x[..., :, None] * x[..., None, :]
+    return x * g[..., None], J
