@@ -9,7 +9,7 @@ from dq_scenarios import Array, Sample
 
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.handeye import METHODS, motions_of
-from gtsam_rwhec.handeye.cost import moments_of
+from gtsam_rwhec.handeye.cost import motion_moments
 from gtsam_rwhec.handeye.daniilidis import squared, unit_combination
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.request import Request
@@ -37,7 +37,7 @@ ALPHAS = np.logspace(-2.0, 1.7, 100)
 def requests(sample: Sample, alphas: Sequence[float] | Array, rng: int = 0) -> list[Request]:
     """One request for each alpha; S, M and W are linear in alpha^2 (eq. 9). ``rng``: seed of random starts."""
     motions = motions_of(sample.C, sample.H)
-    moments = moments_of(motions.rows)
+    moments = motion_moments(motions.rows)
     return [
         Request(motions, moments.cost(float(a)), float(a), None, None, prior=None, scale="known", rng=rng)
         for a in alphas

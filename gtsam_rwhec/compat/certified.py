@@ -24,17 +24,17 @@ def certified_hand_eye(stations: Stations) -> tuple[Array, Array]:
     R_A = stations.R_G.transpose(0, 2, 1)  # gripper_T_base
     t_A = -np.einsum("nab,nb->na", R_A, stations.t_G)
     t_C = stations.t_C + stations.R_C @ stations.origin
-    _, Y = certified(R_A, t_A, stations.R_C, t_C)
+    _, Y = certified_poses(R_A, t_A, stations.R_C, t_C)
     return Y[:3, :3], Y[:3, 3]
 
 
 def certified_robot_world(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> tuple[Array, Array, Array, Array]:
     """Certified base2world and gripper2cam, from world2cam (A, the measurement) and base2gripper (B)."""
-    X, Z = (np.linalg.inv(T) for T in certified(R_B, t_B, R_A, t_A))
+    X, Z = (np.linalg.inv(T) for T in certified_poses(R_B, t_B, R_A, t_A))
     return X[:3, :3], X[:3, 3], Z[:3, :3], Z[:3, 3]
 
 
-def certified(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> tuple[Array, Array]:
+def certified_poses(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> tuple[Array, Array]:
     """X and Y (4, 4) of A X = Y B, solved twice: with unit weights, then with those of the first answer's residuals.
 
     OpenCV's calls have no place for the noise; the residuals of any consistent answer tell rotation's and

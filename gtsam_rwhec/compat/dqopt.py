@@ -8,7 +8,7 @@ from gtsam_rwhec.compat.daniilidis import screws
 from gtsam_rwhec.compat.stations import Stations
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.handeye.cost import Moments, moments_of
+from gtsam_rwhec.handeye.cost import MotionMoments, motion_moments
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
 from gtsam_rwhec.handeye.signs import UNCERTAIN
@@ -33,18 +33,18 @@ def dqopt(stations: Stations) -> tuple[Array, Array]:
         kept = (weight > 0.0) & (a[3] + b[3] >= UNCERTAIN)
         sides = (a[:3] + b[:3], a - b, dual_a[:3] + dual_b[:3], dual_a - dual_b)  # Motions.rows
         rows = np.concatenate([side[:, kept] for side in sides])
-        sums = moments_of(rows)
+        sums = motion_moments(rows)
         AA, BA, BB, used = AA + sums.AA, BA + sums.BA, BB + sums.BB, used + rows.shape[1]
     if used < 2:
         raise UnderdeterminedError(
             f"{used} motions between the poses are not about half a turn, and two are needed; add poses that turn less"
         )
-    moments = Moments(AA, BA, BB, used)
+    moments = MotionMoments(AA, BA, BB, used)
     # To begin with, a translation as long as the motions' own counts as much as a rotation of about a radian.
     alpha = np.sqrt(used / max(float(np.trace(BB)), np.finfo(float).tiny))
     found = minimum(moments.cost(alpha))
     for _ in range(ROUNDS):
-        rotation, translation = residuals(moments, found)
+        rotation, translation = squared_sums(moments, found)
         floor = 1e-14 * used
         if rotation <= floor or translation * alpha**2 <= floor:
             break  # exact poses: nothing to weigh
@@ -54,7 +54,7 @@ def dqopt(stations: Stations) -> tuple[Array, Array]:
     return X[:3, :3], X[:3, 3]
 
 
-def residuals(moments: Moments, found: Minimum) -> tuple[float, float]:
+def squared_sums(moments: MotionMoments, found: Minimum) -> tuple[float, float]:
     """The sums of |A q|^2 and |B q + A q'|^2 of an answer."""
     q, p = found.q, found.q_dual
     rotation = float(q @ moments.AA @ q)

@@ -6,6 +6,7 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
+from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import LARGEST_M, ROTATION_TOLERANCE, Array
@@ -116,7 +117,9 @@ def _rotations(values: Any, where: str) -> Array:
         return array
     if array.size and array.shape[1:] in ((3,), (3, 1), (1, 3)):
         _check_finite(array, where)
-        return rotations_of_vectors(array.reshape(-1, 3))
+        vectors = array.reshape(-1, 3)
+        rotations: Array = se3.expmap(np.concatenate([vectors, np.zeros_like(vectors)], axis=1))[:, :3, :3]
+        return rotations
     if array.size == 0:
         raise CountError(f"{where}: no rotations; at least {FEWEST_POSES} are needed")
     raise PoseError(
@@ -207,15 +210,3 @@ def _check_rotations(R: Array, where: str) -> None:
             f"{where}: the rotation of pose {index} is left-handed (determinant {handed[index]:.6f}): a mirrored axis; "
             "check the axis convention"
         )
-
-
-def rotations_of_vectors(vectors: Array) -> Array:
-    """Rotations (N, 3, 3) of rotation vectors (N, 3): Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=1)
-    x, y, z = vectors.T
-    K = np.zeros((len(vectors), 3, 3))
-    K[:, 2, 1], K[:, 1, 2], K[:, 0, 2], K[:, 2, 0], K[:, 1, 0], K[:, 0, 1] = x, -x, y, -y, z, -z
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # (1 - cos a) / a^2
-    R: Array = np.eye(3) + first[:, None, None] * K + second[:, None, None] * (K @ K)
-    return R

@@ -14,7 +14,7 @@ from gtsam_rwhec.solver.rotations import project
 RobotWorld = tuple[Array, Array, Array, Array]
 
 
-class Moments(NamedTuple):
+class PoseMeans(NamedTuple):
     """Means over the poses of products of (R_A, t_A, 1) and (R_B, t_A, t_B, 1).
 
     Attributes
@@ -37,7 +37,7 @@ class Moments(NamedTuple):
     t_B: Array
 
 
-def moments_of(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> Moments:
+def pose_means(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> PoseMeans:
     """The means, by one GEMM."""
     count = len(R_A)
     F = np.empty((count, 25))
@@ -45,7 +45,7 @@ def moments_of(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> Moments:
     F[:, 15], F[:, 16:] = 1.0, R_B.reshape(count, 9)
     G = (F[:, :16].T @ F) / count
     of_R_A = G[:9].reshape(3, 3, 25)
-    return Moments(
+    return PoseMeans(
         R_A_R_B=of_R_A[:, :, 16:].reshape(3, 3, 3, 3),
         R_A_t_A=of_R_A[:, :, 9:12],
         R_A_t_B=of_R_A[:, :, 12:15],
@@ -64,7 +64,7 @@ def shah(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
     -------
     R_X, t_X, R_Z, t_Z of A X = Z B.
     """
-    m = moments_of(R_A, t_A, R_B, t_B)
+    m = pose_means(R_A, t_A, R_B, t_B)
     U, _, Vt = np.linalg.svd(m.R_A_R_B.transpose(2, 0, 3, 1).reshape(9, 9))  # R_A R_X R_B' = R_Z, vec by columns
     R_X, R_Z = _rotations_of_vec(np.array([Vt[0], U[:, 0]]))
     # Least squares of t_Z - R_A t_X = t_A - R_Z t_B =: d, t_Z = mean d + mean R_A t_X eliminated.
@@ -84,7 +84,7 @@ def li(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
     -------
     R_X, t_X, R_Z, t_Z of A X = Z B.
     """
-    m = moments_of(R_A, t_A, R_B, t_B)
+    m = pose_means(R_A, t_A, R_B, t_B)
     # vec(R_X) is eliminated: R_A, an orthogonal factor, leaves the identity in its block, R_X = mean of R_A' R_Z R_B.
     K = m.R_A_R_B.transpose(1, 3, 0, 2).reshape(9, 9)
     normal = np.zeros((15, 15))  # vec(R_Z), t_X, t_Z

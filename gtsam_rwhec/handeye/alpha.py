@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.handeye.cost import Moments
+from gtsam_rwhec.handeye.cost import MotionMoments
 from gtsam_rwhec.handeye.motion_costs import squared_residuals
 from gtsam_rwhec.handeye.motions import Motions
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
@@ -23,7 +23,7 @@ RANGE = 1e6
 
 
 def estimate_alpha(
-    motions: Motions, moments: Moments, weights: Array | None = None, prior: DualQuaternionPrior | None = None
+    motions: Motions, moments: MotionMoments, weights: Array | None = None, prior: DualQuaternionPrior | None = None
 ) -> float:
     """Alpha with which both kinds of residual have the same size: rms |A q| / rms |B q + A q'| at the optimum.
 
@@ -33,7 +33,7 @@ def estimate_alpha(
     Parameters
     ----------
     motions : Motions
-    moments : Moments
+    moments : MotionMoments
         Of the same motions and weights.
     weights : (N,) array, optional
     prior : DualQuaternionPrior, optional

@@ -6,18 +6,23 @@ Each finds q; q' is then the best that goes with it (eq. 20, ``best_dual``).
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.errors import OptionError, UnderdeterminedError
+from gtsam_rwhec.errors import NotConvergedWarning, OptionError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.degenerate import free_directions, free_of_rotations_alone
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.request import Request
-from gtsam_rwhec.handeye.saddle import SINGULAR, Z_pseudo, best_dual, is_singular
+from gtsam_rwhec.handeye.saddle import SINGULAR, Z_pseudo, best_dual, bracket, is_singular
 from gtsam_rwhec.methods.estimate import Outcome
+
+#: mu stands still when it changes by less than this part of the range that Appendix C gives it.
+STILL = 1e-13
+ITERATIONS = 200
 
 
 def dq2steps(request: Request) -> Outcome[Array]:
@@ -35,7 +40,7 @@ def dq2steps(request: Request) -> Outcome[Array]:
             f"{turned}, and 'dq2steps' takes the rotation from the rotations alone; use method='dqopt', which takes it "
             "from the translations too, or add motions about another axis"
         )
-    found = answer_of(request, vectors[:, 0])  # eq. 19
+    found = outcome_of(request, vectors[:, 0])  # eq. 19
     return replace(found, free_directions=free_of_rotations_alone(request.cost) or found.free_directions)
 
 
@@ -44,9 +49,9 @@ def dqconvrlx(request: Request) -> Outcome[Array]:
 
     ``lower_bound`` is lambda_0 (below eq. 22): the gap is at most ``relaxation_gap``.
     """
-    relaxed = relaxation(request.cost)
+    relaxed = relaxed_cost(request.cost)
     q = relaxed.vectors[:, 0]
-    found = answer_of(request, q)
+    found = outcome_of(request, q)
     return replace(found, lower_bound=max(float(relaxed.values[0]) - relaxed.rounding, 0.0))
 
 
@@ -67,28 +72,59 @@ def dq_nth_order(request: Request, order: int) -> Outcome[Array]:
     """
     if order < 1:
         raise OptionError(f"order={order}: the expansion in mu starts at order 1")
-    relaxed = relaxation(request.cost)
+    relaxed = relaxed_cost(request.cost)
     if is_singular(request.cost):
-        return answer_of(request, relaxed.vectors[:, 0])  # mu = 0 is exact (``Z_pseudo``)
+        return outcome_of(request, relaxed.vectors[:, 0])  # mu = 0 is exact (``Z_pseudo``)
     lambdas, coefficients = expansion(relaxed, max(order, 2))
     mu = _stationary(lambdas)
     in_eigenvectors = sum(c * mu**k for k, c in enumerate(coefficients[: order + 1]))
-    return answer_of(request, relaxed.vectors @ in_eigenvectors)
+    return outcome_of(request, relaxed.vectors @ in_eigenvectors)
 
 
 def dq2ndord_lambda(request: Request) -> Outcome[Array]:
     """The second order in Delta lambda = lambda - lambda_0 (Section 3.2.4, Appendix A, eqs. 35 and 36, corrected)."""
     cost = request.cost
-    relaxed = relaxation(cost)
+    relaxed = relaxed_cost(cost)
     q0 = relaxed.vectors[:, 0]
     if is_singular(cost):
-        return answer_of(request, q0)
+        return outcome_of(request, q0)
     q = lambda_expansion(relaxed)
-    return answer_of(request, q0 if q is None else relaxed.vectors @ q)
+    return outcome_of(request, q0 if q is None else relaxed.vectors @ q)
+
+
+def dqitr(request: Request) -> Outcome[Array]:
+    """DQItr: mu <- q(mu)'Z1 q(mu) / (2 q(mu)'Z2 q(mu)) (eq. 24) until it stands still.
+
+    With M singular (no noise), where the paper finds the iteration unstable, mu is 0 and nothing is iterated.
+
+    Warns
+    -----
+    NotConvergedWarning
+        When mu still moves after 200 iterations: the fixed point need not attract. ``dqopt`` always arrives.
+    """
+    cost = request.cost
+    if is_singular(cost):
+        return outcome_of(request, relaxed_cost(cost).vectors[:, 0])
+    Z0, Z1, Z2 = cost.Z0, cost.Z1, cost.Z2
+    low, high = bracket(Z1, Z2)
+    mu = 0.0
+    for _ in range(ITERATIONS):
+        q = np.linalg.eigh(Z0 + mu * (Z1 - mu * Z2))[1][:, 0]
+        before, mu = mu, float(0.5 * (q @ Z1 @ q) / (q @ Z2 @ q))
+        if abs(mu - before) <= STILL * (high - low):
+            break
+    else:
+        warnings.warn(
+            f"'dqitr' still moves after {ITERATIONS} iterations (mu from {before:.6g} to {mu:.6g}); "
+            "its answer may be off: use method='dqopt'",
+            NotConvergedWarning,
+            stacklevel=4,
+        )
+    return outcome_of(request, q)
 
 
 @dataclass(frozen=True)
-class Relaxation:
+class RelaxedCost:
     """Eq. 21 without the constraint, and Z1 and Z2 in its eigenvectors.
 
     Attributes
@@ -108,7 +144,7 @@ class Relaxation:
     rounding: float
 
 
-def relaxation(cost: DualQuaternionCost) -> Relaxation:
+def relaxed_cost(cost: DualQuaternionCost) -> RelaxedCost:
     """Solve Z0 q = lambda q (eq. 21); of a singular M with its pseudo-inverse."""
     if is_singular(cost):
         values, vectors = np.linalg.eigh(Z_pseudo(cost))
@@ -116,17 +152,17 @@ def relaxation(cost: DualQuaternionCost) -> Relaxation:
     else:
         values, vectors = np.linalg.eigh(cost.Z0)
         Z1, Z2 = vectors.T @ cost.Z1 @ vectors, vectors.T @ cost.Z2 @ vectors
-    return Relaxation(values, vectors, Z1, Z2, 1e-13 * float(np.trace(cost.S)))
+    return RelaxedCost(values, vectors, Z1, Z2, 1e-13 * float(np.trace(cost.S)))
 
 
-def relaxation_gap(relaxed: Relaxation) -> float:
+def relaxation_gap(relaxed: RelaxedCost) -> float:
     """lambda^c - lambda_0 (eq. 22): lambda_0 <= lambda* <= lambda^c, the cost of DQConvRlx."""
     if not relaxed.Z2[0, 0] > 0.0:
         return 0.0
     return float(0.25 * relaxed.Z1[0, 0] ** 2 / relaxed.Z2[0, 0])
 
 
-def expansion(relaxed: Relaxation, order: int) -> tuple[list[float], list[Array]]:
+def expansion(relaxed: RelaxedCost, order: int) -> tuple[list[float], list[Array]]:
     """lambda_k and c_k (4,) of lambda(mu) = sum lambda_k mu^k, q(mu) = sum mu^k sum_a c_ka q_a (eqs. 31 to 33).
 
     Two signs of eq. 33 as printed do not solve eq. 12: the middle line's second term is Z2 q_{k-2}, as the third
@@ -156,7 +192,7 @@ def _stationary(lambdas: list[float]) -> float:
     return float(real[np.abs(real - second).argmin()]) if real.size else second
 
 
-def lambda_expansion(relaxed: Relaxation) -> Array | None:
+def lambda_expansion(relaxed: RelaxedCost) -> Array | None:
     """Q to second order in Delta lambda, in the eigenvectors (4,), not normalised; None where mu = 0 is the answer.
 
     mu = mu_1 D + mu_2 D^2 and q = q_0 + q_1 D + q_2 D^2 solve (Z0 + mu Z1 - mu^2 Z2) q = (lambda_0 + D) q order by
@@ -185,13 +221,13 @@ def lambda_expansion(relaxed: Relaxation) -> Array | None:
     return q
 
 
-def answer_of(request: Request, q: Array) -> Outcome[Array]:
+def outcome_of(request: Request, q: Array) -> Outcome[Array]:
     """The pose of q (4,), not yet of length one, with the best q' (eq. 20).
 
     Algorithm 4 as printed normalises by q^2; a unit quaternion needs |q|.
     """
     q = q / math.sqrt(float(q @ q))
     X = to_transform(q, best_dual(request.cost, q))
-    relaxed = relaxation(request.cost)
+    relaxed = relaxed_cost(request.cost)
     free = free_directions(request.cost, q, relaxed.values, relaxed.vectors, request.noise_free_part)
     return Outcome(X, free_directions=free)

@@ -29,7 +29,7 @@ _STACKED = np.ascontiguousarray(E.transpose(1, 0, 2).reshape(28, 4))
 
 
 @dataclass(frozen=True)
-class Moments:
+class MotionMoments:
     """Sums over the motions (4, 4 each), alpha left out: ``AA`` = A'A, ``BA`` = B'A, ``BB`` = B'B."""
 
     AA: Array
@@ -109,7 +109,7 @@ class DualQuaternionCost:
         return self.value(q, q_dual) + lam * (1.0 - float(q @ q)) - 2.0 * mu * float(q @ q_dual)
 
 
-def moments_of(rows: Array, weights: Array | None = None) -> Moments:
+def motion_moments(rows: Array, weights: Array | None = None) -> MotionMoments:
     """The sums of eq. 9 over ``Motions.rows`` (14, N), alpha left out; weights (N,) multiply each motion's terms."""
     if weights is None:
         gram = rows @ rows.T
@@ -120,7 +120,7 @@ def moments_of(rows: Array, weights: Array | None = None) -> Moments:
             gram += (block * weights[first : first + BLOCK]) @ block.T
     by_part = gram.reshape(2, 7, 2, 7).transpose(0, 2, 1, 3).reshape(4, 49) @ _PRODUCTS
     AA, _, BA, BB = by_part.reshape(4, 4, 4)
-    return Moments(AA, BA, BB, rows.shape[1])
+    return MotionMoments(AA, BA, BB, rows.shape[1])
 
 
 def residuals(rows: Array, q: Array, q_dual: Array) -> Array:

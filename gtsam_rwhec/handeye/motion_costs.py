@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.handeye.cost import BLOCK, DualQuaternionCost, E, moments_of, residuals
+from gtsam_rwhec.handeye.cost import BLOCK, DualQuaternionCost, E, motion_moments, residuals
 from gtsam_rwhec.handeye.motions import Motions
 from gtsam_rwhec.handeye.weights import check_alpha, check_covariances, check_weights
 
@@ -60,7 +60,7 @@ def cost_of(
         checked = check_covariances(covariances, len(motions))
         if checked is not None:
             return covariance_cost(motions, checked)
-    return moments_of(motions.rows, check_weights(weights, len(motions))).cost(check_alpha(alpha))
+    return motion_moments(motions.rows, check_weights(weights, len(motions))).cost(check_alpha(alpha))
 
 
 def squared_residuals(motions: Motions, q: Array, q_dual: Array, weights: Array | None = None) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from scipy.optimize import brentq
 
 from gtsam_rwhec.errors import NotConvergedWarning, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.handeye.approximate import Relaxation, answer_of, relaxation, relaxation_gap
+from gtsam_rwhec.handeye.approximate import RelaxedCost, outcome_of, relaxation_gap, relaxed_cost
 from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import is_singular
 from gtsam_rwhec.methods.estimate import Outcome
@@ -57,7 +57,7 @@ class Curve:
         return scaled
 
 
-def curve(relaxed: Relaxation) -> Curve | None:
+def curve(relaxed: RelaxedCost) -> Curve | None:
     """The curve's coefficients (eq. 15); None where the gap of eq. 22 is rounding, and mu = 0 the answer."""
     gap = relaxation_gap(relaxed)
     if not gap > 1e-15 * max(abs(float(relaxed.values[0])), 1e-15 * abs(float(relaxed.values[3]))):
@@ -204,10 +204,10 @@ def _solve(request: Request, search: Callable[[Curve], float], name: str) -> Out
             f"M = alpha^2 sum A'A is singular (no noise, no rotation, or parallel axes), and {name!r} needs "
             "its inverse; use method='dqopt', which solves this case too"
         )
-    relaxed = relaxation(request.cost)
+    relaxed = relaxed_cost(request.cost)
     of = curve(relaxed)
     if of is None:
-        return answer_of(request, relaxed.vectors[:, 0])
+        return outcome_of(request, relaxed.vectors[:, 0])
     mu = double_root(of, search(of))
     q = np.linalg.eigh(np.diag(relaxed.values) + mu * (relaxed.Z1 - mu * relaxed.Z2))[1][:, 0]
-    return answer_of(request, relaxed.vectors @ q)
+    return outcome_of(request, relaxed.vectors @ q)

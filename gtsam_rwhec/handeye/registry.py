@@ -13,12 +13,11 @@ from numpy.typing import ArrayLike
 from gtsam_rwhec.errors import OptionError, PriorError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, to_pose3
 from gtsam_rwhec.handeye.alpha import estimate_alpha
-from gtsam_rwhec.handeye.approximate import dq2ndord, dq2ndord_lambda, dq2steps, dqconvrlx
+from gtsam_rwhec.handeye.approximate import dq2ndord, dq2ndord_lambda, dq2steps, dqconvrlx, dqitr
 from gtsam_rwhec.handeye.certified import certified
-from gtsam_rwhec.handeye.cost import moments_of
+from gtsam_rwhec.handeye.cost import motion_moments
 from gtsam_rwhec.handeye.daniilidis import daniilidis
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
-from gtsam_rwhec.handeye.iterative import dqitr
 from gtsam_rwhec.handeye.local import chvecopt, dqnlopt, dqnlopt_random, quatvecopt
 from gtsam_rwhec.handeye.motion_costs import covariance_cost, squared_mahalanobis, squared_residuals
 from gtsam_rwhec.handeye.motions import motions_of
@@ -165,7 +164,7 @@ def solve(
         number = check_alpha(alpha)
         cost = covariance_cost(motions, information)
     else:
-        moments = moments_of(motions.rows, w)
+        moments = motion_moments(motions.rows, w)
         number = estimate_alpha(motions, moments, w, prior) if _estimated(alpha) else check_alpha(alpha)
         cost = moments.cost(number)
     if prior is not None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import left, right
-from gtsam_rwhec.handeye.cost import moments_of, residuals
+from gtsam_rwhec.handeye.cost import motion_moments, residuals
 from gtsam_rwhec.handeye.saddle import minimum
 
 #: Scalar parts whose sum is below this do not tell the sign: noise of 11 degrees could have swapped it.
@@ -45,7 +45,7 @@ def resolve_signs(rows: Array, sums: Array, uncertain: NDArray[np.bool_]) -> Non
     """
     same = rows[:, uncertain]
     other = flipped(same, sums[:, uncertain])
-    known = gram(rows) - gram(same)
+    known = rotation_gram(rows) - rotation_gram(same)
     values, vectors = np.linalg.eigh(known)
     determined = values[1] > DETERMINED * values[0] + 1e-12 * values[3]
     starts = [vectors[:, 0]] if determined else _candidate_rotations(rows)
@@ -55,7 +55,7 @@ def resolve_signs(rows: Array, sums: Array, uncertain: NDArray[np.bool_]) -> Non
         for _ in range(ROUNDS):
             swap = _squares(other, rotation) < _squares(same, rotation)
             trial = np.where(swap, other, same)
-            rotation = np.linalg.eigh(known + gram(trial))[1][:, 0]
+            rotation = np.linalg.eigh(known + rotation_gram(trial))[1][:, 0]
         if len(starts) == 1:
             chosen = trial
             break
@@ -65,9 +65,9 @@ def resolve_signs(rows: Array, sums: Array, uncertain: NDArray[np.bool_]) -> Non
     rows[:, uncertain] = chosen
 
 
-def gram(rows: Array) -> Array:
+def rotation_gram(rows: Array) -> Array:
     """The sum of A'A (4, 4)."""
-    return moments_of(rows).AA
+    return motion_moments(rows).AA
 
 
 def _squares(rows: Array, q: Array) -> Array:
@@ -77,7 +77,7 @@ def _squares(rows: Array, q: Array) -> Array:
 
 def _cost(rows: Array) -> float:
     """What the least squares solution costs, translations weighed as much as rotations."""
-    moments = moments_of(rows)
+    moments = motion_moments(rows)
     lengths = np.trace(moments.BB)
     return minimum(moments.cost(float(np.sqrt(np.trace(moments.AA) / lengths)) if lengths > 0.0 else 1.0)).value
 

@@ -15,7 +15,7 @@ import numpy as np
 from gtsam_rwhec.errors import ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.estimate import Outcome, Poses
-from gtsam_rwhec.problem.moments import Gauge
+from gtsam_rwhec.problem.moments import Gauge, Moments, MomentStack, edge_forms
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.parts import connected_components
@@ -227,3 +227,17 @@ def linear_translations(
         raise ScaleError(f"the linear system for the translations has scale {alpha:.6g}, which no real target has")
     t = numbers[: 3 * n].reshape(n, 3) / alpha
     return t[:n_X] + stack.gauge.target_carrier, t[n_X:] + stack.gauge.sensor_carrier, alpha
+
+
+def plain_form(stack: Stack) -> Array:
+    """Q (25, 25) of one pair: x' Q x is half the sum of |R_A t_X + t_A - t_Y - R_Y t_B|^2 + |R_A R_X - R_Y R_B|_F^2.
+
+    x = [t_X, t_Y, 1, vec R_X, vec R_Y], translations about the stack's gauge; no use is made of R_X and R_Y being
+    rotations.
+    """
+    ones = np.ones(len(stack.A))
+    moments = Moments.of(stack.A, stack.B, ones, ones, stack.gauge, False, "-".join([*stack.targets, *stack.sensors]))
+    stacked = MomentStack.of([moments], [False])
+    translation, rotation = edge_forms(stacked.translation, stacked.rotation, stacked.kappa)
+    form: Array = translation[0] + rotation[0]
+    return form

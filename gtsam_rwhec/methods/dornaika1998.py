@@ -6,12 +6,11 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT, to_rotations
-from gtsam_rwhec.methods.absolute import Stack, linear_outcome, rotations_up_to_sign
+from gtsam_rwhec.methods.absolute import Stack, linear_outcome, plain_form, rotations_up_to_sign
 from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
-from gtsam_rwhec.methods.plain_form import plain_form
-from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.problem.problem import Problem
 
 #: The weight of |R R' - I|^2 against the residuals', which is 1.

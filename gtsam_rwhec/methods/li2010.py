@@ -7,11 +7,10 @@ import numpy as np
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT, conjugate, dual_parts, left, to_rotations
-from gtsam_rwhec.methods.absolute import FREE, Stack, rotations_up_to_sign
+from gtsam_rwhec.methods.absolute import FREE, Stack, plain_form, rotations_up_to_sign
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
-from gtsam_rwhec.methods.plain_form import plain_form
 from gtsam_rwhec.problem.problem import Problem
 
 _SOURCE = (

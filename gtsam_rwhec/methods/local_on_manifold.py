@@ -22,8 +22,8 @@ from gtsam_rwhec.errors import NoiseError, OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.methods.applicability import check_problem
 from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes, checked_start
-from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.problem import Problem
 

@@ -52,7 +52,7 @@ class MomentSolution:
 
 
 @dataclass(frozen=True)
-class _Moments:
+class _MomentPlaces:
     """Which moment stands where: index of each entry of M(y y') and M(z z'), and the equations between moments."""
 
     count: int
@@ -62,7 +62,7 @@ class _Moments:
 
 
 @cache
-def _moments(frames: int) -> _Moments:
+def _moment_places(frames: int) -> _MomentPlaces:
     """For one or two quaternions."""
     place: dict[tuple[int, ...], int] = {}
 
@@ -83,13 +83,13 @@ def _moments(frames: int) -> _Moments:
                 row[index(m + 2 * unit[4 * k + a])] += 1.0
             row[index(m)] -= 1.0
             rows.append(row)
-    return _Moments(len(place), even, odd, scipy.sparse.csc_matrix(np.array(rows)))
+    return _MomentPlaces(len(place), even, odd, scipy.sparse.csc_matrix(np.array(rows)))
 
 
 def solve_moments(Q: Array) -> MomentSolution:
     """The relaxation of x'Q'x, x = [vec R_1, (vec R_2,) 1], Q' (10, 10) or (19, 19)."""
     frames = (len(Q) - 1) // 9
-    moments = _moments(frames)
+    moments = _moment_places(frames)
     to_x = np.zeros((len(Q), 1 + 10 * frames))
     to_x[-1, 0] = 1.0
     for k in range(frames):

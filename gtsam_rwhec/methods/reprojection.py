@@ -18,8 +18,8 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, TargetError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms, checked_rows, one_transform, rows_to_transforms
 from gtsam_rwhec.methods.estimate import Poses
+from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import MethodOptions
-from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.vision.camera import Camera
 
@@ -195,8 +195,8 @@ class ReprojectionAnswer:
 def calibrate(observations: Observations, options: MethodOptions | None = None) -> ReprojectionAnswer:
     """Least reprojection error over all X and Y by Levenberg-Marquardt on the manifold.
 
-    Without a start in the options, it is a closed form's answer (``starts.start_of``) for the images' poses; of a flat
-    target's two poses those that this answer predicts are then taken.
+    Without a start in the options, the descent starts at a closed form's answer (``linear_methods.start_of``) for the
+    images' poses. A flat target has two poses in an image; the one that this answer predicts is then taken.
 
     Raises
     ------

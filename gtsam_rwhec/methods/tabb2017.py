@@ -25,8 +25,8 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, of_rotations, to_rotations
 from gtsam_rwhec.methods.absolute import Stack, linear_translations
 from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
-from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.methods.unit_weights import UnitForm, unit_weights
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.reduced_form import ReducedForm

@@ -6,8 +6,8 @@ from .noise import Noise as Noise
 from .noise import langevin_rotations as langevin_rotations
 from .noise import perturb as perturb
 from .rig import general as general
-from .simulation import Answer as Answer
 from .simulation import CalibrationErrors as CalibrationErrors
 from .simulation import FrameDistance as FrameDistance
+from .simulation import PosesAndScale as PosesAndScale
 from .simulation import Simulation as Simulation
 from .simulation import frame_distance as frame_distance

@@ -17,7 +17,7 @@ from gtsam_rwhec.problem.problem import Problem
 FloatArray = NDArray[np.float64]
 
 
-class Answer(Protocol):
+class PosesAndScale(Protocol):
     """Anything with poses by name and a scale; ``gtsam_rwhec.Solution`` is one."""
 
     @property
@@ -102,7 +102,7 @@ class Simulation:
             for pose in frames.values():
                 pose.setflags(write=False)
 
-    def errors(self, answer: Answer) -> CalibrationErrors:
+    def errors(self, answer: PosesAndScale) -> CalibrationErrors:
         """Compare an answer with the truth.
 
         Parameters

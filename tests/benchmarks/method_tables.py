@@ -43,10 +43,10 @@ from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.methods import METHODS, MethodOptions, run
 from gtsam_rwhec.methods.absolute import Stack
 from gtsam_rwhec.methods.horn2023 import solve_dual_quaternions
+from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.local_on_manifold import LomOptions, local_on_manifold
-from gtsam_rwhec.methods.starts import start_of
 from gtsam_rwhec.simulate import CalibrationErrors, FrameDistance, Simulation, frame_distance
-from gtsam_rwhec.simulate.simulation import Answer
+from gtsam_rwhec.simulate.simulation import PosesAndScale
 
 #: The paper's rows by method, each in the order of the noise levels of its tables.
 SHAH_AND_WANG = (
@@ -109,7 +109,7 @@ class Found:
     scale: float = 1.0
 
 
-def solved(simulation: Simulation, experiment: Experiment, method: str, reading: Reading) -> Answer:
+def solved(simulation: Simulation, experiment: Experiment, method: str, reading: Reading) -> PosesAndScale:
     """One run's answer."""
     if method == "lom" and experiment.table == 4 and reading == "inferred":
         X, Y, scale, _ = start_of(simulation.problem, MethodOptions())
@@ -130,7 +130,9 @@ def of_inverses(
     return {name: frame_distance(answer[name].inverse().matrix(), np.linalg.inv(T)) for name, T in truth.items()}
 
 
-def errors_as_run(simulation: Simulation, experiment: Experiment, method: str, answer: Answer) -> CalibrationErrors:
+def errors_as_run(
+    simulation: Simulation, experiment: Experiment, method: str, answer: PosesAndScale
+) -> CalibrationErrors:
     """An answer's errors as the paper's row has them."""
     errors = simulation.errors(answer)
     if experiment.table == 2 and method in INVERTED:

@@ -7,11 +7,10 @@ from simulated import distance, hand_held, pair, planar, poses
 from gtsam_rwhec.errors import OptionError, UnderdeterminedError
 from gtsam_rwhec.handeye import cost_of, motions_of, solve
 from gtsam_rwhec.handeye.approximate import (
-    Relaxation,
+    RelaxedCost,
     dq_nth_order,
     expansion,
     lambda_expansion,
-    relaxation,
     relaxation_gap,
 )
 from gtsam_rwhec.handeye.request import Request
@@ -20,16 +19,16 @@ APPROXIMATE = ["dq2steps", "dqconvrlx", "dq2ndord", "dq2ndord_lambda", "dqitr"]
 
 
 @pytest.fixture(scope="module")
-def relaxed() -> Relaxation:
+def relaxed() -> RelaxedCost:
     s = hand_held(12, 3, 0.2, 0.3)
-    return relaxation(cost_of(motions_of(s.C, s.H)))
+    return relaxed_cost(cost_of(motions_of(s.C, s.H)))
 
 
-def Z(relaxed: Relaxation, mu: float) -> np.ndarray:
+def Z(relaxed: RelaxedCost, mu: float) -> np.ndarray:
     return np.diag(relaxed.values) + mu * relaxed.Z1 - mu**2 * relaxed.Z2
 
 
-def test_the_recursion_gives_the_eigenvalue_and_its_vector(relaxed: Relaxation) -> None:
+def test_the_recursion_gives_the_eigenvalue_and_its_vector(relaxed: RelaxedCost) -> None:
     """Eq. 33 with its middle term corrected; the error of order k shrinks as mu^(k+1)."""
     step = 1e-3 * np.abs(relaxed.values).max() / np.abs(relaxed.Z1).max()
     for order in (1, 2, 3, 4, 5):
@@ -48,7 +47,7 @@ def test_the_recursion_gives_the_eigenvalue_and_its_vector(relaxed: Relaxation) 
             assert small < large * 0.5 ** (order + 1) * 1.3 + 1e-13
 
 
-def test_eq_33_as_printed_is_not_the_eigenvalue(relaxed: Relaxation) -> None:
+def test_eq_33_as_printed_is_not_the_eigenvalue(relaxed: RelaxedCost) -> None:
     """Z2 q_{k-1} in the middle line would put a term of first order that is not there."""
     lambdas, _ = expansion(relaxed, 1)
     printed = relaxed.Z1[0, 0] - relaxed.Z2[0, 0]
@@ -58,7 +57,7 @@ def test_eq_33_as_printed_is_not_the_eigenvalue(relaxed: Relaxation) -> None:
     assert printed != pytest.approx(slope, rel=0.1)
 
 
-def test_second_order_is_eqs_23_and_34(relaxed: Relaxation) -> None:
+def test_second_order_is_eqs_23_and_34(relaxed: RelaxedCost) -> None:
     Z1, Z2 = relaxed.Z1, relaxed.Z2
     gap = relaxed.values[0] - relaxed.values[1:]
     lambdas, c = expansion(relaxed, 2)
@@ -70,7 +69,7 @@ def test_second_order_is_eqs_23_and_34(relaxed: Relaxation) -> None:
     assert c[2] == pytest.approx(np.append(-0.5 * ((Z1[1:, 0] / gap) ** 2).sum(), second))
 
 
-def _lambda_series(relaxed: Relaxation, sign: float) -> tuple[float, float, np.ndarray, np.ndarray]:
+def _lambda_series(relaxed: RelaxedCost, sign: float) -> tuple[float, float, np.ndarray, np.ndarray]:
     """mu_1, mu_2, q_1, q_2 of eq. 35 with ``sign`` before Z2: +1 as printed, -1 corrected."""
     Z1, Z2 = relaxed.Z1, relaxed.Z2
     gap = relaxed.values[0] - relaxed.values[1:]
@@ -86,7 +85,7 @@ def _lambda_series(relaxed: Relaxation, sign: float) -> tuple[float, float, np.n
 
 @pytest.mark.parametrize(("sign", "order"), [(-1.0, 3), (1.0, 2)])
 def test_eq_35_solves_eq_12_to_second_order_only_with_the_other_sign_of_Z2(
-    relaxed: Relaxation, sign: float, order: int
+    relaxed: RelaxedCost, sign: float, order: int
 ) -> None:
     mu1, mu2, q1, q2 = _lambda_series(relaxed, sign)
     size = 1e-3 / max(abs(mu2 / mu1), np.abs(q1).max(), np.sqrt(np.abs(q2).max()))
@@ -98,7 +97,7 @@ def test_eq_35_solves_eq_12_to_second_order_only_with_the_other_sign_of_Z2(
     assert np.log2(residuals[0] / residuals[1]) == pytest.approx(order, abs=0.1)
 
 
-def test_the_lambda_expansion_meets_the_constraint_better_than_the_relaxation(relaxed: Relaxation) -> None:
+def test_the_lambda_expansion_meets_the_constraint_better_than_the_relaxation(relaxed: RelaxedCost) -> None:
     def violation(q: np.ndarray) -> float:
         """How far the best mu of q (eq. 14) is from making q an eigenvector (eq. 12)."""
         q = q / np.linalg.norm(q)
@@ -129,7 +128,7 @@ def test_the_relaxations_gap_is_eq_22() -> None:
     s = hand_held(30, 5, 0.1, 0.2)
     r = solve(s.C, s.H, method="dqconvrlx")
     best = solve(s.C, s.H)
-    relaxed = relaxation(cost_of(motions_of(s.C, s.H)))
+    relaxed = relaxed_cost(cost_of(motions_of(s.C, s.H)))
     assert r.gap == pytest.approx(relaxation_gap(relaxed), rel=1e-4)
     assert r.lower_bound <= best.cost <= r.cost
     assert not r.is_optimal

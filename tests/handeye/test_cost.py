@@ -7,7 +7,7 @@ from simulated import hand_held
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.geometry.quaternions import left, right
 from gtsam_rwhec.handeye import cost as cost_module
-from gtsam_rwhec.handeye.cost import moments_of, residuals
+from gtsam_rwhec.handeye.cost import motion_moments, residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.motion_costs import cost_of, squared_mahalanobis, squared_residuals
 from gtsam_rwhec.handeye.motions import Motions, motions_of
@@ -82,7 +82,7 @@ def test_blocks_add_up(motions: Motions, monkeypatch: pytest.MonkeyPatch) -> Non
 
     def figures() -> list[np.ndarray]:
         return [
-            moments_of(motions.rows, weights).BA,
+            motion_moments(motions.rows, weights).BA,
             cost_of(motions, covariances=covariances).S,
             np.array(squared_residuals(motions, q, q_dual, weights)),
         ]

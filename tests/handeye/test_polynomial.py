@@ -7,18 +7,18 @@ from simulated import hand_held, planar
 
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.handeye import cost_of, motions_of, solve
-from gtsam_rwhec.handeye.approximate import Relaxation, relaxation
+from gtsam_rwhec.handeye.approximate import RelaxedCost, relaxed_cost
 from gtsam_rwhec.handeye.polynomial import Curve, by_resultant, by_sturm, curve, double_root, real_roots, resultant
 from gtsam_rwhec.handeye.saddle import minimum
 
 POLYNOMIAL = ["dqoptpoly_resultant", "dqoptpoly_sturm"]
 
 
-def curve_and_relaxation(make, seed: int, noise: float) -> tuple[Curve, Relaxation, float, float]:
+def curve_and_relaxation(make, seed: int, noise: float) -> tuple[Curve, RelaxedCost, float, float]:
     """The curve, the relaxation, and DQOpt's y = (lambda* - lambda_0) / scale and mu*."""
     s = make(100, seed, noise, noise)
     cost = cost_of(motions_of(s.C, s.H))
-    found, relaxed = minimum(cost), relaxation(cost)
+    found, relaxed = minimum(cost), relaxed_cost(cost)
     of = curve(relaxed)
     assert of is not None
     return of, relaxed, (found.value - relaxed.values[0]) / of.lambda_scale, found.mu

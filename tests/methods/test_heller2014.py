@@ -15,7 +15,7 @@ from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.geometry.quaternions import of_rotations
 from gtsam_rwhec.methods import quaternion_moments, run
 from gtsam_rwhec.methods.heller2014 import Parameterisation, global_minimum
-from gtsam_rwhec.methods.quaternion_moments import PRODUCTS, _moments, products_to_rotation
+from gtsam_rwhec.methods.quaternion_moments import PRODUCTS, _moment_places, products_to_rotation
 from gtsam_rwhec.methods.unit_weights import UnitForm
 from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.descent import descend
@@ -42,7 +42,7 @@ def test_products_of_a_quaternion_are_its_rotation() -> None:
 
 
 def test_moments_of_one_pair_of_quaternions_fulfil_everything() -> None:
-    table = _moments(2)
+    table = _moment_places(2)
     assert table.count == 1 + 20 + 2 * 35 + 100  # even in each, of degrees 0, 2 and 4
     generator = np.random.default_rng(1)
     q = generator.standard_normal((2, 4))
