@@ -12,6 +12,7 @@ from gtsam_rwhec.handeye.approximate import (
     expansion,
     lambda_expansion,
     relaxation_gap,
+    relaxed_cost,
 )
 from gtsam_rwhec.handeye.request import Request
 
