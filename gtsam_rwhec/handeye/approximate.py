@@ -41,7 +41,7 @@ def dq2steps(request: Request) -> Outcome[Array]:
             "from the translations too, or add motions about another axis"
         )
     found = outcome_of(request, vectors[:, 0])  # eq. 19
-    return replace(found, free_directions=free_of_rotations_alone(request.cost) or found.free_directions)
+    return replace(found, free_directions=free_of_rotations_alone(request) or found.free_directions)
 
 
 def dqconvrlx(request: Request) -> Outcome[Array]:
@@ -229,5 +229,5 @@ def outcome_of(request: Request, q: Array) -> Outcome[Array]:
     q = q / math.sqrt(float(q @ q))
     X = to_transform(q, best_dual(request.cost, q))
     relaxed = relaxed_cost(request.cost)
-    free = free_directions(request.cost, q, relaxed.values, relaxed.vectors, request.noise_free_part)
+    free = free_directions(request, q, relaxed.values, relaxed.vectors)
     return Outcome(X, free_directions=free)

@@ -38,19 +38,20 @@ def certified(request: Request) -> Outcome[Array]:
     sigma, kappa = 1.0 / (request.alpha * np.sqrt(2.0 * w)), 2.0 * w
     known = request.scale == "known"
     problem = Problem(scale="known" if known else "shared", keep_measurements=False)
-    problem.add_motion("c", *((C, H) if known else (H, C)), sigma, kappa)
+    name = "h" if known else "c"  # whose pose the problem is about
+    problem.add_motion(name, *((C, H) if known else (H, C)), sigma, kappa)
     with warnings.catch_warnings():  # both are in the answer: free directions, and a bound below the cost
         warnings.simplefilter("ignore", NotUniqueWarning)
         warnings.simplefilter("ignore", NotCertifiedWarning)
         solution = solve(problem)
-    Y, scale = solution.Y["c"], solution.scale
+    Y, scale = solution.Y[name], solution.scale
     if isinstance(scale, dict):
-        scale = scale["c"]
+        scale = scale[name]
     return Outcome(
         X=(Y if known else Y.inverse()).matrix(),
         cost=solution.cost,
         cost_name="eq. 30, chordal" if known else "eq. 30, chordal, of X^-1 with t_C / scale",
         lower_bound=solution.certificate.lower_bound,
-        free_directions=tuple(map(str, solution.identifiability.free_directions)),
+        free_directions=solution.identifiability.free_directions,
         scale=scale,
     )

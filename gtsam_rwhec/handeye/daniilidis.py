@@ -55,7 +55,7 @@ def daniilidis(request: Request) -> Outcome[Array]:
             "can be solved and names the rest"
         )
     q, q_dual = unit_combination(vectors[:4, :2], vectors[4:, :2])
-    free = free_of_rotations_alone(request.cost)
+    free = free_of_rotations_alone(request)
     return Outcome(to_transform(q, q_dual / request.alpha), free_directions=free)
 
 

@@ -1,14 +1,16 @@
 """What the motions leave undetermined in AX = XB, and what can be solved all the same.
 
-Noise in the measurements looks like motion, so nothing is ever exactly undetermined on real data. A direction is
-called free when its information is at most twice what the residuals' noise alone would put there:
+Noise in the measurements looks like motion, so nothing is ever exactly undetermined on real data. As for every problem
+(``gtsam_rwhec.identifiability``), a direction is free when its information is not significantly more than noise alone
+would create there:
 
 - A_i of noise delta q_C, delta q_H has E |A_i p|^2 = E |delta q_C|^2 + E |delta q_H|^2 for *every* unit p, since L
   and R of a unit quaternion are rotations. At the answer the signal's part of A q is zero, so |A q|^2 is that noise,
-  and A'A has this noise in every direction: t, which enters as A q' (eq. 7), is free along directions in which A'A is
-  at most twice q'A'A q, the signal at most the noise.
-- The same of the whole residual: lambda is what noise makes of q'Z q for the best q, and so for every q; the rotation
-  is free along eigenvectors of Z(mu*) whose eigenvalue is at most twice lambda.
+  and A'A has this noise in every direction. t enters as A q' (eq. 7), so its information is that of A'A.
+- The same holds for the whole residual: lambda is what noise makes of q'Z q for the best q, and so for every q. The
+  information about the rotation is in the eigenvalues of Z(mu*).
+
+N motions give 3 N squares of noise to a direction, and the fit takes 6 of the 6 N equations.
 """
 
 from __future__ import annotations
@@ -16,81 +18,74 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.handeye.cost import DualQuaternionCost
+from gtsam_rwhec.geometry.quaternions import to_rotations
 from gtsam_rwhec.handeye.dual_quaternions import times_vectors
+from gtsam_rwhec.handeye.request import Request
+from gtsam_rwhec.handeye.saddle import best_translation
+from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind, FreeReason
+from gtsam_rwhec.identifiability.threshold import free_threshold
 
-#: Total over noise up to which a direction is free: signal and noise in equal parts.
-SIGNAL_AND_NOISE = 2.0
 #: Information below this part of the largest is rounding.
 ROUNDING = 1e-12
-#: A coordinate axis is called by its name within 8 degrees.
-AXIS_COSINE = np.cos(np.radians(8.0))
+#: Step of the finite difference that tells how the translation follows a turn, rad.
+STEP_RAD = 1e-5
 
 
-def free_directions(
-    cost: DualQuaternionCost, q: Array, values: Array, vectors: Array, prior_b: float = 0.0
-) -> tuple[str, ...]:
-    """Free directions in words, of the answer q (4,) with the eigensystem of Z(mu*).
+def free_directions(request: Request, q: Array, values: Array, vectors: Array) -> tuple[FreeDirection, ...]:
+    """Free directions of the answer q (4,): how T_c_h may move, as a right perturbation in h's axes.
 
     Parameters
     ----------
-    cost : DualQuaternionCost
-        Prior included: what it fixes is not free.
+    request : Request
+        What its prior fixes is not free.
     q : (4,) array
     values, vectors : (4,), (4, 4) arrays
-        Of Z(mu*), ascending.
-    prior_b : float
-        What of M is a prior's, and so no noise.
+        Eigensystem of Z(mu*), ascending.
     """
-    words = []
-    scale = float(np.trace(cost.S))
-    limit = SIGNAL_AND_NOISE * max(float(values[0]), 0.0) * _lost_to_fit(cost.count) + ROUNDING * scale
-    if values[1] <= limit:
-        # q_a = (omega / 2, 0) (x) q: a turn in c's axes.
-        turns = times_vectors(q).T @ vectors[:, values <= limit]
-        words.append(f"rotation about {axes_in_words(turns)} of c's axes")
-    V = times_vectors(q)  # q' = (t / 2, 0) (x) q
-    G = V.T @ cost.M @ V
-    of_t, directions = np.linalg.eigh(G)
-    limit = SIGNAL_AND_NOISE * max(float(q @ cost.M @ q) - prior_b, 0.0) * _lost_to_fit(cost.count) + ROUNDING * float(
-        of_t[2]
-    )
-    if of_t[0] <= limit:
-        words.append(f"translation along {axes_in_words(directions[:, of_t <= limit])} of c's axes")
-    return tuple(words)
+    cost, V = request.cost, times_vectors(q)
+    of_t, directions = np.linalg.eigh(V.T @ cost.M @ V)  # q' = (t / 2, 0) (x) q
+    noise = max(float(q @ cost.M @ q) - request.noise_free_part, 0.0)
+    moves = directions[:, of_t <= _limit(noise, float(of_t[2]), cost.count)]
+    noise = max(float(values[0]), 0.0)
+    free = values[1:] <= _limit(noise, float(np.trace(cost.S)), cost.count)
+    turns = 2.0 * V.T @ vectors[:, 1:][:, free]  # q_a = (omega / 2, 0) (x) q: a turn in c's axes
+    return _records(request, q, turns, moves)
 
 
-def free_of_rotations_alone(cost: DualQuaternionCost) -> tuple[str, ...]:
+def free_of_rotations_alone(request: Request) -> tuple[FreeDirection, ...]:
     """Free directions of a method that takes the rotation from the rotations alone, or nearly (DQ2Steps, Dan).
 
     Where the axes differ by no more than their noise, such a rotation about the common axis is noise, and so is the
     translation along it.
     """
-    values, vectors = cost.spectrum
-    limit = SIGNAL_AND_NOISE * max(float(values[0]), 0.0) * _lost_to_fit(cost.count) + ROUNDING * float(values[3])
-    if values[1] > limit:
+    values, vectors = request.cost.spectrum
+    limit = _limit(max(float(values[0]), 0.0), float(values[3]), request.cost.count)
+    q = vectors[:, 0]
+    turns = times_vectors(q).T @ vectors[:, 1:][:, values[1:] <= limit]
+    return _records(request, q, turns, turns)
+
+
+def _limit(noise: float, largest: float, count: int) -> float:
+    """Information up to which a direction is free, of what noise creates in the direction of the answer itself."""
+    lost_to_fit = count / (count - 1.0)
+    threshold = float(free_threshold(3.0 * count, 6 * count - 6))
+    return threshold * noise * lost_to_fit + ROUNDING * largest
+
+
+def _records(request: Request, q: Array, turns: Array, moves: Array) -> tuple[FreeDirection, ...]:
+    """One record for each turn (3, k) and each translation (3, m), both in c's axes."""
+    if not turns.size and not moves.size:
         return ()
-    axes = axes_in_words(times_vectors(vectors[:, 0]).T @ vectors[:, values <= limit])
-    return (
-        f"rotation about {axes} of c's axes, by this method, which has it from the rotations alone",
-        f"translation along {axes} of c's axes",
+    reason = {0: FreeReason.NOISE, 1: FreeReason.ONE_AXIS}.get(moves.shape[1], FreeReason.NO_ROTATION)
+    R_h_c, length_m, V = to_rotations(q).T, 1.0 / request.alpha, times_vectors(q)
+    records = []
+    for axis in turns.T / np.linalg.norm(turns, axis=0)[:, None]:
+        ahead, behind = (best_translation(request.cost, q + s * 0.5 * V @ axis) for s in (STEP_RAD, -STEP_RAD))
+        xi = np.concatenate([R_h_c @ axis, R_h_c @ (ahead - behind) / (2.0 * STEP_RAD * length_m)])
+        records.append((FreeKind.ROTATION, xi / np.linalg.norm(xi)))
+    records += [(FreeKind.TRANSLATION, np.concatenate([np.zeros(3), R_h_c @ axis])) for axis in moves.T]
+    metric = np.repeat([1.0, length_m], 3)
+    return tuple(
+        FreeDirection(kind=kind, reason=reason, frames={"h": tuple((metric * xi).tolist())}, length_m=length_m)
+        for kind, xi in records
     )
-
-
-def _lost_to_fit(count: int) -> float:
-    # Three of a motion's rotation residuals are noise; three in all went into the fit.
-    return count / (count - 1.0) if count > 1 else 1.0
-
-
-def axes_in_words(directions: Array) -> str:
-    """Axes (3, k) by name where they have one."""
-    left, s, _ = np.linalg.svd(directions)
-    rank = int((s > 0.5 * s[0]).sum())
-    if rank >= 3:
-        return "every axis"
-    basis = left[:, :rank] if rank == 1 else left[:, 2:]
-    axis = basis[:, 0] * np.sign(basis[np.abs(basis[:, 0]).argmax(), 0])
-    name = "xyz"[int(np.abs(axis).argmax())] if np.abs(axis).max() > AXIS_COSINE else None
-    x, y, z = np.round(axis, 2) + 0.0  # no -0.00
-    word = name or f"({x:.2f}, {y:.2f}, {z:.2f})"
-    return word if rank == 1 else f"all axes across {word}"

@@ -50,7 +50,7 @@ def solve_with_linear_prior(request: Request, prior: DualQuaternionPrior) -> Out
     return Outcome(
         X=to_transform(q, q_dual),
         lower_bound=_proven_bound(cost, pull, prior.a, mu, candidates[0]),
-        free_directions=free_directions(cost, q, values, vectors, request.noise_free_part),
+        free_directions=free_directions(request, q, values, vectors),
     )
 
 

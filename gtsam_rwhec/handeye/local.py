@@ -22,6 +22,7 @@ from gtsam_rwhec.handeye.dual_quaternions import from_transforms, to_transform
 from gtsam_rwhec.handeye.motion_costs import squared_residuals
 from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.methods.estimate import Outcome
 
 #: least_squares stops where a step changes cost or unknowns by less than this part of them: rounding.
@@ -34,7 +35,7 @@ Vector = Callable[[Array], Array]
 def dqnlopt(request: Request) -> Outcome[Array]:
     """DQNLOpt: descent on the cost (8) from DQOpt's answer, which it should not leave (Section 4.4)."""
     found = minimum(request.cost)
-    return Outcome(descend_dual_quaternion(request, found.q, found.q_dual), free_directions=_free(request, found))
+    return Outcome(descend_dual_quaternion(request, found.q, found.q_dual), free_directions=_free_at(request, found))
 
 
 def dqnlopt_random(request: Request) -> Outcome[Array]:
@@ -53,7 +54,9 @@ def dqnlopt_random(request: Request) -> Outcome[Array]:
     q /= np.linalg.norm(q)
     t = rng.normal(size=3) * _length(request)
     q_dual = 0.5 * left(np.append(t, 0.0)) @ q
-    return Outcome(descend_dual_quaternion(request, q, q_dual), free_directions=_free(request, minimum(request.cost)))
+    return Outcome(
+        descend_dual_quaternion(request, q, q_dual), free_directions=_free_at(request, minimum(request.cost))
+    )
 
 
 def chvecopt(request: Request) -> Outcome[Array]:
@@ -66,7 +69,7 @@ def chvecopt(request: Request) -> Outcome[Array]:
     X = _descend_vector(rotation, translation, request.alpha, found, quaternion_cost=False)
     of_R, of_T = chordal_residuals(request.motions, X, request.weights)
     return Outcome(
-        X, cost=of_R + request.alpha**2 * of_T, cost_name="eq. 30, chordal", free_directions=_free(request, found)
+        X, cost=of_R + request.alpha**2 * of_T, cost_name="eq. 30, chordal", free_directions=_free_at(request, found)
     )
 
 
@@ -80,7 +83,7 @@ def quatvecopt(request: Request) -> Outcome[Array]:
     of_q, _ = squared_residuals(request.motions, q, q_dual, request.weights)
     _, of_T = chordal_residuals(request.motions, X, request.weights)
     return Outcome(
-        X, cost=of_q + request.alpha**2 * of_T, cost_name="eq. 30, quaternion", free_directions=_free(request, found)
+        X, cost=of_q + request.alpha**2 * of_T, cost_name="eq. 30, quaternion", free_directions=_free_at(request, found)
     )
 
 
@@ -190,9 +193,8 @@ def rotation_slopes(q: Array) -> Array:
     return slopes
 
 
-def _free(request: Request, found: Minimum) -> tuple[str, ...]:
-    noise = 0.0 if request.prior is None else request.prior.b
-    return free_directions(request.cost, found.q, found.values, found.vectors, noise)
+def _free_at(request: Request, found: Minimum) -> tuple[FreeDirection, ...]:
+    return free_directions(request, found.q, found.values, found.vectors)
 
 
 def _length(request: Request) -> float:

@@ -24,7 +24,7 @@ def dqopt(request: Request) -> Outcome[Array]:
     return Outcome(
         X=to_transform(found.q, found.q_dual),
         lower_bound=proven_bound(cost, found),
-        free_directions=free_directions(cost, found.q, found.values, found.vectors, request.noise_free_part),
+        free_directions=free_directions(request, found.q, found.values, found.vectors),
     )
 
 

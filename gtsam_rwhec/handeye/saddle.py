@@ -137,7 +137,13 @@ def bracket(Z1: Array, Z2: Array) -> tuple[float, float]:
 
 
 def best_dual(cost: DualQuaternionCost, q: Array) -> Array:
-    """The best q' for a given q, orthogonal to it: eq. 20, without M^-1.
+    """The best q' for a given q, orthogonal to it: eq. 20, without M^-1."""
+    dual: Array = times_vectors(q) @ (0.5 * best_translation(cost, q))
+    return dual
+
+
+def best_translation(cost: DualQuaternionCost, q: Array) -> Array:
+    """The best t (3,) for a given q.
 
     q' = (t / 2, 0) (x) q, and the cost is quadratic in t: three equations, regular with an M that is not. Directions
     of t that nothing depends on get the smallest |t|.
@@ -147,5 +153,5 @@ def best_dual(cost: DualQuaternionCost, q: Array) -> Array:
     values, vectors = np.linalg.eigh(G)
     if not values[0] > SINGULAR * values[2]:
         values = np.where(values > max(SINGULAR * values[2], 1e-300), values, np.inf)
-    half: Array = V @ (vectors @ ((vectors.T @ g) / -values))
-    return half
+    t: Array = 2.0 * (vectors @ ((vectors.T @ g) / -values))
+    return t

@@ -21,7 +21,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import FreeReason, free_directions_of, reason_for
@@ -33,6 +32,7 @@ from gtsam_rwhec.identifiability.information import (
     pair_information,
     prior_information,
 )
+from gtsam_rwhec.identifiability.threshold import free_threshold
 from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiability
 from gtsam_rwhec.problem.moments import ONE, R_A, T_B
 from gtsam_rwhec.problem.pairs import Pair
@@ -40,8 +40,6 @@ from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses
 
-#: A free direction passes for determined with this probability.
-SIGNIFICANCE = 1e-3
 #: Above this many parameters the weakest directions are found by Lanczos on the arrow factor, not densely.
 DENSE_PARAMETERS = 400
 
@@ -138,14 +136,6 @@ def typical_length(part: Part) -> float:
     return float(np.sqrt(max(square / float(part.moments.weight.sum()), 1e-12)))
 
 
-def _threshold(squares: Array | float, degrees_of_freedom: int) -> Array:
-    if degrees_of_freedom <= 0:  # the weights tell the noise, and nothing else does
-        known: Array = np.asarray(chdtri(squares, SIGNIFICANCE) / squares)
-        return known
-    result: Array = np.asarray(fdtri(squares, 0.5 * degrees_of_freedom, 1.0 - SIGNIFICANCE))
-    return result
-
-
 def _rotation_axes(part: Part, noise: Array, degrees_of_freedom: int) -> tuple[list[int], Array]:
     """About how many axes each pair's A turned (Corollary 2, tested against A's noise, (E,) rad^2): 0, 1 or 2;
     and by how much, root mean square, in rad.
@@ -157,7 +147,7 @@ def _rotation_axes(part: Part, noise: Array, degrees_of_freedom: int) -> tuple[l
     counts = part.moments.count
     s = np.linalg.svd(means, compute_uv=False)
     ratio = (1.0 - s**2) / (2.0 * noise[:, None])
-    excited = (ratio > _threshold(2.0 * counts, degrees_of_freedom)[:, None]).sum(axis=1)
+    excited = (ratio > free_threshold(2.0 * counts, degrees_of_freedom)[:, None]).sum(axis=1)
     return [(0, 1, 1, 2)[k] for k in excited], np.sqrt(np.maximum(1.0 - s[:, -1] ** 2, 0.0))
 
 
@@ -176,7 +166,7 @@ def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak
         values, reduced = _all(D, C, E, used)
     else:
         # No direction sums fewer than two squares, and the fewer, the higher its threshold.
-        values, reduced = _weakest_by_lanczos(D, C, E, used, float(_threshold(2.0, degrees_of_freedom)))
+        values, reduced = _weakest_by_lanczos(D, C, E, used, float(free_threshold(2.0, degrees_of_freedom)))
     vectors = np.zeros((len(used), len(values)))
     vectors[used] = reduced
     # Satterthwaite: a direction spread over frames sums as many squares as its shares of their measurements tell.
@@ -184,7 +174,7 @@ def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak
     share[:-1] = (vectors[:-1] ** 2).reshape(len(counts) - 1, 7, len(values)).sum(axis=1)
     share[-1] = vectors[-1] ** 2
     squares = 1.0 / np.maximum((share**2 / (2.0 * counts[:, None])).sum(axis=0), 1e-300)
-    thresholds = _threshold(squares, degrees_of_freedom)
+    thresholds = free_threshold(squares, degrees_of_freedom)
     order = np.argsort(values / thresholds)
     unit = np.r_[leaf_unit.ravel(), border_unit]
     return _Weak(values[order], thresholds[order], vectors[:, order] * unit[:, None])
@@ -243,7 +233,7 @@ def _pairs(
 ) -> dict[Pair, PairIdentifiability]:
     """Every pair on its own, all in one stack of 15 x 15 problems, asked as the whole is."""
     counts = part.moments.count
-    threshold = _threshold(2.0 * counts, degrees_of_freedom)
+    threshold = free_threshold(2.0 * counts, degrees_of_freedom)
     rotations = pairs.used & _IS_ROTATION
     turning, _ = _weakest_of_each(pairs.rotation, pairs.noise_rotation, rotations)
     settled = np.all(turning > threshold[:, None], axis=1, keepdims=False)

@@ -69,7 +69,7 @@ def _row(comparison: Comparison, row: Compared) -> dict[str, Any]:
             "seconds": estimate.seconds,
             "starts_from": estimate.starts_from,
             "notes": list(estimate.notes),
-            "free_directions": list(estimate.free_directions),
+            "free_directions": [str(direction) for direction in estimate.free_directions],
             "scale": estimate.scale,
             "targets": _poses("targetcarrier", estimate.X),
             "sensors": _poses("sensorcarrier", estimate.Y),

@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 import gtsam
 
 from gtsam_rwhec.geometry.poses import PoseLike
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.solver.residuals import Residual
 
@@ -36,7 +37,7 @@ class Outcome(Generic[X]):
         Proven, of the same cost.
     is_optimal : bool or None
         Whether the bound proves the answer, where the method has its own rule for that.
-    free_directions : tuple of str
+    free_directions : tuple of FreeDirection
         What the motions leave undetermined, where the method finds that itself.
     starts_from : str or None
         What an iteration started from; None for closed forms and global methods.
@@ -51,7 +52,7 @@ class Outcome(Generic[X]):
     cost_name: str = ""
     lower_bound: float | None = None
     is_optimal: bool | None = None
-    free_directions: tuple[str, ...] = ()
+    free_directions: tuple[FreeDirection, ...] = ()
     starts_from: str | None = None
     notes: tuple[str, ...] = ()
 
@@ -102,7 +103,7 @@ class Estimate(Generic[X]):
     cost_name : str
     proof : Proof or None
         None where the method proves nothing.
-    free_directions : tuple of str
+    free_directions : tuple of FreeDirection
         What the measurements leave undetermined, judged by this answer's residuals; empty when nothing.
     seconds : float
         The method's own time; of ``handeye.solve``, with checks and evaluation.
@@ -123,7 +124,7 @@ class Estimate(Generic[X]):
     cost: float
     cost_name: str
     proof: Proof | None
-    free_directions: tuple[str, ...]
+    free_directions: tuple[FreeDirection, ...]
     seconds: float
     residuals: dict[Pair, Residual] = field(default_factory=dict)
     alpha: float | None = None

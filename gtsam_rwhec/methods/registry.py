@@ -119,7 +119,7 @@ def estimate_of(name: str, problem: Problem, found: Outcome[Poses], seconds: flo
         seconds=seconds,
         starts_from=found.starts_from,
         notes=found.notes,
-        free_directions=tuple(map(str, evaluation.free_directions)),
+        free_directions=evaluation.free_directions,
     )
 
 

@@ -134,7 +134,7 @@ def standing_still() -> rw.Problem:
 def free_or_refused(name: str, problem: rw.Problem) -> str:
     """What a method's answer leaves free, or why there is no answer."""
     try:
-        return "; ".join(run(name, problem).free_directions)
+        return "; ".join(map(str, run(name, problem).free_directions))
     except UnderdeterminedError as error:
         return str(error)
 
