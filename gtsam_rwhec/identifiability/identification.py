@@ -28,9 +28,9 @@ from gtsam_rwhec.identifiability.information import (
     Information,
     PairInformation,
     information,
-    noise_level,
     pair_information,
     prior_information,
+    variance_factors,
 )
 from gtsam_rwhec.identifiability.threshold import free_threshold
 from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiability
@@ -77,7 +77,7 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
     J_t, J_R : (E,) arrays
         Costs of the pairs at the answer, in the physical model: they tell the noise.
     """
-    noise = noise_level(part, J_t, J_R)
+    noise = variance_factors(part, J_t, J_R)
     pairs = pair_information(part, poses, noise)
     length = typical_length(part)
     axes, turned = _rotation_axes(part, pairs.carrier_noise, noise.degrees_of_freedom)

@@ -31,7 +31,7 @@ _UPPER = np.triu_indices(15, 1)
 
 
 @dataclass(frozen=True)
-class NoiseLevel:
+class PartVarianceFactors:
     """Variance factors of each pair's residuals, (E,): 1 where the weights are true.
 
     ``degrees_of_freedom`` is equations minus unknowns of the whole part.
@@ -42,7 +42,7 @@ class NoiseLevel:
     degrees_of_freedom: int
 
 
-def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
+def variance_factors(part: Part, J_t: Array, J_R: Array) -> PartVarianceFactors:
     """Variance factors from the residuals at the optimum: the part's, or a pair's own where that is larger.
 
     J_t is sum |r|^2 / (2 sigma^2), expected 3 N / 2; J_R is sum kappa |dR|_F^2 / 2 = sum kappa theta^2, expected
@@ -57,7 +57,7 @@ def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
     counts, N = part.moments.count, part.number_of_measurements
     degrees_of_freedom = 6 * N - part.number_of_unknowns
     if degrees_of_freedom <= 0:  # nothing tells the noise but the weights
-        return NoiseLevel(np.ones(len(counts)), np.ones(len(counts)), degrees_of_freedom)
+        return PartVarianceFactors(np.ones(len(counts)), np.ones(len(counts)), degrees_of_freedom)
     correction = 6.0 * N / degrees_of_freedom
     lengths = np.einsum("eii->e", part.moments.translation[:, T_B, T_B])
     factors = []
@@ -67,7 +67,7 @@ def noise_level(part: Part, J_t: Array, J_R: Array) -> NoiseLevel:
     ):
         of_part = correction * float(J.sum()) / (1.5 * N)
         factors.append(np.maximum(np.maximum(J / (1.5 * counts), of_part), floor))
-    return NoiseLevel(factors[0], factors[1], degrees_of_freedom)
+    return PartVarianceFactors(factors[0], factors[1], degrees_of_freedom)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class PairInformation:
     carrier_noise: Array
 
 
-def pair_information(part: Part, poses: PairPoses, noise: NoiseLevel) -> PairInformation:
+def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -> PairInformation:
     """The information of every pair and its noise, all pairs at once.
 
     Noise in a direction that the true motions leave free: with A's rotation off by eps (variance q^2 an axis), what

@@ -11,11 +11,11 @@ import pytest
 import gtsam_rwhec as rw
 from gtsam_rwhec.identifiability.information import (
     FLOOR,
-    NoiseLevel,
+    PartVarianceFactors,
     information,
-    noise_level,
     pair_information,
     prior_information,
+    variance_factors,
 )
 from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.simulate.transforms import inverse, pose, random_poses
@@ -108,7 +108,7 @@ def numeric_information(problem: rw.Problem, part: Part, poses: dict[str, np.nda
 
 
 def our_information(part: Part, answer: Answer) -> np.ndarray:
-    level = NoiseLevel(np.ones(len(part.pairs)), np.ones(len(part.pairs)), 1)
+    level = PartVarianceFactors(np.ones(len(part.pairs)), np.ones(len(part.pairs)), 1)
     pairs = pair_information(part, PairPoses.of(part, answer), level)
     rotation_prior, translation_prior = prior_information(part)
     info = information(
@@ -171,7 +171,7 @@ def test_a_prior_of_a_rotation_counts_twice_kappa_an_axis() -> None:
 # -- noise ------------------------------------------------------------------------------------------
 
 
-def level_of(problem: rw.Problem) -> NoiseLevel:
+def level_of(problem: rw.Problem) -> PartVarianceFactors:
     solution = rw.solve(problem)
     (part,) = parts_of(problem)
     poses = {name: T.matrix() for name, T in {**solution.X, **solution.Y}.items()}
@@ -182,7 +182,7 @@ def level_of(problem: rw.Problem) -> NoiseLevel:
     answer = Answer(
         stacked[:, :3, :3], stacked[:, :3, 3] - shift, np.array(own), scale if isinstance(scale, float) else 1.0
     )
-    return noise_level(part, *costs_of_pairs(part, PairPoses.of(part, answer)))
+    return variance_factors(part, *costs_of_pairs(part, PairPoses.of(part, answer)))
 
 
 @pytest.mark.parametrize(("scale", "count"), [("known", 6), ("known", 40), ("shared", 40)])
@@ -238,7 +238,7 @@ def test_the_bound_on_the_carriers_noise_holds(turned_at: str, A_noise: Noise) -
         T = np.array([{**simulation.X, **simulation.Y}[name] for name in part.free])
         shift = np.array([part.frame_shift(name) for name in part.free])
         poses = PairPoses.of(part, Answer(T[:, :3, :3], T[:, :3, 3] - shift, np.full(2, np.nan), 1.0))
-        level = noise_level(part, *costs_of_pairs(part, poses))
+        level = variance_factors(part, *costs_of_pairs(part, poses))
         bound = pair_information(part, poses, level).carrier_noise[0]
         assert bound > 0.8 / (2.0 * A_noise.kappa)
 
@@ -260,7 +260,7 @@ def test_noise_feigns_what_it_is_said_to() -> None:
         shift = np.array([part.frame_shift(name) for name in part.free])
         poses = PairPoses.of(part, Answer(T[:, :3, :3], T[:, :3, 3] - shift, np.full(2, np.nan), 1.0))
         # Rotation residuals that say exactly how much A's rotations are off: f_R = 2 kappa q^2.
-        level = NoiseLevel(np.array([1e9]), np.array([2.0 * 50.0 * q2]), 6 * count - 12)
+        level = PartVarianceFactors(np.array([1e9]), np.array([2.0 * 50.0 * q2]), 6 * count - 12)
         pairs = pair_information(part, poses, level)
         together = np.zeros(15)
         together[[2, 9]] = 1.0  # both frames about z
