@@ -5,7 +5,6 @@ python tests/benchmarks/camera_logs.py [--poses 1000000]
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from mcap.reader import make_reader
 
@@ -142,6 +141,7 @@ def rows(poses: int = 1_000_000) -> list[Row]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--poses", type=int, default=1_000_000)
-    sys.exit(print_rows("From camera images", rows(parser.parse_args().poses)))
+    arguments = parser.parse_args()
+    sys.exit(print_rows("From camera images", rows(arguments.poses), store=arguments.store))

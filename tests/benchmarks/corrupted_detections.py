@@ -8,7 +8,6 @@ are against the truth: root mean square over all frames, positions and rotations
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -18,7 +17,7 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
@@ -162,8 +161,8 @@ def _calibrated(detected: Path, cleaned: Path) -> Calibrated:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--share", type=float, default=0.3)
     arguments = parser.parse_args()
-    sys.exit(print_rows("Corrupted detections", rows(arguments.seeds, arguments.share)))
+    sys.exit(print_rows("Corrupted detections", rows(arguments.seeds, arguments.share), store=arguments.store))

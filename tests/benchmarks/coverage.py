@@ -14,7 +14,6 @@ Exits with 1 if a bar is missed.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import multiprocessing
 import os
@@ -28,7 +27,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -309,7 +308,7 @@ def joined(outcomes: list[Outcome]) -> Outcome:
 
 def main() -> int:
     """Run both; 0 if the bars are met."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=1000, help="of each case (default: 1000)")
     parser.add_argument("--efficiency-runs", type=int, default=4000, help="of each scale mode (default: 4000)")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
@@ -337,7 +336,7 @@ def main() -> int:
         if arguments.plot is not None:
             console.print(f"Written to {plot(results, arguments.plot)}.")
     if arguments.efficiency_runs:
-        status = max(status, print_rows("Efficiency", efficiency(arguments.efficiency_runs)))
+        status = max(status, print_rows("Efficiency", efficiency(arguments.efficiency_runs), store=arguments.store))
     return status
 
 

@@ -9,14 +9,13 @@ does not count. Then cost, gradient and Gauss-Newton Hessian of the two graphs a
 
 from __future__ import annotations
 
-import argparse
 import time
 import warnings
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from gtsam.symbol_shorthand import S, X, Y
 from interleaved import in_words
@@ -200,9 +199,10 @@ def rows(repetitions: int) -> list[Row]:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--repetitions", type=int, default=5, help="of the timings")
-    return print_rows("Edge summaries in GTSAM", rows(parser.parse_args().repetitions))
+    arguments = parser.parse_args()
+    return print_rows("Edge summaries in GTSAM", rows(arguments.repetitions), store=arguments.store)
 
 
 if __name__ == "__main__":

@@ -18,13 +18,12 @@ least squares that is let run reaches DQOpt's cost from every start. The paper's
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from interleaved import in_words, interleaved
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -249,12 +248,16 @@ def rows(problems: int, starts: int, repetitions: int) -> list[Row]:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--problems", type=int, default=2450)
     parser.add_argument("--starts", type=int, default=4, help="random starts of nonlinear least squares a problem")
     parser.add_argument("--repetitions", type=int, default=301, help="of the calls that are timed")
     arguments = parser.parse_args()
-    return print_rows("AX = XB by dual quaternions", rows(arguments.problems, arguments.starts, arguments.repetitions))
+    return print_rows(
+        "AX = XB by dual quaternions",
+        rows(arguments.problems, arguments.starts, arguments.repetitions),
+        store=arguments.store,
+    )
 
 
 if __name__ == "__main__":

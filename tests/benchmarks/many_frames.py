@@ -8,11 +8,10 @@ FOLDER/time_against_frames.png: as many targets as sensors, all connected, and s
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from interleaved import in_words, interleaved
 
 import gtsam_rwhec as rw
@@ -85,11 +84,11 @@ def plot(folder: Path, repetitions: int) -> Path:
 
 def main() -> int:
     """Print the table; plot if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--repetitions", type=int, default=7)
     parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write time_against_frames.png there")
     arguments = parser.parse_args()
-    status = print_rows("Many frames", rows(arguments.repetitions))
+    status = print_rows("Many frames", rows(arguments.repetitions), store=arguments.store)
     if arguments.plot is not None:
         print(f"Written to {plot(arguments.plot, min(arguments.repetitions, 5))}.")
     return status

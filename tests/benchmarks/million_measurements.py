@@ -8,12 +8,11 @@ number: its peak is traced at a tenth of the measurements and at all of them, in
 
 from __future__ import annotations
 
-import argparse
 import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from interleaved import in_words, interleaved
 from numpy.typing import NDArray
 
@@ -98,11 +97,11 @@ def rows(count: int, repetitions: int) -> list[Row]:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--count", type=int, default=1_000_000)
     parser.add_argument("--repetitions", type=int, default=9)
     arguments = parser.parse_args()
-    return print_rows("Many measurements", rows(arguments.count, arguments.repetitions))
+    return print_rows("Many measurements", rows(arguments.count, arguments.repetitions), store=arguments.store)
 
 
 if __name__ == "__main__":

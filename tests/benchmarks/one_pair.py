@@ -9,11 +9,9 @@ the median of those within the repetitions, which take turns.
 
 from __future__ import annotations
 
-import argparse
-
 import cv2
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from interleaved import in_words, interleaved
 
 import gtsam_rwhec as rw
@@ -76,9 +74,12 @@ def rows(repetitions: int) -> list[Row]:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--repetitions", type=int, default=51)
-    return print_rows(f"One X, one Y, against OpenCV {cv2.__version__}", rows(parser.parse_args().repetitions))
+    arguments = parser.parse_args()
+    return print_rows(
+        f"One X, one Y, against OpenCV {cv2.__version__}", rows(arguments.repetitions), store=arguments.store
+    )
 
 
 if __name__ == "__main__":

@@ -14,13 +14,12 @@ they are OpenCV's own.
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from collections.abc import Callable
 
 import cv2
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from interleaved import Times, in_words, interleaved
 from rich.progress import track
 
@@ -219,12 +218,12 @@ def rows(repetitions: int, problems: int) -> list[Row]:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--repetitions", type=int, default=3)
     parser.add_argument("--problems", type=int, default=200)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    return print_rows("Hand-eye calls", rows(arguments.repetitions, arguments.problems))
+    return print_rows("Hand-eye calls", rows(arguments.repetitions, arguments.problems), store=arguments.store)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ Exits with 1 if a bar is missed up to 40 %.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 import warnings
@@ -23,7 +22,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from numpy.typing import NDArray
 
@@ -297,11 +296,11 @@ def plot(folder: Path, results: dict[Case, list[Result]], seeds: int) -> Path:
 
 def main() -> int:
     """Print the table; plot if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--seeds", type=int, default=40)
     parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write outliers.png there")
     arguments = parser.parse_args()
-    return print_rows("Outliers", rows(arguments.seeds, arguments.plot))
+    return print_rows("Outliers", rows(arguments.seeds, arguments.plot), store=arguments.store)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,10 @@ is timed from the problem with its moments to the certificate, that is until ``s
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from interleaved import in_words
 from scs_relaxation import ScsResult, solve_by_scs
@@ -110,12 +109,12 @@ def _against(
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--no-scs", action="store_true", help="leave out the rows that need SCS")
     parser.add_argument("--repetitions", type=int, default=15, help="of auto, before SCS and again after it")
     arguments = parser.parse_args()
     rows = answers() + ([] if arguments.no_scs else speed(arguments.repetitions))
-    return print_rows("The RWHEC paper's real dataset, sigma = kappa = 1", rows)
+    return print_rows("The RWHEC paper's real dataset, sigma = kappa = 1", rows, store=arguments.store)
 
 
 if __name__ == "__main__":

@@ -1,23 +1,27 @@
 """Every benchmark in one table.
 
-    python tests/benchmarks/run_all.py [--no-scs] [--plot FOLDER] [--outlier-seeds 40] [--coverage-runs 1000]
-                                       [--tables-runs 1000] [--lom-runs 300] [--corrupted-seeds 8]
+    python tests/benchmarks/run_all.py [--quick] [--store] [--no-scs] [--plot FOLDER]
 
 Takes an hour or two: SCS a minute, outliers ten, coverage half an hour, the paper's tables the rest (these three in
-processes of their own, with their own tables); 0 for any of the numbers leaves that part out. The noise sweep is
-examples/noise_sweep.py. Exits with 1 if a bar is missed. Needs opencv-python-headless<5, scs and matplotlib.
+processes of their own, with their own tables). ``--quick`` takes a few minutes for a small part of each: it tells that
+all run and roughly where they are, and its figures are kept apart from the others. The noise sweep is
+examples/noise_sweep.py. Exits with 1 if a bar is missed. Needs scs, and opencv-python-headless<5 for what is compared
+with OpenCV 4's hand-eye calls: `pip install '.[bench]'`; ``--quick`` leaves out what cannot run.
 """
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import camera_logs
 import corrupted_detections
+import cv2
 import edge_summaries
 import hand_eye
 import many_frames
@@ -30,57 +34,112 @@ import single_pairs
 import start_time
 import vision_rate
 import world_origin
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much of each benchmark is run."""
+
+    scs_repetitions: int = 15
+    pair_starts: int = 100
+    pair_repetitions: int = 51
+    hand_eye_problems: int = 2450
+    opencv_problems: int = 200
+    measurements: int = 1_000_000
+    repetitions: int = 9
+    few_repetitions: int = 5
+    outlier_seeds: int = 40
+    log_poses: int = 1_000_000
+    bare_loop_s: float = 45.0
+    corrupted_seeds: int = 8
+    #: Of the scripts that print tables of their own, the number of --runs.
+    runs: tuple[tuple[str, int], ...] = (
+        ("coverage.py", 1000),
+        ("tables_2_to_5.py", 1000),
+        ("method_tables.py", 1000),
+        ("lom_tables.py", 300),
+    )
+
+
+FULL = Sizes()
+QUICK = Sizes(
+    scs_repetitions=3,
+    pair_starts=3,
+    pair_repetitions=7,
+    hand_eye_problems=50,
+    opencv_problems=5,
+    measurements=100_000,
+    repetitions=3,
+    few_repetitions=1,
+    outlier_seeds=1,
+    log_poses=100_000,
+    bare_loop_s=3.0,
+    corrupted_seeds=1,
+    runs=(),
+)
+
+
+def parts(sizes: Sizes, plot: Path | None) -> dict[str, Callable[[], list[Row]]]:
+    """By name, what makes the rows of each benchmark."""
+    return {
+        "start": lambda: start_time.rows(3 * sizes.few_repetitions),
+        "answers on the real dataset": real_dataset.answers,
+        "real dataset against SCS": lambda: real_dataset.speed(sizes.scs_repetitions),
+        "the pairs alone": lambda: (
+            single_pairs.rows_of("known", sizes.pair_starts) + single_pairs.rows_of("shared", sizes.pair_starts)
+        ),
+        "one X, one Y, against OpenCV": lambda: one_pair.rows(sizes.pair_repetitions),
+        "AX = XB by dual quaternions": lambda: hand_eye.rows(sizes.hand_eye_problems, 4, sizes.few_repetitions),
+        "OpenCV's hand-eye methods": lambda: opencv_hand_eye.rows(sizes.few_repetitions, sizes.opencv_problems),
+        "a million measurements": lambda: million_measurements.rows(sizes.measurements, sizes.repetitions),
+        "many frames": lambda: many_frames.rows(sizes.repetitions),
+        "world origin": world_origin.rows,
+        "outliers": lambda: outliers.rows(sizes.outlier_seeds, plot),
+        "edge summaries in GTSAM": lambda: edge_summaries.rows(sizes.few_repetitions),
+        "from camera images": lambda: camera_logs.rows(sizes.log_poses),
+        "images a second": lambda: vision_rate.rows(max(1, sizes.few_repetitions // 2), sizes.bare_loop_s),
+        "wrong detections": lambda: corrupted_detections.rows(sizes.corrupted_seeds),
+    }
+
+
+def cannot_run() -> dict[str, str]:
+    """By name of a part, what it lacks here."""
+    lacking = {}
+    if find_spec("scs") is None:
+        lacking["real dataset against SCS"] = "scs"
+    if not hasattr(cv2, "calibrateRobotWorldHandEye"):
+        for name in ("one X, one Y, against OpenCV", "OpenCV's hand-eye methods"):
+            lacking[name] = "opencv-python-headless<5"
+    return lacking
 
 
 def main() -> int:
     """Run them one after the other."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
+    parser.add_argument("--quick", action="store_true", help="a small part of each, in a few minutes")
     parser.add_argument("--no-scs", action="store_true", help="leave out the rows that need SCS")
     parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write the benchmarks' plots there")
-    parser.add_argument("--outlier-seeds", type=int, default=40, help="of each kind of outliers; 0: none")
-    parser.add_argument("--tables-runs", type=int, default=1000, help="of each experiment of Tables 2-5; 0: none")
-    parser.add_argument("--lom-runs", type=int, default=300, help="of each row LOM of Tables 2-5; 0: none")
-    parser.add_argument("--coverage-runs", type=int, default=1000, help="of each case of coverage; 0: none")
-    parser.add_argument("--corrupted-seeds", type=int, default=8, help="of wrong detections; 0: none")
     arguments = parser.parse_args()
-    parts = {
-        "start": lambda: start_time.rows(repetitions=15),
-        "answers on the real dataset": real_dataset.answers,
-        "real dataset against SCS": lambda: [] if arguments.no_scs else real_dataset.speed(repetitions=15),
-        "the pairs alone": lambda: single_pairs.rows_of("known", 100) + single_pairs.rows_of("shared", 100),
-        "one X, one Y, against OpenCV": lambda: one_pair.rows(repetitions=51),
-        "AX = XB by dual quaternions": lambda: hand_eye.rows(2450, starts=4, repetitions=5),
-        "OpenCV's hand-eye methods": lambda: opencv_hand_eye.rows(repetitions=3, problems=200),
-        "a million measurements": lambda: million_measurements.rows(1_000_000, repetitions=9),
-        "many frames": lambda: many_frames.rows(repetitions=7),
-        "world origin": world_origin.rows,
-        "outliers": lambda: outliers.rows(arguments.outlier_seeds, arguments.plot) if arguments.outlier_seeds else [],
-        "edge summaries in GTSAM": lambda: edge_summaries.rows(repetitions=5),
-        "from camera images": camera_logs.rows,
-        "images a second": lambda: vision_rate.rows(repetitions=2),
-        "wrong detections": lambda: (
-            corrupted_detections.rows(arguments.corrupted_seeds) if arguments.corrupted_seeds else []
-        ),
-    }
+    sizes, lacking = (QUICK, cannot_run()) if arguments.quick else (FULL, {})
+    if arguments.no_scs:
+        lacking["real dataset against SCS"] = "SCS, which --no-scs leaves out"
     rows: list[Row] = []
-    for name, make in parts.items():
+    for name, make in parts(sizes, arguments.plot).items():
+        if name in lacking:
+            print(f"{name}: left out, needs {lacking[name]}", file=sys.stderr, flush=True)
+            continue
         print(f"{name} ...", file=sys.stderr, flush=True)
         start = time.perf_counter()
         rows += make()
         print(f"    {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
-    status = print_rows("What must be reached", rows)
+    title = "A part of each" if arguments.quick else "What must be reached"
+    status = print_rows(title, rows, store=arguments.store)
     if arguments.plot is not None:
         print(f"Written to {many_frames.plot(arguments.plot, repetitions=5)}.")
-    for name, runs in (
-        ("coverage.py", arguments.coverage_runs),
-        ("tables_2_to_5.py", arguments.tables_runs),
-        ("method_tables.py", arguments.tables_runs),
-        ("lom_tables.py", arguments.lom_runs),
-    ):
-        if runs:
-            command = [sys.executable, str(Path(__file__).with_name(name)), "--runs", str(runs)]
-            status = max(status, subprocess.run(command, check=False).returncode)
+    for name, runs in sizes.runs:
+        command = [sys.executable, str(Path(__file__).with_name(name)), "--runs", str(runs)]
+        status = max(status, subprocess.run(command, check=False).returncode)
     return status
 
 

@@ -9,13 +9,12 @@ pairs descend at once by Levenberg-Marquardt steps on SO(3) x SO(3).
 
 from __future__ import annotations
 
-import argparse
 import time
 import warnings
 from collections import Counter
 
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from numpy.typing import NDArray
 
@@ -187,12 +186,12 @@ def rows_of(scale: rw.ScaleMode, starts: int) -> list[Row]:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--starts", type=int, default=100, help="random starts of each pair")
     parser.add_argument("--scale", nargs="+", choices=("known", "shared"), default=("known", "shared"))
     arguments = parser.parse_args()
     rows = [row for scale in arguments.scale for row in rows_of(scale, arguments.starts)]
-    return print_rows("The real dataset's 73 pairs, each alone", rows)
+    return print_rows("The real dataset's 73 pairs, each alone", rows, store=arguments.store)
 
 
 if __name__ == "__main__":

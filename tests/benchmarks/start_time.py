@@ -1,6 +1,6 @@
 """How fast a program starts, beside one that imports gtsam alone.
 
-    python tests/benchmarks/start_time.py [repetitions]
+    python tests/benchmarks/start_time.py [--repetitions 15] [--store]
 
 Every repetition starts each program once, in turns; a ratio is the median over the repetitions. The third row has no
 bar: what a name costs when it is first asked for is no part of the import, and must not hide there.
@@ -12,7 +12,7 @@ import subprocess
 import sys
 from functools import partial
 
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from interleaved import in_words, interleaved
 
 PROGRAMS = {
@@ -45,5 +45,13 @@ def rows(repetitions: int) -> list[Row]:
     return table
 
 
+def main() -> int:
+    """Print the table."""
+    parser = benchmark_parser(__doc__)
+    parser.add_argument("--repetitions", type=int, default=15)
+    arguments = parser.parse_args()
+    return print_rows("Start", rows(arguments.repetitions), store=arguments.store)
+
+
 if __name__ == "__main__":
-    raise SystemExit(print_rows("Start", rows(int(sys.argv[1]) if len(sys.argv) > 1 else 15)))
+    raise SystemExit(main())

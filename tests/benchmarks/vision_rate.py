@@ -9,7 +9,6 @@ again, on one core and on all, in turns; the bare loop with threads, ours as it 
 
 from __future__ import annotations
 
-import argparse
 import threading
 import time
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from interleaved import interleaved
 from loky import cpu_count
 
@@ -88,7 +87,7 @@ def the_log() -> tuple[list[ImageRecord], dict[str, Camera]]:
     return images, cameras
 
 
-def rows(repetitions: int) -> list[Row]:
+def rows(repetitions: int, bare_loop_s: float = LONG_S) -> list[Row]:
     """With one worker, and with all cores."""
     once, cameras = the_log()
     targets = read_rig(CELL / "rig.yaml").target_list
@@ -96,7 +95,7 @@ def rows(repetitions: int) -> list[Row]:
     cores = cpu_count()
     start = time.perf_counter()
     bare_loop(once, 1)
-    images = once * max(1, round(LONG_S / (time.perf_counter() - start)))
+    images = once * max(1, round(bare_loop_s / (time.perf_counter() - start)))
     result = []
     for workers in sorted({1, cores}):
 
@@ -124,9 +123,10 @@ def rows(repetitions: int) -> list[Row]:
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--repetitions", type=int, default=5)
-    return print_rows("Images a second", rows(parser.parse_args().repetitions))
+    arguments = parser.parse_args()
+    return print_rows("Images a second", rows(arguments.repetitions), store=arguments.store)
 
 
 if __name__ == "__main__":

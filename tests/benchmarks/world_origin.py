@@ -9,11 +9,10 @@ its poses are of: T(d) A, Y moves by d).
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 
 import numpy as np
-from bars import Row, print_rows
+from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from numpy.typing import NDArray
 
@@ -75,8 +74,8 @@ def rows() -> list[Row]:
 
 def main() -> int:
     """Print the table."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
-    return print_rows("World origin far away: relative poses and cost", rows())
+    arguments = benchmark_parser(__doc__).parse_args()
+    return print_rows("World origin far away: relative poses and cost", rows(), store=arguments.store)
 
 
 if __name__ == "__main__":

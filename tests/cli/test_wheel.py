@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 
 import gtsam
@@ -20,16 +21,36 @@ CELL = REPOSITORY / "data" / "cell"
 
 
 @pytest.fixture(scope="module")
-def unpacked_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel as pip would unpack it."""
-    built = tmp_path_factory.mktemp("built")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the sdist, and the wheel that is built of the sdist, not of the checkout."""
+    folder = tmp_path_factory.mktemp("built")
     subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(built)], cwd=REPOSITORY, check=True
+        [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(REPOSITORY)],
+        capture_output=True,
+        check=True,
     )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def unpacked_wheel(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel as pip would unpack it."""
     (wheel,) = built.glob("*.whl")
     unpacked = tmp_path_factory.mktemp("site-packages")
     zipfile.ZipFile(wheel).extractall(unpacked)
     return unpacked
+
+
+def test_one_wheel_for_all_systems_and_a_package_index_takes_it(built: Path) -> None:
+    wheel, sdist = sorted(built.iterdir(), key=lambda path: path.suffix, reverse=True)
+    assert (wheel.name, sdist.name) == (
+        f"gtsam_rwhec-{version('gtsam-rwhec')}-py3-none-any.whl",
+        f"gtsam_rwhec-{version('gtsam-rwhec')}.tar.gz",
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(sdist)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_it_has_all_data_and_none_of_the_real_dataset(unpacked_wheel: Path) -> None:

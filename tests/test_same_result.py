@@ -1,0 +1,58 @@
+"""The same input gives the same result whatever the number of threads, cores and workers.
+
+To the last bit as far as this library decides. With another number of threads BLAS adds the parts of its sums in
+another order, so that numbers of larger problems differ in their last digits: by 1e-14 in poses, a million times less
+than what any noise does.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import DEMO, REPOSITORY
+
+#: BLAS's threads, cores, workers that detect.
+PLACES = {"one thread": (1, None, 1), "two": (2, None, 2), "four": (4, None, 3), "four on one core": (4, 1, 2)}
+#: Metres, and entries of rotations; relative for costs and covariances.
+LAST_DIGITS = 1e-12
+
+
+def answers(folder: Path, out: Path, place: str) -> dict[str, np.ndarray]:
+    threads, cores, workers = PLACES[place]
+    if cores is not None and not hasattr(os, "sched_setaffinity"):
+        pytest.skip("this system does not let a process choose its cores")
+    command = [sys.executable, str(REPOSITORY / "tests" / "answers_on_these_cores.py"), str(folder), str(out)]
+    command += ["--workers", str(workers), *([] if cores is None else ["--cores", str(cores)])]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)}
+    subprocess.run(command, check=True, env=environment)
+    with np.load(out) as found:
+        return dict(found)
+
+
+@pytest.mark.parametrize(("data", "others"), [("demo", ["two", "four", "four on one core"]), ("utias", ["four"])])
+def test_threads_cores_and_workers(data: str, others: list[str], utias_folder: Path, tmp_path: Path) -> None:
+    folder = DEMO if data == "demo" else utias_folder
+    found = {
+        place: answers(folder, tmp_path / f"{number}.npz", place)
+        for number, place in enumerate(["one thread", *others])
+    }
+    expected = found.pop("one thread")
+    assert expected["status"] == "certified"
+    assert len(expected["detections: poses"]) > 20
+    for place, other in found.items():
+        assert other.keys() == expected.keys()
+        for name, values in expected.items():
+            if name == "status" or name.startswith("detections"):
+                np.testing.assert_array_equal(other[name], values, err_msg=f"{place}, {name}")
+            elif name.endswith("poses"):
+                np.testing.assert_allclose(other[name], values, rtol=0.0, atol=LAST_DIGITS, err_msg=f"{place}, {name}")
+            else:
+                scale = np.abs(values).max()
+                np.testing.assert_allclose(
+                    other[name] / scale, values / scale, rtol=0.0, atol=LAST_DIGITS, err_msg=f"{place}, {name}"
+                )
