@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 import importlib
 import pkgutil
+import re
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -51,6 +53,18 @@ def test_every_module_is_imported_by_its_name() -> None:
         names: dict[str, object] = {}
         exec(f"import {found.name} as it", names)
         assert names["it"] is sys.modules[found.name], found.name
+
+
+def test_no_package_but_the_command_goes_by_the_table_of_all() -> None:
+    """It reaches every package, those of higher layers too, and import-linter sees none of that."""
+    by_the_top = re.compile(r"^\s*(from gtsam_rwhec import|import gtsam_rwhec(?!\.))", re.MULTILINE)
+    root = Path(str(gtsam_rwhec.__file__)).parent
+    found = {
+        path.relative_to(root).parts[0]
+        for path in root.rglob("*.py")
+        if by_the_top.search(path.read_text(encoding="utf-8"))
+    }
+    assert found == {"cli"}
 
 
 def test_a_table_is_for_type_checkers_what_it_is_for_programs() -> None:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+import gtsam_rwhec as rw
 from gtsam_rwhec.cli.calibrate import calibrate
 from gtsam_rwhec.cli.clean import clean
 from gtsam_rwhec.cli.compare import compare
@@ -55,7 +56,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        typer.echo(f"gtsam-rwhec {version('gtsam-rwhec')} (gtsam {version('gtsam')})")
+        typer.echo(f"gtsam-rwhec {rw.__version__} (gtsam {version('gtsam')})")
         raise typer.Exit
 
 

@@ -19,7 +19,7 @@ from gtsam_rwhec.errors import (
     RwhecError,
     RwhecWarning,
 )
-from gtsam_rwhec.files.printable import printable
+from gtsam_rwhec.files.terminal_text import printable
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from gtsam_rwhec.cli.options import LogArgument
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.files.printable import printable
+from gtsam_rwhec.files.terminal_text import printable
 
 
 def init(

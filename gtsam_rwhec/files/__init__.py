@@ -1,1 +1,5 @@
-"""Small helpers for files: YAML with line numbers, atomic writes, natural order of names, printable text."""
+"""What several packages need around files: YAML with lines, atomic writes, natural order, text for a terminal."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,2 +1,3 @@
 from . import pose_covariances as pose_covariances
 from . import poses as poses
+from . import quaternions as quaternions

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gtsam_rwhec.files.printable import printable
+from gtsam_rwhec.files.terminal_text import printable
 from gtsam_rwhec.report.solution_report import report_console
 from gtsam_rwhec.results.stage_reports import LogFields, TrackCount
 

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import typer
 from places import CELL, DEMO
 from typer.testing import CliRunner
 
-from gtsam_rwhec.cli import calibrate, convert
+from gtsam_rwhec.cli import calibrate, convert, options
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.roads import names
+from gtsam_rwhec.logs.image_folder import Columns
+from gtsam_rwhec.problem import ScaleMode
+from gtsam_rwhec.refinement.options import NoiseSource, Robust
+from gtsam_rwhec.solver import options as solver_options
 
 COMMANDS: Mapping[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 LOG = ("calibrate", CELL / "robot_cell.mcap", "--rig", CELL / "rig.yaml", "-o", "out")
@@ -81,8 +85,17 @@ def test_an_option_that_would_be_passed_over_is_refused(
 
 @pytest.mark.parametrize(("command", "needs"), [("calibrate", calibrate.NEEDS), ("convert", convert.NEEDS)])
 def test_every_option_is_one_of_a_road(command: str, needs: Mapping[type[Any], str]) -> None:
-    options = {parameter.name for parameter in COMMANDS[command].params} - {"help"}
-    assert options == frozenset[str]().union(*map(names, needs))
+    parameters = {parameter.name for parameter in COMMANDS[command].params} - {"help"}
+    assert parameters == frozenset[str]().union(*map(names, needs))
+
+
+def test_choices_are_those_of_the_library() -> None:
+    """The command writes them again, so that its help need not import the library."""
+    assert set(get_args(options.Scale)) == set(get_args(ScaleMode))
+    assert set(get_args(calibrate.Method)) == set(get_args(solver_options.Method))
+    assert {*get_args(calibrate.Refine), "auto"} == set(get_args(NoiseSource))
+    assert set(get_args(calibrate.Robust)) == set(get_args(Robust))
+    assert set(get_args(convert.Columns)) == set(get_args(Columns))
 
 
 def test_all_refused_options_are_named_at_once() -> None:
