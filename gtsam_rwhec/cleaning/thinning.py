@@ -7,8 +7,9 @@ import numpy as np
 from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.geometry.poses import Array
 
-#: A carrier that has moved less than this since the last measurement that was kept has stood still.
-STILL_RAD, STILL_M = float(np.radians(0.5)), 0.003
+#: A carrier that has turned (rad) and moved (m) less than this since the last measurement kept has stood still.
+STILL_RAD = float(np.radians(0.5))
+STILL_M = 0.003
 
 
 def thin(

@@ -24,9 +24,11 @@ MOST = 3000
 GRID_S = 0.01
 #: For derivatives of the angle by the offset.
 STEP_S = 0.005
-#: Of the differences, which tells how well an offset fits: an interval has two detections, so that 30 % wrong ones
-#: spoil half of all intervals. And this quantile of |x| for a normal x of unit variance.
-QUANTILE, NORMAL_QUANTILE = 0.3, 0.3853
+#: This quantile of the differences tells how well an offset fits. An interval has two detections, so that 30 % wrong
+#: ones spoil half of all intervals.
+QUANTILE = 0.3
+#: The same quantile of |x| for a normal x of unit variance.
+NORMAL_QUANTILE = 0.3853
 #: Beyond this many standard deviations a difference of angles is a wrong detection's.
 GROSS = 3.0
 

@@ -26,8 +26,12 @@ from gtsam_rwhec.solver.variables import Answer
 MAX_STEPS = 30
 #: Steps shorter than this (rad, m) end it.
 SHORTEST = 1e-10
-#: Damping to begin with, and how it changes; it may grow this often within a step.
-DAMPING, CHANGE, TRIES = 1e-6, 10.0, 12
+#: Damping to begin with, a share of the Hessian's diagonal.
+DAMPING = 1e-6
+#: After a step that lowers the cost it is divided by this, after another multiplied.
+DAMPING_CHANGE = 10.0
+#: It may grow this often within a step.
+TRIES = 12
 #: [e_i]x, i = 0, 1, 2.
 GENERATORS = np.array(
     [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]],
@@ -50,11 +54,11 @@ def with_exact_scales(part: Part, answer: Answer) -> Answer:
             new_cost, new_gradient, new_hessian = _expand(part, moved, forms)
             if new_cost <= cost:
                 break
-            damping *= CHANGE
+            damping *= DAMPING_CHANGE
         else:
             return answer
         answer, cost, gradient, hessian = moved, new_cost, new_gradient, new_hessian
-        damping /= CHANGE
+        damping /= DAMPING_CHANGE
         if np.abs(step).max() < SHORTEST:
             break
     return answer

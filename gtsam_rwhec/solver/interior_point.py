@@ -13,13 +13,13 @@ dense: 481 constraints on a 217 x 217 matrix, the real dataset, take a fraction 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.linalg
 
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.cause import Start
 from gtsam_rwhec.solver.local_blocks import gram, scatter, traces
@@ -53,9 +53,7 @@ class Relaxation:
     solver: Start
 
 
-def solve_by_blocks(
-    Q: Array, tolerance: float, max_iterations: int, progress: Callable[[str], None] | None = None
-) -> Relaxation:
+def solve_by_blocks(Q: Array, tolerance: float, max_iterations: int, progress: Progress | None = None) -> Relaxation:
     """Solve the relaxation of Q' (9 n + 1 square, symmetric) to a relative gap of ``tolerance``.
 
     Stops earlier where double precision ends; the gap between ``primal`` and ``dual`` says how far it came.

@@ -6,12 +6,11 @@ variant with alpha >= 0 (Section 4.3): with alpha as a variable of its own, h al
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import clarabel
 import numpy as np
 import scipy.sparse
 
+from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.cause import Start
 from gtsam_rwhec.solver.interior_point import Relaxation, solve_by_blocks
@@ -26,7 +25,7 @@ def solve_relaxation(
     Q: Array,
     tolerance: float,
     max_iterations: int,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Relaxation:
     """Solve the relaxation of Q' (9 n + 1 square).
 

@@ -51,7 +51,7 @@ class Trajectory:
             For stamps that are all zero, not increasing, no integers, or another number of them.
         """
         transforms = as_transforms(poses, order, where)
-        stamps = checked_stamps(stamps_ns, len(transforms), where)
+        stamps = increasing_stamps(stamps_ns, len(transforms), where)
         if len(transforms) == 0:
             raise PoseError(f"{where}: no poses")
         rows, _ = checked_rows(transforms, 0, where)
@@ -97,7 +97,7 @@ class Trajectory:
         )
 
 
-def checked_stamps(stamps_ns: ArrayLike, count: int, where: str) -> np.ndarray:
+def increasing_stamps(stamps_ns: ArrayLike, count: int, where: str) -> np.ndarray:
     """(count,) strictly increasing integer nanoseconds.
 
     Raises
