@@ -82,12 +82,16 @@ class RefinementOptions:
         return rw.CarrierNoise(math.radians(self.carrier_noise_deg), 1e-3 * self.carrier_noise_mm)
 
 
-NEEDS = {
-    LogOptions: "only for a log. Leave it out for a folder of CSV files, which has no images.",
-    FolderOptions: "only for a folder of CSV files. For a log, the rig file says this: write it there.",
-    StartOptions: "only for a folder of CSV files with --method local. Add --method local, or leave it out.",
-    RefinementOptions: "only for a folder of CSV files, and without --refine it says nothing. Add --refine given or "
-    "--refine estimate, or leave it out. (A log is always refined, as its rig file says.)",
+# Why a way refuses the options of the others, and what to do.
+NOT_FOR_A_LOG = dict.fromkeys(
+    (FolderOptions, StartOptions, RefinementOptions),
+    "not for a log. Its rig file states sizes, noise and names, and its calibration is always refined. Change the rig "
+    "file, or leave the option out.",
+)
+NOT_FOR_A_FOLDER: dict[type, str] = {
+    LogOptions: "only for a log. A folder of CSV files has no images: leave the option out.",
+    StartOptions: "only with --method local. Add --method local, or leave the option out.",
+    RefinementOptions: "only with --refine. Add --refine given or --refine estimate, or leave the option out.",
 }
 
 
@@ -137,12 +141,12 @@ def calibrate(
     static_tf.launch.py, tf.yaml, rig.urdf.xacro, camchain.yaml and plots.
     """
     if rig is not None or is_log(source):
-        refuse_others(context, [LogOptions], NEEDS)
+        refuse_others(context, [LogOptions], NOT_FOR_A_LOG)
         if output is None:
             raise typer.BadParameter("the calibration of a log is a folder of files: say which with -o FOLDER")
         return calibrate_log(LogOptions(source, rig, images, workers, output))
     records = [FolderOptions, *([StartOptions] if method == "local" else []), *([RefinementOptions] if refine else [])]
-    refuse_others(context, records, NEEDS)
+    refuse_others(context, records, NOT_FOR_A_FOLDER)
     if method == "local" and initial is None:
         raise typer.BadParameter("--method local starts from an earlier result: say which with --initial FILE")
     if (carrier_noise_deg is None) != (carrier_noise_mm is None):

@@ -39,9 +39,8 @@ class ImageFolderOptions:
     camera: str
 
 
-NEEDS = {
-    BagOptions: "always.",
-    ImageFolderOptions: "only for a folder of images, with --poses FILE. Add --poses, or leave it out for a ROS bag.",
+NOT_FOR_A_BAG: dict[type, str] = {
+    ImageFolderOptions: "only for a folder of images with --poses. Add --poses FILE, or leave the option out."
 }
 
 
@@ -64,7 +63,7 @@ def convert(
 ) -> ExitStatus:
     """Make an MCAP log of a ROS bag, or of a folder of images with a file of poses."""
     if poses is None:
-        refuse_others(context, [BagOptions], NEEDS)
+        refuse_others(context, [BagOptions], NOT_FOR_A_BAG)
         said = convert_bag(BagOptions(source, output))
     else:
         said = convert_images(ImageFolderOptions(source, output, poses, columns, parent, child, camera))

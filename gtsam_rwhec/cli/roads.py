@@ -20,7 +20,7 @@ def names(record: Record) -> frozenset[str]:
     return frozenset(field.name for field in fields(record))
 
 
-def refuse_others(context: typer.Context, taken: Collection[Record], needs: Mapping[Record, str]) -> None:
+def refuse_others(context: typer.Context, taken: Collection[Record], others: Mapping[Record, str]) -> None:
     """Refuse each option that the user gave and that none of the taken records has.
 
     Parameters
@@ -29,8 +29,8 @@ def refuse_others(context: typer.Context, taken: Collection[Record], needs: Mapp
         Of the subcommand, with what was given.
     taken
         The records that the chosen way takes.
-    needs
-        For each record of the subcommand, what must be there for its options to count, and what to do if it is not.
+    others
+        The other records of the subcommand: why their options do not count on this way, and what to do.
 
     Raises
     ------
@@ -38,19 +38,13 @@ def refuse_others(context: typer.Context, taken: Collection[Record], needs: Mapp
         Names the options, says why they do not count, and what to do.
     """
     used = frozenset[str]().union(*map(names, taken))
-    reasons = []
-    for record, words in needs.items():
-        passed_over = names(record) - used
-        used |= passed_over  # an option that two records have is named once
-        options = [
-            max(parameter.opts, key=len)
-            for parameter in context.command.params
-            if parameter.name in passed_over and is_given(context, parameter.name)
-        ]
-        if options:
-            reasons.append(f"{', '.join(options)}: {words}")
-    if reasons:
-        raise typer.BadParameter("\n".join(reasons))
+    refused: dict[str, list[str]] = {}
+    for record in others:
+        for parameter in context.command.params:
+            if parameter.name in names(record) - used and is_given(context, parameter.name):
+                refused.setdefault(others[record], []).append(max(parameter.opts, key=len))
+    if refused:
+        raise typer.BadParameter("\n".join(f"{', '.join(options)}: {why}" for why, options in refused.items()))
 
 
 def is_given(context: typer.Context, name: str) -> bool:

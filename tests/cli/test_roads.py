@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -37,31 +37,35 @@ VALUES = {
 }
 
 ROADS = {
-    "log": (LOG, calibrate.NEEDS, [calibrate.LogOptions]),
-    "folder": (FOLDER, calibrate.NEEDS, [calibrate.FolderOptions]),
+    "log": (LOG, calibrate.NOT_FOR_A_LOG, [calibrate.LogOptions]),
+    "folder": (FOLDER, calibrate.NOT_FOR_A_FOLDER, [calibrate.FolderOptions]),
     "local": (
         (*FOLDER, "--method", "local", "--initial", "x.json"),
-        calibrate.NEEDS,
+        calibrate.NOT_FOR_A_FOLDER,
         [calibrate.FolderOptions, calibrate.StartOptions],
     ),
     "refined": (
         (*FOLDER, "--refine", "given"),
-        calibrate.NEEDS,
+        calibrate.NOT_FOR_A_FOLDER,
         [calibrate.FolderOptions, calibrate.RefinementOptions],
     ),
-    "bag": (BAG, convert.NEEDS, [convert.BagOptions]),
+    "bag": (BAG, convert.NOT_FOR_A_BAG, [convert.BagOptions]),
 }
+# These choose the way, and so are never passed over.
+CHOOSING = {"folder": {"rig", "refine"}, "local": {"rig", "refine"}, "refined": {"rig"}, "bag": {"poses"}}
+
+
+def names_of(records: Collection[type[Any]]) -> frozenset[str]:
+    """The parameters that these records hold."""
+    return frozenset[str]().union(*map(names, records))
 
 
 def passed_over() -> list[tuple[str, str]]:
-    """Each road with each option that it does not take, and that does not choose the road either."""
-    choosing = {("folder", "rig"), ("local", "rig"), ("refined", "rig"), ("folder", "refine"), ("local", "refine"),
-                ("bag", "poses")}  # fmt: skip
+    """Each way with each option that it does not take, and that does not choose the way either."""
     return [
         (road, name)
-        for road, (_, needs, taken) in ROADS.items()
-        for name in sorted(frozenset[str]().union(*map(names, needs)) - frozenset[str]().union(*map(names, taken)))
-        if (road, name) not in choosing
+        for road, (_, others, taken) in ROADS.items()
+        for name in sorted(names_of(others) - names_of(taken) - CHOOSING.get(road, set()))
     ]
 
 
@@ -70,7 +74,7 @@ def test_an_option_that_would_be_passed_over_is_refused(
     road: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    arguments, needs, _ = ROADS[road]
+    arguments, others, _ = ROADS[road]
     (parameter,) = [p for p in COMMANDS[arguments[0]].params if p.name == name]
     option = max(parameter.opts, key=len)
     value = VALUES.get(name, parameter.default)
@@ -78,15 +82,16 @@ def test_an_option_that_would_be_passed_over_is_refused(
     done = CliRunner().invoke(app, [str(argument) for argument in (*arguments, *given)])
     assert done.exit_code == 2
     said = " ".join(done.stderr.replace("│", " ").split())
-    record = next(record for record in needs if name in names(record))
-    assert f"{option}: {needs[record]}" in said
+    record = next(record for record in others if name in names(record))
+    assert f"{option}: {others[record]}" in said
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("command", "needs"), [("calibrate", calibrate.NEEDS), ("convert", convert.NEEDS)])
-def test_every_option_is_one_of_a_road(command: str, needs: Mapping[type[Any], str]) -> None:
-    parameters = {parameter.name for parameter in COMMANDS[command].params} - {"help"}
-    assert parameters == frozenset[str]().union(*map(names, needs))
+@pytest.mark.parametrize("road", ROADS)
+def test_every_option_is_taken_or_refused(road: str) -> None:
+    arguments, others, taken = ROADS[road]
+    parameters = {parameter.name for parameter in COMMANDS[arguments[0]].params} - {"help"}
+    assert parameters == names_of(taken) | names_of(others)
 
 
 def test_choices_are_those_of_the_library() -> None:
@@ -103,4 +108,4 @@ def test_all_refused_options_are_named_at_once() -> None:
     done = CliRunner().invoke(app, list(map(str, arguments)))
     said = " ".join(done.stderr.replace("│", " ").split())
     assert "--images, --workers: only for a log." in said
-    assert "--robust: only for a folder of CSV files, and without --refine it says nothing." in said
+    assert "--robust: only with --refine." in said

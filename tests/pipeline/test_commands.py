@@ -104,8 +104,6 @@ def plain(text: str) -> str:
 def test_what_does_not_go_together_is_refused(log: Path, tmp_path: Path) -> None:
     assert "-o FOLDER" in plain(run("calibrate", log, "--rig", CELL / "rig.yaml", status=2).stderr)
     told = run("calibrate", log, "--rig", CELL / "rig.yaml", "-o", tmp_path, "--sigma", "0.1", status=2)
-    assert "--sigma: only for a folder of CSV files. For a log, the rig file says this: write it there." in plain(
-        told.stderr
-    )
+    assert "--sigma: not for a log. Its rig file states sizes, noise and names" in plain(told.stderr)
     assert "needs a rig file" in run("calibrate", log, "-o", tmp_path / "out", status=2).stderr
     assert not (tmp_path / "out").exists()
