@@ -34,6 +34,9 @@ from .refinement import refine as refine
 
 # Keep it in files, print it, draw it.
 from . import report as report
+from .results import Judgement as Judgement
+from .results import Verdict as Verdict
+from .results import judge as judge
 from .results import read_refined as read_refined
 from .results import read_solution as read_solution
 from .results import write_refined as write_refined

@@ -220,4 +220,4 @@ def calibrate_folder(
         if refined is not None:
             rw.report.report_console().print()
             rw.report.print_refined(refined)
-    return exit_status(solution, refined)
+    return exit_status(rw.judge(solution, refined))

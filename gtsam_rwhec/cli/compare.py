@@ -53,4 +53,4 @@ def compare(
             typer.echo(f"Written to {output}.", err=True)
     finally:
         rw.report.print_comparison(comparison)
-    return ExitStatus.NOT_CERTIFIED if comparison.solution is None else exit_status(comparison.solution)
+    return ExitStatus.NOT_CERTIFIED if comparison.solution is None else exit_status(rw.judge(comparison.solution))

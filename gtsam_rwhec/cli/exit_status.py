@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-import gtsam_rwhec as rw
+from gtsam_rwhec.results.verdict import Ground, Judgement
 
 
 class ExitStatus(IntEnum):
@@ -32,14 +32,15 @@ HELP = (
 )
 
 
-def exit_status(solution: rw.Solution, refined: rw.Refined | None = None, *, contradictions: int = 0) -> ExitStatus:
-    """The exit status of a calibration; `contradictions` counts frames that most measurements contradict."""
-    if solution.certificate.status is rw.Status.CERTIFIED_NOT_UNIQUE:
-        return ExitStatus.NOT_UNIQUE
-    if not solution.certificate.is_certified:
-        return ExitStatus.NOT_CERTIFIED
-    if not solution.identifiability.is_unique:
-        return ExitStatus.NOT_UNIQUE
-    if contradictions:
-        return ExitStatus.CONTRADICTED
-    return ExitStatus.NOT_UNIQUE if refined is not None and refined.free_directions else ExitStatus.CERTIFIED
+_STATUS = {
+    Ground.NO_BOUND: ExitStatus.NOT_CERTIFIED,
+    Ground.NOT_CERTIFIED: ExitStatus.NOT_CERTIFIED,
+    Ground.NOT_UNIQUE: ExitStatus.NOT_UNIQUE,
+    Ground.CONTRADICTED: ExitStatus.CONTRADICTED,
+    Ground.SIZE_DOUBTED: ExitStatus.CERTIFIED,
+}
+
+
+def exit_status(judgement: Judgement) -> ExitStatus:
+    """The exit status that the gravest ground of a judgement leads to."""
+    return _STATUS[judgement.grounds[0]] if judgement.grounds else ExitStatus.CERTIFIED

@@ -13,4 +13,4 @@ def show(calibrated: rw.pipeline.Calibrated) -> ExitStatus:
     rw.report.print_solution(refined.solution)
     rw.report.report_console().print()
     rw.report.print_refined(refined)
-    return exit_status(refined.solution, refined, contradictions=len(calibrated.log.contradictions))
+    return exit_status(rw.judge(refined.solution, refined, calibrated.log))

@@ -48,11 +48,10 @@ def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
 
 def _warned(text: str, warnings: tuple[str, ...], name: str) -> str:
     """Warnings as comments ahead of everything else."""
-    lines = [f"DO NOT USE: {warning}" for warning in warnings]
-    if not lines:
+    if not warnings:
         return text
     if name.endswith(".xacro"):
         declaration, rest = text.split("\n", 1)  # XML has it on its first line
-        comment = "\n".join(lines).replace("--", "- -")
+        comment = "\n".join(warnings).replace("--", "- -")
         return f"{declaration}\n<!--\n{comment}\n-->\n{rest}"
-    return "".join(f"# {line}\n" for line in lines) + text
+    return "".join(f"# {warning}\n" for warning in warnings) + text

@@ -5,16 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import gtsam
-
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.methods.comparison import Compared, Comparison
-from gtsam_rwhec.results.schema import CONVENTIONS
-from gtsam_rwhec.results.solution_file import pose_to_file
+from gtsam_rwhec.results.schema import CONVENTIONS, SENSOR_CARRIER, TARGET_CARRIER, pose_rows
 
 FORMAT = "gtsam-rwhec comparison"
 FORMAT_VERSION = 1
@@ -71,14 +67,10 @@ def _row(comparison: Comparison, row: Compared) -> dict[str, Any]:
             "notes": list(estimate.notes),
             "free_directions": [str(direction) for direction in estimate.free_directions],
             "scale": estimate.scale,
-            "targets": _poses("targetcarrier", estimate.X),
-            "sensors": _poses("sensorcarrier", estimate.Y),
+            "targets": pose_rows(TARGET_CARRIER, estimate.X),
+            "sensors": pose_rows(SENSOR_CARRIER, estimate.Y),
         }
     }
-
-
-def _poses(parent: Any, poses: Mapping[str, gtsam.Pose3]) -> list[dict[str, Any]]:
-    return [pose_to_file(parent, name, pose).model_dump(mode="json") for name, pose in poses.items()]
 
 
 def _finite(number: float) -> float | None:

@@ -26,7 +26,7 @@ from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solution_plots import plot_all
 from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
-from gtsam_rwhec.results.refined_file import write_refined
+from gtsam_rwhec.results.result_file import write_refined
 from gtsam_rwhec.rig import Rig
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from gtsam_rwhec.pipeline.solved_log import Solved
+from gtsam_rwhec.results.verdict import Verdict, judge
 from gtsam_rwhec.rig import RigFrames
 
 
 def frames_of(solved: Solved) -> RigFrames:
     """What the exported files hold; sensors under their frames' names."""
     rig, refined = solved.rig, solved.refined
+    judgement = judge(solved.solution, refined, solved.log)
     frame = {name: rig.frame_of(name) for name in rig.sensors}
     offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
     return RigFrames(
@@ -23,16 +25,5 @@ def frames_of(solved: Solved) -> RigFrames:
             for name, sensor in rig.sensors.items()
             if sensor.images is not None and name in refined.Y
         },
-        warnings=_warnings(solved),
+        warnings=() if judgement.verdict is Verdict.USE else (str(judgement),),
     )
-
-
-def _warnings(solved: Solved) -> tuple[str, ...]:
-    """What the exit status of solving says too."""
-    said = list(solved.log.contradictions)
-    certificate = solved.solution.certificate
-    if not certificate.is_certified:
-        said.append(f"not certified: {' '.join(certificate.reason.split())}")
-    if solved.refined.free_directions:
-        said.append(f"the motion does not determine {'; '.join(map(str, solved.refined.free_directions))}")
-    return tuple(said)

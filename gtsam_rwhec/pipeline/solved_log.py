@@ -19,8 +19,7 @@ from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs, write
 from gtsam_rwhec.pipeline.solving_stage import Calibrated
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.results.refined_file import refined_json, refined_of
-from gtsam_rwhec.results.solution_file import parse_result, solution_of
+from gtsam_rwhec.results.result_file import parse_result, refined_json
 from gtsam_rwhec.results.stage_reports import LogFields
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.solution import Solution
@@ -113,17 +112,17 @@ def read_solved(path: str | Path) -> Solved:
                 f"{path} has no {RESULT_FILE} attached: it was not written by gtsam-rwhec solve or calibrate"
             )
         result = parse_result(content, f"{path}, attachment {RESULT_FILE}")
-        if result.log is None:
-            raise LogError(f"{path}, attachment {RESULT_FILE}: it does not say which log it is of")
+        if result.log is None or result.refined is None:
+            raise LogError(f"{path}, attachment {RESULT_FILE}: it is no refined calibration of a log")
         rig = read_embedded_rig(log)
-        refined, pairs = refined_of(result, path), read_pairs(log, rig)
+        refined, pairs = result.refined, read_pairs(log, rig)
     strangers = [*(set(refined.X) - set(rig.targets)), *(set(refined.Y) - set(rig.sensors))]
     if strangers or not pairs:
         why = (
             f"frames that its rig file has not: {', '.join(sorted(strangers)[:10])}" if strangers else "no measurements"
         )
         raise LogError(f"{path} has a {RESULT_FILE}, and {why}: its parts are not of one calibration")
-    return Solved(refined, solution_of(result), pairs, result.log, read_cameras(log), rig)
+    return Solved(refined, result.solution, pairs, result.log, read_cameras(log), rig)
 
 
 def free_name(frame: str, taken: set[str]) -> str:

@@ -24,7 +24,7 @@ from gtsam_rwhec.solving.solution import Solution
 
 @dataclass(frozen=True)
 class Movement:
-    """How far a frame moved from the certified solution."""
+    """How far a frame moved from the certified solution: translation_mm and rotation_deg."""
 
     translation_mm: float
     rotation_deg: float
@@ -69,6 +69,8 @@ class RefinedPoses:
         Inliers, and measurements, with robust="gnc"; else empty.
     free_directions : tuple of FreeDirection
         Empty where everything is determined.
+    joint : JointCovariance
+        Of everything that was unknown.
     """
 
     X: dict[str, gtsam.Pose3]

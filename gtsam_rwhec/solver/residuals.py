@@ -18,7 +18,7 @@ from gtsam_rwhec.solver.variables import Answer
 
 @dataclass(frozen=True)
 class Residual:
-    """Root mean squares of a pair's residuals, weighted as the cost weighs them.
+    """Root mean squares of a pair's residuals (number_of_measurements of them), weighted as the cost weighs them.
 
     translation_rms_m is of |R_A t_X + t_A - t_Y - R_Y t_B / scale| in true metres, rotation_rms_rad of the angle of
     R_A R_X against R_Y R_B.

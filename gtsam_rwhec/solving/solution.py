@@ -15,7 +15,7 @@ from gtsam_rwhec.solver.residuals import Residual
 
 @dataclass(frozen=True)
 class SolvedPart:
-    """The frames of one unconnected part and its own certificate."""
+    """The frames of one unconnected part (their names) and its own certificate."""
 
     names: tuple[str, ...]
     certificate: Certificate

@@ -351,11 +351,11 @@ def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
 
 def test_warnings_are_in_every_file(tmp_path: Path) -> None:
     frames = replace(
-        frames_of([np.eye(4)] * 4), warnings=("cam: 9 of its 10 measurements contradict the answer -- all",)
+        frames_of([np.eye(4)] * 4), warnings=("Do not use: cam: 9 of its 10 measurements contradict the answer -- all",)
     )
     for path in export_all(frames, tmp_path):
         text = path.read_text(encoding="utf-8")
-        assert "DO NOT USE: cam: 9 of its 10 measurements contradict" in text
+        assert "Do not use: cam: 9 of its 10 measurements contradict" in text
         if path.suffix == ".py":
             ast.parse(text)
         elif path.suffix == ".yaml":
@@ -363,4 +363,4 @@ def test_warnings_are_in_every_file(tmp_path: Path) -> None:
         else:
             assert ElementTree.fromstring(text.encode()).tag == "robot"
     for path in export_all(replace(frames, warnings=()), tmp_path):
-        assert "DO NOT USE" not in path.read_text(encoding="utf-8")
+        assert "Do not use" not in path.read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ from utias_log import rig_text, write_utias_log
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.pipeline.all_stages import calibrate_log
-from gtsam_rwhec.results.solution_file import read_result
+from gtsam_rwhec.results.result_file import read_result
 from gtsam_rwhec.rig import parse_rig
 
 SIGMA_M, ROTATION_DEG = 0.005, 0.5

@@ -64,4 +64,4 @@ def test_what_contradicts_is_named_with_its_exit_status_and_in_all_that_is_writt
         "cam_1"
     ]
     for name in ("static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml"):
-        assert "DO NOT USE: cam_1: " in (tmp_path / "out" / name).read_text(encoding="utf-8")
+        assert "Do not use these poses: cam_1: " in (tmp_path / "out" / name).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Files of refined calibrations: the same poses and covariances come back, infinite ones too; damage is refused."""
+"""Result files of refined calibrations: poses and covariances come back, infinite ones too; damage is refused."""
 
 from __future__ import annotations
 
@@ -83,11 +83,11 @@ def test_poses_and_covariances_come_back(kind: str, tmp_path: Path) -> None:
         "iterations",
         "moved",
         "inlier_counts",
+        "free_directions",
         "names",
         "degrees_of_freedom",
     ]:
         assert getattr(back, name) == getattr(refined, name), name
-    assert list(map(str, back.free_directions)) == list(map(str, refined.free_directions))
     if len(refined.Y) > 1:
         pose, covariance = back.relative("sensor0", "sensor1")
         assert pose.equals(refined.relative("sensor0", "sensor1")[0], 1e-15)
@@ -102,7 +102,10 @@ def test_the_certified_solution_is_in_the_same_file(tmp_path: Path) -> None:
     back = rw.read_solution(tmp_path / "refined.json")
     rw.write_solution(back, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "solution.json").read_bytes()
-    assert json.loads((tmp_path / "refined.json").read_bytes())["format_version"] == 2
+    raw = json.loads((tmp_path / "refined.json").read_bytes())
+    assert [pose["child"] for pose in raw["certified"]["sensors"]] == list(refined.solution.Y)
+    assert raw["sensors"] != raw["certified"]["sensors"]  # at the top are the poses to use, the refined ones
+    assert not {"sensors", "targets"} & raw["refined"].keys()
     assert refined.inlier_counts["target1", "sensor0"] == (22, 30)
 
 
@@ -112,12 +115,12 @@ def test_infinite_is_null(tmp_path: Path) -> None:
     text = (tmp_path / "refined.json").read_text(encoding="utf-8")
     assert "Infinity" not in text
     assert "NaN" not in text
-    for frame in json.loads(text)["refined"]["frames"]:
-        degrees, millimetres = refined.standard_deviations(frame["name"])
+    for name, frame in json.loads(text)["refined"]["frames"].items():
+        degrees, millimetres = refined.standard_deviations(name)
         for written, known in (
             (frame["standard_deviations_deg"], degrees),
             (frame["standard_deviations_mm"], millimetres),
-            (np.array(frame["covariance"], dtype=object).ravel(), refined.covariance(frame["name"]).ravel()),
+            (np.array(frame["covariance"], dtype=object).ravel(), refined.covariance(name).ravel()),
         ):
             assert [value is None for value in written] == np.isinf(known).tolist()
         assert None in frame["standard_deviations_mm"]
@@ -132,15 +135,16 @@ def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (lambda raw: raw.update(format_version=1), "version 1 with refined"),
-        (lambda raw: raw.pop("refined"), "version 2 with refined: False"),
-        (lambda raw: raw["refined"]["joint"]["finite"].pop(), "rows, units 24 and finite 23"),
-        (lambda raw: raw["refined"]["joint"]["units"].__setitem__(3, 0.0), "$.refined.joint.units[3]"),
-        (lambda raw: raw["refined"]["joint"]["free"].append([1.0]), "has not 24 numbers"),
-        (lambda raw: raw["refined"]["joint"]["unknowns"][0].update(name="moon"), "have no value: moon"),
-        (lambda raw: raw["refined"]["frames"].pop(), "frames are not the targets and sensors"),
-        (lambda raw: raw["refined"]["sensors"][0].pop("translation_m"), "$.refined.sensors[0].translation_m"),
+        (lambda raw: raw["refined"]["joint"]["finite"].pop(), "slots have 24 rows"),
+        (lambda raw: raw["refined"]["joint"]["finite"][3].pop(), "$.refined.joint.finite: rows of different lengths"),
+        (lambda raw: raw["refined"]["joint"]["unit"].__setitem__(3, 0.0), "$.refined.joint.unit[3]"),
+        (lambda raw: raw["refined"]["joint"]["free"].pop(), "slots have 24 rows"),
+        (lambda raw: raw["refined"]["joint"]["slots"].update(moon=[0, 6]), "have no value: moon"),
+        (lambda raw: raw["refined"]["frames"].popitem(), "frames and moved are not of the targets and sensors"),
+        (lambda raw: raw["sensors"][0].pop("translation_m"), "$.sensors[0].translation_m"),
         (lambda raw: raw["refined"].update(speed=1), "$.refined.speed"),
+        (lambda raw: raw["refined"]["noise"][1].update(redundancy=[1.0]), "redundancy"),
+        (lambda raw: raw["refined"]["noise"][1].update(sensor="moon"), "have no pose: moon"),
     ],
 )
 def test_damage_is_refused_with_its_place(damage: Callable[[Any], object], said: str, tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 import math
+import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,11 +15,12 @@ import gtsam
 import numpy as np
 import pytest
 from places import DEMO
+from pydantic import BaseModel
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
+from gtsam_rwhec.results.result_file import read_solution, write_solution
 from gtsam_rwhec.results.schema import FORMAT_VERSION, ResultFile
-from gtsam_rwhec.results.solution_file import read_solution, write_solution
 from gtsam_rwhec.simulate import Noise, general
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
@@ -36,34 +39,12 @@ def written(demo_solution: rw.Solution, tmp_path: Path) -> Path:
     return tmp_path / "result.json"
 
 
-def in_words(solution: rw.Solution) -> rw.Solution:
-    """The same with causes and free directions in words, which is all that format versions 1 to 3 hold."""
-
-    def told(certificate: rw.Certificate) -> rw.Certificate:
-        return dataclasses.replace(
-            certificate, cause=rw.Cause.NOT_RECORDED, figures={}, words=certificate.words or certificate.reason
-        )
-
-    known = solution.identifiability
-    pairs = {
-        pair: dataclasses.replace(value, free_directions=tuple(map(str, value.free_directions)))
-        for pair, value in known.pairs.items()
-    }
-    return dataclasses.replace(
-        solution,
-        certificate=told(solution.certificate),
-        identifiability=dataclasses.replace(known, pairs=pairs, free_directions=tuple(map(str, known.free_directions))),
-        parts=tuple(dataclasses.replace(part, certificate=told(part.certificate)) for part in solution.parts),
-    )
-
-
 def assert_same(first: rw.Solution, second: rw.Solution) -> None:
     """Every number is the same double, every name and word the same, in the same order."""
     for one, other in ((first.X, second.X), (first.Y, second.Y)):
         assert list(one) == list(other)
         for name in one:
             np.testing.assert_array_equal(one[name].matrix(), other[name].matrix())
-    first, second = in_words(first), in_words(second)
     for field in dataclasses.fields(first):
         if field.name not in ("X", "Y"):
             assert getattr(first, field.name) == getattr(second, field.name), field.name
@@ -116,6 +97,11 @@ def test_a_solution_with_free_directions(tmp_path: Path) -> None:
     assert_same(solution, back)
     assert back.certificate.status is rw.Status.CERTIFIED_NOT_UNIQUE
     assert back.identifiability.free_directions
+    raw = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
+    directions = raw["certified"]["identifiability"]["free_directions"]
+    assert [row["sentence"] for row in directions] == [str(d) for d in back.identifiability.free_directions]
+    assert all(row["kind"] and row["reason"] and set(row["frames"]) <= {*back.X, *back.Y} for row in directions)
+    assert raw["certified"]["certificate"]["cause"] == back.certificate.cause
 
 
 def test_infinities_are_null_and_come_back(demo_solution: rw.Solution, tmp_path: Path) -> None:
@@ -130,8 +116,8 @@ def test_infinities_are_null_and_come_back(demo_solution: rw.Solution, tmp_path:
     solution = dataclasses.replace(demo_solution, certificate=certificate, identifiability=identifiability)
     write_solution(solution, tmp_path / "result.json")
     raw = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
-    assert raw["certificate"]["lower_bound"] is None
-    assert raw["identifiability"]["weakest"] is None
+    assert raw["certified"]["certificate"]["lower_bound"] is None
+    assert raw["certified"]["identifiability"]["weakest"] is None
     assert_same(solution, read_solution(tmp_path / "result.json"))
 
 
@@ -139,7 +125,7 @@ def test_infinities_are_null_and_come_back(demo_solution: rw.Solution, tmp_path:
 def test_what_null_would_not_bring_back_is_not_written(demo_solution: rw.Solution, written: Path, wrong: float) -> None:
     before = written.read_bytes()
     certificate = dataclasses.replace(demo_solution.certificate, lower_bound=wrong)
-    with pytest.raises(FileFormatError, match=r"was not written.*\$\.lower_bound: must be finite, or -inf"):
+    with pytest.raises(FileFormatError, match=r"was not written.*\.certificate\.lower_bound: must be finite, or -inf"):
         write_solution(dataclasses.replace(demo_solution, certificate=certificate), written)
     assert written.read_bytes() == before
 
@@ -157,7 +143,11 @@ def test_awkward_numbers_come_back(demo_solution: rw.Solution, tmp_path: Path) -
 def test_the_file_explains_itself(demo_solution: rw.Solution, written: Path) -> None:
     raw = json.loads(written.read_text(encoding="utf-8"))
     assert raw["format"] == "gtsam-rwhec result"
-    assert raw["format_version"] == 1  # of a file without refined poses, which older readers read too
+    assert raw["format_version"] == FORMAT_VERSION
+    assert (raw["verdict"], raw["verdict_grounds"]) == ("use", [])
+    assert "proven optimal" in raw["verdict_reason"]
+    assert raw["sensors"] == raw["certified"]["sensors"]
+    assert raw["targets"] == raw["certified"]["targets"]
     assert raw["written_by"] == f"gtsam-rwhec {rw.__version__}"
     assert "p_parent = T_parent_child p_child" in raw["conventions"]["pose"]
     pose = raw["sensors"][0]
@@ -168,11 +158,30 @@ def test_the_file_explains_itself(demo_solution: rw.Solution, written: Path) -> 
 
 
 def test_every_field_is_described() -> None:
-    schema = ResultFile.model_json_schema()
-    for name, model in {"ResultFile": schema, **schema["$defs"]}.items():
-        for field, description in model.get("properties", {}).items():
-            stated = {"description", "$ref"} & set(description)
-            assert stated, f"{name}.{field} has no description"
+    """In the file's own classes by pydantic's description; in the library's dataclasses by their docstrings."""
+    undescribed = []
+    seen: set[type] = set()
+
+    def look(kind: Any) -> None:
+        for inner in typing.get_args(kind):
+            look(inner)
+        if not isinstance(kind, type) or kind in seen:
+            return
+        seen.add(kind)
+        if issubclass(kind, BaseModel):
+            for name, field in kind.model_fields.items():
+                undescribed.extend([] if field.description else [f"{kind.__name__}.{name}"])
+                look(field.annotation)
+        elif dataclasses.is_dataclass(kind):
+            documented = " ".join(inspect.getdoc(base) or "" for base in kind.__mro__)
+            for name, annotation in typing.get_type_hints(kind).items():
+                words = [name, name.rpartition("_")[0] or name]
+                undescribed.extend([] if any(word in documented for word in words) else [f"{kind.__name__}.{name}"])
+                look(annotation)
+
+    look(ResultFile)
+    assert {cls.__name__ for cls in seen} > {"ResultFile", "SolutionFields", "RefinedFields", "LogFields"}
+    assert undescribed == []
 
 
 def spoil(written: Path, change: Callable[[dict[str, Any]], object]) -> Path:
@@ -203,27 +212,46 @@ def test_another_version_says_what_to_do(written: Path, version: int, remedy: st
     ("change", "said"),
     [
         (
-            lambda raw: raw["sensors"][1]["translation_m"].__setitem__(2, "x"),
-            r"\$\.sensors\[1\]\.translation_m\[2\]:.*'x'",
+            lambda raw: raw["certified"]["sensors"][1]["translation_m"].__setitem__(2, "x"),
+            r"\$\.certified\.sensors\[1\]\.translation_m\[2\]:.*'x'",
         ),
-        (lambda raw: raw["sensors"][1]["translation_m"].pop(), r"\$\.sensors\[1\]\.translation_m"),
-        (lambda raw: raw["targets"][0].pop("child"), r"\$\.targets\[0\]\.child: Field required"),
-        (lambda raw: raw.pop("certificate"), r"\$\.certificate: Field required"),
-        (lambda raw: raw.update(extra=1), r"\$\.extra: Extra inputs are not permitted"),
-        (lambda raw: raw.update(cost=None), r"\$\.cost"),
-        (lambda raw: raw.update(cost="8.28"), r"\$\.cost: .*'8.28'"),
-        (lambda raw: raw["certificate"].update(status="surely"), r"\$\.certificate\.status:.*'surely'"),
-        (lambda raw: raw["scale"].update(value=-1.0), r"\$\.scale\.value: .*greater than 0"),
-        (lambda raw: raw["scale"].update(mode="per_target"), r"\$\.scale: .*needs by_frame"),
-        (lambda raw: raw["targets"][0]["rotation_matrix"][0].__setitem__(0, 2.0), r"tag_0 is not a rotation"),
         (
-            lambda raw: raw["targets"][0].update(quaternion_wxyz=[1.0, 0.0, 0.0, 0.0]),
-            r"\$\.targets\[0\]: rotation_matrix and quaternion_wxyz of tag_0 are different rotations",
+            lambda raw: raw["certified"]["sensors"][1]["translation_m"].pop(),
+            r"\$\.certified\.sensors\[1\]\.translation_m",
         ),
-        (lambda raw: raw["targets"][0].update(child="cam_0"), r"two poses have the same name: cam_0"),
-        (lambda raw: raw["targets"][0].update(parent="sensorcarrier"), r"given in targetcarrier, but tag_0 in another"),
-        (lambda raw: raw["pairs"][0].update(sensor="cam_9"), r"pairs name frames that have no pose: cam_9"),
-        (lambda raw: raw["pairs"][3].update(number_of_measurements=-1), r"\$\.pairs\[3\]\.number_of_measurements"),
+        (
+            lambda raw: raw["certified"]["targets"][0].pop("child"),
+            r"\$\.certified\.targets\[0\]\.child: Field required",
+        ),
+        (lambda raw: raw["certified"].pop("certificate"), r"\$\.certified\.certificate: Field required"),
+        (lambda raw: raw.update(extra=1), r"\$\.extra: Extra inputs are not permitted"),
+        (lambda raw: raw["certified"].update(cost=None), r"\$\.certified\.cost"),
+        (lambda raw: raw["certified"].update(cost="8.28"), r"\$\.certified\.cost: .*'8.28'"),
+        (lambda raw: raw["certified"]["certificate"].update(status="surely"), r"certificate\.status:.*'surely'"),
+        (lambda raw: raw["certified"].update(scale=-1.0), r"\$\.certified\.scale\.constrained.*greater than 0"),
+        (
+            lambda raw: raw["certified"].update(scale_mode="per_target"),
+            r"scale_mode 'per_target' does not go with .* 1\.0",
+        ),
+        (
+            lambda raw: raw["certified"]["targets"][0]["rotation_matrix"][0].__setitem__(0, 2.0),
+            r"tag_0 is not a rotation",
+        ),
+        (
+            lambda raw: raw["certified"]["targets"][0].update(quaternion_wxyz=[1.0, 0.0, 0.0, 0.0]),
+            r"\$\.certified\.targets\[0\]: rotation_matrix and quaternion_wxyz of tag_0 are different rotations",
+        ),
+        (lambda raw: raw["certified"]["targets"][0].update(child="cam_0"), r"two poses have the same name: cam_0"),
+        (lambda raw: raw["certified"]["targets"][0].update(parent="moon"), r"in several frames: moon, targetcarrier"),
+        (
+            lambda raw: raw["certified"]["residuals"][0].update(sensor="cam_9"),
+            r"pairs name frames that have no pose: cam_9",
+        ),
+        (
+            lambda raw: raw["certified"]["residuals"][3].update(number_of_measurements=1.5),
+            r"\$\.certified\.residuals\[\"tag_1\", \"cam_0\"\]\.number_of_measurements: .*1\.5",
+        ),
+        (lambda raw: raw["certified"]["residuals"].pop(), r"residuals and identifiability\.pairs"),
     ],
 )
 def test_a_damaged_field_is_named(written: Path, change: Callable[[dict[str, Any]], object], said: str) -> None:
@@ -234,7 +262,7 @@ def test_a_damaged_field_is_named(written: Path, change: Callable[[dict[str, Any
 
 def test_many_faults_are_counted(written: Path) -> None:
     with pytest.raises(FileFormatError, match=r"; and \d+ more\.$"):
-        read_solution(spoil(written, lambda raw: [pose.pop("child") for pose in raw["targets"] + raw["sensors"]]))
+        read_solution(spoil(written, lambda raw: [pose.pop("child") for pose in raw["certified"]["targets"]]))
 
 
 @pytest.mark.parametrize(

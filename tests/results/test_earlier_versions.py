@@ -1,0 +1,110 @@
+"""Files that earlier versions wrote (stored, and written by the code of that time) are read with their own meaning."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.results.result_file import read_result
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+
+
+def stored(version: int) -> tuple[Path, dict[str, Any]]:
+    path = GOLDEN / f"result_version_{version}.json"
+    raw: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    assert raw["format_version"] == version
+    return path, raw
+
+
+def assert_poses(poses: dict[str, Any], rows: list[dict[str, Any]]) -> None:
+    assert list(poses) == [row["child"] for row in rows]
+    for row in rows:
+        np.testing.assert_array_equal(poses[row["child"]].translation(), row["translation_m"])
+        np.testing.assert_array_equal(poses[row["child"]].rotation().matrix(), row["rotation_matrix"])
+
+
+def number(scale: dict[str, Any]) -> float | dict[str, float]:
+    value: float | dict[str, float] = scale["by_frame"] if scale["value"] is None else scale["value"]
+    return value
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_the_poses_at_the_top_were_the_certified_ones(version: int) -> None:
+    path, raw = stored(version)
+    solution = rw.read_solution(path)
+    assert_poses(solution.X, raw["targets"])
+    assert_poses(solution.Y, raw["sensors"])
+    assert solution.scale == number(raw["scale"])
+    assert solution.cost == raw["cost"]
+    assert solution.certificate.status == raw["certificate"]["status"]
+    assert solution.certificate.lower_bound == raw["certificate"]["lower_bound"]
+    assert solution.identifiability.weakest == raw["identifiability"]["weakest"]
+    assert [str(d) for d in solution.identifiability.free_directions] == raw["identifiability"]["free_directions"]
+    for row in raw["pairs"]:
+        pair = row["target"], row["sensor"]
+        assert solution.residuals[pair].translation_rms_m == row["translation_rms_m"]
+        assert solution.identifiability.pairs[pair].is_unique == row["is_unique"]
+        assert solution.identifiability.pairs[pair].weakest == row["weakest"]
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_refined_poses_stood_under_refined(version: int) -> None:
+    path, raw = stored(version)
+    refined, fields = rw.read_refined(path), raw["refined"]
+    assert_poses(refined.X, fields["targets"])
+    assert_poses(refined.Y, fields["sensors"])
+    assert refined.scale == number(fields["scale"])
+    assert refined.scale_mode == fields["scale"]["mode"]
+    assert refined.cost == fields["cost"]
+    assert refined.time_offsets_s == fields["time_offsets_s"]
+    for frame in fields["frames"]:
+        np.testing.assert_allclose(
+            refined.covariance(frame["name"]), np.array(frame["covariance"], dtype=float), rtol=1e-12
+        )
+        degrees, millimetres = refined.standard_deviations(frame["name"])
+        np.testing.assert_allclose(degrees, frame["standard_deviations_deg"], rtol=1e-12)
+        np.testing.assert_allclose(millimetres, frame["standard_deviations_mm"], rtol=1e-12)
+        assert refined.moved[frame["name"]].translation_mm == frame["moved_mm"]
+    for row in fields["pairs"]:
+        pair = row["target"], row["sensor"]
+        spare = tuple(math.inf if value is None else value for value in row["redundancy"])
+        noise = refined.noise[pair]
+        assert (noise.rotation_rad, noise.translation_m, noise.redundancy) == (row["noise_rad"], row["noise_m"], spare)
+        assert refined.inlier_counts.get(pair) == (None if row["inliers"] is None else tuple(row["inliers"]))
+
+
+def test_version_3_has_what_became_of_the_log() -> None:
+    path, raw = stored(3)
+    log = read_result(path).log
+    assert log is not None
+    assert log.sensor_carrier == raw["log"]["sensor_carrier"] == "base"
+    assert [track.used for track in log.outliers] == [track["used"] for track in raw["log"]["outliers"]]
+
+
+def test_version_1_was_not_refined() -> None:
+    with pytest.raises(rw.errors.FileFormatError, match="was not refined"):
+        rw.read_refined(stored(1)[0])
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda raw: raw.pop("pairs"), "it lacks 'pairs'"),
+        (lambda raw: raw["certificate"].pop("cost"), r"\$\.certified\.certificate\.cost: Field required"),
+        (lambda raw: raw["sensors"][0].update(child=7), r"\$\.certified\.sensors\[0\]\.child"),
+        (lambda raw: raw.update(extra=1), "extra"),
+    ],
+)
+def test_damage_is_refused_with_the_version(damage: Any, said: str, tmp_path: Path) -> None:
+    _, raw = stored(2)
+    damage(raw)
+    (tmp_path / "damaged.json").write_text(json.dumps(raw), encoding="utf-8")
+    with pytest.raises(rw.errors.FileFormatError, match=f"not a sound result of version 2.*{said}"):
+        rw.read_solution(tmp_path / "damaged.json")
