@@ -37,6 +37,17 @@ class Measurements:
         covariance: Array = variances[:, :, None] * np.eye(6)
         return covariance
 
+    def selected(self, mask: np.ndarray) -> Measurements:
+        """Those marked."""
+        return Measurements(
+            self.A[mask],
+            self.B[mask],
+            self.sigma[mask],
+            self.kappa[mask],
+            None if self.stamps_ns is None else self.stamps_ns[mask],
+            None if self.covariances is None else self.covariances[mask],
+        )
+
     def kept(self) -> KeptMeasurements:
         """Copied, since the caller's arrays may change; sigma and kappa are one for each measurement then."""
         sigma, kappa = (np.broadcast_to(value, len(self.A)) for value in (self.sigma, self.kappa))

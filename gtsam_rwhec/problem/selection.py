@@ -50,7 +50,7 @@ def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
         if mask.shape != (len(raw.A),) or mask.dtype != np.bool_:
             raise CountError(f"keep of {pair} has shape {mask.shape} of {mask.dtype}; give {len(raw.A)} booleans")
         if mask.any():
-            edges[pair] = raw if mask.all() else _taken(raw, mask)
+            edges[pair] = raw if mask.all() else raw.selected(mask)
     return problem.with_measurements(edges)
 
 
@@ -98,7 +98,7 @@ def reweighted(
                 raise NoiseError(f"weights of {pair} are not all finite and at least zero: {w.min():g}")
         positive = w > 0.0
         if positive.any():
-            kept, w = (raw, w) if positive.all() else (_taken(raw, positive), w[positive])
+            kept, w = (raw, w) if positive.all() else (raw.selected(positive), w[positive])
             edges[pair] = _weighed(kept, w, factors)
     return problem.with_measurements(edges)
 
@@ -106,17 +106,6 @@ def reweighted(
 def _check_pairs(problem: Problem, given: ByPair[ArrayLike]) -> None:
     for target, sensor in given:
         problem.moments(target, sensor)
-
-
-def _taken(raw: Measurements, mask: np.ndarray) -> Measurements:
-    return Measurements(
-        raw.A[mask],
-        raw.B[mask],
-        raw.sigma[mask],
-        raw.kappa[mask],
-        None if raw.stamps_ns is None else raw.stamps_ns[mask],
-        None if raw.covariances is None else raw.covariances[mask],
-    )
 
 
 def _weighed(raw: Measurements, w: np.ndarray, factors: VarianceFactors) -> Measurements:

@@ -11,14 +11,11 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from gtsam_rwhec.errors import (
-    CountError,
-    FrameError,
     MeasurementsNotKeptError,
     NotConvergedWarning,
     NotUniqueWarning,
     OptionError,
     RwhecWarning,
-    ScaleError,
     WeightsWarning,
 )
 from gtsam_rwhec.files.progress import Progress, silent
@@ -31,6 +28,7 @@ from gtsam_rwhec.refinement.free_space import FreeSpace, free_space_of
 from gtsam_rwhec.refinement.geodesic import GeodesicModel
 from gtsam_rwhec.refinement.graduated import graduated
 from gtsam_rwhec.refinement.inliers import inliers_of, under_worst_axis
+from gtsam_rwhec.refinement.input_checks import check_inputs, sensors_with_offset
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.pair_data import PairData, local_paths
@@ -39,7 +37,6 @@ from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.refinement.weighting import group_of
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solving.arguments import check_against_knowledge
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.trajectories.local_paths import WINDOW_S
@@ -93,9 +90,9 @@ def refine(
     """
     options = RefineOptions() if options is None else options
     tell = progress or silent
-    _check(problem, solution, options)
+    check_inputs(problem, solution, options)
     estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)
-    everything = Variables.of(problem, _sensors_with_offset(problem, options))
+    everything = Variables.of(problem, sensors_with_offset(problem, options))
     data = _data(problem, everything, options)
     inliers: dict[Pair, np.ndarray] = {}
     start, whole, judged = solution, problem, problem
@@ -118,7 +115,7 @@ def refine(
     for _ in range(MAX_CHOICES):
         if inliers:
             problem = selected(whole, inliers)
-        offsets = tuple(name for name in _sensors_with_offset(whole, options) if name in problem.sensors)
+        offsets = tuple(name for name in sensors_with_offset(whole, options) if name in problem.sensors)
         variables, parts = Variables.of(problem, offsets), parts_of(problem)
         kept = [item.selected(inliers[item.pair]) if inliers else item for item in data if item.pair in problem.pairs]
         model = GeodesicModel.of(kept, variables, options) if kept else ChordalModel(parts, variables)
@@ -237,47 +234,6 @@ def _data(problem: Problem, variables: Variables, options: RefineOptions) -> lis
         )
     paths = local_paths(problem, tuple(variables.offsets), options.carrier_path)
     return [PairData.of(problem, pair, options, paths.get(pair)) for pair in problem.pairs]
-
-
-def _check(problem: Problem, solution: Solution, options: RefineOptions) -> None:
-    if not isinstance(problem, Problem):
-        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
-    if not isinstance(solution, Solution):
-        raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
-    if not isinstance(options, RefineOptions):
-        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.RefineOptions")
-    if solution.scale_mode != problem.scale:
-        raise ScaleError(
-            f"the solution is of a problem with scale={solution.scale_mode!r}, this one has scale={problem.scale!r}; "
-            "solve this problem first"
-        )
-    if not problem.pairs:
-        raise CountError("the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)")
-    try:
-        check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
-    except FrameError as error:
-        raise FrameError(f"the solution is of another problem; solve this one first ({error})") from error
-    if options.noise == "given" and problem.is_relative:
-        raise OptionError(
-            "noise='given', but some measurements were added without sigma or kappa, so that no noise was given; "
-            "take noise='estimate'"
-        )
-    if options.robust == "gnc" and not problem.has_measurements:
-        raise MeasurementsNotKeptError(
-            "robust='gnc' weighs each measurement, and they were not kept (keep_measurements=False); make the problem "
-            "with keep_measurements=True"
-        )
-
-
-def _sensors_with_offset(problem: Problem, options: RefineOptions) -> tuple[str, ...]:
-    if isinstance(options.time_offsets, bool):
-        return problem.sensors if options.time_offsets else ()
-    for name in options.time_offsets:
-        if name not in problem.sensors:
-            raise FrameError(
-                f"RefineOptions.time_offsets names {name!r}, which is no sensor; there are {', '.join(problem.sensors)}"
-            )
-    return tuple(options.time_offsets)
 
 
 def _scale(problem: Problem, state: State) -> float | dict[str, float]:

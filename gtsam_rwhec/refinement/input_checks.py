@@ -1,0 +1,52 @@
+"""Whether a problem, its solution and the options of a refinement go together."""
+
+from __future__ import annotations
+
+from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError, ScaleError
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.solving.arguments import check_against_knowledge
+from gtsam_rwhec.solving.solution import Solution
+
+
+def check_inputs(problem: Problem, solution: Solution, options: RefineOptions) -> None:
+    """Refuse what cannot be refined, or not with these options; ``refine`` says what it raises."""
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    if not isinstance(solution, Solution):
+        raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
+    if not isinstance(options, RefineOptions):
+        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.RefineOptions")
+    if solution.scale_mode != problem.scale:
+        raise ScaleError(
+            f"the solution is of a problem with scale={solution.scale_mode!r}, this one has scale={problem.scale!r}; "
+            "solve this problem first"
+        )
+    if not problem.pairs:
+        raise CountError("the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)")
+    try:
+        check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
+    except FrameError as error:
+        raise FrameError(f"the solution is of another problem; solve this one first ({error})") from error
+    if options.noise == "given" and problem.is_relative:
+        raise OptionError(
+            "noise='given', but some measurements were added without sigma or kappa, so that no noise was given; "
+            "take noise='estimate'"
+        )
+    if options.robust == "gnc" and not problem.has_measurements:
+        raise MeasurementsNotKeptError(
+            "robust='gnc' weighs each measurement, and they were not kept (keep_measurements=False); make the problem "
+            "with keep_measurements=True"
+        )
+
+
+def sensors_with_offset(problem: Problem, options: RefineOptions) -> tuple[str, ...]:
+    """The sensors whose time offsets are to be estimated."""
+    if isinstance(options.time_offsets, bool):
+        return problem.sensors if options.time_offsets else ()
+    for name in options.time_offsets:
+        if name not in problem.sensors:
+            raise FrameError(
+                f"RefineOptions.time_offsets names {name!r}, which is no sensor; there are {', '.join(problem.sensors)}"
+            )
+    return tuple(options.time_offsets)
