@@ -15,9 +15,9 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.methods.absolute import Stack, linear_outcome, linear_rotations
 from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.local_on_manifold import LomOptions, local_on_manifold
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, checked_start
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.rotations import retract
 
 #: The weights rest when their ratio changes by less than this share.
 SETTLED = 1e-6
@@ -57,78 +57,38 @@ def strobl2006(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
 
 
 def reweighed(stack: Stack, X: Array, Y: Array, max_iterations: int) -> Weighed:
-    """Poses and variances in turn, from a start X, Y (4, 4)."""
-    a, c = stack.gauge.sensor_carrier, stack.gauge.target_carrier
-    centred = stack.A.copy()
-    centred[:, :3, 3] = stack.centred_t_A
-    R: Array = np.stack([X[:3, :3], Y[:3, :3]])
-    t: Array = np.stack([X[:3, 3] - c, Y[:3, 3] - a])
+    """Poses and variances in turn, from a start X, Y (4, 4); the poses of each round are LOM's with its weights."""
+    A = stack.A.copy()
+    A[:, :3, 3] = stack.centred_t_A
+    X, Y = X.copy(), Y.copy()
+    X[:3, 3] -= stack.gauge.target_carrier
+    Y[:3, 3] -= stack.gauge.sensor_carrier
+    centred = Problem()
+    centred.add("X", "Y", A, stack.B)
+    # Both errors have three numbers a measurement and share twelve unknowns, which cancel in the ratio of the weights.
+    degrees = max(3.0 * len(A) - 6.0, 1.0)
     ratio, settled, rounds = 0.0, False, 0
     while rounds < ROUNDS:
         rounds += 1
-        e_R, e_t = errors(centred, stack.B, R, t)
-        # Both have three numbers a measurement and share twelve unknowns, which cancel in the ratio of the weights.
-        degrees = max(3.0 * len(centred) - 6.0, 1.0)
+        e_R, e_t = errors(A, stack.B, X, Y)
         sigma_R = max(float(np.sqrt(np.vdot(e_R, e_R) / degrees)), SMALLEST_RAD)
         sigma_t = max(float(np.sqrt(np.vdot(e_t, e_t) / degrees)), SMALLEST_M)
         previous, ratio = ratio, sigma_t / sigma_R
         settled = abs(ratio - previous) <= SETTLED * ratio
         if settled:
             break
-        R, t = _descended(centred, stack.B, R, t, sigma_R, sigma_t, max_iterations)
-    T = np.tile(np.eye(4), (2, 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = R, t + np.stack([c, a])
-    return Weighed(T[0], T[1], sigma_R, sigma_t, rounds, settled)
+        options = LomOptions((sigma_R, sigma_t), max_iterations)
+        found = local_on_manifold(centred, {"X": X}, {"Y": Y}, options=options)
+        X, Y = found.X["X"].matrix(), found.Y["Y"].matrix()
+    X[:3, 3] += stack.gauge.target_carrier
+    Y[:3, 3] += stack.gauge.sensor_carrier
+    return Weighed(X, Y, sigma_R, sigma_t, rounds, settled)
 
 
-def errors(A: Array, B: Array, R: Array, t: Array) -> tuple[Array, Array]:
-    """Rotation vectors of (Y B)^-1 A X and R_A t_X + t_A - R_Y t_B - t_Y, (N, 3) each; R, t those of X and of Y."""
-    R_A, R_B = A[:, :3, :3], B[:, :3, :3]
-    e_R = se3.so3_logmap((R[1] @ R_B).transpose(0, 2, 1) @ R_A @ R[0])
-    e_t = R_A @ t[0] + A[:, :3, 3] - B[:, :3, 3] @ R[1].T - t[1]
-    return e_R, e_t
-
-
-def jacobian(A: Array, B: Array, R: Array, e_R: Array) -> tuple[Array, Array]:
-    """Of e_R by [w_X, w_Y] (N, 3, 6) and of e_t by [w_X, w_Y, t_X, t_Y] (N, 3, 12), rotations R Expmap(w)."""
-    left_inverse = se3.so3_left_jacobian_inverse(e_R)
-    # log(E Expmap(w)): J_r^-1 = (J_l^-1)'; log(Expmap(-R_B' w) E): -J_l^-1 R_B'
-    J_R = np.concatenate([left_inverse.transpose(0, 2, 1), -left_inverse @ B[:, :3, :3].transpose(0, 2, 1)], axis=2)
-    J_t = np.zeros((len(A), 3, 12))
-    J_t[:, :, 3:6] = R[1] @ se3.hat(B[:, :3, 3])
-    J_t[:, :, 6:9] = A[:, :3, :3]
-    J_t[:, :, 9:] = -np.eye(3)
-    return J_R, J_t
-
-
-def _descended(
-    A: Array, B: Array, R: Array, t: Array, sigma_R: float, sigma_t: float, max_iterations: int
-) -> tuple[Array, Array]:
-    """Least |e_R|^2 / sigma_R^2 + |e_t|^2 / sigma_t^2 by Levenberg-Marquardt on SO(3)^2 x R^6."""
-    damping = 1e-9
-    e_R, e_t = errors(A, B, R, t)
-    cost = np.vdot(e_R, e_R) / sigma_R**2 + np.vdot(e_t, e_t) / sigma_t**2
-    for _ in range(max_iterations):
-        J_R, J_t = jacobian(A, B, R, e_R)
-        H = np.einsum("nia,nib->ab", J_t, J_t) / sigma_t**2
-        H[:6, :6] += np.einsum("nia,nib->ab", J_R, J_R) / sigma_R**2
-        g = np.einsum("nia,ni->a", J_t, e_t) / sigma_t**2
-        g[:6] += np.einsum("nia,ni->a", J_R, e_R) / sigma_R**2
-        while True:
-            step = -np.linalg.solve(H + damping * np.diag(np.diagonal(H)), g)
-            R_new, t_new = retract(R, step[:6].reshape(2, 3)), t + step[6:].reshape(2, 3)
-            e_R, e_t = errors(A, B, R_new, t_new)
-            cost_new = np.vdot(e_R, e_R) / sigma_R**2 + np.vdot(e_t, e_t) / sigma_t**2
-            if cost_new <= cost or damping > 1e6:
-                break
-            damping *= 10.0
-        if cost_new > cost:  # rounding: no step goes down
-            return R, t
-        R, t, decrease, cost = R_new, t_new, cost - cost_new, cost_new
-        damping = max(0.1 * damping, 1e-12)
-        if decrease <= 1e-14 * cost and float(np.abs(step).max()) < 1e-8:
-            break
-    return R, t
+def errors(A: Array, B: Array, X: Array, Y: Array) -> tuple[Array, Array]:
+    """Rotation vectors of (Y B)^-1 A X and R_A t_X + t_A - R_Y t_B - t_Y, (N, 3) each."""
+    AX, YB = A @ X, Y @ B
+    return se3.so3_logmap(YB[:, :3, :3].transpose(0, 2, 1) @ AX[:, :3, :3]), AX[:, :3, 3] - YB[:, :3, 3]
 
 
 METHOD = Method(
