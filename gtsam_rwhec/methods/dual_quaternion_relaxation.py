@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.quaternions import dual_parts, left, of_vectors, right
+from gtsam_rwhec.geometry.quaternions import LEFT, dual_parts, left, of_vectors, right
 
 #: Frames up to which the relaxation is solved; a cone of 8 n takes a dense block of order 4 n (8 n + 1) squared.
 MOST_FRAMES = 10
@@ -140,11 +140,8 @@ def _curvature(q: Array, t: Array, gradient_z: Array) -> Array:
     back = -0.25 * np.einsum("nij,nij->n", g, z)
     result[at, :3, at, :3] = back[:, None, None] * np.eye(3)
     # p' = t p / 2: v (p w / 2) / 2, from the right: R(p w / 2) v / 2
-    units = np.eye(4)[:3]
     turned = 0.5 * left(q)[:, :, :3]  # columns p e_k / 2
-    mixed = np.zeros((n, 3, 3))  # [w_k, v_l] = <g', e_l (p e_k / 2)> / 2
-    for axis in range(3):
-        mixed[:, :, axis] = 0.5 * np.einsum("ni,ij,njk->nk", g[:, 1], left(units[axis]), turned)
+    mixed = 0.5 * np.einsum("ni,lij,njk->nkl", g[:, 1], LEFT[:3], turned)  # [w_k, v_l] = <g', e_l (p e_k / 2)> / 2
     result[at, :3, at, 3:] = mixed
     result[at, 3:, at, :3] = mixed.transpose(0, 2, 1)
     return result.reshape(6 * n, 6 * n)

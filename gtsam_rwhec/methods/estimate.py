@@ -23,12 +23,8 @@ class Outcome(Generic[X]):
 
     Attributes
     ----------
-    X : poses by name, or the one pose (4, 4) of A X = X B
+    X, Y : poses by name, or the one pose (4, 4) of A X = X B
         Metres.
-    Y : poses by name
-        None of A X = X B.
-    scale : float, or dict of str to float
-        t_B = scale * (true length).
     cost : float or None
         The method's own; None: that by which the call compares all methods.
     cost_name : str
@@ -37,12 +33,8 @@ class Outcome(Generic[X]):
         Proven, of the same cost.
     is_optimal : bool or None
         Whether the bound proves the answer, where the method has its own rule for that.
-    free_directions : tuple of FreeDirection
-        What the motions leave undetermined, where the method finds that itself.
-    starts_from : str or None
-        What an iteration started from; None for closed forms and global methods.
-    notes : tuple of str
-        What the user should know of this answer.
+    scale, free_directions, starts_from, notes
+        As in ``Estimate``; free directions where the method finds them itself.
     """
 
     X: X

@@ -29,7 +29,7 @@ from gtsam_rwhec.methods.absolute import Stack
 from gtsam_rwhec.methods.dual_quaternion_relaxation import Relaxed, multipliers_of, polished, relaxed
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
-from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
+from gtsam_rwhec.methods.paired_quaternions import agreement, paired_quaternions
 from gtsam_rwhec.problem.problem import Problem
 
 #: How the quaternions of A and B get their signs.
@@ -146,7 +146,7 @@ def solve_dual_quaternions(
         Q = form.matrix(sign)
         found = relaxed(Q, form.frames)
         q, t, cost = polished(Q, found.q, found.t)
-        products = _products(stack, q_A, q_B, q)
+        products = agreement(q_A, q[stack.target], q[len(stack.targets) + stack.sensor], q_B)
         # Each pair's sign as a whole is the frames' own.
         whole = np.sign(stack.sums(sign * products))[np.repeat(np.arange(len(stack.pairs)), stack.counts)]
         contradicted = int(np.count_nonzero(whole * sign * products < 0.0))
@@ -198,13 +198,6 @@ def _continuous(q: Array, first: np.ndarray) -> Array:
     starts = running[first[:-1]]
     result: Array = running * np.repeat(starts, np.diff(first))
     return result
-
-
-def _products(stack: Stack, q_A: Array, q_B: Array, q: Array) -> Array:
-    """<p_a p_x, p_y p_b> (N,): the cosine of half the residual's angle, with the sign."""
-    of_X, of_Y = q[stack.target], q[len(stack.targets) + stack.sensor]
-    product: Array = np.einsum("nij,nj,nik,nk->n", left(q_A), of_X, left(of_Y), q_B)
-    return product
 
 
 def _reference_signs(q_A: Array, q_B: Array, stack: Stack) -> Array:

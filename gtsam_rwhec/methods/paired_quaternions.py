@@ -19,5 +19,10 @@ def paired_quaternions(stack: Stack) -> tuple[Array, Array]:
     R_X, R_Y = linear_rotations(stack)
     q_A, q_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])
     q_X, q_Y = of_rotations(R_X)[stack.target], of_rotations(R_Y)[stack.sensor]
-    product = np.einsum("nij,nj,nik,nk->n", left(q_A), q_X, left(q_Y), q_B)
-    return q_A, np.where(product < 0.0, -1.0, 1.0)[:, None] * q_B
+    return q_A, np.where(agreement(q_A, q_X, q_Y, q_B) < 0.0, -1.0, 1.0)[:, None] * q_B
+
+
+def agreement(q_A: Array, q_X: Array, q_Y: Array, q_B: Array) -> Array:
+    """<q_A q_X, q_Y q_B> (N,): the cosine of half the residual's angle, negative where the signs do not fit."""
+    product: Array = np.einsum("nij,nj,nik,nk->n", left(q_A), q_X, left(q_Y), q_B)
+    return product

@@ -16,7 +16,7 @@ from numpy.random import Generator
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.simulate.noise import Noise, Seed, perturb, released_sphere_translations
+from gtsam_rwhec.simulate.noise import Noise, Seed, perturb, released_sphere_translations, weights_of
 from gtsam_rwhec.simulate.scales import SHARED_SCALE
 from gtsam_rwhec.simulate.simulation import Simulation
 from gtsam_rwhec.simulate.transforms import FloatArray, inverse, pose
@@ -97,8 +97,7 @@ def sphere(
         sensor=MARKER,
         A=A,
         B=B,
-        sigma=None if noise is None else noise.sigma_m,
-        kappa=None if noise is None else noise.kappa,
+        **weights_of(noise),
         source="simulate.sphere",
     )
     return Simulation(problem, X={CAMERA: T_HAND_CAMERA.copy()}, Y={MARKER: T_BASE_MARKER.copy()}, scale=scale)

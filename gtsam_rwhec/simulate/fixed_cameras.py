@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.simulate.noise import Noise, Seed, perturb, released_camera_translations
+from gtsam_rwhec.simulate.noise import Noise, Seed, perturb, released_camera_translations, weights_of
 from gtsam_rwhec.simulate.scales import SHARED_SCALE
 from gtsam_rwhec.simulate.simulation import Simulation
 from gtsam_rwhec.simulate.transforms import FloatArray, inverse, pose, rotations_of_vectors
@@ -76,8 +76,7 @@ def cameras(
             sensor=MARKER,
             A=A,
             B=B,
-            sigma=None if noise is None else noise.sigma_m,
-            kappa=None if noise is None else noise.kappa,
+            **weights_of(noise),
             source="simulate.cameras",
         )
     return Simulation(

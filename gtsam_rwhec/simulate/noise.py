@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypedDict, get_args
 
 import numpy as np
 from numpy.random import Generator
@@ -217,3 +217,15 @@ def perturb(
     noisy[:, :3, :3] = noisy[:, :3, :3] @ rotations
     noisy[:, :3, 3] += translations
     return noisy
+
+
+class Weights(TypedDict):
+    """What ``Problem.add`` takes as weights."""
+
+    sigma: float | None
+    kappa: float | None
+
+
+def weights_of(noise: Noise | None) -> Weights:
+    """The weights that belong to the noise; none for exact measurements."""
+    return {"sigma": None, "kappa": None} if noise is None else {"sigma": noise.sigma_m, "kappa": noise.kappa}

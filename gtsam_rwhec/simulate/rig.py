@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TypedDict, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from gtsam_rwhec.problem.pairs import ByPair, Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.simulate.graphs import Edge, GraphKind, bipartite_edges
 from gtsam_rwhec.simulate.motion import Motion, MotionKind, carrier_poses
-from gtsam_rwhec.simulate.noise import Noise, Seed, perturb
+from gtsam_rwhec.simulate.noise import Noise, Seed, perturb, weights_of
 from gtsam_rwhec.simulate.scales import true_scales
 from gtsam_rwhec.simulate.simulation import Simulation
 from gtsam_rwhec.simulate.transforms import inverse, random_poses
@@ -25,11 +25,6 @@ TARGETS_WITHIN_M = 2.0
 SENSORS_WITHIN_M = 0.5
 #: Time between two poses of the rig: ten a second.
 PERIOD_NS = 100_000_000
-
-
-class _Weights(TypedDict):
-    sigma: float | None
-    kappa: float | None
 
 
 def general(
@@ -143,7 +138,7 @@ def general(
             *pair,
             noisy_T_rig_world[steps],
             perturb(B, noise_of_pair, measuring),
-            **_weights(noise_of_pair),
+            **weights_of(noise_of_pair),
             stamps_ns=PERIOD_NS * steps,
             source="simulate.general",
         )
@@ -153,15 +148,11 @@ def general(
         B = inverse(Y[sensor]) @ A @ Y[sensor]
         B[:, :3, 3] *= alphas[sensor] if isinstance(alphas, dict) else alphas
         B = perturb(B, odometry_noise, driving)
-        problem.add_motion(sensor, A, B, **_weights(odometry_noise), source="simulate.general")
+        problem.add_motion(sensor, A, B, **weights_of(odometry_noise), source="simulate.general")
     if isinstance(alphas, dict):
         for name in known_sizes:
             problem.fix_scale(name, alphas[name])
     return Simulation(problem, X=X, Y=Y, scale=alphas)
-
-
-def _weights(noise: Noise | None) -> _Weights:
-    return {"sigma": None, "kappa": None} if noise is None else {"sigma": noise.sigma_m, "kappa": noise.kappa}
 
 
 def _of_pair(value: Value | ByPair[Value], pair: Pair, option: str) -> Value:
