@@ -1,0 +1,157 @@
+"""Which test file holds which module, where it is not the one of its name.
+
+The rule is tests/PACKAGE/test_MODULE.py for gtsam_rwhec/PACKAGE/MODULE.py, and tests/factors/ for rwhec_factors. The
+table has the other modules, each with a file that tests what it is for. tests/test_where_tested.py holds
+it complete and true: it names each module that is missing, each entry that is not needed, each file that is not there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from places import REPOSITORY
+
+TESTS = REPOSITORY / "tests"
+#: By the name that the table has: where the modules are, and where their tests.
+PACKAGES = {
+    "gtsam_rwhec": (REPOSITORY / "gtsam_rwhec", TESTS),
+    "factors": (REPOSITORY / "factors" / "rwhec_factors", TESTS / "factors"),
+}
+
+
+def modules() -> Iterator[tuple[str, Path]]:
+    """Each module's path in its distribution, without its ending, and the test file of its name."""
+    for name, (root, tests) in PACKAGES.items():
+        for path in sorted(root.rglob("*.py")):
+            if not path.name.startswith("__"):
+                place = path.relative_to(root).with_suffix("")
+                yield f"{name}/{place.as_posix()}", tests / place.parent / f"test_{place.name}.py"
+
+
+#: By package, then by file in tests/: the modules that it tests.
+TABLE: dict[str, dict[str, str]] = {
+    "gtsam_rwhec": {"test_bad_input.py": "errors"},
+    "gtsam_rwhec/calibration": {"calibration/test_cross_validation.py": "folds prediction_errors"},
+    "gtsam_rwhec/cleaning": {
+        "cleaning/test_pair_consensus.py": "removed",
+        "pipeline/test_synthetic_calibration.py": "odometry synchronisation",
+        "trajectories/test_trajectory.py": "thinning",
+    },
+    "gtsam_rwhec/cli": {
+        "cli/test_command.py": "app exit_status failures fetch options",
+        "cli/test_roads.py": "calibrate",
+        "cli/test_wheel.py": "demo log_result",
+        "pipeline/test_commands.py": "clean convert detect export init solve",
+    },
+    "gtsam_rwhec/compat": {
+        "compat/test_opencv.py": (
+            "andreff certified daniilidis dqopt inputs pair_translations quaternion_methods robot_world stations"
+        ),
+    },
+    "gtsam_rwhec/export": {
+        "export/test_exported_files.py": "camchain files overlaps static_tf tf_tree urdf written_poses",
+    },
+    "gtsam_rwhec/files": {
+        "cli/test_stage_display.py": "progress",
+        "pipeline/test_bad_logs.py": "terminal_text",
+        "problem/test_csv_folder.py": "natural_order",
+    },
+    "gtsam_rwhec/first_rig": {"first_rig/test_first_rig.py": "carriers log_contents proposal targets"},
+    "gtsam_rwhec/handeye": {
+        "handeye/test_certified.py": "chordal_form",
+        "handeye/test_cost.py": "motion_costs weights",
+        "handeye/test_dual_quaternions.py": "signs",
+        "handeye/test_linear_and_nonlinear_calls.py": "registry",
+        "handeye/test_optimal.py": "proof saddle",
+        "handeye/test_prior.py": "linear_prior",
+        "handeye/test_refusals.py": "request",
+    },
+    "gtsam_rwhec/identifiability": {"identifiability/test_identification.py": "threshold verdicts"},
+    "gtsam_rwhec/logs": {
+        "logs/test_mcap_reader.py": "checked_poses mcap_blocks message_kinds protobuf_messages records ros2_schemas",
+        "logs/test_mcap_writer.py": "foxglove_schemas written_schemas",
+    },
+    "gtsam_rwhec/methods": {
+        "methods/test_closed_forms.py": "absolute dornaika1998 li2010 linear_methods zhuang1994",
+        "methods/test_comparison.py": "comparison_file",
+        "methods/test_evangelista2023.py": "image_methods reprojection",
+        "methods/test_heller2014.py": "quaternion_moments unit_weights",
+        "methods/test_horn2023.py": "dual_quaternion_relaxation",
+        "methods/test_registry.py": "applicability certified estimate evaluation method",
+    },
+    "gtsam_rwhec/pipeline": {
+        "pipeline/test_bad_logs.py": "intrinsics no_detections output_paths",
+        "pipeline/test_real_dataset.py": "driver_detections",
+        "pipeline/test_same_log.py": "all_stages changed_rig log_contract log_metadata",
+        "pipeline/test_synthetic_calibration.py": (
+            "carrier_motion cleaning_stage detection_stage detections_in_images image_detections measured_pairs "
+            "sensor_detections solution_frames solution_plots solved_log solving_rounds solving_stage tracks"
+        ),
+    },
+    "gtsam_rwhec/problem": {
+        "problem/test_moments.py": "accumulation",
+        "problem/test_problem.py": "knowledge measurements priors",
+        "problem/test_selection.py": "variance_factors",
+    },
+    "gtsam_rwhec/refinement": {
+        "refinement/test_carrier_noise.py": "graph pair_data",
+        "refinement/test_coverage.py": "variance_components",
+        "refinement/test_exact_scales.py": "certified_fit",
+        "refinement/test_graduated.py": "truncated_least_squares",
+        "refinement/test_refine.py": "chordal fit free_space geodesic optimisation options refined refining variables",
+        "refinement/test_robust.py": "inliers weighting",
+    },
+    "gtsam_rwhec/report": {
+        "calibration/test_cross_validation.py": "cross_validation_table",
+        "cli/test_wheel.py": "log_report",
+        "methods/test_comparison.py": "comparison_report",
+        "report/test_solution_report.py": "pose_table sentences",
+    },
+    "gtsam_rwhec/report/plots": {
+        "report/plots/test_drawing.py": "labels",
+        "report/plots/test_plots.py": "coverage deviations frames plotted residuals",
+    },
+    "gtsam_rwhec/results": {"results/test_result_file.py": "schema"},
+    "gtsam_rwhec/rig": {
+        "rig/test_rig_faults.py": "contradictions",
+        "rig/test_rig_file.py": "field_types rig sections target_sections written_rig",
+    },
+    "gtsam_rwhec/simulate": {
+        "simulate/test_paper_simulations.py": "camera_on_sphere fixed_cameras",
+        "simulate/test_rig.py": "graphs motion scales",
+        "simulate/test_simulation.py": "transforms",
+    },
+    "gtsam_rwhec/solver": {
+        "identifiability/test_information.py": "residuals",
+        "solver/test_deflation.py": "lagrangian",
+        "solver/test_reduced_form.py": "forms full_form variables",
+        "solver/test_search.py": "attempt cause found options stages",
+    },
+    "gtsam_rwhec/solving": {
+        "solving/test_certified_solution.py": "arguments given_certificate part_solution solution weights",
+    },
+    "gtsam_rwhec/trajectories": {"trajectories/test_trajectory.py": "local_paths"},
+    "gtsam_rwhec/vision": {
+        "pipeline/test_commands.py": "drawn_detections",
+        "vision/test_ambiguity.py": "agreement",
+        "vision/test_camera.py": "distortion",
+        "vision/test_detection.py": "options rejection",
+        "vision/test_edges.py": "edge_geometry edge_profiles",
+        "vision/test_images.py": "image_sizes",
+        "vision/test_targets.py": "dictionaries",
+    },
+    "factors": {
+        "factors/test_drop_in.py": "hand_eye",
+        "factors/test_known_carrier_options.py": "measurement",
+        "factors/test_priors.py": "values",
+        "factors/test_summaries_and_batches.py": "batch edge_summary",
+    },
+}
+
+WHERE_TESTED = {
+    f"{package}/{module}": file
+    for package, files in TABLE.items()
+    for file, modules_of in files.items()
+    for module in modules_of.split()
+}
