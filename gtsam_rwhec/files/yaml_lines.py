@@ -61,10 +61,13 @@ class YamlFile:
             path = path[:-1]
         return self.lines.get(path, 1)
 
+    def place(self, path: KeyPath) -> str:
+        """``FILE, line N: a.b[0]``."""
+        return ": ".join(filter(None, (f"{self.where}, line {self.line(path)}", dotted(path))))
+
     def fault(self, path: KeyPath, words: str) -> str:
         """``FILE, line N: a.b[0]: words``."""
-        name = dotted(path)
-        return f"{self.where}, line {self.line(path)}: {name}{': ' if name else ''}{words}"
+        return f"{self.place(path)}: {words}"
 
 
 def read_yaml(path: str | Path, *, tags: Collection[str] = ()) -> YamlFile:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic
 from gtsam_rwhec.rig.target_sections import AprilGridTarget, CharucoTarget, TagTarget
-from gtsam_rwhec.vision.targets import FAMILIES
+from gtsam_rwhec.vision.targets import FAMILIES, family_named
 
 #: Lengths that stand in a first rig file until someone measures.
 TAG_M, SQUARE_M, MARKER_M, SPACING = 0.1, 0.04, 0.03, 0.3
@@ -116,12 +116,6 @@ def _of_drivers(drivers: Iterable[DriverTopic], already: Iterable[Guess]) -> Ite
                     remark += f"; TODO the family, which its driver calls {family!r}"
                 section = TagTarget(type="tag", family=known or "tag36h11", id=i, size_m=size_m)
                 yield Guess(f"{known or 'tag'}_{i}", section, f"{remark}; {ids[i]} detections")
-
-
-def family_named(word: str) -> str | None:
-    """The family that a driver means: 36h11, tag36h11, tagStandard36h11, DICT_5X5_100; None if it is none of ours."""
-    bare = re.sub(r"^(dict_)?(apriltag_|aruco_)?(tag)?(standard)?", "", word.strip().lower())
-    return next((f for f in (f"tag{bare}", f"aruco_{bare}") if f in FAMILIES), None)
 
 
 def _squares(markers: int) -> tuple[int, int]:

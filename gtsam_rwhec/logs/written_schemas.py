@@ -23,7 +23,7 @@ _INTEGER = {"type": "integer"}
 _STRING = {"type": "string"}
 
 
-def _message(title: str = "", **properties: Any) -> dict[str, Any]:
+def _message(title: str = "", /, **properties: Any) -> dict[str, Any]:
     schema: dict[str, Any] = {"type": "object", "properties": properties}
     return {"title": title, **schema} if title else schema
 
@@ -40,43 +40,21 @@ _POINT = _message("foxglove.Point2", x=_NUMBER, y=_NUMBER)
 _COLOR = _message("foxglove.Color", r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
 
 _TRANSFORM = _message(
-    "foxglove.FrameTransform",
-    timestamp=_TIME,
-    parent_frame_id=_STRING,
-    child_frame_id=_STRING,
-    translation=_VECTOR,
-    rotation=_QUATERNION,
-)
+    "foxglove.FrameTransform", timestamp=_TIME, parent_frame_id=_STRING, child_frame_id=_STRING,
+    translation=_VECTOR, rotation=_QUATERNION,
+)  # fmt: skip
 _POINTS = _message(
-    "foxglove.PointsAnnotation",
-    timestamp=_TIME,
-    type=_INTEGER,
-    points=_several(_POINT),
-    outline_color=_COLOR,
-    outline_colors=_several(_COLOR),
-    fill_color=_COLOR,
-    thickness=_NUMBER,
-)
+    "foxglove.PointsAnnotation", timestamp=_TIME, type=_INTEGER, points=_several(_POINT), outline_color=_COLOR,
+    outline_colors=_several(_COLOR), fill_color=_COLOR, thickness=_NUMBER,
+)  # fmt: skip
 _TEXT = _message(
-    "foxglove.TextAnnotation",
-    timestamp=_TIME,
-    position=_POINT,
-    text=_STRING,
-    font_size=_NUMBER,
-    text_color=_COLOR,
+    "foxglove.TextAnnotation", timestamp=_TIME, position=_POINT, text=_STRING, font_size=_NUMBER, text_color=_COLOR,
     background_color=_COLOR,
-)
+)  # fmt: skip
 _DETECTION = _message(
-    family=_STRING,
-    id=_STRING,
-    size_m=_NUMBER,
-    corners_px=_several(_POINT),
-    pose=_POSE,
-    covariance=_several(_NUMBER),
-    corner_indices=_several(_INTEGER),
-    reprojection_px=_NUMBER,
-    reason=_STRING,
-)
+    family=_STRING, id=_STRING, size_m=_NUMBER, corners_px=_several(_POINT), pose=_POSE,
+    covariance=_several(_NUMBER), corner_indices=_several(_INTEGER), reprojection_px=_NUMBER, reason=_STRING,
+)  # fmt: skip
 
 _SCHEMAS = {
     "foxglove.FrameTransforms": _message(transforms=_several(_TRANSFORM)),
@@ -88,28 +66,15 @@ _SCHEMAS = {
         timestamp=_TIME, frame_id=_STRING, data={"type": "string", "contentEncoding": "base64"}, format=_STRING
     ),
     "foxglove.CameraCalibration": _message(
-        timestamp=_TIME,
-        frame_id=_STRING,
-        width=_INTEGER,
-        height=_INTEGER,
-        distortion_model=_STRING,
-        D=_several(_NUMBER),
-        K=_several(_NUMBER),
-        R=_several(_NUMBER),
-        P=_several(_NUMBER),
+        timestamp=_TIME, frame_id=_STRING, width=_INTEGER, height=_INTEGER, distortion_model=_STRING,
+        **dict.fromkeys("DKRP", _several(_NUMBER)),
     ),
     TAG_DETECTIONS: _message(timestamp=_TIME, frame_id=_STRING, detections=_several(_DETECTION)),
     MEASURED_PAIR: _message(
-        timestamp=_TIME,
-        target=_STRING,
-        sensor=_STRING,
-        A=_several(_NUMBER),
-        B=_several(_NUMBER),
-        is_inlier={"type": "boolean"},
-        reason=_STRING,
-        covariance=_several(_NUMBER),
+        timestamp=_TIME, target=_STRING, sensor=_STRING, A=_several(_NUMBER), B=_several(_NUMBER),
+        is_inlier={"type": "boolean"}, reason=_STRING, covariance=_several(_NUMBER),
     ),
-}
+}  # fmt: skip
 
 
 def json_schema(name: str) -> bytes:

@@ -16,7 +16,7 @@ from .log_metadata import read_cameras as read_cameras
 from .log_metadata import read_metadata as read_metadata
 from .measured_pairs import MeasuredPairs as MeasuredPairs
 from .measured_pairs import read_pairs as read_pairs
-from .solved_log import Solved as Solved
 from .solved_log import read_solved as read_solved
 from .solving_stage import Calibrated as Calibrated
+from .solving_stage import Solved as Solved
 from .solving_stage import solve_log as solve_log

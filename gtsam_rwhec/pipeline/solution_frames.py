@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.pipeline.solved_log import Solved
+from gtsam_rwhec.pipeline.solving_stage import Solved
 from gtsam_rwhec.results.verdict import Verdict, judge
 from gtsam_rwhec.rig import RigFrames
 

@@ -14,7 +14,7 @@ from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.log_contract import detections_topic
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs
 from gtsam_rwhec.pipeline.solution_frames import frames_of
-from gtsam_rwhec.pipeline.solved_log import Solved
+from gtsam_rwhec.pipeline.solving_stage import Solved
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.report.plots import (
     PlottedCorners,

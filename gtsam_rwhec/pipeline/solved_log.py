@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from gtsam_rwhec.errors import LogError
@@ -15,40 +14,12 @@ from gtsam_rwhec.pipeline.log_contract import (
     topics_up_to_detection,
 )
 from gtsam_rwhec.pipeline.log_metadata import LogMetadata, read_cameras, read_embedded_rig
-from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs, write_pairs
-from gtsam_rwhec.pipeline.solving_stage import Calibrated
-from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.pipeline.measured_pairs import read_pairs, write_pairs
+from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
 from gtsam_rwhec.results.result_file import parse_result, refined_json
-from gtsam_rwhec.results.stage_reports import LogFields
-from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.solving.solution import Solution
-from gtsam_rwhec.vision.camera import Camera
 
 #: Added to the name of a calibrated frame where the raw log has transforms of a frame of that name.
 CALIBRATED = "_calibrated"
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """What a solved log holds.
-
-    Attributes
-    ----------
-    refined : RefinedPoses
-    solution : Solution
-    pairs : dict of (target, sensor) to MeasuredPairs
-    log : LogFields
-    cameras : dict of sensor to Camera
-    rig : Rig
-    """
-
-    refined: RefinedPoses
-    solution: Solution
-    pairs: dict[Pair, MeasuredPairs]
-    log: LogFields
-    cameras: dict[str, Camera]
-    rig: Rig
 
 
 def write_solved(

@@ -15,21 +15,24 @@ from gtsam_rwhec.pipeline.log_contract import CLEANING_METADATA
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, sigma_of, without_outlier_marks
-from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.stage_reports import LogFields, SizeFields, TimeOffsetFields, TrackCount, contradicted
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.vision.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
-class Calibrated:
-    """A calibration from a log.
+class Solved:
+    """A calibration from a log, as a solved log holds it.
 
     Attributes
     ----------
-    refined : Refined
+    refined : RefinedPoses
         Poses, covariances, scales; ``time_offsets_s`` in full, not against the first guess.
+    solution : Solution
+        With its certificate.
     pairs : dict of (target, sensor) to MeasuredPairs
         Every measurement, with A at the final time offsets, and the reason for those that are not used.
     log : LogFields
@@ -38,11 +41,19 @@ class Calibrated:
     rig : Rig
     """
 
-    refined: Refined
+    refined: RefinedPoses
+    solution: Solution
     pairs: Pairs
     log: LogFields
     cameras: dict[str, Camera]
     rig: Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated(Solved):
+    """A calibration from a log, just computed: `refined` is a `Refined`."""
+
+    refined: Refined
 
 
 def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progress | None = None) -> Calibrated:
@@ -118,7 +129,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         ),
         contradicted=contradicted(outliers),
     )
-    return Calibrated(refined, settled.pairs, fields, dict(metadata.cameras), rig)
+    return Calibrated(refined, refined.solution, settled.pairs, fields, dict(metadata.cameras), rig)
 
 
 def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:

@@ -19,7 +19,7 @@ from gtsam_rwhec.pipeline.log_contract import detections_topic
 from gtsam_rwhec.results.stage_reports import TrackCount
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import Tag, Target
+from gtsam_rwhec.vision.targets import Tag, Target, bare_family
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +137,3 @@ def target_of(record: DetectionRecord, targets: Iterable[Target]) -> Target | No
             "of these targets out of the rig file"
         )
     return mine[0] if mine else None
-
-
-def bare_family(name: str) -> str:
-    """Drivers' words for one family made one: tag36h11, 36h11, tagStandard36h11, DICT_APRILTAG_36h11."""
-    word = name.lower()
-    for prefix in ("dict_apriltag_", "dict_", "aruco_", "apriltag_", "tag"):
-        word = word.removeprefix(prefix)
-    return word

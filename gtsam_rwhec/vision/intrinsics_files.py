@@ -84,7 +84,7 @@ def _kalibr_camera(file: YamlFile, name: str) -> Camera:
     coefficients = section.get("distortion_coeffs", () if model == "none" else None)
     D = _numbers(file, (name, "distortion_coeffs"), coefficients, None if model == "none" else 4)
     K = np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
-    return Camera.of(width, height, model, K, D, file.fault((name,), "").removesuffix(": "))
+    return Camera.of(width, height, model, K, D, file.place((name,)))
 
 
 def read_calibration_yaml(path: str | Path) -> Camera:
@@ -114,7 +114,7 @@ def read_calibration_yaml(path: str | Path) -> Camera:
     key = _key(file, _MATRIX)
     K = _matrix(file, key, 9).reshape(3, 3)
     D = _matrix(file, _key(file, _COEFFICIENTS), None)
-    return Camera.of(width, height, _model(file, D), K, D, file.fault((key,), "").removesuffix(": "))
+    return Camera.of(width, height, _model(file, D), K, D, file.place((key,)))
 
 
 def _model(file: YamlFile, D: Array) -> str:

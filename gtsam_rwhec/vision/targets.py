@@ -6,6 +6,7 @@ printed, z out of the paper. Corners of a tag are in OpenCV's order: top left, t
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -175,6 +176,17 @@ class Checkerboard:
 
 
 Target: TypeAlias = Tag | Charuco | AprilGrid | Checkerboard
+
+
+def bare_family(word: str) -> str:
+    """What the words of drivers for one family share: 36h11 of tag36h11, tagStandard36h11 and DICT_APRILTAG_36h11."""
+    return re.sub(r"^(dict_)?(apriltag_|aruco_)?(tag)?(standard)?", "", word.strip().lower())
+
+
+def family_named(word: str) -> str | None:
+    """The family that a driver means by a word; None if it is none of `FAMILIES`."""
+    bare = bare_family(word)
+    return next((family for family in (f"tag{bare}", f"aruco_{bare}") if family in FAMILIES), None)
 
 
 def _square(side_m: float) -> Array:
