@@ -5,8 +5,8 @@ information that the motions give of it is no more than the noise alone would fe
 open (``information.pair_information``). In units of that noise a free direction has a ratio of mean 1: a sum of about
 m = 2 N squares of noise over a noise variance estimated with nu degrees of freedom, an F variate. The threshold is its
 99.9 % quantile F(m, nu): a free direction is called determined once in a thousand. The noise of rotations
-and that of translations are estimated apart, each from about half of the equations to spare: three measurements with
-six to spare ask for a ratio of 130, a hundred for 1.5.
+and that of translations are estimated apart, each from about half of the degrees of freedom: three measurements with
+six of them ask for a ratio of 130, a hundred for 1.5.
 
 Rotation residuals know rotations only, so they are asked first; where they determine every rotation, the rest is about
 translations and scales at those rotations, and where not, everything is asked of all residuals together.

@@ -39,7 +39,7 @@ class SettledFit:
     optimum: Optimum
     information: Array
     factors: FactorsByPair
-    redundancy: dict[tuple[Group, str], float]
+    degrees_of_freedom: dict[tuple[Group, str], float]
     initial_cost: float
     iterations: int
 
@@ -49,7 +49,7 @@ def fit(
 ) -> SettledFit:
     """Optimise, and where weights depend on the answer or on the residuals, again until they are settled."""
     factors: FactorsByPair = dict.fromkeys(problem.pairs, AS_STATED)
-    redundancy: dict[tuple[Group, str], float] = {}
+    degrees_of_freedom: dict[tuple[Group, str], float] = {}
     state, values = start, model.values(start)
     iterations = 0
     if isinstance(model, GeodesicModel) and model.first_loss is not None:
@@ -74,18 +74,19 @@ def fit(
             components = model.next_factors(state, joint, factors, options.noise_groups)
             change = largest_change(factors, components.factors)
             settled = settled and change < SETTLED
-            redundancy = components.redundancy
+            degrees_of_freedom = components.degrees_of_freedom
             if not settled:
                 factors = components.factors
         if settled:
             break
     else:
-        few = sorted(redundancy, key=lambda key: redundancy[key])[:3]
+        few = sorted(degrees_of_freedom, key=lambda key: degrees_of_freedom[key])[:3]
         where = ", ".join(
-            f"the {component} of {group_label(group)}: {redundancy[group, component]:.2g}" for group, component in few
+            f"the {component} of {group_label(group)}: {degrees_of_freedom[group, component]:.2g}"
+            for group, component in few
         )
         warnings.warn(
-            f"the estimated noise did not settle in {MAX_ROUNDS} rounds; the fewest equations to spare have {where}. "
+            f"the estimated noise did not settle in {MAX_ROUNDS} rounds; the fewest degrees of freedom have {where}. "
             + (
                 "The noise given for A may explain the residuals already: give less, or B's noise (noise='given')"
                 if options.carrier_noise is not None
@@ -101,7 +102,9 @@ def fit(
             NotConvergedWarning,
             stacklevel=3,
         )
-    return SettledFit(graph, optimum, information, factors, redundancy, graph.error(model.values(start)), iterations)
+    return SettledFit(
+        graph, optimum, information, factors, degrees_of_freedom, graph.error(model.values(start)), iterations
+    )
 
 
 def _with_knowledge(

@@ -148,8 +148,8 @@ class GeodesicModel:
             step + np.minimum(lengths, step)
         )
         unknowns = sum(unknown.dimension for unknown in self.variables.unknowns)
-        spare = max(6 * len(lengths) - unknowns, 1)
-        square = float(np.sum((weight * lengths) ** 2)) / spare
+        degrees_of_freedom = max(6 * len(lengths) - unknowns, 1)
+        square = float(np.sum((weight * lengths) ** 2)) / degrees_of_freedom
         gain = float(np.mean(weight + slope * lengths / 6.0))
         if not gain > 0.05:
             raise NoiseError(
@@ -170,7 +170,9 @@ class GeodesicModel:
         )
         if not self.is_m_estimate:
             return components
-        return VarianceComponents(self._median_factors(state, factors, groups, components), components.redundancy)
+        return VarianceComponents(
+            self._median_factors(state, factors, groups, components), components.degrees_of_freedom
+        )
 
     def _whitened(self, state: State, factors: FactorsByPair) -> dict[Pair, Array]:
         at = self.linearize(state)
@@ -195,8 +197,8 @@ class GeodesicModel:
         ratios = {}
         for (group, i), values in squares.items():
             all_squares = np.concatenate(values)
-            spare = components.redundancy[group, COMPONENTS[i]] / (3.0 * len(all_squares))
-            ratios[group, i] = max(float(np.median(all_squares)) / float(chdtri(3, 0.5)) / spare, SMALLEST)
+            degrees_of_freedom = components.degrees_of_freedom[group, COMPONENTS[i]] / (3.0 * len(all_squares))
+            ratios[group, i] = max(float(np.median(all_squares)) / float(chdtri(3, 0.5)) / degrees_of_freedom, SMALLEST)
         return {
             pair: VarianceFactors(*(factor * ratios[group_of(pair, groups), i] for i, factor in enumerate(old)))
             for pair, old in factors.items()

@@ -34,12 +34,12 @@ class Movement:
 class PairNoise:
     """The noise of a pair's B that the covariances rest on, root mean square an axis, and how well it is known.
 
-    ``redundancy`` is equations to spare, (rotation, translation): infinite where the noise was given.
+    ``degrees_of_freedom``, (rotation, translation), is how many the noise was estimated with: infinite where given.
     """
 
     rotation_rad: float
     translation_m: float
-    redundancy: tuple[float, float]
+    degrees_of_freedom: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class RefinedPoses:
     @property
     def degrees_of_freedom(self) -> float:
         """Equations that the estimated noise rests on, the fewest of any group; infinite where it was given."""
-        return min((min(noise.redundancy) for noise in self.noise.values()), default=np.inf)
+        return min((min(noise.degrees_of_freedom) for noise in self.noise.values()), default=np.inf)
 
     def squared_radius(self, dimension: int, confidence: float = 0.95) -> float:
         """Up to which xi' covariance^-1 xi is inside the confidence ellipsoid.

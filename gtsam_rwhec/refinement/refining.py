@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtri
 
 from gtsam_rwhec.errors import (
     MeasurementsNotKeptError,
@@ -39,6 +39,7 @@ from gtsam_rwhec.refinement.weighting import group_of
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solving.weights import contradicted_by
 from gtsam_rwhec.trajectories.local_paths import WINDOW_S
 
 #: Times that outliers are chosen anew under the noise as it is; two or three are usual.
@@ -169,28 +170,21 @@ def refine(
     )
 
 
-#: A cost this many times what the given noise predicts makes covariances too small by its root, and is told.
-UNLIKELY = 2.0
-
-
 def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit, options: RefineOptions) -> None:
-    """Compare the residuals with what the noise as given predicts: half the equations to spare."""
+    """Warn where the residuals contradict the noise as given: covariances then are too small."""
     if options.robust not in ("none", "gnc"):  # a loss makes another cost
         return
     beliefs = [p for name, priors in problem.priors.items() if name not in problem.fixed for p in priors]
     equations = 6 * problem.number_of_measurements + sum(
         3 * (p.sigma is not None) + 3 * (p.kappa is not None) for p in beliefs
     )
-    spare = equations - sum(unknown.dimension for unknown in variables.unknowns)
-    if spare <= 0:
-        return
-    # Beyond doubt, too: a chi-square of few degrees of freedom may well be twice its mean.
-    if settled.optimum.cost > UNLIKELY * 0.5 * spare and chdtrc(spare, 2.0 * settled.optimum.cost) < 1e-3:
-        ratio = settled.optimum.cost / (0.5 * spare)
+    cost = settled.optimum.cost
+    ratio = contradicted_by(cost, equations - sum(unknown.dimension for unknown in variables.unknowns))
+    if ratio is not None:
         warnings.warn(
-            f"the residuals cost {settled.optimum.cost:.4g}, {ratio:.3g} times what the given noise predicts "
-            f"({0.5 * spare:.4g}): standard deviations are too small by about {math.sqrt(ratio):.2g}; take "
-            "noise='estimate', robust='gnc' if some measurements are wrong, or carrier_noise if A is not exact",
+            f"the residuals cost {cost:.4g}, {ratio:.3g} times what the given noise predicts ({cost / ratio:.4g}): "
+            f"standard deviations are too small by about {math.sqrt(ratio):.2g}; take noise='estimate', robust='gnc' "
+            "if some measurements are wrong, or carrier_noise if A is not exact",
             WeightsWarning,
             stacklevel=3,
         )
@@ -251,11 +245,14 @@ def _noise(model: Model, settled: SettledFit, options: RefineOptions, estimates:
     for pair, (rotation, translation) in model.given_noise.items():
         factors = settled.factors[pair]
         rotation, translation = rotation * math.sqrt(factors.rotation), translation * math.sqrt(factors.translation)
-        spare = (np.inf, np.inf)
+        degrees_of_freedom = (np.inf, np.inf)
         if estimates:
             group = group_of(pair, options.noise_groups)
-            spare = (settled.redundancy[group, "rotation"], settled.redundancy[group, "translation"])
-        result[pair] = PairNoise(rotation, translation, spare)
+            degrees_of_freedom = (
+                settled.degrees_of_freedom[group, "rotation"],
+                settled.degrees_of_freedom[group, "translation"],
+            )
+        result[pair] = PairNoise(rotation, translation, degrees_of_freedom)
     return result
 
 

@@ -221,11 +221,12 @@ class TruncatedLeastSquares:
         kept = float(chdtr(DOF + 2, self.threshold) / chdtr(DOF, self.threshold))
         number = int(inliers.sum())
         unknowns = sum(6.0 for name in self.problem.targets + self.problem.sensors if name not in self.problem.fixed)
-        freedom = kept * max(3.0 * number - 0.5 * unknowns, 1.0)
+        degrees_of_freedom = kept * max(3.0 * number - 0.5 * unknowns, 1.0)
         if number == 0:
             return self.factors
         return self._factors(
-            float(squares.rotation[inliers].sum()) / freedom, float(squares.translation[inliers].sum()) / freedom
+            float(squares.rotation[inliers].sum()) / degrees_of_freedom,
+            float(squares.translation[inliers].sum()) / degrees_of_freedom,
         )
 
     def _factors(self, rotation: float, translation: float) -> VarianceFactors:

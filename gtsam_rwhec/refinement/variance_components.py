@@ -40,10 +40,10 @@ SMALLEST = 1e-20
 
 @dataclass(frozen=True)
 class VarianceComponents:
-    """Factors, and by group and component how many equations to spare they rest on."""
+    """Factors, and by group and component how many degrees of freedom they rest on."""
 
     factors: FactorsByPair
-    redundancy: dict[tuple[Group, str], float]
+    degrees_of_freedom: dict[tuple[Group, str], float]
 
 
 @dataclass
@@ -95,7 +95,7 @@ def from_measurements(
     Raises
     ------
     NoiseError
-        When a group has no equation to spare.
+        When a group has no degree of freedom.
     """
     sums: dict[Group, _Sums] = {}
     for item in data:
@@ -124,12 +124,12 @@ def from_measurements(
     for item in data:
         old, step = factors[item.pair], steps[group_of(item.pair, groups)]
         updated[item.pair] = VarianceFactors(*(max(float(factor), SMALLEST) for factor in old * step))
-    redundancy: dict[tuple[Group, str], float] = {
+    degrees_of_freedom: dict[tuple[Group, str], float] = {
         (group, component): float(total.expected[k])
         for group, total in sums.items()
         for k, component in enumerate(COMPONENTS)
     }
-    return VarianceComponents(updated, redundancy)
+    return VarianceComponents(updated, degrees_of_freedom)
 
 
 def _step(group: Group, total: _Sums, consistency: float) -> Array:
@@ -171,7 +171,7 @@ def from_moments(
     Raises
     ------
     NoiseError
-        When a group has no equation to spare.
+        When a group has no degree of freedom.
     """
     sums: dict[tuple[Group, str], list[float]] = {}
     for part in parts:
@@ -194,9 +194,9 @@ def from_moments(
     )
 
 
-def _check(group: Group, component: str, spare: float, weighed: float) -> None:
+def _check(group: Group, component: str, degrees_of_freedom: float, weighed: float) -> None:
     """Refuse to estimate from nothing; ``weighed``: how much of the residuals' variance the factors make up."""
-    if spare > 0.5:
+    if degrees_of_freedom > 0.5:
         return
     where = group_label(group)
     if weighed < 0.5:
@@ -206,6 +206,7 @@ def _check(group: Group, component: str, spare: float, weighed: float) -> None:
         )
     joined = "" if group == ("all",) else "join groups (noise_groups='all'), "
     raise NoiseError(
-        f"the {component} noise of {where} cannot be estimated: {spare:.2g} equations to spare; measure more, {joined}"
+        f"the {component} noise of {where} cannot be estimated: {degrees_of_freedom:.2g} degrees of freedom; measure "
+        f"more, {joined}"
         "give less noise of A if you gave any, or give sigma and kappa (noise='given')"
     )

@@ -93,8 +93,8 @@ def _noise_sentence(refined: Refined) -> str:
     rows = noise_table(refined).rows
     if len(rows) != 1:
         return f"Noise of B: {source}; in the table."
-    rotation, translation, *spare = next(iter(rows.values()))
-    backing = f", with {spare[0]} and {spare[1]} equations to spare" if spare else ""
+    rotation, translation, *behind = next(iter(rows.values()))
+    backing = f", with {behind[0]} and {behind[1]} degrees of freedom" if behind else ""
     return f"Noise of B: {rotation}° and {translation} mm an axis, {source}{backing}."
 
 
@@ -138,14 +138,14 @@ def noise_table(refined: Refined) -> FrameTable:
         or len({(label(pair), cells) for pair, cells in noises.items()}) == len({label(pair) for pair in noises})
     )
     rows = {label(pair): cells for pair, cells in noises.items()}
-    headings = ("±°", "±mm") if refined.noise_source == "given" else ("±°", "±mm", "spare (°)", "spare (mm)")
-    title = "Noise of B an axis" + ("" if refined.noise_source == "given" else ", and equations to spare")
+    headings = ("±°", "±mm") if refined.noise_source == "given" else ("±°", "±mm", "d.o.f. (°)", "d.o.f. (mm)")
+    title = "Noise of B an axis" + ("" if refined.noise_source == "given" else ", and degrees of freedom")
     return FrameTable(title, kind, headings, {name: rows[name] for name in sorted(rows, key=natural_key)})
 
 
 def _noise_cells(noise: PairNoise) -> tuple[str, ...]:
     size = (f"{math.degrees(noise.rotation_rad):.3g}", f"{1e3 * noise.translation_m:.3g}")
-    return size + tuple(f"{spare:.0f}" for spare in noise.redundancy if np.isfinite(spare))
+    return size + tuple(f"{number:.0f}" for number in noise.degrees_of_freedom if np.isfinite(number))
 
 
 def _frame_table(title: str, kind: str, poses: Mapping[str, object], refined: Refined) -> FrameTable:

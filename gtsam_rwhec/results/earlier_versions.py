@@ -52,7 +52,8 @@ def as_version_4(raw: dict[str, Any]) -> dict[str, Any]:
     refined["frames"] = {frame["name"]: _without(frame, "name", "moved_mm", "moved_deg") for frame in frames}
     refined["noise"] = [
         {
-            **_only(pair, "target", "sensor", "redundancy"),
+            **_only(pair, "target", "sensor"),
+            "degrees_of_freedom": pair["redundancy"],
             "rotation_rad": pair["noise_rad"],
             "translation_m": pair["noise_m"],
         }

@@ -46,7 +46,7 @@ SENTENCE = "sentence"
 """What a record says in words, for people; not read back."""
 INFINITIES = {
     **dict.fromkeys(("lower_bound", "float_bound", "min_eigenvalue"), -math.inf),
-    **dict.fromkeys(("weakest", "redundancy", "standard_deviations_deg", "standard_deviations_mm"), math.inf),
+    **dict.fromkeys(("weakest", "degrees_of_freedom", "standard_deviations_deg", "standard_deviations_mm"), math.inf),
 }
 """Fields that may be infinite, and which infinity null stands for there."""
 

@@ -50,10 +50,9 @@ class Attempt:
         start: Start,
     ) -> None:
         self.form, self.tolerance, self.options, self.stages = form, tolerance, options, stages
-        with stages.of("descent"):
-            self.best = self._end_from(starts[0])
+        self.best = Descent(starts[0], np.inf, np.inf, 0, converged=False)
         self.start, self.multipliers, self.bound = start, Multipliers.KKT, NOTHING_YET
-        self.descend(starts[1:], start)
+        self.descend(starts, start)
         self.first_cost = self.best.cost
 
     def descend(self, starts: list[Array], start: Start) -> bool:
@@ -61,7 +60,7 @@ class Attempt:
         improved = False
         with self.stages.of("descent"):
             for R in starts:
-                end = self._end_from(R)
+                end = descend(self.form, R, self.options.max_descent_iterations)
                 if end.cost < self.best.cost - 0.01 * self.tolerance(end.cost):
                     improved = True
                     self.best, self.start, self.bound = end, start, NOTHING_YET
@@ -142,9 +141,6 @@ class Attempt:
             return Cause.PROVEN_AFTER_LOCAL_MINIMUM
         needed = self.multipliers is not Multipliers.KKT
         return Cause.PROVEN_WITH_REDUNDANT_CONSTRAINTS if needed else Cause.PROVEN
-
-    def _end_from(self, R: Array) -> Descent:
-        return descend(self.form, R, self.options.max_descent_iterations)
 
     def _add(self, kind: Multipliers, multipliers: Array, r: Array) -> None:
         """Keep the bound that multipliers give at a point, if it is the best."""

@@ -89,7 +89,7 @@ class LocalPaths:
             raise CountError(f"{where}: a time offset needs at least two stamps; there is {len(stamps)}")
         seconds = (stamps - stamps[0]) * 1e-9
         coefficients, leverage = np.zeros((len(stamps), 3, 6)), np.zeros(len(stamps))
-        squares, freedom = np.zeros(6), 0
+        squares, degrees_of_freedom = np.zeros(6), 0
         for i in range(len(stamps)):
             near = _neighbours(seconds, i)
             if len(near) < 2:
@@ -107,8 +107,8 @@ class LocalPaths:
             coefficients[i, : len(solution) - start] = solution[start:]
             leverage[i] = np.linalg.pinv(Z.T @ Z)[start, start]
             squares += ((xi - Z @ solution) ** 2).sum(axis=0)
-            freedom += len(near) - Z.shape[1]
-        return LocalPaths(coefficients[place], leverage[place], squares / max(freedom, 1))
+            degrees_of_freedom += len(near) - Z.shape[1]
+        return LocalPaths(coefficients[place], leverage[place], squares / max(degrees_of_freedom, 1))
 
     @staticmethod
     def along(path: Trajectory, stamps_ns: np.ndarray) -> LocalPaths:
@@ -143,11 +143,11 @@ class LocalPaths:
         inverse = np.linalg.pinv(Z)
         solution = inverse @ np.where(near[..., None], xi, 0.0)
         left = np.where(near[..., None], xi - Z @ solution, 0.0)
-        freedom = max(int((near.sum(axis=1) - 4).sum()), 1)
+        degrees_of_freedom = max(int((near.sum(axis=1) - 4).sum()), 1)
         powers = WINDOW_S ** np.arange(1, 4)
         leverage = (inverse[:, 1] ** 2).sum(axis=1) / WINDOW_S**2
         return LocalPaths(
-            (solution[:, 1:] / powers[:, None])[place], leverage[place], (left**2).sum(axis=(0, 1)) / freedom
+            (solution[:, 1:] / powers[:, None])[place], leverage[place], (left**2).sum(axis=(0, 1)) / degrees_of_freedom
         )
 
 

@@ -113,7 +113,7 @@ def test_estimated_noise_does_not_depend_on_what_was_given(residual: str) -> Non
         noise = next(iter(r.noise.values()))
         assert noise.rotation_rad == pytest.approx(SIGMA_RAD, rel=0.15)
         assert noise.translation_m == pytest.approx(SIGMA_M, rel=0.15)
-        assert sum(noise.redundancy) == pytest.approx(6 * 80 - 24, abs=0.5)
+        assert sum(noise.degrees_of_freedom) == pytest.approx(6 * 80 - 24, abs=0.5)
 
 
 def test_noise_by_sensor_and_by_pair() -> None:
@@ -317,7 +317,7 @@ def test_a_limit_of_iterations_is_told() -> None:
 
 
 def test_two_measurements() -> None:
-    """No equation to spare, one turn only: nothing estimates the noise, and no pose is determined."""
+    """No degree of freedom, one turn only: nothing estimates the noise, and no pose is determined."""
     problem = rig(1, 1, seed=5, number_of_measurements=2).problem
     r = refined(problem)
     assert len(r.free_directions) >= 1
@@ -358,7 +358,7 @@ def test_a_free_direction_just_off_an_axis_is_not_forgotten(tilt_rad: float) -> 
 
 
 def test_estimated_noise_of_correlated_covariances() -> None:
-    """Equations to spare are no more than there are, and covariances nine times too large are told to be."""
+    """Degrees of freedom are no more than there are, and covariances nine times too large are told to be."""
     factors = []
     for seed in range(6):
         generator = np.random.default_rng(seed)
@@ -370,7 +370,7 @@ def test_estimated_noise_of_correlated_covariances() -> None:
         problem.add("target0", "sensor0", raw.A, raw.B @ se3.expmap(xi), covariances=9.0 * covariances)
         r = refined(problem, noise="estimate")
         noise = r.noise["target0", "sensor0"]
-        assert sum(noise.redundancy) == pytest.approx(6 * 60 - 12, abs=1.0)
+        assert sum(noise.degrees_of_freedom) == pytest.approx(6 * 60 - 12, abs=1.0)
         given_m2 = 9.0 * np.einsum("nii->ni", covariances)[:, 3:].mean()
         factors.append(noise.translation_m**2 / given_m2)
     assert np.mean(factors) == pytest.approx(1.0 / 9.0, rel=0.2)

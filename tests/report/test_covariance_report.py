@@ -165,8 +165,8 @@ def test_noise_in_one_sentence_where_it_is_one(rig: rw.Refined, planar: rw.Refin
     noise = next(iter(rig.noise.values()))
     assert (
         f"Noise of B: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm an axis, "
-        f"estimated from the residuals, with {noise.redundancy[0]:.0f} and {noise.redundancy[1]:.0f} equations to "
-        "spare."
+        f"estimated from the residuals, with {noise.degrees_of_freedom[0]:.0f} and {noise.degrees_of_freedom[1]:.0f} "
+        "degrees of freedom."
     ) in refined_sentences(rig)
     assert "Noise of B an axis" not in printed(rig)
 

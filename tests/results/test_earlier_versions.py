@@ -74,9 +74,13 @@ def test_the_refined_poses_stood_under_refined(version: int) -> None:
         assert refined.moved[frame["name"]].translation_mm == frame["moved_mm"]
     for row in fields["pairs"]:
         pair = row["target"], row["sensor"]
-        spare = tuple(math.inf if value is None else value for value in row["redundancy"])
+        degrees = tuple(math.inf if value is None else value for value in row["redundancy"])
         noise = refined.noise[pair]
-        assert (noise.rotation_rad, noise.translation_m, noise.redundancy) == (row["noise_rad"], row["noise_m"], spare)
+        assert (noise.rotation_rad, noise.translation_m, noise.degrees_of_freedom) == (
+            row["noise_rad"],
+            row["noise_m"],
+            degrees,
+        )
         assert refined.inlier_counts.get(pair) == (None if row["inliers"] is None else tuple(row["inliers"]))
 
 

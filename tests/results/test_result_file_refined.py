@@ -143,7 +143,7 @@ def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
         (lambda raw: raw["refined"]["frames"].popitem(), "frames and moved are not of the targets and sensors"),
         (lambda raw: raw["sensors"][0].pop("translation_m"), "$.sensors[0].translation_m"),
         (lambda raw: raw["refined"].update(speed=1), "$.refined.speed"),
-        (lambda raw: raw["refined"]["noise"][1].update(redundancy=[1.0]), "redundancy"),
+        (lambda raw: raw["refined"]["noise"][1].update(degrees_of_freedom=[1.0]), "degrees_of_freedom"),
         (lambda raw: raw["refined"]["noise"][1].update(sensor="moon"), "have no pose: moon"),
     ],
 )
