@@ -17,7 +17,6 @@ from gtsam_rwhec.calibration.folds import Fold, Split, folds_of
 from gtsam_rwhec.calibration.prediction_errors import HoldOutError, PredictionError, prediction_errors
 from gtsam_rwhec.errors import (
     CountError,
-    MeasurementsNotKeptError,
     OptionError,
     OutlierError,
     RwhecWarning,
@@ -162,13 +161,8 @@ def _check(problem: Problem, folds: int, by: str) -> None:
         raise OptionError(f"by={by!r} is not one of {', '.join(map(repr, get_args(Split)))}")
     if not (isinstance(folds, int) and not isinstance(folds, bool) and folds >= 2):
         raise OptionError(f"folds={folds!r}; give a number of at least 2")
-    if not problem.pairs:
-        raise CountError("the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)")
-    if not problem.has_measurements:
-        raise MeasurementsNotKeptError(
-            "cross_validate calibrates without a part of the raw measurements, and they were not kept "
-            "(keep_measurements=False); make the problem with keep_measurements=True"
-        )
+    problem.require_pairs()
+    problem.require_raw_measurements("cross_validate")
     largest = max(problem.moments(*pair).count for pair in problem.pairs)
     if by == "time" and folds > largest:
         raise CountError(

@@ -7,7 +7,6 @@ from typing import Any
 from gtsam_rwhec.errors import (
     CountError,
     FrameError,
-    MeasurementsNotKeptError,
     OptionError,
     PriorError,
     RwhecError,
@@ -46,8 +45,7 @@ def check_problem(method: Method[Any], problem: Problem) -> None:
     name, takes = method.name, method.takes
     if not isinstance(problem, Problem):
         raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
-    if not problem.pairs:
-        raise CountError("the problem is empty: no measurements; add some with problem.add(target, sensor, A, B)")
+    problem.require_pairs()
     if not takes >= _FOR_SCALE[problem.scale]:
         scales = [mode for mode, needed in _FOR_SCALE.items() if takes >= needed]
         raise ScaleError(
@@ -61,10 +59,8 @@ def check_problem(method: Method[Any], problem: Problem) -> None:
         named = ", ".join(dict.fromkeys([*problem.fixed, *problem.priors]))
         raise PriorError(f"{name} has neither fixed frames nor priors, and there are some for {named}")
     _check_frames(method, problem)
-    if not problem.has_measurements and Takes.MOMENTS not in takes:
-        raise MeasurementsNotKeptError(
-            f"{name} needs the raw measurements, and they were not kept; make the problem with keep_measurements=True"
-        )
+    if Takes.MOMENTS not in takes:
+        problem.require_raw_measurements(name)
     if method.check is not None:
         method.check(problem)
 

@@ -85,6 +85,21 @@ class Problem(Knowledge):
         """Whether every raw measurement is still here."""
         return sum(kept.count for kept in self._kept.values()) == self.number_of_measurements
 
+    def require_pairs(self) -> None:
+        """Raise a CountError where nothing was measured."""
+        if not self._kept:
+            raise CountError(
+                "the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)"
+            )
+
+    def require_raw_measurements(self, what: str) -> None:
+        """Raise a MeasurementsNotKeptError where they are not all here; ``what`` needs them."""
+        if not self.has_measurements:
+            raise MeasurementsNotKeptError(
+                f"{what} needs the raw measurements, and they were not kept (keep_measurements=False); make the "
+                "problem with keep_measurements=True"
+            )
+
     @property
     def gauge(self) -> Gauge:
         """The origins that moments are about."""

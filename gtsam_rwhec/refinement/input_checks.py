@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError, ScaleError
+from gtsam_rwhec.errors import FrameError, OptionError, ScaleError
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.solving.arguments import check_against_knowledge
@@ -22,8 +22,7 @@ def check_inputs(problem: Problem, solution: Solution, options: RefineOptions) -
             f"the solution is of a problem with scale={solution.scale_mode!r}, this one has scale={problem.scale!r}; "
             "solve this problem first"
         )
-    if not problem.pairs:
-        raise CountError("the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)")
+    problem.require_pairs()
     try:
         check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
     except FrameError as error:
@@ -33,11 +32,8 @@ def check_inputs(problem: Problem, solution: Solution, options: RefineOptions) -
             "noise='given', but some measurements were added without sigma or kappa, so that no noise was given; "
             "take noise='estimate'"
         )
-    if options.robust == "gnc" and not problem.has_measurements:
-        raise MeasurementsNotKeptError(
-            "robust='gnc' weighs each measurement, and they were not kept (keep_measurements=False); make the problem "
-            "with keep_measurements=True"
-        )
+    if options.robust == "gnc":
+        problem.require_raw_measurements("robust='gnc'")
 
 
 def sensors_with_offset(problem: Problem, options: RefineOptions) -> tuple[str, ...]:

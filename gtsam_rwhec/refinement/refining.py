@@ -11,7 +11,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from gtsam_rwhec.errors import (
-    MeasurementsNotKeptError,
     NotConvergedWarning,
     NotUniqueWarning,
     OptionError,
@@ -221,11 +220,7 @@ def _data(problem: Problem, variables: Variables, options: RefineOptions) -> lis
                 "residual='geodesic', or add them with sigma and kappa"
             )
         return []
-    if not problem.has_measurements:
-        raise MeasurementsNotKeptError(
-            "the geodesic residual needs the raw measurements, and they were not kept (keep_measurements=False); make "
-            "the problem with keep_measurements=True, or refine with RefineOptions(residual='chordal')"
-        )
+    problem.require_raw_measurements("residual='geodesic' (unlike residual='chordal')")
     paths = local_paths(problem, tuple(variables.offsets), options.carrier_path)
     return [PairData.of(problem, pair, options, paths.get(pair)) for pair in problem.pairs]
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from gtsam_rwhec.errors import CountError, FrameError, PoseError, PriorError, ScaleError, UnderdeterminedError
+from gtsam_rwhec.errors import FrameError, PoseError, PriorError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.moments import Gauge, Moments, MomentStack
@@ -102,8 +102,7 @@ def parts_of(problem: Problem) -> list[Part]:
     UnderdeterminedError
         Fewer equations than unknowns in a part.
     """
-    if not problem.pairs:
-        raise CountError("the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)")
+    problem.require_pairs()
     frames = problem.targets + problem.sensors
     for what, names in (("fixed", problem.fixed), ("given a prior", problem.priors), ("scaled", problem.fixed_scales)):
         for name in names:

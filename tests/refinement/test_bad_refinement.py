@@ -60,12 +60,12 @@ def few() -> rw.Problem:
         (
             lambda: rw.refine(MOMENTS_ONLY, SOLUTION),
             rw.errors.MeasurementsNotKeptError,
-            r"geodesic residual needs the raw .*keep_measurements=True, or refine with .*chordal",
+            r"residual='geodesic' \(unlike residual='chordal'\) needs the raw .*keep_measurements=True",
         ),
         (
             lambda: rw.refine(MOMENTS_ONLY, SOLUTION, RefineOptions(residual="chordal", robust="gnc")),
             rw.errors.MeasurementsNotKeptError,
-            "robust='gnc' weighs each measurement",
+            "robust='gnc' needs the raw measurements",
         ),
         (
             lambda: rw.refine(unit_weights(), SOLUTION, RefineOptions(noise="given")),
