@@ -242,7 +242,8 @@ def test_refined_and_free_is_status_3(tmp_path: Path) -> None:
     assert done.returncode == 3
     assert without_stages(done.stderr) == [f"Written to {tmp_path / 'r.json'}."]
     assert " free " in done.stdout
-    assert done.stdout.count("Not determined: ") == 4
+    (direction,) = [line for line in done.stdout.splitlines() if line.startswith("Not determined: ")]
+    assert all(name in direction for name in ("tag_0", "tag_1", "cam_0", "cam_1"))  # they move together
     assert np.isinf(rw.read_refined(tmp_path / "r.json").covariance("cam_0")).any()
 
 
