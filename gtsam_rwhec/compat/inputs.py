@@ -35,7 +35,7 @@ def checked_poses(R: Any, t: Any, names: tuple[str, str]) -> tuple[Array, Array]
     Raises
     ------
     PoseError
-        A shape that is none of these, entries that are not finite, a matrix that is no rotation.
+        Other shapes, entries that are not finite, a matrix that is not a rotation.
     CountError
         Different numbers of rotations and translations.
     """

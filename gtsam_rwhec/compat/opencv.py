@@ -90,7 +90,7 @@ def calibrateHandEye(
     Raises
     ------
     PoseError
-        Shapes that are none of these, entries that are not finite, a matrix that is no rotation.
+        Other shapes, entries that are not finite, a matrix that is not a rotation.
     CountError
         Fewer than three poses, or different numbers.
     UnderdeterminedError
@@ -170,4 +170,4 @@ def _into(given: Array | None, answer: Array) -> Array:
 def _unknown(method: object, prefix: str) -> str:
     names = {name: value for name, value in globals().items() if name.startswith(f"{prefix}_")}
     listed = ", ".join(f"{name} = {value}" for name, value in names.items())
-    return f"method={method!r} is none of {listed}"
+    return f"method={method!r} is not one of {listed}"

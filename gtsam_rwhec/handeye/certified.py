@@ -22,7 +22,7 @@ def certified(request: Request) -> Outcome[Array]:
     """Certified minimum of sum |R_C R - R R_H|^2 + alpha^2 |(R_C - 1) T - R T_H + T_C|^2 (eq. 30, first).
 
     The library's cost J is that with 1 / sigma^2 = 2 alpha^2 w and kappa = 2 w for a motion of weight w. With an
-    unknown scale, t_C = scale * (true length), the equation is turned round, H X^-1 = X^-1 C, so that the scale is the
+    unknown scale, t_C = scale * (true length), the equation is inverted, H X^-1 = X^-1 C, so that the scale is the
     measured side's: the cost is then that of X^-1.
 
     Raises

@@ -45,9 +45,10 @@ def free_directions(request: Request, q: Array, values: Array, vectors: Array) -
     cost, V = request.cost, times_vectors(q)
     of_t, directions = np.linalg.eigh(V.T @ cost.M @ V)  # q' = (t / 2, 0) (x) q
     noise = max(float(q @ cost.M @ q) - request.noise_free_part, 0.0)
-    moves = directions[:, of_t <= _limit(noise, float(of_t[2]), cost.count)]
+    threshold = _threshold(cost.count)
+    moves = directions[:, of_t <= threshold * noise + ROUNDING * of_t[2]]
     noise = max(float(values[0]), 0.0)
-    free = values[1:] <= _limit(noise, float(np.trace(cost.S)), cost.count)
+    free = values[1:] <= threshold * noise + ROUNDING * np.trace(cost.S)
     turns = 2.0 * V.T @ vectors[:, 1:][:, free]  # q_a = (omega / 2, 0) (x) q: a turn in c's axes
     return _records(request, q, turns, moves)
 
@@ -59,17 +60,18 @@ def free_of_rotations_alone(request: Request) -> tuple[FreeDirection, ...]:
     translation along it.
     """
     values, vectors = request.cost.spectrum
-    limit = _limit(max(float(values[0]), 0.0), float(values[3]), request.cost.count)
+    limit = _threshold(request.cost.count) * max(float(values[0]), 0.0) + ROUNDING * values[3]
     q = vectors[:, 0]
     turns = times_vectors(q).T @ vectors[:, 1:][:, values[1:] <= limit]
     return _records(request, q, turns, turns)
 
 
-def _limit(noise: float, largest: float, count: int) -> float:
-    """Information up to which a direction is free, of what noise creates in the direction of the answer itself."""
-    lost_to_fit = count / (count - 1.0)
-    threshold = float(free_threshold(3.0 * count, 6 * count - 6))
-    return threshold * noise * lost_to_fit + ROUNDING * largest
+def _threshold(count: int) -> float:
+    """Information up to which a direction is free, over the noise in the direction of the answer itself.
+
+    Of a motion's three squares of noise in that direction, the fit takes away one part in ``count``.
+    """
+    return float(free_threshold(3.0 * count, 6 * count - 6)) * count / (count - 1.0)
 
 
 def _records(request: Request, q: Array, turns: Array, moves: Array) -> tuple[FreeDirection, ...]:

@@ -47,7 +47,7 @@ def dqnlopt_random(request: Request) -> Outcome[Array]:
         rng = np.random.default_rng(request.rng)
     except (TypeError, ValueError) as error:
         raise OptionError(
-            f"rng={request.rng!r} is no source of random numbers ({error}); give a numpy.random.Generator or a seed "
+            f"rng={request.rng!r} is not a source of random numbers ({error}); give a numpy.random.Generator or a seed "
             "that is not negative"
         ) from error
     q = rng.normal(size=4)

@@ -12,7 +12,7 @@ from gtsam_rwhec.handeye.cost import BLOCK
 from gtsam_rwhec.handeye.dual_quaternions import from_rows
 from gtsam_rwhec.handeye.signs import UNCERTAIN, resolve_signs
 
-#: Motions all smaller than this (rad, m) are none.
+#: When all motions are smaller than this (rad, m), nothing moved.
 STILL = 1e-14
 
 
@@ -50,7 +50,7 @@ def motions_of(C: PosesLike, H: PosesLike, order: QuaternionOrder | None = None)
     Raises
     ------
     PoseError
-        For what is no pose, with the argument and the motion named.
+        When a matrix is not a pose; the message names the argument and the motion.
     CountError
         Unequal numbers, or fewer than two motions.
     UnderdeterminedError

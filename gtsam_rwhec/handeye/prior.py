@@ -39,7 +39,7 @@ class DualQuaternionPrior:
     Raises
     ------
     PoseError, PriorError
-        For what is no pose, or weights that cannot be used.
+        When T is not a pose, or a weight cannot be used.
     """
 
     T: PoseLike

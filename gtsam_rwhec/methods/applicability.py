@@ -36,7 +36,7 @@ def refusal(method: Method[Any], problem: Problem) -> RwhecError | None:
 
 
 def check_problem(method: Method[Any], problem: Problem) -> None:
-    """Refuse what the method has no place for.
+    """Refuse a problem that the method cannot solve.
 
     Raises
     ------

@@ -108,7 +108,7 @@ def compare(
     CountError, FrameError, UnderdeterminedError
         For a problem that nothing can solve.
     OptionError
-        For a name that is none.
+        When a method's name is unknown.
     """
     chosen = [method_of(name) for name in (METHODS if methods is None else methods)]
     options = options or MethodOptions()

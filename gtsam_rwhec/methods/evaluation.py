@@ -24,7 +24,7 @@ class Evaluation:
     Attributes
     ----------
     cost : float
-        J (eq. 18), priors included; turned round where the certified solver turns it round.
+        J (eq. 18), priors included; of the inverted equation where the certified solver inverts it.
     residuals : dict of (target, sensor) to Residual
     free_directions : tuple of FreeDirection
         What the measurements leave undetermined, judged by this answer's residuals: where they are far larger
@@ -51,7 +51,7 @@ def evaluate(
     Raises
     ------
     FrameError, PoseError, PriorError, ScaleError
-        For an answer that is none of this problem.
+        When the answer lacks a frame, or contradicts what the problem fixes.
     """
     parts = parts_of(problem)
     check_against_knowledge(problem, X, Y, scale)

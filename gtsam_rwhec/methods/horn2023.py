@@ -6,7 +6,7 @@ quadratic form z'Qz over z = [p_X, p_X', ..., p_Y, p_Y', ...]. Each frame has tw
 **Signs.** Each measured rotation has two unit quaternions. The sign of a x - y b as a whole means nothing, that of b
 against a does: a measurement whose sign is wrong asks for the opposite of x and y, and there are 2^N problems of N
 measurements, of which one is meant. ``Signs`` are the ways to choose; what is wrong with them is counted in the answer.
-The relaxation is tight with wrong signs too: its certificate is of a problem that nobody asked.
+The relaxation is tight with wrong signs too: its certificate then proves the optimum of the wrong problem.
 
 In the RWHEC paper's Section 8.2 (four cameras, 108 poses, its released noise) continuous signs are lost in 2 runs of
 100 at kappa = 12 (6 of 300 measured; such a run ends about 40 degrees and half a metre away, and a few of them make the

@@ -18,7 +18,7 @@ def linear_method(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
 
 
 def start_of(problem: Problem, options: MethodOptions) -> tuple[Poses, Poses, float, str]:
-    """X, Y, scale, and what they are, in words.
+    """X, Y, scale, and a sentence that says where they are from.
 
     Left out, the start is Wang's answer; for several of both sides, or an unknown scale, which Wang's method has not,
     that of the same linear systems extended to them.
@@ -26,7 +26,7 @@ def start_of(problem: Problem, options: MethodOptions) -> tuple[Poses, Poses, fl
     Raises
     ------
     FrameError, PoseError, ScaleError
-        For a start that is none.
+        When the given start lacks a frame, or has something else than poses and a scale.
     UnderdeterminedError
         When the linear systems do not determine one.
     """

@@ -71,9 +71,9 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
     Raises
     ------
     OptionError
-        For a name that is none, or options that are none.
+        When the name is unknown, or the options are no ``MethodOptions``.
     CountError, FrameError, MeasurementsNotKeptError, NoiseError, PriorError, ScaleError
-        For a problem that the method cannot handle, in words.
+        When the method cannot solve the problem; the message says why.
     UnderdeterminedError
         When the measurements do not determine the method's equations.
     """

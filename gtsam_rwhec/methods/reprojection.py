@@ -82,7 +82,7 @@ class Observations:
         Raises
         ------
         CountError, FrameError, NoiseError, PoseError, TargetError
-            For shapes that do not fit, names without camera or target, what is no pose.
+            When shapes do not fit, a name has no camera or target, or a matrix is not a pose.
         """
         if not (np.isfinite(corner_px) and corner_px > 0.0):
             raise NoiseError(f"corner_px is {corner_px!r}; give a positive number of pixels")

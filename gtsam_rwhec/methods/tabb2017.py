@@ -4,8 +4,8 @@
 
     c1 = sum |A_i X - Y B_i|_F^2            c2 = sum |A_i - Y B_i X^-1|_F^2
 
-A left multiplication by a pose changes no Frobenius norm, so c2 is sum |B_i X^-1 - Y^-1 A_i|_F^2: c1 of the equation
-turned round, quadratic in the inverses' entries as c1 is in those of X and Y. "Simultaneous" minimises a cost over
+A left multiplication by a pose changes no Frobenius norm, so c2 is sum |B_i X^-1 - Y^-1 A_i|_F^2: c1 of the inverted
+equation, quadratic in the entries of the inverses as c1 is in those of X and Y. "Simultaneous" minimises a cost over
 rotations and translations together, "separable" its rotation part first and the translations for those rotations.
 Their third kind, reprojection errors (rp1), needs images: see ``reprojection``.
 """

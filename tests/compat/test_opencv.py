@@ -195,7 +195,7 @@ def test_bad_input_of_the_robot_world_call():
 
 
 def test_an_unknown_method_is_refused():
-    with pytest.raises(OptionError, match="method=9 is none of CALIB_HAND_EYE_TSAI = 0"):
+    with pytest.raises(OptionError, match="method=9 is not one of CALIB_HAND_EYE_TSAI = 0"):
         opencv.calibrateHandEye([], [], [], [], method=9)
 
 
