@@ -26,7 +26,6 @@ from gtsam_rwhec.rig import AprilGridTarget, CharucoTarget, Rig, parse_rig
 from gtsam_rwhec.rig.field_types import is_name
 from gtsam_rwhec.vision.dictionaries import dictionary
 from gtsam_rwhec.vision.tag_survey import tags_in_image
-from gtsam_rwhec.vision.targets import family_named
 
 STEP_NS = 100_000_000
 POSES = 12
@@ -332,18 +331,6 @@ def test_tags_of_small_families_that_were_seen_once_are_left_out() -> None:
     guesses, remarks = targets_seen(look({"tag16h5": tags}), [])
     assert [guess.name for guess in guesses] == ["tag16h5_3"]
     assert remarks == ["left out, seen too seldom to be sure: tag16h5 7"]
-
-
-@pytest.mark.parametrize(
-    ("word", "family"),
-    [
-        ("tag36h11", "tag36h11"), ("36h11", "tag36h11"), ("tagStandard36h11", "tag36h11"), ("Tag16h5", "tag16h5"),
-        ("DICT_5X5_100", "aruco_5x5_100"), ("DICT_APRILTAG_36h10", "tag36h10"), ("aruco_mip_36h12", "aruco_mip_36h12"),
-        ("", None), ("tagCircle21h7", None),
-    ],
-)  # fmt: skip
-def test_drivers_words_for_families(word: str, family: str | None) -> None:
-    assert family_named(word) == family
 
 
 def test_each_place_is_one_tag() -> None:

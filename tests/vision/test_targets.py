@@ -9,7 +9,7 @@ import pytest
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.vision.dictionaries import dictionary, modules
 from gtsam_rwhec.vision.tag_survey import BY_TRUST
-from gtsam_rwhec.vision.targets import FAMILIES, AprilGrid, Charuco, Checkerboard, Tag, Target
+from gtsam_rwhec.vision.targets import FAMILIES, AprilGrid, Charuco, Checkerboard, Tag, Target, family_named
 
 TAG = Tag("tag", "tag36h11", 3, 0.12)
 BOARD = Charuco("board", "aruco_5x5_100", 7, 5, 0.04, 0.03)
@@ -123,3 +123,15 @@ def test_the_widest_dictionaries_begin_with_the_others() -> None:
 def test_what_cannot_be_printed(make: object, words: str) -> None:
     with pytest.raises(TargetError, match=rf"^target t: .*{words}"):
         make()  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("word", "family"),
+    [
+        ("tag36h11", "tag36h11"), ("36h11", "tag36h11"), ("tagStandard36h11", "tag36h11"), ("Tag16h5", "tag16h5"),
+        ("DICT_5X5_100", "aruco_5x5_100"), ("DICT_APRILTAG_36h10", "tag36h10"), ("aruco_mip_36h12", "aruco_mip_36h12"),
+        ("", None), ("tagCircle21h7", None),
+    ],
+)  # fmt: skip
+def test_drivers_words_for_families(word: str, family: str | None) -> None:
+    assert family_named(word) == family
