@@ -20,7 +20,7 @@ def naive_cost(
     form: str = "direct",
     gauge: Gauge | None = None,
 ) -> float:
-    """J of Problem 3 ("direct") or of the equation turned round ("inverse"), priors included, by plain loops.
+    """J of Problem 3 ("direct") or of the inverse equation ("inverse"), priors included, by plain loops.
 
     The residuals turned round are those of the origin of the target's carrier (for motions, the sensor's), so they
     depend on where that is: ``gauge`` says.

@@ -9,7 +9,7 @@ One column of features per measurement, 25 of them::
     f = [vec R_A (9), t_A (3), vec R_B (9), t_B (3), 1]          (vec stacks columns)
 
 ``translation = sum f f' / sigma^2`` holds everything that eqs. 35-41 of the RWHEC paper need, for Problem 3 and for
-the equation turned round (one scale per target); ``rotation = sum kappa vec(R_A) vec(R_B)'`` all that L(G^rho) needs.
+the inverse equation (one scale per target); ``rotation = sum kappa vec(R_A) vec(R_B)'`` all that L(G^rho) needs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import LARGEST_M, Array, checked_rows
 
 R_A, T_A, R_B, T_B, ONE = slice(0, 9), slice(9, 12), slice(12, 21), slice(21, 24), 24
-#: The features of the equation turned round, B X^-1 = Y^-1 A: A and B change places.
+#: The features of the inverse equation, B X^-1 = Y^-1 A: A and B change places.
 SWAPPED = np.r_[12:24, 0:12, 24]
 #: Measurements handled at once: blocks of this many stay in the processor's cache.
 BLOCK = 2048
@@ -45,7 +45,8 @@ class Gauge:
         """The reference that makes the translations of ``A`` (N, 4, 4) small: min |R_A c + t_A - a|^2 over a, c.
 
         Where ``motion`` (N,) says so, both ends are the sensor's carrier (AX = XB): c = a. A component that the
-        motions leave open stays small (minimum norm). Poses that are none give the zero gauge; the check is elsewhere.
+        motions leave open stays small (minimum norm). Numbers too large for poses, which ``Problem.add`` refuses later,
+        give the gauge zero.
         """
         if not np.abs(A).max() <= LARGEST_M:
             return Gauge()
@@ -226,9 +227,9 @@ def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array
     Parameters
     ----------
     translation : (E, 25, 25) array
-        Second moments of the features, about the gauge; permuted by ``SWAPPED`` for the equation turned round.
+        Second moments of the features, about the gauge; permuted by ``SWAPPED`` for the inverse equation.
     rotation : (E, 9, 9) array
-        sum kappa vec(R_A) vec(R_B)' (transposed for the equation turned round).
+        sum kappa vec(R_A) vec(R_B)' (transposed for the inverse equation).
     kappa : (E,) array
 
     Returns

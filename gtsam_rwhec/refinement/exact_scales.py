@@ -1,4 +1,4 @@
-"""From the optimum of the equation turned round to that of the physical one, where scales are the targets' own.
+"""From the optimum of the inverse equation to that of the physical one, where scales are the targets' own.
 
 With a scale for each target the certified form is C X'_j = Y'_k A (DESIGN fact 7): what noise does to the measured
 rotation acts on a lever arm there, and its optimum's physical residuals are larger than sigma says. Outliers are told

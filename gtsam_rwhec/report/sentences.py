@@ -31,7 +31,7 @@ def certificate_sentence(certificate: Certificate) -> str:
     if certificate.status is Status.CERTIFIED:
         return f"Certified globally optimal: {proof}."
     if certificate.status is Status.CERTIFIED_NOT_UNIQUE:
-        return f"Certified, but not unique: {proof}, yet others cost as little, up to noise."
+        return f"Certified, but not unique: {proof}; other answers fit as well, up to noise."
     if certificate.status is Status.GAP:
         return f"Not certified: {proof}; {certificate.reason}."
     return f"Not certified: this answer costs {certificate.cost:.10g}; {certificate.reason}."
@@ -74,7 +74,7 @@ def scale_sentence(solution: Solution) -> str:
 def weights_sentence(solution: Solution) -> str:
     """What the cost may be compared with."""
     if solution.is_relative:
-        return "Weights: sigma or kappa was not given; 1 (m) stood in for it, and costs and covariances are relative."
+        return "Weights: sigma or kappa was not given, and 1 (m) was used; costs and covariances are relative."
     if solution.certificate.objective.form == "inverse":
         return "Weights: as given; the cost is that of the inverse equation B X^-1 = Y^-1 A, which is no chi-square."
     return "Weights: as given; if they are true, the cost is half a chi-square."

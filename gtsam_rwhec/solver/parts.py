@@ -15,7 +15,7 @@ from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.priors import Prior
 from gtsam_rwhec.problem.problem import Problem
 
-#: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" the equation turned round, B X^-1 = Y^-1 A, which
+#: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" the inverse equation, B X^-1 = Y^-1 A, which
 #: a scale for each target needs (DESIGN fact 7).
 Kind = Literal["direct", "inverse"]
 #: Beyond this many times the translations' spread, moving the gauge costs digits (its square, of sixteen).
@@ -142,7 +142,7 @@ def _part(problem: Problem, members: frozenset[str]) -> Part:
     sensors = tuple(name for name in problem.sensors if name in members)
     gauge, moments = _centred(problem, pairs)
     priors = {name: problem.priors[name] for name in problem.priors if name in members}
-    turned_round = problem.scale == "per_target" or (
+    is_inverse = problem.scale == "per_target" or (
         problem.scale == "shared" and any(p.sigma is not None for beliefs in priors.values() for p in beliefs)
     )
     shift = {name: gauge.target_carrier for name in targets} | {name: gauge.sensor_carrier for name in sensors}
@@ -161,7 +161,7 @@ def _part(problem: Problem, members: frozenset[str]) -> Part:
         },
         fixed_scales={name: s for name, s in problem.fixed_scales.items() if name in members},
         gauge=gauge,
-        kind="inverse" if turned_round else "direct",
+        kind="inverse" if is_inverse else "direct",
         scale=problem.scale,
         is_relative=problem.is_relative,
     )

@@ -1,4 +1,4 @@
-"""``certify``: anybody's answer in, its certificate out."""
+"""``certify``: the certificate of an answer, whoever found it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def certify(
     options: SolveOptions | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
-    """Certify anybody's answer: its cost against a rigorous bound on what any answer costs.
+    """Certify a given answer: its cost against a rigorous bound on what any answer costs.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def certify(
     Raises
     ------
     FrameError, PoseError, ScaleError
-        For an answer that lacks a frame, has something that is no pose, or a scale that is none.
+        For an answer that lacks a frame, or has an invalid pose or scale.
     PriorError, ScaleError
         For an answer that contradicts a fixed frame or a known scale.
     """

@@ -1,4 +1,4 @@
-"""From the certified optimum of the equation turned round to the physical one."""
+"""From the certified optimum of the inverse equation to the physical one."""
 
 from __future__ import annotations
 

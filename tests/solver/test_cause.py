@@ -1,0 +1,66 @@
+"""Causes and paths: facts, and their words."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from gtsam_rwhec.solver import Cause, Multipliers, SearchPath, Start, Status
+
+FIGURES = {
+    "cost": 2.0,
+    "free_directions": 3.0,
+    "mirror_cost": 1.0,
+    "frames": 130.0,
+    "max_dense_frames": 120.0,
+    "relaxation_cost": 1.5,
+    "better_cost": 1.0,
+    "reduced_cost": 1.9,
+    "reduced_bound": 2.5,
+}
+
+
+@pytest.mark.parametrize("cause", list(Cause))
+def test_every_cause_has_a_sentence_and_a_status(cause: Cause) -> None:
+    said = cause.sentence(FIGURES)
+    assert said
+    assert not set(said) & set("{}")
+    if cause is not Cause.NOT_RECORDED:
+        assert cause.status in Status
+        assert cause.is_proven == (cause.status is Status.CERTIFIED)
+
+
+def test_the_three_reasons_of_design_fact_4_are_three_causes() -> None:
+    redundant, local, not_tight = (
+        Cause.PROVEN_WITH_REDUNDANT_CONSTRAINTS,
+        Cause.PROVEN_AFTER_LOCAL_MINIMUM,
+        Cause.NOT_TIGHT,
+    )
+    assert [cause.status for cause in (redundant, local, not_tight)] == [Status.CERTIFIED, Status.CERTIFIED, Status.GAP]
+
+
+@pytest.mark.parametrize(
+    ("start", "multipliers", "mirrored"), list(itertools.product(Start, Multipliers, (False, True)))
+)
+def test_a_path_is_read_back_from_its_words(start: Start, multipliers: Multipliers, mirrored: bool) -> None:
+    path = SearchPath(start, multipliers, is_mirrored=mirrored)
+    assert SearchPath.parse(str(path)) == path
+
+
+@pytest.mark.parametrize(
+    ("text", "start", "multipliers"),
+    [
+        ("relaxation, small dual", Start.INTERIOR_POINT, Multipliers.ALL_CONSTRAINTS),
+        ("relaxation with alpha >= 0", Start.NONNEGATIVE_SCALE, Multipliers.RELAXATION),
+        ("spectral start, dual, better start, small dual", Start.SPECTRAL, Multipliers.KKT),
+    ],
+)
+def test_paths_of_older_files_are_read(text: str, start: Start, multipliers: Multipliers) -> None:
+    path = SearchPath.parse(text)
+    assert (path.start, path.multipliers) == (start, multipliers)
+
+
+def test_what_is_no_path_is_refused() -> None:
+    with pytest.raises(ValueError, match="guess"):
+        SearchPath.parse("guess, dual")
