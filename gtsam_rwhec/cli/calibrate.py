@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,7 +25,7 @@ from gtsam_rwhec.cli.options import (
     TargetsOption,
     WorkersOption,
 )
-from gtsam_rwhec.cli.roads import refuse_others
+from gtsam_rwhec.cli.roads import refuse
 from gtsam_rwhec.cli.stage_display import StageDisplay
 
 Method = Literal["auto", "sdp", "local"]
@@ -53,16 +53,10 @@ class FolderOptions:
     sigma: float | None
     kappa: float | None
     method: Method
+    initial: Path | None
     targets: str
     sensors: str
     output: Path | None
-
-
-@dataclass(frozen=True)
-class StartOptions:
-    """What the method ``local`` takes."""
-
-    initial: Path
 
 
 @dataclass(frozen=True)
@@ -82,16 +76,17 @@ class RefinementOptions:
         return rw.CarrierNoise(math.radians(self.carrier_noise_deg), 1e-3 * self.carrier_noise_mm)
 
 
-# Why a way refuses the options of the others, and what to do.
-NOT_FOR_A_LOG = dict.fromkeys(
-    (FolderOptions, StartOptions, RefinementOptions),
-    "not for a log. Its rig file states sizes, noise and names, and its calibration is always refined. Change the rig "
-    "file, or leave the option out.",
+OF_LOG, OF_FOLDER, OF_REFINEMENT = (
+    frozenset(field.name for field in fields(record)) for record in (LogOptions, FolderOptions, RefinementOptions)
 )
-NOT_FOR_A_FOLDER: dict[type, str] = {
-    LogOptions: "only for a log. A folder of CSV files has no images: leave the option out.",
-    StartOptions: "only with --method local. Add --method local, or leave the option out.",
-    RefinementOptions: "only with --refine. Add --refine given or --refine estimate, or leave the option out.",
+# What each way refuses: why, what to do, and the options.
+NOT_FOR_A_LOG = {
+    "not for a log. Its rig file states sizes, noise and names, and its calibration is always refined. Change the rig "
+    "file, or leave the option out.": (OF_FOLDER | OF_REFINEMENT) - OF_LOG,
+}
+NOT_FOR_A_FOLDER = {"only for a log. A folder of CSV files has no images: leave the option out.": OF_LOG - OF_FOLDER}
+NOT_WITHOUT_REFINEMENT = NOT_FOR_A_FOLDER | {
+    "only with --refine. Add --refine given or --refine estimate, or leave the option out.": OF_REFINEMENT
 }
 
 
@@ -141,19 +136,17 @@ def calibrate(
     static_tf.launch.py, tf.yaml, rig.urdf.xacro, camchain.yaml and plots.
     """
     if rig is not None or is_log(source):
-        refuse_others(context, [LogOptions], NOT_FOR_A_LOG)
+        refuse(context, NOT_FOR_A_LOG)
         if output is None:
             raise typer.BadParameter("the calibration of a log is a folder of files: say which with -o FOLDER")
         return calibrate_log(LogOptions(source, rig, images, workers, output))
-    records = [FolderOptions, *([StartOptions] if method == "local" else []), *([RefinementOptions] if refine else [])]
-    refuse_others(context, records, NOT_FOR_A_FOLDER)
-    if method == "local" and initial is None:
-        raise typer.BadParameter("--method local starts from an earlier result: say which with --initial FILE")
+    refuse(context, NOT_WITHOUT_REFINEMENT if refine is None else NOT_FOR_A_FOLDER)
+    if (method == "local") != (initial is not None):
+        raise typer.BadParameter("--method local and --initial FILE go together: give both, or neither")
     if (carrier_noise_deg is None) != (carrier_noise_mm is None):
-        raise typer.BadParameter("--carrier-noise-deg and --carrier-noise-mm go together: give both")
+        raise typer.BadParameter("--carrier-noise-deg and --carrier-noise-mm go together: give both, or neither")
     return calibrate_folder(
-        FolderOptions(source, scale, sigma, kappa, method, targets, sensors, output),
-        None if initial is None else StartOptions(initial),
+        FolderOptions(source, scale, sigma, kappa, method, initial, targets, sensors, output),
         None if refine is None else RefinementOptions(refine, robust, carrier_noise_deg, carrier_noise_mm),
     )
 
@@ -180,9 +173,7 @@ def calibrate_log(options: LogOptions) -> ExitStatus:
     return status
 
 
-def calibrate_folder(
-    options: FolderOptions, start: StartOptions | None, refinement: RefinementOptions | None
-) -> ExitStatus:
+def calibrate_folder(options: FolderOptions, refinement: RefinementOptions | None) -> ExitStatus:
     """Solve, refine where that is asked for, write the result and print the report."""
     check_folder_of(options.output)
     with StageDisplay() as stage, said_in_the_report():
@@ -197,8 +188,8 @@ def calibrate_folder(
             keep_measurements=refinement is not None,
         )
         initial = None
-        if start is not None:
-            earlier = rw.read_solution(start.initial)
+        if options.initial is not None:
+            earlier = rw.read_solution(options.initial)
             initial = (earlier.X, earlier.Y, earlier.scale)
         solution = rw.solve(problem, method=options.method, initial=initial, progress=stage)
         refined = None

@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from gtsam_rwhec.cli import calibrate, convert, options
 from gtsam_rwhec.cli.app import app
-from gtsam_rwhec.cli.roads import names
 from gtsam_rwhec.logs.image_folder import Columns
 from gtsam_rwhec.problem import ScaleMode
 from gtsam_rwhec.refinement.options import NoiseSource, Robust
@@ -36,36 +35,32 @@ VALUES = {
     "workers": "2",
 }
 
+# What is typed, what the way refuses, and what it takes.
 ROADS = {
-    "log": (LOG, calibrate.NOT_FOR_A_LOG, [calibrate.LogOptions]),
-    "folder": (FOLDER, calibrate.NOT_FOR_A_FOLDER, [calibrate.FolderOptions]),
-    "local": (
-        (*FOLDER, "--method", "local", "--initial", "x.json"),
-        calibrate.NOT_FOR_A_FOLDER,
-        [calibrate.FolderOptions, calibrate.StartOptions],
-    ),
+    "log": (LOG, calibrate.NOT_FOR_A_LOG, calibrate.OF_LOG),
+    "folder": (FOLDER, calibrate.NOT_WITHOUT_REFINEMENT, calibrate.OF_FOLDER),
     "refined": (
         (*FOLDER, "--refine", "given"),
         calibrate.NOT_FOR_A_FOLDER,
-        [calibrate.FolderOptions, calibrate.RefinementOptions],
+        calibrate.OF_FOLDER | calibrate.OF_REFINEMENT,
     ),
-    "bag": (BAG, convert.NOT_FOR_A_BAG, [convert.BagOptions]),
+    "bag": (BAG, convert.NOT_FOR_A_BAG, {"source", "output", "poses"}),
 }
 # These choose the way, and so are never passed over.
-CHOOSING = {"folder": {"rig", "refine"}, "local": {"rig", "refine"}, "refined": {"rig"}, "bag": {"poses"}}
+CHOOSING = {"folder": {"rig", "refine"}, "refined": {"rig"}}
 
 
-def names_of(records: Collection[type[Any]]) -> frozenset[str]:
-    """The parameters that these records hold."""
-    return frozenset[str]().union(*map(names, records))
+def names_of(refused: Mapping[str, Collection[str]]) -> set[str]:
+    """The parameters that are refused, for whatever reason."""
+    return set().union(*refused.values())
 
 
 def passed_over() -> list[tuple[str, str]]:
     """Each way with each option that it does not take, and that does not choose the way either."""
     return [
         (road, name)
-        for road, (_, others, taken) in ROADS.items()
-        for name in sorted(names_of(others) - names_of(taken) - CHOOSING.get(road, set()))
+        for road, (_, refused, _) in ROADS.items()
+        for name in sorted(names_of(refused) - CHOOSING.get(road, set()))
     ]
 
 
@@ -74,24 +69,24 @@ def test_an_option_that_would_be_passed_over_is_refused(
     road: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    arguments, others, _ = ROADS[road]
+    arguments, refused, _ = ROADS[road]
     (parameter,) = [p for p in COMMANDS[arguments[0]].params if p.name == name]
     option = max(parameter.opts, key=len)
     value = VALUES.get(name, parameter.default)
     given = [option] if value is None else [option, value]
     done = CliRunner().invoke(app, [str(argument) for argument in (*arguments, *given)])
     assert done.exit_code == 2
-    said = " ".join(done.stderr.replace("│", " ").split())
-    record = next(record for record in others if name in names(record))
-    assert f"{option}: {others[record]}" in said
+    (why,) = [why for why, names in refused.items() if name in names]
+    assert f"{option}: {why}" in " ".join(done.stderr.replace("│", " ").split())
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("road", ROADS)
-def test_every_option_is_taken_or_refused(road: str) -> None:
-    arguments, others, taken = ROADS[road]
+def test_every_option_is_either_taken_or_refused(road: str) -> None:
+    arguments, refused, taken = ROADS[road]
     parameters = {parameter.name for parameter in COMMANDS[arguments[0]].params} - {"help"}
-    assert parameters == names_of(taken) | names_of(others)
+    assert parameters == names_of(refused) | taken
+    assert not names_of(refused) & taken
 
 
 def test_choices_are_those_of_the_library() -> None:
