@@ -95,6 +95,7 @@ TABLE: dict[str, dict[str, str]] = {
         "problem/test_selection.py": "variance_factors",
     },
     "gtsam_rwhec/refinement": {
+        "refinement/test_bad_refinement.py": "input_checks",
         "refinement/test_carrier_noise.py": "graph pair_data",
         "refinement/test_coverage.py": "variance_components",
         "refinement/test_exact_scales.py": "certified_fit",
