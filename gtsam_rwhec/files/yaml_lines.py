@@ -3,6 +3,7 @@
 Only what people write by hand is read: one document of mappings, lists and scalars. Aliases (which can blow a small
 file up), tags (which can stand for any object), keys given twice and keys that are no text are refused. A scalar
 without quotes is a number, true, false or null as in YAML 1.2: ``1e-3`` is a number, ``no`` and ``12:30`` are text.
+PyYAML parses the file; its own constructor takes ``1e-3`` for text, ``no`` for false and the last of two equal keys.
 """
 
 from __future__ import annotations

@@ -3,6 +3,11 @@
 Nothing in the file is trusted: lengths are held against the file's size, decompression stops at a limit, checksums are
 compared. A file without an index (or with one that does not fit) is read through once; one that ends too early is read
 as far as it goes, and `losses` says what is missing.
+
+The records are read by the `mcap` library. Finding the blocks, opening them and cutting them into messages is ours.
+Measured on 2026-11-21 with mcap 1.6.0 (tests/benchmarks/own_code_against_libraries.py): a message takes 1.0 us, with
+mcap's reader 8 us. Of 20,000 messages in a file with one damaged chunk mcap's reader loses all, this one 4,100; in a
+file that breaks off at 70 % all, and 3,600. mcap opens LZ4 chunks without a limit on their size.
 """
 
 from __future__ import annotations

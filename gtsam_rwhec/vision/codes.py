@@ -4,6 +4,11 @@ OpenCV compares one candidate with one code after another: in large families thi
 with OpenCV 5 nearly all of it. So it is given only the tags that are looked for, and those of no target are found and
 read here, once an image for all families and without OpenCV's care for the last of them. (The candidates that OpenCV
 rejects will not do: of a tag and the outline of its white margin it hands out one.)
+
+Measured on 2026-11-21 with OpenCV 5.0.0 on the shipped log's images of 640 x 480, two families, one core
+(tests/benchmarks/own_code_against_libraries.py): finding and reading every quadrangle takes 6 ms an image as here, 38
+ms with ``Dictionary.identify`` for each quadrangle, and 255 ms with ``ArucoDetector`` and whole families. Detection of
+the targets takes 13 ms. All three read the same tags.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Width and height of compressed images as their headers state them: for a look before a file becomes gigabytes."""
+"""Width and height of compressed images as their headers state them: for a look before a file becomes gigabytes.
+
+The size must be no smaller than what OpenCV will decode. Measured on 2026-11-22
+(tests/benchmarks/own_code_against_libraries.py): of TIFFs that give their width twice imagesize 2.0.1 takes the last,
+and OpenCV the first. Of 771 damaged images that OpenCV 5 decodes, Pillow 13.0.0 refuses 5 and this module none.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Names beside points, placed so that they cover neither each other nor what is drawn."""
+"""Names beside points, placed so that they cover neither each other nor what is drawn.
+
+Measured on 2026-11-22 (tests/benchmarks/own_code_against_libraries.py): of 120 names among 1,200 points, those on
+another name or on a point are 1 here, 33 with adjustText 1.4.0 and 0 with textalloc 1.2.4; but textalloc cannot draw on
+a row of a figure (matplotlib's SubFigure), which our pictures need.
+"""
 
 from __future__ import annotations
 
