@@ -1,4 +1,4 @@
-"""From what a log holds to measurements that agree: synchronised, thinned, without gross outliers."""
+"""Cleaning of measurements: they are synchronised, thinned, and gross outliers are removed."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""What the messages of a log are read as: checked, SI units, one class for each kind of content.
+"""Records: what the messages of a log are read as, checked and in SI units, one class for each kind of content.
 
 Transforms are ``T_parent_child`` (4, 4), metres. Stamps are the messages' own (``header.stamp``, ``timestamp``),
 `logged_ns` is when the recorder wrote the message; both are integer nanoseconds. Arrays are views of larger ones that

@@ -15,9 +15,9 @@ from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-#: Stamps that go back by more than this, in the order in which messages were logged: a clock was set meanwhile.
+#: Where stamps go back by more than this, in the order of the log, a clock was set while it was recorded.
 BACKWARDS_S = 1.0
-#: Stamps from here on (the year 2116) are none; so differences and time offsets stay within 64 bits.
+#: Stamps must be before this (the year 2116), so that differences and time offsets fit into 64 bits.
 LATEST_NS = 1 << 62
 #: Topics that an error lists, at most: a stranger's log may have thousands.
 MOST_NAMED = 50

@@ -1,4 +1,4 @@
-"""Taking up a log that a stage wrote, with the rig file that is in it or with another: what of it still holds."""
+"""What must be done again when a log that a stage wrote is used with a changed rig file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gtsam_rwhec.logs import Log
 from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig
 from gtsam_rwhec.rig import Rig
 
-#: Keys of a sensor's section that detection goes by.
+#: Keys of a sensor's section that detection depends on.
 DETECTED_BY = ("images", "detections", "intrinsics")
 
 
@@ -18,7 +18,7 @@ DETECTED_BY = ("images", "detections", "intrinsics")
 class Changes:
     """Where a rig file differs from the one that a log was made with, by the stage that must be run again for it.
 
-    Sensors and targets that were left out, and what only the solution goes by (sizes, noise, robust), are no changes.
+    Sensors and targets that are left out do not count, nor does what only solving depends on (sizes, noise, robust).
     """
 
     detection: tuple[str, ...]
@@ -26,7 +26,7 @@ class Changes:
 
 
 def changes(made_with: Rig, rig: Rig) -> Changes:
-    """Compare."""
+    """Compare the rig file that a log was made with and another."""
     return Changes(tuple(_of_detection(made_with, rig)), tuple(_of_cleaning(made_with, rig)))
 
 

@@ -1,4 +1,4 @@
-"""Detections that a driver made: their corners made poses with the rig file's sizes, or their poses as they are."""
+"""Detections of a driver: poses are computed from its corners with the rig file's sizes, or taken as they are."""
 
 from __future__ import annotations
 

@@ -93,14 +93,15 @@ def problem_of(
     rig : Rig
         For its noise.
     offsets_s : dict of sensor to float
-        What A was taken with: the problem's stamps are the carriers'.
+        The time offsets at which A was taken: the stamps of the problem are those of the carriers' clock.
     free_sizes : collection of str
         Targets whose size is estimated.
 
     Raises
     ------
     NoiseError
-        Where ``noise: {corner_px: ...}`` is asked for and a measurement has no covariance; covariances that are none.
+        Where ``noise: {corner_px: ...}`` is asked for and a measurement has no covariance; a covariance is not positive
+        definite.
     """
     problem = Problem("per_target" if free_sizes else "known")
     has_covariances = all(measured.covariance is not None for measured in pairs.values())

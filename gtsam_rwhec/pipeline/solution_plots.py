@@ -59,7 +59,7 @@ def plot_all(solved: Solved, solved_path: str | Path, folder: Path) -> list[Path
 
 
 def plotted_residuals(solved: Solved) -> dict[Pair, PlottedMeasurement]:
-    """Each measurement against what the answer predicts of it."""
+    """The residuals of each pair: measurements against their predictions."""
     first = min(int(measured.stamps_ns.min()) for measured in solved.pairs.values() if len(measured.stamps_ns))
     result = {}
     for pair, measured in solved.pairs.items():

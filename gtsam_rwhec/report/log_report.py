@@ -30,14 +30,13 @@ def log_sentences(log: LogFields) -> list[str]:
     """What was looked at, and everything that was removed, by reason."""
     looked = ", ".join(f"{count} of {sensor}" for sensor, count in log.detection.images.items())
     sentences = [f"Looked at {looked} in {', '.join(log.detection.sources)}."]
-    for stage, tracks in (
-        ("Detections not used", log.detection.tracks),
-        ("Removed in cleaning", log.cleaning.tracks),
-        ("Left out by robust estimation", log.outliers),
+    rejected = {why for track in log.detection.tracks for why in track.removed}  # cleaning counts these again
+    for stage, tracks, told_before in (
+        ("Detections not used", log.detection.tracks, set[str]()),
+        ("Removed in cleaning", log.cleaning.tracks, rejected),
+        ("Left out by robust estimation", log.outliers, set[str]()),
     ):
-        reasons = _by_reason(
-            tracks, {why for t in log.detection.tracks for why in t.removed} if "clean" in stage else set()
-        )
+        reasons = _by_reason(tracks, told_before)
         if reasons:
             sentences.append(f"{stage}: {'; '.join(reasons)}.")
     for size in log.sizes:
@@ -133,12 +132,12 @@ def _table(log: LogFields) -> Table:
     return table
 
 
-def _by_reason(tracks: tuple[TrackCount, ...], known: set[str]) -> list[str]:
+def _by_reason(tracks: tuple[TrackCount, ...], told_before: set[str]) -> list[str]:
     """Each reason with its count and where it was met; reasons of an earlier stage are left to that one."""
     reasons: dict[str, list[tuple[TrackCount, int]]] = {}
     for track in tracks:
         for why, count in track.removed.items():
-            if why not in known:
+            if why not in told_before:
                 reasons.setdefault(why, []).append((track, count))
     return [
         f"{sum(count for _, count in found)} {why} ("

@@ -1,4 +1,4 @@
-"""Rig files: which sensors and targets there are, on which carriers, and where the log has what is needed of each."""
+"""Rig files: the sensors and targets, what carries them, and where the log has the data of each."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Which of a plane's two poses: by one extrinsic rotation for the whole track.
+"""The choice between a plane's two poses by one extrinsic rotation for the whole track.
 
 A_i X = Y B_i in every image, so R_A R_X = R_Y R_B with one R_X and one R_Y: what the carriers did and these two say
 how the target is turned in each image, to a degree or so, and its two poses are tens of degrees apart. Rotations and

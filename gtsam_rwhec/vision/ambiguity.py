@@ -1,4 +1,4 @@
-"""Which of a plane's two poses: decided over a whole track, not image by image.
+"""The choice between a plane's two poses, made over a whole track and not image by image.
 
 A far or nearly frontal plane looks almost the same in two poses, mirror images of each other about the line of sight.
 One image tells them apart by its reprojection errors alone, a little. A track tells more: between two images the
@@ -19,15 +19,17 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.agreement import LEAST_IMAGES, choose_by_agreement
 
-#: Of an angle between two images beyond what corner noise explains: clocks apart, an arm that is not exact (rad).
+#: Standard deviation of an angle between two images beyond corner noise (rad): time offsets, errors of the arm.
 SIGMA_TURN_RAD = float(np.radians(3.0))
-#: Where the carriers' turning is not known, how fast a target may turn against the camera (rad/s).
+#: How fast a target turns against the camera (rad/s, standard deviation) where the carriers' turning is not known.
 SIGMA_RATE_RAD_S = float(np.radians(60.0))
-#: Links over more than this say nothing.
+#: Two images further apart in time than this are not compared.
 LONGEST_LINK_S = 3.0
-#: No single link or image may decide against all others (in log-likelihood).
-MOST_OF_A_LINK, MOST_OF_AN_IMAGE = 8.0, 30.0
-#: Candidates nearer than this are one pose.
+#: The most (log-likelihood) that the comparison of two images may cost, so that it cannot outweigh all others.
+MOST_OF_A_LINK = 8.0
+#: The most (log-likelihood) that one image may cost, for the same reason.
+MOST_OF_AN_IMAGE = 30.0
+#: Two candidates whose rotations differ by less are one pose.
 SAME_RAD = float(np.radians(0.2))
 
 

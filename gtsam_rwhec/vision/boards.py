@@ -1,4 +1,4 @@
-"""Corners of boards: where squares meet, which blur leaves where they are."""
+"""Corners of boards: blur does not move the points where two dark squares meet."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard
 
 #: Of cornerSubPix: rounds, and the step (pixels) that ends them.
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
-#: A corner that refinement moves further than this share of its window went to another one.
+#: A corner that refinement moves by more than this share of its window is taken for another corner.
 MOST_MOVED = 0.8
 #: Windows at an AprilGrid's corners, half their size as shares of a tag's side, and of the gap between tags at most:
 #: first to find the corner (where black squares touch OpenCV's contours go astray by pixels), then to measure it.
 FIND, FIND_GAP, MEASURE, MEASURE_GAP = 0.2, 0.7, 0.13, 0.55
-#: Corners further than this from where the others say are somebody's finger, or another corner (pixels).
+#: A corner further than this (pixels) from where the other corners predict it is not used.
 ASTRAY_PX = 1.5
 #: Windows at a checkerboard's corners, half their size as a share of a square.
 OF_SQUARE = 0.4
@@ -97,7 +97,7 @@ def aprilgrid_corners(gray: Gray, board: AprilGrid, ids: np.ndarray, tags_px: Ar
 
 
 def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndarray:
-    """Which (n,) of a board's corners (n, 3) and (n, 2) agree with most of them; all where too few could tell."""
+    """Which (n,) of a board's corners (n, 3), seen at (n, 2), agree with most of them; all where there are too few."""
     everyone = np.ones(len(corners_m), dtype=bool)
     x = camera.undistort(corners_px)
     if len(corners_m) < 6 or not np.isfinite(x).all():
