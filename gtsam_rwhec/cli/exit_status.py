@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from gtsam_rwhec.results.verdict import Ground, Judgement
+import gtsam_rwhec as rw
 
 
 class ExitStatus(IntEnum):
@@ -32,15 +32,14 @@ HELP = (
 )
 
 
-_STATUS = {
-    Ground.NO_BOUND: ExitStatus.NOT_CERTIFIED,
-    Ground.NOT_CERTIFIED: ExitStatus.NOT_CERTIFIED,
-    Ground.NOT_UNIQUE: ExitStatus.NOT_UNIQUE,
-    Ground.CONTRADICTED: ExitStatus.CONTRADICTED,
-    Ground.SIZE_DOUBTED: ExitStatus.CERTIFIED,
-}
-
-
-def exit_status(judgement: Judgement) -> ExitStatus:
+def exit_status(judgement: rw.Judgement) -> ExitStatus:
     """The exit status that the gravest ground of a judgement leads to."""
-    return _STATUS[judgement.grounds[0]] if judgement.grounds else ExitStatus.CERTIFIED
+    ground = rw.Ground
+    status = {
+        ground.NO_BOUND: ExitStatus.NOT_CERTIFIED,
+        ground.NOT_CERTIFIED: ExitStatus.NOT_CERTIFIED,
+        ground.NOT_UNIQUE: ExitStatus.NOT_UNIQUE,
+        ground.CONTRADICTED: ExitStatus.CONTRADICTED,
+        ground.SIZE_DOUBTED: ExitStatus.CERTIFIED,
+    }
+    return status[judgement.grounds[0]] if judgement.grounds else ExitStatus.CERTIFIED
