@@ -34,6 +34,7 @@ from .refinement import refine as refine
 
 # Keep it in files, print it, draw it.
 from . import report as report
+from . import results as results
 from .results import Ground as Ground
 from .results import Judgement as Judgement
 from .results import Verdict as Verdict

@@ -207,8 +207,8 @@ def calibrate_folder(options: FolderOptions, refinement: RefinementOptions | Non
                 rw.write_refined(refined, options.output)
             typer.echo(f"Written to {options.output}.", err=True)
     finally:  # a result that cannot be written is shown all the same
-        rw.report.print_solution(solution)
-        if refined is not None:
-            rw.report.report_console().print()
+        if refined is None:
+            rw.report.print_solution(solution)
+        else:
             rw.report.print_refined(refined)
     return exit_status(rw.judge(solution, refined))

@@ -9,8 +9,5 @@ from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
 def show(calibrated: rw.pipeline.Calibrated) -> ExitStatus:
     """Print the report; the exit status that the calibration leads to."""
     refined = calibrated.refined
-    rw.report.print_log(calibrated.log)
-    rw.report.print_solution(refined.solution)
-    rw.report.report_console().print()
-    rw.report.print_refined(refined)
+    rw.report.print_refined(refined, log=calibrated.log)
     return exit_status(rw.judge(refined.solution, refined, calibrated.log))

@@ -1,6 +1,9 @@
 from .demo_log import LOG as LOG
 from .demo_log import RIG as RIG
+from .demo_log import TRUTH as TRUTH
+from .demo_log import DemoTruth as DemoTruth
 from .demo_log import demo_folder as demo_folder
+from .demo_log import demo_truth as demo_truth
 from .download import UTIAS_URL as UTIAS_URL
 from .download import Fetched as Fetched
 from .download import fetch_utias as fetch_utias

@@ -1,13 +1,18 @@
-"""Where the demo's log is."""
+"""The demo's log, and what is true of it."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+import gtsam
+import numpy as np
+
 from gtsam_rwhec.errors import FileFormatError
 
-LOG, RIG = "robot_cell.mcap", "rig.yaml"
+LOG, RIG, TRUTH = "robot_cell.mcap", "rig.yaml", "truth.json"
 
 
 def demo_folder() -> Path:
@@ -25,4 +30,55 @@ def demo_folder() -> Path:
             return folder
     raise FileFormatError(
         f"The demo's data is at neither {candidates[0]} nor {candidates[1]}: install the package again."
+    )
+
+
+@dataclass(frozen=True)
+class DemoTruth:
+    """What the log was made with.
+
+    Attributes
+    ----------
+    X : dict of str to gtsam.Pose3
+        T_base_target of each target, metres.
+    Y : dict of str to gtsam.Pose3
+        T_hand_camera of each camera, metres.
+    time_offsets_s : dict of str to float
+        Of each camera: its stamp t is the robot's t + offset.
+    scale : dict of str to float
+        Stated / true length of each target.
+    twice_seen : str
+        The target whose tag is printed on a poster too.
+    twice_seen_by : str
+        The camera that sees that poster.
+    twice_seen_in : int
+        In how many of its images.
+    """
+
+    X: dict[str, gtsam.Pose3]
+    Y: dict[str, gtsam.Pose3]
+    time_offsets_s: dict[str, float]
+    scale: dict[str, float]
+    twice_seen: str
+    twice_seen_by: str
+    twice_seen_in: int
+
+
+def demo_truth() -> DemoTruth:
+    """What is true of the demo's log.
+
+    Raises
+    ------
+    FileFormatError
+        The demo's data is not there.
+    """
+    raw = json.loads((demo_folder() / TRUTH).read_text(encoding="utf-8"))
+    return DemoTruth(
+        X={name: gtsam.Pose3(np.array(T)) for name, T in raw["T_base_target"].items()},
+        Y={name: gtsam.Pose3(np.array(T)) for name, T in raw["T_hand_camera"].items()},
+        time_offsets_s=raw["time_offset_s"],
+        scale=raw["scale"],
+        twice_seen=raw["poster"]["target"],
+        twice_seen_by=raw["poster"]["camera"],
+        twice_seen_in=len(raw["poster"]["stamps_ns"]),
     )

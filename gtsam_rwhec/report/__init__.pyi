@@ -1,6 +1,7 @@
 from .comparison_report import print_comparison as print_comparison
 from .covariance_report import print_refined as print_refined
 from .cross_validation_table import print_cross_validation as print_cross_validation
+from .demo_report import print_demo as print_demo
 from .log_report import print_log as print_log
 from .pair_grid import PairGrid as PairGrid
 from .pose_table import sensor_table as sensor_table

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 from rich.console import Console
-from rich.text import Text
 
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
@@ -15,8 +14,18 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.refinement.unknowns import UnknownKind
-from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
-from gtsam_rwhec.report.solution_report import report_console
+from gtsam_rwhec.report.log_report import doubts, print_log
+from gtsam_rwhec.report.pose_table import POSE_HEADINGS, RESIDUAL_LEGEND, FrameTable, pose_cells, residual_table
+from gtsam_rwhec.report.solution_report import (
+    print_heading,
+    print_sentence,
+    print_solution_details,
+    print_tables,
+    print_verdict,
+    report_console,
+)
+from gtsam_rwhec.results.stage_reports import LogFields
+from gtsam_rwhec.results.verdict import judge
 
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
 LEGEND = (
@@ -26,8 +35,8 @@ LEGEND = (
 )
 
 
-def print_refined(refined: Refined, console: Console | None = None) -> None:
-    """Print the tables and sentences of the covariance report.
+def print_refined(refined: Refined, console: Console | None = None, *, log: LogFields | None = None) -> None:
+    """Print the verdict, the refined poses with their standard deviations, what to do, and the details.
 
     Parameters
     ----------
@@ -35,30 +44,50 @@ def print_refined(refined: Refined, console: Console | None = None) -> None:
         What `gtsam_rwhec.refine` returned.
     console
         Where to; None for standard output.
+    log
+        What became of the measurements, where they come from a log.
     """
     console = report_console() if console is None else console
-    console.print(Text("Refined calibration and its standard deviations", style="bold"))
-    console.print()
-    for table in (
+    solution = refined.solution
+    print_verdict(console, judge(solution, refined, log))
+    tables = (
         _frame_table("Sensors in the frame that carries them", "sensor", refined.Y, refined),
         _frame_table("Targets in the frame that carries them", "target", refined.X, refined),
-        *(_relative_table(kind, poses, refined) for kind, poses in (("sensor", refined.Y), ("target", refined.X))),
-    ):
-        if table.rows:
-            console.print(table)
-    console.print(Text(LEGEND, style="dim"), soft_wrap=not console.is_terminal)
+    )
+    print_tables(console, tables, LEGEND)
+    for sentence in scale_and_offset_sentences(refined):
+        print_sentence(console, sentence)
+    free = refined.free_directions or solution.identifiability.free_directions
+    advice = doubts(log) if log is not None else []
+    if free or advice:
+        print_heading(console, "What to do")
+    for direction in free:
+        print_sentence(console, f"Not determined: {direction}", "bold red")
+    if free:
+        print_sentence(console, "Turn further while measuring, about two different axes or more; or fix known frames.")
+    for sentence in advice:
+        print_sentence(console, sentence, "bold yellow")
+    print_heading(console, "Details")
+    if log is not None:
+        print_log(log, console)
+    print_tables(
+        console,
+        [_relative_table(kind, poses, refined) for kind, poses in (("sensor", refined.Y), ("target", refined.X))]
+        + [residual_table(solution)],
+        RESIDUAL_LEGEND,
+    )
     console.print()
     noise = noise_table(refined)
     if len(noise.rows) > 1:
         console.print(noise)
     for sentence in refined_sentences(refined):
-        console.print(Text(sentence), soft_wrap=not console.is_terminal)
-    for direction in refined.free_directions:
-        console.print(Text(f"Not determined: {direction}", style="bold red"), soft_wrap=not console.is_terminal)
+        print_sentence(console, sentence)
+    console.print()
+    print_solution_details(console, solution)
 
 
-def refined_sentences(refined: Refined) -> list[str]:
-    """What the tables do not hold: scale, time offsets, noise, cost, outliers."""
+def scale_and_offset_sentences(refined: Refined) -> list[str]:
+    """What is used beside the poses: scales and time offsets."""
     sentences = []
     for unknown in refined.unknowns:
         if unknown.kind is UnknownKind.FRAME:
@@ -75,7 +104,12 @@ def refined_sentences(refined: Refined) -> list[str]:
                 f"Time offset of {owner}: {offset:+.3f} ± {_cell(1e3 * deviation, 3)} ms (the carriers' time is its "
                 "stamps' plus this)."
             )
-    sentences += [_noise_sentence(refined), _carrier_noise_sentence(refined)]
+    return sentences
+
+
+def refined_sentences(refined: Refined) -> list[str]:
+    """What the standard deviations rest on: noise, cost, outliers."""
+    sentences = [_noise_sentence(refined), _carrier_noise_sentence(refined)]
     loss = "" if refined.options.robust in ("none", "gnc") else f", {refined.options.robust} loss"
     steps = f"{refined.iterations} iteration{'' if refined.iterations == 1 else 's'}"
     sentences.append(

@@ -6,23 +6,17 @@ import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
-from gtsam_rwhec.files.terminal_text import printable
-from gtsam_rwhec.report.solution_report import report_console
+from gtsam_rwhec.report.solution_report import print_sentence, report_console
 from gtsam_rwhec.results.stage_reports import LogFields, TrackCount
 
 
 def print_log(log: LogFields, console: Console | None = None) -> None:
-    """Print what was detected, cleaned and left out, and which sizes are doubted."""
+    """Print what was detected, cleaned and left out."""
     console = report_console() if console is None else console
     console.print(_table(log))
-    for sentence in log.contradictions:
-        console.print(Text(printable(f"Do not use: {sentence}."), style="bold red"), soft_wrap=not console.is_terminal)
     for sentence in log_sentences(log):
-        console.print(Text(printable(sentence)), soft_wrap=not console.is_terminal)
-    for sentence in doubts(log):
-        console.print(Text(printable(sentence), style="bold yellow"), soft_wrap=not console.is_terminal)
+        print_sentence(console, sentence)
     console.print()
 
 

@@ -17,9 +17,10 @@ from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solving.solution import Solution
 
+RESIDUAL_LEGEND = "Residuals: root mean square over the n measurements of a frame, in millimetres and degrees."
 POSE_LEGEND = (
-    "Translations in metres; rotations as roll, pitch, yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll). Residuals: root "
-    "mean square over the n measurements of a frame, in millimetres and degrees."
+    "Translations in metres; rotations as roll, pitch, yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll). "
+    + RESIDUAL_LEGEND
 )
 
 POSE_HEADINGS = ("x m", "y m", "z m", "roll°", "pitch°", "yaw°")
@@ -92,6 +93,18 @@ def sensor_table(solution: Solution) -> FrameTable:
 def target_table(solution: Solution) -> FrameTable:
     """The poses X = T_targetcarrier_target, one line for each target."""
     return _frame_table("Targets in the frame that carries them", "target", solution.X, solution)
+
+
+def residual_table(solution: Solution) -> FrameTable:
+    """How well each frame's measurements fit the certified answer."""
+    rows = {
+        name: _residual_cells(
+            pooled_residual(residual for pair, residual in solution.residuals.items() if name in pair)
+        )
+        for poses in (solution.Y, solution.X)
+        for name in sorted(poses, key=natural_key)
+    }
+    return FrameTable("Certified residuals", "frame", RESIDUAL_HEADINGS, rows)
 
 
 def _frame_table(title: str, kind: str, poses: Mapping[str, gtsam.Pose3], solution: Solution) -> FrameTable:

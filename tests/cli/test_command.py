@@ -203,11 +203,12 @@ def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
     given = ("calibrate", DEMO, "--sigma", 0.005, "--kappa", 6565, "--refine", "given")
     done = run(*given, "-o", result)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.index("Certified globally optimal") < done.stdout.index("Refined calibration")
+    assert done.stdout.startswith("Use these poses: ")
+    assert done.stdout.index("±x mm") < done.stdout.index("Details") < done.stdout.index("Certified globally optimal")
     assert "Noise of B: 0.5° and 5 mm an axis, as given." in done.stdout
     refined = rw.read_refined(result)
     for name in refined.Y:
-        (_, row, *_) = [line for line in done.stdout.splitlines() if line.startswith(f" {name} ")]
+        (row, *_) = [line for line in done.stdout.splitlines() if line.startswith(f" {name} ")]
         np.testing.assert_allclose(
             [float(cell) for cell in row.split()[7:10]], refined.standard_deviations(name)[1], atol=0.0051
         )
@@ -244,6 +245,7 @@ def test_refined_and_free_is_status_3(tmp_path: Path) -> None:
     assert " free " in done.stdout
     (direction,) = [line for line in done.stdout.splitlines() if line.startswith("Not determined: ")]
     assert all(name in direction for name in ("tag_0", "tag_1", "cam_0", "cam_1"))  # they move together
+    assert done.stdout.startswith("Do not use these poses: ")
     assert np.isinf(rw.read_refined(tmp_path / "r.json").covariance("cam_0")).any()
 
 

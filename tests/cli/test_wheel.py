@@ -55,8 +55,8 @@ def test_one_wheel_for_all_systems_and_a_package_index_takes_it(built: Path) -> 
 
 def test_it_has_all_data_and_none_of_the_real_dataset(unpacked_wheel: Path) -> None:
     shipped = unpacked_wheel / "gtsam_rwhec" / "demo_data"
-    assert sorted(path.name for path in shipped.iterdir()) == ["rig.yaml", "robot_cell.mcap"]
-    for path in shipped.iterdir():  # the truth stays behind
+    assert sorted(path.name for path in shipped.iterdir()) == ["rig.yaml", "robot_cell.mcap", "truth.json"]
+    for path in shipped.iterdir():
         assert path.read_bytes() == (CELL / path.name).read_bytes()
     assert (unpacked_wheel / "gtsam_rwhec" / "datasets" / "utias_files.txt").is_file()
     assert (unpacked_wheel / "gtsam_rwhec" / "py.typed").is_file()

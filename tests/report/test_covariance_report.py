@@ -18,7 +18,12 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import PairNoise
 from gtsam_rwhec.report import print_refined
-from gtsam_rwhec.report.covariance_report import deviation_cells, noise_table, refined_sentences
+from gtsam_rwhec.report.covariance_report import (
+    deviation_cells,
+    noise_table,
+    refined_sentences,
+    scale_and_offset_sentences,
+)
 from gtsam_rwhec.simulate import Motion, Noise, general
 
 NOISE = Noise(sigma_m=0.005, kappa=0.5 / np.radians(0.5) ** 2)
@@ -124,7 +129,7 @@ def test_what_is_free_is_called_free(planar: rw.Refined) -> None:
 
 def test_scales_of_targets_have_deviations(rig: rw.Refined) -> None:
     assert isinstance(rig.scale, dict)
-    sentences = refined_sentences(rig)
+    sentences = scale_and_offset_sentences(rig)
     for name in ("target1", "target2"):
         deviation = math.sqrt(rig.covariance(f"scale:{name}")[0, 0])
         value = f"{rig.scale[name]:.6f} ± {deviation:.6f}"
@@ -135,11 +140,14 @@ def test_scales_of_targets_have_deviations(rig: rw.Refined) -> None:
 def test_a_shared_scale_and_a_free_one() -> None:
     shared = refined_of(general(1, 1, seed=5, noise=NOISE, scale="shared").problem)
     deviation = math.sqrt(shared.covariance("scale")[0, 0])
-    assert refined_sentences(shared)[0] == f"Scale (measured / true length): {shared.scale:.6f} ± {deviation:.6f}."
+    assert (
+        scale_and_offset_sentences(shared)[0]
+        == f"Scale (measured / true length): {shared.scale:.6f} ± {deviation:.6f}."
+    )
     still = refined_of(
         general(1, 1, seed=5, noise=NOISE, scale="shared", motion=Motion("planar", extent_m=0.0)).problem
     )
-    assert "± free." in refined_sentences(still)[0]
+    assert "± free." in scale_and_offset_sentences(still)[0]
 
 
 def test_time_offsets_have_deviations() -> None:
@@ -152,7 +160,7 @@ def test_time_offsets_have_deviations() -> None:
     B = [gtsam.Pose3(np.linalg.inv(Y) @ a @ X).retract(np.full(6, 1e-4) * (-1.0) ** i) for i, a in enumerate(A)]
     problem.add("target0", "sensor0", A, B, 0.001, 1e5, stamps_ns=np.arange(60) * 100_000_000)
     refined = refined_of(problem, time_offsets=True)
-    (sentence,) = [s for s in refined_sentences(refined) if s.startswith("Time offset")]
+    (sentence,) = [s for s in scale_and_offset_sentences(refined) if s.startswith("Time offset")]
     offset, deviation = refined.time_offsets_s["sensor0"], math.sqrt(refined.covariance("time_offset:sensor0")[0, 0])
     assert sentence == (
         f"Time offset of sensor0: {1e3 * offset:+.3f} ± {1e3 * deviation:.3f} ms (the carriers' time is its stamps' "
