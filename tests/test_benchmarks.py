@@ -12,7 +12,7 @@ from places import REPOSITORY
 
 BENCHMARKS = REPOSITORY / "tests" / "benchmarks"
 #: Their imports need what is only in the extra `bench`.
-OF_BENCH = {"scs_relaxation", "real_dataset", "run_all"}
+OF_BENCH = {"scs_relaxation", "real_dataset", "run_all", "own_code_against_libraries"}
 
 
 def test_every_script_finds_what_it_imports() -> None:
