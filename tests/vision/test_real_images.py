@@ -45,7 +45,7 @@ def test_a_checkerboard_on_a_hand(workcell_camera2: Path) -> None:
         image = cv2.imread(str(workcell_camera2 / "image" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
         assert image is not None
         ((detection,),) = (frame.detections for frame in detector([image]))
-        assert detection.reason == ""
+        assert detection.rejection is None
         assert len(detection.indices) == 12
         seen.append(detection.T[0])
         hand.append(np.loadtxt(workcell_camera2 / "pose" / f"{name}.csv"))
