@@ -1,6 +1,10 @@
 """Writing calibrations to JSON files and reading them back, bit for bit.
 
 What a file holds is in `gtsam_rwhec.results.schema`; units and frame conventions are also written inside every file.
+
+Pydantic reads and checks the records as they are. `_to_json` and `_from_json` do by hand what pydantic (2.14, tried)
+does not: its JSON has null for NaN and for both infinities, and none of these comes back as a float; a key that is a
+pair becomes the text "a,b", which comes back as no pair; and it has nothing for gtsam.Pose3, arrays and slices.
 """
 
 from __future__ import annotations
