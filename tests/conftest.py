@@ -7,24 +7,11 @@ from pathlib import Path
 
 import cv2
 import pytest
-import scipy.linalg  # noqa: F401  # its BLAS is another one than NumPy's, and both are limited
 from places import REPOSITORY
-from threadpoolctl import threadpool_limits
 
 #: Beside calls that OpenCV 5 lacks; with it these run where tests/vision/test_other_opencv.py brings OpenCV 4.
 BESIDE_OPENCV_4 = ["compat/test_beside_opencv4.py", "methods/test_opencv4.py"]
 collect_ignore = [] if hasattr(cv2, "calibrateRobotWorldHandEye") else BESIDE_OPENCV_4
-
-
-def pytest_configure() -> None:
-    """Share the cores out among the workers of pytest-xdist: each one's BLAS takes all of them else, and they wait.
-
-    In the workers only, and only in their own process: commands, examples and all that tests start as processes of
-    their own run as a user runs them, and so does ``pytest -n0``.
-    """
-    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    if workers > 1:
-        threadpool_limits(max(1, (os.cpu_count() or 1) // workers), user_api="blas")
 
 
 @pytest.fixture(scope="session")
