@@ -22,17 +22,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import adjustText
 import cv2
 import imagesize
 import numpy as np
-import textalloc
 import zstandard
 from bars import Row, print_rows
 from interleaved import interleaved
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.text import Text
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -41,7 +36,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from vision_rate import CELL, the_log
 
 from gtsam_rwhec.logs import LogWriter, open_log, ros2_schemas
-from gtsam_rwhec.report.plots.labels import label_points
 from gtsam_rwhec.rig import read_rig
 from gtsam_rwhec.vision.codes import identified, quadrangles
 from gtsam_rwhec.vision.dictionaries import dictionary, tag_detector
@@ -52,8 +46,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "logs"))
 from log_files import POSE, TRANSFORM, header, ros2_log, xyz
 
 T0 = 1_700_000_000_000_000_000
-#: Seeds of pictures, and damaged files of each format.
-PICTURES, DAMAGED = 6, 500
+#: Damaged files of each format.
+DAMAGED = 500
 
 
 def row(what: str, figures: dict[str, float], unit: str) -> Row:
@@ -219,54 +213,6 @@ def _identify(gray: np.ndarray, quad: np.ndarray, family: str) -> int:
     return int(number) if is_one else -1
 
 
-def names() -> list[Row]:
-    """``report/plots/labels.py`` against adjustText and textalloc: 20 names among 200 points."""
-
-    def adjusted(axes: Any, points: np.ndarray, words: list[str], clear_of: np.ndarray) -> None:
-        texts = [axes.text(*point, word, fontsize=8.5) for point, word in zip(points, words, strict=True)]
-        x, y = np.vstack([points, clear_of]).T
-        adjustText.adjust_text(texts, x=x, y=y, target_x=points[:, 0], target_y=points[:, 1], ax=axes, iter_lim=100)
-
-    def allocated(axes: Any, points: np.ndarray, words: list[str], clear_of: np.ndarray) -> None:
-        x, y = np.vstack([points, clear_of]).T
-        textalloc.allocate(axes, *points.T, words, x_scatter=x, y_scatter=y, textsize=8.5, nbr_candidates=500)
-
-    calls = {"ours": label_points, "adjustText": adjusted, "textalloc": allocated}
-    covered: Counter[str] = Counter({name: 0 for name in calls})
-
-    def place(name: str, figure: Any) -> int:
-        generator = np.random.default_rng(seed)
-        axes = figure.subplots()
-        points, clear_of = generator.uniform(size=(20, 2)), generator.uniform(size=(200, 2))
-        axes.set(xlim=(-0.1, 1.1), ylim=(-0.1, 1.1))
-        figure.figure.draw_without_rendering()
-        calls[name](axes, points, [f"frame_{i}" for i in range(20)], clear_of)
-        figure.figure.draw_without_rendering()
-        boxes = [Text.get_window_extent(text) for text in axes.texts if text.get_text()]  # without its line
-        pixels = axes.transData.transform(np.vstack([points, clear_of]))
-        inside = sum(bool(((pixels > box.p0) & (pixels < box.p1)).all(axis=1).any()) for box in boxes)
-        return inside + sum(box.overlaps(other) for i, box in enumerate(boxes) for other in boxes[:i])
-
-    for seed in range(PICTURES):  # noqa: B007  (read by `place`)
-        for name in calls:
-            figure = Figure(figsize=(6.0, 5.0), dpi=100)
-            FigureCanvasAgg(figure)
-            covered[name] += place(name, figure)
-    try:
-        figure = Figure()
-        FigureCanvasAgg(figure)
-        place("textalloc", figure.subfigures(1, 1))
-        takes = "yes"
-    except AttributeError as error:
-        takes = f"no: {error}"
-    less = covered["ours"] < covered["adjustText"]
-    words = ", ".join(f"{name} {count}" for name, count in covered.items())
-    return [
-        Row(f"names over others or over points, of {20 * PICTURES}", words, "ours is less than adjustText", less),
-        Row("    textalloc draws on a row of a figure (SubFigure)", takes, "no", takes != "yes"),
-    ]
-
-
 def sizes() -> list[Row]:
     """``vision/image_sizes.py`` against Pillow and imagesize: damaged files, and TIFFs that state two widths."""
     Image.MAX_IMAGE_PIXELS = None
@@ -341,13 +287,13 @@ def rows(messages: int) -> list[Row]:
     """All of them."""
     with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return [*reading(Path(name), messages), *decoding(Path(name), messages), *tags(), *names(), *sizes()]
+        return [*reading(Path(name), messages), *decoding(Path(name), messages), *tags(), *sizes()]
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--messages", type=int, default=20_000)
     status = print_rows("Our own code against libraries", rows(parser.parse_args().messages))
-    names_of = ("mcap", "mcap-ros2-support", "rosbags", "adjusttext", "textalloc", "pillow", "imagesize")
+    names_of = ("mcap", "mcap-ros2-support", "rosbags", "pillow", "imagesize")
     print(", ".join(f"{name} {version(name)}" for name in names_of))
     raise SystemExit(status)

@@ -29,6 +29,7 @@ import million_measurements
 import one_pair
 import opencv_hand_eye
 import outliers
+import own_code_against_libraries
 import real_dataset
 import single_pairs
 import start_time
@@ -53,6 +54,7 @@ class Sizes:
     log_poses: int = 1_000_000
     bare_loop_s: float = 45.0
     corrupted_seeds: int = 8
+    log_messages: int = 20_000
     #: Of the scripts that print tables of their own, the number of --runs.
     runs: tuple[tuple[str, int], ...] = (
         ("coverage.py", 1000),
@@ -76,6 +78,7 @@ QUICK = Sizes(
     log_poses=100_000,
     bare_loop_s=3.0,
     corrupted_seeds=1,
+    log_messages=5_000,
     runs=(),
 )
 
@@ -100,6 +103,7 @@ def parts(sizes: Sizes, plot: Path | None) -> dict[str, Callable[[], list[Row]]]
         "from camera images": lambda: camera_logs.rows(sizes.log_poses),
         "images a second": lambda: vision_rate.rows(max(1, sizes.few_repetitions // 2), sizes.bare_loop_s),
         "wrong detections": lambda: corrupted_detections.rows(sizes.corrupted_seeds),
+        "our own code against libraries": lambda: own_code_against_libraries.rows(sizes.log_messages),
     }
 
 

@@ -1,4 +1,4 @@
-"""Where the frames are on their carriers, seen from above and from the side, with how well their places are known."""
+"""A picture of the frames on their carriers, from above and from the side, with the covariances of their positions."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from gtsam_rwhec.report.plots.drawing import (
     AXIS_COLOURS,
     AXIS_NAMES,
     BLACK,
+    GREY,
     ORANGE,
     PURPLE,
     picture,
@@ -21,7 +22,6 @@ from gtsam_rwhec.report.plots.drawing import (
     say,
     shortened,
 )
-from gtsam_rwhec.report.plots.labels import label_points
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
 if TYPE_CHECKING:
@@ -31,12 +31,20 @@ if TYPE_CHECKING:
 
 #: Quantile 0.95 of chi-square with 3 degrees of freedom.
 CHI2_95 = 7.814727903251179
-#: Shares of the picture: a frame's axes; the largest ellipse.
-AXIS_SHARE, ELLIPSE_SHARE = 0.1, 0.07
-#: The carrier's origin is left out when it is this many times further away than the frames are spread.
+#: Length of a frame's axes, as a share of the scene.
+AXIS_SHARE = 0.1
+#: Semi-axis of the largest ellipsoid, as a share of the scene.
+ELLIPSE_SHARE = 0.07
+#: Room around the scene, as a share of it.
+MARGIN_SHARE = 0.1
+#: The carrier's origin is left out when its distance is more than this many times the spread of the frames.
 FAR_ORIGIN = 5.0
-#: Frames that are spread over less are drawn as if they were in one place.
+#: Frames with a smaller spread (m) are drawn as if they were in one place.
 SMALLEST_M = 1e-6
+#: Size of the names, points.
+NAME_SIZE = 8.5
+#: Places that textalloc tries for each name.
+PLACES = 500
 
 
 def plot_frames(frames: RigFrames, covariances: Mapping[str, Array], path: str | Path) -> None:
@@ -46,10 +54,10 @@ def plot_frames(frames: RigFrames, covariances: Mapping[str, Array], path: str |
     ----------
     frames : RigFrames
     covariances : dict of str to (6, 6) array
-        Of T_carrier_frame's right perturbation [omega (rad), v (m)], by frame; a frame may lack one, entries may be
-        infinite.
+        Covariance of T_carrier_frame's right perturbation [omega (rad), v (m)], by frame. A frame may lack one. Entries
+        may be infinite.
     path
-        The PNG; replaced if it is there.
+        The PNG file. An existing file is replaced.
 
     Raises
     ------
@@ -58,28 +66,29 @@ def plot_frames(frames: RigFrames, covariances: Mapping[str, Array], path: str |
     FileFormatError
         The file cannot be written.
     """
+    rows = (("Sensors", frames.sensor_carrier, frames.sensors), ("Targets", frames.target_carrier, frames.targets))
+    scenes = []
     with picture(path, 12.0, 10.0) as figure:
-        rows = (("Sensors", frames.sensor_carrier, frames.sensors), ("Targets", frames.target_carrier, frames.targets))
-        drawn = []
-        halves = figure.subfigures(2, 1, squeeze=False)[:, 0]
-        for row, (what, carrier, poses) in zip(halves, rows, strict=True):
+        for (what, carrier, poses), row in zip(rows, figure.subplots(2, 2), strict=True):
             positions = {name: _position_covariance(T, covariances.get(name)) for name, T in poses.items()}
             scene = _Scene(carrier, dict(poses), positions)
-            row.suptitle(f"{what} on {carrier}{scene.note}", x=0.01, ha="left")
-            if not poses:
-                say(row.subplots(), f"no {what.lower()}")
-                continue
-            for axes, view in zip(row.subplots(1, 2), scene.views, strict=True):
-                drawn.append((axes, *scene.draw(axes, view)))
-        _legend(figure, {name: covariances[name] for _, _, poses in rows for name in poses if name in covariances})
+            if poses:
+                scenes += [(scene, axes, view) for axes, view in zip(row, scene.views, strict=True)]
+            else:
+                say(row[0], f"no {what.lower()}")
+                row[1].set_axis_off()
+            row[0].set_title(f"{what} on {carrier}{scene.note}", size=12, pad=24)
+        for scene, axes, view in scenes:
+            scene.draw(axes, view)
+        _legend(figure, [covariance for scene, *_ in scenes for covariance in scene.covariances.values()])
         figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # settled; names need not be laid out again
-        for axes, points, names, clear_of in drawn:
-            label_points(axes, points, [shortened(name) for name in names], clear_of)
+        figure.set_layout_engine("none")  # The layout is settled: names must not change it.
+        for scene, axes, view in scenes:
+            scene.draw_names(axes, view)
 
 
 class _Scene:
-    """One carrier with what it carries."""
+    """One carrier and the frames that it carries."""
 
     def __init__(self, carrier: str, poses: dict[str, Array], covariances: dict[str, Array | None]) -> None:
         self.carrier, self.poses, self.covariances = carrier, poses, covariances
@@ -90,45 +99,40 @@ class _Scene:
         if self.has_origin:
             places = np.vstack([places, np.zeros(3)])
         sides = np.ptp(places, axis=0)
-        # A scale that nothing determines can draw all frames together into one place.
+        # An undetermined scale can draw all frames together into one place.
         self.extent = float(sides.max()) if sides.max() > SMALLEST_M else 0.1
-        #: Above, and the side that shows more.
+        #: The view from above, and the side view that shows more.
         self.views = ((0, 1), (0, 2) if sides[0] >= sides[1] else (1, 2))
-        largest = max((_semi_axes(c).max() for c in covariances.values() if _is_finite(c)), default=0.0)
+        largest = max(
+            (_semi_axes(c).max() for c in covariances.values() if c is not None and _is_finite(c)), default=0.0
+        )
         self.times = round_down(max(ELLIPSE_SHARE * self.extent / largest, 1.0)) if largest > 0.0 else 1.0
 
     @property
     def note(self) -> str:
-        """What is to be known of the drawing."""
+        """How large the ellipsoids are drawn, and whether the origin is in the picture."""
         notes = []
-        if any(_is_finite(c) for c in self.covariances.values()):
+        if any(c is not None and _is_finite(c) for c in self.covariances.values()):
             size = f"drawn {self.times:,.0f} times as large" if self.times > 1.0 else "to scale"
             notes.append(f"95 % confidence ellipsoids of position, {size}")
         if not self.has_origin:
             notes.append(f"the origin of {self.carrier} is out of sight")
         return "".join(f"; {note}" for note in notes)
 
-    def draw(self, axes: Axes, view: tuple[int, int]) -> tuple[Array, list[str], Array]:
-        """Draw one view; points to be labelled (N, 2), their names, and points (M, 2) to be left clear."""
+    def draw(self, axes: Axes, view: tuple[int, int]) -> None:
+        """Draw one view, without names."""
         from matplotlib.patches import Polygon
         from matplotlib.ticker import MultipleLocator
 
         i, j = view
         length = AXIS_SHARE * self.extent
-        points: list[Array] = []
-        names: list[str] = []
-        clear_of: list[Array] = []
         if self.has_origin:
-            clear_of.append(_draw_axes(axes, np.eye(4), view, 0.7 * length, 3.0))
+            _draw_axes(axes, np.eye(4), view, 0.7 * length, 3.0)
             axes.plot(0.0, 0.0, "s", color=BLACK, markersize=5, zorder=4)
-            points.append(np.zeros(2))
-            names.append(self.carrier)
         for name, T in self.poses.items():
             at, covariance = T[[i, j], 3], self.covariances[name]
-            clear_of.append(_draw_axes(axes, T, view, length, 1.6))
+            _draw_axes(axes, T, view, length, 1.6)
             axes.plot(*at, "o", color=BLACK, markersize=3, zorder=5)
-            points.append(at)
-            names.append(name)
             if covariance is None:
                 continue
             if _is_finite(covariance):
@@ -137,29 +141,51 @@ class _Scene:
             else:
                 outline = at + ELLIPSE_SHARE * self.extent * _circle()
                 axes.add_patch(Polygon(outline, fill=False, edgecolor=PURPLE, lw=1.6, ls="--", zorder=2))
-            clear_of.append(outline[::2])
         axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.14)
+        # Margins of the axes would not do: matplotlib takes them away to make the aspect equal.
+        axes.update_datalim(axes.dataLim.padded(MARGIN_SHARE * self.extent))
+        axes.margins(0.0)
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_locator(MultipleLocator(round_down(0.35 * self.extent)))
-        axes.set_title("from above" if view == (0, 1) else "from the side")
+        axes.text(0.0, 1.02, "from above" if view == (0, 1) else "from the side", transform=axes.transAxes, size=10.5)
         axes.set_xlabel(f"{AXIS_NAMES[i]} of {self.carrier} (m)")
         axes.set_ylabel(f"{AXIS_NAMES[j]} of {self.carrier} (m)")
-        return np.array(points), names, np.concatenate(clear_of)
+
+    def draw_names(self, axes: Axes, view: tuple[int, int]) -> None:
+        """Write the frames' names beside their origins, clear of each other and of everything drawn."""
+        origin = {self.carrier: np.eye(4)} if self.has_origin else {}
+        names = [shortened(name) for name in (*origin, *self.poses)]
+        points = np.array([T[list(view), 3] for T in (*origin.values(), *self.poses.values())])
+        write_names(axes, points, names)
 
 
-def _draw_axes(axes: Axes, T: Array, view: tuple[int, int], length: float, width: float) -> Array:
-    """A frame's three axes; points (M, 2) along them. The one that is nearest to the eye comes last, on top."""
+def write_names(axes: Axes, points: Array, names: list[str]) -> None:
+    """Write names beside points (N, 2), data coordinates, clear of each other and of the lines and patches drawn.
+
+    The layout and the limits of the axes must be settled (``figure.draw_without_rendering``).
+    """
+    import textalloc
+
+    axes.autoscale(enable=False)
+    lines = [np.asarray(line.get_path().vertices) for line in axes.lines]
+    outlines = [np.asarray(patch.get_path().vertices) for patch in axes.patches]
+    x, y = np.concatenate([points, *lines, *outlines]).T
+    textalloc.allocate(
+        axes, points[:, 0], points[:, 1], names, x_scatter=x, y_scatter=y, x_lines=[line[:, 0] for line in lines],
+        y_lines=[line[:, 1] for line in lines], textsize=NAME_SIZE, nbr_candidates=PLACES,
+        linecolor=GREY, linewidth=0.6, zorder=6,
+    )  # fmt: skip
+
+
+def _draw_axes(axes: Axes, T: Array, view: tuple[int, int], length: float, width: float) -> None:
+    """Draw a frame's three axes; the axis nearest to the eye comes last, on top."""
     towards_eye = T[3 - sum(view), :3]
-    along = []
     for k in np.argsort(towards_eye):
         start, step = T[list(view), 3], length * T[list(view), k]
         axes.plot(*np.array([start, start + step]).T, color=AXIS_COLOURS[k], lw=width, solid_capstyle="round", zorder=3)
-        along.append(start + np.linspace(0.1, 1.0, 10)[:, None] * step)
-    return np.concatenate(along)
 
 
-def _legend(figure: Figure, covariances: Mapping[str, Array]) -> None:
+def _legend(figure: Figure, covariances: list[Array | None]) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -167,7 +193,7 @@ def _legend(figure: Figure, covariances: Mapping[str, Array]) -> None:
         Line2D([], [], color=colour, lw=2, label=f"{name} axis")
         for name, colour in zip(AXIS_NAMES, AXIS_COLOURS, strict=True)
     ]
-    determined = [bool(np.isfinite(covariance[3:, 3:]).all()) for covariance in covariances.values()]
+    determined = [_is_finite(covariance) for covariance in covariances if covariance is not None]
     if any(determined):
         handles.append(Patch(facecolor=ORANGE, edgecolor=BLACK, alpha=0.45, label="95 % confidence"))
     if not all(determined):
@@ -176,7 +202,7 @@ def _legend(figure: Figure, covariances: Mapping[str, Array]) -> None:
 
 
 def _position_covariance(T: Array, covariance: Array | None) -> Array | None:
-    """(3, 3) of the position along the carrier's axes; infinite where any direction of it is."""
+    """Covariance (3, 3) of the position along the carrier's axes; infinite where any direction of it is."""
     if covariance is None:
         return None
     block = checked(covariance)[3:, 3:]
@@ -186,24 +212,23 @@ def _position_covariance(T: Array, covariance: Array | None) -> Array | None:
     return turned
 
 
-def _is_finite(covariance: Array | None) -> bool:
-    return covariance is not None and bool(np.isfinite(covariance).all())
+def _is_finite(covariance: Array) -> bool:
+    return bool(np.isfinite(covariance).all())
 
 
-def _semi_axes(covariance: Array | None) -> Array:
-    assert covariance is not None
+def _semi_axes(covariance: Array) -> Array:
     semi_axes: Array = np.sqrt(CHI2_95 * np.maximum(np.linalg.eigvalsh(covariance), 0.0))
     return semi_axes
 
 
 def _shadow(covariance: Array) -> Array:
-    """(N, 2) outline of the ellipsoid's shadow along an axis, of the (2, 2) block that is left."""
+    """Outline (N, 2) of the ellipsoid's shadow along an axis; `covariance` is the (2, 2) block that is left."""
     variances, axes = np.linalg.eigh(covariance)
     outline: Array = _circle() * np.sqrt(CHI2_95 * np.maximum(variances, 0.0)) @ axes.T
     return outline
 
 
 def _circle() -> Array:
-    """(N, 2) points of the unit circle."""
+    """Points (N, 2) of the unit circle."""
     turn = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     return np.column_stack([np.cos(turn), np.sin(turn)])

@@ -8,12 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from gtsam_rwhec.report.plots.coverage import _share
 from gtsam_rwhec.report.plots.drawing import plain_decades, round_down, shortened
-from gtsam_rwhec.report.plots.frames import CHI2_95, _shadow
-from gtsam_rwhec.report.plots.labels import label_points
+from gtsam_rwhec.report.plots.frames import CHI2_95, _shadow, write_names
 
 AXES = Figure().subplots()
 
@@ -28,11 +26,12 @@ def test_names_do_not_cover_one_another_or_what_is_drawn(seed: int, count: int) 
     points = generator.uniform(0.0, 1.0, (count, 2))
     points[-1] = points[0]  # two at one place
     clear_of = generator.uniform(0.0, 1.0, (12, 2))
+    axes.plot(*clear_of.T[:, None], ".")  # one line for each point
     axes.set(xlim=(-0.1, 1.1), ylim=(-0.1, 1.1))
     figure.draw_without_rendering()
-    label_points(axes, points, [f"frame_{i}" for i in range(count)], clear_of)
+    write_names(axes, points, [f"frame_{i}" for i in range(count)])
     figure.draw_without_rendering()
-    boxes = [Text.get_window_extent(text) for text in axes.texts]  # of an annotation: without its line
+    boxes = [text.get_window_extent() for text in axes.texts]
     assert [text.get_text() for text in axes.texts] == [f"frame_{i}" for i in range(count)]
     drawn = axes.transData.transform(np.vstack([points, clear_of]))
     for i, box in enumerate(boxes):
