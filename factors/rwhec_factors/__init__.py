@@ -9,7 +9,7 @@ from rwhec_factors.batch import BatchResiduals, Linearization, robot_world_hand_
 from rwhec_factors.carrier_pose_variables import pose_robot_world_hand_eye_factor, two_pose_robot_world_hand_eye_factor
 from rwhec_factors.edge_summary import EdgeSummary, edge_summary_factor, hand_eye_summary_factor
 from rwhec_factors.hand_eye import hand_eye_factor, pose_hand_eye_factor
-from rwhec_factors.known_carrier_pose import robot_world_hand_eye_factor, scaled_robot_world_hand_eye_factor
+from rwhec_factors.known_carrier_pose import robot_world_hand_eye_factor
 from rwhec_factors.priors import (
     direction_prior_factor,
     dual_quaternion_prior_factor,
@@ -39,7 +39,6 @@ __all__ = [
     "robot_world_hand_eye_batch_factor",
     "robot_world_hand_eye_factor",
     "rotation_prior_factor",
-    "scaled_robot_world_hand_eye_factor",
     "shifted_pose_prior_factor",
     "two_pose_robot_world_hand_eye_factor",
 ]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import gtsam
 import numpy as np
 
-from rwhec_factors.measurement import Prediction, Residual, measurement_factor
+from rwhec_factors.arguments import check_choice
+from rwhec_factors.measurement import Carriers, Residual, measurement_factor
+from rwhec_factors.se3 import Array
 from rwhec_factors.values import pose_of
 
 Carrier = Literal["sensorcarrier_in_targetcarrier", "targetcarrier_in_sensorcarrier"]
@@ -24,13 +26,11 @@ def pose_robot_world_hand_eye_factor(
     residual: Residual = "geodesic",
     pose: Carrier = "sensorcarrier_in_targetcarrier",
 ) -> gtsam.CustomFactor:
-    """One measurement of a target from a carrier whose pose P is a variable, as a robot's in a SLAM graph is.
+    """The factor of one measurement from a carrier whose pose P is a variable, such as a robot's in a SLAM graph.
 
     With ``pose="sensorcarrier_in_targetcarrier"`` (the default) P = T_targetcarrier_sensorcarrier, for instance
     T_world_robot: A = P^-1. With "targetcarrier_in_sensorcarrier" P = T_sensorcarrier_targetcarrier = A itself, for
-    instance T_base_hand where the target is on the hand.
-
-    Residual: that of ``robot_world_hand_eye_factor`` at A; with ``scale_key`` that of the scaled one.
+    instance T_base_hand where the target is on the hand. The residual is ``robot_world_hand_eye_factor``'s with this A.
 
     Parameters
     ----------
@@ -43,39 +43,28 @@ def pose_robot_world_hand_eye_factor(
     B : gtsam.Pose3
         T_sensor_target, measured; metres (times the scale).
     noise : gtsam.noiseModel.Base
-        Of B's right perturbation, dimension 6.
+        Noise of B's right perturbation, dimension 6.
     scale_key : int, optional
-        Key of a 1-vector s, the last key: t_B = s * (true length).
+        Key of a 1-vector s, the factor's last key: t_B = s * (true length).
     residual : "geodesic" or "chordal"
     pose : "sensorcarrier_in_targetcarrier" or "targetcarrier_in_sensorcarrier"
 
     Raises
     ------
     TypeError, ValueError
-        For what is no pose or no noise model, noise that cannot be honoured, or keys that are not all different.
+        If B is not a valid pose, the factor cannot hold the noise, or two keys are equal.
     """
-    if pose not in get_args(Carrier):
-        raise ValueError(f"pose={pose!r} is not one of {', '.join(map(repr, get_args(Carrier)))}")
+    check_choice("pose", pose, Carrier)
     inverted = pose == "sensorcarrier_in_targetcarrier"
     what = "P = T_targetcarrier_sensorcarrier" if inverted else "P = T_sensorcarrier_targetcarrier"
 
-    def predict(values: gtsam.Values, wanted: bool) -> Prediction:
-        carrier = pose_of(values, pose_key, what)
-        X = pose_of(values, target_key, "X = T_targetcarrier_target")
-        Y = pose_of(values, sensor_key, "Y = T_sensorcarrier_sensor")
-        if inverted:
-            T_carrier_sensor = carrier.compose(Y)  # T_targetcarrier_sensor
-            predicted = T_carrier_sensor.inverse().compose(X)
-        else:
-            predicted = Y.inverse().compose(carrier.compose(X))
-        if not wanted:
-            return Prediction(predicted, Y, [])
-        by_sensor = -predicted.inverse().AdjointMap()
-        # A Expmap(d) moves the prediction by Ad(X^-1) d; P = A^-1 moves it as Y does, seen from P.
-        by_pose = by_sensor @ Y.inverse().AdjointMap() if inverted else X.inverse().AdjointMap()
-        return Prediction(predicted, Y, [by_pose, np.eye(6), by_sensor])
+    def carriers(values: gtsam.Values) -> tuple[gtsam.Pose3, dict[int, Array]]:
+        P = pose_of(values, pose_key, what)
+        # (P Expmap(d))^-1 = P^-1 Expmap(-Ad(P) d)
+        return (P.inverse(), {pose_key: -P.AdjointMap()}) if inverted else (P, {pose_key: np.eye(6)})
 
-    return measurement_factor([pose_key, target_key, sensor_key], sensor_key, B, noise, predict, scale_key, residual)
+    keys = [pose_key, target_key, sensor_key]
+    return measurement_factor(keys, target_key, sensor_key, carriers, B, noise, scale_key, residual)
 
 
 def two_pose_robot_world_hand_eye_factor(
@@ -89,38 +78,35 @@ def two_pose_robot_world_hand_eye_factor(
     scale_key: int | None = None,
     residual: Residual = "geodesic",
 ) -> gtsam.CustomFactor:
-    """One measurement where both carriers move: a robot's camera that sees a tag on another robot.
+    """The factor of one measurement where both carriers move: a robot's camera sees a tag on another robot.
 
-    P_i = T_world_sensorcarrier and P_j = T_world_targetcarrier in one common frame: A = P_i^-1 P_j.
-
-    Residual: that of ``robot_world_hand_eye_factor`` at A; with ``scale_key`` that of the scaled one.
+    P_i = T_world_sensorcarrier and P_j = T_world_targetcarrier in one common frame: A = P_i^-1 P_j. The residual is
+    ``robot_world_hand_eye_factor``'s with this A.
 
     Parameters
     ----------
     sensorcarrier_key, targetcarrier_key : int
         Keys of P_i and P_j, Pose3.
-    target_key, sensor_key : int
-        Keys of X = T_targetcarrier_target and Y = T_sensorcarrier_sensor, Pose3.
-    B, noise, scale_key, residual
+    target_key, sensor_key, B, noise, scale_key, residual
         As in ``pose_robot_world_hand_eye_factor``.
 
     Raises
     ------
     TypeError, ValueError
-        As there.
+        As in ``pose_robot_world_hand_eye_factor``.
     """
-
-    def predict(values: gtsam.Values, wanted: bool) -> Prediction:
-        P_i = pose_of(values, sensorcarrier_key, "P_i = T_world_sensorcarrier")
-        P_j = pose_of(values, targetcarrier_key, "P_j = T_world_targetcarrier")
-        X = pose_of(values, target_key, "X = T_targetcarrier_target")
-        Y = pose_of(values, sensor_key, "Y = T_sensorcarrier_sensor")
-        predicted = P_i.compose(Y).inverse().compose(P_j.compose(X))
-        if not wanted:
-            return Prediction(predicted, Y, [])
-        by_sensor = -predicted.inverse().AdjointMap()
-        by_sensorcarrier = by_sensor @ Y.inverse().AdjointMap()
-        return Prediction(predicted, Y, [by_sensorcarrier, X.inverse().AdjointMap(), np.eye(6), by_sensor])
-
+    names = ("P_i = T_world_sensorcarrier", "P_j = T_world_targetcarrier")
+    carriers = between(sensorcarrier_key, targetcarrier_key, names)
     keys = [sensorcarrier_key, targetcarrier_key, target_key, sensor_key]
-    return measurement_factor(keys, sensor_key, B, noise, predict, scale_key, residual)
+    return measurement_factor(keys, target_key, sensor_key, carriers, B, noise, scale_key, residual)
+
+
+def between(first_key: int, second_key: int, names: tuple[str, str]) -> Carriers:
+    """A = P_i^-1 P_j of two pose variables; ``names`` describe them in errors."""
+
+    def carriers(values: gtsam.Values) -> tuple[gtsam.Pose3, dict[int, Array]]:
+        A = pose_of(values, first_key, names[0]).between(pose_of(values, second_key, names[1]))
+        # (P_i Expmap(d))^-1 P_j = A Expmap(-Ad(A^-1) d)
+        return A, {first_key: -A.inverse().AdjointMap(), second_key: np.eye(6)}
+
+    return carriers

@@ -1,9 +1,11 @@
-"""All measurements of a pair in one factor of at most 25 rows, exactly: the certified cost as it is (DESIGN fact 2).
+"""All measurements of a pair in one factor of at most 25 rows: exactly the certified cost (design fact 2).
 
-Over x = [s (t_X - c), s (t_Y - a), s, vec R_X, vec R_Y] (scale s; origins c of the target's and a of the sensor's
-carrier; vec stacks columns) the chordal cost of any number of measurements is one quadratic form x' Q x (RWHEC paper,
-eqs. 24-42). With 2 Q = L' L, the residual L x has the same cost 1/2 |L x|^2, gradient and Gauss-Newton Hessian as all
-of them together.
+The chordal cost of any number of measurements is one quadratic form x' Q x (RWHEC paper, eqs. 24-42) of
+
+    x = [s (t_X - c), s (t_Y - a), s, vec R_X, vec R_Y]
+
+with the scale s, the origins c (target's carrier) and a (sensor's carrier), and vec stacking columns. With 2 Q = L' L
+the residual L x has the cost 1/2 |L x|^2, the gradient and the Gauss-Newton Hessian of all the measurements together.
 """
 
 from __future__ import annotations
@@ -15,12 +17,13 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rwhec_factors.se3 import Array, hat, stacked
+from rwhec_factors.arguments import check_keys, checked_pairs
+from rwhec_factors.se3 import HATS, Array
 from rwhec_factors.values import number_of, pose_of
 
-#: Measurements summed at once.
+#: Number of measurements that are summed at once, which bounds the memory.
 BLOCK = 4096
-#: Eigenvalues of Q below this, of the largest after scaling, are its rounding: they make no row.
+#: Eigenvalues of the scaled Q below this share of the largest are rounding: they make no row.
 ROUNDING = 1e-15
 
 T_X, T_Y, SCALE, R_X, R_Y = slice(0, 3), slice(3, 6), 6, slice(7, 16), slice(16, 25)
@@ -28,7 +31,7 @@ T_X, T_Y, SCALE, R_X, R_Y = slice(0, 3), slice(3, 6), 6, slice(7, 16), slice(16,
 
 @dataclass(frozen=True)
 class EdgeSummary:
-    """A pair's measurements as one quadratic form. Additive: ``a + b`` holds both, about one origin.
+    """A pair's measurements as one quadratic form. ``a + b`` holds the measurements of both, about a's origins.
 
     Attributes
     ----------
@@ -38,7 +41,7 @@ class EdgeSummary:
     count : int
         Number of measurements.
     target_origin, sensor_origin : (3,) arrays
-        c and a, in metres: t_X and t_Y are referred to them, or a world far away would take the form's digits.
+        c and a, in metres: t_X and t_Y are relative to them. Origins near the poses keep the form's digits.
     """
 
     form: Array
@@ -71,13 +74,9 @@ class EdgeSummary:
         Raises
         ------
         ValueError
-            For arrays that do not go together, or weights that are not positive and finite.
+            If the shapes of A and B differ, an entry is not finite, or a weight is not positive and finite.
         """
-        A, B = stacked(A), stacked(B)
-        if A.ndim != 3 or A.shape[1:] != (4, 4) or A.shape != B.shape or len(A) == 0:
-            raise ValueError(f"A has shape {A.shape} and B {B.shape}; both must be (N, 4, 4) with one N of at least 1")
-        if not (np.isfinite(A).all() and np.isfinite(B).all()):
-            raise ValueError("A or B has entries that are NaN or infinite; leave these measurements out")
+        A, B = checked_pairs(A, B)
         weights = []
         for name, value in (("sigma", sigma), ("kappa", kappa)):
             weight = np.asarray(value, dtype=np.float64)
@@ -95,7 +94,7 @@ class EdgeSummary:
         return EdgeSummary(form, len(A), c, a)
 
     def about(self, target_origin: Array, sensor_origin: Array) -> EdgeSummary:
-        """The same about other origins, exactly in formula (far ones cost digits)."""
+        """The same form about other origins, exact but for rounding (origins far away cost digits)."""
         shift = np.eye(25)
         shift[T_X, SCALE] = target_origin - self.target_origin
         shift[T_Y, SCALE] = sensor_origin - self.sensor_origin
@@ -109,7 +108,7 @@ class EdgeSummary:
 
 
 def _rows(A: Array, B: Array, root_weight: Array, root_kappa: Array, c: Array, a: Array) -> Array:
-    """(12 N, 25) whitened rows: M_R (eq. 25) and M_t (eq. 30), about the origins."""
+    """Whitened rows (12 N, 25): M_R (eq. 25) and M_t (eq. 30), about the origins."""
     count = len(A)
     R_A, R_B, t_B = A[:, :3, :3], B[:, :3, :3], B[:, :3, 3]
     t_A = A[:, :3, 3] + R_A @ c - a
@@ -125,30 +124,31 @@ def _rows(A: Array, B: Array, root_weight: Array, root_kappa: Array, c: Array, a
     return M.reshape(12 * count, 25)
 
 
-#: d (R e_j) = -R hat(e_j) omega, for a right perturbation omega.
-_COLUMNS = -hat(np.eye(3))
-
-
 def square_root(form: Array) -> Array:
     """L (r, 25), r <= 25, with L' L = 2 Q.
 
-    Scaled to a unit diagonal first: translations' and rotations' weights may be orders of magnitude apart.
+    Q is scaled to a unit diagonal first: weights of translations and rotations may be orders of magnitude apart.
 
     Raises
     ------
     ValueError
-        For a form that is not finite, or not positive semidefinite but for rounding.
+        If the form is not finite, or not positive semidefinite up to rounding.
     """
     form = np.asarray(form, dtype=np.float64)
     if form.shape != (25, 25) or not np.isfinite(form).all():
-        raise ValueError(f"the form has shape {form.shape}, or entries that are no numbers; it is 25 x 25 and finite")
+        raise ValueError(
+            f"the form has shape {form.shape}, or entries that are not finite; give EdgeSummary.of(A, B, sigma, kappa)"
+        )
     doubled = form + form.T
     diagonal = np.diagonal(doubled)
     size = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(doubled / size[:, None] / size)
     largest = values[-1]
     if values[0] < -1e-9 * max(largest, 1e-300):
-        raise ValueError(f"the form is not positive semidefinite (eigenvalue {values[0]:.3g} after scaling)")
+        raise ValueError(
+            f"the form is not positive semidefinite (eigenvalue {values[0]:.3g} after scaling); "
+            "give EdgeSummary.of(A, B, sigma, kappa)"
+        )
     kept = values > ROUNDING * largest
     root: Array = (np.sqrt(values[kept]) * vectors[:, kept]).T * size
     return root
@@ -170,19 +170,15 @@ def edge_summary_factor(
     Returns
     -------
     gtsam.CustomFactor
-        At most 25 rows, unit noise; its weights are in the summary. Robust losses weigh measurements, so they cannot
-        be put on it: take single factors, or re-weight and summarise anew.
+        At most 25 rows, unit noise; the weights are in the summary. A robust loss weighs single measurements, so it
+        needs single factors; or re-weight the measurements and summarise them anew.
 
     Raises
     ------
     ValueError, TypeError
-        For equal keys, or what is no summary.
+        If two keys are equal (motions of one sensor take ``hand_eye_summary_factor``), or the summary is not valid.
     """
-    if target_key == sensor_key:
-        raise ValueError(
-            f"target and sensor have one key, {gtsam.DefaultKeyFormatter(target_key)}; for A Y = Y B of one sensor's "
-            "motions take hand_eye_summary_factor"
-        )
+    check_keys([target_key, sensor_key])
     return _summary_factor([target_key, sensor_key], summary, scale_key)
 
 
@@ -191,7 +187,7 @@ def hand_eye_summary_factor(
 ) -> gtsam.CustomFactor:
     """All motions of one sensor, A Y = Y B (AX = XB), as one factor; A and B both T_before_after.
 
-    Parameters, result and errors as of ``edge_summary_factor``, with Y in both places; the summary's origins are equal.
+    Parameters, result and errors are ``edge_summary_factor``'s, with Y for both poses and one origin for both carriers.
     """
     if isinstance(summary, EdgeSummary) and not np.array_equal(summary.target_origin, summary.sensor_origin):
         summary = summary.about(summary.sensor_origin, summary.sensor_origin)
@@ -202,8 +198,7 @@ def _summary_factor(ends: list[int], summary: EdgeSummary, scale_key: int | None
     if not isinstance(summary, EdgeSummary):
         raise TypeError(f"the summary is a {type(summary).__name__}; give EdgeSummary.of(A, B, sigma, kappa)")
     keys = ends + ([] if scale_key is None else [scale_key])
-    if len(set(keys)) != len(keys):
-        raise ValueError(f"the scale has a pose's key, {gtsam.DefaultKeyFormatter(keys[-1])}; give it one of its own")
+    check_keys(keys)
     L = square_root(summary.form)
     origins = (summary.target_origin, summary.sensor_origin)
     names = ("X = T_targetcarrier_target", "Y = T_sensorcarrier_sensor")
@@ -225,7 +220,7 @@ def _summary_factor(ends: list[int], summary: EdgeSummary, scale_key: int | None
             for pose, (L_t, L_R) in zip(poses, parts, strict=True):
                 R_pose = pose.rotation().matrix()
                 block = np.empty((len(L), 6), order="F")
-                block[:, :3] = L_R @ (R_pose @ _COLUMNS).reshape(9, 3)
+                block[:, :3] = -L_R @ (R_pose @ HATS).reshape(9, 3)
                 block[:, 3:] = L_t @ (scale * R_pose)
                 blocks.append(block)
             if len(ends) == 1:

@@ -1,4 +1,4 @@
-"""Noise models: what a factor cannot honour is refused in words, where GTSAM would take something else in silence."""
+"""Checks of noise models: the factors refuse noise that GTSAM would replace by other noise without a word."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ Noise = gtsam.noiseModel.Base
 
 
 def checked(noise: object, dimension: int, what: str) -> Noise:
-    """A Gaussian or robust noise model of a dimension, positive definite and finite.
+    """A Gaussian or robust noise model of the right dimension, positive definite and finite.
 
     Raises
     ------
     TypeError
-        For what is no noise model.
+        If the value is not a noise model.
     ValueError
-        For another dimension, a hard constraint (zero sigma), or a covariance that is singular or no number.
+        If the dimension is wrong, a sigma is zero (a hard constraint), or the covariance is singular or not finite.
     """
     if not isinstance(noise, gtsam.noiseModel.Base):
         raise TypeError(
@@ -36,18 +36,20 @@ def checked(noise: object, dimension: int, what: str) -> Noise:
             "sigma, or add a gtsam.NonlinearEqualityPose3 to what is known"
         )
     if not np.isfinite(information).all():
-        raise ValueError(f"the noise model of {what} has entries that are no numbers: sigmas {gaussian.sigmas()}")
+        raise ValueError(
+            f"the noise model of {what} has entries that are NaN (sigmas: {gaussian.sigmas()}); give numbers"
+        )
     size = np.sqrt(np.diagonal(information))
     if not (size > 0.0).all() or np.linalg.eigvalsh(information / size[:, None] / size)[0] < 1e-14:
         raise ValueError(
-            f"the noise model of {what} is singular: it says nothing of some direction (an infinite sigma?); for a "
-            "part of a pose take a factor that measures that part"
+            f"the noise model of {what} is singular: some direction has no information (an infinite sigma?). "
+            "To constrain a part of a pose, take a factor that measures that part"
         )
     return noise
 
 
 def without_loss(noise: Noise) -> Any:
-    """The Gaussian inside a robust model; itself where there is no loss."""
+    """The Gaussian model inside a robust model; a Gaussian model itself."""
     while isinstance(noise, gtsam.noiseModel.Robust):
         noise = noise.noise()
     gaussian: Any = noise  # GTSAM has no third kind
@@ -63,33 +65,32 @@ def information_of(gaussian: Any) -> Array:
 
 
 def chordal(noise: Noise, what: str) -> Noise:
-    """For the chordal residual's twelve rows, from a model of B's perturbation (6): [rotation (rad), translation (m)].
+    """The noise of the chordal residual's rows: nine of a rotation (rad), then any three of a translation (m).
 
-    |R - R_0|_F^2 is 2 theta^2: each of the nine rows has sqrt(2) times the rotation's standard deviation.
+    ``noise`` is of a right perturbation, (3,) or (6,). |R - R_0|_F^2 is 2 theta^2, so each of the nine rows has sqrt(2)
+    times the rotation's standard deviation.
 
     Raises
     ------
     ValueError
-        When rotation or translation is not isotropic, or the two are correlated: this residual holds two numbers.
+        If the rotation or the translation is not isotropic, or the two are correlated.
     """
     gaussian = without_loss(noise)
     information = information_of(gaussian)
-    diagonal = np.diagonal(information)
-    same = np.r_[np.full(3, diagonal[:3].mean()), np.full(3, diagonal[3:].mean())]
-    unit = np.sqrt(same)
-    if np.abs(information / unit[:, None] / unit - np.eye(6)).max() > 1e-6:
+    mean = np.diagonal(information).reshape(-1, 3).mean(axis=1)
+    unit = np.sqrt(np.repeat(mean, 3))
+    if np.abs(information / unit[:, None] / unit - np.eye(len(unit))).max() > 1e-6:
         raise ValueError(
             f"the noise model of {what} is anisotropic, and the chordal residual holds one sigma for rotation and one "
             f"for translation (sigmas: {gaussian.sigmas()}); take residual='geodesic', or Diagonal.Sigmas of "
-            "[r, r, r, t, t, t]"
+            "[r, r, r, t, t, t] (Isotropic.Sigma for a rotation alone)"
         )
-    sigma_R, sigma_t = 1.0 / unit[0], 1.0 / unit[3]
-    rows: Noise = gtsam.noiseModel.Diagonal.Sigmas(np.r_[np.full(9, np.sqrt(2.0) * sigma_R), np.full(3, sigma_t)])
-    return with_loss_of(noise, rows)
+    rows = np.r_[np.full(9, np.sqrt(2.0 / mean[0])), np.repeat(1.0 / np.sqrt(mean[1:]), 3)]
+    return with_loss_of(noise, gtsam.noiseModel.Diagonal.Sigmas(rows))
 
 
 def with_loss_of(noise: Noise, gaussian: Noise) -> Noise:
-    """A Gaussian model in the loss of another, if that has one."""
+    """The Gaussian model under the robust loss of ``noise``, if ``noise`` has one."""
     if isinstance(noise, gtsam.noiseModel.Robust):
         return gtsam.noiseModel.Robust.Create(noise.robust(), with_loss_of(noise.noise(), gaussian))
     return gaussian

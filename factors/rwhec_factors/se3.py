@@ -1,6 +1,6 @@
-"""SE(3) for many poses at once: what GTSAM's Pose3 does for one. Poses (N, 4, 4); tangents (N, 6), [omega, v].
+"""SE(3) for many poses at once, like gtsam.Pose3 for one. Poses (N, 4, 4); tangents (N, 6), [omega, v].
 
-Equations: Barfoot, State Estimation for Robotics (2024), Chapter 8; its rotation-second order turned into GTSAM's.
+Equations: Barfoot, State Estimation for Robotics (2024), Chapter 8, with GTSAM's order: rotation first.
 """
 
 from __future__ import annotations
@@ -12,24 +12,28 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-#: Below this angle (rad) series are taken in place of quotients whose numerators cancel.
+#: Angle, rad, below which series replace quotients whose numerators cancel.
 SMALL = 1e-2
-#: Above this one the rotation's axis is taken from its symmetric part: the antisymmetric one vanishes at pi.
+#: Angle, rad, above which the axis comes from the rotation's symmetric part: the antisymmetric part is zero at pi.
 LARGE = 3.0
 
 
 def stacked(poses: Any) -> Array:
-    """(N, 4, 4) of an array, or of a list of gtsam.Pose3."""
+    """An array, or a list of gtsam.Pose3, as (N, 4, 4)."""
     if isinstance(poses, (list, tuple)) and poses and hasattr(poses[0], "matrix"):
         poses = [pose.matrix() for pose in poses]
     return np.asarray(poses, dtype=np.float64)
 
 
 def hat(v: Array) -> Array:
-    """(N, 3, 3) with hat(v) w = v x w."""
+    """The matrices (N, 3, 3) with hat(v) w = v x w."""
     x, y, z = np.moveaxis(v, -1, 0)
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3)
+
+
+#: hat(e_1), hat(e_2), hat(e_3): hat(omega) e_i = -hat(e_i) omega, so d (R e_i) = -R hat(e_i) omega.
+HATS = hat(np.eye(3))
 
 
 def inverse(T: Array) -> Array:
@@ -43,7 +47,7 @@ def inverse(T: Array) -> Array:
 
 
 def adjoint(T: Array) -> Array:
-    """(N, 6, 6): T Expmap(xi) T^-1 = Expmap(adjoint(T) xi)."""
+    """The matrices (N, 6, 6) with T Expmap(xi) T^-1 = Expmap(adjoint(T) xi)."""
     result = np.zeros((len(T), 6, 6))
     R = T[:, :3, :3]
     result[:, :3, :3] = result[:, 3:, 3:] = R
@@ -52,7 +56,7 @@ def adjoint(T: Array) -> Array:
 
 
 def so3_logmap(R: Array) -> Array:
-    """(N, 3) rotation vectors of (N, 3, 3) rotations, angles in [0, pi], accurate near 0 and near pi."""
+    """Rotation vectors (N, 3) of rotations (N, 3, 3), with angles in [0, pi], accurate near 0 and near pi."""
     half = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=-1)
     sine = np.linalg.norm(half, axis=1)
     cosine = 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0)
@@ -61,7 +65,7 @@ def so3_logmap(R: Array) -> Array:
     scale = np.where(small, 1.0 + angle**2 / 6.0, angle / np.where(small, 1.0, sine))
     omega: Array = scale[:, None] * half
     for n in np.flatnonzero(angle > LARGE):
-        # R + R' = 2 cos I + 2 (1 - cos) a a': the axis from the largest column, its sign from the sine's side.
+        # R + R' = 2 cos I + 2 (1 - cos) a a': the largest column gives the axis, `half` its sign.
         outer = 0.5 * (R[n] + R[n].T) - np.cos(angle[n]) * np.eye(3)
         axis = outer[:, int(np.argmax(np.diagonal(outer)))]
         axis = axis / np.linalg.norm(axis)
@@ -70,7 +74,7 @@ def so3_logmap(R: Array) -> Array:
 
 
 def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
-    """(1 - cos) / angle^2, (angle - sin) / angle^3, and the square's coefficient of the left Jacobian's inverse."""
+    """(1 - cos) / angle^2, (angle - sin) / angle^3, and the coefficient of hat^2 in the left Jacobian's inverse."""
     small = angle < SMALL
     t = np.where(small, 1.0, angle)
     t2 = angle * angle
@@ -82,7 +86,7 @@ def _coefficients(angle: Array) -> tuple[Array, Array, Array]:
 
 
 def so3_left_jacobian_inverse(omega: Array) -> Array:
-    """(N, 3, 3): I - hat/2 + d hat^2."""
+    """The inverse (N, 3, 3) of the SO(3) left Jacobian: I - hat/2 + d hat^2."""
     W = hat(omega)
     _, _, d = _coefficients(np.linalg.norm(omega, axis=1))
     result: Array = np.eye(3) - 0.5 * W + d[:, None, None] * (W @ W)
@@ -90,7 +94,7 @@ def so3_left_jacobian_inverse(omega: Array) -> Array:
 
 
 def expmap(xi: Array) -> Array:
-    """(N, 4, 4) poses of tangents (N, 6)."""
+    """Poses (N, 4, 4) of tangents (N, 6)."""
     omega = xi[:, :3]
     W = hat(omega)
     W2 = W @ W
@@ -106,17 +110,17 @@ def expmap(xi: Array) -> Array:
 
 
 def logmap(T: Array) -> Array:
-    """(N, 6) tangents of poses (N, 4, 4): T = Expmap(xi), angles in [0, pi]."""
+    """Tangents (N, 6) of poses (N, 4, 4): T = Expmap(xi), with angles in [0, pi]."""
     omega = so3_logmap(T[:, :3, :3])
     v = np.einsum("nij,nj->ni", so3_left_jacobian_inverse(omega), T[:, :3, 3])
     return np.concatenate([omega, v], axis=1)
 
 
 def right_jacobian_inverse(xi: Array) -> Array:
-    """(N, 6, 6): Log(Expmap(xi) Expmap(d)) = xi + result d to first order in d.
+    """The matrices (N, 6, 6) with Log(Expmap(xi) Expmap(d)) = xi + result d to first order in d.
 
-    The right Jacobian is the left one at -xi; its inverse is [[J, 0], [-J Q J, J]] with J the SO(3) left Jacobian's
-    inverse at -omega and Q the coupling of translation with rotation (Barfoot eq. 8.91, in GTSAM's order).
+    The right Jacobian is the left Jacobian at -xi. Its inverse is [[J, 0], [-J Q J, J]]: J is the inverse of the SO(3)
+    left Jacobian at -omega, Q the coupling of translation with rotation (Barfoot eq. 8.91, in GTSAM's order).
     """
     omega, v = -xi[:, :3], -xi[:, 3:]
     J = so3_left_jacobian_inverse(omega)
@@ -132,7 +136,7 @@ def _coupling(omega: Array, v: Array) -> Array:
     WV, VW = W @ V, V @ W
     WVW = WV @ W
     t = np.linalg.norm(omega, axis=1)
-    small = t < 0.1  # fourth-order differences cancel earlier
+    small = t < 0.1  # differences of fourth order cancel at larger angles
     s = np.where(small, 1.0, t)
     t2 = t * t
     q1 = np.where(small, 1.0 / 6.0 - t2 / 120.0 * (1.0 - t2 / 42.0 * (1.0 - t2 / 72.0)), (s - np.sin(s)) / s**3)

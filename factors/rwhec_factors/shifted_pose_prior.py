@@ -1,4 +1,4 @@
-"""A carrier's pose as it was measured, at a clock that is off by an unknown time."""
+"""A prior on a carrier's pose, where the sensor's clock has an unknown time offset."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rwhec_factors import noise_models
-from rwhec_factors.known_carrier_pose import checked_twist
-from rwhec_factors.measurement import check_pose
+from rwhec_factors.arguments import check_pose, checked_twists
 from rwhec_factors.se3 import Array
 from rwhec_factors.values import number_of, pose_of
 
@@ -18,33 +17,31 @@ from rwhec_factors.values import number_of, pose_of
 def shifted_pose_prior_factor(
     pose_key: int, time_offset_key: int, T: gtsam.Pose3, twist: ArrayLike, noise: gtsam.noiseModel.Base
 ) -> gtsam.CustomFactor:
-    """A measured pose T of a carrier that moves: P is where it was an unknown time d later.
+    """A prior on the pose P of a moving carrier: P is the measured pose T, moved on by an unknown time d.
 
-    For P a variable that several measurements of one instant share (``pose_robot_world_hand_eye_factor``), while the
-    sensor's clock is off: what the carrier reported at the stamp, moved on by d, is a prior on P.
-
-    Residual: Log((T Expmap(d twist))^-1 P), 6.
+    Several measurements of one instant may share P (``pose_robot_world_hand_eye_factor``).
+    The residual is Log((T Expmap(d twist))^-1 P), (6,).
 
     Parameters
     ----------
     pose_key : int
-        Of P, a Pose3.
+        Key of P, a Pose3.
     time_offset_key : int
-        Of d, a 1-vector, seconds: the sensor's stamp t is the carriers' t + d.
+        Key of d, a 1-vector, seconds: the sensor's stamp t is the carriers' t + d.
     T : gtsam.Pose3
         Measured at the stamp, metres.
     twist : (6,)
         [omega (rad/s), v (m/s)] in P's own axes.
     noise : gtsam.noiseModel.Base
-        Of T's right perturbation, dimension 6, rotation first.
+        Noise of T's right perturbation, dimension 6, rotation first.
 
     Raises
     ------
     TypeError, ValueError
-        For what is no pose, twist or noise model.
+        If T, the twist or the noise model is not valid.
     """
     check_pose(T, "the measured pose")
-    velocity = checked_twist(twist)
+    velocity = checked_twists(twist, (6,))
     model = noise_models.checked(noise, 6, "the measured pose")
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Any] | None) -> Array:

@@ -1,4 +1,4 @@
-"""Variables out of gtsam.Values, with errors that name the key and say what it should be."""
+"""Variables out of gtsam.Values, with errors that name the key and the type that it should have."""
 
 from __future__ import annotations
 
@@ -6,15 +6,7 @@ import gtsam
 
 
 def pose_of(values: gtsam.Values, key: int, what: str) -> gtsam.Pose3:
-    """The Pose3 of a key.
-
-    Raises
-    ------
-    KeyError
-        When the key is missing.
-    TypeError
-        When it holds something else.
-    """
+    """The Pose3 of a key; KeyError if the key is missing, TypeError if it holds another type."""
     try:
         return values.atPose3(key)
     except RuntimeError as error:
@@ -22,15 +14,7 @@ def pose_of(values: gtsam.Values, key: int, what: str) -> gtsam.Pose3:
 
 
 def number_of(values: gtsam.Values, key: int, what: str) -> float:
-    """The number in the 1-vector of a key.
-
-    Raises
-    ------
-    KeyError
-        When the key is missing.
-    TypeError
-        When it holds something else.
-    """
+    """The number in the 1-vector of a key; KeyError if the key is missing, TypeError if it holds another type."""
     try:
         vector = values.atVector(key)
     except RuntimeError as error:
@@ -48,4 +32,4 @@ def name_of(key: int) -> str:
 def _explained(values: gtsam.Values, key: int, what: str, error: RuntimeError) -> KeyError | TypeError:
     if not values.exists(key):
         return KeyError(f"{name_of(key)} is not in the values; it should be {what}")
-    return TypeError(f"{name_of(key)} should be {what}; it holds something else ({error})")
+    return TypeError(f"{name_of(key)} should be {what}; it holds another type ({error})")

@@ -10,7 +10,7 @@ import numpy as np
 from rwhec_factors.batch import robot_world_hand_eye_batch_factor
 from rwhec_factors.carrier_pose_variables import pose_robot_world_hand_eye_factor
 from rwhec_factors.edge_summary import EdgeSummary, edge_summary_factor, hand_eye_summary_factor
-from rwhec_factors.known_carrier_pose import robot_world_hand_eye_factor, scaled_robot_world_hand_eye_factor
+from rwhec_factors.known_carrier_pose import robot_world_hand_eye_factor
 from rwhec_factors.priors import position_prior_factor, rotation_prior_factor
 from rwhec_factors.shifted_pose_prior import shifted_pose_prior_factor
 
@@ -171,22 +171,20 @@ def add_single(
     """One geodesic factor for each measurement, so that GTSAM's losses weigh each on its own."""
     for item in data:
         target, sensor = variables.ends(item.pair)
-        scale_key, offset_key = variables.scale_key(item.pair), variables.offset_key(item.pair)
         twists = item.residuals.twists
         for i, (A, B) in enumerate(zip(item.residuals.A, item.residuals.B, strict=True)):
-            poses = (to_pose3(A[:3, :3], A[:3, 3]), to_pose3(B[:3, :3], B[:3, 3]))
-            noise = robust_noise(covariances[item.pair][i], robust)
-            twist = None if twists is None else twists[i]
-            if scale_key is None:
-                graph.add(
-                    robot_world_hand_eye_factor(target, sensor, *poses, noise, time_offset_key=offset_key, twist=twist)
+            graph.add(
+                robot_world_hand_eye_factor(
+                    target,
+                    sensor,
+                    to_pose3(A[:3, :3], A[:3, 3]),
+                    to_pose3(B[:3, :3], B[:3, 3]),
+                    robust_noise(covariances[item.pair][i], robust),
+                    scale_key=variables.scale_key(item.pair),
+                    time_offset_key=variables.offset_key(item.pair),
+                    twist=None if twists is None else twists[i],
                 )
-            else:
-                graph.add(
-                    scaled_robot_world_hand_eye_factor(
-                        target, sensor, scale_key, *poses, noise, time_offset_key=offset_key, twist=twist
-                    )
-                )
+            )
 
 
 def add_with_carriers(

@@ -23,7 +23,6 @@ from rwhec_factors import (
     EdgeSummary,
     edge_summary_factor,
     robot_world_hand_eye_factor,
-    scaled_robot_world_hand_eye_factor,
 )
 
 import gtsam_rwhec as rw
@@ -76,11 +75,9 @@ def singles(problem: rw.Problem, variables: Variables) -> gtsam.NonlinearFactorG
         m = problem.measurements(target, sensor)
         for A, B in zip(m.A, m.B, strict=True):
             poses = gtsam.Pose3(A), gtsam.Pose3(B)
-            if variables.scaled:
-                factor = scaled_robot_world_hand_eye_factor(*keys, S(0), *poses, noise, residual="chordal")
-            else:
-                factor = robot_world_hand_eye_factor(*keys, *poses, noise, residual="chordal")
-            graph.add(factor)
+            graph.add(
+                robot_world_hand_eye_factor(*keys, *poses, noise, scale_key=variables.scale_key, residual="chordal")
+            )
     return graph
 
 

@@ -13,7 +13,6 @@ from rwhec_factors import (
     pose_hand_eye_factor,
     pose_robot_world_hand_eye_factor,
     robot_world_hand_eye_factor,
-    scaled_robot_world_hand_eye_factor,
     two_pose_robot_world_hand_eye_factor,
 )
 
@@ -117,10 +116,7 @@ def test_they_agree_with_known_carriers(residual: str) -> None:
     A = P_s.inverse().compose(P_t)
     values = values_of({P(0): P_s, P(1): P_t, P(2): A, P(3): A.inverse(), X(0): X_, Y(0): Y_, S(0): 1.3})
     for options in ({}, {"scale_key": S(0)}):
-        if options:
-            known = scaled_robot_world_hand_eye_factor(X(0), Y(0), S(0), A, B, NOISE, residual=residual)
-        else:
-            known = robot_world_hand_eye_factor(X(0), Y(0), A, B, NOISE, residual=residual)
+        known = robot_world_hand_eye_factor(X(0), Y(0), A, B, NOISE, residual=residual, **options)
         for factor in (
             two_pose_robot_world_hand_eye_factor(P(0), P(1), X(0), Y(0), B, NOISE, residual=residual, **options),
             pose_robot_world_hand_eye_factor(P(2), X(0), Y(0), B, NOISE, residual=residual, pose=STRAIGHT, **options),

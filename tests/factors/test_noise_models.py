@@ -16,7 +16,7 @@ REFUSED = {
     "a zero sigma": (noiseModel.Diagonal.Sigmas(np.r_[0.0, np.ones(5)]), "standard deviation of zero"),
     "isotropic zero": (noiseModel.Isotropic.Sigma(6, 0.0), "standard deviation of zero"),
     "robust over Constrained": (robust(noiseModel.Constrained.All(6)), "standard deviation of zero"),
-    "NaN": (noiseModel.Diagonal.Sigmas(np.r_[np.nan, np.ones(5)]), "no numbers"),
+    "NaN": (noiseModel.Diagonal.Sigmas(np.r_[np.nan, np.ones(5)]), "entries that are NaN"),
     "infinite sigma": (noiseModel.Diagonal.Sigmas(np.r_[np.inf, np.ones(5)]), "singular"),
     "no information": (noiseModel.Gaussian.SqrtInformation(np.diag([0.0, 1, 1, 1, 1, 1])), "singular"),
     "dimension": (noiseModel.Unit.Create(3), "dimension 3; it should have 6"),
@@ -25,14 +25,14 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_honoured_is_refused_in_words(name: str) -> None:
+def test_noise_that_a_factor_cannot_hold_is_refused(name: str) -> None:
     model, words = REFUSED[name]
     with pytest.raises(ValueError, match=words):
         noise_models.checked(model, 6, "B")
 
 
 @pytest.mark.parametrize("model", [None, 0.1, np.eye(6)])
-def test_what_is_no_noise_model_is_a_type_error(model: object) -> None:
+def test_a_value_that_is_not_a_noise_model_is_a_type_error(model: object) -> None:
     with pytest.raises(TypeError, match=r"give a gtsam\.noiseModel of dimension 6"):
         noise_models.checked(model, 6, "B")
 
@@ -47,7 +47,7 @@ def test_what_is_no_noise_model_is_a_type_error(model: object) -> None:
         robust(noiseModel.Gaussian.Covariance(np.eye(6) + 0.3)),
     ],
 )
-def test_the_rest_is_kept_as_it_is(model: noiseModel.Base) -> None:
+def test_valid_noise_is_kept_as_it_is(model: noiseModel.Base) -> None:
     assert noise_models.checked(model, 6, "B") is model
 
 

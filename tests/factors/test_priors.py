@@ -215,7 +215,7 @@ def test_a_direction_prior_leaves_the_opposite_direction(angle: float) -> None:
     assert factor.error(result) < 1e-6
 
 
-def test_a_direction_prior_measures_the_angle_between_and_no_turn_about_it() -> None:
+def test_a_direction_prior_measures_the_angle_between_the_axes_and_ignores_turns_about_the_axis() -> None:
     factor = direction_prior_factor(X(0), [0.0, 0.0, 5.0], [0.0, 0.0, 2.0], 1.0)
     for tilt in (0.0, 0.3, 1.5, 3.0):
         for turn in (0.0, 1.0, -2.0):
@@ -302,7 +302,7 @@ def test_a_known_tilt_leaves_one_turn() -> None:
     np.testing.assert_allclose(J @ np.r_[AXIS, 0.0, 0.0, 0.0], 0.0, atol=1e-12)
 
 
-def test_what_cannot_be_meant_is_refused_in_words() -> None:
+def test_arguments_that_are_not_valid_are_refused() -> None:
     T, unit3, unit6 = gtsam.Pose3(), noiseModel.Unit.Create(3), noiseModel.Unit.Create(6)
     anisotropic = noiseModel.Diagonal.Sigmas(np.array([0.1, 0.1, 0.2]))
     cases: list[tuple[Callable[[], object], type[Exception], str]] = [

@@ -1,0 +1,81 @@
+"""Checks of the factors' arguments: each refuses a bad argument with its name, its value and what to give."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rwhec_factors.se3 import Array, stacked
+from rwhec_factors.values import name_of
+
+
+def check_pose(pose: object, what: str) -> None:
+    """Refuse a value that is not a finite gtsam.Pose3."""
+    if not isinstance(pose, gtsam.Pose3):
+        raise TypeError(f"{what} is a {type(pose).__name__}; give a gtsam.Pose3")
+    if not np.isfinite(pose.matrix()).all():
+        raise ValueError(f"{what} has entries that are NaN or infinite; leave the measurement out:\n{pose.matrix()}")
+
+
+def check_choice(name: str, value: object, choices: Any) -> None:
+    """Refuse a value that is not in a Literal type."""
+    if value not in get_args(choices):
+        raise ValueError(f"{name}={value!r} is not one of {', '.join(map(repr, get_args(choices)))}")
+
+
+def check_keys(keys: list[int]) -> None:
+    """Refuse one key for two variables."""
+    if len(set(keys)) != len(keys):
+        raise ValueError(f"the keys {', '.join(map(name_of, keys))} are not all different; give each variable its own")
+
+
+def checked_pairs(A: Any, B: Any) -> tuple[Array, Array]:
+    """A and B as finite (N, 4, 4) arrays with one N of at least 1."""
+    A, B = stacked(A), stacked(B)
+    if A.ndim != 3 or A.shape[1:] != (4, 4) or A.shape != B.shape or len(A) == 0:
+        raise ValueError(f"A has shape {A.shape} and B {B.shape}; both must be (N, 4, 4) with one N of at least 1")
+    if not (np.isfinite(A).all() and np.isfinite(B).all()):
+        raise ValueError("A or B has entries that are NaN or infinite; leave these measurements out")
+    return A, B
+
+
+def check_time_offset(time_offset_key: int | None, twists: ArrayLike | None) -> None:
+    """Refuse a time offset without the carriers' velocity, and a velocity without a time offset."""
+    if (time_offset_key is None) != (twists is None):
+        raise ValueError("a time offset needs both its key (time_offset_key=) and the carriers' velocity (twist=)")
+
+
+def checked_twists(twists: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Velocities of the carriers, finite and of the given shape."""
+    velocity = np.asarray(twists, dtype=np.float64)
+    if velocity.shape != shape or not np.isfinite(velocity).all():
+        raise ValueError(f"the twist is {velocity}; give finite numbers of shape {shape}, [omega (rad/s), v (m/s)]")
+    return velocity
+
+
+def checked_vector(value: ArrayLike, name: str) -> Array:
+    """Three finite numbers."""
+    vector = np.asarray(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name} is {value!r}; give three finite numbers")
+    return vector
+
+
+def unit_vector(value: ArrayLike, name: str) -> Array:
+    """A direction (3,) as a vector of length 1."""
+    vector = checked_vector(value, name)
+    length = np.linalg.norm(vector)
+    if length == 0.0:
+        raise ValueError(f"{name} is {vector}, which has no direction; give a vector that is not zero")
+    unit: Array = vector / length
+    return unit
+
+
+def positive(value: float, name: str) -> float:
+    """A finite number above zero."""
+    if not (np.isfinite(value) and value > 0.0):
+        raise ValueError(f"{name} is {value}; give a positive number")
+    return float(value)
