@@ -127,10 +127,10 @@ TABLE: dict[str, dict[str, str]] = {
         "identifiability/test_information.py": "residuals",
         "solver/test_deflation.py": "lagrangian",
         "solver/test_reduced_form.py": "forms full_form variables",
-        "solver/test_search.py": "attempt found options stages",
+        "solver/test_search.py": "found options stages",
     },
     "gtsam_rwhec/solving": {
-        "solving/test_certified_solution.py": "arguments given_certificate part_solution solution",
+        "solving/test_certified_solution.py": "arguments part_solution solution",
     },
     "gtsam_rwhec/trajectories": {"trajectories/test_trajectory.py": "local_paths"},
     "gtsam_rwhec/vision": {

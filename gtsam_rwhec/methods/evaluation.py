@@ -10,7 +10,7 @@ from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.identifiability.identification import identify
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.full_form import add_priors, assemble, edge_slots, forms_of_edges
+from gtsam_rwhec.solver.full_form import full_forms
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
 from gtsam_rwhec.solver.variables import as_variables, given_answer
@@ -60,10 +60,8 @@ def evaluate(
     free: list[FreeDirection] = []
     for part in parts:
         answer = given_answer(part, X, Y, scale)
-        translation, rotation = forms_of_edges(part)
-        form = assemble(part, edge_slots(part), translation + rotation)
-        add_priors(form, part)
-        cost += max(form.value(*as_variables(part, answer)), 0.0)
+        full, _ = full_forms(part)
+        cost += max(full.value(*as_variables(part, answer)), 0.0)
         poses = PairPoses.of(part, answer)
         J_t, J_R = costs_of_pairs(part, poses)
         residuals |= residuals_of_pairs(part, poses, J_t, J_R)

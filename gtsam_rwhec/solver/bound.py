@@ -5,18 +5,18 @@ constraint is zero at y. Write y = x + [z, 0] for any x whose last entry is 1::
 
     y' Z y = x' Z x + 2 g' z + z' Z_rr z,      g = (Z x) without its last entry
 
-If Z_rr >= diag(m) with m > 0, the right side is at least x' Z x - sum g^2 / m; this is the dual certificate of DESIGN
+If Z_rr >= diag(m) with m > 0, the right side is at least x' Z x - sum g^2 / m. This is the dual certificate of design
 fact 3 with the null vector taken out beforehand, so that the test of definiteness has room. If only Z_rr >= -diag(m)
 can be shown (free directions, or no certificate), |z_i| <= sqrt(3) + |r_i| for each rotation bounds the loss.
 
-With an unknown scale nothing couples to h: (R, alpha) and (-R, -alpha) cost the same and Z_rr has the null vector r
-itself. Then an entry j of r takes the part of h: y_r = a r + z with z_j = 0 and a = y_j / r_j, |a| <= 1 / |r_j|.
+With an unknown scale nothing couples to h: (R, alpha) and (-R, -alpha) cost the same, and r itself is a null vector of
+Z_rr. Then an entry j of r takes the role of h: y_r = a r + z with z_j = 0 and a = y_j / r_j, |a| <= 1 / |r_j|.
 
-Where Z_rr is singular, because an answer is free or has a twin, that loss is that of the verified test on the whole of
-Z_rr; ``deflation`` takes the null directions out first and loses next to nothing.
+Z_rr is singular where an answer is free or has a twin. ``deflation`` takes the null directions out first and loses
+next to nothing; the verified test of all of Z_rr would lose the whole allowance.
 
-x'Zx and g are evaluated in extended precision with their rounding bounded, the test is ``verified``'s: the bound
-is a true one on the optimum of the stored D, C, E, G of ``ReducedForm``.
+x'Zx and g are evaluated in extended precision, with a bound on their rounding; ``verified`` tests the definiteness.
+The bound is a true bound on the optimum of the stored D, C, E, G of ``ReducedForm``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ MORE_ROOM = 16.0
 
 @dataclass(frozen=True)
 class Bound:
-    """A rigorous lower bound and what it rests on.
+    """A rigorous lower bound, and what was proven about Z for it; ``Bound()`` claims nothing.
 
     Attributes
     ----------
@@ -61,18 +61,18 @@ class Bound:
         Where Z_rr is negative: an eigenvector, for a better start.
     """
 
-    lower_bound: float
-    value: float
-    definite: bool
-    semidefinite: bool
-    eigenvalue: float
-    direction: Array | None
+    lower_bound: float = -np.inf
+    value: float = -np.inf
+    definite: bool = False
+    semidefinite: bool = False
+    eigenvalue: float = -np.inf
+    direction: Array | None = None
 
 
 def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
     """The bound that multipliers (n, 20) and a point r (9 n,) give; any will do, optimal ones give a tight one."""
     if not (np.isfinite(multipliers).all() and np.isfinite(r).all()):  # of a solver that failed
-        return Bound(-np.inf, -np.inf, False, False, -np.inf, None)
+        return Bound()
     L, n = form.leaves, form.rotations
     value, z, value_error, z_error = lagrangian(form, multipliers, np.append(r, 1.0))
     g, g_error, constant = z[:-1], z_error[:-1], z[-1]
@@ -135,7 +135,7 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
                 break
             extra = 1.5 * extra + 4.0 * float(max(leaf_unit.max(initial=0.0), border_unit.max(initial=0.0)))
         else:  # an estimate of the eigenvalue that is off by 1.5^60: nothing is claimed
-            return Bound(-np.inf, float(value), False, False, -np.inf, direction)
+            return Bound(value=float(value), direction=direction)
     slack = np.r_[slack_leaf.ravel(), slack_border].reshape(n, 9)
     loss = float((slack.max(axis=1) * size_z**2).sum())
     if semidefinite and 9 * n <= DENSE_EIGEN_SIZE:

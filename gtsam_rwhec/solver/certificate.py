@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 from gtsam_rwhec.solver.cause import Cause, SearchPath, Status
@@ -16,7 +17,7 @@ class Objective:
     ----------
     form : "direct" or "inverse"
         "direct" is the cost of A X = Y B (eq. 18). "inverse" is the cost of B X^-1 = Y^-1 A, which a scale for each
-        target, and priors on translations with an unknown scale, need (DESIGN facts 7 and 11): half of it is no
+        target, and priors on translations with an unknown scale, need (design facts 7 and 11): half of it is no
         chi-square, and refining finds the exact model's optimum from there.
     has_priors : bool
         Whether priors are part of it.
@@ -108,18 +109,19 @@ class Certificate:
 
     @property
     def relative_gap(self) -> float:
-        """The gap over the cost; 0 / 0, which exact data give, counts as the gap over the tolerance's scale."""
-        return self.gap / max(abs(self.cost), 1e6 * self.tolerance, 1e-300) if self._tiny else self.gap / self.cost
+        """The gap over the cost; with a cost of zero, as exact data give, over a million times the tolerance."""
+        return self._relative_gap(self.lower_bound)
 
     @property
     def float_gap(self) -> float:
         """The relative gap without the allowance for rounding."""
-        gap = max(0.0, self.cost - self.float_bound)
-        return gap / max(abs(self.cost), 1e6 * self.tolerance, 1e-300) if self._tiny else gap / self.cost
+        return self._relative_gap(self.float_bound)
 
-    @property
-    def _tiny(self) -> bool:
-        return self.cost <= self.tolerance
+    def _relative_gap(self, bound: float) -> float:
+        is_zero = self.cost <= self.tolerance
+        return max(0.0, self.cost - bound) / (
+            max(abs(self.cost), 1e6 * self.tolerance, 1e-300) if is_zero else self.cost
+        )
 
     def __str__(self) -> str:
         unit = " (unit weights: relative)" if self.is_relative else ""
@@ -135,10 +137,9 @@ class Certificate:
             return certificates[0]
         statuses, causes = list(Status), list(Cause)
         worst = max(certificates, key=lambda c: (statuses.index(c.status), causes.index(c.cause)))
-        seconds: dict[str, float] = {}
+        seconds: Counter[str] = Counter()
         for certificate in certificates:
-            for stage, duration in certificate.seconds.items():
-                seconds[stage] = seconds.get(stage, 0.0) + duration
+            seconds.update(certificate.seconds)
         return Certificate(
             status=worst.status,
             cause=worst.cause,
@@ -153,6 +154,6 @@ class Certificate:
             min_eigenvalue=min(c.min_eigenvalue for c in certificates),
             tolerance=sum(c.tolerance for c in certificates),
             is_relative=worst.is_relative,
-            seconds=seconds,
+            seconds=dict(seconds),
             figures={"cost": worst.cost} | worst.figures | {"parts": float(len(certificates))},
         )

@@ -5,27 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.bound import Bound
 from gtsam_rwhec.solver.cause import Cause, SearchPath
 
 
 @dataclass(frozen=True)
 class Found:
-    """The best rotations of a part and the best bound on what any answer costs.
+    """The best rotations of a part and the best bound on the cost of any answer.
 
     Attributes
     ----------
     R : (n, 3, 3) array
         In the order of ``part.free``, as the form has them.
     cost : float
-        x'Q'x there.
-    lower_bound : float
-        Rigorous; at most ``cost``.
-    float_bound : float
-        The same without the allowance for rounding: x'Zx.
-    is_definite : bool
-        Whether Z is proven positive definite, so that no other answer costs the same.
-    eigenvalue : float
-        A proven lower bound on the smallest eigenvalue of Z.
+        x'Q'x at R.
+    bound : Bound
+        Its ``lower_bound`` is at most ``cost``.
     tolerance : float
         The absolute gap up to which the answer counts as proven optimal.
     path : SearchPath
@@ -36,10 +31,7 @@ class Found:
 
     R: Array
     cost: float
-    lower_bound: float
-    float_bound: float
-    is_definite: bool
-    eigenvalue: float
+    bound: Bound
     tolerance: float
     path: SearchPath
     cause: Cause
@@ -48,4 +40,4 @@ class Found:
     @property
     def is_closed(self) -> bool:
         """Whether the gap is within the tolerance: the answer is proven optimal."""
-        return self.cost - self.lower_bound <= self.tolerance
+        return self.cost - self.bound.lower_bound <= self.tolerance

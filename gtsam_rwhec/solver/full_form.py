@@ -1,8 +1,8 @@
 """The full quadratic form Q (RWHEC paper eq. 42), kept in blocks.
 
-Every free frame has 13 numbers, [t (3), s (1), vec R (9)], s its own scale where it has one. Two numbers belong to
-all: alpha, the shared scale, and h, the homogenising entry (1 at every answer). What a problem does not use stays
-zero and is left out by the reduction. x' Q x is the cost J, its 1/2 included.
+Every free frame has 13 numbers, [t (3), s (1), vec R (9)]; s is its own scale where it has one. All frames share two
+numbers: alpha, the shared scale, and h, the homogenising entry (1 at every answer). A number that a problem does not
+use stays zero, and the reduction leaves it out. x' Q x is the cost J, its 1/2 included.
 
 In the "direct" kind t is alpha times the translation; in the "inverse" kind frames are inverted (X^-1, Y^-1) and the
 scale variable is 1/alpha.
@@ -24,10 +24,10 @@ ALPHA, H = 26, 27
 
 @dataclass(frozen=True)
 class FullForm:
-    """Blocks of Q, and of its rotation residuals alone.
+    """Blocks of Q over L leaves, P centers and the tail, [alpha, h].
 
     leaf (L, 13, 13); leaf_center (L, P, 13, 13); leaf_tail (L, 13, 2); center (P, 13, 13); center_tail (P, 13, 2);
-    tail (2, 2): alpha and h.
+    tail (2, 2).
     """
 
     leaf: Array
@@ -58,20 +58,26 @@ class FullForm:
         return float(own + 2.0 * coupled + tail @ self.tail @ tail)
 
 
-@dataclass(frozen=True)
-class EdgeSlots:
-    """Where the edges of a part go: indices of leaf and center (one past the end: none), and 25 -> 28 substitution."""
+def full_forms(part: Part) -> tuple[FullForm, FullForm]:
+    """Q of a part, and the form of its rotation residuals alone; both with the priors."""
+    translation, rotation = part.moments.translation, part.moments.rotation
+    if part.kind == "inverse":
+        translation = translation[:, SWAPPED[:, None], SWAPPED]
+        rotation = rotation.transpose(0, 2, 1)
+    of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa)
+    slots = _edge_slots(part)
+    full, alone = (_assembled(part, *slots, of_edges) for of_edges in (of_translations + of_rotations, of_rotations))
+    for form in (full, alone):
+        _add_priors(form, part)
+    return full, alone
 
-    leaf: np.ndarray
-    center: np.ndarray
-    substitution: Array
 
+def _edge_slots(part: Part) -> tuple[np.ndarray, np.ndarray, Array]:
+    """Each edge's leaf and center (one past the last index: none), and (25, 28), what its variables are in the form.
 
-def edge_slots(part: Part) -> EdgeSlots:
-    """The substitution of each edge's [t_X, t_Y, alpha, r_X, r_Y] by leaf, center, alpha and h.
-
-    A fixed frame becomes constants times h (its translation times alpha, where t is alpha times the translation);
-    a known scale becomes h; both ends of a motion are one frame.
+    [t_X, t_Y, alpha, r_X, r_Y] become numbers of leaf, center, alpha and h. A fixed frame becomes constants times h
+    (its translation times alpha, where t is alpha times the translation); a known scale becomes h; both ends of a
+    motion are one frame.
     """
     place = {name: (0, i) for i, name in enumerate(part.leaves)}
     place |= {name: (1, i) for i, name in enumerate(part.centers)}
@@ -99,7 +105,7 @@ def edge_slots(part: Part) -> EdgeSlots:
             S[e, 6, 13 * place[target][0] + 3] = 1.0
         else:
             S[e, 6, H] = 1.0 / part.fixed_scales.get(target, 1.0)
-    return EdgeSlots(leaf, center, S)
+    return leaf, center, S
 
 
 def _as_variable(T: Array, part: Part) -> Array:
@@ -112,34 +118,25 @@ def _as_variable(T: Array, part: Part) -> Array:
     return inverse
 
 
-def forms_of_edges(part: Part) -> tuple[Array, Array]:
-    """Translation and rotation forms (E, 25, 25) of all edges of a part."""
-    translation, rotation = part.moments.translation, part.moments.rotation
-    if part.kind == "inverse":
-        translation = translation[:, SWAPPED[:, None], SWAPPED]
-        rotation = rotation.transpose(0, 2, 1)
-    return edge_forms(translation, rotation, part.moments.kappa)
-
-
-def assemble(part: Part, slots: EdgeSlots, edge_form: Array) -> FullForm:
-    """Add up the edges' forms (E, 25, 25) into the blocks of Q."""
+def _assembled(part: Part, leaf_of: np.ndarray, center_of: np.ndarray, S: Array, of_edges: Array) -> FullForm:
+    """The blocks of Q: the sum of the edges' forms (E, 25, 25)."""
     L, P = len(part.leaves), len(part.centers)
-    Q = slots.substitution.transpose(0, 2, 1) @ edge_form @ slots.substitution
+    Q = S.transpose(0, 2, 1) @ of_edges @ S
     one, two, tail = slice(0, 13), slice(13, 26), slice(26, 28)
     # One row more than there are frames: where an edge has no leaf or no center, its zeros go there.
     leaf, leaf_tail = np.zeros((L + 1, 13, 13)), np.zeros((L + 1, 13, 2))
     center, center_tail = np.zeros((P + 1, 13, 13)), np.zeros((P + 1, 13, 2))
     leaf_center = np.zeros((L + 1, P + 1, 13, 13))
-    np.add.at(leaf, slots.leaf, Q[:, one, one])
-    np.add.at(leaf_tail, slots.leaf, Q[:, one, tail])
-    np.add.at(center, slots.center, Q[:, two, two])
-    np.add.at(center_tail, slots.center, Q[:, two, tail])
-    leaf_center[slots.leaf, slots.center] = Q[:, one, two]  # each pair of frames has one edge
+    np.add.at(leaf, leaf_of, Q[:, one, one])
+    np.add.at(leaf_tail, leaf_of, Q[:, one, tail])
+    np.add.at(center, center_of, Q[:, two, two])
+    np.add.at(center_tail, center_of, Q[:, two, tail])
+    leaf_center[leaf_of, center_of] = Q[:, one, two]  # each pair of frames has one edge
     return FullForm(leaf[:L], leaf_center[:L, :P], leaf_tail[:L], center[:P], center_tail[:P], Q[:, tail, tail].sum(0))
 
 
-def add_priors(form: FullForm, part: Part) -> None:
-    """Add kappa |R - R_0|_F^2 / 2 and |t - t_0|^2 / (2 sigma^2), quadratic once multiplied by h (DESIGN fact 11)."""
+def _add_priors(form: FullForm, part: Part) -> None:
+    """Add kappa |R - R_0|_F^2 / 2 and |t - t_0|^2 / (2 sigma^2), quadratic once multiplied by h (design fact 11)."""
     place = {name: (form.leaf, form.leaf_tail, i) for i, name in enumerate(part.leaves)}
     place |= {name: (form.center, form.center_tail, i) for i, name in enumerate(part.centers)}
     for name, priors in part.priors.items():
@@ -147,13 +144,13 @@ def add_priors(form: FullForm, part: Part) -> None:
             continue
         block, tail, index = place[name]
         for prior in priors:
-            quadratic = prior_form(prior.transform, prior.sigma, prior.kappa, part)
+            quadratic = _prior_form(prior.transform, prior.sigma, prior.kappa, part)
             block[index] += quadratic[:13, :13]
             tail[index, :, 1] += quadratic[:13, 13]
             form.tail[1, 1] += quadratic[13, 13]
 
 
-def prior_form(T: Array, sigma: float | None, kappa: float | None, part: Part) -> Array:
+def _prior_form(T: Array, sigma: float | None, kappa: float | None, part: Part) -> Array:
     """The form (14, 14) of one prior over [t, s, vec R, h]."""
     rows = []
     if sigma is not None:

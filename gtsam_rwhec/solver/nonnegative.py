@@ -25,7 +25,7 @@ from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.interior_point import Relaxation
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_with_scale
-from gtsam_rwhec.solver.rotations import random_rotations, vec
+from gtsam_rwhec.solver.rotations import vec
 from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.small_dual import stationary_multipliers
 from gtsam_rwhec.solver.variables import answer_of
@@ -88,16 +88,14 @@ def run_with_nonnegative_scale(search: Search) -> Found:
             options.max_relaxation_iterations,
         )
     with search.stages.of("descent"):
-        generator = np.random.default_rng(options.seed)
-        starts = round_to_rotations(relaxation)
-        starts += [random_rotations(form.rotations, generator) for _ in range(options.random_starts)]
+        starts = round_to_rotations(relaxation) + search.random_starts(options.random_starts)
         at_zero = _descend(without_scale(form), starts, options.max_descent_iterations)
         # From where the scale is held at zero the cost may fall to the positive side.
         ends = _descend(form, starts + [end.R for end in at_zero], options.max_descent_iterations)
     positive = [end for end in ends if answer_of(search.part, form, end.R).scale > 0.0]
     with search.stages.of("dual certificate"):
         bound = max(_bounds(form, relaxation, at_zero[0].R), key=lambda each: each.lower_bound)
-    lower = max(bound.lower_bound, found.lower_bound)  # more constraints, no lower optimum
+    lower = max(bound.lower_bound, found.bound.lower_bound)  # a constraint lowers no optimum
     if not positive or positive[0].cost > at_zero[0].cost:
         proven = at_zero[0].cost - lower <= search.tolerance(at_zero[0].cost)
         raise ScaleError(
@@ -109,10 +107,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
     constrained = Found(
         R=best.R,
         cost=best.cost,
-        lower_bound=min(lower, best.cost),
-        float_bound=bound.value,
-        is_definite=bound.definite,
-        eigenvalue=bound.eigenvalue,
+        bound=dataclasses.replace(bound, lower_bound=min(lower, best.cost)),
         tolerance=search.tolerance(best.cost),
         path=SearchPath(Start.NONNEGATIVE_SCALE, Multipliers.RELAXATION),
         cause=Cause.NOT_TIGHT,

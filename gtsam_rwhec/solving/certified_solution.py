@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import gtsam
 
@@ -12,13 +13,14 @@ from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.identifiability.verdicts import Identifiability
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.cause import Cause
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.nonnegative import run_with_nonnegative_scale
 from gtsam_rwhec.solver.options import Method, SolveOptions, check_method
 from gtsam_rwhec.solver.parts import connected_components, parts_of
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.variables import given_answer, rotations_as_variables
+from gtsam_rwhec.solver.variables import as_variables, given_answer, rotations_as_variables
 from gtsam_rwhec.solving.arguments import Poses, Scale, check_against_knowledge, check_types
 from gtsam_rwhec.solving.part_solution import PartSolution
 from gtsam_rwhec.solving.solution import Solution, SolvedPart
@@ -87,6 +89,64 @@ def solve(
             found = search.with_positive_scale(search.run(method, None))
         results.append(PartSolution.of(search, found))
     return _merge(problem, results)
+
+
+def certify(
+    problem: Problem,
+    X: Poses,
+    Y: Poses,
+    scale: Scale = 1.0,
+    *,
+    options: SolveOptions | None = None,
+    progress: Progress | None = None,
+) -> Certificate:
+    """Certify a given answer: its cost against a rigorous bound on what any answer costs.
+
+    Parameters
+    ----------
+    problem : Problem
+    X, Y : dict of str to pose
+        T_targetcarrier_target and T_sensorcarrier_sensor.
+    scale : float or dict of str to float
+        One number, or one for each target with scale="per_target".
+    options : SolveOptions, optional
+    progress : callable, optional
+
+    Returns
+    -------
+    Certificate
+        Of the answer as given. ``Cause.BETTER_ANSWER`` says that the search found a better one.
+
+    Raises
+    ------
+    FrameError, PoseError, ScaleError
+        For an answer that lacks a frame, or has an invalid pose or scale.
+    PriorError, ScaleError
+        For an answer that contradicts a fixed frame or a known scale.
+    """
+    check_types(problem, options)
+    options = options or SolveOptions()
+    parts = parts_of(problem)
+    check_against_knowledge(problem, X, Y, scale)
+    certificates = []
+    for part in parts:
+        given = given_answer(part, X, Y, scale)
+        search = Search.of(part, options, progress)
+        found = search.run("auto", rotations_as_variables(part, given.R))
+        cost = search.forms.full.value(*as_variables(part, given))
+        tolerance = search.tolerance(cost)
+        best = PartSolution.of(search, found).certificate
+        gap = cost - found.bound.lower_bound
+        cause, figures = best.cause, best.figures
+        if gap < -tolerance:
+            cause, figures = Cause.BELOW_BOUND, {"reduced_bound": found.bound.lower_bound}
+        elif cost - found.cost > tolerance or (gap > tolerance and best.is_optimal):
+            cause, figures = Cause.BETTER_ANSWER, {"better_cost": found.cost}
+        # The bound holds to the last digit of the stored form; the cost of the given answer has rounding of its own.
+        lower, floating = min(best.lower_bound, cost), min(best.float_bound, cost)
+        best = replace(best, cost=cost, lower_bound=lower, float_bound=floating, tolerance=tolerance)
+        certificates.append(replace(best, status=cause.status, cause=cause, figures=figures))
+    return Certificate.merged(certificates)
 
 
 def _merge(problem: Problem, results: list[PartSolution]) -> Solution:

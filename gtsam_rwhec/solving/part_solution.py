@@ -24,7 +24,7 @@ TWIN = FreeDirection(FreeKind.TWIN, FreeReason.SYMMETRY)
 
 @dataclass(frozen=True)
 class PartSolution:
-    """Of one part; ``residual_cost`` is that of the measurements alone, in the physical model."""
+    """One solved part; ``residual_cost`` is the cost of its measurements alone, in the physical model."""
 
     part: Part
     answer: Answer
@@ -49,33 +49,39 @@ class PartSolution:
             poses = PairPoses.of(part, answer)
             J_t, J_R = costs_of_pairs(part, poses)
             known = identify(part, poses, J_t, J_R)
-        # The bound speaks of the reduced form; the answer's cost in the unreduced one shows what reducing it lost.
+        # The bound is about the reduced form. The cost in the full form shows how many digits the reduction lost.
         cost = max(search.forms.full.value(*as_variables(part, answer)), 0.0)
-        cause, figures = found.cause, found.figures
-        if not np.isfinite(found.lower_bound):
-            cause, figures = Cause.NO_BOUND, {}
+        bound = found.bound
+        if not np.isfinite(bound.lower_bound):
+            found = replace(found, cause=Cause.NO_BOUND, figures={})
         elif abs(cost - found.cost) > found.tolerance:
-            cause, figures = Cause.DIGITS_LOST, {"reduced_cost": found.cost}
-            # Zero, as J is a sum of squares: the one bound that stays true.
-            found = replace(found, cost=cost, lower_bound=0.0, tolerance=search.tolerance(cost))
+            found = replace(
+                found,
+                cost=cost,
+                tolerance=search.tolerance(cost),
+                cause=Cause.DIGITS_LOST,
+                figures={"reduced_cost": found.cost},
+            )
+            bound = replace(bound, lower_bound=0.0)  # J is a sum of squares: zero is the one bound that stays true
         elif found.is_closed and not known.is_unique:
-            cause, figures = Cause.FREE_DIRECTIONS, {"free_directions": float(len(known.free_directions))}
-        elif found.is_closed and not found.is_definite and search.has_twin(found):
-            cause, figures = Cause.TWIN, {}
+            number = float(len(known.free_directions))
+            found = replace(found, cause=Cause.FREE_DIRECTIONS, figures={"free_directions": number})
+        elif found.is_closed and not bound.definite and search.has_twin(found):
+            found = replace(found, cause=Cause.TWIN, figures={})
             known = replace(known, is_unique=False, free_directions=(TWIN,))
         certificate = Certificate(
-            status=cause.status,
-            cause=cause,
+            status=found.cause.status,
+            cause=found.cause,
             objective=Objective(part.kind, bool(part.priors)),
             path=found.path,
             cost=found.cost,
-            lower_bound=found.lower_bound,
-            float_bound=found.float_bound if found.is_definite else found.lower_bound,
-            min_eigenvalue=-max(found.cost - found.lower_bound, 0.0) if found.is_definite else found.eigenvalue,
+            lower_bound=bound.lower_bound,
+            float_bound=bound.value if bound.definite else bound.lower_bound,
+            min_eigenvalue=-max(found.cost - bound.lower_bound, 0.0) if bound.definite else bound.eigenvalue,
             tolerance=found.tolerance,
             is_relative=part.is_relative,
             seconds=dict(search.stages.seconds),
-            figures=figures,
+            figures=found.figures,
         )
         residuals = residuals_of_pairs(part, poses, J_t, J_R)
         return PartSolution(part, answer, certificate, known, residuals, float(J_t.sum() + J_R.sum()))

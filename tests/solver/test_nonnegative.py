@@ -72,7 +72,7 @@ def outcome(seed: int) -> tuple[Found | None, float, float]:
     except ScaleError as error:
         cost, lower = re.search(r"\(cost (\S+), no answer below (\S+);", str(error)).groups()
         return None, float(cost), float(lower)
-    return found, found.cost, found.lower_bound
+    return found, found.cost, found.bound.lower_bound
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -65,7 +65,7 @@ def lowest_of_random_starts(form: ReducedForm, count: int, seed: int = 0) -> flo
 
 def assert_never_beaten(search: Search, found: Found, starts: int) -> None:
     lowest = lowest_of_random_starts(search.form, starts)
-    assert lowest >= found.lower_bound - 1e-13 * search.form.magnitude
+    assert lowest >= found.bound.lower_bound - 1e-13 * search.form.magnitude
     if found.is_closed:
         assert lowest >= found.cost - max(1e-9 * found.cost, 1e-13 * search.form.magnitude)
 
@@ -146,8 +146,8 @@ class TestGrossNoise:
             bound = solve_by_clarabel(search.form.dense(), 1e-9, 200).dual
             assert found.cause is Cause.NOT_TIGHT
             assert found.figures["relaxation_cost"] == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))
-            assert found.lower_bound == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))
-            assert found.lower_bound < found.cost - 1e-5
+            assert found.bound.lower_bound == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))
+            assert found.bound.lower_bound < found.cost - 1e-5
 
     def test_a_gap_is_said_to_be_one(self) -> None:
         """Known from the draws above: rotation noise of sixty degrees about each axis and four measurements."""
@@ -399,7 +399,7 @@ class TestWhatCertifiedMeans:
         search = searched(simulation.problem)
         found = search.run("auto", None)
         x = np.append(flat(true_rotations(simulation)), 1.0)
-        assert found.lower_bound <= x @ search.form.apply(x)
+        assert found.bound.lower_bound <= x @ search.form.apply(x)
 
 
 def peak_memory(problem: rw.Problem) -> int:
