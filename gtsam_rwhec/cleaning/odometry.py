@@ -1,4 +1,4 @@
-"""Limits for odometry (DQ paper, Appendix D.1): steps that no sensor can make, stamps too far apart for one instant."""
+"""Limits for odometry (DQ paper, Appendix D.1): the largest step of a sensor, the largest distance of two stamps."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from rwhec_factors import se3
 from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.geometry.poses import Array
 
-#: The paper's: 10 cm or 11.5 degrees between two consecutive frames indicate a tracking error.
+#: Metres. The paper's limit: a larger step between two consecutive frames is a tracking error.
 MAX_STEP_M = 0.10
+#: Radians. The paper's limit for the same step: 11.5 degrees.
 MAX_STEP_RAD = float(np.radians(11.5))
-#: The paper's: further apart than this, two sensors' poses are not of one instant.
+#: Seconds. The paper's limit: two sensors' poses with stamps further apart are not of one instant.
 MAX_APART_S = 0.1
 
 
@@ -25,29 +26,27 @@ def odometry_gates(
     max_step_rad: float = MAX_STEP_RAD,
     max_apart_s: float = MAX_APART_S,
 ) -> Kept:
-    """Keep poses that both sensors reached in a step that can be, at one instant.
+    """Keep the poses of one instant that both sensors reached in a step within the limits.
 
     Parameters
     ----------
     T_first, T_second : (N, 4, 4) arrays
-        Poses of two sensors, row by row of about one instant; metres.
+        Poses of two sensors, metres. Row i of both arrays is of about one instant.
     stamps_first_ns, stamps_second_ns : (N,) integers
     max_step_m, max_step_rad, max_apart_s : float
 
     Returns
     -------
     Kept
-        A pose after a step too large is removed; the next is compared with it all the same, as the paper does.
+        The pose after a step that is too large is removed. The next pose is still compared with it, as in the paper.
     """
-    apart = np.abs(stamps_first_ns - stamps_second_ns) * 1e-9
-    kept = Kept.of(apart > max_apart_s, RemovalReason.STAMPS_APART, stamps_first_ns, apart, max_apart_s)
+    apart_s = np.abs(stamps_first_ns - stamps_second_ns) * 1e-9
+    checks = [(RemovalReason.STAMPS_APART, apart_s, max_apart_s)]
     for T, too_far, too_turned in (
         (T_first, RemovalReason.FIRST_SENSOR_STEP_M, RemovalReason.FIRST_SENSOR_STEP_RAD),
         (T_second, RemovalReason.SECOND_SENSOR_STEP_M, RemovalReason.SECOND_SENSOR_STEP_RAD),
     ):
         step = se3.inverse(T[:-1]) @ T[1:]
-        metres = np.r_[0.0, np.linalg.norm(step[:, :3, 3], axis=1)]
-        radians = np.r_[0.0, np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1)]
-        kept = kept.and_of(metres > max_step_m, too_far, stamps_first_ns, metres, max_step_m)
-        kept = kept.and_of(radians > max_step_rad, too_turned, stamps_first_ns, radians, max_step_rad)
-    return kept
+        checks.append((too_far, np.r_[0.0, np.linalg.norm(step[:, :3, 3], axis=1)], max_step_m))
+        checks.append((too_turned, np.r_[0.0, np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1)], max_step_rad))
+    return Kept.within(stamps_first_ns, *checks)

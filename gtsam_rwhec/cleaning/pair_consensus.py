@@ -1,9 +1,9 @@
-"""Gross outliers of one pair, by consensus on its own A X = Y B (RWHEC paper, Section 9, eq. 66).
+"""Gross outliers of one pair, found by consensus on its own A X = Y B (RWHEC paper, Section 9, eq. 66).
 
-The paper knows Y and asks which measurements agree on X. Here neither is known: a hypothesis is X, Y (and a scale) of a
-few measurements, in closed form, all hypotheses at once; the one that most measurements agree with is fitted again to
-those that do. What it is for is gross errors (another tag's id, a reflection, a flipped pose): robust refinement
-(``robust="gnc"``) does the fine work.
+The paper knows Y and asks which measurements agree on X. Here neither X nor Y is known. A hypothesis is X, Y (and a
+scale) from a few measurements, in closed form; all hypotheses are computed at once. The hypothesis that most
+measurements agree with is fitted again to the measurements that agree. This step removes gross errors: the id of
+another tag, a reflection, a flipped pose. Robust refinement (``robust="gnc"``) finds the small ones.
 """
 
 from __future__ import annotations
@@ -15,27 +15,32 @@ import numpy as np
 from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.rotations import project
+
+#: A hypothesis is fitted at most so often to the measurements that agree with it; two or three fits are the rule.
+MOST_FITS = 10
 
 
 @dataclass(frozen=True)
 class ConsensusOptions:
-    """Limits of agreement; the paper's are the defaults.
+    """Limits of agreement; the defaults are the paper's.
 
     Attributes
     ----------
     max_translation_m, max_rotation_rad : float
-        Within which of its prediction a measurement agrees: 0.6 m and 60 degrees.
+        A measurement agrees if it is this near to its prediction.
     min_inlier_share : float
-        Below it the pair's measurements are all removed.
+        If a smaller share of the pair's measurements agrees, all of them are removed.
     scale_known : bool
-        Whether target lengths are known.
+        Whether the target's length is known.
     max_scale_error : float
-        With an unknown scale: how far from 1 it may be (tag sizes known within 10 %).
+        How far an unknown scale may be from 1: tag sizes are known within 10 %.
     hypotheses : int
-        Samples drawn.
+        Number of samples.
     sample_size : int
-        Measurements each.
+        Measurements in each sample.
     seed : int
+        Seed of the generator that draws the samples.
     """
 
     max_translation_m: float = 0.6
@@ -58,7 +63,7 @@ class ConsensusOptions:
 
 @dataclass(frozen=True)
 class Consensus:
-    """Which measurements agree (``kept``), how many, and the hypothesis they agree on: X, Y (4, 4), scale."""
+    """The measurements that agree (``kept``), their share, and their hypothesis: X, Y (4, 4) and scale."""
 
     kept: Kept
     share: float
@@ -68,7 +73,7 @@ class Consensus:
 
 
 def find_consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: ConsensusOptions | None = None) -> Consensus:
-    """Sort out a pair's measurements.
+    """Keep the measurements of a pair that agree on one hypothesis.
 
     Parameters
     ----------
@@ -80,49 +85,49 @@ def find_consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: Consensus
     Returns
     -------
     Consensus
-        A pair with a single measurement is removed whole: nothing can validate it. With two, which agree with what is
-        fitted to them almost always, the limits still apply.
+        A single measurement is removed: nothing can validate it. Two measurements almost always agree with what is
+        fitted to them, but the limits still apply.
     """
     options = options or ConsensusOptions()
     N = len(A)
+    everything = np.ones(N, dtype=bool)
     if N < 2:
-        kept = Kept.of(np.ones(N, dtype=bool), RemovalReason.SINGLE, stamps_ns, np.ones(N), 2.0)
+        kept = Kept.of(everything, RemovalReason.SINGLE, stamps_ns, np.ones(N), 2.0)
         return Consensus(kept, 0.0, np.eye(4), np.eye(4), 1.0)
     generator = np.random.default_rng(options.seed)
-    size = min(options.sample_size, N)
-    # Each row a sample without repetition: the first of a random order.
-    samples = np.argsort(generator.random((options.hypotheses, N)), axis=1)[:, :size]
-    mask, hypothesis = _best(A, B, *closed_form(A[samples], B[samples], options), options)
-    for _ in range(10):  # fitted to what agrees, until the same agree
+    # Each row is a sample without repetition: the beginning of a random order.
+    order = np.argsort(generator.random((options.hypotheses, N)), axis=1)
+    samples = order[:, : min(options.sample_size, N)]
+    best = _best(A, B, closed_form(A[samples], B[samples], options), options)
+    for _ in range(MOST_FITS):
+        mask = best.agrees
         if mask.sum() < 2:
             break
-        X, Y, scale = closed_form(A[mask][None], B[mask][None], options)
-        again, fitted = _best(A, B, X, Y, scale, options)
-        if again.sum() < mask.sum():
+        again = _best(A, B, closed_form(A[mask][None], B[mask][None], options), options)
+        if again.agrees.sum() < mask.sum():
             break
-        stable = np.array_equal(again, mask)
-        mask, hypothesis = again, fitted
-        if stable:
+        best = again
+        if np.array_equal(again.agrees, mask):
             break
-    share = float(mask.mean())
-    X_best, Y_best, s_best = hypothesis
-    metres, radians = (v[0] for v in distances(A, B, X_best[None], Y_best[None], np.array([s_best])))
+    share = float(best.agrees.mean())
     if share < options.min_inlier_share:
-        everything = np.ones(N, dtype=bool)
-        kept = Kept.of(everything, RemovalReason.NO_CONSENSUS, stamps_ns, np.full(N, share), options.min_inlier_share)
-        return Consensus(kept, share, X_best, Y_best, s_best)
-    turned, moved = radians > options.max_rotation_rad, metres > options.max_translation_m
-    kept = Kept.of(turned, RemovalReason.ROTATION_OFF, stamps_ns, radians, options.max_rotation_rad)
-    kept = kept.and_of(moved, RemovalReason.TRANSLATION_OFF, stamps_ns, metres, options.max_translation_m)
-    return Consensus(kept, share, X_best, Y_best, s_best)
+        shares = np.full(N, share)
+        kept = Kept.of(everything, RemovalReason.NO_CONSENSUS, stamps_ns, shares, options.min_inlier_share)
+    else:
+        kept = Kept.within(
+            stamps_ns,
+            (RemovalReason.ROTATION_OFF, best.radians, options.max_rotation_rad),
+            (RemovalReason.TRANSLATION_OFF, best.metres, options.max_translation_m),
+        )
+    return Consensus(kept, share, best.X, best.Y, best.scale)
 
 
 def closed_form(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, Array, Array]:
     """X, Y (H, 4, 4) and scale (H,) of H samples of n measurements, A and B (H, n, 4, 4).
 
-    Rotations first (Shah 2013): sum R_A (x) R_B turns vec R_X into n vec R_Y; its first singular vectors, brought to
-    SO(3), are R_Y and R_X. Then translations and scale by least squares, of minimum norm where a sample leaves some
-    free.
+    First the rotations (Shah 2013): sum R_A (x) R_B maps vec R_X to n vec R_Y. The first singular vectors of the sum,
+    projected to SO(3), are R_Y and R_X. Then translations and scale by least squares, with minimum norm where a
+    sample leaves a direction free.
     """
     H, n = A.shape[:2]
     R_A, R_B = A[..., :3, :3], B[..., :3, :3]
@@ -130,7 +135,6 @@ def closed_form(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, A
     K = np.einsum("hnik,hnjl->hijkl", R_A, R_B).reshape(H, 9, 9) / n
     U, _, Vt = np.linalg.svd(K)
     R_X, R_Y = _rotation(Vt[:, 0].reshape(H, 3, 3)), _rotation(U[:, :, 0].reshape(H, 3, 3))
-    # A singular vector's sign is arbitrary, the pair's is not: the better of the two rotations near each.
     rows = np.zeros((H, n, 3, 6 + (not options.scale_known)))
     rows[..., 0:3], rows[..., 3:6] = R_A, -np.eye(3)
     seen = np.einsum("hij,hnj->hni", R_Y, B[..., :3, 3])
@@ -143,7 +147,8 @@ def closed_form(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, A
     if not options.scale_known:
         low, high = 1.0 / (1.0 + options.max_scale_error), 1.0 / (1.0 - options.max_scale_error)
         inverse = np.clip(solution[:, 6], low, high)
-        # At a limit the translations are others. So it is where the motion does not tell the scale: turning in place.
+        # At a limit the translations are solved again. The scale is at a limit where the motion does not determine it:
+        # the carrier turns in place.
         at_limit = inverse != solution[:, 6]
         if at_limit.any():
             right = inverse[at_limit, None, None] * seen[at_limit] - A[at_limit, ..., :3, 3]
@@ -165,12 +170,8 @@ def _least_squares(rows: Array, right: Array) -> Array:
 
 
 def _rotation(M: Array) -> Array:
-    """The nearest rotation to (H, 3, 3) matrices known up to sign: det M tells which sign."""
-    M = M * np.where(np.linalg.det(M) < 0.0, -1.0, 1.0)[:, None, None]
-    U, _, Vt = np.linalg.svd(M)
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    rotation: Array = U @ Vt
-    return rotation
+    """The rotations nearest to matrices (H, 3, 3) of unknown sign: det M > 0 tells the sign."""
+    return project(M * np.where(np.linalg.det(M) < 0.0, -1.0, 1.0)[:, None, None])
 
 
 def distances(A: Array, B: Array, X: Array, Y: Array, scale: Array) -> tuple[Array, Array]:
@@ -183,13 +184,24 @@ def distances(A: Array, B: Array, X: Array, Y: Array, scale: Array) -> tuple[Arr
     return metres, np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
 
-def _best(
-    A: Array, B: Array, X: Array, Y: Array, scale: Array, options: ConsensusOptions
-) -> tuple[np.ndarray, tuple[Array, Array, float]]:
-    """The hypothesis that most agree with; of equals the one with the smaller distances."""
+@dataclass(frozen=True)
+class _Best:
+    """A hypothesis X, Y, scale; the distances (N,) of the measurements from it, and which measurements agree."""
+
+    agrees: np.ndarray
+    metres: Array
+    radians: Array
+    X: Array
+    Y: Array
+    scale: float
+
+
+def _best(A: Array, B: Array, hypotheses: tuple[Array, Array, Array], options: ConsensusOptions) -> _Best:
+    """The hypothesis that most measurements agree with; among equals, the one with the smallest distances."""
+    X, Y, scale = hypotheses
     metres, radians = distances(A, B, X, Y, scale)
     agree = (metres <= options.max_translation_m) & (radians <= options.max_rotation_rad)
     size = metres / options.max_translation_m + radians / options.max_rotation_rad
     score = agree.sum(axis=1) - np.where(agree, size, 0.0).sum(axis=1) / (2.0 * len(A) + 1.0)
     best = int(np.argmax(score))
-    return agree[best], (X[best], Y[best], float(scale[best]))
+    return _Best(agree[best], metres[best], radians[best], X[best], Y[best], float(scale[best]))

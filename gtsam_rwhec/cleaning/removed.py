@@ -1,4 +1,4 @@
-"""Which measurements a step of cleaning keeps, and why each of the others is removed."""
+"""The result of a step of cleaning: the measurements that it keeps, and why it removed the others."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 class RemovalReason(StrEnum):
-    """Why a measurement is not used; the values are the words in logs and reports, with the unit of `Removed.value`."""
+    """Why a measurement is not used. Logs and reports print these words; the unit is the unit of `Removed.value`."""
 
     SEEN_TWICE = "seen twice at one stamp"
     OUTSIDE_TRAJECTORY = "outside the carrier's trajectory (s)"
@@ -32,16 +33,18 @@ class RemovalReason(StrEnum):
 
 @dataclass(frozen=True)
 class Removed:
-    """One measurement that was taken out.
+    """One measurement that a step removed.
 
     Attributes
     ----------
     reason : RemovalReason
+        Why the step removed it.
     index : int
-        In the step's input.
+        Row of the measurement in the step's input.
     stamp_ns : int
+        Stamp of the measurement, nanoseconds.
     value, limit : float
-        What was compared, and with what; in the unit that `reason` names.
+        The value that was compared, and its limit, in the unit that `reason` names.
     """
 
     reason: RemovalReason
@@ -53,29 +56,35 @@ class Removed:
 
 @dataclass(frozen=True)
 class Kept:
-    """The result of a step: mask (N,) of what is kept, and the rest in order of index."""
+    """The result of a step: a mask (N,) of the measurements that it keeps, and the removed ones in order of index."""
 
     mask: np.ndarray
     removed: tuple[Removed, ...]
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many were removed for each reason."""
+        """How many measurements were removed for each reason."""
         return dict(Counter(item.reason for item in self.removed))
 
     @staticmethod
-    def of(bad: np.ndarray, reason: RemovalReason, stamps_ns: np.ndarray, values: np.ndarray, limit: float) -> Kept:
-        """Keep all but those marked ``bad`` (N,)."""
+    def of(bad: np.ndarray, reason: RemovalReason, stamps_ns: np.ndarray, values: np.ndarray, limit: ArrayLike) -> Kept:
+        """Keep all measurements but the ``bad`` ones (N,); `limit` is one number or one for each measurement."""
+        limits = np.broadcast_to(np.asarray(limit, dtype=float), bad.shape)
         return Kept(
             ~bad,
             tuple(
-                Removed(reason, int(i), int(stamps_ns[i]), float(values[i]), float(limit)) for i in np.flatnonzero(bad)
+                Removed(reason, i, int(stamps_ns[i]), float(values[i]), float(limits[i]))
+                for i in np.flatnonzero(bad).tolist()
             ),
         )
 
-    def and_of(
-        self, bad: np.ndarray, reason: RemovalReason, stamps_ns: np.ndarray, values: np.ndarray, limit: float
-    ) -> Kept:
-        """Keep what is kept so far, but those marked ``bad`` (N,); each is removed for one reason, the first."""
-        more = Kept.of(bad & self.mask, reason, stamps_ns, values, limit)
-        return Kept(self.mask & more.mask, tuple(sorted(self.removed + more.removed, key=lambda item: item.index)))
+    @staticmethod
+    def by_all(*steps: Kept) -> Kept:
+        """Keep what every step keeps; a measurement has the reason of the first step that removes it."""
+        first = {item.index: item for step in reversed(steps) for item in step.removed}
+        return Kept(np.logical_and.reduce([step.mask for step in steps]), tuple(first[i] for i in sorted(first)))
+
+    @staticmethod
+    def within(stamps_ns: np.ndarray, *checks: tuple[RemovalReason, np.ndarray, float]) -> Kept:
+        """Keep the measurements whose values (N,) are at most the limit of each check; see `by_all`."""
+        return Kept.by_all(*(Kept.of(values > limit, why, stamps_ns, values, limit) for why, values, limit in checks))

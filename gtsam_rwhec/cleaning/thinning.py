@@ -1,4 +1,4 @@
-"""Measurements at standstill, of which few are kept, and in fast motion, which are removed."""
+"""Two steps of cleaning: most measurements at standstill are removed, and all measurements in fast motion."""
 
 from __future__ import annotations
 
@@ -7,23 +7,24 @@ import numpy as np
 from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.geometry.poses import Array
 
-#: A carrier that has turned (rad) and moved (m) less than this since the last measurement kept has stood still.
+#: Radians. A carrier that has turned and moved less than this since the last measurement kept has stood still.
 STILL_RAD = float(np.radians(0.5))
+#: Metres; see `STILL_RAD`.
 STILL_M = 0.003
 
 
 def thin(
     A: Array, stamps_ns: np.ndarray, *, min_rotation_rad: float = STILL_RAD, min_translation_m: float = STILL_M
 ) -> Kept:
-    """Keep a measurement when the carrier has turned or moved since the last one kept.
+    """Keep a measurement if the carrier has turned or moved since the last measurement that was kept.
 
-    A hundred frames at one pose weigh a hundred times, and share the error of that pose (A's), which no covariance
-    that takes them for independent knows.
+    A hundred images at one pose weigh a hundred times, and they share the error of that pose (A). A covariance that
+    takes the images for independent is then too small.
 
     Parameters
     ----------
     A : (N, 4, 4) array
-        Carrier poses, in order of time, metres.
+        The carrier's poses, in order of time, metres.
     stamps_ns : (N,) integers
     min_rotation_rad, min_translation_m : float
     """
@@ -50,7 +51,7 @@ def without_fast(
     max_turning_rad_s: float,
     max_moving_m_s: float,
 ) -> Kept:
-    """Keep what was seen slowly: fast motion blurs images and makes stamps matter.
+    """Keep the measurements at low speed: fast motion blurs images, and errors of stamps count more.
 
     Parameters
     ----------
@@ -59,7 +60,8 @@ def without_fast(
     stamps_ns : (N,) integers
     max_turning_rad_s, max_moving_m_s : float
     """
-    kept = Kept.of(
-        turning_rad_s > max_turning_rad_s, RemovalReason.TURNING_FAST, stamps_ns, turning_rad_s, max_turning_rad_s
+    return Kept.within(
+        stamps_ns,
+        (RemovalReason.TURNING_FAST, turning_rad_s, max_turning_rad_s),
+        (RemovalReason.MOVING_FAST, moving_m_s, max_moving_m_s),
     )
-    return kept.and_of(moving_m_s > max_moving_m_s, RemovalReason.MOVING_FAST, stamps_ns, moving_m_s, max_moving_m_s)

@@ -1,8 +1,9 @@
-"""A sensor's clock against its carrier's, before anything is calibrated: turning has no frame.
+"""The time offset between a sensor's clock and its carrier's, from turning alone, before anything is calibrated.
 
-A_i X = Y B_i makes A_i^-1 A_j and B_i B_j^-1 rotations by one angle, whatever X and Y are. The offset that makes the
-angles agree best over all intervals is found on a grid (by a quantile of the differences that wrong detections do not
-move), then by Gauss-Newton. Refinement takes it from there, with poses, as a variable (``RefineOptions.time_offsets``).
+A_i X = Y B_i makes A_i^-1 A_j and B_i B_j^-1 rotations by the same angle, whatever X and Y are. The offset is the one
+at which the angles of all intervals agree best. A grid search finds it first; it compares a quantile of the
+differences, which wrong detections do not change. Gauss-Newton follows. Refinement can go on from there, with the
+offset as a variable beside the poses (``RefineOptions.time_offsets``).
 """
 
 from __future__ import annotations
@@ -17,19 +18,21 @@ from gtsam_rwhec.errors import StampError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-#: Angles are compared over about this time: long against a frame's noise, short against what the motion does.
+#: Seconds between the two detections of an interval: long enough for the angle to exceed a detection's noise, short
+#: enough for the motion not to repeat itself.
 INTERVAL_S = 0.4
-#: Intervals that are used, at most, evenly from all of them.
+#: Intervals that are used, at most, taken evenly from all.
 MOST = 3000
+#: Seconds between two offsets of the grid search.
 GRID_S = 0.01
-#: For derivatives of the angle by the offset.
+#: Seconds; step of the central differences of the angle with respect to the offset.
 STEP_S = 0.005
-#: This quantile of the differences tells how well an offset fits. An interval has two detections, so that 30 % wrong
-#: ones spoil half of all intervals.
+#: This quantile of the differences tells how well an offset fits. An interval has two detections: with 30 % wrong
+#: detections, half of all intervals are wrong.
 QUANTILE = 0.3
 #: The same quantile of |x| for a normal x of unit variance.
 NORMAL_QUANTILE = 0.3853
-#: Beyond this many standard deviations a difference of angles is a wrong detection's.
+#: A difference of angles beyond this many standard deviations comes from a wrong detection.
 GROSS = 3.0
 
 
@@ -40,11 +43,11 @@ class TimeOffset:
     Attributes
     ----------
     offset_s, sigma_s : float
-        And its standard deviation, from the scatter of the angles.
+        The offset and its standard deviation, which comes from the scatter of the angles.
     intervals : int
         How many angles were compared.
     angle_rms_rad : float
-        Of what is left of their differences, gross ones left out.
+        Root mean square of the differences of the angles, without gross ones.
     """
 
     offset_s: float
@@ -61,33 +64,34 @@ def coarse_time_offset(
     max_gap_s: float = 0.2,
     where: str = "the sensor",
 ) -> TimeOffset:
-    """Estimate a constant offset from the turning of carrier and sensor.
+    """The constant time offset at which carrier and sensor turn by the same angles.
 
     Parameters
     ----------
     carrier : Trajectory
+        Poses of the carrier.
     tracks : sequence of (stamps_ns (M,), B (M, 4, 4))
-        Of each target that the sensor saw, in order of time.
+        One for each target that the sensor saw, in order of time.
     search_s : float
-        Offsets up to this are looked for.
+        The search covers offsets from -search_s to search_s.
     max_gap_s : float
-        The carrier's poses are not interpolated over more.
+        Between poses of the carrier further apart nothing is interpolated.
     where : str
-        For messages.
+        The sensor, for messages.
 
     Raises
     ------
     StampError
-        When the motion does not tell: too little turning, a turning that repeats itself, or an offset at the search's
-        end.
+        The motion does not determine the offset: too little turning, turning that repeats itself, or the best offset
+        is at the end of the search.
     """
     start, end, angle = (np.concatenate(parts) for parts in zip(*(_intervals(*t) for t in tracks), strict=True))
     thinned = np.linspace(0, max(len(start) - 1, 0), min(MOST, len(start))).astype(int)
     start, end, angle = start[thinned], end[thinned], angle[thinned]
     if len(start) < 10:
         raise StampError(
-            f"{where}: {len(start)} intervals of {INTERVAL_S:g} s in which a target stayed in view; a time offset "
-            "needs ten and more. Record longer, or set it to what is known"
+            f"{where}: a target stayed in view for {len(start)} intervals of {INTERVAL_S:g} s; a time offset needs at "
+            "least ten. Record longer, or state the offset"
         )
 
     def differences(offset_s: float) -> Array:
@@ -110,22 +114,22 @@ def coarse_time_offset(
         first, last = carrier.span_s
         raise StampError(
             f"{where}: no offset of up to {search_s:g} s brings half of its stamps, from {start.min() * 1e-9:.3f} to "
-            f"{end.max() * 1e-9:.3f} s, into {carrier.where}, from {first:.3f} to {last:.3f} s (gaps of up to "
-            f"{max_gap_s:g} s bridged); are they of another clock?"
+            f"{end.max() * 1e-9:.3f} s, into {carrier.where}, from {first:.3f} to {last:.3f} s (gaps "
+            f"up to {max_gap_s:g} s are interpolated); are they of another clock?"
         )
     best = int(np.argmin(costs))
     _check_grid(grid, costs, best, len(start), where, search_s)
     offset, sigma, rms, used = _refined(differences, float(grid[best]))
     if not sigma < 0.1 * search_s:
         raise StampError(
-            f"{where}: the turning of carrier and sensor tells the time offset to +-{sigma:.2g} s only; turn faster "
-            "and unevenly while recording, or set the offset to what is known"
+            f"{where}: the turning of carrier and sensor determines the time offset only to +-{sigma:.2g} s; turn "
+            "faster and unevenly while recording, or state the offset"
         )
     return TimeOffset(offset, sigma, used, rms)
 
 
 def _intervals(stamps_ns: np.ndarray, B: Array) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Start, end (stamps) and angle of each pair of frames that are about an interval apart."""
+    """Stamps (start, end) and angle of each pair of detections that are about `INTERVAL_S` apart."""
     later = np.searchsorted(stamps_ns, stamps_ns + round(INTERVAL_S * 1e9))
     i = np.flatnonzero(later < len(stamps_ns))
     j = later[i]
@@ -136,22 +140,23 @@ def _intervals(stamps_ns: np.ndarray, B: Array) -> tuple[np.ndarray, np.ndarray,
 
 
 def _check_grid(grid: Array, costs: Array, best: int, count: int, where: str, search_s: float) -> None:
+    """Refuse a best offset at the end of the search, or one that another offset matches."""
     if best in (0, len(grid) - 1):
         raise StampError(
-            f"{where}: turning agrees best at the search's end, {grid[best]:+.2f} s; widen the search (now "
-            f"{search_s:g} s), or the motion does not tell the offset"
+            f"{where}: turning agrees best at the end of the search, {grid[best]:+.2f} s. Widen the search (now "
+            f"{search_s:g} s), or turn unevenly while recording"
         )
     far = np.abs(grid - grid[best]) > 2.0 * INTERVAL_S
     if far.any() and costs[far].min() < costs[best] * (1.0 + 3.0 / np.sqrt(count)):
         other = grid[far][int(np.argmin(costs[far]))]
         raise StampError(
             f"{where}: turning agrees as well at {other:+.2f} s as at {grid[best]:+.2f} s: the motion repeats "
-            "itself or hardly turns. Turn unevenly while recording, or set the offset to what is known"
+            "itself or hardly turns. Turn unevenly while recording, or state the offset"
         )
 
 
 def _refined(differences: Callable[[float], Array], offset: float) -> tuple[float, float, float, int]:
-    """Gauss-Newton from the grid's best: offset, its standard deviation, the angles' scatter, intervals used."""
+    """Gauss-Newton from the best offset of the grid: offset, standard deviation, rms of the angles, intervals used."""
     sigma = rms = np.inf
     used = 0
     for _ in range(20):

@@ -12,7 +12,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
-from gtsam_rwhec.logs.message_kinds import IMAGE_SCHEMAS, schema_word
+from gtsam_rwhec.logs.message_kinds import schema_word
 from gtsam_rwhec.rig.field_types import is_text
 from gtsam_rwhec.vision.images import decode_gray
 from gtsam_rwhec.vision.tag_survey import BY_TRUST, tags_in_image
@@ -121,7 +121,7 @@ def read_contents(log: Log) -> LogContents:
     readable -= {topic.name for topic in topics if topic.unreadable or schema_word(topic.schema) == "PosesInFrame"}
     transforms = {topic.name for topic in topics if topic.is_tf}
     for topic in topics:
-        if topic.name in readable and schema_word(topic.schema) in IMAGE_SCHEMAS:
+        if topic.name in readable and topic.has_images:
             wanted = np.linspace(0, max(topic.count - 1, 0), IMAGES).round().astype(int)
             contents.images[topic.name] = ImageTopic(
                 topic.name, topic.schema, topic.count, wanted=frozenset(wanted.tolist())

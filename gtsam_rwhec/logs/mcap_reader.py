@@ -26,7 +26,7 @@ from mcap.records import Channel, Schema
 from gtsam_rwhec.errors import LogError, LogWarning, MessageError
 from gtsam_rwhec.logs import foxglove_schemas, protobuf_messages, ros2_schemas
 from gtsam_rwhec.logs.mcap_blocks import Block, McapFile
-from gtsam_rwhec.logs.message_kinds import TF_TOPICS, TRANSFORM_SCHEMAS
+from gtsam_rwhec.logs.message_kinds import IMAGE_SCHEMAS, TF_TOPICS, TRANSFORM_SCHEMAS, schema_word
 from gtsam_rwhec.logs.records import Array, PoseRecord, Record
 
 OnBad = Literal["warn", "raise"]
@@ -59,6 +59,11 @@ class Topic:
     def is_tf(self) -> bool:
         """Whether it has transforms of the log's tree of frames."""
         return self.name.rpartition("/")[2] in TF_TOPICS or self.schema in TRANSFORM_SCHEMAS
+
+    @property
+    def has_images(self) -> bool:
+        """Whether its messages are images that can be decoded."""
+        return schema_word(self.schema) in IMAGE_SCHEMAS
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import LogError, OptionError
 from gtsam_rwhec.export import export_all
 from gtsam_rwhec.files.progress import Progress, silent
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.changed_rig import changes
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
@@ -39,29 +39,31 @@ def calibrate_log(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Calibrated:
-    """Detect, clean, solve and export.
+    """Detect, clean, solve and export: from a log and a rig file to a folder with the calibration.
 
-    Writes ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``, ``camchain.yaml``
-    and ``plots/`` into a folder. While it works the folder has a ``detected.mcap`` too; after an interruption, give
-    that as the log to go on from there. With a log that a stage wrote, the stages after it run. A cleaned log is
-    cleaned anew where `rig` has other settings for cleaning than the log was cleaned with.
+    The folder gets ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``,
+    ``camchain.yaml`` and ``plots/``. During the work it has a ``detected.mcap`` too. To go on after an interruption,
+    give ``detected.mcap`` as the log. For a log that a stage wrote, only the stages after it run. A cleaned log is
+    cleaned again if the settings for cleaning in `rig` differ from those that the log was cleaned with.
 
     Parameters
     ----------
     log_path
         As for ``open_log``.
     rig : Rig or None
-        None: the one embedded in a log that a stage wrote.
+        None: the rig file embedded in a log that a stage wrote.
     out
-        The folder; made if it is not there.
+        The folder; it is made if it does not exist.
     images : "copy" or "leave_out"
         Whether ``clean.mcap`` has the images too.
     workers : int, optional
-        Threads, and for long logs processes, for detection; left out, one for each core.
+        Threads, and for long logs processes, for detection; by default one for each core.
     progress : callable, optional
 
     Raises
     ------
+    OptionError
+        A log that a stage wrote is given with `workers`, or has no images and is given with ``images="copy"``.
     RwhecError
         As each stage does.
     """
@@ -69,19 +71,16 @@ def calibrate_log(
     with open_log(log_path) as log:
         source = log.files[0].path
         is_raw = not is_from_stage(log)
-        if not is_raw and len(log.files) > 1:
-            raise LogError(
-                f"{', '.join(str(file.path) for file in log.files[:10])}: of several files one or more were written by "
-                "a stage; give that one alone, or the raw ones"
-            )
-        is_cleaned = CLEANING_METADATA in log.metadata() and (
-            rig is None or not changes(read_embedded_rig(log), rig).cleaning
-        )
         if is_raw:
             if rig is None:
                 raise LogError(f"{source}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
             check_is_not_read(log, detected)
             check_is_not_read(log, clean)
+        else:
+            _check_stage_log(log, images, workers)
+        is_cleaned = CLEANING_METADATA in log.metadata() and (
+            rig is None or not changes(read_embedded_rig(log), rig).cleaning
+        )
     out = made_folder(out)
     if is_raw:
         assert rig is not None
@@ -93,8 +92,28 @@ def calibrate_log(
     calibrated = solve_into(source, rig, out, images=images, progress=progress)
     export_solved(out / CLEAN_LOG, out, progress=progress)
     if is_raw:
-        detected.unlink(missing_ok=True)  # all of it is in clean.mcap
+        detected.unlink(missing_ok=True)  # clean.mcap has all that was in it
     return calibrated
+
+
+def _check_stage_log(log: Log, images: Images, workers: int | None) -> None:
+    """Refuse a log of a stage that is one of several files, and options that count only in detection."""
+    if len(log.files) > 1:
+        raise LogError(
+            f"{', '.join(str(file.path) for file in log.files[:10])}: a stage wrote at least one of these files; give "
+            "that file alone, or only raw logs"
+        )
+    path = log.files[0].path
+    if workers is not None:
+        raise OptionError(
+            f"workers={workers} (--workers) counts only in detection, and the detections are already in {path}: leave "
+            "the option out, or give the raw log"
+        )
+    if images == "copy" and not any(topic.has_images for topic in log.topics()):
+        raise OptionError(
+            f'images="copy" (--images): {path} has no images to copy, because detection left them out. Leave the '
+            "option out, or give the raw log"
+        )
 
 
 def solve_into(

@@ -19,7 +19,7 @@ from gtsam_rwhec.pipeline.log_contract import detections_topic
 from gtsam_rwhec.results.stage_reports import TrackCount
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import Tag, Target, bare_family
+from gtsam_rwhec.vision.targets import Tag, Target, is_same_print
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ def target_of(record: DetectionRecord, targets: Iterable[Target]) -> Target | No
         for t in targets
         if isinstance(t, Tag)
         and record.id == str(t.id)
-        and (not record.family or bare_family(record.family) == bare_family(t.family))
+        and (not record.family or is_same_print(record.family, t.family))
     ]
     if len(mine) > 1:
         raise FrameError(

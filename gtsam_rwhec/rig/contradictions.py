@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from typing import Any
@@ -13,7 +12,7 @@ from gtsam_rwhec.files.yaml_lines import KeyPath, suggestion
 from gtsam_rwhec.rig.sections import Carriers, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.options import DetectionOptions
-from gtsam_rwhec.vision.targets import Checkerboard, Target
+from gtsam_rwhec.vision.targets import Checkerboard, Target, is_same_print
 
 Fault = tuple[KeyPath, str]
 
@@ -106,15 +105,10 @@ def _lookalikes(targets: list[Target]) -> Iterator[Fault]:
                 )
             continue
         shared = sorted(set(first.ids) & set(second.ids))
-        if shared and _kind(first.family) == _kind(second.family):
+        if shared and is_same_print(first.family, second.family):
             some = ", ".join(map(str, shared[:5])) + (", ..." if len(shared) > 5 else "")
             yield (
                 ("targets", second.name),
                 f"tags {some} of {second.family} belong to target {first.name} too: no image tells the two apart; "
                 "print targets with different ids",
             )
-
-
-def _kind(family: str) -> str:
-    """Families whose tags with one id look the same: ArUco's smaller dictionaries begin its larger ones."""
-    return re.sub(r"^(aruco_\dx\d)_\d+$", r"\1", family)

@@ -178,15 +178,24 @@ class Checkerboard:
 Target: TypeAlias = Tag | Charuco | AprilGrid | Checkerboard
 
 
-def bare_family(word: str) -> str:
-    """What the words of drivers for one family share: 36h11 of tag36h11, tagStandard36h11 and DICT_APRILTAG_36h11."""
-    return re.sub(r"^(dict_)?(apriltag_|aruco_)?(tag)?(standard)?", "", word.strip().lower())
+def is_same_print(first: str, second: str) -> bool:
+    """Whether tags with the same id look the same in two families, which drivers may name in their own words.
+
+    ArUco's smaller dictionaries are the beginning of its larger ones: their sizes do not matter.
+    """
+    a, b = (re.sub(r"^(\dx\d)_\d+$", r"\1", _bare(word)) for word in (first, second))
+    return a == b
 
 
 def family_named(word: str) -> str | None:
     """The family that a driver means by a word; None if it is none of `FAMILIES`."""
-    bare = bare_family(word)
+    bare = _bare(word)
     return next((family for family in (f"tag{bare}", f"aruco_{bare}") if family in FAMILIES), None)
+
+
+def _bare(word: str) -> str:
+    """36h11 of tag36h11, tagStandard36h11 and DICT_APRILTAG_36h11: what the words of drivers for a family share."""
+    return re.sub(r"^(dict_)?(apriltag_|aruco_)?(tag)?(standard)?", "", word.strip().lower())
 
 
 def _square(side_m: float) -> Array:

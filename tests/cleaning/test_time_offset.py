@@ -93,7 +93,7 @@ def test_motions_that_do_not_tell_are_refused(road: object, words: str) -> None:
 
 
 def test_too_few() -> None:
-    with pytest.raises(rw.errors.StampError, match="needs ten"):
+    with pytest.raises(rw.errors.StampError, match="at least ten"):
         coarse_time_offset(carrier(), [track(0.0, count=12)])
 
 

@@ -511,7 +511,7 @@ def test_a_calibration_that_ends_early_leaves_whole_files(
         patched.setattr(os, "replace", stopped)
         kind = KeyboardInterrupt if isinstance(stop, KeyboardInterrupt) else FileFormatError
         with pytest.raises(kind) as caught:
-            calibrate_log(log, rig, tmp_path / "out", workers=1)
+            calibrate_log(log, rig, tmp_path / "out")
     if kind is FileFormatError:
         assert re.search(rf"{re.escape(name)} cannot be written: No space left on device", str(caught.value))
     check_whole(tmp_path / "out")

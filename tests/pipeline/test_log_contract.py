@@ -11,6 +11,7 @@ import synthetic_logs as made
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.pipeline import log_contract
 from gtsam_rwhec.pipeline.tracks import target_of
+from gtsam_rwhec.vision.targets import Tag
 
 OF_DETECTION = {
     log_contract.detections_topic("rig/cam_0"),
@@ -52,3 +53,9 @@ def test_drivers_words_for_a_family(family: str) -> None:
     assert target is not None
     assert target.name == "tag_0"
     assert target_of(DetectionRecord(1, 1, "/tags", "cam_0", "tag25h9", "0"), made.rig().target_list) is None
+
+
+def test_a_driver_with_a_larger_dictionary_sees_the_same_marker() -> None:
+    targets = [Tag("marker", "aruco_5x5_50", 3, 0.1)]
+    seen = DetectionRecord(1, 1, "/tags", "cam_0", "DICT_5X5_1000", "3")
+    assert target_of(seen, targets) == targets[0]

@@ -9,7 +9,16 @@ import pytest
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.vision.dictionaries import dictionary, modules
 from gtsam_rwhec.vision.tag_survey import BY_TRUST
-from gtsam_rwhec.vision.targets import FAMILIES, AprilGrid, Charuco, Checkerboard, Tag, Target, family_named
+from gtsam_rwhec.vision.targets import (
+    FAMILIES,
+    AprilGrid,
+    Charuco,
+    Checkerboard,
+    Tag,
+    Target,
+    family_named,
+    is_same_print,
+)
 
 TAG = Tag("tag", "tag36h11", 3, 0.12)
 BOARD = Charuco("board", "aruco_5x5_100", 7, 5, 0.04, 0.03)
@@ -135,3 +144,22 @@ def test_what_cannot_be_printed(make: object, words: str) -> None:
 )  # fmt: skip
 def test_drivers_words_for_families(word: str, family: str | None) -> None:
     assert family_named(word) == family
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "is_same"),
+    [
+        ("tag36h11", "DICT_APRILTAG_36h11", True), ("aruco_5x5_50", "aruco_5x5_1000", True),
+        ("DICT_5X5_100", "aruco_5x5_250", True), ("aruco_5x5_50", "aruco_6x6_50", False), ("36h11", "36h10", False),
+        ("aruco_original", "aruco_5x5_1000", False),
+    ],
+)  # fmt: skip
+def test_families_whose_tags_look_the_same(first: str, second: str, is_same: bool) -> None:
+    assert is_same_print(first, second) is is_same
+    assert is_same_print(second, first) is is_same
+
+
+@pytest.mark.parametrize("side", [4, 5, 6, 7])
+def test_smaller_aruco_dictionaries_begin_the_larger_ones(side: int) -> None:
+    small, large = (dictionary(f"aruco_{side}x{side}_{count}") for count in (50, 1000))
+    np.testing.assert_array_equal(small.bytesList, large.bytesList[:50])
