@@ -1,6 +1,6 @@
-"""Pictures of a calibration, one PNG each: frames, residuals, coverage of the images, standard deviations.
+"""Pictures of a calibration as PNG files: frames, residuals, coverage of the images, standard deviations.
 
-matplotlib is imported when something is drawn, not before.
+matplotlib is imported by the first picture.
 """
 
 import lazy_loader

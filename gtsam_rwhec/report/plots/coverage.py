@@ -1,10 +1,10 @@
-"""Where in each camera's image targets were seen, and how well their corners fit there."""
+"""A picture of each camera's image: where targets were seen, and the reprojection errors of their corners."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,9 +18,13 @@ if TYPE_CHECKING:
     from matplotlib.collections import PathCollection
     from matplotlib.colors import Colormap
 
-#: Cells along the longer side of an image, for its coverage and for mean errors; corners that a mean is of at least.
-COVERAGE_CELLS, MEAN_CELLS, LEAST_CORNERS = 16, 10, 5
-#: An arrow of the largest mean error is as long as this share of a cell.
+#: Cells along the longer side of an image, for its coverage.
+COVERAGE_CELLS = 16
+#: Cells along the longer side of an image, for mean errors.
+MEAN_CELLS = 10
+#: A mean error is drawn only for a cell with at least this many corners.
+LEAST_CORNERS = 5
+#: Length of the longest arrow, as a share of a cell.
 ARROW_SHARE = 0.9
 
 
@@ -32,9 +36,9 @@ def plot_coverage(corners: Mapping[str, PlottedCorners], cameras: Mapping[str, C
     corners : dict of str to PlottedCorners
         By sensor.
     cameras : dict of str to Camera
-        By sensor, for the images' sizes; of a sensor that is not there, the size is taken from its corners.
+        By sensor, for the sizes of the images. Without a camera the size is taken from the corners.
     path
-        The PNG; replaced if it is there.
+        The PNG file. An existing file is replaced.
 
     Raises
     ------
@@ -43,6 +47,7 @@ def plot_coverage(corners: Mapping[str, PlottedCorners], cameras: Mapping[str, C
     """
     columns = min(max(len(corners), 1), 2 if len(corners) <= 4 else 3)
     rows = -(-len(corners) // columns) or 1
+    corners = {sensor: _finite(seen) for sensor, seen in corners.items()}
     sizes = {sensor: _size(seen, cameras.get(sensor)) for sensor, seen in corners.items()}
     tallest = max((height / width for width, height in sizes.values()), default=0.75)
     width_in = 12.0 if columns > 1 else 8.0
@@ -54,14 +59,13 @@ def plot_coverage(corners: Mapping[str, PlottedCorners], cameras: Mapping[str, C
             say(figure.subplots(), "no corners")
             return
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
-        errors = [np.linalg.norm(_finite(seen).errors_px, axis=1) for seen in corners.values()]
-        every = np.concatenate(errors)
-        # The colours are for most; the few that are larger have the last one.
+        every = np.concatenate([np.linalg.norm(seen.errors_px, axis=1) for seen in corners.values()])
+        # The 2 % of the corners with the largest errors share the last colour.
         largest = float(np.quantile(every, 0.98)) if len(every) else 0.0
         largest = largest or 1.0
         points = None
         for axes, (sensor, seen) in zip(panels, corners.items(), strict=False):
-            points = _draw(axes, sensor, _finite(seen), sizes[sensor], largest)
+            points = _draw(axes, sensor, seen, sizes[sensor], largest)
         for axes in panels[len(corners) :]:
             axes.set_visible(False)
         assert points is not None
@@ -69,36 +73,30 @@ def plot_coverage(corners: Mapping[str, PlottedCorners], cameras: Mapping[str, C
             points, ax=panels.tolist(), extend="max", extendfrac=0.03, aspect=40, shrink=0.8, pad=0.015
         )
         bar.set_label("reprojection error of a corner (px)")
-        words = f"mean error of {LEAST_CORNERS} or more neighbouring corners, as many times as long as the title says"
+        words = f"mean error of {LEAST_CORNERS} or more neighbouring corners, enlarged as the title says"
         arrow = Line2D([], [], marker=">", markersize=5, lw=1.2, color=BLUE, label=words)
         figure.legend(handles=[arrow], loc="outside lower left")
 
 
-class _Seen(NamedTuple):
-    pixels: Array
-    errors_px: Array
-
-
-def _finite(seen: PlottedCorners) -> _Seen:
+def _finite(seen: PlottedCorners) -> PlottedCorners:
     pixels, errors = np.asarray(seen.pixels, dtype=float), np.asarray(seen.errors_px, dtype=float)
     good = np.isfinite(pixels).all(axis=1) & np.isfinite(errors).all(axis=1)
-    return _Seen(pixels[good], errors[good])
+    return PlottedCorners(pixels[good], errors[good])
 
 
 def _size(seen: PlottedCorners, camera: Camera | None) -> tuple[float, float]:
     if camera is not None:
         return float(camera.width), float(camera.height)
-    pixels = _finite(seen).pixels
-    if not len(pixels):
+    if not len(seen.pixels):
         return 4.0, 3.0
-    width, height = np.maximum(np.ceil(pixels.max(axis=0)) + 1.0, 1.0)
+    width, height = np.maximum(np.ceil(seen.pixels.max(axis=0)) + 1.0, 1.0)
     return float(width), float(height)
 
 
-def _draw(axes: Axes, sensor: str, seen: _Seen, size: tuple[float, float], largest: float) -> PathCollection:
+def _draw(axes: Axes, sensor: str, seen: PlottedCorners, size: tuple[float, float], largest: float) -> PathCollection:
     width, height = size
     errors = np.linalg.norm(seen.errors_px, axis=1)
-    order = np.argsort(errors, kind="stable")  # the worst on top
+    order = np.argsort(errors, kind="stable")  # the largest errors on top
     points = axes.scatter(
         seen.pixels[order, 0], seen.pixels[order, 1],
         c=errors[order], s=6, lw=0, cmap=_colours(), vmin=0.0, vmax=largest, zorder=2,
@@ -118,7 +116,7 @@ def _draw(axes: Axes, sensor: str, seen: _Seen, size: tuple[float, float], large
 
 
 def _colours() -> Colormap:
-    """From pale orange to black, so that on white the worst are seen best; without what is too pale to see."""
+    """From pale orange to black: on white the largest errors are seen best. The palest colours are left out."""
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 
@@ -126,13 +124,13 @@ def _colours() -> Colormap:
 
 
 def _share(pixels: Array, size: tuple[float, float]) -> float:
-    """Which share of the image's cells has corners in it."""
+    """The share of the image's cells that contain corners."""
     cells, count = _cells(pixels, size, COVERAGE_CELLS)
     return len(np.unique(cells)) / count
 
 
-def _draw_means(axes: Axes, seen: _Seen, size: tuple[float, float]) -> str:
-    """Mean errors of cells as arrows: what noise does not do, but wrong intrinsics do. How large they are drawn."""
+def _draw_means(axes: Axes, seen: PlottedCorners, size: tuple[float, float]) -> str:
+    """Draw mean errors of cells as arrows; return their scale for the title. Wrong intrinsics do not average out."""
     cells, _ = _cells(seen.pixels, size, MEAN_CELLS)
     means = []
     for cell in np.unique(cells):
@@ -154,7 +152,7 @@ def _draw_means(axes: Axes, seen: _Seen, size: tuple[float, float]) -> str:
 
 
 def _cells(pixels: Array, size: tuple[float, float], along: int) -> tuple[np.ndarray, int]:
-    """Index of each pixel's cell (N,), and how many cells there are; cells are nearly square."""
+    """Index (N,) of each pixel's cell, and the number of cells; cells are nearly square."""
     side = max(size) / along
     columns, rows = (max(int(np.ceil(length / side - 1e-9)), 1) for length in size)
     u, v = (np.clip(((pixels[:, k] + 0.5) / side).astype(int), 0, (columns, rows)[k] - 1) for k in range(2))

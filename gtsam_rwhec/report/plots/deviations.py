@@ -1,4 +1,4 @@
-"""How well each frame is known: standard deviations about and along its axes."""
+"""A picture of each frame's standard deviations, about and along its axes."""
 
 from __future__ import annotations
 
@@ -26,8 +26,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
 
-#: Of the three axes: markers, and where in a frame's row they are.
-MARKERS, HEIGHTS = ("o", "s", "^"), (-0.22, 0.0, 0.22)
+#: Markers of the axes x, y, z.
+MARKERS = ("o", "s", "^")
+#: Heights of the markers in a frame's row, in rows.
+HEIGHTS = (-0.22, 0.0, 0.22)
 
 
 def plot_deviations(frames: RigFrames, covariances: Mapping[str, Array], path: str | Path) -> None:
@@ -37,10 +39,10 @@ def plot_deviations(frames: RigFrames, covariances: Mapping[str, Array], path: s
     ----------
     frames : RigFrames
     covariances : dict of str to (6, 6) array
-        Of T_carrier_frame's right perturbation [omega (rad), v (m)], by frame. A frame without one is not estimated;
-        infinite variances are drawn as undetermined.
+        Covariance of T_carrier_frame's right perturbation [omega (rad), v (m)], by frame. A frame without a covariance
+        is drawn as not estimated, an infinite variance as undetermined.
     path
-        The PNG; replaced if it is there.
+        The PNG file. An existing file is replaced.
 
     Raises
     ------
@@ -49,18 +51,15 @@ def plot_deviations(frames: RigFrames, covariances: Mapping[str, Array], path: s
     FileFormatError
         The file cannot be written.
     """
+    carried = ((frames.sensor_carrier, frames.sensors), (frames.target_carrier, frames.targets))
     groups = [
         (f"{what} on {carrier}", list(poses))
-        for what, carrier, poses in (
-            ("Sensors", frames.sensor_carrier, frames.sensors),
-            ("Targets", frames.target_carrier, frames.targets),
-        )
+        for what, (carrier, poses) in zip(("Sensors", "Targets"), carried, strict=True)
         if poses
     ]
-    deviations = {
-        name: standard_deviations(covariances[name]) for _, names in groups for name in names if name in covariances
-    }
-    rows = sum(len(names) for _, names in groups)
+    every = [name for _, names in groups for name in names]
+    deviations = {name: standard_deviations(covariances[name]) for name in every if name in covariances}
+    rows = len(every)
     with picture(path, 11.0, 1.6 + 0.42 * rows + 0.5 * len(groups)) as figure:
         if not groups:
             say(figure.subplots(), "no frames")
@@ -112,7 +111,7 @@ def _draw(axes: Axes, deviations: dict[str, Array], names: list[str], limits: tu
 
 
 def _limits(values: Array) -> tuple[float, float, float]:
-    """Lower and upper end of the axis, and by which factor its last part, for what is infinite, is long."""
+    """Lower and upper end of the axis, and the factor that its last part, for infinite values, spans."""
     finite = values[np.isfinite(values) & (values > 0.0)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.1, 1.0)
     middle = np.sqrt(low * high)

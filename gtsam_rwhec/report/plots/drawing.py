@@ -1,4 +1,4 @@
-"""What all pictures share: colours that everyone can tell apart, type, and how a file is made of a figure."""
+"""Colours, style, text and files that all pictures share."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-#: Okabe and Ito's palette, which people with any form of colour blindness tell apart.
+#: The palette of Okabe and Ito: people with any form of colour blindness can tell its colours apart.
 BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 SKY, PURPLE, BLACK, GREY, PALE = "#56B4E9", "#CC79A7", "#000000", "#777777", "#DDDDDD"
-#: The axes x, y, z of frames.
+#: Colours of the axes x, y, z of frames.
 AXIS_COLOURS = (VERMILLION, GREEN, BLUE)
 AXIS_NAMES = ("x", "y", "z")
 
@@ -39,20 +39,22 @@ STYLE = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "savefig.dpi": "figure",
-    # Reasons and names are text, whatever is in them.
+    # Reasons and names come from logs: a "$" in them is no formula.
     "text.parse_math": False,
 }
-#: Characters of a reason, and of a name, that there is room for.
-LONGEST_REASON, LONGEST_NAME = 60, 28
+#: Longest reason that a legend has room for, characters.
+LONGEST_REASON = 60
+#: Longest name that a title or an axis has room for, characters.
+LONGEST_NAME = 28
 
 
 @contextmanager
 def picture(
     path: str | Path, width_in: float, height_in: float, layout: Literal["constrained", "compressed"] = "constrained"
 ) -> Iterator[Figure]:
-    """A figure that is written as a PNG when the block ends without an error; always the same bytes for the same.
+    """Yield a figure, and write it as a PNG when the block ends without an error; equal figures give equal bytes.
 
-    The layout "compressed" is for panels whose sides have a fixed ratio.
+    The layout "compressed" is for panels with a fixed ratio of their sides.
 
     Raises
     ------
@@ -73,14 +75,14 @@ def picture(
 
 
 def say(axes: Axes, words: str) -> None:
-    """Words in place of what there is not."""
+    """Write words in the middle of empty axes."""
     axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", color=GREY)
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
 
 
 def shortened(text: str, most: int = LONGEST_NAME) -> str:
-    """One line of at most so many characters, which the font has; what is cut is cut from the middle."""
+    """The text as one line of at most `most` characters that the font has; a long text loses its middle."""
     line = "".join(c if c.isprintable() else " " for c in text.encode("latin-1", "replace").decode("latin-1"))
     line = " ".join(line.split())
     if len(line) <= most:
@@ -90,7 +92,7 @@ def shortened(text: str, most: int = LONGEST_NAME) -> str:
 
 
 def plain_decades(axis: Axis, low: float, high: float) -> None:
-    """Ticks of a logarithmic axis as people write numbers; between the decades too where there are few."""
+    """Label a logarithmic axis with plain numbers; for a ratio below 30 also between the powers of ten."""
     few = high < 30.0 * low
     powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
     for steps, minor in (((1.0, 2.0, 5.0) if few else (1.0,), False), (() if few else (2.0, 5.0), True)):
@@ -99,6 +101,6 @@ def plain_decades(axis: Axis, low: float, high: float) -> None:
 
 
 def round_down(number: float) -> float:
-    """A positive number to 1, 2 or 5 times a power of ten, not above it."""
+    """The largest 1, 2 or 5 times a power of ten that is not above a positive number."""
     power = 10.0 ** np.floor(np.log10(number))
     return float(max(step * power for step in (0.5, 1.0, 2.0, 5.0) if step * power <= number * (1.0 + 1e-12)))

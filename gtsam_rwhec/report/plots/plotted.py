@@ -1,4 +1,4 @@
-"""What the pictures are of, beside frames and their covariances: residuals over time, and corners in images."""
+"""The data of the pictures, beside frames and their covariances: residuals over time, and corners in images."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ from gtsam_rwhec.geometry.poses import Array
 
 @dataclass(frozen=True, eq=False)
 class PlottedMeasurement:
-    """A pair's measurements, those that were removed too.
+    """All measurements of a pair, with the removed measurements.
 
     Attributes
     ----------
     stamps_s : (N,) array
-        Seconds, from any beginning that all pairs share.
-    rotation_deg, translation_mm : (N,) arrays
-        How far each is from what the answer predicts; nan where it cannot be said (no pose of the carriers).
+        Seconds since a time that all pairs share.
+    rotation_deg : (N,) array
+        Angle between the measured and the predicted rotation, degrees; nan where the carriers' poses are not known.
+    translation_mm : (N,) array
+        Distance between the measured and the predicted translation, millimetres; nan as above.
     inlier : (N,) array of bool
-        Whether it was used.
+        Whether the measurement was used.
     reason : sequence of N str
-        Why it was not; of those that were used, nothing is read.
+        Why a measurement was not used. The reasons of used measurements are not read.
 
     Raises
     ------
     CountError
-        They are not of one length.
+        The arrays have different lengths.
     """
 
     stamps_s: Array
@@ -41,7 +43,7 @@ class PlottedMeasurement:
     def __post_init__(self) -> None:
         shapes = {name: np.shape(getattr(self, name)) for name in self.__dataclass_fields__}
         if any(shape != (len(self.reason),) for shape in shapes.values()):
-            raise CountError(f"arrays of one length are needed, one entry a measurement; their shapes are {shapes}")
+            raise CountError(f"give arrays of one length, one entry for each measurement; their shapes are {shapes}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +53,14 @@ class PlottedCorners:
     Attributes
     ----------
     pixels : (N, 2) array
-        Where they were seen.
+        Where the corners were seen, pixels.
     errors_px : (N, 2) array
         Seen minus predicted, pixels.
 
     Raises
     ------
     CountError
-        They are not of these shapes.
+        An array has another shape.
     """
 
     pixels: Array

@@ -1,9 +1,8 @@
-"""How far each measurement is from what the answer predicts, over time; and what was removed, by reason."""
+"""A picture of the residuals over time, with the removed measurements by reason."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,12 +31,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
 
-#: The most frequent reasons have these, the rest share `REST`.
+#: Markers and colours of the most frequent reasons; the other reasons share `REST`.
 SYMBOLS = (("x", VERMILLION), ("^", ORANGE), ("s", GREEN), ("D", PURPLE), ("v", SKY), ("+", BLACK))
 REST = ("1", GREY)
+#: Legend of `REST`.
 OTHER = "other reasons"
-#: Where those are whose residual is not known: along the lower edge.
-UNKNOWN_AT, UNKNOWN = 0.04, "(on the lower edge: residual not known)"
+#: Height of the measurements whose residual is not known, as a share of the axes.
+UNKNOWN_AT = 0.04
+#: Legend of the measurements whose residual is not known.
+UNKNOWN = "(on the lower edge: residual not known)"
+#: In place of an empty reason.
 NO_REASON = "not used"
 
 
@@ -48,7 +51,7 @@ def plot_residuals(measurements: ByPair[PlottedMeasurement], path: str | Path) -
     ----------
     measurements : dict of (target, sensor) to PlottedMeasurement
     path
-        The PNG; replaced if it is there.
+        The PNG file. An existing file is replaced.
 
     Raises
     ------
@@ -79,31 +82,21 @@ def plot_residuals(measurements: ByPair[PlottedMeasurement], path: str | Path) -
         figure.legend(handles=_handles(symbols, reasons, has_unknown=unknown), loc="outside upper left", ncols=3)
 
 
-@dataclass(frozen=True, eq=False)
-class _Row:
-    """All measurements of a sensor."""
-
-    stamps_s: Array
-    rotation_deg: Array
-    translation_mm: Array
-    inlier: np.ndarray
-    reason: list[str]
-
-
-def _joined(sensor: str, measurements: ByPair[PlottedMeasurement]) -> _Row:
+def _joined(sensor: str, measurements: ByPair[PlottedMeasurement]) -> PlottedMeasurement:
+    """All measurements of a sensor; a reason is empty exactly where a measurement was used."""
     of_sensor = [measured for (_, name), measured in measurements.items() if name == sensor]
-    inlier = np.concatenate([np.asarray(measured.inlier, dtype=bool) for measured in of_sensor])
-    words = [word for measured in of_sensor for word in measured.reason]
-    return _Row(
-        np.concatenate([np.asarray(measured.stamps_s, dtype=float) for measured in of_sensor]),
-        np.concatenate([np.asarray(measured.rotation_deg, dtype=float) for measured in of_sensor]),
-        np.concatenate([np.asarray(measured.translation_mm, dtype=float) for measured in of_sensor]),
-        inlier,
-        ["" if used else word or NO_REASON for used, word in zip(inlier, words, strict=True)],
+    stamps, rotation, translation, inlier = (
+        np.concatenate([np.asarray(getattr(measured, field), dtype=kind) for measured in of_sensor])
+        for field, kind in (("stamps_s", float), ("rotation_deg", float), ("translation_mm", float), ("inlier", bool))
     )
+    words = [word for measured in of_sensor for word in measured.reason]
+    reason = ["" if used else word or NO_REASON for used, word in zip(inlier, words, strict=True)]
+    return PlottedMeasurement(stamps, rotation, translation, inlier, reason)
 
 
-def _draw(axes: Axes, row: _Row, values: Array, begin: float, symbols: dict[str, tuple[str, str]]) -> None:
+def _draw(
+    axes: Axes, row: PlottedMeasurement, values: Array, begin: float, symbols: dict[str, tuple[str, str]]
+) -> None:
     time = row.stamps_s - begin
     low, high = _limits(values, row.inlier)
     axes.set_yscale("log")
@@ -122,19 +115,13 @@ def _draw(axes: Axes, row: _Row, values: Array, begin: float, symbols: dict[str,
             (time[at & ~np.isfinite(values)], UNKNOWN_AT, axes.get_xaxis_transform()),
         ):
             axes.plot(
-                stamps,
-                np.broadcast_to(heights, stamps.shape),
-                marker,
-                color=colour,
-                markersize=5,
-                markerfacecolor="none",
-                transform=transform,
-                zorder=3,
-            )
+                stamps, np.broadcast_to(heights, stamps.shape), marker,
+                color=colour, markersize=5, markerfacecolor="none", transform=transform, zorder=3,
+            )  # fmt: skip
 
 
 def _limits(values: Array, inlier: np.ndarray) -> tuple[float, float]:
-    """Of the axis: all that is large, and what is used down to a hundredth of its median."""
+    """Ends of the axis: up to the largest residual, and down to a hundredth of the median of the used residuals."""
     positive = values[np.isfinite(values) & (values > 0.0)]
     if not len(positive):
         return 0.1, 10.0
