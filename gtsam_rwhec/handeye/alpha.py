@@ -7,43 +7,37 @@ import math
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.handeye.cost import MotionMoments
+from gtsam_rwhec.handeye.cost import motion_moments
 from gtsam_rwhec.handeye.motion_costs import squared_residuals
 from gtsam_rwhec.handeye.motions import Motions
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
 from gtsam_rwhec.handeye.saddle import minimum
 
+#: Most solutions with a new alpha each.
 ITERATIONS = 50
-#: Alpha stands still when it changes by less than this part; residuals tell it to a few per cent at best.
+#: Alpha has converged when it changes by less than this part. Residuals tell alpha to a few per cent at best.
 STILL = 1e-6
-#: Residuals below this part of what moved are rounding and tell nothing.
+#: Residuals below this part of the motions' own size are rounding and tell nothing.
 ROUNDING = 1e-24
-#: How far from its starting value alpha may go.
+#: Alpha stays within this factor of its starting value.
 RANGE = 1e6
 
 
-def estimate_alpha(
-    motions: Motions, moments: MotionMoments, weights: Array | None = None, prior: DualQuaternionPrior | None = None
-) -> float:
-    """Alpha with which both kinds of residual have the same size: rms |A q| / rms |B q + A q'| at the optimum.
+def estimate_alpha(motions: Motions, weights: Array | None = None, prior: DualQuaternionPrior | None = None) -> float:
+    """Alpha (1/m) that gives both kinds of residual the same size: rms |A q| / rms |B q + A q'| at the optimum.
 
-    Each step lowers N log(sum |A q|^2) + N log(sum |B q + A q'|^2), the likelihood of normal residuals whose two
-    sigmas are unknown: with the poses given alpha is that ratio, with alpha given the poses are DQOpt's.
+    Each step lowers N log(sum |A q|^2) + N log(sum |B q + A q'|^2): the likelihood of normal residuals whose two
+    sigmas are unknown. For given poses alpha is that ratio, and for given alpha the poses are DQOpt's. Where the
+    residuals are rounding, alpha stays as it is; at the start it is the ratio of the motions' own sizes.
 
     Parameters
     ----------
     motions : Motions
-    moments : MotionMoments
-        Of the same motions and weights.
     weights : (N,) array, optional
     prior : DualQuaternionPrior, optional
         Its a and b keep their meaning while alpha changes.
-
-    Returns
-    -------
-    float
-        1/m. Where the residuals are rounding, or nothing moves, the ratio of the motions' own sizes.
     """
+    moments = motion_moments(motions.rows, weights)
     turned, moved = float(np.trace(moments.AA)), float(np.trace(moments.BB))
     if not (turned > 0.0 and moved > 0.0):
         return 1.0

@@ -1,6 +1,6 @@
 """The DQ paper's analytic approximations: rotation first, the relaxation, expansions about it (Section 3.2, App. A).
 
-Each finds q; q' is then the best that goes with it (eq. 20, ``best_dual``).
+Each method finds q. Then q' is the best for that q (eq. 20, ``best_dual``).
 """
 
 from __future__ import annotations
@@ -20,9 +20,12 @@ from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import SINGULAR, Z_pseudo, best_dual, bracket, is_singular
 from gtsam_rwhec.methods.estimate import Outcome
 
-#: mu stands still when it changes by less than this part of the range that Appendix C gives it.
+#: DQItr has converged when mu changes by less than this part of Appendix C's range of mu.
 STILL = 1e-13
+#: Most iterations of DQItr.
 ITERATIONS = 200
+#: Rounding of lambda_0, as a part of tr S.
+ROUNDING = 1e-13
 
 
 def dq2steps(request: Request) -> Outcome[Array]:
@@ -31,28 +34,27 @@ def dq2steps(request: Request) -> Outcome[Array]:
     Raises
     ------
     UnderdeterminedError
-        When the rotations alone leave the rotation free: parallel axes, or no rotation.
+        When the rotations alone do not determine the rotation: parallel axes, or no rotation.
     """
     values, vectors = request.cost.spectrum
     if not values[1] > SINGULAR * values[3]:
         turned = "no motion rotates" if not values[3] > 0.0 else "all motions rotate about parallel axes"
         raise UnderdeterminedError(
-            f"{turned}, and 'dq2steps' takes the rotation from the rotations alone; use method='dqopt', which takes it "
-            "from the translations too, or add motions about another axis"
+            f"{turned}, and 'dq2steps' takes the rotation from the rotations alone; use method='dqopt', which uses "
+            "the translations too, or add motions about another axis"
         )
     found = outcome_of(request, vectors[:, 0])  # eq. 19
     return replace(found, free_directions=free_of_rotations_alone(request) or found.free_directions)
 
 
 def dqconvrlx(request: Request) -> Outcome[Array]:
-    """DQConvRlx (Section 3.2.3, Algorithm 3): without the constraint q . q' = 0, then projected onto it.
+    """DQConvRlx (Section 3.2.3, Algorithm 3): solved without the constraint q . q' = 0, then projected onto it.
 
     ``lower_bound`` is lambda_0 (below eq. 22): the gap is at most ``relaxation_gap``.
     """
     relaxed = relaxed_cost(request.cost)
-    q = relaxed.vectors[:, 0]
-    found = outcome_of(request, q)
-    return replace(found, lower_bound=max(float(relaxed.values[0]) - relaxed.rounding, 0.0))
+    bound = float(relaxed.values[0]) - ROUNDING * float(np.trace(request.cost.S))
+    return replace(outcome_of(request, relaxed.vectors[:, 0]), lower_bound=max(bound, 0.0))
 
 
 def dq2ndord(request: Request) -> Outcome[Array]:
@@ -61,14 +63,14 @@ def dq2ndord(request: Request) -> Outcome[Array]:
 
 
 def dq_nth_order(request: Request, order: int) -> Outcome[Array]:
-    """The expansion in mu to any order (Appendix A): q(mu) of eq. 32 where d lambda / d mu = 0 is nearest mu = 0.
+    """The expansion in mu to any order (Appendix A): q(mu) of eq. 32 at the root of d lambda / d mu nearest mu = 0.
 
     Parameters
     ----------
     request : Request
     order : int
-        Of lambda and q, >= 1; 2 is ``dq2ndord``. The series converges for |mu| up to where Z's two smallest
-        eigenvalues meet in the complex plane; orders beyond help within it only.
+        Order of lambda and q, >= 1; 2 is ``dq2ndord``. The series converges for |mu| up to where Z's two smallest
+        eigenvalues meet in the complex plane. Higher orders help only within that range.
     """
     if order < 1:
         raise OptionError(f"order={order}: the expansion in mu starts at order 1")
@@ -83,40 +85,36 @@ def dq_nth_order(request: Request, order: int) -> Outcome[Array]:
 
 def dq2ndord_lambda(request: Request) -> Outcome[Array]:
     """The second order in Delta lambda = lambda - lambda_0 (Section 3.2.4, Appendix A, eqs. 35 and 36, corrected)."""
-    cost = request.cost
-    relaxed = relaxed_cost(cost)
-    q0 = relaxed.vectors[:, 0]
-    if is_singular(cost):
-        return outcome_of(request, q0)
-    q = lambda_expansion(relaxed)
-    return outcome_of(request, q0 if q is None else relaxed.vectors @ q)
+    relaxed = relaxed_cost(request.cost)
+    q = None if is_singular(request.cost) else lambda_expansion(relaxed)
+    return outcome_of(request, relaxed.vectors[:, 0] if q is None else relaxed.vectors @ q)
 
 
 def dqitr(request: Request) -> Outcome[Array]:
-    """DQItr: mu <- q(mu)'Z1 q(mu) / (2 q(mu)'Z2 q(mu)) (eq. 24) until it stands still.
+    """DQItr: mu <- q(mu)'Z1 q(mu) / (2 q(mu)'Z2 q(mu)) (eq. 24) until mu converges.
 
-    With M singular (no noise), where the paper finds the iteration unstable, mu is 0 and nothing is iterated.
+    With M singular (no noise) the paper finds the iteration unstable. There mu = 0 is exact, and nothing is iterated.
 
     Warns
     -----
     NotConvergedWarning
-        When mu still moves after 200 iterations: the fixed point need not attract. ``dqopt`` always arrives.
+        When mu still changes after 200 iterations: the fixed point need not attract. ``dqopt`` always converges.
     """
     cost = request.cost
     if is_singular(cost):
         return outcome_of(request, relaxed_cost(cost).vectors[:, 0])
-    Z0, Z1, Z2 = cost.Z0, cost.Z1, cost.Z2
+    Z1, Z2 = cost.Z1, cost.Z2
     low, high = bracket(Z1, Z2)
     mu = 0.0
     for _ in range(ITERATIONS):
-        q = np.linalg.eigh(Z0 + mu * (Z1 - mu * Z2))[1][:, 0]
+        q = np.linalg.eigh(cost.Z(mu))[1][:, 0]
         before, mu = mu, float(0.5 * (q @ Z1 @ q) / (q @ Z2 @ q))
         if abs(mu - before) <= STILL * (high - low):
             break
     else:
         warnings.warn(
-            f"'dqitr' still moves after {ITERATIONS} iterations (mu from {before:.6g} to {mu:.6g}); "
-            "its answer may be off: use method='dqopt'",
+            f"'dqitr' has not converged after {ITERATIONS} iterations (mu changed from {before:.6g} to {mu:.6g}); "
+            "its answer may be wrong: use method='dqopt'",
             NotConvergedWarning,
             stacklevel=4,
         )
@@ -133,26 +131,20 @@ class RelaxedCost:
         lambda_a and q_a of Z0.
     Z1, Z2 : (4, 4) arrays
         Entry [a, b] is q_a'Z q_b, the paper's Z^ab.
-    rounding : float
-        What rounding may have added to lambda_0.
     """
 
     values: Array
     vectors: Array
     Z1: Array
     Z2: Array
-    rounding: float
 
 
 def relaxed_cost(cost: DualQuaternionCost) -> RelaxedCost:
-    """Solve Z0 q = lambda q (eq. 21); of a singular M with its pseudo-inverse."""
+    """Solve Z0 q = lambda q (eq. 21); with a singular M, by its pseudo-inverse and with Z1 = Z2 = 0."""
     if is_singular(cost):
-        values, vectors = np.linalg.eigh(Z_pseudo(cost))
-        Z1 = Z2 = np.zeros((4, 4))
-    else:
-        values, vectors = np.linalg.eigh(cost.Z0)
-        Z1, Z2 = vectors.T @ cost.Z1 @ vectors, vectors.T @ cost.Z2 @ vectors
-    return RelaxedCost(values, vectors, Z1, Z2, 1e-13 * float(np.trace(cost.S)))
+        return RelaxedCost(*np.linalg.eigh(Z_pseudo(cost)), np.zeros((4, 4)), np.zeros((4, 4)))
+    values, vectors = np.linalg.eigh(cost.Z0)
+    return RelaxedCost(values, vectors, vectors.T @ cost.Z1 @ vectors, vectors.T @ cost.Z2 @ vectors)
 
 
 def relaxation_gap(relaxed: RelaxedCost) -> float:
@@ -165,8 +157,8 @@ def relaxation_gap(relaxed: RelaxedCost) -> float:
 def expansion(relaxed: RelaxedCost, order: int) -> tuple[list[float], list[Array]]:
     """lambda_k and c_k (4,) of lambda(mu) = sum lambda_k mu^k, q(mu) = sum mu^k sum_a c_ka q_a (eqs. 31 to 33).
 
-    Two signs of eq. 33 as printed do not solve eq. 12: the middle line's second term is Z2 q_{k-2}, as the third
-    line has it, not Z2 q_{k-1} (checked against Z(mu)'s own eigenvalues: tests/handeye/test_approximate.py).
+    Eq. 33 as printed does not solve eq. 12: the middle line's second term must be Z2 q_{k-2}, as in the third line, in
+    place of Z2 q_{k-1} (checked against Z(mu)'s own eigenvalues: tests/handeye/test_approximate.py).
     """
     gaps = relaxed.values[0] - relaxed.values[1:]  # lambda_0a
     lambdas = [float(relaxed.values[0])]
@@ -183,8 +175,8 @@ def expansion(relaxed: RelaxedCost, order: int) -> tuple[list[float], list[Array
 
 
 def _stationary(lambdas: list[float]) -> float:
-    """The mu nearest 0 where the truncated series has d lambda / d mu = 0 and a maximum; eq. 34 at second order."""
-    second = -0.5 * lambdas[1] / lambdas[2]  # eq. 34; lambda_2 < 0, lambda_0(mu) being concave
+    """The mu where the truncated series has d lambda / d mu = 0, nearest to eq. 34's, which is second order."""
+    second = -0.5 * lambdas[1] / lambdas[2]  # eq. 34; lambda_2 < 0, since lambda_0(mu) is concave
     if len(lambdas) == 3:
         return second
     roots = np.roots([k * lambdas[k] for k in range(len(lambdas) - 1, 0, -1)])
@@ -196,15 +188,15 @@ def lambda_expansion(relaxed: RelaxedCost) -> Array | None:
     """Q to second order in Delta lambda, in the eigenvectors (4,), not normalised; None where mu = 0 is the answer.
 
     mu = mu_1 D + mu_2 D^2 and q = q_0 + q_1 D + q_2 D^2 solve (Z0 + mu Z1 - mu^2 Z2) q = (lambda_0 + D) q order by
-    order. As printed, eq. 35 has mu_1^2 Z2 with the wrong sign, in mu_2 and in q_2 (Z2 enters eq. 12 with a minus),
-    eq. 36 the Z2 terms of q.(mu Z2 - Z1/2).q = 0, and Delta lambda's formula divides by 2 where it must divide by
-    2 c_2. With the signs as below the residual of eq. 12 is of third order; as printed, of second
+    order. As printed, eq. 35 has the wrong sign of mu_1^2 Z2, in mu_2 and in q_2 (Z2 enters eq. 12 with a minus).
+    Eq. 36 has the wrong sign of the Z2 terms of q.(mu Z2 - Z1/2).q = 0. Delta lambda's formula divides by 2 in place of
+    2 c_2. With the signs below the residual of eq. 12 is of third order; as printed, of second
     (tests/handeye/test_approximate.py).
     """
     Z1, Z2 = relaxed.Z1, relaxed.Z2
     gaps = relaxed.values[0] - relaxed.values[1:]
     if abs(Z1[0, 0]) * abs(Z1[0, 0]) <= 1e-30 * abs(Z2[0, 0]) * abs(relaxed.values[3]):
-        return None  # lambda does not change with mu: no expansion in it, and eq. 14 gives mu = 0
+        return None  # lambda does not change with mu: it has no expansion in lambda, and eq. 14 gives mu = 0
     mu1 = 1.0 / Z1[0, 0]
     q1 = np.concatenate([[0.0], mu1 * Z1[1:, 0] / gaps])
     mu2 = -(mu1 * Z1[0] @ q1 - mu1**2 * Z2[0, 0]) / Z1[0, 0]
@@ -214,20 +206,19 @@ def lambda_expansion(relaxed: RelaxedCost) -> Array | None:
     c0 = 0.5 * Z1[0, 0]
     c1 = Z1[0] @ q1 - mu1 * Z2[0, 0]
     c2 = Z1[0] @ q2 + 0.5 * q1 @ Z1 @ q1 - Z2[0] @ (2.0 * mu1 * q1) - mu2 * Z2[0, 0]
-    root = c1 * c1 - 4.0 * c0 * c2
+    discriminant = c1 * c1 - 4.0 * c0 * c2
     # The root that goes to -c0 / c1 as c2 goes to 0, without cancellation.
-    change = -2.0 * c0 / (c1 + math.copysign(math.sqrt(root), c1)) if root >= 0.0 else -c0 / c1
+    change = -2.0 * c0 / (c1 + math.copysign(math.sqrt(discriminant), c1)) if discriminant >= 0.0 else -c0 / c1
     q: Array = np.array([1.0, 0.0, 0.0, 0.0]) + change * (q1 + change * q2)
     return q
 
 
 def outcome_of(request: Request, q: Array) -> Outcome[Array]:
-    """The pose of q (4,), not yet of length one, with the best q' (eq. 20).
+    """The pose of q (4,), of any length, with the best q' (eq. 20).
 
     Algorithm 4 as printed normalises by q^2; a unit quaternion needs |q|.
     """
     q = q / math.sqrt(float(q @ q))
-    X = to_transform(q, best_dual(request.cost, q))
     relaxed = relaxed_cost(request.cost)
     free = free_directions(request, q, relaxed.values, relaxed.vectors)
-    return Outcome(X, free_directions=free)
+    return Outcome(to_transform(q, best_dual(request.cost, q)), free_directions=free)

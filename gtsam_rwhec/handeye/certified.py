@@ -1,7 +1,7 @@
-"""The library's own AX = XB: the chordal cost, its minimum proven, with a known or an unknown scale.
+"""AX = XB by the library's certified solver: the chordal cost, with a known or an unknown scale.
 
-``Problem.add_motion`` and ``solve`` do it, for any number of sensors, with priors and with targets in the same problem;
-here is one sensor behind the call that the other methods have.
+Here one sensor stands behind the call that all AX = XB methods share. ``Problem.add_motion`` and ``solve`` take any
+number of sensors, with priors and with targets in the same problem.
 """
 
 from __future__ import annotations
@@ -21,26 +21,24 @@ from gtsam_rwhec.solving.certified_solution import solve
 def certified(request: Request) -> Outcome[Array]:
     """Certified minimum of sum |R_C R - R R_H|^2 + alpha^2 |(R_C - 1) T - R T_H + T_C|^2 (eq. 30, first).
 
-    The library's cost J is that with 1 / sigma^2 = 2 alpha^2 w and kappa = 2 w for a motion of weight w. With an
-    unknown scale, t_C = scale * (true length), the equation is inverted, H X^-1 = X^-1 C, so that the scale is the
-    measured side's: the cost is then that of X^-1.
+    The library's cost J is this cost, with 1 / sigma^2 = 2 alpha^2 w and kappa = 2 w for a motion of weight w. An
+    unknown scale has t_C = scale * (true length). The equation is then inverted, H X^-1 = X^-1 C, so that the measured
+    side has the scale: the cost is that of X^-1.
 
     Raises
     ------
     ScaleError
-        A scale that is not positive at the optimum.
+        When the scale at the optimum is not positive.
     """
-    C, H, weights = request.motions.C, request.motions.H, request.weights
-    w = np.ones(len(C)) if weights is None else weights
+    w = np.ones(len(request.motions)) if request.weights is None else request.weights
     used = w > 0.0
-    if not used.all():
-        C, H, w = C[used], H[used], w[used]
+    C, H, w = request.motions.C[used], request.motions.H[used], w[used]
     sigma, kappa = 1.0 / (request.alpha * np.sqrt(2.0 * w)), 2.0 * w
     known = request.scale == "known"
     problem = Problem(scale="known" if known else "shared", keep_measurements=False)
     name = "h" if known else "c"  # whose pose the problem is about
     problem.add_motion(name, *((C, H) if known else (H, C)), sigma, kappa)
-    with warnings.catch_warnings():  # both are in the answer: free directions, and a bound below the cost
+    with warnings.catch_warnings():  # the answer holds both facts: free directions and bound
         warnings.simplefilter("ignore", NotUniqueWarning)
         warnings.simplefilter("ignore", NotCertifiedWarning)
         solution = solve(problem)

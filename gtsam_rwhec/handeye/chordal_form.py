@@ -5,36 +5,32 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.handeye.cost import BLOCK
+from gtsam_rwhec.handeye.cost import blocks
 from gtsam_rwhec.handeye.motions import Motions
 
 
 def chordal_moments(motions: Motions, weights: Array | None = None) -> tuple[Array, Array]:
-    """Sums over the motions, one pass.
+    """The two forms of eq. 30, summed over the motions in one pass.
 
     Returns
     -------
     rotation : (9, 9) array
-        |R_C R - R R_H|^2 = vec(R)' rotation vec(R), vec taking rows: R_C (x) I - I (x) R_H'.
+        |R_C R - R R_H|^2 = vec(R)' rotation vec(R). Here vec takes rows: R_C (x) I - I (x) R_H'.
     translation : (13, 13) array
         |(R_C - 1) T - R T_H + T_C|^2 as a form of (vec R, T, 1).
     """
     rotation, translation = np.zeros((9, 9)), np.zeros((13, 13))
-    for first in range(0, len(motions), BLOCK):
-        block = slice(first, first + BLOCK)
+    for block in blocks(len(motions)):
         C, H = motions.C[block], motions.H[block]
-        b = len(C)
-        w = np.ones(b) if weights is None else weights[block]
-        R_C, R_H, t_C, t_H = C[:, :3, :3].reshape(b, 9), H[:, :3, :3].reshape(b, 9), C[:, :3, 3], H[:, :3, 3]
-        # (R_C (x) I - I (x) R_H')'(...) = 2 I - R_C' (x) R_H' - R_C (x) R_H; entry (i, j), (k, l) of R_C (x) R_H is
+        w = np.ones(len(C)) if weights is None else weights[block]
+        # (R_C (x) I - I (x) R_H')'(...) = 2 I - R_C' (x) R_H' - R_C (x) R_H. Entry (i, j), (k, l) of R_C (x) R_H is
         # R_C[i, k] R_H[j, l].
-        K = ((R_C * w[:, None]).T @ R_H).reshape(3, 3, 3, 3).transpose(0, 2, 1, 3).reshape(9, 9)
+        K = np.einsum("n,nik,njl->ijkl", w, C[:, :3, :3], H[:, :3, :3], optimize=True).reshape(9, 9)
         rotation += 2.0 * w.sum() * np.eye(9) - K - K.T
         # Row r of the residual is -t_H . R[r] + (R_C - 1)[r] . T + t_C[r]: seven numbers f_r times the unknowns.
-        f = np.empty((b, 3, 7))
-        f[:, :, :3] = -t_H[:, None, :]
-        f[:, :, 3:6] = C[:, :3, :3] - np.eye(3)
-        f[:, :, 6] = t_C
+        f = np.empty((len(C), 3, 7))
+        f[:, :, :3] = -H[:, None, :3, 3]
+        f[:, :, 3:] = C[:, :3] - np.eye(3, 4)
         for r in range(3):
             used = [3 * r, 3 * r + 1, 3 * r + 2, 9, 10, 11, 12]
             translation[np.ix_(used, used)] += (f[:, r] * w[:, None]).T @ f[:, r]
@@ -43,13 +39,9 @@ def chordal_moments(motions: Motions, weights: Array | None = None) -> tuple[Arr
 
 def chordal_residuals(motions: Motions, X: Array, weights: Array | None = None) -> tuple[float, float]:
     """The sums of |R_C R - R R_H|^2 and |(R_C - 1) T - R T_H + T_C|^2 of a pose (4, 4), from the motions' residuals."""
-    rotation = translation = 0.0
-    for first in range(0, len(motions), BLOCK):
-        block = slice(first, first + BLOCK)
+    by_column = np.zeros(4)  # three of the rotation, one of the translation
+    for block in blocks(len(motions)):
         E = motions.C[block] @ X - X @ motions.H[block]
-        squares = (E[:, :3] ** 2).sum(axis=1)  # by column: three of the rotation, one of the translation
-        if weights is not None:
-            squares *= weights[block, None]
-        rotation += float(squares[:, :3].sum())
-        translation += float(squares[:, 3].sum())
-    return rotation, translation
+        squares = (E[:, :3] ** 2).sum(axis=1)
+        by_column += squares.sum(axis=0) if weights is None else weights[block] @ squares
+    return float(by_column[:3].sum()), float(by_column[3])

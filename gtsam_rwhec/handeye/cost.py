@@ -1,36 +1,33 @@
-"""The DQ paper's cost (eq. 8) as three 4 x 4 matrices: one pass over the motions, whatever alpha is.
+"""The DQ paper's cost (eq. 8) as three 4 x 4 matrices, from one pass over the motions that serves every alpha.
 
-A_i = L(q_C) - R(q_H) is linear in seven numbers of a motion and B_i in seven of its dual parts
-(``Motions.rows``), so the sums over motions of A'A, B'B and B'A are linear in one 14 x 14 matrix of moments.
+A_i = L(q_C) - R(q_H) is linear in seven numbers of a motion, and B_i in seven numbers of the motion's dual parts
+(``Motions.rows``). So the sums of A'A, B'B and B'A over the motions are linear in one 14 x 14 matrix of moments.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT
 
-#: Motions worked on at once: memory beyond the input stays bounded.
+#: Number of motions that are worked on at once. It bounds the memory beyond the input.
 BLOCK = 32768
 
-#: A = sum_k a_k E_k with a = [v_C + v_H, v_C - v_H, w_C - w_H]: entry [k] is E_k (4, 4).
-E = np.zeros((7, 4, 4))
-for _k in range(3):
-    _a, _b = (_k + 1) % 3, (_k + 2) % 3
-    E[_k, _b, _a], E[_k, _a, _b] = 1.0, -1.0
-    E[3 + _k, _k, 3], E[3 + _k, 3, _k] = 1.0, -1.0
-E[6] = np.eye(4)
-#: Row 7 k + l is vec(E_k' E_l): turns moments sum a_k b_l into sum A'B.
+#: Entry [k] is E_k (4, 4) of A = sum_k a_k E_k, with a = [v_C + v_H, v_C - v_H, w_C - w_H].
+E = np.concatenate([0.5 * (LEFT - RIGHT)[:3], 0.5 * (LEFT + RIGHT)[:3], LEFT[3:]])
+#: Row 7 k + l is vec(E_k' E_l). It turns moments sum a_k b_l into the sum of A'B.
 _PRODUCTS = np.einsum("kji,ljm->klim", E, E).reshape(49, 16)
 _STACKED = np.ascontiguousarray(E.transpose(1, 0, 2).reshape(28, 4))
 
 
 @dataclass(frozen=True)
 class MotionMoments:
-    """Sums over the motions (4, 4 each), alpha left out: ``AA`` = A'A, ``BA`` = B'A, ``BB`` = B'B."""
+    """Sums over ``count`` motions, (4, 4) each, without alpha: ``AA`` of A'A, ``BA`` of B'A, ``BB`` of B'B."""
 
     AA: Array
     BA: Array
@@ -45,12 +42,12 @@ class MotionMoments:
 
 @dataclass(frozen=True)
 class DualQuaternionCost:
-    """q'S q + 2 q'W q_dual + q_dual'M q_dual, the cost (8) as eq. 9 writes it.
+    """The cost (8) as eq. 9 writes it: q'S q + 2 q'W q_dual + q_dual'M q_dual.
 
     Attributes
     ----------
     S, M, W : (4, 4) arrays
-        Below eq. 9: S = A'A + alpha^2 B'B, M = alpha^2 A'A, W = alpha^2 B'A.
+        As below eq. 9: S = A'A + alpha^2 B'B, M = alpha^2 A'A, W = alpha^2 B'A.
     count : int
         Number of motions.
     """
@@ -62,7 +59,7 @@ class DualQuaternionCost:
 
     @cached_property
     def spectrum(self) -> tuple[Array, Array]:
-        """Eigenvalues (4,), ascending, and eigenvectors (4, 4) of M."""
+        """Eigenvalues (4,) of M, ascending, and its eigenvectors (4, 4)."""
         values, vectors = np.linalg.eigh(self.M)
         return values, vectors
 
@@ -75,7 +72,7 @@ class DualQuaternionCost:
 
     @cached_property
     def Z2(self) -> Array:
-        """M^-1 (eq. 13), for an M that is not singular."""
+        """M^-1 (eq. 13). M must not be singular."""
         half, _ = self._halves
         result: Array = half @ half.T
         return result
@@ -101,30 +98,43 @@ class DualQuaternionCost:
         return matrix
 
     def value(self, q: Array, q_dual: Array) -> float:
-        """The cost of one dual quaternion, parts (4,) each; loses digits where it is small beside tr S."""
+        """The cost of a dual quaternion, parts (4,) each. Digits are lost where the cost is small beside tr S."""
         return float(q @ self.S @ q + 2.0 * (q @ self.W @ q_dual) + q_dual @ self.M @ q_dual)
 
-    def lagrangian(self, q: Array, q_dual: Array, lam: float, mu: float) -> float:
-        """L of eq. 9."""
-        return self.value(q, q_dual) + lam * (1.0 - float(q @ q)) - 2.0 * mu * float(q @ q_dual)
+
+def blocks(count: int, matrices: int = 1) -> Iterator[slice]:
+    """Slices that cut ``count`` motions into blocks; smaller blocks where each motion needs several ``matrices``."""
+    step = BLOCK // matrices
+    return (slice(first, first + step) for first in range(0, count, step))
+
+
+def gram(rows: Array, weights: Array | None = None) -> Array:
+    """The sum of weight * row row' (n, n) over motions, the columns of ``rows`` (n, N)."""
+    if weights is None:
+        product: Array = rows @ rows.T
+        return product
+    total = np.zeros((len(rows), len(rows)))
+    for block in blocks(rows.shape[1]):
+        total += (rows[:, block] * weights[block]) @ rows[:, block].T
+    return total
+
+
+def by_parts(moments: Array, products: Array) -> Array:
+    """Sums of P'P (2, 2, 4, 4) for P of primal and dual parts, from moments (2 n, 2 n) and vec(P_k' P_l) (n n, 16)."""
+    n = len(moments) // 2
+    pairs = moments.reshape(2, n, 2, n).transpose(0, 2, 1, 3).reshape(4, n * n)
+    sums: Array = (pairs @ products).reshape(2, 2, 4, 4)
+    return sums
 
 
 def motion_moments(rows: Array, weights: Array | None = None) -> MotionMoments:
-    """The sums of eq. 9 over ``Motions.rows`` (14, N), alpha left out; weights (N,) multiply each motion's terms."""
-    if weights is None:
-        gram = rows @ rows.T
-    else:
-        gram = np.zeros((14, 14))
-        for first in range(0, rows.shape[1], BLOCK):
-            block = rows[:, first : first + BLOCK]
-            gram += (block * weights[first : first + BLOCK]) @ block.T
-    by_part = gram.reshape(2, 7, 2, 7).transpose(0, 2, 1, 3).reshape(4, 49) @ _PRODUCTS
-    AA, _, BA, BB = by_part.reshape(4, 4, 4)
+    """The sums of eq. 9 over ``Motions.rows`` (14, N), without alpha. Weights (N,) multiply the motions' terms."""
+    (AA, _), (BA, BB) = by_parts(gram(rows, weights), _PRODUCTS)
     return MotionMoments(AA, BA, BB, rows.shape[1])
 
 
 def residuals(rows: Array, q: Array, q_dual: Array) -> Array:
-    """A_i q (first four rows) and B_i q + A_i q' (last four) of each motion of ``Motions.rows`` (14, N): (8, N)."""
+    """A_i q (first four rows) and B_i q + A_i q' (last four rows) of motions ``Motions.rows`` (14, N): (8, N)."""
     P, P_dual = (_STACKED @ q).reshape(4, 7), (_STACKED @ q_dual).reshape(4, 7)
     linear = np.zeros((8, 14))
     linear[:4, :7] = linear[4:, 7:] = P

@@ -1,12 +1,13 @@
 """Dan: Daniilidis, Hand-Eye Calibration Using Dual Quaternions (IJRR 1999), the linear method of the DQ paper's [9].
 
-The scalar parts, which conjugation keeps, are left out of (7): six rows a motion, linear in eight unknowns (q, q'),
+A conjugation keeps the scalar parts, so eq. 7 is taken without them: six rows a motion, linear in eight unknowns
+(q, q'),
 
     [ P   0 ]           P = [Skew(v_C + v_H), v_C - v_H]   (3 x 4, unknowns with the scalar last),
-    [ P'  P ]           P' the same of the dual parts,
+    [ P'  P ]           P' the same of the dual parts.
 
-whose null space has two dimensions without noise. It holds one unit dual quaternion. Nothing is minimised: the answer
-is the combination, with |q| = 1 and q . q' = 0, of the two right singular vectors of the smallest singular values.
+Without noise the null space has two dimensions and holds one unit dual quaternion. Nothing is minimised: the answer
+combines the two right singular vectors of the smallest singular values so that |q| = 1 and q . q' = 0.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ import numpy as np
 
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.handeye.cost import BLOCK, E
+from gtsam_rwhec.handeye.cost import E, by_parts, gram
 from gtsam_rwhec.handeye.degenerate import free_of_rotations_alone
 from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.methods.estimate import Outcome
 
-#: Squares of singular values below this, relative to the largest, are rounding.
+#: Squares of singular values below this part of the largest are rounding.
 NULL = 1e-13
 #: Rows of ``Motions.rows`` that hold vector parts.
 _VECTORS = [0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]
@@ -37,41 +38,35 @@ def daniilidis(request: Request) -> Outcome[Array]:
     Raises
     ------
     UnderdeterminedError
-        When all axes are parallel, or nothing rotates: the null space then has more than two dimensions.
+        When all axes are parallel, or no motion rotates: the null space then has more than two dimensions.
     """
-    rows = request.motions.rows
-    gram = np.zeros((12, 12))
-    for first in range(0, rows.shape[1], BLOCK):
-        block = rows[_VECTORS, first : first + BLOCK]
-        weighted = block if request.weights is None else block * request.weights[first : first + BLOCK]
-        gram += weighted @ block.T
-    gram[6:] *= request.alpha
-    gram[:, 6:] *= request.alpha
-    values, vectors = np.linalg.eigh(squared(gram))
+    moments = gram(request.motions.rows, request.weights)[np.ix_(_VECTORS, _VECTORS)]
+    moments[6:] *= request.alpha
+    moments[:, 6:] *= request.alpha
+    values, vectors = np.linalg.eigh(squared(moments))
     if values[2] <= NULL * values[7]:
         raise UnderdeterminedError(
             "Daniilidis' equations have more than the two null vectors of a solvable problem: no motion rotates, or "
-            "all rotate about parallel axes; add motions about another axis, or use method='dqopt', which solves what "
-            "can be solved and names the rest"
+            "all motions rotate about parallel axes; add motions about another axis, or use method='dqopt', which "
+            "solves what can be solved and names the free directions"
         )
     q, q_dual = unit_combination(vectors[:4, :2], vectors[4:, :2])
     free = free_of_rotations_alone(request)
     return Outcome(to_transform(q, q_dual / request.alpha), free_directions=free)
 
 
-def squared(gram: Array) -> Array:
+def squared(moments: Array) -> Array:
     """T'T (8, 8) from moments (12, 12) of (v_C + v_H, v_C - v_H) of the primal parts, then of the dual parts."""
-    blocks = gram.reshape(2, 6, 2, 6).transpose(0, 2, 1, 3).reshape(4, 36) @ _PRODUCTS
-    PP, _, DP, DD = blocks.reshape(4, 4, 4)
+    (PP, _), (DP, DD) = by_parts(moments, _PRODUCTS)
     return np.block([[PP + DD, DP], [DP.T, PP]])
 
 
 def unit_combination(u: Array, v: Array) -> tuple[Array, Array]:
-    """The unit dual quaternion among the combinations of two vectors, columns of u (4, 2) over those of v (4, 2).
+    """The unit dual quaternion among the combinations of two vectors: the columns of u (4, 2) over those of v (4, 2).
 
-    Of the two combinations with q . q' = 0 the one with the longer q is taken: without noise the other one's vanishes.
-    (The paper takes their coefficients' ratio s as unknown, and has to avoid the vector whose coefficient is 0; an
-    angle avoids none.)
+    Two combinations have q . q' = 0. The combination with the longer q is taken: without noise the other q vanishes.
+    (The paper solves for the ratio s of the coefficients and must avoid a vector whose coefficient is 0. An angle
+    avoids no vector.)
 
     Raises
     ------

@@ -1,12 +1,12 @@
-"""What the motions leave undetermined in AX = XB, and what can be solved all the same.
+"""Free directions of AX = XB: what the motions do not determine.
 
-Noise in the measurements looks like motion, so nothing is ever exactly undetermined on real data. As for every problem
-(``gtsam_rwhec.identifiability``), a direction is free when its information is not significantly more than noise alone
-would create there:
+Noise in the measurements looks like motion, so real data never leave a direction exactly undetermined. As for every
+problem (``gtsam_rwhec.identifiability``), a direction is free when its information is not significantly more than noise
+alone would create there:
 
-- A_i of noise delta q_C, delta q_H has E |A_i p|^2 = E |delta q_C|^2 + E |delta q_H|^2 for *every* unit p, since L
-  and R of a unit quaternion are rotations. At the answer the signal's part of A q is zero, so |A q|^2 is that noise,
-  and A'A has this noise in every direction. t enters as A q' (eq. 7), so its information is that of A'A.
+- With noise delta q_C, delta q_H, A_i has E |A_i p|^2 = E |delta q_C|^2 + E |delta q_H|^2 for *every* unit p, since L
+  and R of a unit quaternion are rotations. At the answer the signal's part of A q is zero. So |A q|^2 is that noise,
+  and A'A has it in every direction. t enters as A q' (eq. 7), so its information is that of A'A.
 - The same holds for the whole residual: lambda is what noise makes of q'Z q for the best q, and so for every q. The
   information about the rotation is in the eigenvalues of Z(mu*).
 
@@ -27,24 +27,25 @@ from gtsam_rwhec.identifiability.threshold import free_threshold
 
 #: Information below this part of the largest is rounding.
 ROUNDING = 1e-12
-#: Step of the finite difference that tells how the translation follows a turn, rad.
+#: Step (rad) of the finite difference that tells how the translation follows a turn.
 STEP_RAD = 1e-5
 
 
 def free_directions(request: Request, q: Array, values: Array, vectors: Array) -> tuple[FreeDirection, ...]:
-    """Free directions of the answer q (4,): how T_c_h may move, as a right perturbation in h's axes.
+    """Free directions of the answer q (4,), as right perturbations of T_c_h; what a prior fixes is not free.
 
     Parameters
     ----------
     request : Request
-        What its prior fixes is not free.
     q : (4,) array
+        Rotation of the answer.
     values, vectors : (4,), (4, 4) arrays
-        Eigensystem of Z(mu*), ascending.
+        Eigenvalues of Z(mu*), ascending, and its eigenvectors.
     """
     cost, V = request.cost, times_vectors(q)
     of_t, directions = np.linalg.eigh(V.T @ cost.M @ V)  # q' = (t / 2, 0) (x) q
-    noise = max(float(q @ cost.M @ q) - request.noise_free_part, 0.0)
+    of_prior = 0.0 if request.prior is None else request.prior.b  # the prior's part of M is no sign of noise
+    noise = max(float(q @ cost.M @ q) - of_prior, 0.0)
     threshold = _threshold(cost.count)
     moves = directions[:, of_t <= threshold * noise + ROUNDING * of_t[2]]
     noise = max(float(values[0]), 0.0)
@@ -56,7 +57,7 @@ def free_directions(request: Request, q: Array, values: Array, vectors: Array) -
 def free_of_rotations_alone(request: Request) -> tuple[FreeDirection, ...]:
     """Free directions of a method that takes the rotation from the rotations alone, or nearly (DQ2Steps, Dan).
 
-    Where the axes differ by no more than their noise, such a rotation about the common axis is noise, and so is the
+    Where the axes differ by no more than their noise, the rotation about the common axis is free, and so is the
     translation along it.
     """
     values, vectors = request.cost.spectrum
@@ -67,9 +68,9 @@ def free_of_rotations_alone(request: Request) -> tuple[FreeDirection, ...]:
 
 
 def _threshold(count: int) -> float:
-    """Information up to which a direction is free, over the noise in the direction of the answer itself.
+    """Information up to which a direction is free, over the noise along the answer itself.
 
-    Of a motion's three squares of noise in that direction, the fit takes away one part in ``count``.
+    The fit takes away one part in ``count`` of a motion's three squares of noise along the answer.
     """
     return float(free_threshold(3.0 * count, 6 * count - 6)) * count / (count - 1.0)
 

@@ -1,8 +1,8 @@
 """The prior's linear form, a |1 - dq|^2 (DQ paper, eq. 25): the 4 x 4 eigenproblem becomes one of 8 x 8.
 
 With |q| = |dq| = 1 the term is 2 a - 2 a q_0 . q. For a given mu, q minimises q'Z(mu) q - 2 a q_0 . q on the sphere:
-(Z(mu) - lambda) q = a q_0, whose lambda is the smallest real eigenvalue of [[Z, -1], [-a^2 q_0 q_0', Z]] (Gander,
-Golub and von Matt 1989, eq. 9). That minimum is concave in mu, and a lower bound of the cost, as lambda_0(mu) is.
+(Z(mu) - lambda) q = a q_0, and lambda is the smallest real eigenvalue of [[Z, -1], [-a^2 q_0 q_0', Z]] (Gander,
+Golub and von Matt 1989, eq. 9). That minimum is concave in mu and a lower bound of the cost, as lambda_0(mu) is.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.degenerate import free_directions
 from gtsam_rwhec.handeye.dual_quaternions import times_vectors, to_transform
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
-from gtsam_rwhec.handeye.proof import proven
+from gtsam_rwhec.handeye.proof import proven_bound
 from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import Z_pseudo, best_dual, bracket, is_singular
 from gtsam_rwhec.methods.estimate import Outcome
@@ -37,19 +37,19 @@ def solve_with_linear_prior(request: Request, prior: DualQuaternionPrior) -> Out
     else:
         mu = _multiplier(cost, pull)
         Z = cost.Z(mu)
-        # Where two minima of the sphere are equal at mu, each side of it has one of them.
+        # Where the sphere has two equal minima at mu, each side of mu has one of them.
         near = 1e-9 * (abs(mu) + float(np.sqrt(cost.spectrum[0][0])))
         candidates = [on_sphere(cost.Z(m), pull) for m in (mu, mu - near, mu + near)]
     poses = [(q, best_dual(cost, q)) for q, _ in candidates]
     q, q_dual = min(poses, key=lambda pose: cost.value(*pose) - 2.0 * float(pull @ pose[0]))
-    # The tangent directions' curvature is that of Z - lambda; the noise, as for DQOpt, Z's smallest eigenvalue.
+    # The curvature along the sphere is that of Z - lambda. The noise is Z's smallest eigenvalue, as for DQOpt.
     V = times_vectors(q)
     curvatures, turns = np.linalg.eigh(V.T @ (Z - candidates[0][1] * np.eye(4)) @ V)
     noise = max(float(np.linalg.eigvalsh(Z)[0]), 0.0)
     values, vectors = np.append(noise, noise + curvatures), np.column_stack([q, V @ turns])
     return Outcome(
         X=to_transform(q, q_dual),
-        lower_bound=_proven_bound(cost, pull, prior.a, mu, candidates[0]),
+        lower_bound=_bound_at(cost, pull, prior.a, mu, candidates[0]),
         free_directions=free_directions(request, q, values, vectors),
     )
 
@@ -78,17 +78,18 @@ def on_sphere(Z: Array, pull: Array) -> tuple[Array, float]:
     if gaps[0] > 1e-12 * (abs(values[0]) + length):
         q = p / gaps
         return vectors @ (q / math.sqrt(float(q @ q))), lam
-    # The pull has nothing of the smallest eigenvector: either sign of it completes q.
+    # The pull has no part along the smallest eigenvector: either sign of that vector completes q.
     q = np.concatenate([[0.0], p[1:] / np.maximum(gaps[1:], 1e-300)])
     q[0] = math.copysign(math.sqrt(max(1.0 - float(q @ q), 0.0)), p[0])
     return vectors @ (q / math.sqrt(float(q @ q))), float(values[0])
 
 
 def _multiplier(cost: DualQuaternionCost, pull: Array) -> float:
+    """mu*, where q . q' = 0 (eq. 11)."""
     Z1, Z2 = cost.Z1, cost.Z2
     low, high = bracket(Z1, Z2)  # Appendix C holds for every q
 
-    def f(mu: float) -> float:  # q . q' (eq. 11), rising
+    def f(mu: float) -> float:  # q . q', which rises with mu
         q, _ = on_sphere(cost.Z(mu), pull)
         return float(mu * (q @ Z2 @ q) - 0.5 * (q @ Z1 @ q))
 
@@ -99,20 +100,19 @@ def _multiplier(cost: DualQuaternionCost, pull: Array) -> float:
     return float(brentq(f, low, high, xtol=1e-15 * (high - low), rtol=1e-14))
 
 
-def _proven_bound(cost: DualQuaternionCost, pull: Array, a: float, mu: float, minimum: tuple[Array, float]) -> float:
-    """Where [[S - lambda, W - mu, -pull], [., M, 0], [., 0, tau]] is positive semidefinite, lambda - tau + 2 a."""
+def _bound_at(cost: DualQuaternionCost, pull: Array, a: float, mu: float, minimum: tuple[Array, float]) -> float:
+    """The largest proven lower bound of the cost with the prior's rotation part.
+
+    Where [[S - lambda, W - mu, -pull], [., M, 0], [., 0, tau]] is positive semidefinite, it is lambda - tau + 2 a.
+    """
     q, lam = minimum
     tau = float(pull @ q)
-    K = np.zeros((9, 9))
-    K[:4, :4], K[4:8, 4:8], K[:4, 4:8] = cost.S, cost.M, cost.W - mu * np.eye(4)
-    K[4:8, :4] = K[:4, 4:8].T
-    K[:4, 8] = K[8, :4] = -pull
-    step = 1e-14 * (float(np.trace(cost.S)) + a)
-    while step < lam - tau + 2.0 * a:
-        trial = K.copy()
-        trial[range(4), range(4)] -= lam - step
-        trial[8, 8] = tau + step
-        if proven(trial):
-            return lam - tau + 2.0 * a - 2.0 * step
-        step *= 4.0
-    return 0.0
+    value = lam - tau + 2.0 * a
+    W, zero = cost.W - mu * np.eye(4), np.zeros((4, 1))
+
+    def form(lower: float) -> Array:
+        step = 0.5 * (value - lower)  # half of it to lambda, half of it to tau
+        S, column = cost.S - (lam - step) * np.eye(4), -pull[:, None]
+        return np.block([[S, W, column], [W.T, cost.M, zero], [column.T, zero.T, np.array([[tau + step]])]])
+
+    return proven_bound(form, value, 2e-14 * (float(np.trace(cost.S)) + a))

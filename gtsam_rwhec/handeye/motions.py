@@ -1,4 +1,4 @@
-"""The motions of AX = XB: C_i X = X H_i, checked, and what the DQ paper's equations need of them."""
+"""The motions of AX = XB: C_i X = X H_i, checked, with the numbers that the DQ paper's equations take from them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, as_transforms, checked_rows
-from gtsam_rwhec.handeye.cost import BLOCK
+from gtsam_rwhec.handeye.cost import blocks
 from gtsam_rwhec.handeye.dual_quaternions import from_rows
 from gtsam_rwhec.handeye.signs import UNCERTAIN, resolve_signs
 
@@ -23,10 +23,10 @@ class Motions:
     Attributes
     ----------
     C, H : (N, 4, 4) arrays
-        C_i = T_cbefore_cafter, H_i = T_hbefore_hafter of the same move, metres; X = T_c_h.
+        C_i = T_cbefore_cafter and H_i = T_hbefore_hafter of the same move, metres; X = T_c_h.
     rows : (14, N) array
-        With v, w the vector and scalar part: v_C + v_H (3), v_C - v_H (3), w_C - w_H, then the same of the dual
-        parts. They are all that A_i and B_i (below eq. 6) depend on. The signs of q_C and q_H agree (``signs``).
+        With v the vector part and w the scalar part: v_C + v_H (3), v_C - v_H (3), w_C - w_H, then the same of the
+        dual parts. A_i and B_i (below eq. 6) depend on nothing else. The signs of q_C and q_H agree (``signs``).
     """
 
     C: Array
@@ -60,7 +60,8 @@ def motions_of(C: PosesLike, H: PosesLike, order: QuaternionOrder | None = None)
     count = len(C)
     if count != len(H):
         raise CountError(
-            f"C has {count} motions and H has {len(H)}; C_i X = X H_i pairs them one to one: give as many of both"
+            f"C has {count} motions and H has {len(H)}; C_i X = X H_i pairs motion i of C with motion i of H: "
+            "give as many of both"
         )
     if count < 2:
         raise CountError(
@@ -68,14 +69,13 @@ def motions_of(C: PosesLike, H: PosesLike, order: QuaternionOrder | None = None)
         )
     rows = np.empty((14, count))
     sums = np.empty((2, count))
-    for first in range(0, count, BLOCK):
-        block = slice(first, first + BLOCK)
-        _fill(C[block], H[block], first, rows[:, block], sums[:, block])
+    for block in blocks(count):
+        _fill(C[block], H[block], block.start, rows[:, block], sums[:, block])
     if np.abs(rows[:7]).max() <= STILL:
-        rows[:7] = 0.0  # rounding of a rotation that there is not would pass for one
+        rows[:7] = 0.0  # rounding would pass for a rotation
     if np.abs(rows).max() <= STILL:
         raise UnderdeterminedError(
-            f"all {count} motions are the identity, in C and in H; nothing moved, so nothing can be told: "
+            f"all {count} motions are the identity, in C and in H: nothing moved, so X cannot be told; "
             "give relative poses between times at which the frames stood differently"
         )
     uncertain = sums[0] < UNCERTAIN
@@ -85,17 +85,16 @@ def motions_of(C: PosesLike, H: PosesLike, order: QuaternionOrder | None = None)
 
 
 def _fill(C: Array, H: Array, first: int, rows: Array, sums: Array) -> None:
+    """Fill a block's ``Motions.rows``, and the sums (2, b) of the scalar parts and of the dual scalar parts."""
     b = len(C)
     try:  # both at once, in half the calls
         checked, _ = checked_rows(np.concatenate([C, H]), first, "C and H")
     except PoseError:
-        checked_rows(C, first, "C")  # each by itself says which and where
+        checked_rows(C, first, "C")  # each alone: the error names the argument and the motion
         checked_rows(H, first, "H")
         raise
-    q, q_dual = from_rows(checked)
-    for part, top in ((q, 0), (q_dual, 7)):
+    for part, top in zip(from_rows(checked), (0, 7), strict=True):
         of_C, of_H = part[:, :b], part[:, b:]
         np.add(of_C[:3], of_H[:3], out=rows[top : top + 3])
         np.subtract(of_C, of_H, out=rows[top + 3 : top + 7])
-    np.add(q[3, :b], q[3, b:], out=sums[0])
-    np.add(q_dual[3, :b], q_dual[3, b:], out=sums[1])
+        np.add(of_C[3], of_H[3], out=sums[top // 7])

@@ -1,13 +1,14 @@
 """DQOptPoly (DQ paper, Section 3.1.2 and Appendix B): the optimum from the algebraic curve p(lambda, mu) = 0.
 
 p(lambda, mu) = det(Z(mu) - lambda) (eq. 15) has 25 coefficients. As a polynomial in mu it has eight real roots for
-lambda from lambda_0 of the relaxation up to lambda*, where the two around mu = 0 meet, and six beyond. Two searches for
-lambda* in one variable: the sign of the resultant of p and dp/dmu, and the number of real roots by Sturm's theorem.
+lambda from the relaxation's lambda_0 up to lambda*. At lambda* the two roots around mu = 0 meet; beyond there are six.
+Two searches in one variable find lambda*: by the sign of the resultant of p and dp/dmu, and by the number of real roots
+(Sturm's theorem).
 
-The paper starts at lambda = 0. Here lambda is counted from lambda_0, Z is written in the relaxation's eigenvectors, mu
-and lambda are scaled by what eqs. 14 and 22 expect of them: the same curve, with digits left in double precision.
-Of lambda* - lambda_0 the resultant then keeps 14 of 16 digits, Sturm's sequence 7 (rotation noise of 1e-4 rad) to 13
-(0.1 rad): tests/handeye/test_polynomial.py. DQOpt needs none of this.
+The paper starts at lambda = 0. Here lambda is counted from lambda_0, Z is written in the relaxation's eigenvectors, and
+mu and lambda are scaled by the sizes that eqs. 14 and 22 expect. The curve is the same, and double precision keeps more
+digits. Of 16 digits of lambda* - lambda_0 the resultant keeps 14, and Sturm's sequence 7 (rotation noise of 1e-4 rad)
+to 13 (0.1 rad): tests/handeye/test_polynomial.py. DQOpt needs none of this.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
+from numpy.polynomial.polynomial import polydiv
 from scipy.optimize import brentq
 
 from gtsam_rwhec.errors import NotConvergedWarning, UnderdeterminedError
@@ -26,11 +29,13 @@ from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import is_singular
 from gtsam_rwhec.methods.estimate import Outcome
 
-#: lambda* is looked for up to this many times eq. 22's gap, an upper bound that rounding may have touched.
+#: The searches end at this many times eq. 22's gap. The gap is an upper bound, up to rounding.
 BEYOND = 1.25
-#: A remainder below this part of what it was formed from is rounding: two roots have met.
+#: A remainder below this part of its dividend is rounding: two roots have met.
 ROUNDING = 1e-15
+#: The resultant's search starts at this part of eq. 22's gap: at 0 one root is mu = 0 and spoils the roots' mean.
 NOT_ZERO = 1e-3
+#: Halvings of Sturm's interval, below the rounding of a double.
 BISECTIONS = 60
 
 
@@ -41,9 +46,9 @@ class Curve:
     Attributes
     ----------
     coefficients : (5, 9) array
-        Entry [m, n] is that of y^m x^n; 25 are not zero: n <= 8 - 2 m.
+        Entry [m, n] belongs to y^m x^n; 25 are not zero: n <= 8 - 2 m.
     mu_scale, lambda_scale : float
-        Eq. 14 for the relaxation's q, and the gap of eq. 22.
+        mu of eq. 14 for the relaxation's q, and the gap of eq. 22.
     """
 
     coefficients: Array
@@ -51,53 +56,45 @@ class Curve:
     lambda_scale: float
 
     def in_x(self, y: float) -> Array:
-        """Coefficients (9,) of the polynomial in x for one y, of x^0 first, the largest of size one."""
+        """Coefficients (9,) of the polynomial in x at one y, x^0 first, scaled so that the largest is one."""
         p: Array = y ** np.arange(5) @ self.coefficients
         scaled: Array = p / np.abs(p).max()
         return scaled
 
 
 def curve(relaxed: RelaxedCost) -> Curve | None:
-    """The curve's coefficients (eq. 15); None where the gap of eq. 22 is rounding, and mu = 0 the answer."""
+    """The curve's coefficients (eq. 15); None where the gap of eq. 22 is rounding, and mu = 0 is the answer."""
     gap = relaxation_gap(relaxed)
     if not gap > 1e-15 * max(abs(float(relaxed.values[0])), 1e-15 * abs(float(relaxed.values[3]))):
         return None
     mu = 0.5 * float(relaxed.Z1[0, 0] / relaxed.Z2[0, 0])  # eq. 14
-    # Each entry of Z - lambda is a polynomial (2, 3) in (y, x); rows scaled to size one, which scales p alone.
-    entries = np.zeros((4, 4, 2, 3))
+    # Each entry of Z - lambda is a polynomial in (y, x). Rows are scaled to size one, which only scales p. A polynomial
+    # is stored by powers of y in steps of nine: no power of x is above 8, so products are convolutions.
+    entries = np.zeros((4, 4, 2, 9))
     entries[:, :, 0, 0] = np.diag(relaxed.values - relaxed.values[0])
     entries[:, :, 0, 1] = mu * relaxed.Z1
     entries[:, :, 0, 2] = -(mu**2) * relaxed.Z2
     entries[range(4), range(4), 1, 0] = -gap
     entries /= np.abs(entries).max(axis=(1, 2, 3))[:, None, None, None]
-    return Curve(_determinant(entries), mu, gap)
+    return Curve(_determinant(entries.reshape(4, 4, 18)), mu, gap)
 
 
 def _determinant(entries: Array) -> Array:
     """The determinant (5, 9) of a 4 x 4 matrix of polynomials, by the minors of its upper and lower two rows."""
-    total = np.zeros((5, 9))
-    pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
-    for i, j in pairs:
+    total = np.zeros(69)
+    for i, j in combinations(range(4), 2):
         k, m = (c for c in range(4) if c not in (i, j))
-        upper = _product(entries[0, i], entries[1, j]) - _product(entries[0, j], entries[1, i])
-        lower = _product(entries[2, k], entries[3, m]) - _product(entries[2, m], entries[3, k])
-        total += (-1.0) ** (i + j + 1) * _product(upper, lower)
-    return total
-
-
-def _product(p: Array, q: Array) -> Array:
-    """The product of two polynomials in two variables."""
-    result = np.zeros((p.shape[0] + q.shape[0] - 1, p.shape[1] + q.shape[1] - 1))
-    for i, j in np.ndindex(p.shape):
-        result[i : i + q.shape[0], j : j + q.shape[1]] += p[i, j] * q
-    return result
+        upper = np.convolve(entries[0, i], entries[1, j]) - np.convolve(entries[0, j], entries[1, i])
+        lower = np.convolve(entries[2, k], entries[3, m]) - np.convolve(entries[2, m], entries[3, k])
+        total += (-1.0) ** (i + j + 1) * np.convolve(upper, lower)
+    return total[:45].reshape(5, 9)
 
 
 def resultant(p: Array) -> float:
-    """The resultant of p (9,) and its derivative up to a positive factor: the determinant of their Sylvester matrix.
+    """The resultant of p (9,) and its derivative, up to a positive factor: the determinant of their Sylvester matrix.
 
-    x is scaled so that the roots' geometric mean is one: without that the determinant (15, 15) of roots of very
-    different size has no correct digit, not even its sign.
+    x is scaled so that the geometric mean of the roots is one. Without this, roots of very different size leave the
+    determinant (15, 15) with no correct digit, and often with the wrong sign.
     """
     p = p * (abs(p[0] / p[8]) ** 0.125) ** np.arange(9)
     p = p / np.abs(p).max()
@@ -113,18 +110,14 @@ def resultant(p: Array) -> float:
 
 
 def real_roots(p: Array) -> int:
-    """How many real roots p (9,) has, by Sturm's theorem: sign changes of the sequence at -infinity less at infinity.
+    """The number of real roots of p (9,), by Sturm's theorem: sign changes at -infinity less those at infinity.
 
     The paper's "P_1 = P_0" is a misprint: P_1 is the derivative of P_0.
     """
     sequence = [p, p[1:] * np.arange(1, 9)]
     while len(sequence[-1]) > 1:
         above, divisor = sequence[-2:]
-        remainder = above.copy()
-        for top in range(len(above) - 1, len(divisor) - 2, -1):  # long division
-            low = top - len(divisor) + 1
-            remainder[low : top + 1] -= remainder[top] / divisor[-1] * divisor
-        remainder = -remainder[: len(divisor) - 1]
+        remainder = -polydiv(above, divisor)[1]
         size = float(np.abs(remainder).max())
         if size <= ROUNDING * float(np.abs(above).max()):
             break
@@ -136,17 +129,16 @@ def real_roots(p: Array) -> int:
 
 
 def by_resultant(of: Curve) -> float:
-    """The y at which the resultant first changes its sign."""
+    """The least y at which the resultant changes its sign."""
 
     def f(y: float) -> float:
         return resultant(of.in_x(y))
 
-    # At y = 0 one root is mu = 0, whose geometric mean with the rest says nothing.
     if f(NOT_ZERO) * f(BEYOND) < 0.0:
         return float(brentq(f, NOT_ZERO, BEYOND, xtol=1e-15, rtol=1e-14))
     warnings.warn(
-        "'dqoptpoly_resultant' sees no change of the resultant's sign: the roots are closer than double precision "
-        "tells; the answer is the relaxation's. Use method='dqopt'",
+        "'dqoptpoly_resultant' finds no change of the resultant's sign: two roots are too close for double precision; "
+        "its answer is the relaxation's: use method='dqopt'",
         NotConvergedWarning,
         stacklevel=5,
     )
@@ -154,7 +146,7 @@ def by_resultant(of: Curve) -> float:
 
 
 def by_sturm(of: Curve) -> float:
-    """The y at which two of the eight real roots are lost."""
+    """The y at which two of the eight real roots meet and vanish."""
     low, high = 0.0, BEYOND
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
@@ -168,7 +160,7 @@ def by_sturm(of: Curve) -> float:
 def double_root(of: Curve, y: float) -> float:
     """The mu at which two roots meet: the root of dp/dmu at which p is nearest zero.
 
-    p itself has a double root there, of which half the digits are lost; that of its derivative is simple.
+    p itself has a double root there and would lose half the digits; the root of its derivative is simple.
     """
     p = of.in_x(y)
     x = np.roots((p[1:] * np.arange(1, 9))[::-1]).real
@@ -177,24 +169,12 @@ def double_root(of: Curve, y: float) -> float:
 
 
 def dqoptpoly_resultant(request: Request) -> Outcome[Array]:
-    """DQOptPoly by the resultant.
-
-    Raises
-    ------
-    UnderdeterminedError
-        With M singular: the curve's coefficients are not finite.
-    """
+    """DQOptPoly by the resultant; UnderdeterminedError with a singular M: the curve's coefficients are not finite."""
     return _solve(request, by_resultant, "dqoptpoly_resultant")
 
 
 def dqoptpoly_sturm(request: Request) -> Outcome[Array]:
-    """DQOptPoly by counting real roots.
-
-    Raises
-    ------
-    UnderdeterminedError
-        With M singular: the curve's coefficients are not finite.
-    """
+    """DQOptPoly by counting real roots; UnderdeterminedError with a singular M, as for the resultant."""
     return _solve(request, by_sturm, "dqoptpoly_sturm")
 
 
@@ -202,7 +182,7 @@ def _solve(request: Request, search: Callable[[Curve], float], name: str) -> Out
     if is_singular(request.cost):
         raise UnderdeterminedError(
             f"M = alpha^2 sum A'A is singular (no noise, no rotation, or parallel axes), and {name!r} needs "
-            "its inverse; use method='dqopt', which solves this case too"
+            "its inverse; use method='dqopt', which needs no inverse"
         )
     relaxed = relaxed_cost(request.cost)
     of = curve(relaxed)

@@ -1,4 +1,4 @@
-"""A pose known beforehand, in the DQ paper's cost (Section 3.3)."""
+"""The prior of the DQ paper's cost (Section 3.3): a pose known beforehand, with weights."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.weights import LARGEST
 
 PriorForm = Literal["imaginary", "distance"]
-#: G of eq. 26: the imaginary parts.
+#: G of eq. 26 selects the imaginary parts.
 G = np.diag([1.0, 1.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True)
 class DualQuaternionPrior:
-    """The hand-eye pose is near T: Q = Q_0 (x) dQ with dQ near 1.
+    """A prior that the hand-eye pose is near T: Q = Q_0 (x) dQ with dQ near 1.
 
-    Near T, for a deviation by an angle theta and a length d, the cost has a theta^2 / 4 + b d^2 / 4 added.
+    For a small deviation from T, by an angle theta and a length d, it adds a theta^2 / 4 + b d^2 / 4 to the cost.
 
     Parameters
     ----------
     T : gtsam.Pose3 or (4, 4) array
         T_c_h, metres.
     a, b : float
-        Weights of the rotation and of the translation (1/m^2), not negative, not both zero.
+        Weights of the rotation and of the translation (1/m^2): not negative, and not both zero.
     form : "imaginary" or "distance"
-        a dq'G dq + b |dq'|^2 (eq. 26): all of the cost's properties stay. Or a |1 - dq|^2 + b |dq'|^2 (eq. 25), which
-        has a linear term (``linear_prior``).
+        "imaginary" adds a dq'G dq + b |dq'|^2 (eq. 26) and keeps all properties of the cost. "distance" adds
+        a |1 - dq|^2 + b |dq'|^2 (eq. 25), which has a linear term (``linear_prior``).
 
     Raises
     ------
@@ -50,11 +50,9 @@ class DualQuaternionPrior:
     def __post_init__(self) -> None:
         for name, weight in (("a", self.a), ("b", self.b)):
             if not (isinstance(weight, (int, float, np.number)) and np.isreal(weight) and 0.0 <= weight <= LARGEST):
-                raise PriorError(
-                    f"the prior's {name}={weight!r} is no weight; give a finite number that is >= 0, up to {LARGEST:g}"
-                )
+                raise PriorError(f"the prior's {name}={weight!r} is not a weight; give a number from 0 to {LARGEST:g}")
         if self.a == 0.0 and self.b == 0.0:
-            raise PriorError("the prior's a and b are both 0: it says nothing; leave it out, or give weights")
+            raise PriorError("the prior's weights a and b are both 0; give a weight above 0, or leave the prior out")
         if self.form not in ("imaginary", "distance"):
             raise PriorError(f"the prior's form={self.form!r} is not 'imaginary' (eq. 26) or 'distance' (eq. 25)")
         object.__setattr__(self, "T", one_transform(self.T, "the prior's pose"))
@@ -72,9 +70,9 @@ class DualQuaternionPrior:
         return left(conjugate(q)), left(conjugate(q_dual))
 
     def added_to(self, cost: DualQuaternionCost) -> DualQuaternionCost:
-        """The cost with the prior's quadratic terms (eq. 29; of eq. 25 the translation's only).
+        """The cost with the prior's quadratic terms (eq. 29); of the form "distance", with the translation's term only.
 
-        b |q_0'|^2 |q|^2, a constant that the paper drops from eq. 28, is kept: the cost stays a sum of squares.
+        The paper drops the constant b |q_0'|^2 |q|^2 from eq. 28. It is kept here: the cost stays a sum of squares.
         """
         L, L_dual = self._deviation
         S = cost.S + self.b * L_dual.T @ L_dual
@@ -83,11 +81,11 @@ class DualQuaternionPrior:
         return DualQuaternionCost(S, cost.M + self.b * np.eye(4), cost.W + self.b * L_dual.T @ L, cost.count)
 
     def value(self, q: Array, q_dual: Array) -> float:
-        """What the prior adds to the cost of a pose, parts (4,) of either sign."""
+        """The prior's term of the cost of a pose, parts (4,) of either sign."""
         L, L_dual = self._deviation
         dq, dq_dual = L @ q, L_dual @ q + L @ q_dual
         if self.form == "imaginary":
             rotation = float(dq[:3] @ dq[:3])
-        else:  # |1 - dq|^2, of +-dQ the one nearer 1
+        else:  # |1 - dq|^2 with the sign of dq that is nearer 1
             rotation = float(dq[:3] @ dq[:3] + (1.0 - abs(dq[3])) ** 2)
         return self.a * rotation + self.b * float(dq_dual @ dq_dual)

@@ -1,26 +1,49 @@
-"""Proof, in double precision, that a small matrix is positive semidefinite."""
+"""Proof, in double precision, that a small matrix is positive semidefinite, and lower bounds from such proofs."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 
-#: Rounding that a Cholesky factorisation in double of a 9 x 9 matrix can hide, of unit diagonal (Higham 2002,
-#: Theorem 10.7: 9 gamma_10 = 1e-14), and that of forming its entries.
+#: Rounding that a Cholesky factorisation of a 9 x 9 matrix of unit diagonal can hide in double precision (Higham 2002,
+#: Theorem 10.7: 9 gamma_10 = 1e-14), together with the rounding of the matrix's own entries.
 HIDDEN = 1.2e-14
 
 
 def proven(K: Array) -> bool:
-    """Whether K (n, n), n <= 9, is proven to be positive semidefinite. Changes K's diagonal.
+    """Whether K (n, n), n <= 9, is proven to be positive semidefinite. K's diagonal is changed.
 
-    A factorisation that runs through proves it of a matrix that differs by up to ``HIDDEN`` of each diagonal entry
-    (of the products of their roots, off the diagonal); that much is taken off beforehand.
+    A factorisation that succeeds proves this of a matrix whose entries differ from K's by up to ``HIDDEN`` times the
+    root of the product of their two diagonal entries. So ``HIDDEN`` is first taken off the diagonal.
     """
-    diagonal = K.diagonal().copy()
-    np.fill_diagonal(K, diagonal * (1.0 - HIDDEN))
+    np.fill_diagonal(K, K.diagonal() * (1.0 - HIDDEN))
     try:
         np.linalg.cholesky(K)
     except np.linalg.LinAlgError:
         return False
     return True
+
+
+def proven_bound(form: Callable[[float], Array], value: float, step: float) -> float:
+    """The first proven bound among value - step, value - 4 step, value - 16 step, ...; 0 where none above 0 is proven.
+
+    Parameters
+    ----------
+    form : callable
+        Gives, for a candidate bound, a new matrix (n, n), n <= 9. The bound holds when the matrix is positive
+        semidefinite.
+    value : float
+        The optimum, up to rounding: of a sum of squares, so that 0 is always a bound.
+    step : float
+        First distance from the optimum.
+    """
+    lower = value - step
+    while lower > 0.0:
+        if proven(form(lower)):
+            return lower
+        step *= 4.0
+        lower = value - step
+    return 0.0

@@ -1,4 +1,4 @@
-"""Every AX = XB method behind one call."""
+"""All AX = XB methods, and the one call that runs each of them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gtsam_rwhec.handeye.optimal import dqopt
 from gtsam_rwhec.handeye.polynomial import dqoptpoly_resultant, dqoptpoly_sturm
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
 from gtsam_rwhec.handeye.request import Request, ScaleMode
-from gtsam_rwhec.handeye.weights import check_alpha, check_covariances, check_weights
+from gtsam_rwhec.handeye.weights import check_alpha, check_covariances, check_one_kind, check_weights
 from gtsam_rwhec.methods.estimate import Estimate, Outcome, Proof
 from gtsam_rwhec.methods.method import Method, Properties, Takes
 
@@ -64,7 +64,7 @@ METHODS: dict[str, Method[[Request]]] = {
         _of_dq_paper(
             "dq2steps", dq2steps, "Section 3.2.2, Algorithm 2", "axes that are not parallel", _QUADRATIC, joint=False
         ),
-        _of_dq_paper("dqconvrlx", dqconvrlx, "Section 3.2.3", "little noise: q . q' = 0 nearly without asking"),
+        _of_dq_paper("dqconvrlx", dqconvrlx, "Section 3.2.3", "little noise: q . q' = 0 nearly holds unasked"),
         _of_dq_paper("dq2ndord", dq2ndord, "Section 3.2.4, Algorithm 4", "mu small, as with little noise"),
         _of_dq_paper("dq2ndord_lambda", dq2ndord_lambda, "Appendix A", "lambda near the relaxation's"),
         _of_dq_paper("dqitr", dqitr, "Section 3.2.5, Algorithm 5", "a fixed point that attracts; some noise"),
@@ -93,14 +93,14 @@ METHODS: dict[str, Method[[Request]]] = {
     )
 }
 
-#: A cost below this part of all squares is zero.
-NOTHING = 1e-28
-#: The cost's name with a prior.
+#: The name of the cost with a prior, by the prior's form.
 _COST_WITH_PRIOR = {"imaginary": "eq. 26", "distance": "eq. 25"}
-#: A gap is closed at this part of the cost.
+#: A gap is closed when it is below this part of the cost,
 CLOSED = 1e-9
-#: Rounding of a cost, as a part of the squares that cancel in it.
+#: or below this part of the squares that cancel in the cost, which is rounding,
 ROUNDING = 1e-12
+#: or below this part of all squares: the cost is then zero.
+NOTHING = 1e-28
 
 
 def solve(
@@ -125,31 +125,32 @@ def solve(
     method : str
         A name of ``METHODS``.
     alpha : float or "estimate"
-        1/m: what a translation residual counts beside a rotation residual (eq. 8), about sigma_rotation /
+        Weight of a translation residual beside a rotation residual (eq. 8), 1/m: about sigma_rotation /
         sigma_translation. "estimate" finds it from the residuals.
     weights : (N,) array, optional
         Factor of each motion's terms.
     covariances : (N, 8, 8) or (8, 8) array, optional
         Of the residuals (A q, B q + A q'), in place of alpha and weights.
     prior : DualQuaternionPrior, optional
+        A pose X known beforehand.
     order : "wxyz" or "xyzw", optional
         For rows of 7 (quaternion, translation).
     rng : numpy.random.Generator or int, optional
-        For methods that start at random.
+        For methods with a random start.
     scale : "known" or "unknown"
-        Whether t_C's unit is the metre.
+        Whether t_C is in metres.
 
     Returns
     -------
     Estimate
-        With the one pose X, and alpha.
+        The one pose X = T_c_h, its cost and proof, and alpha.
 
     Raises
     ------
     PoseError, CountError, UnderdeterminedError
         For motions that cannot be used.
     OptionError, NoiseError, PriorError
-        For options, weights or priors that cannot be used, or not with this method.
+        For options, weights or priors that cannot be used at all, or not with this method.
     """
     start = time.perf_counter()
     if not isinstance(method, str) or method not in METHODS:
@@ -158,15 +159,16 @@ def solve(
     _check_options(chosen, weights, covariances, prior, scale)
     motions = motions_of(C, H, order)
     w, information = check_weights(weights, len(motions)), check_covariances(covariances, len(motions))
-    if information is not None:
-        if _estimated(alpha):
-            raise OptionError("alpha='estimate' and covariances are both given; covariances take alpha's place")
+    if not (isinstance(alpha, str) and alpha == "estimate"):
         number = check_alpha(alpha)
-        cost = covariance_cost(motions, information)
+    elif information is None:
+        number = estimate_alpha(motions, w, prior)
     else:
-        moments = motion_moments(motions.rows, w)
-        number = estimate_alpha(motions, moments, w, prior) if _estimated(alpha) else check_alpha(alpha)
-        cost = moments.cost(number)
+        raise OptionError("alpha='estimate' and covariances are both given; covariances take alpha's place")
+    if information is None:
+        cost = motion_moments(motions.rows, w).cost(number)
+    else:
+        cost = covariance_cost(motions, information)
     if prior is not None:
         cost = prior.added_to(cost)
     request = Request(motions, cost, number, w, information, prior, scale, rng)
@@ -174,7 +176,7 @@ def solve(
 
 
 def evaluated(request: Request, found: Outcome[Array], method: str, start: float) -> Estimate[gtsam.Pose3]:
-    """A method's outcome with its cost, computed afresh from the pose that is handed out, and its proof."""
+    """The estimate of a method's outcome: with its cost, computed anew from the pose itself, and its proof."""
     (q,), (q_dual,) = from_transforms(found.X[None])
     cost = cost_of_pose(request, q, q_dual) if found.cost is None else found.cost
     name = (found.cost_name or "eq. 8") if request.prior is None else _COST_WITH_PRIOR[request.prior.form]
@@ -198,17 +200,13 @@ def evaluated(request: Request, found: Outcome[Array], method: str, start: float
 
 
 def cost_of_pose(request: Request, q: Array, q_dual: Array) -> float:
-    """The cost (8) of a pose, parts (4,), with the prior's: sums of squares of the motions' own residuals."""
+    """The cost (8) of a pose, parts (4,), with the prior's term: sums of squares of the motions' own residuals."""
     if request.covariances is not None:
         cost = squared_mahalanobis(request.motions, q, q_dual, request.covariances)
     else:
         rotation, translation = squared_residuals(request.motions, q, q_dual, request.weights)
         cost = rotation + request.alpha**2 * translation
     return cost if request.prior is None else cost + request.prior.value(q, q_dual)
-
-
-def _estimated(alpha: object) -> bool:
-    return isinstance(alpha, str) and alpha == "estimate"
 
 
 def _check_options(
@@ -219,9 +217,8 @@ def _check_options(
     scale: ScaleMode,
 ) -> None:
     if scale not in ("known", "unknown"):
-        raise OptionError(f"scale={scale!r} is not 'known' or 'unknown'")
-    if weights is not None and covariances is not None:
-        raise OptionError("weights and covariances are both given; put the weights into the covariances")
+        raise OptionError(f"scale={scale!r} is not known; choose 'known' or 'unknown'")
+    check_one_kind(weights, covariances)
     if prior is not None and not isinstance(prior, DualQuaternionPrior):
         raise PriorError(f"the prior is a {type(prior).__name__}; give a gtsam_rwhec.handeye.DualQuaternionPrior")
     for given, needed in (

@@ -1,4 +1,4 @@
-"""What every AX = XB method is asked, checked and summed up."""
+"""What every AX = XB method gets: the motions, checked and summed up, and the options."""
 
 from __future__ import annotations
 
@@ -17,21 +17,26 @@ ScaleMode = Literal["known", "unknown"]
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be solved.
+    """A problem C_i X = X H_i and how to solve it.
 
     Attributes
     ----------
     motions : Motions
+        C and H, checked.
     cost : DualQuaternionCost
-        Eq. 8 with alpha, weights or covariances, and the prior (eqs. 26-29) if there is one.
+        Eq. 8 with alpha, with weights or covariances, and with the prior (eqs. 26-29) if there is one.
     alpha : float
-        1/m.
+        Weight of translations beside rotations, 1/m.
     weights : (N,) array or None
+        Factor of each motion's terms.
     covariances : (N, 8, 8) or (1, 8, 8) array or None
+        Of the residuals (A q, B q + A q').
     prior : DualQuaternionPrior or None
+        A pose known beforehand.
     scale : "known" or "unknown"
+        Whether t_C is in metres.
     rng : numpy.random.Generator, int or None
-        For methods that start at random: ``numpy.random.default_rng(rng)``.
+        For methods with a random start: ``numpy.random.default_rng(rng)``.
     """
 
     motions: Motions
@@ -42,8 +47,3 @@ class Request:
     prior: DualQuaternionPrior | None
     scale: ScaleMode
     rng: np.random.Generator | int | None
-
-    @property
-    def noise_free_part(self) -> float:
-        """What of M is a prior's, and so no sign of noise."""
-        return 0.0 if self.prior is None else self.prior.b

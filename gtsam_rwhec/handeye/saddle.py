@@ -1,8 +1,8 @@
 """The minimum of the DQ paper's cost as the saddle of its two multipliers (Sections 3.1.2 and 3.2.1).
 
-lambda_0(mu), the smallest eigenvalue of Z(mu) (eq. 12), is concave, and for *every* mu a lower bound of the cost over
-all poses (it is the Lagrangian's minimum). At its maximum q . q' = 0: the bound is attained. The search is Newton's,
-from mu = 0, with the derivatives of lambda_0 that one eigendecomposition gives; its first step is eq. 34.
+lambda_0(mu), the smallest eigenvalue of Z(mu) (eq. 12), is concave. As the Lagrangian's minimum it is, for *every* mu,
+a lower bound of the cost over all poses. At its maximum q . q' = 0, and a pose attains the bound. Newton's method
+starts at mu = 0, with the derivatives of lambda_0 from one eigendecomposition; its first step is eq. 34.
 """
 
 from __future__ import annotations
@@ -16,39 +16,37 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.dual_quaternions import times_vectors
 
-#: M's eigenvalues below this times its largest are rounding: M is singular.
+#: Eigenvalues of M below this part of its largest are rounding: M is singular.
 SINGULAR = 1e-14
-#: The search ends when what is left to gain is this part of lambda_0: far below its rounding.
+#: The search ends when a step gains less than this part of lambda_0, far below its rounding.
 GAIN = 1e-17
+#: Most steps of the search.
 STEPS = 200
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where the Lagrangian's two multipliers have their saddle, and the pose there.
+    """The saddle of the Lagrangian's two multipliers, and the pose there.
 
     Attributes
     ----------
     q, q_dual : (4,) arrays
-        The answer; |q| = 1, q . q_dual = 0.
+        The pose, xyzw: |q| = 1, q . q_dual = 0.
     mu : float
         The multiplier of q . q' = 0.
-    value : float
-        lambda_0(mu): the cost, up to rounding.
     values, vectors : (4,), (4, 4) arrays
-        Eigenvalues, ascending, and eigenvectors of Z(mu).
+        Eigenvalues of Z(mu), ascending, and its eigenvectors. values[0] is the cost, up to rounding.
     """
 
     q: Array
     q_dual: Array
     mu: float
-    value: float
     values: Array
     vectors: Array
 
 
 def is_singular(cost: DualQuaternionCost) -> bool:
-    """Whether M has eigenvalues that are rounding only (no noise, no rotation, or parallel axes)."""
+    """Whether an eigenvalue of M is only rounding (no noise, no rotation, or parallel axes)."""
     values, _ = cost.spectrum
     return not float(values[0]) > SINGULAR * float(values[3])
 
@@ -56,21 +54,21 @@ def is_singular(cost: DualQuaternionCost) -> bool:
 def minimum(cost: DualQuaternionCost) -> Minimum:
     """Minimise the cost over all unit dual quaternions.
 
-    With M singular the constraint costs nothing to meet, along M's null space, and the minimum is that of the
-    relaxation: mu = 0 (``Z_pseudo``).
+    With a singular M, a step along M's null space meets the constraint at no cost. The minimum is then the
+    relaxation's, at mu = 0 (``Z_pseudo``).
     """
     if is_singular(cost):
         values, vectors = np.linalg.eigh(Z_pseudo(cost))
         q, mu = vectors[:, 0], 0.0
     else:
         mu, values, vectors, q = search(cost.Z0, cost.Z1, cost.Z2)
-    return Minimum(q, best_dual(cost, q), mu, float(values[0]), values, vectors)
+    return Minimum(q, best_dual(cost, q), mu, values, vectors)
 
 
 def Z_pseudo(cost: DualQuaternionCost) -> Array:
-    """S - W M^+ W' (4, 4): Z0 (eq. 13) with M's null space left out.
+    """S - W M^+ W' (4, 4): Z0 (eq. 13) without M's null space.
 
-    A vector n with A n = 0 has W n = 0 too, so that q' + c n costs what q' does, and c meets q . q' = 0 unless
+    A vector n with A n = 0 has W n = 0 too. So q' + c n costs as much as q', and some c meets q . q' = 0 unless
     q . n = 0.
     """
     values, vectors = cost.spectrum
@@ -81,15 +79,10 @@ def Z_pseudo(cost: DualQuaternionCost) -> Array:
 
 
 def search(Z0: Array, Z1: Array, Z2: Array) -> tuple[float, Array, Array, Array]:
-    """Maximise lambda_0(mu) over mu.
+    """Maximise lambda_0(mu) over mu: mu*, eigenvalues (4,) and eigenvectors (4, 4) of Z(mu*), and q (4,).
 
-    Returns
-    -------
-    mu : float
-    values, vectors : (4,), (4, 4) arrays
-        Of Z(mu).
-    q : (4,) array
-        The eigenvector of the smallest eigenvalue; where two are equal, that of them with q . q' = 0.
+    q is the eigenvector of the smallest eigenvalue. Where the two smallest are equal, it is the vector of their plane
+    with q . q' = 0.
     """
     mu, low, high = 0.0, -math.inf, math.inf
     for step in range(STEPS):
@@ -103,8 +96,7 @@ def search(Z0: Array, Z1: Array, Z2: Array) -> tuple[float, Array, Array, Array]
             break
         second = float(q @ Z2 @ q) + g1 * g1 / (l1 - l0) + g2 * g2 / (l2 - l0) + g3 * g3 / (l3 - l0)
         change = 0.5 * g0 / second
-        # What a Newton step has yet to gain.
-        if abs(g0 * change) <= GAIN * abs(l0) + 1e-32 * l3:
+        if abs(g0 * change) <= GAIN * abs(l0) + 1e-32 * l3:  # the gain of a Newton step
             return mu, values, vectors, q
         low, high = (mu, high) if g0 > 0.0 else (low, mu)
         target = mu + change
@@ -117,8 +109,8 @@ def search(Z0: Array, Z1: Array, Z2: Array) -> tuple[float, Array, Array, Array]
         if target in (low, high, mu):
             break
         mu = target
-    # lambda_0 has a kink where it is largest: two eigenvalues meet (no noise of some kind), and q is that vector of
-    # their plane with q . q' = 0 (it exists: f_0 changes its sign there).
+    # lambda_0 has a kink at its maximum: two eigenvalues meet (rotations or translations without noise). Their plane
+    # has a vector with q . q' = 0, since f_0 changes its sign at the kink.
     plane = vectors[:, :2]
     F = plane.T @ (mu * Z2 - 0.5 * Z1) @ plane
     (f0, f1), turn = np.linalg.eigh(F)
@@ -145,8 +137,8 @@ def best_dual(cost: DualQuaternionCost, q: Array) -> Array:
 def best_translation(cost: DualQuaternionCost, q: Array) -> Array:
     """The best t (3,) for a given q.
 
-    q' = (t / 2, 0) (x) q, and the cost is quadratic in t: three equations, regular with an M that is not. Directions
-    of t that nothing depends on get the smallest |t|.
+    q' = (t / 2, 0) (x) q, and the cost is quadratic in t. Its three equations can be regular where M is singular. Along
+    directions on which the cost does not depend, t is zero.
     """
     V = times_vectors(q)  # q' = V t / 2
     G, g = V.T @ cost.M @ V, V.T @ (cost.W.T @ q)

@@ -1,4 +1,4 @@
-"""Checks of what weighs the motions: alpha, one weight for each, or covariances of the residuals."""
+"""Checks of the weights of motions: alpha, one weight for each motion, or covariances of the residuals."""
 
 from __future__ import annotations
 
@@ -8,31 +8,27 @@ from numpy.typing import ArrayLike
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
 from gtsam_rwhec.geometry.poses import Array
 
-#: Weights beyond this, and below its inverse, leave no room for squares and sums in double precision.
+#: Weights above this, and below its inverse, leave no room for squares and sums in double precision.
 LARGEST = 1e100
 
 
-def check_alpha(alpha: float | str) -> float:
-    """Alpha as a float.
+def check_one_kind(weights: ArrayLike | None, covariances: ArrayLike | None) -> None:
+    """Refuse weights together with covariances (OptionError)."""
+    if weights is not None and covariances is not None:
+        raise OptionError("weights and covariances are both given; put the weights into the covariances")
 
-    Raises
-    ------
-    OptionError
-        When it is not a positive, finite number, or one whose square no sum holds.
-    """
+
+def check_alpha(alpha: float | str) -> float:
+    """Alpha as a float; an OptionError when it is not positive and finite, or its square overflows sums."""
     try:
         number = float(alpha)
     except (TypeError, ValueError):
         number = float("nan")
-    if not 0.0 < number < float("inf"):
-        raise OptionError(
-            f"alpha={alpha!r} is not a positive, finite number; it weighs translation residuals (1/m) against rotation "
-            "residuals, about sigma_rotation / sigma_translation; 'estimate' finds it from the residuals"
-        )
     if not 1.0 / LARGEST <= number <= LARGEST:
         raise OptionError(
-            f"alpha={alpha!r} is beyond {1.0 / LARGEST:g} to {LARGEST:g}, where no double precision sum holds its "
-            "square; it is about sigma_rotation / sigma_translation (1/m)"
+            f"alpha={alpha!r} is not a positive number from {1.0 / LARGEST:g} to {LARGEST:g}; it weighs translation "
+            "residuals (1/m) against rotation residuals, about sigma_rotation / sigma_translation; 'estimate' finds it "
+            "from the residuals"
         )
     return number
 
@@ -53,7 +49,7 @@ def check_weights(weights: ArrayLike | None, count: int) -> Array | None:
     Raises
     ------
     CountError, NoiseError
-        Not one for each motion; negative or not finite, or all zero.
+        Not one for each motion; negative or not finite; or fewer than two that are not zero.
     """
     if weights is None:
         return None
@@ -63,8 +59,7 @@ def check_weights(weights: ArrayLike | None, count: int) -> Array | None:
     bad = np.flatnonzero(~((array >= 0.0) & (array <= LARGEST)))
     if bad.size:
         raise NoiseError(
-            f"weight {bad[0]} is {array[bad[0]]}; weights are finite (up to {LARGEST:g}) and not negative (0 leaves a "
-            "motion out)"
+            f"weight {bad[0]} is {array[bad[0]]}; give a finite number from 0 (the motion is left out) to {LARGEST:g}"
         )
     if np.count_nonzero(array) < 2:
         raise NoiseError(f"{np.count_nonzero(array)} of {count} weights are not zero; AX = XB needs two motions")
@@ -72,7 +67,7 @@ def check_weights(weights: ArrayLike | None, count: int) -> Array | None:
 
 
 def check_covariances(covariances: ArrayLike | None, count: int) -> Array | None:
-    """Covariances of the residuals (A q, B q + A q'), (N, 8, 8) or (8, 8) for all; returns (N or 1, 8, 8) or None.
+    """Covariances (N, 8, 8), or (8, 8) for all motions, of (A q, B q + A q'); returns (N or 1, 8, 8), or None.
 
     Raises
     ------
@@ -92,12 +87,15 @@ def check_covariances(covariances: ArrayLike | None, count: int) -> Array | None
     asymmetry = np.abs(array - array.transpose(0, 2, 1)).max(axis=(1, 2))
     bad = np.flatnonzero(~(asymmetry <= 1e-9 * np.abs(array).max(axis=(1, 2))))
     if bad.size:
-        raise NoiseError(f"covariance {bad[0]} is not finite and symmetric (off by {asymmetry[bad[0]]:.3g})")
+        raise NoiseError(
+            f"covariance {bad[0]} is not finite and symmetric (off by {asymmetry[bad[0]]:.3g}); give finite numbers, "
+            "the same on both sides of the diagonal"
+        )
     smallest = np.linalg.eigvalsh(array)[:, 0]
     bad = np.flatnonzero(smallest <= 0.0)
     if bad.size:
         raise NoiseError(
-            f"covariance {bad[0]} is not positive definite (smallest eigenvalue {smallest[bad[0]]:.3g}); add what the "
-            "least certain direction is really uncertain by"
+            f"covariance {bad[0]} is not positive definite (smallest eigenvalue {smallest[bad[0]]:.3g}); add the "
+            "variance that its most certain direction really has"
         )
     return array

@@ -67,14 +67,6 @@ def test_one_covariance_is_alpha(motions: Motions) -> None:
     assert pytest.approx(by_alpha.M) == by_covariance.M
 
 
-def test_the_lagrangian_is_lambda_at_the_constraints(motions: Motions) -> None:
-    cost = cost_of(motions)
-    q = np.array([0.0, 0.6, 0.0, 0.8])
-    q_dual = np.array([1.0, 0.8, 0.3, -0.6])
-    assert cost.lagrangian(q, q_dual, 3.0, 5.0) == pytest.approx(cost.value(q, q_dual))
-    assert cost.lagrangian(2 * q, q_dual, 3.0, 5.0) == pytest.approx(cost.value(2 * q, q_dual) - 9.0)
-
-
 def test_blocks_add_up(motions: Motions, monkeypatch: pytest.MonkeyPatch) -> None:
     weights = np.random.default_rng(2).uniform(0, 1, 30)
     covariances = np.diag(np.arange(1.0, 9.0))

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from simulated import distance, hand_held, pair, poses
 
 from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
-from gtsam_rwhec.handeye import motions as motions_module
+from gtsam_rwhec.handeye import cost as cost_module
 from gtsam_rwhec.handeye import solve
 from gtsam_rwhec.handeye.cost import residuals
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
@@ -98,7 +98,7 @@ def test_what_is_no_pose_is_refused_with_its_place() -> None:
 def test_blocks_are_one(monkeypatch: pytest.MonkeyPatch) -> None:
     s = hand_held(50, 4, largest_rad=np.pi)
     whole = motions_of(s.C, s.H).rows
-    monkeypatch.setattr(motions_module, "BLOCK", 16)
+    monkeypatch.setattr(cost_module, "BLOCK", 16)
     assert np.array_equal(motions_of(s.C, s.H).rows, whole)
     bad = s.C.copy()
     bad[40, :3, :3] *= 1.1

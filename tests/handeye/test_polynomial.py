@@ -21,7 +21,7 @@ def curve_and_relaxation(make, seed: int, noise: float) -> tuple[Curve, RelaxedC
     found, relaxed = minimum(cost), relaxed_cost(cost)
     of = curve(relaxed)
     assert of is not None
-    return of, relaxed, (found.value - relaxed.values[0]) / of.lambda_scale, found.mu
+    return of, relaxed, (found.values[0] - relaxed.values[0]) / of.lambda_scale, found.mu
 
 
 def test_the_curve_is_the_determinant() -> None:
