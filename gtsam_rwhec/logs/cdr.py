@@ -76,18 +76,18 @@ class Batch:
     shape: Shape
     rows: NDArray[np.uint8]
 
-    def text(self, *path: str) -> str:
-        """A string; the same in all messages of the batch."""
-        value = find(self.shape.tree, *path)
+    def text(self, tree: Any, path: str) -> str:
+        """The string at `path` below `tree`; all messages of the batch have the same."""
+        value = find(tree, path)
         if not isinstance(value, str):
-            raise MessageError(f"field {'.'.join(path)} is no string")
+            raise MessageError(f"field {path} is not a string")
         return value
 
-    def numbers(self, tree: Any, *path: str) -> NDArray[Any]:
+    def numbers(self, tree: Any, path: str) -> NDArray[Any]:
         """(N,) or (N, count) numbers at `path` below `tree`."""
-        leaf = find(tree, *path)
+        leaf = find(tree, path)
         if not isinstance(leaf, Numbers):
-            raise MessageError(f"field {'.'.join(path)} has no numbers")
+            raise MessageError(f"field {path} has no numbers")
         size = np.dtype(leaf.dtype).itemsize * (1 if leaf.count is None else leaf.count)
         columns = np.ascontiguousarray(self.rows[:, leaf.offset : leaf.offset + size])
         if leaf.count is None:
@@ -95,11 +95,11 @@ class Batch:
         return columns.view(leaf.dtype) if size else np.zeros((len(self.rows), 0), leaf.dtype)
 
 
-def find(tree: Any, *path: str) -> Any:
-    """What is at `path`; an error that names the field that is not there."""
-    for name in path:
+def find(tree: Any, path: str) -> Any:
+    """The value at `path` (``header.stamp.sec``) below `tree`; a MessageError names a field that is not there."""
+    for name in path.split("."):
         if not isinstance(tree, dict) or name not in tree:
-            raise MessageError(f"the schema in the log has no field {'.'.join(path)}")
+            raise MessageError(f"the schema in the log has no field {path}")
         tree = tree[name]
     return tree
 

@@ -1,54 +1,40 @@
-"""Quaternions, positions and covariances of many messages at once: checked, and made (4, 4) and GTSAM's (6, 6)."""
+"""Checks of many messages' poses and images, and their poses as (4, 4) and covariances as GTSAM's (6, 6) arrays."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.logs.records import Array
 
-#: How far a quaternion's norm may be from 1; nearer ones are normalised.
+#: A quaternion's norm may be this far from 1; the quaternion is then normalised.
 QUATERNION_TOLERANCE = 1e-2
-#: Positions beyond this are no positions.
+#: A position further away than this, in metres, is refused.
 LARGEST_M = 1e12
 
 
 def transforms(positions: Array, quaternions_xyzw: Array) -> tuple[Array, dict[int, str]]:
-    """Make (N, 4, 4) transforms.
-
-    Parameters
-    ----------
-    positions : (N, 3), metres
-    quaternions_xyzw : (N, 4)
+    """Make (N, 4, 4) transforms of (N, 3) positions in metres and (N, 4) quaternions.
 
     Returns
     -------
-    T : (N, 4, 4)
-        Identity where there is a fault.
-    faults : dict
-        By index, in words: not finite, no unit quaternion.
+    T : (N, 4, 4) array
+        The identity where there is a fault.
+    faults : dict of int to str
+        What is wrong, by index: an entry that is not finite, a norm that is not 1, a position too far away.
     """
     norms = np.sqrt(np.einsum("ij,ij->i", quaternions_xyzw, quaternions_xyzw))
-    # Comparisons with NaN are false, which is what makes it a fault here.
+    # Every comparison with NaN is false, so NaN is a fault.
     good = (np.abs(norms - 1.0) <= QUATERNION_TOLERANCE) & (np.abs(positions) <= LARGEST_M).all(axis=1)
-    faults = {}
-    if not good.all():
-        for i in np.flatnonzero(~good).tolist():
-            faults[i] = _fault(positions[i], quaternions_xyzw[i], float(norms[i]))
+    bad = np.flatnonzero(~good).tolist()
+    faults = {i: _fault(positions[i], quaternions_xyzw[i], float(norms[i])) for i in bad}
+    if bad:
         positions = np.where(good[:, None], positions, 0.0)
         quaternions_xyzw = np.where(good[:, None], quaternions_xyzw, [0.0, 0.0, 0.0, 1.0])
-        norms = np.where(good, norms, 1.0)
-    x, y, z, w = (quaternions_xyzw / norms[:, None]).T
     T = np.zeros((len(norms), 4, 4))
-    T[:, 0, 0] = 1 - 2 * (y * y + z * z)
-    T[:, 0, 1] = 2 * (x * y - z * w)
-    T[:, 0, 2] = 2 * (x * z + y * w)
-    T[:, 1, 0] = 2 * (x * y + z * w)
-    T[:, 1, 1] = 1 - 2 * (x * x + z * z)
-    T[:, 1, 2] = 2 * (y * z - x * w)
-    T[:, 2, 0] = 2 * (x * z - y * w)
-    T[:, 2, 1] = 2 * (y * z + x * w)
-    T[:, 2, 2] = 1 - 2 * (x * x + y * y)
+    if len(norms):
+        T[:, :3, :3] = Rotation.from_quat(quaternions_xyzw).as_matrix()
     T[:, :3, 3] = positions
     T[:, 3, 3] = 1.0
     return T, faults
@@ -63,20 +49,15 @@ def _fault(position: Array, quaternion: Array, norm: float) -> str:
 
 
 def gtsam_covariances(T: Array, covariances: Array) -> list[Array | None]:
-    """Turn covariances of ROS poses into GTSAM's.
+    """Turn (N, 6, 6) covariances of ROS poses T (N, 4, 4) into GTSAM's.
 
-    ROS has (x, y, z, turns about the fixed axes x, y, z) in the parent frame: t + d, Exp(phi) R. A right perturbation
-    [omega, v] moves (R, t) to (R Exp(omega), t + R v), so omega = R' phi and v = R' d.
-
-    Parameters
-    ----------
-    T : (N, 4, 4)
-    covariances : (N, 6, 6)
+    ROS has (x, y, z, rotations about the fixed axes x, y, z) in the parent frame: t + d, Exp(phi) R. A right
+    perturbation [omega, v] moves (R, t) to (R Exp(omega), t + R v), so omega = R' phi and v = R' d.
 
     Returns
     -------
-    list of N
-        (6, 6); None where it is all zeros, has a negative variance (ROS's ways of saying unknown), or is not finite.
+    list of (6, 6) arrays or None
+        None for a covariance that is all zeros or has a negative variance (ROS says "unknown" so) or is not finite.
     """
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
     known: NDArray[np.bool_] = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
@@ -84,10 +65,16 @@ def gtsam_covariances(T: Array, covariances: Array) -> list[Array | None]:
         known &= (diagonal >= 0).all(axis=1) & diagonal.any(axis=1)
     if not known.any():
         return [None] * len(T)
-    order = [3, 4, 5, 0, 1, 2]
-    J = np.zeros((int(known.sum()), 6, 6))
-    J[:, :3, :3] = J[:, 3:, 3:] = T[known, :3, :3]
-    rotation_first = covariances[known][:, order][:, :, order]
-    right = J.transpose(0, 2, 1) @ (0.5 * (rotation_first + rotation_first.transpose(0, 2, 1))) @ J
-    found = iter(right)
-    return [next(found) if is_known else None for is_known in known.tolist()]
+    symmetric = np.where(known[:, None, None], 0.5 * (covariances + covariances.transpose(0, 2, 1)), 0.0)
+    # (N, 2, 2, 3, 3) blocks, rotation first
+    blocks = symmetric.reshape(-1, 2, 3, 2, 3).transpose(0, 1, 3, 2, 4)[:, ::-1, ::-1]
+    R = T[:, None, None, :3, :3]
+    right = (R.swapaxes(-1, -2) @ blocks @ R).transpose(0, 1, 3, 2, 4).reshape(-1, 6, 6)
+    return [covariance if is_known else None for covariance, is_known in zip(right, known.tolist(), strict=True)]
+
+
+def image_fault(width: int, height: int, step: int, data: bytes) -> str:
+    """What is wrong with a raw image's size; empty where the data has all rows."""
+    if width * height and step * height <= len(data):
+        return ""
+    return f"image of {width} x {height} pixels, {step} bytes a row, has {len(data)} bytes"
