@@ -70,7 +70,7 @@ def gtsam_covariances(T: Array, covariances: Array) -> list[Array | None]:
     blocks = symmetric.reshape(-1, 2, 3, 2, 3).transpose(0, 1, 3, 2, 4)[:, ::-1, ::-1]
     R = T[:, None, None, :3, :3]
     right = (R.swapaxes(-1, -2) @ blocks @ R).transpose(0, 1, 3, 2, 4).reshape(-1, 6, 6)
-    return [covariance if is_known else None for covariance, is_known in zip(right, known.tolist(), strict=True)]
+    return [right[i] if is_known else None for i, is_known in enumerate(known.tolist())]
 
 
 def image_fault(width: int, height: int, step: int, data: bytes) -> str:

@@ -132,7 +132,12 @@ def _poses(where: Pose, batch: Batch, topic: str, logged_ns: list[int]) -> list[
         T, covariances, wrong = _pose(batch, tree, where)
         parent, child = _frame(batch, tree), _frame(batch, tree, where.child) if where.child else ""
         each = zip(logged_ns, _stamps(batch, tree), T, covariances, strict=True)
-        parts.append([PoseRecord(logged, stamp, topic, parent, child, *pose) for logged, stamp, *pose in each])
+        parts.append(
+            [
+                PoseRecord(logged, stamp, topic, parent, child, T_i, covariance)
+                for logged, stamp, T_i, covariance in each
+            ]
+        )
         faults = wrong | faults
     return _by_message(parts, faults, len(logged_ns))
 
