@@ -1,13 +1,14 @@
-"""The parts of an MCAP file that hold messages: found by the file's index or by reading through it, and opened.
+"""The blocks of an MCAP file that hold messages: this module finds them, opens them and cuts them into messages.
 
-Nothing in the file is trusted: lengths are held against the file's size, decompression stops at a limit, checksums are
-compared. A file without an index (or with one that does not fit) is read through once; one that ends too early is read
-as far as it goes, and `losses` says what is missing.
+The module trusts nothing in the file: it holds lengths against the file's size, decompresses up to a limit, and
+compares checksums. It reads a file once from front to back where the file has no index or a wrong one. It reads a
+truncated file as far as the file goes; `losses` says what is missing.
 
-The records are read by the `mcap` library. Finding the blocks, opening them and cutting them into messages is ours.
-Measured on 2026-11-21 with mcap 1.6.0 (tests/benchmarks/own_code_against_libraries.py): a message takes 1.0 us, with
-mcap's reader 8 us. Of 20,000 messages in a file with one damaged chunk mcap's reader loses all, this one 4,100; in a
-file that breaks off at 70 % all, and 3,600. mcap opens LZ4 chunks without a limit on their size.
+The `mcap` library reads single records. Finding, opening and cutting blocks stays here: the library is slower and loses
+more. Measured on 2026-11-21 with mcap 1.6.0 (tests/benchmarks/own_code_against_libraries.py): a message takes 1.0 us,
+with mcap's reader 8 us. Of 20,000 messages in a file with one damaged chunk mcap's reader loses all, this module 4,100.
+In a file that breaks off at 70 % the reader loses all, this module 3,600. mcap opens LZ4 chunks without a limit on
+their size.
 """
 
 from __future__ import annotations
@@ -20,32 +21,36 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import lz4.frame
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Footer, McapRecord, Schema, Statistics
 from mcap.stream_reader import StreamReader
+from numpy.lib.stride_tricks import sliding_window_view
 
 from gtsam_rwhec.errors import LogError
 
 MAGIC = b"\x89MCAP0\r\n"
-#: A chunk that claims or yields more than this is not opened.
+#: Bytes of the largest chunk that is opened, as the chunk states them and as it yields them.
 LARGEST_CHUNK = 1 << 29
-#: Messages outside chunks are taken together in blocks of about this size.
+#: Bytes of a block of messages outside chunks, about.
 LOOSE_BLOCK = 1 << 22
+#: The head of every record: opcode and length.
 _RECORD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-_FOOTER_BYTES = 9 + 20
-#: What the records' readers raise for bytes that are none.
+#: The head of a message record.
+_HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")])
+_FOOTER_BYTES = _RECORD.size + 20
+#: What the readers of records raise for bytes that are not a record.
 _FAULTS = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError)
 
 
 @dataclass(frozen=True)
 class Block:
-    """Where messages are: a chunk's record, or records outside chunks; and the first of their log times.
+    """Where messages are: the record of a chunk, or records outside chunks; and their first log time.
 
-    `is_cut`: the file ends inside the chunk.
+    `is_cut` says that the file ends inside the chunk.
     """
 
     offset: int
@@ -57,20 +62,20 @@ class Block:
 
 @dataclass(frozen=True)
 class Messages:
-    """The messages of an opened block: message i is ``data[start[i]:end[i]]``, of channel `channel[i]`."""
+    """The messages of an opened block: message i is ``data[start[i]:end[i]]``.
+
+    `heads` (N,) has each message's channel, sequence, log_time and publish_time.
+    """
 
     data: bytes
-    channel: array[int]
-    sequence: array[int]
-    log_time: array[int]
-    publish_time: array[int]
+    heads: np.ndarray
     start: array[int]
     end: array[int]
 
 
 @dataclass
 class Seen:
-    """How many messages a channel has, and the first and last of their log times."""
+    """How many messages a channel has, and their first and last log time."""
 
     count: int = 0
     first_ns: int | None = None
@@ -117,7 +122,7 @@ class McapFile:
             self._read_through()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._stream.close()
 
     def open(self, block: Block) -> Messages:
@@ -126,7 +131,7 @@ class McapFile:
         Raises
         ------
         LogError
-            It cannot be: wrong compression, size or checksum.
+            The block has a wrong compression, size or checksum.
         """
         raw = self._read(block.offset, block.length)
         return self._split(self._opened(raw, block) if block.is_chunk else raw, block.offset)
@@ -142,7 +147,7 @@ class McapFile:
         return data
 
     def _read_summary(self) -> bool:
-        """Take schemas, channels, chunks and counts from the index; False where it is missing or does not fit."""
+        """Take schemas, channels, chunks and counts from the index; return whether the index fits the file."""
         footer_at = self.size - len(MAGIC) - _FOOTER_BYTES
         if footer_at < len(MAGIC):
             return False
@@ -169,14 +174,14 @@ class McapFile:
                 return False
             self.blocks.append(Block(chunk.chunk_start_offset, chunk.chunk_length, True, chunk.message_start_time))
         self.seen = {channel: Seen(count) for channel, count in statistics.channel_message_counts.items()}
-        # Without the messages' own indexes, a channel's span is that of the chunks that have it.
+        # A channel's span is the span of its chunks: the indexes of single messages are not read.
         for chunk in chunks:
             for channel in chunk.message_index_offsets:
                 _widen(self.seen.setdefault(channel, Seen()), chunk.message_start_time, chunk.message_end_time)
         return True
 
     def _records(self, start: int) -> list[McapRecord]:
-        """Those from a place in the file to its end; read from memory, where no stated length takes more."""
+        """The records from a place in the file to its end, read from memory: a wrong length allocates nothing."""
         stream = io.BytesIO(self._read(start, self.size - start))
         return list(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
 
@@ -187,7 +192,7 @@ class McapFile:
             self.channels[record.id] = record
 
     def _read_through(self) -> None:
-        """Find the blocks of a file without an index, and where it stops making sense."""
+        """Find the blocks of a file without an index, and the place where it ends or is damaged."""
         at, loose_at, is_cut = len(MAGIC), 0, False
         while at + _RECORD.size <= self.size:
             opcode, length = _RECORD.unpack(self._read(at, _RECORD.size))
@@ -214,7 +219,7 @@ class McapFile:
         saved = sum(seen.count for seen in self.seen.values()) - before
         self.losses.append(
             f"{self.path} ends too early, or is damaged, at byte {at} of {self.size}: the last {self.size - at} bytes "
-            f"and whatever should follow are lost, but for {saved} messages of the chunk that breaks off"
+            f"and all that should follow are lost, but for {saved} messages of the chunk that breaks off"
         )
 
     def _count_loose(self, start: int, end: int) -> None:
@@ -228,18 +233,17 @@ class McapFile:
         except LogError as error:
             self.losses.append(str(error))
             return
-        if not messages.log_time:
-            return
-        for channel, log_time in zip(messages.channel, messages.log_time, strict=True):
-            seen = self.seen.get(channel)
-            if seen is None:
-                seen = self.seen[channel] = Seen()
-            seen.count += 1
-            _widen(seen, log_time, log_time)
-        self.blocks.append(replace(block, start_ns=min(messages.log_time)))
+        channels, log_time = messages.heads["channel"], messages.heads["log_time"]
+        for channel in np.unique(channels).tolist():
+            times = log_time[channels == channel]
+            seen = self.seen.setdefault(channel, Seen())
+            seen.count += len(times)
+            _widen(seen, int(times.min()), int(times.max()))
+        if len(log_time):
+            self.blocks.append(replace(block, start_ns=int(log_time.min())))
 
     def _opened(self, raw: bytes, block: Block) -> bytes:
-        """What a chunk record holds; as much as there is of one that is cut."""
+        """The records in a chunk; of a chunk that is cut, as many as there are."""
         where = f"{self.path}, chunk at byte {block.offset}"
         stream = _stream(raw)
         try:
@@ -267,24 +271,17 @@ class McapFile:
         return data
 
     def _split(self, data: bytes, offset: int) -> Messages:
-        channel, sequence = array("H"), array("I")
-        log_time, publish_time = array("Q"), array("Q")
         starts, ends = array("Q"), array("Q")
         at = 0
-        unpack_record, unpack_message = _RECORD.unpack_from, _MESSAGE.unpack_from
-        while at + 9 <= len(data):
-            opcode, length = unpack_record(data, at)
-            start = at + 9
+        unpack, record_bytes, head_bytes = _RECORD.unpack_from, _RECORD.size, _HEAD.itemsize
+        while at + record_bytes <= len(data):
+            opcode, length = unpack(data, at)
+            start = at + record_bytes
             at = start + length
             if at > len(data):
                 break
-            if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
-                channel_id, number, logged, published = unpack_message(data, start)
-                channel.append(channel_id)
-                sequence.append(number)
-                log_time.append(logged)
-                publish_time.append(published)
-                starts.append(start + _MESSAGE.size)
+            if opcode == Opcode.MESSAGE and length >= head_bytes:
+                starts.append(start + head_bytes)
                 ends.append(at)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 try:
@@ -293,11 +290,14 @@ class McapFile:
                     raise LogError(
                         f"{self.path}, byte {offset}: a schema or channel cannot be read: {error}"
                     ) from error
-        return Messages(data, channel, sequence, log_time, publish_time, starts, ends)
+        if not starts:
+            return Messages(data, np.zeros(0, _HEAD), starts, ends)
+        windows = sliding_window_view(np.frombuffer(data, np.uint8), head_bytes)
+        return Messages(data, windows[np.array(starts) - head_bytes].view(_HEAD)[:, 0], starts, ends)
 
 
 def _decompressed(chunk: Chunk) -> bytes:
-    """At most one byte more than the chunk states, whatever its data would become."""
+    """The chunk's data; at most one byte more than the chunk states."""
     most = chunk.uncompressed_size + 1
     if chunk.compression == "zstd":
         decompressor = zstandard.ZstdDecompressor(max_window_size=1 << 27)

@@ -16,11 +16,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
+from mcap.reader import McapReader, make_reader
 from mcap.records import Channel, Schema
 
 from gtsam_rwhec.errors import LogError, LogWarning, MessageError
@@ -37,6 +37,7 @@ MOST_OPEN_BYTES = 1 << 30
 #: Topics that an error lists, at most: a stranger's log may have thousands.
 MOST_NAMED = 50
 
+_Entry = TypeVar("_Entry")
 _Decoder = Callable[[str, Sequence[bytes | memoryview], list[int]], list[foxglove_schemas.Read]]
 
 
@@ -142,29 +143,24 @@ class Log:
         return tuple(found[key] for key in sorted(found))
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """The metadata records of all files by name; of one name the last counts.
+        """The metadata records of all files by name; the last record of a name counts.
 
-        Found by the files' index: a file that lacks it, or is truncated, has none.
+        The files' index leads to them: a file without an index, or a truncated file, has none.
         """
-        found: dict[str, dict[str, str]] = {}
-        for file in self.files:
-            with open(file.path, "rb") as stream:
-                try:
-                    found |= {entry.name: dict(entry.metadata) for entry in make_reader(stream).iter_metadata()}
-                except (McapError, struct.error, ValueError, EOFError):
-                    continue  # `losses` says what is wrong with the file
-        return found
+        return {entry.name: dict(entry.metadata) for entry in self._indexed(McapReader.iter_metadata)}
 
     def attachment(self, name: str) -> bytes | None:
-        """What is attached under a name, found as `metadata` is; None if nothing is."""
-        found = None
+        """The content that is attached under a name, found as `metadata` is; None where there is none."""
+        found = [entry.data for entry in self._indexed(McapReader.iter_attachments) if entry.name == name]
+        return found[-1] if found else None
+
+    def _indexed(self, entries: Callable[[McapReader], Iterator[_Entry]]) -> Iterator[_Entry]:
         for file in self.files:
             with open(file.path, "rb") as stream:
                 try:
-                    found = next((a.data for a in make_reader(stream).iter_attachments() if a.name == name), found)
+                    yield from entries(make_reader(stream))
                 except (McapError, struct.error, ValueError, EOFError):
-                    continue
-        return found
+                    continue  # `losses` says what is wrong with the file
 
     def records(self, topics: Iterable[str] | None = None, on_bad: OnBad = "warn") -> Iterator[Record]:
         """Go through the log in the order of log time.
@@ -233,28 +229,24 @@ class Log:
             As `records`; or there are none, or of several pairs of frames (the message has them).
         """
         stamps: list[int] = []
-        blocks: list[Array] = []
-        pending: list[Array] = []
         pairs: dict[tuple[str, str], None] = {}
-        for record in self.records([topic]):
-            if not isinstance(record, PoseRecord):
-                raise LogError(f"topic {topic} has no poses but {type(record).__name__}s")
-            if parent not in (None, record.parent) or child not in (None, record.child):
-                continue
-            pairs[record.parent, record.child] = None
-            stamps.append(record.stamp_ns)
-            pending.append(record.T)
-            if len(pending) == SLICE:
-                blocks.append(np.stack(pending))
-                pending = []
+
+        def transforms() -> Iterator[Array]:
+            for record in self.records([topic]):
+                if not isinstance(record, PoseRecord):
+                    raise LogError(f"topic {topic} has no poses but {type(record).__name__}s")
+                if parent in (None, record.parent) and child in (None, record.child):
+                    pairs[record.parent, record.child] = None
+                    stamps.append(record.stamp_ns)
+                    yield record.T
+
+        T: np.ndarray = np.fromiter(transforms(), np.dtype((np.float64, (4, 4))))
         if len(pairs) != 1:
             of = "; ".join(f"{a or '?'} to {b or '?'}" for a, b in list(pairs)[:20])
             raise LogError(f"topic {topic} has poses of {len(pairs)} pairs of frames ({of}); name parent and child")
-        if pending:
-            blocks.append(np.stack(pending))
-        ((parent, child),) = pairs
-        order = np.argsort(np.array(stamps, dtype=np.int64), kind="stable")
-        return PoseSeries(np.array(stamps, dtype=np.int64)[order], np.concatenate(blocks)[order], parent, child)
+        stamps_ns = np.array(stamps, dtype=np.int64)
+        order = np.argsort(stamps_ns, kind="stable")
+        return PoseSeries(stamps_ns[order], T[order], *next(iter(pairs)))
 
     def _checked_topics(self, topics: Iterable[str] | None) -> set[str] | None:
         if topics is None:
@@ -276,13 +268,12 @@ class Log:
         if key not in self._decoders:
             file = self.files[number]
             channel = file.channels.get(channel_id)
-            if channel is None:
-                self._decoders[key] = f"channel {channel_id} is not described in the file"
-            else:
-                try:
-                    self._decoders[key] = _decoder_for(channel, file.schemas.get(channel.schema_id))
-                except MessageError as error:
-                    self._decoders[key] = str(error)
+            try:
+                if channel is None:
+                    raise MessageError(f"channel {channel_id} is not described in the file")
+                self._decoders[key] = _decoder_for(channel, file.schemas.get(channel.schema_id))
+            except MessageError as error:
+                self._decoders[key] = str(error)
         return self._decoders[key]
 
     def _records_of(self, number: int, block: Block, wanted: set[str] | None, bad: _Bad) -> Iterator[Record]:
@@ -293,16 +284,15 @@ class Log:
         except LogError as error:
             bad.add(f"{file.path}", error)
             return
-        log_time = np.array(messages.log_time, dtype=np.uint64)
+        log_time = messages.heads["log_time"]
         order = np.argsort(log_time, kind="stable")
         data = memoryview(messages.data)
         for start in range(0, len(order), SLICE):
-            places = order[start : start + SLICE].tolist()
-            by_channel: dict[int, list[int]] = {}
-            for i in places:
-                by_channel.setdefault(messages.channel[i], []).append(i)
+            places = order[start : start + SLICE]
+            channels = messages.heads["channel"][places]
             read: dict[int, Sequence[Record]] = {}
-            for channel_id, members in by_channel.items():
+            for channel_id in np.unique(channels).tolist():
+                members = places[channels == channel_id].tolist()
                 decoder = self._decoder(number, channel_id)
                 if isinstance(decoder, str):
                     if channel_id not in file.channels:
@@ -312,13 +302,13 @@ class Log:
                 if wanted is not None and topic not in wanted:
                     continue
                 cut = [data[messages.start[i] : messages.end[i]] for i in members]
-                results = decoder(topic, cut, [messages.log_time[i] for i in members])
+                results = decoder(topic, cut, log_time[members].tolist())
                 for i, result in zip(members, results, strict=True):
                     if isinstance(result, str):
                         bad.add(f"topic {topic}", MessageError(f"{file.path}, topic {topic}: {result}"))
                     else:
                         read[i] = result
-            for i in places:
+            for i in places.tolist():
                 yield from read.pop(i, ())
 
 

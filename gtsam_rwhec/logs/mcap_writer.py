@@ -106,18 +106,17 @@ class LogWriter:
                 except LogError:
                     continue
                 made: dict[int, int | None] = {}
-                for i, channel_id in enumerate(messages.channel):
+                spans = zip(messages.start, messages.end, strict=True)
+                for (channel_id, sequence, logged, published), (start, end) in zip(
+                    messages.heads.tolist(), spans, strict=True
+                ):
                     if channel_id not in made:
                         made[channel_id] = self._copied_channel(file, channel_id, wanted, images)
                     target = made[channel_id]
-                    if target is None:
-                        continue
-                    data = messages.data[messages.start[i] : messages.end[i]]
-                    with self._saying():
-                        self._writer.add_message(
-                            target, messages.log_time[i], data, messages.publish_time[i], messages.sequence[i]
-                        )
-                    copied += 1
+                    if target is not None:
+                        with self._saying():
+                            self._writer.add_message(target, logged, messages.data[start:end], published, sequence)
+                        copied += 1
         return copied
 
     def transforms(self, topic: str, stamp_ns: int, transforms: Iterable[tuple[str, str, Array]]) -> None:

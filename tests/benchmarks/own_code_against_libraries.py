@@ -66,7 +66,7 @@ def reading(folder: Path, count: int) -> list[Row]:
 
     def ours() -> int:
         with open_log(path) as log:
-            return sum(len(part.open(block).channel) for part in log.files for block in part.blocks)
+            return sum(len(part.open(block).heads) for part in log.files for block in part.blocks)
 
     def mcaps(file: Path = path) -> int:
         found = 0
