@@ -113,7 +113,7 @@ TABLE: dict[str, dict[str, str]] = {
         "report/plots/test_drawing.py": "labels",
         "report/plots/test_plots.py": "coverage deviations frames plotted residuals",
     },
-    "gtsam_rwhec/results": {"results/test_result_file.py": "schema"},
+    "gtsam_rwhec/results": {"results/test_result_file.py": "json_tree schema"},
     "gtsam_rwhec/rig": {
         "rig/test_rig_faults.py": "contradictions",
         "rig/test_rig_file.py": "field_types rig sections target_sections written_rig",

@@ -28,7 +28,7 @@ from gtsam_rwhec.pipeline.log_metadata import read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, write_pairs
 from gtsam_rwhec.pipeline.output_paths import check_writable
 from gtsam_rwhec.pipeline.tracks import Track, read_tracks
-from gtsam_rwhec.results.stage_reports import CleaningReport
+from gtsam_rwhec.results.log_history import CleaningReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 

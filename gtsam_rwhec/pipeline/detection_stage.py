@@ -20,7 +20,7 @@ from gtsam_rwhec.pipeline.log_metadata import LogMetadata
 from gtsam_rwhec.pipeline.no_detections import no_detections
 from gtsam_rwhec.pipeline.output_paths import check_is_not_read, check_writable
 from gtsam_rwhec.pipeline.sensor_detections import detection_report
-from gtsam_rwhec.results.stage_reports import DetectionReport
+from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 
 

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log, LogWriter
 from gtsam_rwhec.pipeline.log_contract import CAMERAS_METADATA, CLEANING_METADATA, DETECTION_METADATA, RIG_METADATA
-from gtsam_rwhec.results.stage_reports import CleaningReport, DetectionReport
+from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport
 from gtsam_rwhec.rig import Rig, parse_rig, rig_text
 from gtsam_rwhec.vision.camera import Camera
 

@@ -6,7 +6,7 @@ from collections import Counter
 
 from gtsam_rwhec.first_rig.log_contents import read_contents
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.results.stage_reports import DetectionReport
+from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 
 #: Of the tags that are no target, so many are named.

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from gtsam_rwhec.logs import DetectionRecord, Log
-from gtsam_rwhec.results.stage_reports import DetectionReport, TrackCount
+from gtsam_rwhec.results.log_history import DetectionReport, TrackCount
 from gtsam_rwhec.rig import Rig
 
 

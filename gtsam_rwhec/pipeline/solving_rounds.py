@@ -20,7 +20,7 @@ from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.refining import refine
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
-from gtsam_rwhec.results.stage_reports import SizeFields
+from gtsam_rwhec.results.log_history import SizeFields
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.certified_solution import solve
 

@@ -17,7 +17,7 @@ from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, sigma_of, without_outlier_marks
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
-from gtsam_rwhec.results.stage_reports import LogFields, SizeFields, TimeOffsetFields, TrackCount, contradicted
+from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TimeOffsetFields, contradictions
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.vision.camera import Camera
@@ -106,9 +106,9 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         refined,
         time_offsets_s={name: offsets[name] for name in estimated},
         inlier_counts={
-            count.pair: (count.used, count.used + sum(count.removed.values()))
+            count.pair: (count.used, count.used + count.left_out)
             for count in outliers
-            if rig.cleaning.robust == "gnc" and (count.used or count.removed)
+            if rig.cleaning.robust == "gnc" and (count.used or count.left_out)
         },
     )
     fields = LogFields(
@@ -127,7 +127,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
             for name in rig.sensors
             if name in offsets
         ),
-        contradicted=contradicted(outliers),
+        contradicted=contradictions(outliers),
     )
     return Calibrated(refined, refined.solution, settled.pairs, fields, dict(metadata.cameras), rig)
 
@@ -139,8 +139,8 @@ def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:
     return size.model_copy(update={"scale": scale, "sigma": sigma_of(refined, Unknown(UnknownKind.SCALE, size.target))})
 
 
-def _outlier_count(measured: MeasuredPairs) -> TrackCount:
+def _outlier_count(measured: MeasuredPairs) -> OutlierCount:
     """What robust estimation used and left out."""
     count = measured.count
-    removed = {why: number for why, number in count.removed.items() if why == RemovalReason.OUTLIER}
-    return count.model_copy(update={"removed": removed})
+    left_out = count.removed.get(RemovalReason.OUTLIER, 0)
+    return OutlierCount(target=count.target, sensor=count.sensor, used=count.used, left_out=left_out)

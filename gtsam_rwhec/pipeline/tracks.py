@@ -16,7 +16,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import check_order
 from gtsam_rwhec.pipeline.log_contract import detections_topic
-from gtsam_rwhec.results.stage_reports import TrackCount
+from gtsam_rwhec.results.log_history import TrackCount
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import Tag, Target, is_same_print

@@ -24,7 +24,7 @@ from gtsam_rwhec.report.solution_report import (
     print_verdict,
     report_console,
 )
-from gtsam_rwhec.results.stage_reports import LogFields
+from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.verdict import judge
 
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")

@@ -14,7 +14,7 @@ from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.solution_report import print_heading, print_sentence, print_tables, report_console
-from gtsam_rwhec.results.stage_reports import LogFields
+from gtsam_rwhec.results.log_history import LogFields
 
 LEGEND = "off: between the found pose and the true one. 95 %: whether the truth is inside the confidence ellipsoid."
 
@@ -72,7 +72,7 @@ def hidden_sentences(refined: RefinedPoses, log: LogFields, truth: DemoTruth) ->
                 f"{1e3 * refined.time_offsets_s[sensor]:.2f} ± {1e3 * deviation_s:.2f} ms."
             )
     pair = Pair(truth.twice_seen, truth.twice_seen_by)
-    seen = sum(t.used + sum(t.removed.values()) for t in log.detection.tracks if t.pair == pair)
+    seen = sum(t.seen for t in log.detection.tracks if t.pair == pair)
     used = sum(t.used for t in log.outliers if t.pair == pair)
     sentences.append(
         f"A poster shows the tag of {pair.target} a second time, in {truth.twice_seen_in} images of {pair.sensor}. "

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gtsam_rwhec.report.solution_report import print_sentence, report_console
-from gtsam_rwhec.results.stage_reports import LogFields, TrackCount
+from gtsam_rwhec.results.log_history import LogFields, TrackCount
 
 
 def print_log(log: LogFields, console: Console | None = None) -> None:
@@ -28,7 +28,6 @@ def log_sentences(log: LogFields) -> list[str]:
     for stage, tracks, told_before in (
         ("Detections not used", log.detection.tracks, set[str]()),
         ("Removed in cleaning", log.cleaning.tracks, rejected),
-        ("Left out by robust estimation", log.outliers, set[str]()),
     ):
         reasons = _by_reason(tracks, told_before)
         if reasons:
@@ -50,7 +49,8 @@ def doubts(log: LogFields) -> list[str]:
         if faults:
             said.append(f"{len(faults)} images of {sensor} could not be used, the first: {faults[0]}")
     said += _unused(log)
-    given = [clock.sensor for clock in log.time_offsets if clock.sigma_s is None and clock.sensor in log.contradicted]
+    contradicted = {counts.frame for counts in log.contradicted}
+    given = [clock.sensor for clock in log.time_offsets if clock.sigma_s is None and clock.sensor in contradicted]
     if given:
         said.append(
             f"The clock of {', '.join(given)} was taken as given. If its stamps may be late, set time_offset: estimate "
@@ -118,7 +118,7 @@ def _table(log: LogFields) -> Table:
         pair = track.pair
         table.add_row(
             *pair,
-            str(track.used + sum(track.removed.values())),
+            str(track.seen),
             str(track.used),
             str(cleaned[pair].used if pair in cleaned else 0),
             str(used[pair].used if pair in used else 0),

@@ -1,7 +1,7 @@
-"""Result files of versions 1 to 3, laid out as version 4 is.
+"""Result files of versions 1 to 3, converted to version 4.
 
-There, ``sensors`` and ``targets`` at the top were the certified poses, and refined ones stood under ``refined``.
-Version 1 had no ``refined``, version 2 no ``log``. There was no verdict.
+In these versions ``sensors`` and ``targets`` at the top were the certified poses; ``refined`` had the refined poses.
+Version 1 had no ``refined``, version 2 had no ``log``, and no version had a verdict.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from dataclasses import asdict
 from typing import Any
 
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind
+from gtsam_rwhec.results.log_history import OutlierCount, contradictions
 from gtsam_rwhec.solver.cause import Cause, SearchPath
 
 FIRST_VERSION = 1
@@ -18,12 +19,12 @@ _RESIDUAL = ("translation_rms_m", "rotation_rms_rad")
 
 
 def as_version_4(raw: dict[str, Any]) -> dict[str, Any]:
-    """A file's fields, moved to where version 4 has them.
+    """Move a file's fields to their places in version 4.
 
     Raises
     ------
-    KeyError, TypeError, AttributeError
-        A field is missing, or not what it should be, so that nothing can be moved.
+    ValueError, KeyError, TypeError, AttributeError
+        A field is missing, or is of another type than its version says.
     """
     heading = ("format", "format_version", "written_by", "conventions", "refined", "log")
     certified = {name: value for name, value in raw.items() if name not in heading}
@@ -38,12 +39,12 @@ def as_version_4(raw: dict[str, Any]) -> dict[str, Any]:
         **{name: raw[name] for name in ("format", "written_by", "conventions")},
         "format_version": 4,
         "verdict": "care",
-        "verdict_reason": "a file of an earlier version has no verdict",
+        "verdict_reason": "an earlier version wrote this file, without a verdict",
         "verdict_grounds": [],
         "certified": _with_scale(certified),
     }
     if raw.get("log") is not None:
-        result["log"] = raw["log"]
+        result["log"] = _log(raw["log"])
     if raw.get("refined") is None:
         return {**result, **_only(certified, "targets", "sensors", "scale", "scale_mode")}
     refined = _with_scale(_with_directions(raw["refined"]))
@@ -67,8 +68,18 @@ def as_version_4(raw: dict[str, Any]) -> dict[str, Any]:
     return {**result, **posed, "refined": refined}
 
 
+def _log(log: dict[str, Any]) -> dict[str, Any]:
+    """Convert a log: its outliers were counted by reason, and contradicted frames were names only."""
+    outliers = [
+        OutlierCount(**_only(row, "target", "sensor", "used"), left_out=sum(row["removed"].values()))
+        for row in log["outliers"]
+    ]
+    records = {"outliers": outliers, "contradicted": contradictions(outliers)}
+    return {**log, **{name: [record.model_dump() for record in made] for name, made in records.items()}}
+
+
 def _certificate(fields: dict[str, Any]) -> dict[str, Any]:
-    """Causes were sentences; the objective was one of two, with or without priors."""
+    """Convert a certificate: its cause, objective and path were sentences."""
     objective = fields["objective"]
     return {
         **_without(fields, "reason"),
@@ -83,13 +94,13 @@ def _certificate(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_directions(fields: dict[str, Any]) -> dict[str, Any]:
-    """Free directions were sentences."""
+    """Convert free directions: they were sentences."""
     directions = [asdict(FreeDirection(FreeKind.WORDS, None, words=words)) for words in fields["free_directions"]]
     return {**fields, "free_directions": directions}
 
 
 def _joint(joint: dict[str, Any]) -> dict[str, Any]:
-    """Only the lower triangle was written, and free directions row by row."""
+    """Convert the joint covariance: only its lower triangle was written, and free directions were rows."""
     slots, first = {}, 0
     for unknown in joint["unknowns"]:
         slots[unknown["name"]] = [first, first := first + unknown["rows"]]

@@ -1,8 +1,8 @@
-"""What a result file holds: the library's own frozen dataclasses, which pydantic reads and checks as they are.
+"""The fields of a result file: the library's own frozen dataclasses, which pydantic reads and checks.
 
-A class here is one of them (its base) with the few fields told anew that JSON has in another way: poses, arrays, what
-has pairs for keys. Everything that is not described is an error, and nothing is converted. The records' docstrings
-describe their fields; lengths are in metres, angles in radians, times in seconds, where a name does not say otherwise.
+A class here declares again the few fields of its base that JSON writes in another way: poses, arrays, and dictionaries
+whose keys are pairs. An unknown field is an error, and no value is converted to another type. The docstrings of the
+bases describe the fields. Lengths are in metres, angles in radians, times in seconds, unless a name says otherwise.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiab
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.refined import PairNoise, RefinedPoses
-from gtsam_rwhec.refinement.unknowns import Unknown
-from gtsam_rwhec.results.stage_reports import LogFields
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.verdict import Ground, Verdict
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solving.solution import Solution
 
 FORMAT: Final = "gtsam-rwhec result"
+#: It grows whenever a reader of the version before would misread or refuse the file.
 FORMAT_VERSION: Final = 4
-"""Raised whenever a reader of the last version would misread or refuse the file."""
 
 CONVENTIONS = {
     "poses": (
-        "sensors and targets at the top are the poses to use: the refined ones where the answer was refined, and else "
-        "the certified ones, which are under certified too"
+        "sensors and targets at the top are the poses to use: the refined poses if the answer was refined, otherwise "
+        "the certified poses; certified has the certified poses in either case"
     ),
     "pose": (
         "T_parent_child is the pose of frame child in frame parent: p_parent = T_parent_child p_child. "
-        "quaternion_wxyz is scalar first, of unit norm, and says the same as rotation_matrix (rows)."
+        "quaternion_wxyz is scalar first, of unit norm, and the same rotation as rotation_matrix (rows)."
     ),
     "model": (
         "T_sensorcarrier_targetcarrier T_targetcarrier_target = T_sensorcarrier_sensor T_sensor_target (A X = Y B); "
@@ -51,17 +51,18 @@ CONVENTIONS = {
         "origin of child (GTSAM's right perturbation)"
     ),
     "infinity": (
-        "null stands for a number that is infinite: minus infinity in lower_bound, float_bound and min_eigenvalue (no "
-        "bound was found), of either sign in a covariance, and plus infinity elsewhere"
+        "null means an infinite number: minus infinity in lower_bound, float_bound and min_eigenvalue (no bound was "
+        "found), infinity of either sign in a covariance, and plus infinity elsewhere"
     ),
-    "sentence": "what a record says, in words; not read back",
+    "sentence": "the meaning of a record in words; not read back",
 }
 
-SENSOR_CARRIER, TARGET_CARRIER = "sensorcarrier", "targetcarrier"
-"""Names of the carriers where no rig file names them."""
-
+#: Name of the frame that carries the sensors, if no rig file names it.
+SENSOR_CARRIER = "sensorcarrier"
+#: Name of the frame that carries the targets, if no rig file names it.
+TARGET_CARRIER = "targetcarrier"
+#: Largest difference of an element of R' R from the identity, and of R from its quaternion, in an undamaged file.
 POSE_TOLERANCE = 1e-6
-"""How far a file's rotation may be from a rotation, and its quaternion from it, before it is taken for damaged."""
 
 CONFIG = ConfigDict(extra="forbid", frozen=True, strict=True)
 Triple = tuple[float, float, float]
@@ -69,16 +70,16 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class Pose(BaseModel):
-    """T_parent_child."""
+    """The pose T_parent_child of a frame on its carrier."""
 
     model_config = CONFIG
 
-    parent: Name = Field(description="the frame in which the pose is given, the carrier: as the rig file names it")
-    child: Name = Field(description="the frame whose pose it is: the target's or sensor's name")
+    parent: Name = Field(description="the carrier: the frame in which the pose is given, with its name in the rig file")
+    child: Name = Field(description="name of the target or sensor whose pose this is")
     translation_m: Triple = Field(description="origin of child in parent, m")
     quaternion_wxyz: tuple[float, float, float, float] = Field(description="rotation, scalar first, for other programs")
     rotation_matrix: tuple[Triple, Triple, Triple] = Field(
-        description="the same rotation, row by row; this is what is read back, as a quaternion loses the last bit"
+        description="the same rotation, row by row. Only the matrix is read back: a quaternion loses the last bit"
     )
 
     @model_validator(mode="after")
@@ -96,10 +97,10 @@ class Pose(BaseModel):
 
 
 def pose_rows(parent: str, poses: Mapping[str, gtsam.Pose3]) -> list[dict[str, Any]]:
-    """The poses that one carrier carries, as JSON has them: the fields of `Pose`."""
+    """The poses of the frames on one carrier as JSON: rows with the fields of `Pose`."""
     rows = []
     for name, pose in poses.items():
-        q: Any = pose.rotation().toQuaternion()  # Eigen's quaternion, of which gtsam's stubs say nothing
+        q: Any = pose.rotation().toQuaternion()  # Eigen's quaternion, which gtsam's stubs do not type
         rows.append(
             {
                 "parent": parent,
@@ -132,17 +133,17 @@ def _array_of(rows: list[list[float]]) -> Array:
 
 
 def _as(kind: Any, made: Any) -> GetPydanticSchema:
-    """Read as another type than the one that is annotated, and made into that."""
+    """Let pydantic read `kind` and call `made` for a value of the annotated type."""
     return GetPydanticSchema(lambda _, handler: handler.generate_schema(Annotated[kind, AfterValidator(made)]))
 
 
 def _told_as(kind: type[Any]) -> GetPydanticSchema:
-    """A record of the library's own class (the base), with the fields that `kind` tells anew."""
+    """Let pydantic read the class `kind` and make a record of its base, which is the library's own class."""
     return _as(kind, lambda record: kind.__bases__[0](**vars(record)))
 
 
+#: `json_tree.from_json` makes such keys of a file's rows {target, sensor, ...}.
 PairKey = Annotated[Pair, BeforeValidator(lambda key: Pair(*json.loads(key)))]
-"""Of rows {target, sensor, ...} in a file `result_file` makes keys for pydantic."""
 UnknownKey = Annotated[Unknown, BeforeValidator(Unknown.of)]
 Rows = Annotated[slice, _as(tuple[int, int], lambda ends: slice(*ends))]
 Poses = _as(tuple[Pose, ...], _poses_of)
@@ -153,14 +154,14 @@ Matrix = Annotated[Array, _as(list[list[float]], _array_of)]
 
 @dataclass(frozen=True)
 class IdentifiabilityFields(Identifiability):
-    """What all measurements together determine."""
+    """What all measurements together determine, in a file."""
 
     pairs: dict[PairKey, PairIdentifiability]
 
 
 @dataclass(frozen=True)
 class SolutionFields(Solution):
-    """The certified solution."""
+    """The certified solution in a file."""
 
     X: Annotated[dict[str, gtsam.Pose3], Poses, Field(alias="targets")]
     Y: Annotated[dict[str, gtsam.Pose3], Poses, Field(alias="sensors")]
@@ -171,12 +172,9 @@ class SolutionFields(Solution):
 
 @dataclass(frozen=True)
 class JointFields(JointCovariance):
-    """The joint covariance: slots are the first row of each name, and the one after its last."""
+    """The joint covariance in a file: a slot is the first row of an unknown, and the row after its last."""
 
-    slots: dict[
-        Annotated[Unknown, BeforeValidator(Unknown.of)],
-        Annotated[slice, _as(tuple[int, int], lambda ends: slice(*ends))],
-    ]
+    slots: dict[UnknownKey, Rows]
     finite: Matrix
     free: Matrix
     unit: Annotated[Array, _as(list[Positive], np.array)]
@@ -184,14 +182,16 @@ class JointFields(JointCovariance):
 
 @dataclass(frozen=True)
 class FrameFields:
-    """How well a refined frame is known, for people; the joint covariance is read back.
+    """How well a refined frame is known. This is for people; only the joint covariance is read back.
 
     Attributes
     ----------
-    standard_deviations_deg, standard_deviations_mm : 3 float
-        About, and along, the frame's own x, y, z; null: infinite, free.
+    standard_deviations_deg : 3 float
+        Of rotations about the frame's own x, y and z axes, degrees; null: infinite, because a direction is free.
+    standard_deviations_mm : 3 float
+        Of translations along the same axes, millimetres; null as above.
     covariance : 6 x 6
-        Rows [omega (rad), v (m)]; zero for a fixed frame; null: infinite, of either sign.
+        Of [omega (rad), v (m)]; zero for a fixed frame; null: infinite, of either sign.
     """
 
     standard_deviations_deg: Triple
@@ -201,16 +201,16 @@ class FrameFields:
 
 @dataclass(frozen=True)
 class RefinedFields(RefinedPoses):
-    """The refined calibration; in a file its poses and scale stand at the top.
+    """The refined calibration in a file; its poses and scale stand at the top of the file.
 
     Attributes
     ----------
     residual : str
-        Geodesic or chordal.
+        "geodesic" or "chordal".
     robust : str
-        The loss; gnc: outliers were left out; or none.
+        The robust loss; "gnc" if outliers were left out; or "none".
     frames : dict of str to FrameFields
-        Every target and sensor.
+        How well each target and sensor is known.
     """
 
     X: Annotated[dict[str, gtsam.Pose3], Poses, Field(alias="targets")]
@@ -225,7 +225,7 @@ class RefinedFields(RefinedPoses):
 
 
 class ResultFile(BaseModel):
-    """A calibration and everything that is known about it."""
+    """A calibration in a file."""
 
     model_config = CONFIG
 
@@ -233,12 +233,12 @@ class ResultFile(BaseModel):
     format_version: Literal[4] = Field(description="the version of these fields")
     written_by: str = Field(description="the library and its version")
     verdict: Verdict = Field(description="use, care or do_not_use")
-    verdict_reason: str = Field(description="why, in words")
-    verdict_grounds: tuple[Ground, ...] = Field(description="what speaks against use, for programs")
-    conventions: dict[str, str] = Field(description="what poses, scale and units mean, for people; not read back")
-    certified: SolutionFields = Field(description="the certified solution: where refining began, if there was any")
-    refined: RefinedFields | None = Field(default=None, description="left out where nothing was refined")
-    log: LogFields | None = Field(default=None, description="left out where the measurements are of no log")
+    verdict_reason: str = Field(description="the grounds in words")
+    verdict_grounds: tuple[Ground, ...] = Field(description="what speaks against using the poses")
+    conventions: dict[str, str] = Field(description="what poses, scale and units mean; not read back")
+    certified: SolutionFields = Field(description="the certified solution, at which a refinement began")
+    refined: RefinedFields | None = Field(default=None, description="the refined calibration, if there is one")
+    log: LogFields | None = Field(default=None, description="what became of the measurements, if they come from a log")
 
     @model_validator(mode="after")
     def _names_fit_together(self) -> ResultFile:
@@ -258,18 +258,21 @@ class ResultFile(BaseModel):
             if isinstance(answer, RefinedFields):
                 _check_joint(answer, names)
         if self.certified.residuals.keys() != self.certified.identifiability.pairs.keys():
-            raise ValueError("residuals and identifiability.pairs are of different pairs")
+            raise ValueError("residuals and identifiability.pairs have different pairs")
         return self
 
 
 def _check_joint(refined: RefinedFields, names: set[str]) -> None:
     if refined.frames.keys() != names or refined.moved.keys() != names:
-        raise ValueError(f"frames and moved are not of the targets and sensors {', '.join(sorted(names))}")
-    offsets = {f"time_offset:{name}" for name in refined.time_offsets_s}
-    scales = {"scale", *(f"scale:{name}" for name in (refined.scale if isinstance(refined.scale, dict) else ()))}
-    unknown = set(map(str, refined.joint.slots)) - names - offsets - scales
+        raise ValueError(f"frames and moved must have the targets and sensors {', '.join(sorted(names))}")
+    owners = (
+        *((UnknownKind.FRAME, name) for name in names),
+        *((UnknownKind.TIME_OFFSET, name) for name in refined.time_offsets_s),
+        *((UnknownKind.SCALE, name) for name in (refined.scale if isinstance(refined.scale, dict) else [""])),
+    )
+    unknown = refined.joint.slots.keys() - {Unknown(*owner) for owner in owners}
     if unknown:
-        raise ValueError(f"unknowns that have no value: {', '.join(sorted(unknown))}")
+        raise ValueError(f"unknowns that have no value: {', '.join(sorted(map(str, unknown)))}")
     size = max((rows.stop for rows in refined.joint.slots.values()), default=0)
     shapes = refined.joint.unit.shape, refined.joint.finite.shape, refined.joint.free.shape[:1]
     if shapes != ((size,), (size, size), (size,)):

@@ -1,4 +1,4 @@
-"""Whether a calibration is to be used: one rule, for the report, the result file, exports and the exit status."""
+"""The verdict on a calibration: may its poses be used? Reports, files, exports and the exit status share this rule."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.results.stage_reports import LogFields
+from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.cause import Status
 from gtsam_rwhec.solving.solution import Solution
 
@@ -14,16 +14,16 @@ from gtsam_rwhec.solving.solution import Solution
 class Verdict(StrEnum):
     """What to do with the poses."""
 
-    #: Certified, determined by the measurements, contradicted by none of them.
+    #: The answer is certified, and the measurements determine it and do not contradict it.
     USE = "use"
-    #: They may be right, but something speaks against them that a person should look at first.
+    #: The poses may be right, but a person should first look at the grounds.
     CARE = "care"
-    #: Some poses are known to be wrong, or could be others just as well.
+    #: Some poses are wrong, or the measurements do not determine them.
     DO_NOT_USE = "do_not_use"
 
     @property
     def words(self) -> str:
-        """How a sentence about it begins."""
+        """The instruction to the user."""
         return {
             Verdict.USE: "Use these poses",
             Verdict.CARE: "Use these poses with care",
@@ -34,34 +34,35 @@ class Verdict(StrEnum):
 class Ground(StrEnum):
     """What speaks against using the poses, the gravest first."""
 
-    #: No bound on the cost was found.
+    #: No lower bound of the cost was found.
     NO_BOUND = "no_bound"
-    #: The bound is below the cost: a better answer may exist.
+    #: The lower bound is below the cost: a better answer may exist.
     NOT_CERTIFIED = "not_certified"
     #: The measurements leave a direction free.
     NOT_UNIQUE = "not_unique"
     #: Most measurements of a sensor or target were left out as outliers.
     CONTRADICTED = "contradicted"
-    #: A size was taken as stated, and the measurements say another one.
+    #: The stated size of a target was used, but it does not fit the motion.
     SIZE_DOUBTED = "size_doubted"
 
     @property
     def verdict(self) -> Verdict:
-        """What it leads to."""
+        """The verdict to which this ground leads."""
         return Verdict.CARE if self in (Ground.NOT_CERTIFIED, Ground.SIZE_DOUBTED) else Verdict.DO_NOT_USE
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict and what it rests on.
+    """A verdict with its grounds.
 
     Attributes
     ----------
     verdict : Verdict
+        What to do with the poses.
     grounds : tuple of Ground
-        What speaks against using the poses, the gravest first; none for ``Verdict.USE``.
+        What speaks against using the poses, the gravest first; empty for ``Verdict.USE``.
     reason : str
-        The same in words.
+        The grounds in words.
     """
 
     verdict: Verdict
@@ -80,30 +81,29 @@ def judge(solution: Solution, refined: RefinedPoses | None = None, log: LogField
     solution : Solution
         The certified solution.
     refined : RefinedPoses, optional
-        What refining made of it.
+        The refined calibration.
     log : LogFields, optional
-        What became of the measurements of a log.
+        What became of the measurements, if they come from a log.
     """
     certificate = solution.certificate
     found: dict[Ground, str] = {}
     if certificate.status is Status.FAILED:
-        found[Ground.NO_BOUND] = "it is not proven that they are near the best answer, as no bound was found"
+        found[Ground.NO_BOUND] = "no lower bound of the cost was found, so a much better answer may exist"
     elif not certificate.is_optimal:
         found[Ground.NOT_CERTIFIED] = (
-            "it is not proven that no answer is better: the cost may be up to "
-            f"{100.0 * certificate.relative_gap:.2g} % above the lowest"
+            f"a better answer may exist; its cost would be lower by at most {100.0 * certificate.relative_gap:.2g} %"
         )
     is_unique = solution.identifiability.is_unique and certificate.status is not Status.CERTIFIED_NOT_UNIQUE
     if not is_unique or (refined is not None and refined.free_directions):
-        found[Ground.NOT_UNIQUE] = "the measurements do not determine all of them: others fit as well"
+        found[Ground.NOT_UNIQUE] = "the measurements do not determine all poses; other poses fit them equally well"
     if log is not None:
         if log.contradicted:
-            found[Ground.CONTRADICTED] = "; ".join(log.contradictions)
+            found[Ground.CONTRADICTED] = "; ".join(map(str, log.contradicted))
         doubted = [size.target for size in log.sizes if size.is_doubted and not size.is_free]
         if doubted:
             found[Ground.SIZE_DOUBTED] = f"the stated size of {', '.join(doubted)} does not fit the motion"
     if found:
         worst = max((ground.verdict for ground in found), key=list(Verdict).index)
         return Judgement(worst, tuple(found), "; ".join(found.values()))
-    answer = "they are" if refined is None else "the answer that they were refined from is"
-    return Judgement(Verdict.USE, (), f"{answer} proven optimal, and the measurements determine every pose")
+    answer = "the answer" if refined is None else "the certified answer, where the refinement began,"
+    return Judgement(Verdict.USE, (), f"{answer} is proven optimal, and the measurements determine every pose")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -57,11 +58,9 @@ def test_what_contradicts_is_named_with_its_exit_status_and_in_all_that_is_writt
     )
     assert done.returncode == 6, done.stdout + done.stderr
     said = " ".join(done.stdout.split())
-    assert "Do not use these poses: cam_1: " in said
-    assert "cam_0: " not in said.split("contradict the answer")[0]
+    assert re.match(r"Do not use these poses: \d+ of \d+ measurements of cam_1 contradict the answer\.", said)
     assert "The clock of cam_1 was taken as given" in said
-    assert json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))["log"]["contradicted"] == [
-        "cam_1"
-    ]
+    log_fields = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))["log"]
+    assert [counts["frame"] for counts in log_fields["contradicted"]] == ["cam_1"]
     for name in ("static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml"):
-        assert "Do not use these poses: cam_1: " in (tmp_path / "out" / name).read_text(encoding="utf-8")
+        assert "measurements of cam_1 contradict" in (tmp_path / "out" / name).read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.datasets.demo_log import demo_truth
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind, slots_of
 from gtsam_rwhec.report.demo_report import hidden_sentences, print_demo, truth_table
-from gtsam_rwhec.results.stage_reports import LogFields, SizeFields, TrackCount
+from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TrackCount
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -40,7 +40,7 @@ def found() -> tuple[rw.RefinedPoses, LogFields]:
     log = stored.log.model_copy(
         update={
             "detection": stored.log.detection.model_copy(update={"tracks": tracks}),
-            "outliers": (TrackCount(target="tag_2", sensor="cam_left", used=17),),
+            "outliers": (OutlierCount(target="tag_2", sensor="cam_left", used=17),),
             "sizes": (SizeFields(target="board", stated_m=0.041, scale=1.0251, sigma=1e-4, is_free=True),),
         }
     )

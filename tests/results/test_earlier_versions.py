@@ -92,6 +92,18 @@ def test_version_3_has_what_became_of_the_log() -> None:
     assert [track.used for track in log.outliers] == [track["used"] for track in raw["log"]["outliers"]]
 
 
+def test_version_3_counted_outliers_by_reason_and_only_named_contradicted_frames(tmp_path: Path) -> None:
+    _, raw = stored(3)
+    first = raw["log"]["outliers"][0]
+    first["removed"] = {"outlier (robust estimation)": 2 * first["used"]}
+    raw["log"]["contradicted"] = [first["sensor"]]
+    (tmp_path / "result.json").write_text(json.dumps(raw), encoding="utf-8")
+    log = read_result(tmp_path / "result.json").log
+    assert log is not None
+    assert log.outliers[0].left_out == 2 * first["used"]
+    assert (log.contradicted[0].frame, log.contradicted[0].left_out) == (first["sensor"], 2 * first["used"])
+
+
 def test_version_1_was_not_refined() -> None:
     with pytest.raises(rw.errors.FileFormatError, match="was not refined"):
         rw.read_refined(stored(1)[0])
@@ -110,5 +122,5 @@ def test_damage_is_refused_with_the_version(damage: Any, said: str, tmp_path: Pa
     _, raw = stored(2)
     damage(raw)
     (tmp_path / "damaged.json").write_text(json.dumps(raw), encoding="utf-8")
-    with pytest.raises(rw.errors.FileFormatError, match=f"not a sound result of version 2.*{said}"):
+    with pytest.raises(rw.errors.FileFormatError, match=f"not a valid result of version 2.*{said}"):
         rw.read_solution(tmp_path / "damaged.json")

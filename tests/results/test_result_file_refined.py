@@ -128,7 +128,7 @@ def test_infinite_is_null(tmp_path: Path) -> None:
 
 def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
     rw.write_solution(rw.solve(general(1, 1, seed=5, noise=NOISE).problem), tmp_path / "solution.json")
-    with pytest.raises(FileFormatError, match=r"was not refined; read it with read_solution, or refine"):
+    with pytest.raises(FileFormatError, match=r"was not refined\. Read it with read_solution, or refine"):
         rw.read_refined(tmp_path / "solution.json")
 
 
@@ -140,7 +140,7 @@ def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
         (lambda raw: raw["refined"]["joint"]["unit"].__setitem__(3, 0.0), "$.refined.joint.unit[3]"),
         (lambda raw: raw["refined"]["joint"]["free"].pop(), "slots have 24 rows"),
         (lambda raw: raw["refined"]["joint"]["slots"].update(moon=[0, 6]), "have no value: moon"),
-        (lambda raw: raw["refined"]["frames"].popitem(), "frames and moved are not of the targets and sensors"),
+        (lambda raw: raw["refined"]["frames"].popitem(), "frames and moved must have the targets and sensors"),
         (lambda raw: raw["sensors"][0].pop("translation_m"), "$.sensors[0].translation_m"),
         (lambda raw: raw["refined"].update(speed=1), "$.refined.speed"),
         (lambda raw: raw["refined"]["noise"][1].update(degrees_of_freedom=[1.0]), "degrees_of_freedom"),

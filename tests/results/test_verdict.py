@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.results.log_history import FrameOutliers, LogFields, SizeFields
 from gtsam_rwhec.results.result_file import Result, read_result
-from gtsam_rwhec.results.stage_reports import LogFields, SizeFields, TrackCount
 from gtsam_rwhec.results.verdict import Ground, Verdict, judge
 
 GOLDEN = Path(__file__).parents[1] / "golden"
+CONTRADICTED = FrameOutliers(frame="cam_side", left_out=20, measurements=23)
 
 
 @pytest.fixture(scope="module")
@@ -61,11 +62,10 @@ def changed(log: LogFields | None, **fields: Any) -> LogFields:
 
 
 def test_contradicted_frames_are_not_to_be_used(result: Result) -> None:
-    tracks = (TrackCount(target="tag_7", sensor="cam_side", used=3, removed={"outlier": 20}),)
-    log = changed(result.log, contradicted=("cam_side",), outliers=tracks)
+    log = changed(result.log, contradicted=(CONTRADICTED,))
     judgement = judge(result.solution, result.refined, log)
     assert (judgement.verdict, judgement.grounds) == (Verdict.DO_NOT_USE, (Ground.CONTRADICTED,))
-    assert "cam_side: 20 of its 23 measurements contradict the answer" in judgement.reason
+    assert "20 of 23 measurements of cam_side contradict the answer" in judgement.reason
 
 
 @pytest.mark.parametrize(("is_free", "verdict"), [(False, Verdict.CARE), (True, Verdict.USE)])
@@ -76,7 +76,7 @@ def test_a_doubted_size_asks_for_care_unless_it_was_estimated(result: Result, is
 
 def test_the_worst_ground_decides_and_all_are_said(result: Result) -> None:
     size = SizeFields(target="tag_7", stated_m=0.1, scale=1.02, sigma=0.001, is_free=False)
-    log = changed(result.log, contradicted=("cam_side",), sizes=(size,))
+    log = changed(result.log, contradicted=(CONTRADICTED,), sizes=(size,))
     judgement = judge(with_status(result.solution, rw.Status.GAP), result.refined, log)
     assert judgement.verdict is Verdict.DO_NOT_USE
     assert judgement.grounds == (Ground.NOT_CERTIFIED, Ground.CONTRADICTED, Ground.SIZE_DOUBTED)

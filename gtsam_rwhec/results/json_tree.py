@@ -1,0 +1,115 @@
+"""Records as trees of JSON values and back, bit for bit; and what is wrong with a file, in words.
+
+Pydantic reads and checks the records. These functions do what pydantic (2.14, tried) does not. Its JSON has null for
+NaN and for both infinities, and none of these becomes a float again. A key that is a pair becomes the text "a,b", which
+does not become a pair again. It does not know gtsam.Pose3, arrays and slices.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from pydantic import ValidationError
+
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.solver.certificate import Certificate
+
+#: Fields at the top of a file: those of the refined answer if there is one, else those of the certified answer.
+POSED = ("sensors", "targets", "scale", "scale_mode")
+#: Fields whose keys are pairs. JSON has no such keys: a file has rows {target, sensor, ...}.
+ROWS = ("residuals", "pairs", "noise", "inlier_counts")
+#: The field in which a record says in words what it means. It is for people and is not read back.
+SENTENCE = "sentence"
+#: Fields that may be infinite, and the infinity for which null stands in each.
+INFINITIES = {
+    **dict.fromkeys(("lower_bound", "float_bound", "min_eigenvalue"), -math.inf),
+    **dict.fromkeys(("weakest", "degrees_of_freedom", "standard_deviations_deg", "standard_deviations_mm"), math.inf),
+}
+
+
+def to_json(value: Any, place: str, field: str = "") -> Any:
+    """Turn a record into JSON values: null for infinity, rows for `ROWS`, and its sentence if it has one.
+
+    Raises
+    ------
+    ValueError
+        A number is infinite or NaN in a field where it must be finite.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        tree = {f.name: to_json(getattr(value, f.name), f"{place}.{f.name}", f.name) for f in fields(value)}
+        return {**tree, SENTENCE: str(value)} if isinstance(value, Certificate | FreeDirection) else tree
+    if isinstance(value, Mapping):
+        if field in ROWS:
+            return [
+                {**pair._asdict(), **(item if isinstance(item, dict) else {"value": item})}
+                for pair, item in ((pair, to_json(item, f"{place}[{pair}]", field)) for pair, item in value.items())
+            ]
+        return {str(key): to_json(item, f"{place}.{key}", field) for key, item in value.items()}
+    if isinstance(value, slice):
+        return [value.start, value.stop]
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [to_json(item, f"{place}[{index}]", field) for index, item in enumerate(value)]
+    if not isinstance(value, float) or math.isfinite(value):
+        return None if isinstance(value, gtsam.Pose3) else value  # `pose_rows` writes poses
+    if value == INFINITIES.get(field):
+        return None
+    allowed = f", or {INFINITIES[field]} (null)" if field in INFINITIES else ""
+    raise ValueError(f"{place}: must be finite{allowed} (found {value})")
+
+
+def from_json(value: Any, place: str, field: str) -> Any:
+    """Reverse `to_json`; a pair that is a key becomes its JSON text.
+
+    Raises
+    ------
+    ValueError
+        A number is infinite or NaN, or a row lacks its target or sensor.
+    """
+    if isinstance(value, dict):
+        told = {key: item for key, item in value.items() if key != SENTENCE or not isinstance(item, str)}
+        return {key: from_json(item, f"{place}.{key}", key) for key, item in told.items()}
+    if isinstance(value, list) and field in ROWS and all(isinstance(row, dict) for row in value):
+        rows = {}
+        for index, row in enumerate(from_json(value, place, "")):
+            if not {"target", "sensor"} <= row.keys():
+                raise ValueError(f"{place}[{index}]: a target and a sensor are missing")
+            key = json.dumps([row.pop("target"), row.pop("sensor")])
+            rows[key] = row["value"] if row.keys() == {"value"} else row
+        return rows
+    if isinstance(value, list):
+        return [from_json(item, f"{place}[{index}]", field) for index, item in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{place}: {value} is not a number of JSON")
+    return INFINITIES[field] if value is None and field in INFINITIES else value
+
+
+def in_words(error: Exception) -> str:
+    """What is wrong with a file: of pydantic's error, each fault with its JSON path, the first three in full."""
+    if isinstance(error, KeyError):
+        return f"it lacks {error}."
+    if not isinstance(error, ValidationError):
+        return f"{error}."
+    faults = []
+    for fault in error.errors(include_url=False):
+        keys = fault["loc"][1:] if fault["loc"][:1] == ("refined",) and fault["loc"][1] in POSED else fault["loc"]
+        place = "$" + "".join(_step(key) for key in keys)
+        given = repr(fault["input"])
+        value = f" (found {given})" if len(given) <= 60 and fault["type"] != "missing" else ""
+        faults.append(f"{place}: {fault['msg'].removeprefix('Value error, ')}{value}")
+    rest = f"; and {len(faults) - 3} more" if len(faults) > 3 else ""
+    return "; ".join(faults[:3]) + rest + "."
+
+
+def _step(key: int | str) -> str:
+    """One step of a JSON path; a key that begins with [ is a pair already."""
+    if isinstance(key, int):
+        return f"[{key}]"
+    return key if key.startswith("[") else f".{key}"

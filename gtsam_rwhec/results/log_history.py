@@ -1,0 +1,178 @@
+"""What became of the measurements of a log: what each stage used, and what it removed, with the reasons.
+
+The logs that stages write hold these records, and so does the result file.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Annotated, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from gtsam_rwhec.problem.pairs import Pair
+
+#: Standard deviations by which a stated size must differ from the measured size before it is doubted.
+SIZE_SIGMAS = 5.0
+#: Share by which a stated size must differ as well: printers, calipers and intrinsics are seldom better.
+SIZE_SHARE = 0.004
+#: Seconds whose nanoseconds fit 64 bits; rig files have the same limit.
+Seconds: TypeAlias = Annotated[float, Field(ge=-4e9, le=4e9)]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class _Count(_Record):
+    """How many measurements of one target by one sensor were used."""
+
+    target: str = Field(description="the target's name")
+    sensor: str = Field(description="the sensor's name")
+    used: int = Field(description="measurements that went on to the next stage")
+
+    @property
+    def pair(self) -> Pair:
+        """The pair that was counted."""
+        return Pair(self.target, self.sensor)
+
+
+class TrackCount(_Count):
+    """How many measurements of a pair a stage used, and how many it removed for which reason."""
+
+    removed: dict[str, int] = Field(default={}, description="number of removed measurements, by reason")
+
+    def __str__(self) -> str:
+        return f"{self.target} in {self.sensor}: {', '.join(f'{count} {why}' for why, count in self.removed.items())}"
+
+    @property
+    def seen(self) -> int:
+        """Number of measurements, used and removed."""
+        return self.used + sum(self.removed.values())
+
+
+class OutlierCount(_Count):
+    """How many measurements of a pair the answer uses, and how many were left out as outliers."""
+
+    left_out: int = Field(default=0, description="measurements that were left out as outliers")
+
+
+class FrameOutliers(_Record):
+    """How many measurements of one sensor or target were left out as outliers."""
+
+    frame: str = Field(description="name of the sensor or target")
+    left_out: int = Field(description="measurements that were left out as outliers")
+    measurements: int = Field(description="all measurements of the frame, with the outliers")
+
+    def __str__(self) -> str:
+        return f"{self.left_out} of {self.measurements} measurements of {self.frame} contradict the answer"
+
+    @property
+    def is_majority(self) -> bool:
+        """Whether more than half of the measurements are outliers."""
+        return 2 * self.left_out > self.measurements
+
+
+class DetectionReport(_Record):
+    """What the detection stage reports."""
+
+    sources: tuple[str, ...] = Field(description="file names of the logs")
+    images: dict[str, int] = Field(description="number of images, or of a detection driver's messages, by sensor")
+    undecoded: dict[str, tuple[str, ...]] = Field(description="images that could not be used, and why, by sensor")
+    tracks: tuple[TrackCount, ...] = Field(description="detections of each target in each sensor")
+    strangers: dict[str, int] = Field(description="how often a tag was seen that is no target, by family and id")
+    unseen: tuple[str, ...] = Field(default=(), description="targets that no sensor saw")
+    corner_px: dict[str, float] = Field(
+        description="measured standard deviation of a corner along each axis, pixels, by target/sensor"
+    )
+
+
+class CleaningReport(_Record):
+    """What the cleaning stage reports."""
+
+    tracks: tuple[TrackCount, ...] = Field(description="measurements of each target by each sensor")
+    time_offsets_s: dict[str, Seconds] = Field(
+        description="by sensor, at which the carriers' poses were taken: as given, or found from turning rates"
+    )
+    coarse_sigma_s: dict[str, float] = Field(
+        description="standard deviations of the time offsets that were found from turning rates"
+    )
+
+
+class SizeFields(_Record):
+    """What the measurements say about a target's stated size."""
+
+    target: str = Field(description="the target's name")
+    stated_m: float = Field(description="the length in the rig file, metres")
+    scale: float = Field(description="stated length / true length")
+    sigma: float | None = Field(description="standard deviation of scale; null where the motion does not determine it")
+    is_free: bool = Field(description="true: the size was estimated, as it does not fit the motion, or on request")
+
+    @property
+    def percent_too_large(self) -> float:
+        """By how much the stated size exceeds the true size, percent; negative where it is too small."""
+        return 100.0 * (self.scale - 1.0)
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether the measurements contradict the stated size clearly, and by a share that matters."""
+        off = abs(self.scale - 1.0)
+        return self.sigma is not None and off > SIZE_SHARE and off > SIZE_SIGMAS * self.sigma
+
+
+class TimeOffsetFields(_Record):
+    """The time offset of a sensor's clock."""
+
+    sensor: str = Field(description="the sensor's name")
+    offset_s: Seconds = Field(description="the sensor's stamp t is the carriers' t + offset")
+    sigma_s: float | None = Field(
+        description="standard deviation; null where the offset was given, or the motion does not determine it"
+    )
+
+
+class LogFields(_Record):
+    """Where a calibration's measurements came from, and what became of them."""
+
+    sensor_carrier: str = Field(description="name of the frame that carries the sensors")
+    target_carrier: str = Field(description="name of the frame that carries the targets")
+    detection: DetectionReport = Field(description="what the detection stage reported")
+    cleaning: CleaningReport = Field(description="what the cleaning stage reported")
+    outliers: tuple[OutlierCount, ...] = Field(description="measurements in the answer, and outliers, of each pair")
+    sizes: tuple[SizeFields, ...] = Field(description="what the measurements say about the stated sizes")
+    time_offsets: tuple[TimeOffsetFields, ...] = Field(description="time offset of every sensor that was used")
+    contradicted: tuple[FrameOutliers, ...] = Field(
+        default=(), description="sensors and targets whose poses must not be used"
+    )
+
+
+def contradictions(outliers: Iterable[OutlierCount]) -> tuple[FrameOutliers, ...]:
+    """The sensors and targets of which more than half of the measurements were left out as outliers.
+
+    Then the answer is as likely to be wrong as the outliers are: a clock, a size or a mounting may have changed. The
+    frame with most outliers comes first. Its outliers then count for no other frame: the targets are not to blame for
+    a camera that contradicts all of them.
+    """
+    rest = outliers = tuple(outliers)
+    everything = _by_frame(outliers)
+    names: list[str] = []
+    while majorities := [counts for counts in _by_frame(rest).values() if counts.is_majority]:
+        names.append(max(majorities, key=lambda counts: counts.left_out).frame)
+        rest = tuple(count for count in rest if names[-1] not in count.pair)
+    # A frame that was seen only together with contradicted frames rests on them.
+    known = {*names, *_by_frame(rest)}
+    names += [name for name, counts in everything.items() if name not in known and counts.is_majority]
+    return tuple(everything[name] for name in names)
+
+
+def _by_frame(outliers: Iterable[OutlierCount]) -> dict[str, FrameOutliers]:
+    """The counts of each sensor and target, over all its pairs."""
+    left_out, measurements = Counter[str](), Counter[str]()
+    for count in outliers:
+        for name in count.pair:
+            left_out[name] += count.left_out
+            measurements[name] += count.left_out + count.used
+    return {
+        name: FrameOutliers(frame=name, left_out=left_out[name], measurements=number)
+        for name, number in measurements.items()
+    }

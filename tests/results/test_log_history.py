@@ -1,0 +1,37 @@
+"""What became of the measurements of a log."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import ValidationError
+
+from gtsam_rwhec.results.log_history import FrameOutliers, OutlierCount, TrackCount, contradictions
+
+
+def names(*outliers: OutlierCount) -> list[str]:
+    return [counts.frame for counts in contradictions(outliers)]
+
+
+def test_a_frame_most_of_whose_measurements_were_left_out_is_contradicted() -> None:
+    good = OutlierCount(target="tag", sensor="left", used=40, left_out=3)
+    bad = OutlierCount(target="tag", sensor="right", used=4, left_out=30)
+    assert contradictions([good]) == ()
+    assert contradictions([good, bad]) == (FrameOutliers(frame="right", left_out=30, measurements=34),)
+    assert str(contradictions([good, bad])[0]) == "30 of 34 measurements of right contradict the answer"
+
+
+def test_targets_are_not_to_blame_for_a_camera() -> None:
+    def pair(target: str, sensor: str, used: int, left_out: int) -> OutlierCount:
+        return OutlierCount(target=target, sensor=sensor, used=used, left_out=left_out)
+
+    of_one = [pair("a", "right", 4, 60), pair("b", "right", 2, 70)]
+    assert names(pair("a", "left", 40, 3), pair("b", "left", 30, 1), *of_one) == ["right"]
+    # Nothing but the camera saw b: where it is rests on that camera alone.
+    assert names(pair("a", "left", 40, 3), *of_one) == ["right", "b"]
+    assert set(names(pair("a", "right", 1, 60))) == {"a", "right"}
+    assert names() == []
+
+
+def test_unknown_fields_are_refused() -> None:
+    with pytest.raises(ValidationError):
+        TrackCount.model_validate({"target": "t", "sensor": "s", "used": 1, "lost": 2})
