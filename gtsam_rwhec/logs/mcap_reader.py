@@ -147,11 +147,11 @@ class Log:
 
         The files' index leads to them: a file without an index, or a truncated file, has none.
         """
-        return {entry.name: dict(entry.metadata) for entry in self._indexed(McapReader.iter_metadata)}
+        return {entry.name: dict(entry.metadata) for entry in self._indexed(lambda reader: reader.iter_metadata())}
 
     def attachment(self, name: str) -> bytes | None:
         """The content that is attached under a name, found as `metadata` is; None where there is none."""
-        found = [entry.data for entry in self._indexed(McapReader.iter_attachments) if entry.name == name]
+        found = [entry.data for entry in self._indexed(lambda reader: reader.iter_attachments()) if entry.name == name]
         return found[-1] if found else None
 
     def _indexed(self, entries: Callable[[McapReader], Iterator[_Entry]]) -> Iterator[_Entry]:

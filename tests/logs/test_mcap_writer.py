@@ -90,6 +90,9 @@ def test_annotations_metadata_and_attachments(tmp_path: Path) -> None:
         assert b'"text": "tag 7"' in message.data
         assert [m.metadata for m in reader.iter_metadata()] == [{"gap": "1e-9"}]
         assert [(a.name, a.data) for a in reader.iter_attachments()] == [("result.json", b"{}")]
+    with open_log(path) as log:
+        assert log.metadata() == {"certificate": {"gap": "1e-9"}}
+        assert (log.attachment("result.json"), log.attachment("nothing")) == (b"{}", None)
 
 
 def raw_log(path: Path) -> Path:
