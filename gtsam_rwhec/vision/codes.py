@@ -1,14 +1,14 @@
-"""Which tag of a family a quadrangle is, for many quadrangles and the whole family at once.
+"""The ids of tags in many quadrangles, read against a whole family at once.
 
-OpenCV compares one candidate with one code after another: in large families this takes most of the time of detection,
-with OpenCV 5 nearly all of it. So it is given only the tags that are looked for, and those of no target are found and
-read here, once an image for all families and without OpenCV's care for the last of them. (The candidates that OpenCV
-rejects will not do: of a tag and the outline of its white margin it hands out one.)
+OpenCV compares each candidate with one code after another: in large families this takes most of the time of detection,
+with OpenCV 5 nearly all of it. Therefore OpenCV searches only for the targets' tags. Tags of no target are found and
+read here, once in each image for all families; a few of them may be missed. OpenCV's rejected candidates cannot serve:
+of a tag and the outline of its white margin OpenCV returns only one.
 
 Measured on 2026-11-21 with OpenCV 5.0.0 on the shipped log's images of 640 x 480, two families, one core
 (tests/benchmarks/own_code_against_libraries.py): finding and reading every quadrangle takes 6 ms an image as here, 38
 ms with ``Dictionary.identify`` for each quadrangle, and 255 ms with ``ArucoDetector`` and whole families. Detection of
-the targets takes 13 ms. All three read the same tags.
+the targets takes 13 ms. All three ways read the same tags.
 """
 
 from __future__ import annotations
@@ -20,24 +20,32 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.dictionaries import dictionary
+from gtsam_rwhec.vision.edge_geometry import from_unit_square
 from gtsam_rwhec.vision.images import Gray
 
-#: A quadrangle's edges: window (pixels) and difference of the threshold, how far a contour may be off as a share of its
-#: length, and its shortest side: a tag of 8 modules has 1.5 pixels for each.
-WINDOW, DARKER, OFF, LEAST_PX = 23, 7, 0.03, 12.0
-#: Looks into a cell along each side, as shares of it.
+#: Window of the adaptive threshold, pixels.
+WINDOW = 23
+#: A dark pixel is darker than the mean of its window by this gray value.
+DARKER = 7
+#: Largest distance of a contour from its quadrangle, as a share of the contour's length.
+OFF = 0.03
+#: Shortest side of a quadrangle, pixels: 1.5 for each of a tag's 8 modules.
+LEAST_PX = 12.0
+#: Places of samples along each side of a cell, as shares of the side.
 LOOKS = np.array([0.3, 0.5, 0.7])
-#: Below this difference of its darkest and brightest cells a quadrangle is one gray.
+#: Least difference between the brightest and the darkest cells of a tag, gray values.
 LEAST_CONTRAST = 15.0
-#: Shares of wrong bits: of the border's, and of those that a family's distances allow to correct (OpenCV's).
-BORDER_ERRORS, CORRECTED = 0.35, 0.6
-#: Quadrangles whose middles are nearer than this share of the smaller one are one tag.
+#: Largest share of wrong bits in a border (OpenCV's value).
+BORDER_ERRORS = 0.35
+#: Share of the bits that a family's distances allow to correct and that are corrected (OpenCV's value).
+CORRECTED = 0.6
+#: Quadrangles whose middles are nearer than this share of the smaller quadrangle's size are one tag.
 SAME_TAG = 0.25
 
 
 @cache
 def codes(family: str) -> tuple[Array, int]:
-    """Bits of a family's tags, 1 and -1, and how many of a tag's may be wrong: (count, 4, n n), turned by quarters."""
+    """Bits (count, 4, n n) of a family's tags in four quarter turns, 1 and -1, and how many bits may be wrong."""
     tags = dictionary(family)
     n = int(tags.markerSize)
     bits = np.array([cv2.aruco.Dictionary.getBitsFromByteList(row[None], n) for row in tags.bytesList])
@@ -67,7 +75,7 @@ def quadrangles(gray: Gray) -> Array:
 
 
 def identified(gray: Gray, quads: Array, family: str, border_bits: int = 1) -> np.ndarray:
-    """Ids (N,) of quadrangles (N, 4, 2), pixels, clockwise; -1 for what is no tag of the family."""
+    """Ids (N,) of quadrangles (N, 4, 2), pixels, clockwise; -1 where a quadrangle is no tag of the family."""
     signs, correctable = codes(family)
     n = round(np.sqrt(signs.shape[2]))
     white = _white_cells(gray, quads, n + 2 * border_bits)
@@ -86,12 +94,14 @@ def identified(gray: Gray, quads: Array, family: str, border_bits: int = 1) -> n
 
 
 def _white_cells(gray: Gray, quads: Array, modules: int) -> np.ndarray:
-    """(N, modules, modules) booleans: which cells are white; all of them where there is no contrast."""
+    """Which cells are white: (N, modules, modules) booleans, all true where there is no contrast."""
     if not len(quads):
         return np.ones((0, modules, modules), dtype=bool)
     along = ((np.arange(modules)[:, None] + LOOKS) / modules).ravel()
     places = np.stack(np.broadcast_arrays(along, along[:, None], 1.0), axis=-1).reshape(-1, 3)
-    seen = places @ _from_unit_square(quads).transpose(0, 2, 1)
+    # Three corners on a line give no finite homography and no tag.
+    H = np.nan_to_num(from_unit_square(quads), posinf=0.0, neginf=0.0)
+    seen = places @ H.transpose(0, 2, 1)
     x, y = ((seen[..., i] / seen[..., 2]).astype(np.float32) for i in range(2))
     looks = cv2.remap(gray, x, y, cv2.INTER_LINEAR).astype(np.float32)
     cells = looks.reshape(len(quads), modules, len(LOOKS), modules, len(LOOKS)).mean(axis=(2, 4))
@@ -100,24 +110,8 @@ def _white_cells(gray: Gray, quads: Array, modules: int) -> np.ndarray:
     return white
 
 
-def _from_unit_square(quads: Array) -> Array:
-    """Homographies (N, 3, 3) that take (0, 0), (1, 0), (1, 1), (0, 1) to the corners (N, 4, 2)."""
-    first, second, third, fourth = quads.transpose(1, 0, 2)
-    bend = first - second + third - fourth
-    sides = np.stack([second - third, fourth - third], axis=2)  # bend = sides (g, h), from the corner (1, 1)
-    det = np.linalg.det(sides)
-    sides[np.abs(det) < 1e-9] = np.eye(2)  # three corners on a line: no tag, whatever is read
-    gh = np.linalg.solve(sides, bend[..., None])[..., 0]
-    H = np.ones((len(quads), 3, 3))
-    H[:, :2, 0] = second - first + gh[:, :1] * second
-    H[:, :2, 1] = fourth - first + gh[:, 1:] * fourth
-    H[:, :2, 2] = first
-    H[:, 2, :2] = gh
-    return H
-
-
 def unlike(quads: Array, others: Array) -> Array:
-    """Those of quadrangles (N, 4, 2) that are neither one of others (M, 4, 2) nor a second find of an earlier one."""
+    """The quadrangles (N, 4, 2) that are neither among others (M, 4, 2) nor the same tag as an earlier quadrangle."""
     everything = np.concatenate([others, quads])
     middles = everything.mean(axis=1)
     size = np.linalg.norm(everything - middles[:, None], axis=2).mean(axis=1)

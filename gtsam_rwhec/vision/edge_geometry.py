@@ -1,4 +1,4 @@
-"""Of tags' sides in images: gray values between pixels, lines through points, the square behind four corners."""
+"""Geometry of tags' sides: gray values between pixels, lines through points, homographies from the unit square."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.images import Gray
 
-#: Points further from their line than this many times the median are an occluder's.
+#: Points further from their line than this many times the median distance belong to something in front of the tag.
 GROSS = 3.5
 
 
 def median(values: Array, count: np.ndarray) -> Array:
-    """(...) medians of the first `count` of values (..., n) by size; the others are infinite."""
+    """Medians (...) of values (..., n); the last n - count values by size are infinite and do not count."""
     middle = np.maximum((count - 1) // 2, 0)[..., None]
     found: Array = np.take_along_axis(np.sort(values, axis=-1), middle, axis=-1)[..., 0]
     return found
 
 
 def area(corners: Array) -> Array:
-    """(N,) areas of quadrangles (N, 4, 2), pixels^2: half the cross product of the diagonals."""
+    """Areas (N,) of quadrangles (N, 4, 2), pixels^2: half the cross product of the diagonals."""
     first, second = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     found: Array = 0.5 * np.abs(_cross(first, second))
     return found
 
 
 def sampled(stack: Gray, image_of: np.ndarray, points: Array) -> Array:
-    """Bilinear gray values at points (N, ..., 2) of each one's image; borders go on outside.
+    """Bilinear gray values at points (N, ..., 2), each point in its own image; the border's values go on outside.
 
-    (cv2.remap rounds places to 1/32 of a pixel.)
+    Not by cv2.remap, which rounds places to 1/32 of a pixel.
     """
     _, height, width = stack.shape
     x = np.clip(np.nan_to_num(points[..., 0]), 0.0, width - 1.001)
@@ -44,7 +44,7 @@ def sampled(stack: Gray, image_of: np.ndarray, points: Array) -> Array:
 
 
 def lines_through(x: Array, good: np.ndarray, least: int) -> Array:
-    """Homogeneous lines (N, 4, 3) through points (N, 4, P, 2); nan where fewer than `least` are good."""
+    """Homogeneous lines (N, 4, 3) through points (N, 4, P, 2); nan where fewer than `least` points are good."""
     weight = np.where(good & np.isfinite(x).all(axis=-1), 1.0, 0.0)
     x = np.nan_to_num(x)
     for _ in range(3):
@@ -65,7 +65,7 @@ def lines_through(x: Array, good: np.ndarray, least: int) -> Array:
 
 
 def crossings(lines: Array) -> Array:
-    """Corners (N, 4, 2) where homogeneous lines (N, 4, 3) of sides meet: side k - 1 and side k in corner k."""
+    """Corners (N, 4, 2) of homogeneous lines (N, 4, 3) along sides: sides k - 1 and k meet in corner k."""
     met = np.cross(np.roll(lines, 1, axis=1), lines)
     with np.errstate(invalid="ignore", divide="ignore"):
         corners: Array = met[..., :2] / met[..., 2:]
@@ -85,7 +85,7 @@ def from_unit_square(corners: Array) -> Array:
 
 
 def mapped(H: Array, x: Array, y: float) -> Array:
-    """Points (..., P, 2) where homographies (..., 3, 3) take (x, y), x (P,)."""
+    """Points (..., P, 2) to which homographies (..., 3, 3) take (x, y), x (P,)."""
     places = H[..., None, :, 0] * x[:, None] + H[..., None, :, 1] * y + H[..., None, :, 2]
     with np.errstate(invalid="ignore", divide="ignore"):
         points: Array = places[..., :2] / places[..., 2:]

@@ -1,8 +1,8 @@
-"""Where the edge of a tag's border is along a profile across it, by a model of what is printed there.
+"""The place of a tag's edge along a profile across it, from a model of the printed pattern.
 
-From inside: the code's cell (black or white, not known), one module of black border, the paper, and where that may end,
-a module further, whatever is behind; all blurred alike. Blur of half a module mixes them, and without the neighbours
-the edge would be found too far inside, a tag's four edges alike.
+From inside outwards a profile crosses the code's cell (black or white, not known), one module of black border, and one
+module of paper or more; the background beyond the paper is not known. Blur mixes all four. A model without the
+neighbours of the edge would place all four edges of a tag too far inside where the blur is half a module.
 """
 
 from __future__ import annotations
@@ -14,17 +14,29 @@ from scipy.special import ndtr
 
 from gtsam_rwhec.geometry.poses import Array
 
-#: Prior standard deviations: of what is beyond the border and beyond the paper, in units of the edge's step; of the
-#: edge's shift and of the blur's change in one round, in units of the blur. They only keep columns apart that the
-#: samples do not: held against so much noise (in units of the step) they weigh next to nothing.
-BEYOND, SHIFT, NOISE = 2.0, 1.0, 0.01
+#: Prior standard deviation of the gray values beyond the border and beyond the paper, in units of the edge's step.
+BEYOND = 2.0
+#: Prior standard deviation of the edge's shift and of the blur's change in one round, in units of the blur.
+SHIFT = 1.0
+#: Noise of a sample, in units of the step. With so little noise the priors only separate columns that the samples do
+#: not separate.
+NOISE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Of profiles (...): how far outwards the edge is, by what the blur differs, the step's height, what is left.
+    """Edges that were fitted to profiles (...).
 
-    `shift` and `wider` are in the profiles' unit of length, `rms` in units of the step.
+    Attributes
+    ----------
+    shift : (...) array
+        How far outwards the edge is, in the profiles' unit of length.
+    wider : (...) array
+        By how much the blur is wider than assumed, in the same unit.
+    step : (...) array
+        By how much the paper is lighter than the border.
+    rms : (...) array
+        Root mean square of the residuals, in units of the step.
     """
 
     shift: Array
@@ -34,26 +46,26 @@ class Fitted:
 
 
 def fit_profiles(values: Array, places: Array, module: Array, blur: Array, step: Array) -> Fitted:
-    """One Gauss-Newton step from an edge at 0.
+    """Fit edges to profiles by one Gauss-Newton step from an edge at 0.
 
     Parameters
     ----------
     values : (..., S) array
         Gray values.
     places : (..., S) array
-        Where, from inside (negative) outwards.
+        Places of the values, from inside (negative) outwards.
     module : (...) array
-        How far inside the code begins.
+        Distance from the edge inwards to the code.
     blur : (...) array
-        Standard deviation.
+        Standard deviation of the blur.
     step : (...) array
         About how much lighter the paper is than the border: a scale for the priors.
     """
     sigma = blur[..., None]
     z = places / sigma
     inner, outer = (places + module[..., None]) / sigma, (places - module[..., None]) / sigma
-    columns = [np.ones_like(z), ndtr(z), ndtr(-inner), ndtr(outer), -_bell(z), -z * _bell(z)]
-    K = np.stack(columns, axis=-1)
+    bell = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+    K = np.stack([np.ones_like(z), ndtr(z), ndtr(-inner), ndtr(outer), -bell, -z * bell], axis=-1)
     prior = np.array([0.0, 0.0, *[(NOISE / BEYOND) ** 2] * 2, *[(NOISE / SHIFT) ** 2] * 2])
     H = np.swapaxes(K, -1, -2) @ K + np.diag(prior) + 1e-9 * np.eye(6)
     y = values / step[..., None]
@@ -61,8 +73,3 @@ def fit_profiles(values: Array, places: Array, module: Array, blur: Array, step:
     rms = np.sqrt(((np.einsum("...sk,...k->...s", K, c) - y) ** 2).mean(axis=-1))
     height = np.where(np.abs(c[..., 1]) > 1e-3, c[..., 1], np.nan)
     return Fitted(c[..., 4] / height * blur, c[..., 5] / height * blur, c[..., 1] * step, rms / np.abs(height))
-
-
-def _bell(z: Array) -> Array:
-    density: Array = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
-    return density

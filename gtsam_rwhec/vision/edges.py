@@ -1,10 +1,10 @@
 """Corners of tags from their edges.
 
-A corner detector's window holds a right angle, and blur rounds it: the corner moves inwards, by tenths of a pixel, all
-four alike, so that the tag looks smaller and further away. A straight edge stays where it is under any symmetric blur.
-So: the edge's place across a number of profiles along each side, a line through them in undistorted coordinates, and
-the corners where the lines meet. First by the area under each profile, which needs no start; then by a model of the
-neighbours that blur into it (`edge_profiles`).
+Blur rounds the right angle in a corner detector's window: all four corners move inwards by tenths of a pixel, and the
+tag looks smaller and further away. A straight edge stays where it is under any symmetric blur. Therefore each side is
+found in profiles across it, a line is fitted to each side in undistorted coordinates, and the lines meet in the
+corners. The area under each profile gives a first place of the edge and needs no start; then a model of the edge's
+neighbours, which blur into it, gives the place (`edge_profiles`).
 """
 
 from __future__ import annotations
@@ -20,22 +20,42 @@ from gtsam_rwhec.vision.edge_geometry import area, crossings, from_unit_square, 
 from gtsam_rwhec.vision.edge_profiles import fit_profiles
 from gtsam_rwhec.vision.images import Gray
 
-#: Profiles along a side, over this part of it (near the corners two edges mix), and how many must be good.
-PROFILES, PART, LEAST = 18, (0.12, 0.88), 6
+#: Profiles along a side.
+PROFILES = 18
+#: The part of a side that has profiles: near the corners two edges mix.
+PART = (0.12, 0.88)
+#: Good profiles that a line needs.
+LEAST = 6
 #: Samples across an edge.
 SAMPLES = 13
-#: How far a first profile reaches inwards and outwards, in modules of the tag, and in pixels at most. Inwards the code
-#: may be white a module away and must not blur into it; outwards the paper may end.
-INWARDS, OUTWARDS, REACH_PX = 0.55, 0.7, 5.0
-#: As far in modules where the model is, which knows of both; and at most so many standard deviations of the blur, and
-#: pixels more.
-MODEL_INWARDS, MODEL_OUTWARDS, BLURS, MORE_PX = 1.1, 0.9, 3.5, 1.5
-#: Of areas, and of the model.
-ROUNDS, MODEL_ROUNDS = 2, 3
-#: The blur is at least this (pixels, a pixel's own), and at most so many modules: beyond, no code is read.
-LEAST_BLUR_PX, MOST_BLUR = 0.35, 1.0
-#: Of a profile, in units of its step: what the model may leave, and how high the step must be for it to count.
-MOST_LEFT, LEAST_STEP, LEAST_GRAY = 0.15, 0.5, 8.0
+#: Reach of a first profile inwards, modules: a white cell of the code, a module away, must not blur into the profile.
+INWARDS = 0.55
+#: Reach of a first profile outwards, modules: the paper may end.
+OUTWARDS = 0.7
+#: Reach of a first profile at most, pixels.
+REACH_PX = 5.0
+#: Reach of the model's profiles inwards, modules: the model contains the code.
+MODEL_INWARDS = 1.1
+#: Reach of the model's profiles outwards, modules: the model contains the paper's end.
+MODEL_OUTWARDS = 0.9
+#: Reach of the model's profiles at most: standard deviations of the blur.
+BLURS = 3.5
+#: Reach of the model's profiles at most: pixels beyond `BLURS`.
+MORE_PX = 1.5
+#: Rounds by areas.
+ROUNDS = 2
+#: Rounds by the model.
+MODEL_ROUNDS = 3
+#: Least blur, pixels: a pixel's own.
+LEAST_BLUR_PX = 0.35
+#: Largest blur, modules: beyond it no code can be read.
+MOST_BLUR = 1.0
+#: Largest root mean square of a good profile's residuals, in units of the step.
+MOST_LEFT = 0.15
+#: Least step of a good profile, as a share of the tag's step.
+LEAST_STEP = 0.5
+#: Least step of a tag, gray values.
+LEAST_GRAY = 8.0
 
 
 @dataclass(frozen=True)
@@ -45,9 +65,9 @@ class RefinedCorners:
     Attributes
     ----------
     corners_px : (N, 4, 2) array
-        nan where the edges were not found.
+        Pixels; nan where the edges were not found.
     blur_px : (N,) array
-        Standard deviation of the blur across the edges, of the side where it is largest; a pixel's own is in it.
+        Standard deviation of the blur across the edges, on the side with the largest blur; contains a pixel's own blur.
     """
 
     corners_px: Array
@@ -57,19 +77,19 @@ class RefinedCorners:
 def refine_corners(
     images: Sequence[Gray], image_of: np.ndarray, corners_px: Array, camera: Camera, modules: int
 ) -> RefinedCorners:
-    """Refine corners of tags that are dark on light, of several images at once.
+    """Refine the corners of dark tags on light paper, in several images at once.
 
     Parameters
     ----------
     images : sequence of (height, width) uint8
-        Of one size.
+        Images of one size.
     image_of : (N,) integers
-        Each tag's.
+        The number of each tag's image.
     corners_px : (N, 4, 2) array
-        In order around the tag, within a pixel or two.
+        Corners in order around the tag, right to a pixel or two.
     camera : Camera
     modules : int
-        Along a side, borders included: how far a profile may reach inwards before it meets the code.
+        Modules along a side with both borders: they tell where the code begins.
     """
     corners = corners_px.copy()
     blur = np.full(len(corners), np.nan)
@@ -106,7 +126,7 @@ def _by_areas(stack: Gray, image_of: np.ndarray, corners: Array, camera: Camera,
     outward = np.sign(np.einsum("nki,nki->nk", normal, 0.5 * (start + end) - middle))
     normal *= outward[..., None]
     share = np.linspace(*PART, PROFILES)
-    # Across a slanted tag there is less than its sides are long: its area over the longest.
+    # A slanted tag is narrower than its sides are long: take its area over its longest side.
     with np.errstate(invalid="ignore", divide="ignore"):
         module = area(corners) / length[..., 0].max(axis=1) / modules  # (N,)
     inwards, outwards = np.minimum(INWARDS * module, REACH_PX), np.minimum(OUTWARDS * module, REACH_PX)
@@ -114,20 +134,19 @@ def _by_areas(stack: Gray, image_of: np.ndarray, corners: Array, camera: Camera,
     u = np.linspace(0.0, 1.0, SAMPLES)
     d = u * reach[..., 0] - inwards[:, None]
     foot = start[:, :, None] + share[:, None] * length[:, :, None] * along[:, :, None]  # (N, 4, P, 2)
-    # (N, 4, P, S, 2): from inside the dark border outwards
+    # (N, 4, P, S, 2): from the dark border outwards
     points = foot[:, :, :, None] + d[:, None, None, :, None] * normal[:, :, None, None]
     profile = sampled(stack, image_of, points)
     dark, light = profile[..., 0], profile[..., -2:].mean(axis=-1)
     contrast = light - dark  # (N, 4, P)
-    # Black is as black all along a side, and one sample alone is noisy; white is as white as the light makes it there.
+    # Black is equal along a side, and a single sample is noisy: take the median. White varies with the light.
     black = np.median(dark, axis=2, keepdims=True)[..., None]
     with np.errstate(invalid="ignore", divide="ignore"):
         rise = (profile - black) / (light[..., None] - black)
-        # The area under the rise tells where a step with the same plateaus would be, whatever its (symmetric) blur.
-        place = 1.0 - (rise.sum(axis=-1) - 0.5 * (rise[..., 0] + rise[..., -1])) / (
-            SAMPLES - 1
-        )  # in units of reach, from its inner end
-        # The rise is the blur's distribution function: its variance is the second moment of its differences.
+        # The area under the rise gives the place of a step with the same plateaus, under any symmetric blur. The unit
+        # is the reach, from its inner end.
+        place = 1.0 - np.trapezoid(rise, u, axis=-1)
+        # The rise is the blur's distribution function: the second moment of its differences is the blur's variance.
         centres = 0.5 * (u[1:] + u[:-1])
         mass = np.diff(rise, axis=-1)
         variance = (mass * (centres - place[..., None]) ** 2).sum(axis=-1)
@@ -137,7 +156,7 @@ def _by_areas(stack: Gray, image_of: np.ndarray, corners: Array, camera: Camera,
     off = np.where(good, place, 0.0) * reach - inwards[:, None, None]
     edge = foot + off[..., None] * normal[:, :, None]
     refined = _corners(camera, edge, good)
-    # Further than the profiles reach, nothing was seen.
+    # A corner that moves further than the profiles reach is not measured.
     moved = np.linalg.norm(refined - corners, axis=-1).max(axis=1)
     refined = np.where((moved[:, None, None] < reach + 0.5), refined, np.nan)
     middle_one = median(np.where(good, variance, np.inf).reshape(len(corners), -1), good.sum(axis=(1, 2)))
@@ -147,15 +166,15 @@ def _by_areas(stack: Gray, image_of: np.ndarray, corners: Array, camera: Camera,
 
 
 def _corners(camera: Camera, edge: Array, good: np.ndarray) -> Array:
-    """(N, 4, 2) where lines through the good ones of points on edges (N, 4, P, 2) meet, in undistorted coordinates."""
+    """Corners (N, 4, 2) from the good points on edges (N, 4, P, 2), by lines in undistorted coordinates."""
     with np.errstate(invalid="ignore", over="ignore"):
         return camera.pixels(crossings(lines_through(camera.undistort(edge), good, LEAST)))
 
 
 def _by_model(stack: Gray, image_of: np.ndarray, edges: _Edges, camera: Camera, modules: int) -> _Edges:
-    """One round from edges that are right to a pixel."""
+    """Refine edges that are right to a pixel, by one round of the model."""
     x = camera.undistort(edges.corners_px)
-    # Of each side: the square that it is the first side of.
+    # For each side: the square whose first side it is.
     H = from_unit_square(np.stack([np.roll(x, -k, axis=1) for k in range(4)], axis=1))
     share = np.linspace(*PART, PROFILES)
     foot, inner = (camera.pixels(mapped(H, share, y)) for y in (0.0, 1.0 / modules))  # (N, 4, P, 2)

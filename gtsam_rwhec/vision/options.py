@@ -1,4 +1,4 @@
-"""Options of detection."""
+"""The options of detection: limits, and the noise of corners."""
 
 from __future__ import annotations
 
@@ -11,26 +11,29 @@ from gtsam_rwhec.errors import OptionError
 
 @dataclass(frozen=True)
 class DetectionOptions:
-    """When a detection is not used. What is rejected is counted by reason, and stays in the log that is written.
+    """Limits beyond which a detection is not used.
+
+    Rejected detections are counted by reason and stay in the log that is written.
 
     Attributes
     ----------
     min_side_px : float
-        Shortest side of a tag (of a board's bounding box): below it corners move by large shares of it.
+        Least length of a tag's sides, or of a board's bounding box, pixels: errors of corners are a large share of a
+        shorter side.
     min_corners : int
-        Corners of a board.
+        Least number of a board's corners.
     max_blur_px : float
-        Standard deviation of the blur across a tag's edges: motion or focus.
+        Largest standard deviation of the blur across a tag's edges, pixels. Motion and wrong focus blur.
     max_grazing_deg : float
-        Between the line of sight and the target's normal.
+        Largest angle between the line of sight and the target's normal, degrees; 90 is from the side.
     max_reprojection_px : float
-        Root mean square over a detection's corners.
+        Largest root mean square of the reprojection errors of a detection's corners, pixels.
     ambiguity_margin : float
-        How much less likely (difference of log-likelihoods) the other one of a plane's two poses must be, after the
-        whole track has been looked at.
+        Least difference of log-likelihoods between the chosen pose of a plane and its other candidate, over the whole
+        track.
     corner_px : float
-        Standard deviation of a corner along each axis, from which covariances are propagated; with ``noise: estimate``
-        only their proportions count.
+        Standard deviation of a corner along each axis, pixels: it gives the poses' covariances. With ``noise:
+        estimate`` only the proportions of the covariances count.
     """
 
     min_side_px: float = 12.0
@@ -47,4 +50,6 @@ class DetectionOptions:
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not (0.0 < value < np.inf):
                 raise OptionError(f"DetectionOptions.{field.name}={value!r}; give a positive number")
         if self.max_grazing_deg > 90.0:
-            raise OptionError(f"DetectionOptions.max_grazing_deg={self.max_grazing_deg!r}; 90 is from the side")
+            raise OptionError(
+                f"DetectionOptions.max_grazing_deg={self.max_grazing_deg!r}; give at most 90, which is from the side"
+            )

@@ -1,8 +1,8 @@
 """Poses of flat targets from their corners: both of a plane's two candidates, refined, with covariances.
 
-IPPE (Collins and Bartoli 2014, as OpenCV has it) gives two poses; each is refined by Gauss-Newton on the reprojection
-error in pixels, all of an image at once. Far or nearly frontal planes have two minima of nearly the same error; which
-is the right one no single image tells (`ambiguity`).
+IPPE (Collins and Bartoli 2014, in OpenCV) gives two poses. Gauss-Newton on the reprojection error in pixels refines
+both, for all targets at once. A far or nearly frontal plane has two minima of nearly the same error: a single image
+does not tell which minimum is right (see `ambiguity`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 
+#: Steps of Gauss-Newton, at most.
 STEPS = 15
 #: The iteration ends when costs change by less than this share.
 SETTLED = 1e-9
@@ -24,20 +25,20 @@ SETTLED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PlanePoses:
-    """Poses of N flat targets, two candidates each, the better first.
+    """Poses of N flat targets, two candidates for each target, the better candidate first.
 
     Attributes
     ----------
     T : (N, 2, 4, 4) array
-        T_camera_target, metres; nan where none was found.
+        T_camera_target, metres; nan where no pose was found.
     squared_px : (N, 2) array
         Sums of squared reprojection errors, px^2.
     reprojection_px : (N, 2) array
-        Root mean square over corners (of the error's length).
+        Root mean square over corners of the error's length, px.
     covariance : (N, 2, 6, 6) array
-        Of the right perturbation, rotation first, from corner noise along each axis.
+        Covariance of the right perturbation [omega (rad), v (m)], from corner noise.
     errors_px : (N, n, 2) array
-        Of the better candidate's corners, seen minus predicted; nan where a target has fewer corners.
+        Seen minus predicted corners of the better candidate; nan where a target has fewer corners.
     """
 
     T: Array
@@ -56,9 +57,9 @@ def plane_poses(
     ----------
     camera : Camera
     corners_m : sequence of (n_i, 3) arrays
-        In each target's frame, z = 0; four or more.
+        In each target's frame, z = 0; four corners or more.
     corners_px : sequence of (n_i, 2) arrays
-        Where they were seen.
+        Where the corners were seen.
     corner_px : float
         Standard deviation of a corner along each axis, pixels.
     """
@@ -80,11 +81,11 @@ def plane_poses(
 
 
 def _ippe(points: Array, x: Array) -> Array:
-    """(2, 4, 4): IPPE's two poses from normalised coordinates; nan for what it does not find."""
+    """IPPE's two poses (2, 4, 4) from normalised coordinates; nan for a pose that is not found."""
     T = np.full((2, 4, 4), np.nan)
     if not np.isfinite(x).all():
         return T
-    # OpenCV's is wrong, or divides by zero, for what is exactly frontal or on the axis: with a little noise it is not.
+    # OpenCV is wrong, or divides by zero, for targets that are exactly frontal or on the axis: add a little noise.
     aside = np.stack([np.cos(np.arange(len(x))), np.sin(2.0 * np.arange(len(x)))], axis=1) * np.ptp(x, axis=0).max()
     for share in (1e-6, 1e-5):
         try:
@@ -92,7 +93,7 @@ def _ippe(points: Array, x: Array) -> Array:
                 points[:, None], (x + share * aside)[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
             )
         except cv2.error:
-            return T  # corners on one line
+            return T  # The corners are on one line.
         if all(np.isfinite(turn).all() for turn in rotations):
             break
     for k, (turn, t) in enumerate(zip(rotations[:2], translations[:2], strict=True)):
@@ -105,7 +106,7 @@ def _ippe(points: Array, x: Array) -> Array:
 def _refined(
     camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, corner_px: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Gauss-Newton, damped where a step does not help: T, sum of squares, covariances, errors (N, 2, n, 2)."""
+    """Damped Gauss-Newton: T, sums of squares, covariances, errors (N, 2, n, 2)."""
     T = T.copy()
     errors, J = _linearised(camera, T, p, u, known)
     cost = np.einsum("ncki,ncki->nc", errors, errors)
@@ -113,7 +114,7 @@ def _refined(
     with np.errstate(invalid="ignore"):
         for _ in range(STEPS):
             H = np.einsum("nckia,nckib->ncab", J, J)
-            g = np.einsum("nckia,ncki->nca", J, errors)
+            g = np.einsum("nckia,ncki->nca", J, errors)[..., None]
             diagonal = np.einsum("ncaa->nca", H)
             step = _solved(H + np.eye(6) * (damping[..., None] * diagonal + 1e-12)[..., None, :], g)
             tried = T @ se3.expmap(np.nan_to_num(step).reshape(-1, 6)).reshape(T.shape)
@@ -124,22 +125,21 @@ def _refined(
                 np.where(better.reshape(better.shape + (1,) * (a.ndim - 2)), b, a)
                 for a, b in ((T, tried), (errors, new_errors), (J, new_J))
             )
-            # Worse by rounding alone is as settled as better by rounding alone.
+            # A change within rounding is settled, for the better or for the worse.
             moved = np.abs(cost - new_cost) > SETTLED * (1e-6 + cost)
             cost = np.where(better, new_cost, cost)
             damping = np.where(better, damping * 0.1, np.maximum(damping, 1e-6) * 100.0)
             if not (moved & (better | (damping < 1.0))).any():
                 break
     H = np.einsum("nckia,nckib->ncab", J, J) / corner_px**2
-    eye = np.broadcast_to(np.eye(6), H.shape)
-    covariance = _solved(H, eye)
+    covariance = _solved(H, np.broadcast_to(np.eye(6), H.shape))
     covariance = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
     cost = np.where(np.isfinite(T).all(axis=(-1, -2)) & np.isfinite(covariance).all(axis=(-1, -2)), cost, np.nan)
     return T, cost, covariance, errors
 
 
 def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray) -> tuple[Array, Array]:
-    """Errors (N, 2, n, 2), seen minus predicted, and the predictions' derivatives (N, 2, n, 2, 6).
+    """Errors (N, 2, n, 2), seen minus predicted, and the derivatives (N, 2, n, 2, 6) of the predictions.
 
     A right perturbation [omega, v] moves a point of the target by R (omega x p + v) in the camera's frame.
     """
@@ -152,29 +152,20 @@ def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray)
         # d(x, y)/d(X, Y, Z) = [I, -x] / Z
         to_x = np.concatenate([np.broadcast_to(np.eye(2), (*x.shape, 2)), -x[..., None]], axis=-1) / z[..., None, None]
         DR = D @ to_x @ R[:, :, None]
-    moved = np.concatenate([-_skew(p), np.broadcast_to(np.eye(3), (*p.shape, 3))], axis=-1)
+    moved = np.concatenate([-se3.hat(p), np.broadcast_to(np.eye(3), (*p.shape, 3))], axis=-1)
     J = DR @ moved[:, None]
     errors = u[:, None] - pixels
     mask = known[:, None, :, None]
     return np.where(mask, errors, 0.0), np.where(mask[..., None], J, 0.0)
 
 
-def _skew(p: Array) -> Array:
-    zero = np.zeros(p.shape[:-1])
-    rows = [zero, -p[..., 2], p[..., 1], p[..., 2], zero, -p[..., 0], -p[..., 1], p[..., 0], zero]
-    return np.stack(rows, axis=-1).reshape(*p.shape, 3)
-
-
 def _solved(H: Array, g: Array) -> Array:
-    """H^-1 g where H is finite and regular, nan elsewhere; g (..., 6) or (..., 6, 6)."""
+    """H^-1 g, g (..., 6, n); nan where H is not finite or singular."""
     bad = np.asarray(~np.isfinite(H).all(axis=(-1, -2)))
-    # Units differ (rad, m): scale to a unit diagonal before judging and solving.
+    # Units differ (rad, m): scale to a unit diagonal before the test and the solution.
     unit = np.sqrt(np.where(bad[..., None], 1.0, np.maximum(np.einsum("...aa->...a", H), 1e-300)))
     scaled = np.where(bad[..., None, None], np.eye(6), H / (unit[..., :, None] * unit[..., None, :]))
     bad |= np.linalg.eigvalsh(scaled)[..., 0] < 1e-14
     scaled = np.where(bad[..., None, None], np.eye(6), scaled)
-    if g.ndim == H.ndim:
-        result = np.linalg.solve(scaled, np.nan_to_num(g) / unit[..., :, None]) / unit[..., :, None]
-        return np.where(bad[..., None, None], np.nan, result)
-    result = np.linalg.solve(scaled, (np.nan_to_num(g) / unit)[..., None])[..., 0] / unit
-    return np.where(bad[..., None], np.nan, result)
+    result = np.linalg.solve(scaled, np.nan_to_num(g) / unit[..., None]) / unit[..., None]
+    return np.where(bad[..., None, None], np.nan, result)

@@ -1,4 +1,4 @@
-"""Why a detection is not used."""
+"""The reasons why a detection is not used."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Rejection(StrEnum):
-    """Why a detection is not used; the values are the words in logs, reports and pictures.
+    """Why a detection is not used. The values are the words in logs, reports and pictures.
 
     `DetectionOptions` has the limits.
     """

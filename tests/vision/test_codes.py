@@ -67,3 +67,9 @@ def test_double_borders() -> None:
     image = tag_in_perspective("tag36h11", 5, corners, border_bits=2)
     assert identified(image, corners[None], "tag36h11", 2).tolist() == [5]
     assert identified(image, corners[None], "tag36h11", 1).tolist() == [-1]
+
+
+def test_three_corners_on_a_line_are_no_tag() -> None:
+    gray = np.random.default_rng(0).integers(0, 256, (60, 60)).astype(np.uint8)
+    flat = np.array([[[10, 10], [30, 10], [50, 10], [10, 50]], [[10, 10], [10, 10], [10, 10], [10, 10]]], dtype=float)
+    assert identified(gray, flat, "tag36h11").tolist() == [-1, -1]

@@ -234,7 +234,7 @@ def test_grazing_is_the_angle_of_the_line_of_sight() -> None:
         ({"max_reprojection_px": np.inf}, "max_reprojection_px=inf"),
         ({"min_corners": True}, "min_corners=True"),
         ({"ambiguity_margin": "3"}, "ambiguity_margin='3'"),
-        ({"max_grazing_deg": 91.0}, "90 is from the side"),
+        ({"max_grazing_deg": 91.0}, "at most 90"),
     ],
 )
 def test_options_that_make_no_sense(changes: dict[str, float], words: str) -> None:
