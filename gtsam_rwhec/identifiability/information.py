@@ -1,9 +1,9 @@
-"""The Fisher information that a part's motions give about poses and scales, and what A's noise alone would create.
+"""The Fisher information that a part's motions give about poses and scales, and the share that A's noise creates.
 
 Parameters are what users perturb: for each free frame [omega, v], a right perturbation T Expmap(xi) in GTSAM's order
 (rad, m), and the logarithm of each unknown scale. The information is the *expected* one: B enters by its prediction
-Y^-1 A X at the answer, not by its noisy measurement, so that only A can feign excitation. It comes from the moments of
-A alone. With c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carrier's frame):
+Y^-1 A X at the answer, not by its noisy measurement, so that only the noise of A can pass for information. The moments
+of A suffice. With c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carrier's frame):
 
 - rotation residual, weight 2 kappa:        omega_X - (R_Y' R_A R_X)' omega_Y
 - translation residual, weight alpha^2/s^2: R_A R_X v_X - R_Y v_Y + c^ R_Y omega_Y + c dlog alpha
@@ -20,11 +20,11 @@ from gtsam_rwhec.problem.moments import ONE, R_A, T_A, T_B
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses
 
-#: No data are taken for more exact than this, in radians and as a part of the measured lengths: where the noise is
-#: zero, the eigenvalues' own rounding (1e-16 / floor^2) must not pass for information.
+#: No data count as more exact than this, in radians and as a part of the measured lengths: where the noise is zero,
+#: the rounding of the eigenvalues (1e-16 / floor^2) must not pass for information.
 FLOOR = 1e-7
-#: A pair's 15 parameters: the target's seven, the sensor's seven, the shared scale. A frame's seven: rotation,
-#: translation, logarithm of its own scale.
+#: The 15 parameters of a pair: seven of the target, seven of the sensor, the logarithm of the shared scale. The seven
+#: of a frame: rotation, translation, logarithm of its own scale.
 OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
 
 _UPPER = np.triu_indices(15, 1)
@@ -43,20 +43,15 @@ class PartVarianceFactors:
 
 
 def variance_factors(part: Part, J_t: Array, J_R: Array) -> PartVarianceFactors:
-    """Variance factors from the residuals at the optimum: the part's, or a pair's own where that is larger.
+    """Variance factors from the costs J_t, J_R (E,) of the pairs at the optimum, in the physical model.
 
-    J_t is sum |r|^2 / (2 sigma^2), expected 3 N / 2; J_R is sum kappa |dR|_F^2 / 2 = sum kappa theta^2, expected
-    3 N / 2 too, as each axis has variance 1 / (2 kappa). The part's are corrected for the unknowns that were fitted.
-
-    Parameters
-    ----------
-    part : Part
-    J_t, J_R : (E,) arrays
-        Of each pair, in the physical model.
+    A pair has the variance factor of the part, or its own where that is larger. J_t is sum |r|^2 / (2 sigma^2),
+    expected 3 N / 2; J_R is sum kappa |dR|_F^2 / 2 = sum kappa theta^2, expected 3 N / 2 too, as each axis has variance
+    1 / (2 kappa). The part's factors are corrected for the unknowns that were fitted.
     """
     counts, N = part.moments.count, part.number_of_measurements
     degrees_of_freedom = 6 * N - part.number_of_unknowns
-    if degrees_of_freedom <= 0:  # nothing tells the noise but the weights
+    if degrees_of_freedom <= 0:  # only the weights tell the noise
         return PartVarianceFactors(np.ones(len(counts)), np.ones(len(counts)), degrees_of_freedom)
     correction = 6.0 * N / degrees_of_freedom
     lengths = np.einsum("eii->e", part.moments.translation[:, T_B, T_B])
@@ -72,10 +67,10 @@ def variance_factors(part: Part, J_t: Array, J_R: Array) -> PartVarianceFactors:
 
 @dataclass(frozen=True)
 class PairInformation:
-    """Of every pair: rotation residuals' and translation residuals' information, and what noise alone would create.
+    """Of every pair: the information of its rotation and translation residuals, and what noise alone would create.
 
-    rotation, translation (E, 15, 15); noise_rotation, noise_translation (E, 15), diagonal; used (E, 15): the
-    parameters that exist; carrier_noise (E,) in rad^2, the largest variance an axis that A's rotations may have.
+    rotation, translation (E, 15, 15); noise_rotation, noise_translation (E, 15), diagonal; used (E, 15): whether the
+    pair has the parameter; carrier_noise (E,) in rad^2: the largest variance that an axis of A's rotations may have.
     """
 
     rotation: Array
@@ -89,13 +84,13 @@ class PairInformation:
 def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -> PairInformation:
     """The information of every pair and its noise, all pairs at once.
 
-    Noise in a direction that the true motions leave free: with A's rotation off by eps (variance q^2 an axis), what
-    was zero becomes eps x omega or eps x v, expected at 2 q^2 |.|^2; both ends move together along a free direction,
-    so each takes half. The residuals do not tell A's noise from B's, but they bound it: rotation residuals hold all
-    of it, so q^2 <= f_R / (2 kappa); translation residuals hold it at the end of a lever arm a, so
-    2 q^2 |a|^2 <= 3 f_t sigma^2. Where A turns wrongly about its target carrier's origin, as given, the arm is t_X;
-    about its sensor carrier's, it is c: the shorter one is safe. A's translation noise is at most f_t sigma^2 an axis:
-    2 f_t |omega_Y|^2, and 3 f_t for a scale.
+    In a direction that the true motions leave free, A's rotation error eps (variance q^2 an axis) turns a zero into
+    eps x omega or eps x v, with expected square 2 q^2 |.|^2. Both ends move together along a free direction, so each
+    takes half. The residuals do not separate A's noise from B's, but they bound A's noise: the rotation residuals hold
+    all of it, so q^2 <= f_R / (2 kappa); the translation residuals hold it at the end of a lever arm a, so
+    2 q^2 |a|^2 <= 3 f_t sigma^2. If A is wrongly turned about the origin of its target carrier, as given, the arm is
+    t_X; about the origin of its sensor carrier, the arm is c: the shorter arm is safe. A's translation noise is at most
+    f_t sigma^2 an axis: 2 f_t |omega_Y|^2, and 3 f_t for a scale.
     """
     E = len(part.pairs)
     R_X, t_X, R_Y, t_Y, alpha = poses.R_X, poses.t_X, poses.R_Y, poses.t_Y, poses.alpha
@@ -171,17 +166,15 @@ def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -
     return PairInformation(rotation, translation, noise_rotation, noise_translation, used, q2)
 
 
-_LEVI_CIVITA = np.zeros((3, 3, 3))
-for _i in range(3):
-    _LEVI_CIVITA[_i, (_i + 1) % 3, (_i + 2) % 3] = 1.0
-    _LEVI_CIVITA[_i, (_i + 2) % 3, (_i + 1) % 3] = -1.0
+#: eps_ijk: +1 or -1 for even and odd permutations of the axes.
+_LEVI_CIVITA = np.cross(np.eye(3)[:, None], np.eye(3)[None])
 
 
 @dataclass(frozen=True)
 class Information:
-    """Arrow-shaped: leaf (L, 7, 7), coupling (L, 7, 7 P + 1), border (7 P + 1 square), and the noise's diagonal.
+    """Arrow matrix: leaf (L, 7, 7), coupling (L, 7, 7 P + 1), border (7 P + 1 square); and the diagonal of the noise.
 
-    Order of the border: the centers' seven, then the logarithm of the shared scale.
+    The border has seven parameters of each center, then the logarithm of the shared scale.
     """
 
     leaf: Array
@@ -196,42 +189,41 @@ class Information:
 def information(part: Part, by_pair: Array, noise: Array, used: np.ndarray, priors: Array) -> Information:
     """Add up pairs' information (E, 15, 15) and noise (E, 15), and the priors' (n, 7) diagonal, along the graph."""
     L, P = len(part.leaves), len(part.centers)
+    n = L + P
     place = {name: i for i, name in enumerate(part.free)}
-    leaf, coupling = np.zeros((L, 7, 7)), np.zeros((L, 7, 7 * P + 1))
-    border = np.zeros((7 * P + 1, 7 * P + 1))
-    frame_noise, frame_used = np.zeros((L + P, 7)), np.zeros((L + P, 7), dtype=bool)
-    for e, pair in enumerate(part.pairs):
-        ends = [(place[name], slice(7 * end, 7 * end + 7)) for end, name in enumerate(pair) if name in place]
-        for i, at in ends:
-            frame_noise[i] += noise[e, at]
-            frame_used[i] |= used[e, at]
-            if i < L:
-                leaf[i] += by_pair[e, at, at]
-                coupling[i, :, -1] += by_pair[e, at, 14]
-            else:
-                own = slice(7 * (i - L), 7 * (i - L) + 7)
-                border[own, own] += by_pair[e, at, at]
-                border[own, -1] += by_pair[e, at, 14]
-        if len(ends) == 2 and not pair.is_motion:
-            (i, at_i), (j, at_j) = sorted(ends)
-            coupling[i, :, 7 * (j - L) : 7 * (j - L) + 7] += by_pair[e, at_i, at_j]
-    border[-1, :-1] = border[:-1, -1]
+    ends = np.array([[place.get(name, n) for name in pair] for pair in part.pairs])  # n: a fixed frame
+    # Of each frame alone; one row more takes what the fixed frames would get.
+    own, with_scale = np.zeros((n + 1, 7, 7)), np.zeros((n + 1, 7))
+    frame_noise, frame_used = np.zeros((n + 1, 7)), np.zeros((n + 1, 7), dtype=bool)
+    sides = slice(0, 7), slice(7, 14)
+    for frames, at in zip(ends.T, sides, strict=True):
+        np.add.at(own, frames, by_pair[:, at, at])
+        np.add.at(with_scale, frames, by_pair[:, at, 14])
+        np.add.at(frame_noise, frames, noise[:, at])
+        np.logical_or.at(frame_used, frames, used[:, at])
+    coupling, border = np.zeros((L, 7, 7 * P + 1)), np.zeros((7 * P + 1, 7 * P + 1))
+    for e in np.flatnonzero((ends < n).all(axis=1) & (ends[:, 0] != ends[:, 1])):
+        (i, at_i), (j, at_j) = sorted(zip(ends[e], sides, strict=True))  # the leaf before the center
+        coupling[i, :, 7 * (j - L) : 7 * (j - L) + 7] += by_pair[e, at_i, at_j]
+    coupling[:, :, -1] = with_scale[:L]
+    np.einsum("papb->pab", border[:-1, :-1].reshape(P, 7, P, 7))[...] = own[L:n]
+    border[-1, :-1] = border[:-1, -1] = with_scale[L:n].ravel()
     border[-1, -1] = by_pair[:, 14, 14].sum()
-    np.einsum("lii->li", leaf)[...] += priors[:L]
+    np.einsum("lii->li", own)[:L] += priors[:L]
     np.einsum("ii->i", border)[:-1] += priors[L:].ravel()
     return Information(
-        leaf,
+        own[:L],
         coupling,
         border,
         frame_noise[:L],
-        np.r_[frame_noise[L:].ravel(), noise[:, 14].sum()],
+        np.r_[frame_noise[L:n].ravel(), noise[:, 14].sum()],
         frame_used[:L],
-        np.r_[frame_used[L:].ravel(), used[:, 14].any()],
+        np.r_[frame_used[L:n].ravel(), used[:, 14].any()],
     )
 
 
 def prior_information(part: Part) -> tuple[Array, Array]:
-    """The priors' information, diagonal, for rotations and translations apart: (n, 7) each."""
+    """The diagonal of the priors' information about rotations (n, 7), and about translations (n, 7)."""
     rotation, translation = np.zeros((len(part.free), 7)), np.zeros((len(part.free), 7))
     for i, name in enumerate(part.free):
         for prior in part.priors.get(name, []):

@@ -1,15 +1,15 @@
 """Linear algebra on block-arrow matrices, which is the fill that Appendix B of the RWHEC paper shows.
 
-The graph is bipartite. With the larger side as *leaves* and the smaller as *border*, every matrix of this library is::
+The graph is bipartite. With the larger side as *leaves* and the smaller side as *border*, every matrix here is::
 
     [ D_1            C_1 ]        D (L, m, m)   one block a leaf; leaves never meet
     [      ...       ... ]        C (L, m, b)
     [           D_L  C_L ]        E (b, b)
     [ C_1' ...  C_L'   E ]
 
-and, where eliminated translations couple everything, minus a product G'G with few rows, which is an arrow matrix
-again with the border larger by G's rows: [[T, G'], [G, I]] is positive definite exactly when T - G'G is. Factoring
-costs time linear in the leaves.
+Where eliminated translations couple everything, a product G'G with few rows is subtracted. That is an arrow matrix
+again, with the border larger by the rows of G: [[T, G'], [G, I]] is positive definite exactly when T - G'G is. The
+time to factor grows linearly with the leaves.
 """
 
 from __future__ import annotations
@@ -39,6 +39,12 @@ class ArrowFactor:
         z_leaf = y - (wide @ z_border).reshape(y.shape)
         return backward_substitution(self.leaves, z_leaf), z_border
 
+    def solve_vector(self, v: Array) -> Array:
+        """Solve for one vector (L m + b,)."""
+        L, m = self.leaves.shape[:2]
+        leaf, border = self.solve(v[: L * m].reshape(L, m, 1), v[L * m :, None])
+        return np.concatenate([leaf.ravel(), border.ravel()])
+
 
 def flat(stack: Array) -> Array:
     """A stack (L, m, c) as one matrix (L m, c); for L = 0 or c = 0 too."""
@@ -46,18 +52,9 @@ def flat(stack: Array) -> Array:
 
 
 def with_low_rank(C: Array, E: Array, G_leaf: Array, G_border: Array) -> tuple[Array, Array]:
-    """Coupling and border of the arrow matrix that stands for (D, C, E) - G'G.
-
-    G_leaf is (k, L, m), G_border (k, b).
-    """
-    k = len(G_border)
+    """Coupling and border of the arrow matrix that stands for (D, C, E) - G'G; G_leaf (k, L, m), G_border (k, b)."""
     C_wide = np.concatenate([C, G_leaf.transpose(1, 2, 0)], axis=2)
-    b = len(E)
-    E_wide = np.empty((b + k, b + k))
-    E_wide[:b, :b] = E
-    E_wide[b:, :b] = G_border
-    E_wide[:b, b:] = G_border.T
-    E_wide[b:, b:] = np.eye(k)
+    E_wide = np.block([[E, G_border.T], [G_border, np.eye(len(G_border))]])
     return C_wide, E_wide
 
 
@@ -70,7 +67,7 @@ def cholesky(D: Array, C: Array, E: Array) -> ArrowFactor | None:
         border = np.linalg.cholesky(E - wide.T @ wide)
     except np.linalg.LinAlgError:
         return None
-    # LAPACK may let NaN and infinity pass as pivots; whatever holds one ends up on the diagonal.
+    # LAPACK may let NaN and infinity pass as pivots; they end up on the diagonal.
     if not (np.isfinite(np.einsum("lii->li", leaves)).all() and np.isfinite(np.diagonal(border)).all()):
         return None
     return ArrowFactor(leaves, coupling, border)
@@ -101,12 +98,10 @@ def backward_substitution(lower: Array, right: Array) -> Array:
 
 def dense(D: Array, C: Array, E: Array) -> Array:
     """The arrow matrix as one array."""
-    leaves, m = D.shape[:2]
-    size = leaves * m
+    L, m = D.shape[:2]
+    size = L * m
     full = np.zeros((size + len(E), size + len(E)))
-    for leaf in range(leaves):
-        block = slice(leaf * m, (leaf + 1) * m)
-        full[block, block] = D[leaf]
+    np.einsum("lilj->lij", full[:size, :size].reshape(L, m, L, m))[...] = D
     full[:size, size:] = C.reshape(size, len(E))
     full[size:, :size] = full[:size, size:].T
     full[size:, size:] = E

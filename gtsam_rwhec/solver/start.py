@@ -64,7 +64,7 @@ def _smallest_eigenvector(S: Array) -> Array:
 
 
 def _handedness(r: Array) -> float:
-    """+1 or -1, so that the blocks of r are right-handed (DESIGN fact 5)."""
+    """+1 or -1, so that the blocks of r are right-handed (design fact 5)."""
     determinants = np.linalg.det(unvec(r))
     return 1.0 if determinants.sum() >= 0.0 else -1.0
 
@@ -87,22 +87,19 @@ def unconstrained_start(form: ReducedForm) -> list[Array]:
     factor = arrow.cholesky(form.D + shift * np.eye(9), border, square)
     if factor is None:
         return []
-    split = 9 * form.leaves
-    k = len(form.G)
 
-    def solve(right: Array) -> Array:
-        leaf, rest = factor.solve(right[:split].reshape(-1, 9, 1), np.r_[right[split:], np.zeros(k)][:, None])
-        return np.concatenate([leaf.ravel(), rest[: len(rest) - k, 0]])
+    def solved(right: Array) -> Array:
+        return factor.solve_vector(np.r_[right, np.zeros(len(form.G))])[: len(right)]
 
     last = np.zeros(form.size)
     last[-1] = 1.0
     linear = form.apply(last)[:-1]
     candidates = []
     if np.abs(linear).max(initial=0.0) > 0.0:
-        candidates.append(solve(-linear))
+        candidates.append(solved(-linear))
     v: Array = np.ones(form.size - 1)
     for _ in range(8):
-        v = solve(v)
+        v = solved(v)
         v /= np.linalg.norm(v)
     candidates.append(v * _handedness(v))
     return [project(unvec(r)) for r in candidates]
