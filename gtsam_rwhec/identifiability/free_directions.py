@@ -1,4 +1,4 @@
-"""Free directions: how an answer may move while the measurements fit as well, up to their noise."""
+"""Free directions: how an answer can move while the measurements fit as well, up to their noise."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 
-#: A frame's share of a direction below this part of the largest share goes unsaid; directions of length 1 that turn the
-#: frames by less than this are called translations.
+#: A sentence leaves out a frame whose share is below this part of the largest share. A direction of length 1 that
+#: turns the frames by less than this (in rad) is a translation.
 SHARE = 0.05
-#: A sentence names this many frames and counts the others.
+#: A sentence names at most this many frames and counts the rest.
 NAMED = 4
-#: An axis within this angle of a coordinate axis is called by its name.
+#: A sentence names a coordinate axis where the direction is within 8 degrees of it.
 AXIS_COSINE = np.cos(np.radians(8.0))
-#: Motion that turned by this much (root mean square) did turn, even where the residuals are as large as its turning.
+#: A motion that turns by more than this (root mean square) really turned, even if its residuals are as large.
 TURNED_RAD = np.radians(3.0)
 
 Twist = tuple[float, float, float, float, float, float]
@@ -26,55 +26,51 @@ Twist = tuple[float, float, float, float, float, float]
 class FreeKind(StrEnum):
     """What moves along a free direction."""
 
-    #: A frame turns; its translation, or another frame, may move along.
+    #: A frame turns; its translation, or another frame, may move with it.
     ROTATION = "rotation"
     #: Frames translate, and nothing turns.
     TRANSLATION = "translation"
-    #: A scale changes; frames may translate along.
+    #: A scale changes; frames may translate with it.
     SCALE = "scale"
     #: A sensor's time offset changes.
     TIME_OFFSET = "time_offset"
-    #: No direction at the answer: another answer, elsewhere, costs as little.
+    #: No direction at the answer, but another answer far away that costs as little.
     TWIN = "twin"
-    #: Read from a file whose format has words only; ``FreeDirection.words`` are those.
+    #: Read from an older file that has only a sentence: ``FreeDirection.words``.
     WORDS = "words"
 
 
 class FreeReason(StrEnum):
-    """Why a direction is free."""
+    """Why a direction is free: the reason's name in files, and its words at the end of a sentence."""
 
-    #: Residuals as large as the motion: the poses contradict each other.
-    CONTRADICTION = "contradiction"
-    NO_ROTATION = "no_rotation"
-    ONE_AXIS = "one_axis"
+    words: str
+
+    CONTRADICTION = (
+        "contradiction",
+        "the rotation residuals are as large as the motion: check whether A or B is inverted and the order of the "
+        "quaternions",
+    )
+    NO_ROTATION = "no_rotation", "the motion did not turn"
+    ONE_AXIS = "one_axis", "the motion turned about one axis only"
     #: The motion turned enough, and still the information is no more than noise alone would create.
-    NOISE = "noise"
-    #: Translations of the frames make up for a change of the scale.
-    COMPENSATED = "compensated"
-    #: The carriers stood still, as far as the noise of their poses lets tell.
-    STANDSTILL = "standstill"
-    #: Half turns, or a symmetric motion, fit two answers.
-    SYMMETRY = "symmetry"
+    NOISE = "noise", "the measurements say no more about it than their noise would"
+    COMPENSATED = "compensated", "with these motions, translations of the frames make up for it"
+    STANDSTILL = "standstill", "the carriers moved no faster than the noise of their poses makes it seem"
+    SYMMETRY = "symmetry", "half turns, or a symmetric motion, fit both"
 
-
-_BECAUSE = {
-    FreeReason.CONTRADICTION: "the rotation residuals are as large as the motion: check whether A or B is inverted and "
-    "the order of the quaternions",
-    FreeReason.NO_ROTATION: "the motion did not turn",
-    FreeReason.ONE_AXIS: "the motion turned about one axis only",
-    FreeReason.NOISE: "the measurements say no more about it than their noise would",
-    FreeReason.COMPENSATED: "with these motions, translations of the frames make up for it",
-    FreeReason.STANDSTILL: "the carriers moved no faster than the noise of their poses makes it seem",
-    FreeReason.SYMMETRY: "half turns, or a symmetric motion, fit both",
-}
+    def __new__(cls, value: str, words: str) -> FreeReason:
+        """A member of the table."""
+        reason = str.__new__(cls, value)
+        reason._value_, reason.words = value, words
+        return reason
 
 
 @dataclass(frozen=True)
 class FreeDirection:
-    """One direction in which the answer may move while the measurements fit as well, up to their noise.
+    """One direction in which the answer can move while the measurements fit as well, up to their noise.
 
-    The direction has length 1 where a rotation of 1 rad, a translation of ``length_m``, a scale times e, and a time
-    offset of 1 s each count as 1. Its sign is arbitrary. ``str()`` says it in a sentence.
+    The direction has length 1, where a rotation of 1 rad, a translation of ``length_m``, a scale times e, and a time
+    offset of 1 s each count as 1. Its sign is arbitrary. ``str()`` is a sentence.
 
     Attributes
     ----------
@@ -108,18 +104,17 @@ class FreeDirection:
     def __str__(self) -> str:
         if self.reason is None:
             return self.words
-        because = _BECAUSE[self.reason]
         if self.kind is FreeKind.TWIN:
-            return f"another answer, far from this one, costs the same: {because}"
+            return f"another answer, far from this one, costs the same: {self.reason.words}"
         first, *others = self._movements()
         what = {FreeKind.ROTATION: "rotation of ", FreeKind.TRANSLATION: "translation of "}.get(self.kind, "change of ")
         more = len(others) + 1 - NAMED
         named = others[: NAMED - 1] + ([f"{more} more"] if more > 0 else [])
         together = f", together with {_listed(named)}" if named else ""
-        return f"{what}{first}{together}: {because}"
+        return f"{what}{first}{together}: {self.reason.words}"
 
     def _movements(self) -> Iterator[str]:
-        """What moves, that of the direction's kind first."""
+        """What moves; first what the direction's kind names."""
         twists = {name: np.array(twist) / np.repeat([1.0, self.length_m], 3) for name, twist in self.frames.items()}
         turns = {name: twist[:3] for name, twist in twists.items()}
         shifts = {name: twist[3:] for name, twist in twists.items()}
@@ -138,12 +133,12 @@ class FreeDirection:
 
 
 def reason_for(axes: int, turned_rad: float, residual_rad: float) -> FreeReason:
-    """Why something of a pair is free.
+    """Why a direction of a pair is free.
 
     Parameters
     ----------
     axes : int
-        About how many axes its motion turned, beyond the noise: 0, 1, or 2 for two and more.
+        Number of axes about which the pair's motion turned, beyond the noise: 0, 1, or 2 for two and more.
     turned_rad : float
         Root mean square of its turning, noise included.
     residual_rad : float
@@ -157,9 +152,9 @@ def reason_for(axes: int, turned_rad: float, residual_rad: float) -> FreeReason:
 def free_directions_of(
     names: tuple[str, ...], basis: Array, length_m: float, reasons: Mapping[str, FreeReason]
 ) -> tuple[FreeDirection, ...]:
-    """Records of the free directions that a basis spans: as many as it has columns, each as sparse as can be.
+    """Records of the free directions that a basis spans: as many as it has columns, each as sparse as possible.
 
-    Rotations come first, apart from directions that turn nothing; of these, changes of scales come first.
+    Directions that turn frames come first, then changes of scales, then translations.
 
     Parameters
     ----------
@@ -170,7 +165,7 @@ def free_directions_of(
     length_m : float
         How many metres count as one radian.
     reasons : dict of str to FreeReason
-        Of each frame (``reason_for``).
+        Reason of each frame, from ``reason_for``.
     """
     if basis.shape[1] == 0:
         return ()
@@ -178,7 +173,7 @@ def free_directions_of(
     weighed, _ = np.linalg.qr(basis / unit[:, None])
     row = np.tile(np.arange(7), len(names))
     is_turn, is_scale = np.r_[row < 3, False], np.r_[row == 6, True]
-    # Directions that turn nothing come apart from those that do: the right singular vectors of the rotations' rows.
+    # The right singular vectors of the rotations' rows separate directions that turn frames from the rest.
     _, s, Vt = np.linalg.svd(weighed[is_turn], full_matrices=True)
     turns = np.zeros(len(Vt), dtype=bool)
     turns[: len(s)] = s > SHARE
@@ -190,10 +185,10 @@ def free_directions_of(
 
 
 def _sparse(columns: Array, rows_first: list[np.ndarray]) -> Array:
-    """Another basis (d, k) of the columns' span, by elimination: each column has a row that the others lack.
+    """Another basis (d, k) of the columns' span, by elimination: each column has a row that is zero in the others.
 
-    ``rows_first``: masks (d,) of rows among which to look for such a row, one mask after the other. The same span gives
-    the same basis, whatever ``columns`` it is told by.
+    ``rows_first``: masks (d,) of the rows among which to look for such a row, one mask after the other. The same span
+    gives the same basis, whichever ``columns`` span it.
     """
     done: dict[int, Array] = {}
     for rows in rows_first:
@@ -202,7 +197,7 @@ def _sparse(columns: Array, rows_first: list[np.ndarray]) -> Array:
             if size.max() <= SHARE:
                 break
             pivot = int(np.argmax(size > 0.9 * size.max()))  # the first of several that are as large
-            along = np.linalg.svd(columns[pivot : pivot + 1])[2].T  # the first column is that row's, others lack it
+            along = np.linalg.svd(columns[pivot : pivot + 1])[2].T  # the row is zero in all columns but the first
             new, columns = columns @ along[:, 0], columns @ along[:, 1:]
             done = {row: column - new * (column[pivot] / new[pivot]) for row, column in done.items()} | {pivot: new}
     return np.column_stack([*done.values(), columns]) if done else columns

@@ -1,19 +1,19 @@
-"""What the motion can and cannot determine (RWHEC paper Section 6, DESIGN fact 8).
+"""What the motion can and cannot determine (RWHEC paper Section 6, design fact 8).
 
-Noise excites every direction a little, so rank says nothing on real data. A direction is called *free* when the
-information that the motions give of it is no more than the noise alone would feign there if the true motions left it
-open (``information.pair_information``). In units of that noise a free direction has a ratio of mean 1: a sum of about
-m = 2 N squares of noise over a noise variance estimated with nu degrees of freedom, an F variate. The threshold is its
-99.9 % quantile F(m, nu): a free direction is called determined once in a thousand. The noise of rotations
-and that of translations are estimated apart, each from about half of the degrees of freedom: three measurements with
-six of them ask for a ratio of 130, a hundred for 1.5.
+Noise excites every direction a little, so the rank decides nothing on real data. A direction counts as *free* when the
+motions give no more information about it than noise alone would create if the true motions left the direction open
+(``information.pair_information``). In units of that noise a free direction has a ratio of mean 1: a sum of about
+m = 2 N squares of noise over a noise variance estimated with nu degrees of freedom, an F variate. The threshold is the
+99.9 % quantile F(m, nu): a free direction counts as determined once in a thousand times. The noise of rotations and the
+noise of translations are estimated separately, each from about half of the degrees of freedom: three measurements with
+six degrees of freedom need a ratio of 130, a hundred measurements need 1.5.
 
-Rotation residuals know rotations only, so they are asked first; where they determine every rotation, the rest is about
-translations and scales at those rotations, and where not, everything is asked of all residuals together.
+Rotation residuals depend on rotations only, so rotations are tested first. If all rotations are determined, the second
+test is about translations and scales at those rotations; if not, one test of everything uses all residuals together.
 
 Corollaries 2 and 4 are the same test on one pair: rotations about two distinct axes leave nothing free. Theorems 1 and
-3 (one determined pair determines all that is connected) and endnote 9 (pairs that only together determine) need no
-rule of their own: information adds along the graph, and the whole is tested as the pairs are.
+3 (one determined pair determines all that is connected) and endnote 9 (pairs that determine only together) need no rule
+of their own: information adds along the graph, and the whole is tested as the pairs are.
 """
 
 from __future__ import annotations
@@ -40,8 +40,10 @@ from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses
 
-#: Above this many parameters the weakest directions are found by Lanczos on the arrow factor, not densely.
+#: Above this many parameters Lanczos on the arrow factor finds the weakest directions, not a dense decomposition.
 DENSE_PARAMETERS = 400
+#: Which of a pair's 15 parameters are rotations.
+_IS_ROTATION = np.isin(np.arange(15), (0, 1, 2, 7, 8, 9))
 
 
 @dataclass(frozen=True)
@@ -62,12 +64,8 @@ class _Weak:
         return float(self.values[0] / self.thresholds[0]) if len(self.values) else np.inf
 
 
-_IS_ROTATION = np.zeros(15, dtype=bool)
-_IS_ROTATION[[0, 1, 2, 7, 8, 9]] = True
-
-
 def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiability:
-    """Test every direction of a part, and of each of its pairs alone, at its answer.
+    """Test every direction of a part at an answer, and every direction of each pair alone.
 
     Parameters
     ----------
@@ -75,7 +73,7 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
     poses : PairPoses
         The answer.
     J_t, J_R : (E,) arrays
-        Costs of the pairs at the answer, in the physical model: they tell the noise.
+        Costs of the pairs at the answer, in the physical model; the noise is estimated from them.
     """
     noise = variance_factors(part, J_t, J_R)
     pairs = pair_information(part, poses, noise)
@@ -83,27 +81,25 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
     axes, turned = _rotation_axes(part, pairs.carrier_noise, noise.degrees_of_freedom)
     residual = np.sqrt(J_R / part.moments.kappa)  # J_R is sum kappa theta^2
     reasons = [reason_for(*of_pair) for of_pair in zip(axes, turned, residual, strict=True)]
-    of_each = _pairs(part, pairs, noise.degrees_of_freedom, axes, reasons, length)
     weak = _weakest_of_part(part, pairs, noise.degrees_of_freedom)
-    # The pair that turned most speaks for a frame.
-    speaks = {
-        name: max((a, e) for e, (a, pair) in enumerate(zip(axes, part.pairs, strict=True)) if name in pair)
+    # A frame has the reason of its pair that turned about most axes; of several such pairs, of the last one.
+    of_frame = {
+        name: reasons[max((a, e) for e, (a, pair) in enumerate(zip(axes, part.pairs, strict=True)) if name in pair)[1]]
         for name in part.free
     }
-    seen = {name: reasons[e] for name, (_, e) in speaks.items()}
-    free = free_directions_of(part.free, weak.directions[:, weak.free], length, seen)
+    free = free_directions_of(part.free, weak.directions[:, weak.free], length, of_frame)
     return Identifiability(
         is_unique=not free,
         free_directions=free,
         weakest=float(weak.values[0]) if len(weak.values) else np.inf,
         threshold=float(weak.thresholds[0]) if len(weak.values) else 0.0,
-        pairs=of_each,
+        pairs=_pairs(part, pairs, noise.degrees_of_freedom, axes, reasons, length),
         parts=(part.names,),
     )
 
 
 def _weakest_of_part(part: Part, pairs: PairInformation, degrees_of_freedom: int) -> _Weak:
-    """Rotations first; where they are all determined, the rest at those rotations, and else everything together."""
+    """Test rotations; then, if all are determined, the rest at those rotations, and else everything together."""
     index = {name: i for i, name in enumerate(part.free)}
     counts = np.zeros(len(index) + 1)
     for pair, count in zip(part.pairs, part.moments.count, strict=True):
@@ -131,17 +127,17 @@ def _weakest_of_part(part: Part, pairs: PairInformation, degrees_of_freedom: int
 
 
 def typical_length(part: Part) -> float:
-    """Root mean square of |t_B|, in metres: weighs radians against metres in words."""
+    """Root mean square of |t_B|, in metres: the length that counts as one radian in a sentence."""
     square = float(np.einsum("ekk->", part.moments.translation[:, T_B, T_B]))
     return float(np.sqrt(max(square / float(part.moments.weight.sum()), 1e-12)))
 
 
 def _rotation_axes(part: Part, noise: Array, degrees_of_freedom: int) -> tuple[list[int], Array]:
-    """About how many axes each pair's A turned (Corollary 2, tested against A's noise, (E,) rad^2): 0, 1 or 2;
-    and by how much, root mean square, in rad.
+    """About how many axes each pair's A turned (0, 1 or 2), and by how much (E,): root mean square, in rad.
 
-    The mean of R_A shortens every direction but a common axis: 1 - s^2 of its singular values is the mean square
-    sine of the turning that leaves that direction; noise alone makes it 2 q^2.
+    Corollary 2, tested against A's noise (E,), in rad^2. The mean of R_A shortens every direction but a common axis:
+    1 - s^2 of its singular values is the mean square sine of the turning that leaves that direction. Noise alone makes
+    it 2 q^2.
     """
     means = part.moments.translation[:, R_A, ONE].reshape(-1, 3, 3) / part.moments.weight[:, None, None]
     counts = part.moments.count
@@ -152,7 +148,7 @@ def _rotation_axes(part: Part, noise: Array, degrees_of_freedom: int) -> tuple[l
 
 
 def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak:
-    """The directions with the least information in units of noise; all that are free are among them."""
+    """The directions with the least information in units of noise; all free directions are among them."""
     leaf_unit = _unit(info.leaf_noise, info.used_leaf)
     border_unit = _unit(info.border_noise, info.used_border)
     D = info.leaf * leaf_unit[:, :, None] * leaf_unit[:, None, :]
@@ -163,13 +159,13 @@ def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak
     if size == 0:
         return _Weak(np.zeros(0), np.zeros(0), np.zeros((len(used), 0)))
     if size <= DENSE_PARAMETERS:
-        values, reduced = _all(D, C, E, used)
+        values, reduced = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])
     else:
-        # No direction sums fewer than two squares, and the fewer, the higher its threshold.
+        # Every direction sums at least two squares, and fewer squares have a higher threshold.
         values, reduced = _weakest_by_lanczos(D, C, E, used, float(free_threshold(2.0, degrees_of_freedom)))
     vectors = np.zeros((len(used), len(values)))
     vectors[used] = reduced
-    # Satterthwaite: a direction spread over frames sums as many squares as its shares of their measurements tell.
+    # Satterthwaite: the squares that a direction sums follow from its shares of the frames' measurements.
     share = np.empty((len(counts), len(values)))
     share[:-1] = (vectors[:-1] ** 2).reshape(len(counts) - 1, 7, len(values)).sum(axis=1)
     share[-1] = vectors[-1] ** 2
@@ -181,13 +177,13 @@ def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak
 
 
 def _unit(noise: Array, used: np.ndarray) -> Array:
-    """What brings a parameter to units of its noise; 0 where it is not asked."""
+    """The factor that brings a parameter to units of its noise; 0 for an unused parameter."""
     result: Array = np.where(used, 1.0 / np.sqrt(np.where(used, noise, 1.0)), 0.0)
     return result
 
 
 def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray, enough: float) -> tuple[Array, Array]:
-    """The smallest eigenpairs, up to one above ``enough``, by Lanczos on the inverse, linear in the leaves."""
+    """The smallest eigenpairs, up to one above ``enough``, by Lanczos on the inverse; time linear in the leaves."""
     L, m = D.shape[:2]
     largest = max(np.einsum("lii->li", D).max(initial=0.0), np.diagonal(E).max(initial=0.0))
     shift = max(1e-6, 1e-13 * float(largest))  # above the factorisation's rounding, far below any threshold
@@ -198,14 +194,10 @@ def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray, enough: 
     if factor is None:
         raise FloatingPointError("the information matrix is not positive semidefinite: its entries overflow")
 
-    def solve(v: Array) -> Array:
-        leaf, border = factor.solve(v[: L * m].reshape(L, m, 1), v[L * m :].reshape(-1, 1))
-        return np.concatenate([leaf.ravel(), border.ravel()])
-
     from scipy.sparse.linalg import LinearOperator, eigsh  # slow to import, and few problems need it
 
     size = len(used)
-    operator = LinearOperator((size, size), matvec=solve, dtype=np.float64)
+    operator = LinearOperator((size, size), matvec=factor.solve_vector, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(size) * used
     count = 12
     while 4 * count < size:
@@ -214,13 +206,8 @@ def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray, enough: 
         if values.max() > enough:
             return values, vectors[used]
         count *= 4
-    return _all(D, C, E, used)  # so many are free that Lanczos is no gain
-
-
-def _all(D: Array, C: Array, E: Array, used: np.ndarray) -> tuple[Array, Array]:
-    """All eigenpairs, densely."""
-    values, vectors = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])
-    return values, vectors
+    everything = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])  # with so many free, Lanczos is no gain
+    return everything.eigenvalues, everything.eigenvectors
 
 
 def _pairs(
@@ -231,29 +218,28 @@ def _pairs(
     reasons: list[FreeReason],
     length: float,
 ) -> dict[Pair, PairIdentifiability]:
-    """Every pair on its own, all in one stack of 15 x 15 problems, asked as the whole is."""
+    """Test every pair alone as the whole is tested, all pairs in one stack of 15 x 15 problems."""
     counts = part.moments.count
     threshold = free_threshold(2.0 * counts, degrees_of_freedom)
     rotations = pairs.used & _IS_ROTATION
     turning, _ = _weakest_of_each(pairs.rotation, pairs.noise_rotation, rotations)
-    settled = np.all(turning > threshold[:, None], axis=1, keepdims=False)
-    asked = pairs.used & ~(_IS_ROTATION & settled[:, None])
+    settled = np.all(turning > threshold[:, None], axis=1, keepdims=True)
     rest, directions = _weakest_of_each(
-        pairs.translation + np.where(settled, 0.0, 1.0)[:, None, None] * pairs.rotation,
-        pairs.noise_translation + np.where(settled, 0.0, 1.0)[:, None] * pairs.noise_rotation,
-        asked,
+        pairs.translation + ~settled[:, :, None] * pairs.rotation,
+        pairs.noise_translation + ~settled * pairs.noise_rotation,
+        pairs.used & ~(_IS_ROTATION & settled),
     )
     result = {}
     for e, pair in enumerate(part.pairs):
         free = np.less_equal(rest[e], threshold[e])
         ends = {name: 7 * end for end, name in enumerate(pair) if name not in part.fixed}
         if not free.any() and axes[e] < 2 and len(ends) == 2:
-            free[rest[e].argmin()] = True  # Corollary 4: about one axis a pair alone leaves a direction open
+            free[rest[e].argmin()] = True  # Corollary 4: a pair that turns about one axis leaves a direction free
         rows = [first + k for first in ends.values() for k in range(7)] + [14]
         directions_free = free_directions_of(
             tuple(ends), directions[e][rows][:, free], length, dict.fromkeys(ends, reasons[e])
         )
-        weakest = float(min(rest[e].min(), turning[e].min())) if settled[e] else float(rest[e].min())
+        weakest = float(min(rest[e].min(), turning[e].min() if settled[e] else np.inf))
         result[pair] = PairIdentifiability(
             not free.any(), directions_free, axes[e], int(counts[e]), weakest, float(threshold[e])
         )
@@ -261,7 +247,7 @@ def _pairs(
 
 
 def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array, Array]:
-    """Eigenvalues (E, 15) in units of noise and directions (E, 15, 15); infinite for what a pair does not have."""
+    """Eigenvalues (E, 15) in units of noise and directions (E, 15, 15); infinite for parameters that are not used."""
     unit = _unit(noise, used)
     matrix = info * unit[:, :, None] * unit[:, None, :]
     diagonal = np.einsum("eii->ei", matrix)  # a view

@@ -1,4 +1,4 @@
-"""What measurements determine, of a pair alone and of the whole."""
+"""What the measurements of one pair determine, and of the whole problem."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from gtsam_rwhec.problem.pairs import Pair
 
 @dataclass(frozen=True)
 class PairIdentifiability:
-    """What one pair determines on its own.
+    """What one pair determines alone.
 
     Attributes
     ----------
     is_unique : bool
     free_directions : tuple of FreeDirection
     rotation_axes : int
-        About how many axes its motion turned: 0, 1, or 2 for two and more (Corollary 2).
+        Number of axes about which its motion turned: 0, 1, or 2 for two and more (Corollary 2).
     number_of_measurements : int
     weakest : float
-        Information of the weakest direction, in units of what noise alone would create.
+        Information of the weakest direction, in units of the information that noise alone would create.
     threshold : float
-        Up to which ``weakest`` counts as free.
+        Up to this value of ``weakest`` the direction is free.
     """
 
     is_unique: bool
@@ -35,18 +35,18 @@ class PairIdentifiability:
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What a problem's measurements determine. ``str()`` says how what the pairs determine spreads to the whole.
+    """What a problem's measurements determine. ``str()`` is a sentence about the pairs and the whole.
 
     Attributes
     ----------
     is_unique : bool
         Whether every frame and scale is determined.
     free_directions : tuple of FreeDirection
-        They span everything that is free.
+        They span all that is free.
     weakest, threshold : float
         As in ``PairIdentifiability``, for the whole.
     pairs : dict of (target, sensor) to PairIdentifiability
-        Each pair on its own: the grid of the paper's Figure 8.
+        Each pair alone: the grid of the paper's Figure 8.
     parts : tuple of tuple of str
         Frames of each unconnected part.
     """
