@@ -73,7 +73,7 @@ TABLE: dict[str, dict[str, str]] = {
         "logs/test_mcap_writer.py": "foxglove_schemas written_schemas",
     },
     "gtsam_rwhec/methods": {
-        "methods/test_closed_forms.py": "absolute dornaika1998 li2010 linear_methods zhuang1994",
+        "methods/test_closed_forms.py": "absolute dornaika1998 li2010 linear_methods normal_equations zhuang1994",
         "methods/test_comparison.py": "comparison_file",
         "methods/test_evangelista2023.py": "image_methods reprojection",
         "methods/test_heller2014.py": "quaternion_moments unit_weights",

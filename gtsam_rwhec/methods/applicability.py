@@ -16,7 +16,7 @@ from gtsam_rwhec.methods.method import Method, Takes
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
 
-#: A X = Y B of one X and one Y takes two relative motions, three poses, about axes that are not parallel.
+#: Measurements that A X = Y B of one X and one Y takes: two motions about axes that are not parallel.
 FEWEST = 3
 #: What a method must take for each kind of scale.
 _FOR_SCALE: dict[ScaleMode, frozenset[Takes]] = {
@@ -27,7 +27,7 @@ _FOR_SCALE: dict[ScaleMode, frozenset[Takes]] = {
 
 
 def refusal(method: Method[Any], problem: Problem) -> RwhecError | None:
-    """The error with which a method refuses a problem; None if it takes it."""
+    """The error with which a method refuses a problem; None if it takes the problem."""
     try:
         check_problem(method, problem)
     except RwhecError as error:
@@ -42,46 +42,44 @@ def check_problem(method: Method[Any], problem: Problem) -> None:
     ------
     CountError, FrameError, MeasurementsNotKeptError, OptionError, PriorError, ScaleError
     """
-    name, takes = method.name, method.takes
+    takes = method.takes
     if not isinstance(problem, Problem):
         raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
     problem.require_pairs()
     if not takes >= _FOR_SCALE[problem.scale]:
         scales = [mode for mode, needed in _FOR_SCALE.items() if takes >= needed]
         raise ScaleError(
-            f"{name} takes scale={' or '.join(map(repr, scales))}, and this problem has scale={problem.scale!r}; "
-            + ("it has one scale for all" if len(scales) > 1 else "it has no scale")
+            f"this method takes scale={' or '.join(map(repr, scales))}, and the problem has scale={problem.scale!r}"
         )
     motions = [pair.sensor for pair in problem.pairs if pair.is_motion]
     if motions and Takes.MOTIONS not in takes:
-        raise FrameError(f"{name} solves A X = Y B, and {motions[0]} has motions of its own (A Y = Y B)")
+        raise FrameError(f"this method solves A X = Y B, and {motions[0]} has motions of its own (A Y = Y B)")
     if (problem.fixed or problem.priors) and Takes.PRIORS not in takes:
         named = ", ".join(dict.fromkeys([*problem.fixed, *problem.priors]))
-        raise PriorError(f"{name} has neither fixed frames nor priors, and there are some for {named}")
+        raise PriorError(f"this method takes neither fixed frames nor priors, and the problem has some for {named}")
     _check_frames(method, problem)
     if Takes.MOMENTS not in takes:
-        problem.require_raw_measurements(name)
+        problem.require_raw_measurements("this method")
     if method.check is not None:
         method.check(problem)
 
 
 def _check_frames(method: Method[Any], problem: Problem) -> None:
-    name, takes = method.name, method.takes
     targets, sensors = len(problem.targets), len(problem.sensors)
+    alone = "one target and one sensor" + (", or one sensor's motions" if Takes.MOTIONS in method.takes else "")
     can, what = {
-        "": (targets == sensors == 1, "one target and one sensor"),
+        "": (len(problem.pairs) == 1, alone),
         "Xs": (sensors == 1, "several targets and one sensor"),
         "Xs or Ys": (min(targets, sensors) <= 1, "several targets or several sensors, not both"),
         "Xs and Ys": (True, ""),
     }[method.properties.multiple]
-    alone = Takes.MOTIONS in takes and targets == 0 and sensors == 1  # A Y = Y B of one sensor
-    if not can and not alone:
+    if not can:
         raise FrameError(
-            f"{name} solves for {what}; here are {targets} target{'s' * (targets != 1)} and {sensors} "
-            f"sensor{'s' * (sensors != 1)}"
+            f"this method solves for {what}; the problem has {targets} target{'s' * (targets != 1)}, {sensors} "
+            f"sensor{'s' * (sensors != 1)} and the pairs {', '.join(map(str, problem.pairs))}"
         )
-    if targets == sensors == 1 and Takes.PRIORS not in takes and problem.number_of_measurements < FEWEST:
+    if targets == sensors == 1 and Takes.PRIORS not in method.takes and problem.number_of_measurements < FEWEST:
         raise CountError(
-            f"{name}: {problem.number_of_measurements} measurements; one target and one sensor take at least "
+            f"the problem has {problem.number_of_measurements} measurements; one target and one sensor take at least "
             f"{FEWEST}, turned about axes that are not parallel"
         )

@@ -1,4 +1,4 @@
-"""This library's own method behind the same call: the certified global optimum (RWHEC paper, Algorithm 1)."""
+"""This library's own method as one of the methods: the certified global optimum (RWHEC paper, Algorithm 1)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,19 @@ from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
+SOURCE = (
+    "E. Wise et al., A certifiably correct algorithm for generalized robot-world and hand-eye calibration, "
+    "arXiv 2507.23045"
+)
+
 
 def certified(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """``gtsam_rwhec.solve``; what it would warn of is in the notes."""
+    """Solve by ``gtsam_rwhec.solve``; the notes have the certificate where it does not prove the answer."""
     return outcome_of(quiet_solution(problem, options))
 
 
 def quiet_solution(problem: Problem, options: MethodOptions) -> Solution:
-    """``gtsam_rwhec.solve`` without its warnings: what they say is in the solution."""
+    """Solve by ``gtsam_rwhec.solve`` without its warnings: the solution has their facts."""
     with warnings.catch_warnings():
         for category in (NotUniqueWarning, NotCertifiedWarning, WeightsWarning):
             warnings.simplefilter("ignore", category)
@@ -44,9 +49,8 @@ def outcome_of(solution: Solution) -> Outcome[Poses]:
 METHOD = Method(
     name="certified",
     properties=Properties("SE(3)", probabilistic=True, certifiable=True, multiple="Xs and Ys", monocular=True),
-    source="E. Wise et al., A certifiably correct algorithm for generalized robot-world and hand-eye calibration, "
-    "arXiv 2507.23045",
-    assumes="Isotropic noise on B, exact A. A proof says so when another answer could be better.",
+    source=SOURCE,
+    assumes="Isotropic noise on B, exact A. The answer says whether it is proven optimal.",
     function=certified,
     takes=frozenset({Takes.SHARED_SCALE, Takes.SCALE_PER_TARGET, Takes.MOTIONS, Takes.PRIORS, Takes.MOMENTS}),
 )

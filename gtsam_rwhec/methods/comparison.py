@@ -1,4 +1,4 @@
-"""All methods that apply to one problem, side by side: cost, residuals, time, and the distance from the bound."""
+"""The answers of all methods that can solve a problem: cost, residuals, time, and distance from the lower bound."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from gtsam_rwhec.methods.method import Method, MethodOptions
 from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Certificate
-from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solving.solution import Solution
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One method's line: its estimate, or the error for which there is none."""
+    """One method with its estimate, or with the error for which it has no estimate."""
 
     method: Method[[Problem, MethodOptions]]
     estimate: Estimate[dict[str, gtsam.Pose3]] | None = None
@@ -32,35 +31,34 @@ class Compared:
 
     @property
     def translation_rms_m(self) -> float:
-        """Root mean square over all measurements."""
-        return self._pooled([(r.number_of_measurements, r.translation_rms_m) for r in self._residuals])
+        """Root mean square over all measurements, metres."""
+        return self._pooled("translation_rms_m")
 
     @property
     def rotation_rms_rad(self) -> float:
-        """Root mean square over all measurements."""
-        return self._pooled([(r.number_of_measurements, r.rotation_rms_rad) for r in self._residuals])
+        """Root mean square over all measurements, radians."""
+        return self._pooled("rotation_rms_rad")
 
-    @property
-    def _residuals(self) -> Iterable[Residual]:
-        return () if self.estimate is None else self.estimate.residuals.values()
-
-    @staticmethod
-    def _pooled(values: list[tuple[int, float]]) -> float:
-        count = sum(number for number, _ in values)
-        return math.sqrt(sum(number * value**2 for number, value in values) / count) if count else math.nan
+    def _pooled(self, rms: str) -> float:
+        if self.estimate is None:
+            return math.nan
+        residuals = self.estimate.residuals.values()
+        squares = sum(pair.number_of_measurements * getattr(pair, rms) ** 2 for pair in residuals)
+        return math.sqrt(squares / sum(pair.number_of_measurements for pair in residuals))
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All methods' lines, those that apply first, cheapest first.
+    """All methods' answers.
 
     Attributes
     ----------
     rows : tuple of Compared
+        Methods with an answer first, by increasing cost.
     solution : Solution or None
-        The certified one, whose certificate's bound holds for every answer; None when there is none.
+        The certified solution; its certificate's bound holds for every answer.
     error : RwhecError or None
-        Why there is none.
+        Why there is no certified solution.
     """
 
     rows: tuple[Compared, ...]
@@ -69,11 +67,11 @@ class Comparison:
 
     @property
     def certificate(self) -> Certificate | None:
-        """What bounds every answer's cost from below."""
+        """The certificate whose lower bound holds for every answer's cost; None without a certified solution."""
         return None if self.solution is None else self.solution.certificate
 
     def gap(self, row: Compared) -> float | None:
-        """By how much a method's answer costs more than any answer must; None without a bound, or an answer."""
+        """The answer's cost above the lower bound; None without a bound or an answer."""
         if row.estimate is None or self.certificate is None or not math.isfinite(self.certificate.lower_bound):
             return None
         return max(0.0, row.estimate.cost - self.certificate.lower_bound)
@@ -91,26 +89,26 @@ def compare(
     methods: Iterable[str] | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Solve a problem by every method that applies.
+    """Solve a problem by every method that can solve it.
 
     Parameters
     ----------
     problem : Problem
     options : MethodOptions, optional
-        The same for all.
+        The same for all methods.
     methods : iterable of str, optional
-        Names; left out: all. The certified method is always solved, for its bound.
+        Names; all methods if left out. The certified method always runs, for its bound.
     progress : callable, optional
-        Called with each method's name as it begins.
+        Called with each method's name when the method begins.
 
     Raises
     ------
     CountError, FrameError, UnderdeterminedError
-        For a problem that nothing can solve.
+        When no method can solve the problem.
     OptionError
         When a method's name is unknown.
     """
-    chosen = [method_of(name) for name in (METHODS if methods is None else methods)]
+    chosen = dict.fromkeys(method_of(name) for name in (METHODS if methods is None else methods))
     options = options or MethodOptions()
     check_problem(certified.METHOD, problem)
     if progress is not None:
@@ -122,15 +120,12 @@ def compare(
     except RwhecError as raised:
         error = raised
     seconds = time.perf_counter() - start
-    rows = []
-    for method in dict.fromkeys(chosen):
-        if method is not certified.METHOD:
-            rows.append(_compared(method, problem, options, progress))
-        elif solution is None:
-            rows.append(Compared(method, error=error))
-        else:
-            outcome = certified.outcome_of(solution)
-            rows.append(Compared(method, estimate_of(method.name, problem, outcome, seconds)))
+    rows = [_compared(method, problem, options, progress) for method in chosen if method is not certified.METHOD]
+    if certified.METHOD in chosen:
+        estimate = None
+        if solution is not None:
+            estimate = estimate_of("certified", problem, certified.outcome_of(solution), seconds)
+        rows.append(Compared(certified.METHOD, estimate, error))
     rows.sort(key=lambda row: math.inf if row.estimate is None else row.estimate.cost)
     return Comparison(tuple(rows), solution, error)
 

@@ -17,7 +17,7 @@ FORMAT_VERSION = 1
 
 
 def comparison_fields(comparison: Comparison) -> dict[str, Any]:
-    """What the file holds: the bound on any answer, and each method with its answer or the reason why it has none."""
+    """The file's fields: the lower bound, and each method with its answer or the reason why it has no answer."""
     certificate = comparison.certificate
     return {
         "format": FORMAT,

@@ -1,4 +1,4 @@
-"""Least z'Qz over unit dual quaternions: Shor's relaxation, rounding, polishing on the manifold, multipliers.
+"""The least z'Qz over unit dual quaternions: Shor's relaxation, rounding, descent on a chart, multipliers.
 
 z = [p_1, p_1', p_2, p_2', ...], |p_i| = 1, <p_i, p_i'> = 0. The relaxation's dual is max sum lambda_i subject to
 Z = Q - blkdiag([[lambda_i I, mu_i I], [mu_i I, 0]]) >= 0.
@@ -13,56 +13,51 @@ import numpy as np
 import scipy.sparse
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.quaternions import LEFT, dual_parts, left, of_vectors, right
+from gtsam_rwhec.geometry.quaternions import dual_parts, left, of_vectors, right
+from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
+from gtsam_rwhec.solver.conic_solver import solve_conic, stacked, unstacked
 
-#: Frames up to which the relaxation is solved; a cone of 8 n takes a dense block of order 4 n (8 n + 1) squared.
+#: Number of frames up to which the relaxation is solved; a cone of 8 n takes a dense block of order 4 n (8 n + 1)
+#: squared.
 MOST_FRAMES = 10
+#: Relative gap and infeasibility at which the interior-point solver stops.
 TOLERANCE = 1e-10
+#: Steps after which the interior-point solver, and steps after which the descent stops in any case.
+STEPS, DESCENT_STEPS = 200, 1000
 
 
 @dataclass(frozen=True)
 class Relaxed:
-    """What the relaxation gives: a start, p (n, 4) and t (n, 3), the solver's bound and its steps."""
+    """The relaxation's answer: the nearest p (n, 4) and t (n, 3), metres, and the solver's lower bound."""
 
     q: Array
     t: Array
     lower_bound: float
-    iterations: int
 
 
 def relaxed(Q: Array, frames: int) -> Relaxed:
-    """Solve the relaxation of Q (8 n, 8 n) and round it.
+    """Solve the relaxation of Q (8 n, 8 n) and round its answer.
 
-    Beyond ``MOST_FRAMES`` the smallest eigenvector stands in for it, with its eigenvalue's bound, 0.
+    Beyond ``MOST_FRAMES`` the smallest eigenvector replaces the answer, and the lower bound is 0.
     """
     if frames > MOST_FRAMES:
-        return Relaxed(*rounded(_smallest_eigenvector(Q), frames), 0.0, 0)
+        return Relaxed(*rounded(_smallest_eigenvector(Q), frames), 0.0)
     size = 8 * frames
     scale = float(np.abs(Q).max()) or 1.0
-    j, i = np.tril_indices(size)  # Clarabel stacks the upper triangle, column after column
-    root = np.where(i == j, 1.0, np.sqrt(2.0))
     frame, entry = np.repeat(np.arange(frames), 4), np.tile(np.arange(4), frames)
     primal, dual = 8 * frame + entry, 8 * frame + entry + 4
     rows = np.concatenate([primal * (primal + 1) // 2 + primal, dual * (dual + 1) // 2 + primal])
     columns = np.concatenate([2 * frame, 2 * frame + 1])
     values = np.concatenate([np.ones(4 * frames), np.full(4 * frames, np.sqrt(2.0))])
-    A = scipy.sparse.csc_matrix((values, (rows, columns)), (len(i), 2 * frames))
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
-    zero = scipy.sparse.csc_matrix((2 * frames, 2 * frames))
-    objective = np.tile([-1.0, 0.0], frames)
-    cones = [clarabel.PSDTriangleConeT(size)]
-    solution = clarabel.DefaultSolver(zero, objective, A, Q[i, j] / scale * root, cones, settings).solve()
-    Z = np.zeros((size, size))
-    Z[i, j] = np.array(solution.z) / root
-    Z = Z + Z.T - np.diag(np.diagonal(Z))
-    q, t = rounded(np.linalg.eigh(Z)[1][:, -1], frames)
-    return Relaxed(q, t, scale * float(np.array(solution.x)[::2].sum()), int(solution.iterations))
+    A = scipy.sparse.csc_matrix((values, (rows, columns)), (size * (size + 1) // 2, 2 * frames))
+    cost, cones = np.tile([-1.0, 0.0], frames), [clarabel.PSDTriangleConeT(size)]
+    multipliers, z, _ = solve_conic(cost, A, stacked(Q / scale), cones, TOLERANCE, STEPS)
+    q, t = rounded(np.linalg.eigh(unstacked(z, size))[1][:, -1], frames)
+    return Relaxed(q, t, scale * float(multipliers[::2].sum()))
 
 
 def _smallest_eigenvector(Q: Array) -> Array:
-    """Of Q with its dual parts eliminated, since they have no length of their own; then those."""
+    """The smallest eigenvector of Q without its dual parts, which have no length of their own, then the dual parts."""
     blocks = Q.reshape(-1, 2, 4, len(Q) // 8, 2, 4)
     half = len(Q) // 2
     pp, pd, dd = (blocks[:, a, :, :, b, :].reshape(half, half) for a, b in ((0, 0), (0, 1), (1, 1)))
@@ -73,7 +68,7 @@ def _smallest_eigenvector(Q: Array) -> Array:
 
 
 def rounded(z: Array, frames: int) -> tuple[Array, Array]:
-    """Unit p (n, 4) and t (n, 3) nearest to z: each frame over its length, the dual part made orthogonal."""
+    """The unit p (n, 4) and t (n, 3) nearest to z: frames are divided by their lengths, dual parts made orthogonal."""
     parts = z.reshape(frames, 2, 4)
     lengths = np.linalg.norm(parts[:, 0], axis=1)[:, None]
     q, dual = parts[:, 0] / lengths, parts[:, 1] / lengths
@@ -88,74 +83,30 @@ def vector_of(q: Array, t: Array) -> Array:
 
 
 def polished(Q: Array, q: Array, t: Array) -> tuple[Array, Array, float]:
-    """Go down from p (n, 4), t (n, 3) on the manifold, by Newton's method with damping: p, t, z'Qz."""
-    n = len(q)
+    """The local minimum of z'Qz near p (n, 4) and t (n, 3): p, t and the cost."""
+    start = np.concatenate([q, t], axis=1).ravel()
+    found = descend_on_chart(Q, pose_chart, start, DESCENT_STEPS).reshape(-1, 7)
+    q, t = found[:, :4] / np.linalg.norm(found[:, :4], axis=1, keepdims=True), found[:, 4:]
     z = vector_of(q, t)
-    gradient_z = Q @ z
-    cost, damping = float(z @ gradient_z), 0.0
-    floor = 1e-12 * float(np.trace(Q))
-    for _ in range(100):
-        basis = _tangents(q, t)
-        H = basis.T @ Q @ basis + _curvature(q, t, gradient_z)
-        g = basis.T @ gradient_z
-        while True:
-            values = np.linalg.eigvalsh(H)
-            shift = max(damping, 0.0 if values[0] > floor else floor - values[0])
-            step = -np.linalg.solve(H + shift * np.eye(6 * n), g)
-            q_new, t_new = _moved(q, t, step)
-            z = vector_of(q_new, t_new)
-            cost_new = float(z @ (Q @ z))
-            if cost_new <= cost + 1e-15 * abs(cost) or damping > 1e6 * floor * 1e12:
-                break
-            damping = max(4.0 * damping, 1e-9 * float(np.trace(Q)))
-        if cost_new > cost:
-            break
-        decrease, cost = cost - cost_new, cost_new
-        q, t, damping = q_new, t_new, damping / 8.0
-        gradient_z = Q @ z
-        if decrease <= 1e-15 * cost and float(np.abs(step).max()) < 1e-9:
-            break
-    return q, t, cost
+    return q, t, float(z @ Q @ z)
 
 
-def _tangents(q: Array, t: Array) -> Array:
-    """dz (8 n, 6 n) of steps [w, v] a frame: p (w / 2, 1), t + v."""
-    n = len(q)
-    turned = 0.5 * left(q)[:, :, :3]  # (n, 4, 3)
-    basis = np.zeros((n, 8, n, 6))
-    at = np.arange(n)
-    basis[at, :4, at, :3] = turned
-    basis[at, 4:, at, :3] = 0.5 * left(of_vectors(t)) @ turned
-    basis[at, 4:, at, 3:] = 0.5 * right(q)[:, :, :3]
-    return basis.reshape(8 * n, 6 * n)
-
-
-def _curvature(q: Array, t: Array, gradient_z: Array) -> Array:
-    """<Qz, second derivatives of z> (6 n, 6 n): along the geodesic, p turns back by |w|^2 / 4."""
-    n = len(q)
-    g = gradient_z.reshape(n, 2, 4)
-    z = vector_of(q, t).reshape(n, 2, 4)
-    result = np.zeros((n, 6, n, 6))
-    at = np.arange(n)
-    back = -0.25 * np.einsum("nij,nij->n", g, z)
-    result[at, :3, at, :3] = back[:, None, None] * np.eye(3)
-    # p' = t p / 2: v (p w / 2) / 2, from the right: R(p w / 2) v / 2
-    turned = 0.5 * left(q)[:, :, :3]  # columns p e_k / 2
-    mixed = 0.5 * np.einsum("ni,lij,njk->nkl", g[:, 1], LEFT[:3], turned)  # [w_k, v_l] = <g', e_l (p e_k / 2)> / 2
-    result[at, :3, at, 3:] = mixed
-    result[at, 3:, at, :3] = mixed.transpose(0, 2, 1)
-    return result.reshape(6 * n, 6 * n)
-
-
-def _moved(q: Array, t: Array, step: Array) -> tuple[Array, Array]:
-    steps = step.reshape(-1, 6)
-    turn = np.concatenate([0.5 * steps[:, :3], np.ones((len(q), 1))], axis=1)
-    moved = np.einsum("nij,nj->ni", left(q), turn)
-    return moved / np.linalg.norm(moved, axis=1)[:, None], t + steps[:, 3:]
+def pose_chart(p: Array) -> tuple[Array, Array]:
+    """z (8 n,) of 7 numbers a frame, a quaternion of any length and t in metres, and its derivatives (8 n, 7 n)."""
+    frames = p.reshape(-1, 7)
+    length = np.linalg.norm(frames[:, :4], axis=1, keepdims=True)
+    q, t = frames[:, :4] / length, frames[:, 4:]
+    by_quaternion = (np.eye(4) - q[:, :, None] * q[:, None, :]) / length[:, :, None]
+    n, at = len(frames), np.arange(len(frames))
+    derivatives = np.zeros((n, 8, n, 7))
+    derivatives[at, :4, at, :4] = by_quaternion
+    derivatives[at, 4:, at, :4] = 0.5 * left(of_vectors(t)) @ by_quaternion  # p' = t p / 2
+    derivatives[at, 4:, at, 4:] = 0.5 * right(q)[:, :, :3]
+    return vector_of(q, t), derivatives.reshape(8 * n, 7 * n)
 
 
 def multipliers_of(Q: Array, q: Array, t: Array) -> tuple[float, float]:
-    """sum lambda_i at a critical point, and the smallest eigenvalue of Z: where that is not negative, a bound.
+    """The sum of lambda_i at a critical point, and Z's smallest eigenvalue; the sum is a bound where Z >= 0.
 
     From Q z = blkdiag z: lambda_i p + mu_i p' = (Qz)_p and mu_i p = (Qz)_p'.
     """

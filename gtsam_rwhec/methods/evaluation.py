@@ -1,4 +1,4 @@
-"""Anybody's answer under the certified objective: J, each pair's residuals, what is free; all from moments."""
+"""Any answer under the certified objective: J, each pair's residuals and the free directions, from moments alone."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ class Evaluation:
     Attributes
     ----------
     cost : float
-        J (eq. 18), priors included; of the inverted equation where the certified solver inverts it.
+        J (eq. 18) with priors, in the inverse form where the certified solver uses the inverse form.
     residuals : dict of (target, sensor) to Residual
     free_directions : tuple of FreeDirection
-        What the measurements leave undetermined, judged by this answer's residuals: where they are far larger
-        than the noise, more counts as free.
+        What the measurements leave undetermined, by this answer's residuals: larger residuals leave more free.
     """
 
     cost: float
@@ -39,14 +38,7 @@ class Evaluation:
 def evaluate(
     problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
 ) -> Evaluation:
-    """Evaluate an answer.
-
-    Parameters
-    ----------
-    problem : Problem
-    X, Y : dict of str to pose
-        T_targetcarrier_target and T_sensorcarrier_sensor, metres.
-    scale : float or dict of str to float
+    """Evaluate an answer: X = T_targetcarrier_target and Y = T_sensorcarrier_sensor by name, metres, and the scale.
 
     Raises
     ------
@@ -72,5 +64,11 @@ def evaluate(
 def cost_of_answer(
     problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
 ) -> float:
-    """J of an answer; see ``evaluate``."""
+    """J of an answer: X = T_targetcarrier_target and Y = T_sensorcarrier_sensor by name, metres, and the scale.
+
+    Raises
+    ------
+    FrameError, PoseError, PriorError, ScaleError
+        When the answer lacks a frame, or contradicts what the problem fixes.
+    """
     return evaluate(problem, X, Y, scale).cost

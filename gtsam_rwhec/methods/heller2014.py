@@ -1,10 +1,10 @@
 """Heller, Henrion and Pajdla 2014: the cost of A X = Y B (or A Y = Y B) as a polynomial, its global minimum by an SDP.
 
-The cost sum |A_i X - Y B_i|_F^2 is quadratic in the matrices' entries. Over quaternions it is of degree four, whose
-first relaxation in Lasserre's hierarchy is that of order two (``quaternion_moments``); over rotation matrices, with all
-the quadratic equations between their entries, of degree two and order one. The products of a quaternion's entries
-fulfil 20 equations q_a q_b q_c q_d = q_a q_c q_b q_d, the matrix's entries 20 independent ones: but for the second
-block of moments the two relaxations are one, and with it that over quaternions is tight where the other is not.
+The cost sum |A_i X - Y B_i|_F^2 is quadratic in the matrices' entries. Over quaternions it is of degree four: the first
+relaxation in Lasserre's hierarchy is of order two (``quaternion_moments``). Over rotation matrices, with all quadratic
+equations between their entries, it is of degree two, and the relaxation of order one. The products of a quaternion's
+entries fulfil 20 equations q_a q_b q_c q_d = q_a q_c q_b q_d; the matrix's entries fulfil 20 independent equations. The
+relaxations differ by the second block of moments alone, with which quaternions are tight where matrices are not.
 """
 
 from __future__ import annotations
@@ -16,47 +16,47 @@ from typing import Literal
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.estimate import Outcome, Poses
-from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes
+from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Properties, Takes
 from gtsam_rwhec.methods.quaternion_moments import STEPS, solve_moments
 from gtsam_rwhec.methods.unit_weights import COST, UnitForm
-from gtsam_rwhec.methods.wise2020 import certified_rotations, check_frames
+from gtsam_rwhec.methods.wise2020 import certified_rotations
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.descent import descend
 
 Parameterisation = Literal["quaternion", "matrix"]
-#: The order of each one's first relaxation.
-ORDERS: dict[Parameterisation, int] = {"quaternion": 2, "matrix": 1}
-#: Gaps, of the cost and of a grossly wrong answer's cost, up to which a relaxation is called tight: what an
-#: interior-point solver's multipliers leave.
-TIGHT, ROUNDING = 1e-5, 1e-8
+#: Each parameterisation's first relaxation, in words.
+RELAXATIONS: dict[Parameterisation, str] = {
+    "quaternion": "order 2 over quaternions",
+    "matrix": "order 1 over rotation matrices",
+}
+#: Gap, relative to the cost, up to which a relaxation counts as tight: what the solver's multipliers leave.
+TIGHT = 1e-5
+#: The same, relative to the cost of a grossly wrong answer, for exact data.
+ROUNDING = 1e-8
 
 
 @dataclass(frozen=True)
 class PolynomialMinimum:
-    """Rotations (n, 3, 3), their cost, the relaxation's lower bound, and its order."""
+    """Rotations (n, 3, 3), their cost, the relaxation's lower bound, and whether the bound proves the answer."""
 
     R: Array
     cost: float
     lower_bound: float
-    order: int
     is_tight: bool
 
 
 def heller2014(
     problem: Problem, options: MethodOptions, parameterisation: Parameterisation = "quaternion"
 ) -> Outcome[Poses]:
-    """One X and one Y, or one sensor's motions; known scale."""
+    """Solve for one X and one Y, or one sensor's motions, of known scale."""
     form = UnitForm.of(problem)
     found = global_minimum(form, parameterisation)
-    gap = found.cost - found.lower_bound
-    order = f"order {found.order} over {'quaternions' if parameterisation == 'quaternion' else 'rotation matrices'}"
-    if found.is_tight:
-        note = f"the relaxation of {order} is tight: cost {found.cost:.6g}, bound {gap:.1e} below it"
-    else:
-        note = (
-            f"the relaxation of {order} is not tight: cost {found.cost:.6g}, bound {gap:.2g} below it; the next order "
-            "was not tried"
-        )
+    note = (
+        f"the relaxation of {RELAXATIONS[parameterisation]} is {'tight' if found.is_tight else 'not tight'}: cost "
+        f"{found.cost:.6g}, bound {found.cost - found.lower_bound:.1e} below it"
+    )
+    if not found.is_tight:
+        note += "; the next order was not tried"
     return replace(
         form.outcome(found.R, notes=(note,)),
         cost=found.cost,
@@ -67,25 +67,18 @@ def heller2014(
 
 
 def global_minimum(form: UnitForm, parameterisation: Parameterisation = "quaternion") -> PolynomialMinimum:
-    """The relaxation's answer, descended from, and its bound.
-
-    Raises
-    ------
-    OptionError
-        For another parameterisation.
-    """
+    """Solve the relaxation, descend from its answer, and bound the cost; OptionError for another parameterisation."""
     if parameterisation == "matrix":
         certified = certified_rotations(form)
         R, cost, lower = certified.R, certified.cost, certified.lower_bound
     elif parameterisation == "quaternion":
         relaxed = solve_moments(form.reduced.dense())
-        ends = [descend(form.reduced, start, STEPS) for start in relaxed.starts]
-        best = min(ends, key=lambda end: end.cost)
+        best = min((descend(form.reduced, start, STEPS) for start in relaxed.starts), key=lambda end: end.cost)
         R, cost, lower = best.R, best.cost, min(relaxed.lower_bound, best.cost)
     else:
         raise OptionError(f"heller2014: parameterisation={parameterisation!r} is not 'quaternion' or 'matrix'")
     is_tight = bool(cost - lower <= max(TIGHT * cost, ROUNDING * form.reduced.magnitude))
-    return PolynomialMinimum(R, cost, lower, ORDERS[parameterisation], is_tight)
+    return PolynomialMinimum(R, cost, lower, is_tight)
 
 
 _SOURCE = (
@@ -99,11 +92,9 @@ def _method(name: str, parameterisation: Parameterisation, representation: str) 
         name=name,
         properties=Properties(representation, certifiable=True),
         source=_SOURCE,
-        assumes="Errors alike in all measurements, a radian as bad as a metre. Proves its answer, or says that it has "
-        "not.",
+        assumes=f"{UNWEIGHTED} The answer says whether it is proven optimal.",
         function=partial(heller2014, parameterisation=parameterisation),
         takes=frozenset({Takes.MOTIONS}),
-        check=check_frames,
     )
 
 

@@ -1,17 +1,19 @@
 """Horn, Wodtko, Buchholz and Dietmayer 2023: unit dual quaternions, a quadratic problem with its own relaxation.
 
-With poses as dual quaternions, p + eps p', p' = t p / 2, the residual a x - y b is linear in x and y, and the cost a
-quadratic form z'Qz over z = [p_X, p_X', ..., p_Y, p_Y', ...]. Each frame has two constraints, |p| = 1 and <p, p'> = 0.
+A pose is the dual quaternion p + eps p', p' = t p / 2. The residual a x - y b is then linear in x and y, and the cost
+is a quadratic form z'Qz over z = [p_X, p_X', ..., p_Y, p_Y', ...]. Each frame has two constraints, |p| = 1 and
+<p, p'> = 0.
 
-**Signs.** Each measured rotation has two unit quaternions. The sign of a x - y b as a whole means nothing, that of b
-against a does: a measurement whose sign is wrong asks for the opposite of x and y, and there are 2^N problems of N
-measurements, of which one is meant. ``Signs`` are the ways to choose; what is wrong with them is counted in the answer.
-The relaxation is tight with wrong signs too: its certificate then proves the optimum of the wrong problem.
+**Signs.** Each measured rotation has two unit quaternions. The sign of a x - y b as a whole has no effect. The sign of
+b relative to a has one: a measurement with the wrong sign asks for the opposite of x and y. N measurements give 2^N
+problems, and only one is right. ``Signs`` names the ways to choose; the answer counts the signs that it contradicts.
+The relaxation is tight with wrong signs too: its certificate then proves the optimum of the wrong problem (design
+fact 19).
 
-In the RWHEC paper's Section 8.2 (four cameras, 108 poses, its released noise) continuous signs are lost in 2 runs of
-100 at kappa = 12 (6 of 300 measured; such a run ends about 40 degrees and half a metre away, and a few of them make the
-paper's 69 +- 121 mm), and in none of 300 at kappa = 125. Signs of nonnegative scalars fail in every run there, and in
-Section 8.1's.
+In the RWHEC paper's Section 8.2 (four cameras, 108 poses, released noise) continuous signs fail in 2 of 100 runs at
+kappa = 12 (measured: 6 of 300) and in none of 300 at kappa = 125. A failed run ends about 40 degrees and half a metre
+away; a few such runs make the paper's 69 +- 121 mm. Signs of nonnegative scalars fail in every run there, and in
+Section 8.1.
 """
 
 from __future__ import annotations
@@ -28,49 +30,45 @@ from gtsam_rwhec.geometry.quaternions import conjugate, dual_parts, left, of_rot
 from gtsam_rwhec.methods.absolute import Stack
 from gtsam_rwhec.methods.dual_quaternion_relaxation import Relaxed, multipliers_of, polished, relaxed
 from gtsam_rwhec.methods.estimate import Outcome, Poses
-from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
+from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.paired_quaternions import agreement, paired_quaternions
 from gtsam_rwhec.problem.problem import Problem
 
 #: How the quaternions of A and B get their signs.
 #:
-#: "aligned": those that the answer satisfies, from a rotation estimate without signs and then from the answer itself.
-#: "continuous": of A and of B apart, each nearer to the one before it than its opposite: right for smooth paths.
-#: "scalar": no scalar part is negative, as many conversions from matrices have it.
-#: "random": by the seed.
+#: "aligned": the signs that the answer satisfies. A rotation estimate without signs chooses first, then the answer.
+#: "continuous": A's and B's quaternions apart, each near to the quaternion before it. Right for smooth paths.
+#: "scalar": no scalar part is negative, as in many conversions from matrices.
+#: "random": drawn with the seed.
 Signs = Literal["aligned", "continuous", "scalar", "random"]
-#: What is squared. Multiplying by a dual quaternion changes the norm, so these are different costs: "a x - y b", or
-#: "x - a* y b", X against what each measurement makes of Y. The RWHEC paper's rows "Horn" are those of the second.
+#: The residual that is squared. A product with a dual quaternion changes the norm, so "a x - y b" and "x - a* y b" are
+#: different costs. The RWHEC paper's rows "Horn" have the second.
 Residual = Literal["a x - y b", "x - a* y b"]
-#: A relative gap up to which the relaxation's bound proves the answer: what its solver's tolerance leaves.
+#: Relative gap up to which the relaxation's bound proves the answer: what its solver's tolerance leaves.
 CLOSED = 1e-6
-#: Rounds of choosing signs by the answer.
+#: Most rounds of choosing signs by the answer.
 ROUNDS = 10
-#: A quarter of a squared metre is what the dual part makes of a unit translation; beside it a rotation of an angle
-#: counts a quarter of its square.
-DUAL_WEIGHT = 1.0
+#: Angle of a residual, degrees, from which a measurement's sign cannot be told.
+UNCERTAIN_DEG = 150.0
 
 
 @dataclass(frozen=True)
 class DualQuaternionAnswer:
-    """Of one choice of signs.
+    """The answer for one choice of signs.
 
     Attributes
     ----------
     R, t : (n, 3, 3) and (n, 3) arrays
-        All targets' frames, then all sensors'; metres.
+        Frames of all targets, then of all sensors; metres.
     cost, lower_bound : float
-        z'Qz, and what no z goes below with these signs, by the relaxation's multipliers. The cost is of these signs'
-        problem: it says nothing of the others'.
+        z'Qz with these signs, and what no z goes below, by the relaxation's multipliers. Other signs have other costs.
     signs : (N,) array
-        Of each measurement's <p_a, p_b> times that of the quaternions with which ``of_rotations`` answers:
-        two choices of signs can be compared by it, whatever the signs of a and b apart.
+        Sign of each measurement's <p_a, p_b> relative to the quaternions of ``of_rotations``. Two choices of signs can
+        be compared by it.
     contradicted : int
-        Measurements whose sign the answer itself contradicts, the one that fits the frame as a whole being free.
+        Number of measurements whose sign the answer contradicts. The common sign of a pair is free.
     smallest_margin : float
-        The least |<p_a p_x, p_y p_b>|, the cosine of half the residual's angle: near zero a sign cannot be told.
-    rounds : int
-        Relaxations solved.
+        The least |<p_a p_x, p_y p_b>|, the cosine of half the residual's angle: near zero the sign cannot be told.
     """
 
     R: Array
@@ -80,7 +78,6 @@ class DualQuaternionAnswer:
     signs: Array
     contradicted: int
     smallest_margin: float
-    rounds: int
 
     @property
     def gap(self) -> float:
@@ -89,7 +86,7 @@ class DualQuaternionAnswer:
 
 
 def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned") -> Outcome[Poses]:
-    """Several Xs or several Ys, known scale."""
+    """Solve for several Xs or several Ys of known scale."""
     stack = Stack.of(problem)
     found = solve_dual_quaternions(stack, signs, options.seed)
     n_X = len(stack.targets)
@@ -97,10 +94,10 @@ def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned")
     if found.contradicted:
         notes.append(
             f"{found.contradicted} of {len(stack.A)} signs (signs={signs!r}) contradict the answer: another choice of "
-            "signs has a better one"
+            "signs has a better answer"
         )
-    if found.smallest_margin < np.cos(0.5 * np.radians(150.0)):
-        notes.append("a measurement is off by more than 150 degrees: its sign cannot be told")
+    if found.smallest_margin < np.cos(0.5 * np.radians(UNCERTAIN_DEG)):
+        notes.append(f"a residual is larger than {UNCERTAIN_DEG:g} degrees: the measurement's sign cannot be told")
     outcome = stack.outcome(found.R[:n_X], found.t[:n_X], found.R[n_X:], found.t[n_X:], notes=notes)
     return replace(
         outcome,
@@ -112,144 +109,90 @@ def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned")
 
 
 def solve_dual_quaternions(
-    stack: Stack,
-    signs: Signs = "aligned",
-    seed: int = 0,
-    dual_weight: float = DUAL_WEIGHT,
-    residual: Residual = "a x - y b",
+    stack: Stack, signs: Signs = "aligned", seed: int = 0, residual: Residual = "a x - y b"
 ) -> DualQuaternionAnswer:
-    """The global optimum of Horn's cost for a choice of signs.
-
-    Parameters
-    ----------
-    stack : Stack
-    signs : "aligned", "continuous", "scalar" or "random"
-    seed : int
-        Of "random".
-    dual_weight : float
-        Of the dual part's square against the primal part's.
-    residual : "a x - y b" or "x - a* y b"
+    """The global optimum of Horn's cost for a choice of signs; "random" signs are drawn with the seed.
 
     Raises
     ------
     OptionError
-        For another choice of signs, or another residual.
+        When ``signs`` or ``residual`` is not one of the choices.
     UnderdeterminedError
-        When the rotations are not determined (by "aligned", which looks at them first).
+        When the rotations are not determined ("aligned" finds them first).
     """
     q_A, q_B = signed_quaternions(stack, signs, seed)
-    form = _Form.of(stack, q_A, q_B, dual_weight, residual)
-    sign = np.ones(len(q_B))
-    rounds = 0
-    while True:
-        rounds += 1
-        Q = form.matrix(sign)
-        found = relaxed(Q, form.frames)
+    rows_X, rows_Y = residual_rows(stack, q_A, q_B, residual)
+    fitting = np.ones(len(q_B))
+    for _ in range(ROUNDS if signs == "aligned" else 1):
+        sign = fitting
+        Q = form_of(stack, rows_X, sign[:, None, None] * rows_Y)
+        found = relaxed(Q, len(Q) // 8)
         q, t, cost = polished(Q, found.q, found.t)
         products = agreement(q_A, q[stack.target], q[len(stack.targets) + stack.sensor], q_B)
-        # Each pair's sign as a whole is the frames' own.
+        # The common sign of a pair belongs to its frames.
         whole = np.sign(stack.sums(sign * products))[np.repeat(np.arange(len(stack.pairs)), stack.counts)]
+        fitting = np.where(whole * products < 0.0, -1.0, 1.0)
         contradicted = int(np.count_nonzero(whole * sign * products < 0.0))
-        if signs != "aligned" or contradicted == 0 or rounds == ROUNDS:
+        if contradicted == 0:
             break
-        sign = np.where(whole * products < 0.0, -1.0, 1.0)
+    plain_A, plain_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])
+    reference = np.sign(np.einsum("ni,ni->n", plain_A, q_A) * np.einsum("ni,ni->n", plain_B, q_B))
     return DualQuaternionAnswer(
         to_rotations(q),
         t,
         max(cost, 0.0),
         _bound(Q, q, t, cost, found),
-        sign * _reference_signs(q_A, q_B, stack),
+        sign * reference,
         contradicted,
         float(np.abs(products).min()),
-        rounds,
     )
 
 
 def signed_quaternions(stack: Stack, signs: Signs, seed: int) -> tuple[Array, Array]:
-    """q_A and q_B (N, 4), scalar last, with a choice of signs.
-
-    Raises
-    ------
-    OptionError
-    """
+    """q_A and q_B (N, 4), scalar last, with a choice of signs; raises OptionError for another choice."""
     if signs == "aligned":
         return paired_quaternions(stack)
     q_A, q_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])
     if signs == "scalar":
-        return _with(np.where(q_A[:, 3] < 0.0, -1.0, 1.0), q_A), _with(np.where(q_B[:, 3] < 0.0, -1.0, 1.0), q_B)
+        return np.where(q_A[:, 3:] < 0.0, -q_A, q_A), np.where(q_B[:, 3:] < 0.0, -q_B, q_B)
     if signs == "continuous":
-        return _with(_continuous(q_A, stack.first), q_A), _with(_continuous(q_B, stack.first), q_B)
+        return _continuous(q_A, stack.first), _continuous(q_B, stack.first)
     if signs == "random":
-        generator = np.random.default_rng(seed)
-        return q_A, _with(generator.choice([-1.0, 1.0], len(q_B)), q_B)
-    raise OptionError(f"signs={signs!r} is not one of 'aligned', 'continuous', 'scalar', 'random'")
-
-
-def _with(sign: Array, q: Array) -> Array:
-    return sign[:, None] * q
+        return q_A, np.random.default_rng(seed).choice([-1.0, 1.0], (len(q_B), 1)) * q_B
+    raise OptionError(f"signs={signs!r} is not one of {', '.join(map(repr, get_args(Signs)))}")
 
 
 def _continuous(q: Array, first: np.ndarray) -> Array:
-    """Signs (N,) with which each quaternion is nearest to the one before, pair by pair."""
+    """The quaternions (N, 4) with signs that bring each near to the quaternion before it, pair by pair."""
     steps = np.ones(len(q))
     steps[1:] = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
     steps[first[:-1]] = 1.0
-    running: Array = np.cumprod(steps)
-    starts = running[first[:-1]]
-    result: Array = running * np.repeat(starts, np.diff(first))
-    return result
+    running = np.cumprod(steps)
+    signed: Array = (running * np.repeat(running[first[:-1]], np.diff(first)))[:, None] * q
+    return signed
 
 
-def _reference_signs(q_A: Array, q_B: Array, stack: Stack) -> Array:
-    """Of the quaternions' signs together, against those of the plain conversion from matrices."""
-    plain_A, plain_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])
-    result: Array = np.sign(np.einsum("ni,ni->n", plain_A, q_A) * np.einsum("ni,ni->n", plain_B, q_B))
-    return result
+def residual_rows(stack: Stack, q_A: Array, q_B: Array, residual: Residual = "a x - y b") -> tuple[Array, Array]:
+    """M_X and M_Y (N, 8, 8): each measurement's residual is M_X z_X - M_Y z_Y; OptionError for another residual."""
+    if residual not in get_args(Residual):
+        raise OptionError(f"residual={residual!r} is not one of {', '.join(map(repr, get_args(Residual)))}")
+    of_Y = _multiplication(q_B, stack.B[:, :3, 3], right)
+    if residual == "a x - y b":
+        return _multiplication(q_A, stack.A[:, :3, 3], left), of_Y
+    t_inverse = -np.einsum("nji,nj->ni", stack.A[:, :3, :3], stack.A[:, :3, 3])
+    return np.tile(np.eye(8), (len(of_Y), 1, 1)), _multiplication(conjugate(q_A), t_inverse, left) @ of_Y
 
 
-@dataclass(frozen=True)
-class _Form:
-    """Each pair's 16 x 16 matrix of |a x - y b|^2; only its off-diagonal block knows signs, so rows are kept for it."""
-
-    frames: int
-    own_X: Array
-    own_Y: Array
-    rows_X: Array
-    rows_Y: Array
-    stack: Stack
-
-    @staticmethod
-    def of(stack: Stack, q_A: Array, q_B: Array, dual_weight: float, residual: Residual = "a x - y b") -> _Form:
-        if residual not in get_args(Residual):
-            raise OptionError(f"residual={residual!r} is not one of {', '.join(map(repr, get_args(Residual)))}")
-        weight = np.repeat([1.0, np.sqrt(dual_weight)], 4)[:, None]
-        rows_Y = _multiplication(q_B, stack.B[:, :3, 3], right)
-        if residual == "a x - y b":
-            rows_X = weight * _multiplication(q_A, stack.A[:, :3, 3], left)
-            rows_Y = weight * rows_Y
-        else:
-            t_inverse = -np.einsum("nji,nj->ni", stack.A[:, :3, :3], stack.A[:, :3, 3])
-            rows_X = np.tile(weight * np.eye(8), (len(stack.A), 1, 1))
-            rows_Y = weight * (_multiplication(conjugate(q_A), t_inverse, left) @ rows_Y)
-        edges = [slice(8 * i, 8 * j) for i, j in zip(stack.first[:-1], stack.first[1:], strict=True)]
-        flat_X, flat_Y = rows_X.reshape(-1, 8), rows_Y.reshape(-1, 8)
-        own_X = np.array([flat_X[edge].T @ flat_X[edge] for edge in edges])
-        own_Y = np.array([flat_Y[edge].T @ flat_Y[edge] for edge in edges])
-        return _Form(len(stack.targets) + len(stack.sensors), own_X, own_Y, flat_X, flat_Y, stack)
-
-    def matrix(self, sign: Array) -> Array:
-        """Q (8 n, 8 n) with a sign (N,) for each b."""
-        n_X = len(self.stack.targets)
-        Q = np.zeros((self.frames, 8, self.frames, 8))
-        signed = np.repeat(sign, 8)[:, None] * self.rows_Y
-        for e, (j, k) in enumerate(self.stack.pairs):
-            rows = slice(8 * self.stack.first[e], 8 * self.stack.first[e + 1])
-            cross = self.rows_X[rows].T @ signed[rows]
-            Q[j, :, j] += self.own_X[e]
-            Q[n_X + k, :, n_X + k] += self.own_Y[e]
-            Q[j, :, n_X + k] -= cross
-            Q[n_X + k, :, j] -= cross.T
-        return Q.reshape(8 * self.frames, 8 * self.frames)
+def form_of(stack: Stack, rows_X: Array, rows_Y: Array) -> Array:
+    """Q (8 n, 8 n): z'Qz is the sum of the squared residuals M_X z_X - M_Y z_Y."""
+    n_X = len(stack.targets)
+    size = 8 * (n_X + len(stack.sensors))
+    Q = np.zeros((size, size))
+    for (j, k), of_X, of_Y in zip(stack.pairs, stack.by_pair(rows_X), stack.by_pair(rows_Y), strict=True):
+        rows = np.concatenate([of_X.reshape(-1, 8), -of_Y.reshape(-1, 8)], axis=1)
+        at = np.r_[8 * j : 8 * j + 8, 8 * (n_X + k) : 8 * (n_X + k) + 8]
+        Q[np.ix_(at, at)] += rows.T @ rows
+    return Q
 
 
 def _multiplication(q: Array, t: Array, side: Callable[[Array], Array]) -> Array:
@@ -261,7 +204,7 @@ def _multiplication(q: Array, t: Array, side: Callable[[Array], Array]) -> Array
 
 
 def _bound(Q: Array, q: Array, t: Array, cost: float, found: Relaxed) -> float:
-    """By the multipliers at the polished answer; where those do not prove it, the solver's, true to its tolerance."""
+    """The bound by the multipliers at the answer; where these prove nothing, the solver's, true to its tolerance."""
     value, smallest = multipliers_of(Q, q, t)
     if smallest >= -1e-13 * len(Q) * float(np.abs(Q).max()):
         return min(value, cost)
@@ -273,7 +216,7 @@ METHOD = Method(
     properties=Properties("dual quaternions", certifiable=True, multiple="Xs or Ys"),
     source="M. Horn, T. Wodtko, M. Buchholz and K. Dietmayer, Extrinsic infrastructure calibration using the hand-eye "
     "robot-world formulation, IEEE Intelligent Vehicles Symposium 2023",
-    assumes="Errors alike in all measurements, a radian as bad as a metre; a cost that changes with the origins of the "
-    "carriers' frames; signs of the quaternions that fit together, which large rotation errors make uncertain.",
+    assumes=f"{UNWEIGHTED} The cost changes with the origins of the carriers' frames. Signs of quaternions must fit; "
+    "large rotation errors make them uncertain.",
     function=horn2023,
 )

@@ -1,7 +1,7 @@
-"""Methods that minimise reprojection errors: Evangelista et al. 2023, and rp1 of Tabb and Ahmad Yousef 2017.
+"""The records of methods that minimise reprojection errors: Evangelista et al. 2023, Tabb and Ahmad Yousef's rp1 2017.
 
-They take corners in pixels in place of measured poses, so there is no ``Problem`` to run them on: ``reprojection``
-has what they take, and ``reprojection.calibrate`` solves it. Here are their records, for the table of methods.
+They take corners in pixels, not measured poses, so they cannot solve a ``Problem``. ``reprojection.Observations`` holds
+the corners, and ``reprojection.calibrate`` solves for the poses.
 """
 
 from __future__ import annotations
@@ -15,13 +15,7 @@ from gtsam_rwhec.problem.problem import Problem
 
 
 def refuse_poses(problem: Problem, options: MethodOptions | None = None) -> NoReturn:
-    """Refuse what has poses in place of images.
-
-    Raises
-    ------
-    FrameError
-        Always.
-    """
+    """Refuse a problem of poses: always raises FrameError."""
     raise FrameError(
         f"this method minimises reprojection errors, and the problem's {problem.number_of_measurements} measurements "
         "are poses; give corners in pixels, as gtsam_rwhec.methods.reprojection.Observations, to "
@@ -35,8 +29,7 @@ EVANGELISTA = Method(
     properties=Properties("SE(3)", multiple="Xs"),
     source="D. Evangelista, E. Olivastri, D. Allegri, E. Menegatti and A. Pretto, A graph-based optimization framework "
     "for hand-eye calibration for multi-camera setups, ICRA 2023",
-    assumes="Images: corners in pixels, alike in all of them, with cameras whose intrinsics are known; a start near "
-    "the answer.",
+    assumes="Corners in pixels, equally accurate, of cameras whose intrinsics are known. A start near the answer.",
     check=refuse_poses,
 )
 RP1 = Method(
@@ -44,6 +37,6 @@ RP1 = Method(
     function=refuse_poses,
     properties=Properties("rotation vectors", multiple="Xs or Ys"),
     source=SOURCE,
-    assumes="Images: corners in pixels, with cameras whose intrinsics are known; a start near the answer.",
+    assumes="Corners in pixels, of cameras whose intrinsics are known. A start near the answer.",
     check=refuse_poses,
 )

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT, conjugate, dual_parts, left, to_rotations
-from gtsam_rwhec.methods.absolute import FREE, Stack, plain_form, rotations_up_to_sign
+from gtsam_rwhec.methods.absolute import Stack, plain_form, rotations_up_to_sign
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
+from gtsam_rwhec.methods.normal_equations import solve_scaled
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.problem.problem import Problem
 
@@ -27,16 +27,12 @@ def kronecker(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     stack = Stack.of(problem)
     form = plain_form(stack)
     unknown = np.delete(np.arange(25), 6)
-    normal, right = form[np.ix_(unknown, unknown)], -form[unknown, 6]
-    scaling = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    equilibrated = normal * scaling[:, None] * scaling
-    if np.linalg.eigvalsh(equilibrated)[0] <= FREE:
-        raise UnderdeterminedError(
-            "the linear system of the 24 entries of X and Y is singular: rotations about parallel axes or by half "
-            "turns alone, carriers that do not move, or a sensor that always sees the target in the same place; turn "
-            "about a second axis, and change the distance"
-        )
-    x = scaling * np.linalg.solve(equilibrated, scaling * right)
+    undetermined = (
+        "the linear system of the 24 entries of X and Y is singular: rotations about parallel axes, half turns alone, "
+        "carriers that do not move, or a sensor that always sees the target in the same place; turn about a second "
+        "axis, and change the distance"
+    )
+    x = solve_scaled(form[np.ix_(unknown, unknown)], -form[unknown, 6], undetermined)
     R = rotations_up_to_sign(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
     gauge = stack.gauge
     return stack.outcome(R[:1], x[None, :3] + gauge.target_carrier, R[1:], x[None, 3:6] + gauge.sensor_carrier)

@@ -24,6 +24,9 @@ Arguments = ParamSpec("Arguments")
 #: of the other; several of both.
 Multiple = Literal["", "Xs or Ys", "Xs", "Xs and Ys"]
 
+#: What most methods assume of the noise (``Method.assumes``).
+UNWEIGHTED = "All measurements equally accurate, a radian weighs as much as a metre."
+
 
 class Takes(Enum):
     """What a method can use besides poses (or motions) of known scale."""

@@ -2,13 +2,13 @@
 
 vec R is linear in the ten products q_a q_b (``PRODUCTS``), so x'Q'x is a polynomial of degree four in the quaternions
 of one or two rotations, even in each of them. With y = [1, products of q_1, products of q_2] it is y'Cy, and the
-relaxation is over moments: what a measure on pairs of unit quaternions would have as integrals of the monomials.
+relaxation is over moments: the integrals of the monomials by a measure on pairs of unit quaternions.
 
     minimise <C, M(y y')>   subject to   M(y y') >= 0,   M(z z') >= 0 for z = q_1 (x) q_2,
                                          moments of m |q_k|^2 = those of m,   moment of 1 = 1
 
-The flips q_k -> -q_k keep everything, so moments of odd degree vanish and the moment matrix of order two falls into
-these two blocks (and the q_k q_k', which the first one with |q_k| = 1 makes positive semidefinite).
+The flips q_k -> -q_k change nothing, so moments of odd degree vanish. The moment matrix of order two then falls into
+these two blocks and the blocks q_k q_k', which are positive semidefinite by the first block and |q_k| = 1.
 """
 
 from __future__ import annotations
@@ -22,13 +22,16 @@ import scipy.sparse
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, to_rotations
+from gtsam_rwhec.solver.conic_solver import solve_conic, triangle, unstacked
 from gtsam_rwhec.solver.rotations import project, unvec
 
-#: The scalar first: the solver's last digits, and with them its bound, depend on the order.
+#: Order of a quaternion's entries, scalar first. The solver's last digits, and so its bound, depend on the order.
 _ENTRIES = (3, 0, 1, 2)
 #: (a, b) of the ten products q_a q_b.
 PRODUCTS = [(_ENTRIES[i], _ENTRIES[j]) for i in range(4) for j in range(i, 4)]
+#: Relative gap and infeasibility at which the interior-point solver stops.
 TOLERANCE = 1e-11
+#: Most steps of the interior-point solver, and of the descent after it.
 STEPS = 200
 
 
@@ -39,21 +42,20 @@ def products_to_rotation() -> Array:
 
 @dataclass(frozen=True)
 class MomentSolution:
-    """Starts (list of (n, 3, 3) rotations), a lower bound on the cost, how near the moments are to one point's.
+    """Starts (list of (n, 3, 3) rotations), a lower bound on the cost, and whether the moments are a single point's.
 
-    ``eigenvalue_ratio`` is the second eigenvalue of M(y y') over the first: zero where one answer is optimal and the
-    relaxation tight.
+    ``eigenvalue_ratio`` is the second eigenvalue of M(y y') over the first: zero where one answer alone is optimal and
+    the relaxation is tight.
     """
 
     starts: list[Array]
     lower_bound: float
     eigenvalue_ratio: float
-    iterations: int
 
 
 @dataclass(frozen=True)
 class _MomentPlaces:
-    """Which moment stands where: index of each entry of M(y y') and M(z z'), and the equations between moments."""
+    """The index of the moment in each entry of M(y y') and M(z z'), and the equations between moments."""
 
     count: int
     even: np.ndarray
@@ -63,7 +65,7 @@ class _MomentPlaces:
 
 @cache
 def _moment_places(frames: int) -> _MomentPlaces:
-    """For one or two quaternions."""
+    """The places for one or two quaternions."""
     place: dict[tuple[int, ...], int] = {}
 
     def index(exponents: np.ndarray) -> int:
@@ -87,7 +89,7 @@ def _moment_places(frames: int) -> _MomentPlaces:
 
 
 def solve_moments(Q: Array) -> MomentSolution:
-    """The relaxation of x'Q'x, x = [vec R_1, (vec R_2,) 1], Q' (10, 10) or (19, 19)."""
+    """Solve the relaxation of x'Q'x, x = [vec R_1, (vec R_2,) 1], Q' (10, 10) or (19, 19)."""
     frames = (len(Q) - 1) // 9
     moments = _moment_places(frames)
     to_x = np.zeros((len(Q), 1 + 10 * frames))
@@ -106,52 +108,39 @@ def solve_moments(Q: Array) -> MomentSolution:
     A = scipy.sparse.vstack([equations, *[-_triangle(block, moments.count) for block in blocks]], format="csc")
     b = np.zeros(A.shape[0])
     b[0] = 1.0
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.max_iter = STEPS
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
-    zero = scipy.sparse.csc_matrix((moments.count, moments.count))
-    solution = clarabel.DefaultSolver(zero, cost, A, b, cones, settings).solve()
-    mu, z = np.array(solution.x), np.array(solution.z)
+    mu, z, _ = solve_conic(cost, A, b, cones, TOLERANCE, STEPS)
     values = np.linalg.eigvalsh(mu[moments.even])
     return MomentSolution(
         _rounded(mu[moments.even], frames),
         scale * _lower_bound(cost, A, z, equations.shape[0], blocks),
         float(max(values[-2], 0.0) / values[-1]),
-        int(solution.iterations),
     )
 
 
 def _triangle(block: np.ndarray, count: int) -> scipy.sparse.csc_matrix:
-    """svec of a block of moments as a linear map: Clarabel stacks the upper triangle, column after column."""
-    j, i = np.tril_indices(len(block))
-    root = np.where(i == j, 1.0, np.sqrt(2.0))
-    return scipy.sparse.csc_matrix((root, (np.arange(len(i)), block[i, j])), (len(i), count))
+    """The linear map from the moments to the stacked entries of a block."""
+    i, j, weight = triangle(len(block))
+    return scipy.sparse.csc_matrix((weight, (np.arange(len(i)), block[i, j])), (len(i), count))
 
 
 def _lower_bound(cost: Array, A: scipy.sparse.csc_matrix, z: Array, equations: int, blocks: list[np.ndarray]) -> float:
-    """-z_0, less what the solver's tolerance leaves: true (up to rounding) for any multipliers z.
+    """A lower bound that holds (up to rounding) for any multipliers z: -z_0, less what the solver's tolerance leaves.
 
     For the moments mu of any unit quaternions, cost' mu = -z_0 + sum <Z, M> + r' mu with r = cost + A' z. No moment
-    exceeds 1, the trace of M(y y') is at most 1 + n and that of M(z z') is 1. The smallest change of z first makes r
-    vanish.
+    exceeds 1. The trace of M(y y') is at most 1 + n, the trace of M(z z') is 1. The smallest change of z that makes r
+    vanish comes first.
     """
     z = z - np.linalg.lstsq(A.T.toarray(), cost + A.T @ z, rcond=None)[0]
     bound = -float(z[0]) - float(np.abs(cost + A.T @ z).sum())
     start = equations
     for block, trace in zip(blocks, (1.0 + (len(blocks[0]) - 1) // 10, 1.0), strict=False):
-        size = len(block)
-        j, i = np.tril_indices(size)
-        Z = np.zeros((size, size))
-        Z[i, j] = z[start : start + len(i)] / np.where(i == j, 1.0, np.sqrt(2.0))
-        Z = Z + Z.T - np.diag(np.diagonal(Z))
-        bound += trace * min(0.0, float(np.linalg.eigvalsh(Z)[0]))
-        start += len(i)
+        bound += trace * min(0.0, float(np.linalg.eigvalsh(unstacked(z[start:], len(block)))[0]))
+        start += len(block) * (len(block) + 1) // 2
     return bound
 
 
 def _rounded(M: Array, frames: int) -> list[Array]:
-    """Rotations from the second moments of each quaternion, and of the rotation matrices that they mean."""
+    """Rotations from the second moments of each quaternion, and from the rotation matrices that these moments mean."""
     by_quaternion = np.empty((frames, 3, 3))
     for k in range(frames):
         second = np.zeros((4, 4))

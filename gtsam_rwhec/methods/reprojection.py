@@ -16,8 +16,17 @@ from numpy.typing import ArrayLike
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, TargetError
-from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms, checked_rows, one_transform, rows_to_transforms
+from gtsam_rwhec.geometry.poses import (
+    Array,
+    PosesLike,
+    as_transforms,
+    checked_rows,
+    one_transform,
+    rows_to_transforms,
+    to_pose3,
+)
 from gtsam_rwhec.methods.estimate import Poses
+from gtsam_rwhec.methods.levenberg_marquardt import Linearised, descend
 from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import MethodOptions
 from gtsam_rwhec.problem.problem import Problem
@@ -212,36 +221,26 @@ def calibrate(observations: Observations, options: MethodOptions | None = None) 
         [one_transform(X[name], f"start of {name}") for name in targets]
         + [one_transform(Y[name], f"start of {name}") for name in sensors]
     )
-    linear = linearised(observations, T)
-    if not np.isfinite(linear.cost):
+    if not np.isfinite(linearised(observations, T).cost):
         raise CameraError(
-            f"the start ({starts_from}) puts a corner that was seen behind its camera; give a better one by "
+            f"the start ({starts_from}) puts a corner that was seen behind its camera; give a better start by "
             "MethodOptions.start"
         )
-    damping, converged, iteration = 1e-6, False, 0
-    while iteration < options.max_iterations and not converged:
-        iteration += 1
-        while True:
-            step = -np.linalg.solve(linear.H + damping * np.diag(np.diagonal(linear.H)), linear.g)
-            tried = T @ se3.expmap(step.reshape(-1, 6))
-            ahead = linearised(observations, tried)
-            if ahead.cost <= linear.cost or damping > 1e9:
-                break
-            damping *= 10.0
-        if ahead.cost > linear.cost:
-            converged = True  # no step goes down: rounding
-            break
-        decrease = linear.cost - ahead.cost
-        converged = bool(decrease <= 1e-12 * ahead.cost and np.abs(step).max() < 1e-7)
-        T, linear, damping = tried, ahead, max(0.1 * damping, 1e-12)
-    poses = [gtsam.Pose3(gtsam.Rot3(one[:3, :3]), one[:3, 3]) for one in T]
+    found = descend(
+        lambda poses: linearised(observations, poses),
+        lambda poses, step: poses @ se3.expmap(step.reshape(-1, 6)),
+        T,
+        options.max_iterations,
+    )
+    poses = [to_pose3(pose[:3, :3], pose[:3, 3]) for pose in found.point]
+    corners = sum(int(view.known.sum()) for view in observations.views.values())
     return ReprojectionAnswer(
         dict(zip(targets, poses[: len(targets)], strict=True)),
         dict(zip(sensors, poses[len(targets) :], strict=True)),
-        linear.cost,
-        float(observations.corner_px * np.sqrt(2.0 * linear.cost / linear.corners)),
-        iteration,
-        converged,
+        found.cost,
+        float(observations.corner_px * np.sqrt(2.0 * found.cost / corners)),
+        found.iterations,
+        found.converged,
         starts_from,
     )
 
@@ -266,22 +265,15 @@ def _start(observations: Observations, options: MethodOptions) -> tuple[Poses, P
     return X, Y, f"{words} of the images' poses"
 
 
-@dataclass(frozen=True, eq=False)
-class Linearised:
-    """Half the weighed sum of squares, its gradient and Gauss-Newton Hessian by [w, v] of all frames, corner count."""
-
-    cost: float
-    g: Array
-    H: Array
-    corners: int
-
-
 def linearised(observations: Observations, T: Array) -> Linearised:
-    """At poses T (n_X + n_Y, 4, 4), perturbed on the right; infinite where a corner seen is behind its camera."""
+    """Half the sum of squares over corner_px^2 at poses T (n_X + n_Y, 4, 4), for right perturbations [w, v] of each.
+
+    The cost is infinite where a corner that was seen is behind its camera.
+    """
     targets, sensors = observations.targets, observations.sensors
     n = len(T)
     H, g = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
-    cost, corners = 0.0, 0
+    cost = 0.0
     for (target, sensor), view in observations.views.items():
         i, j = targets.index(target), len(targets) + sensors.index(sensor)
         camera, p = observations.cameras[sensor], observations.corners[target]
@@ -290,7 +282,7 @@ def linearised(observations: Observations, T: Array) -> Linearised:
         seen = p @ R.transpose(0, 2, 1) + to_camera[:, None, :3, 3]
         known = view.known
         if (seen[known][:, 2] <= 1e-9).any():
-            return Linearised(np.inf, g.ravel(), H.reshape(6 * n, 6 * n), 0)
+            return Linearised(np.inf, g.ravel(), H.reshape(6 * n, 6 * n))
         z = np.where(known, seen[:, :, 2], 1.0)
         x = np.where(known[:, :, None], seen[:, :, :2] / z[:, :, None], 0.0)
         pixels, D = camera.pixel_jacobian(x)
@@ -310,8 +302,7 @@ def linearised(observations: Observations, T: Array) -> Linearised:
         g[i] += rows_X.T @ e
         g[j] += rows_Y.T @ e
         cost += 0.5 * float(e @ e)
-        corners += int(known.sum())
-    return Linearised(cost, g.ravel(), H.reshape(6 * n, 6 * n), corners)
+    return Linearised(cost, g.ravel(), H.reshape(6 * n, 6 * n))
 
 
 def _in_plane(points: Array, name: str) -> tuple[Array, Array]:

@@ -25,10 +25,12 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, of_rotations, to_rotations
 from gtsam_rwhec.methods.absolute import Stack, linear_translations
 from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
 from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.methods.unit_weights import UnitForm, unit_weights
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import vec
 
@@ -78,28 +80,19 @@ def tabb2017(
 
 
 def least(form: ReducedForm, R: Array, parameterisation: Parameterisation, max_iterations: int) -> Array:
-    """Rotations (n, 3, 3) of a local minimum of x'Q'x, from a start."""
-    from scipy.optimize import least_squares
-
+    """Rotations (n, 3, 3) of a local minimum of x'Q'x, from the rotations R."""
     to_parameters, chart = CHARTS[parameterisation]
-    values, vectors = np.linalg.eigh(form.dense())
-    root = (np.sqrt(np.maximum(values, 0.0)) * vectors).T  # |root x|^2 = x' Q' x
-    start = to_parameters(R)
-    n, k = start.shape
+    n, k = to_parameters(R).shape
 
-    def residual(p: Array) -> Array:
-        rows: Array = root[:, :-1] @ vec(chart(p.reshape(n, k))[0]).ravel() + root[:, -1]
-        return rows
+    def point(p: Array) -> tuple[Array, Array]:
+        rotations, by_parameter = chart(p.reshape(n, k))
+        derivatives = np.zeros((9 * n + 1, n * k))  # of x = [vec R_1, ..., vec R_n, 1]
+        for frame in range(n):
+            derivatives[9 * frame : 9 * frame + 9, k * frame : k * frame + k] = by_parameter[frame]
+        return homogeneous(rotations), derivatives
 
-    def jacobian(p: Array) -> Array:
-        derivative = chart(p.reshape(n, k))[1]
-        rows: Array = np.einsum("rnv,nvk->rnk", root[:, :-1].reshape(-1, n, 9), derivative).reshape(-1, n * k)
-        return rows
-
-    found = least_squares(
-        residual, start.ravel(), jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=max_iterations
-    )
-    return chart(found.x.reshape(n, k))[0]
+    found = descend_on_chart(form.dense(), point, to_parameters(R).ravel(), max_iterations)
+    return chart(found.reshape(n, k))[0]
 
 
 def from_euler(p: Array) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
-"""A X = Y B with all weights 1, as the certified solver's quadratic form: for methods whose cost knows no noise.
+"""A X = Y B with all weights 1 as the certified solver's quadratic form, for methods whose cost has no noise model.
 
-A radian then weighs as much as a metre (times the square root of two, the Frobenius norm's). Translations, and a shared
-scale, are eliminated exactly: x'Q'x over x = [vec R_1, ..., vec R_n, 1] is the least cost that rotations leave (RWHEC
+A radian weighs as much as a metre (times the square root of two, by the Frobenius norm). Translations and a shared
+scale are eliminated exactly: x'Q'x over x = [vec R_1, ..., vec R_n, 1] is the least cost for given rotations (RWHEC
 paper, eq. 48), its 1/2 included.
 """
 
@@ -18,10 +18,9 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.forms import Forms
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.reduced_form import ReducedForm, reduce
-from gtsam_rwhec.solver.start import spectral_start
 from gtsam_rwhec.solver.variables import answer_of
 
-#: The cost of all methods that have this form.
+#: The name of this cost in ``Estimate.proof``.
 COST = "J with all weights 1"
 
 
@@ -29,7 +28,7 @@ COST = "J with all weights 1"
 class UnitForm:
     """The form of one connected problem, and the way back to its poses.
 
-    ``turned``: of B X^-1 = Y^-1 A, whose frames are the inverses of the problem's.
+    With ``turned`` it is the form of B X^-1 = Y^-1 A, whose frames are the inverses of the problem's frames.
     """
 
     part: Part
@@ -38,18 +37,12 @@ class UnitForm:
 
     @staticmethod
     def of(problem: Problem, *, turned: bool = False) -> UnitForm:
-        """From the raw measurements, whatever their weights.
-
-        Raises
-        ------
-        FrameError
-            For a problem that falls into parts that nothing joins.
-        """
+        """The form of raw measurements; FrameError for a problem that falls into unconnected parts."""
         parts = parts_of(unit_weights(problem, turned=turned))
         if len(parts) > 1:
             raise FrameError(
-                f"the measurements fall into {len(parts)} parts that nothing joins ({', '.join(parts[0].names)} is "
-                "one); solve them apart"
+                f"the measurements fall into {len(parts)} unconnected parts (one part has "
+                f"{', '.join(parts[0].names)}); solve each part as a problem of its own"
             )
         return UnitForm(parts[0], Forms.of(parts[0]), turned)
 
@@ -60,35 +53,21 @@ class UnitForm:
 
     @property
     def rotations_alone(self) -> ReducedForm:
-        """Of the rotation residuals alone."""
+        """The form of the rotation residuals alone."""
         return reduce(self.forms.rotation)
-
-    def spectral_start(self) -> list[Array]:
-        """Rotations (n, 3, 3) in the order of ``part.free``, by the smallest eigenvector of the rotation residuals."""
-        return spectral_start(self.part, self.forms.rotation)
 
     def rotations_of(self, X: Poses, Y: Poses) -> Array:
         """Rotations (n, 3, 3) of given poses, as the form has them."""
-        R = np.array(
-            [
-                one_transform((X if name in self.part.targets else Y)[name], f"start of {name}")[:3, :3]
-                for name in self.part.free
-            ]
-        )
+        poses = {**X, **Y}
+        R = np.array([one_transform(poses[name], f"start of {name}")[:3, :3] for name in self.part.free])
         return np.ascontiguousarray(R.transpose(0, 2, 1)) if self.turned else R
 
     def outcome(self, R: Array, starts_from: str | None = None, notes: tuple[str, ...] = ()) -> Outcome[Poses]:
-        """Poses with the best translations (and scale) for rotations R (n, 3, 3).
-
-        Raises
-        ------
-        ScaleError
-            For a scale that is not positive.
-        """
+        """Poses with the best translations (and scale) for rotations R (n, 3, 3); ScaleError if the scale is <= 0."""
         answer = answer_of(self.part, self.reduced, R)
         if not answer.scale > 0.0:
             raise ScaleError(
-                f"the scale of least cost is {answer.scale:.6g}, which no real target has; check the conventions of "
+                f"the scale of least cost is {answer.scale:.6g}; a real scale is positive. Check the conventions of "
                 "the poses, or move along more than one circle or sphere"
             )
         T: Array = np.tile(np.eye(4), (len(R), 1, 1))

@@ -1,8 +1,8 @@
 """Wise, Giamou, Khoubyarian, Grebe and Kelly 2020: one sensor, certified by the Kronecker form's own relaxation.
 
-A X = Y B of one X and one Y, or A Y = Y B of a sensor's motions (hand-eye calibration, as the paper has it), as a
-quadratic cost of vec R_X and vec R_Y by Kronecker products, translations and the monocular scale eliminated; 21
-quadratic constraints a rotation, solved as a semidefinite program. Its dual is a lower bound on what any answer costs.
+The paper solves A Y = Y B, one sensor's motions (hand-eye calibration); A X = Y B of one X and one Y is solved alike.
+The cost is quadratic in vec R_X and vec R_Y by Kronecker products, without translations and the monocular scale.
+Each rotation has 21 quadratic constraints. The semidefinite relaxation's dual is a lower bound on every answer's cost.
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.estimate import Outcome, Poses
-from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes
+from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Properties, Takes
 from gtsam_rwhec.methods.unit_weights import COST, UnitForm
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.bound import lower_bound
@@ -24,7 +23,9 @@ from gtsam_rwhec.solver.local_blocks import scatter
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_by_clarabel
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers, vec
 
+#: Relative gap and infeasibility at which the interior-point solver stops.
 TOLERANCE = 1e-10
+#: Most steps of the interior-point solver, and of the descent.
 STEPS = 200
 #: Second over first eigenvalue of the solution below which it has rank one, and the relaxation is tight.
 RANK_ONE = 1e-5
@@ -32,9 +33,9 @@ RANK_ONE = 1e-5
 
 @dataclass(frozen=True)
 class CertifiedRotations:
-    """Rotations (n, 3, 3) of least cost and the proof.
+    """Rotations (n, 3, 3) of least cost, a lower bound on every answer's cost, and how tight the relaxation is.
 
-    ``lower_bound`` holds for every answer; ``eigenvalue_ratio`` is the solution's second over its first.
+    ``eigenvalue_ratio`` is the relaxation's second eigenvalue over its first.
     """
 
     R: Array
@@ -44,12 +45,12 @@ class CertifiedRotations:
 
     @property
     def gap(self) -> float:
-        """Relative to the cost; for exact data, whose cost is rounding, it says nothing."""
+        """Cost minus bound, relative to the cost; it says nothing of exact data, whose cost is rounding."""
         return (self.cost - self.lower_bound) / max(self.cost, 1e-300)
 
 
 def wise2020(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """One X and one Y, or one sensor's motions; known or shared scale."""
+    """Solve for one X and one Y, or one sensor's motions; known or shared scale."""
     form = UnitForm.of(problem)
     found = certified_rotations(form)
     is_tight = found.eigenvalue_ratio < RANK_ONE
@@ -66,7 +67,7 @@ def wise2020(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
 
 
 def certified_rotations(form: UnitForm) -> CertifiedRotations:
-    """Solve the relaxation by Clarabel, descend from its rotations, and bound by the better of both multipliers."""
+    """Solve the relaxation by Clarabel, descend from its rotations, and take the best of three lower bounds."""
     reduced = form.reduced
     Q = reduced.dense()
     relaxation = solve_by_clarabel(Q, TOLERANCE, STEPS)
@@ -81,25 +82,11 @@ def certified_rotations(form: UnitForm) -> CertifiedRotations:
 
 
 def _relaxation_bound(Q: Array, relaxation: Relaxation) -> float:
-    """gamma + (3 n + 1) min(0, lambda_min(Z)), as x'x = 3 n + 1: the better one where the relaxation is not tight."""
+    """gamma + (3 n + 1) min(0, lambda_min(Z)), as x'x = 3 n + 1: the best bound where the relaxation is not tight."""
     Z = Q - scatter(np.einsum("nk,kij->nij", relaxation.multipliers, CONSTRAINTS))
     Z[-1, -1] -= relaxation.dual
     trace = (len(Q) - 1) / 3.0 + 1.0
     return relaxation.dual + trace * min(0.0, float(np.linalg.eigvalsh(Z)[0]))
-
-
-def check_frames(problem: Problem) -> None:
-    """One pair of frames, or one sensor's motions alone.
-
-    Raises
-    ------
-    FrameError
-    """
-    if len(problem.pairs) > 1:
-        raise FrameError(
-            f"one target and one sensor, or one sensor's motions, and here are {len(problem.pairs)} pairs of frames: "
-            f"{', '.join(map(str, problem.pairs))}"
-        )
 
 
 METHOD = Method(
@@ -107,8 +94,7 @@ METHOD = Method(
     properties=Properties("SE(3)", certifiable=True, monocular=True),
     source="E. Wise, M. Giamou, S. Khoubyarian, A. Grebe and J. Kelly, Certifiably optimal monocular hand-eye "
     "calibration, IEEE MFI 2020",
-    assumes="Errors alike in all measurements, a radian as bad as a metre. Proves its answer, or says that it has not.",
+    assumes=f"{UNWEIGHTED} The answer says whether it is proven optimal.",
     function=wise2020,
     takes=frozenset({Takes.SHARED_SCALE, Takes.MOTIONS}),
-    check=check_frames,
 )

@@ -6,9 +6,10 @@ import numpy as np
 
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.quaternions import left, of_rotations, right, to_rotations
-from gtsam_rwhec.methods.absolute import FREE, Stack, linear_outcome, linear_rotations
+from gtsam_rwhec.methods.absolute import Stack, linear_outcome, linear_rotations
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
+from gtsam_rwhec.methods.normal_equations import FREE
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.problem.problem import Problem
 

@@ -48,8 +48,7 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
     if without:
         console.print(Text("No answer:", style="bold"))
         for row in without:
-            reason = str(row.error).removeprefix(f"{row.method.name} ").removeprefix(f"{row.method.name}: ")
-            console.print(Text(f"  - {row.method.name}: {reason}"), soft_wrap=wrap)
+            console.print(Text(f"  - {row.method.name}: {row.error}"), soft_wrap=wrap)
         console.print()
     if comparison.certificate is None:
         console.print(Text(f"No bound on the cost: {comparison.error}", style="bold red"), soft_wrap=wrap)

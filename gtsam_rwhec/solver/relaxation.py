@@ -13,6 +13,7 @@ import scipy.sparse
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.cause import Start
+from gtsam_rwhec.solver.conic_solver import solve_conic, stacked, unstacked
 from gtsam_rwhec.solver.interior_point import Relaxation, solve_by_blocks
 from gtsam_rwhec.solver.local_blocks import local_indices
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, project, unvec
@@ -88,31 +89,19 @@ def _relaxation(Q: Array, X: Array, y: Array, scale: float, nu: float, iteration
 
 def _clarabel(C: Array, n: int, tolerance: float, max_iterations: int) -> tuple[Array, Array, int]:
     """X, multipliers and iterations; C is over [r, h], or over [r, h, alpha]: then X's entry h alpha is nonnegative."""
-    size = len(C)
-    upper_j, upper_i = np.tril_indices(size)  # Clarabel stacks the upper triangle, column after column
-    root = np.where(upper_i == upper_j, 1.0, np.sqrt(2.0))
-    A = _constraint_columns(n, size)
-    b = C[upper_i, upper_j] * root
-    cones = [clarabel.PSDTriangleConeT(size)]
-    if size == 9 * n + 2:  # nu >= 0, the multiplier of h alpha
-        entry = (upper_i == 9 * n) & (upper_j == 9 * n + 1)
-        A = scipy.sparse.hstack([A, scipy.sparse.csc_matrix((entry * 0.5 * root)[:, None])], format="csc")
+    A, b = _constraint_columns(n, len(C)), stacked(C)
+    cones = [clarabel.PSDTriangleConeT(len(C))]
+    if len(C) == 9 * n + 2:  # nu >= 0, the multiplier of h alpha
+        entry = np.zeros_like(C)
+        entry[9 * n, 9 * n + 1] = 0.5
+        A = scipy.sparse.hstack([A, scipy.sparse.csc_matrix(stacked(entry)[:, None])], format="csc")
         A = scipy.sparse.vstack([A, scipy.sparse.csc_matrix(([-1.0], ([0], [A.shape[1] - 1])), (1, A.shape[1]))], "csc")
         b = np.r_[b, 0.0]
         cones.append(clarabel.NonnegativeConeT(1))
-    q = np.zeros(A.shape[1])
-    q[20 * n] = -1.0
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.max_iter = max_iterations
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
-    zero = scipy.sparse.csc_matrix((A.shape[1], A.shape[1]))
-    solution = clarabel.DefaultSolver(zero, q, A, b, cones, settings).solve()
-    z = np.array(solution.z)[: len(upper_i)]
-    X = np.zeros((size, size))
-    X[upper_i, upper_j] = z / root
-    X = X + X.T - np.diag(np.diagonal(X))
-    return X, np.array(solution.x), int(solution.iterations)
+    cost = np.zeros(A.shape[1])
+    cost[20 * n] = -1.0
+    multipliers, z, iterations = solve_conic(cost, A, b, cones, tolerance, max_iterations)
+    return unstacked(z, len(C)), multipliers, iterations
 
 
 def _constraint_columns(n: int, size: int) -> scipy.sparse.csc_matrix:

@@ -97,7 +97,7 @@ def test_report_has_a_line_for_each(tmp_path: object) -> None:
     text = printed(result)
     for name in METHODS:
         assert len([line for line in text.splitlines() if line.strip().startswith((name + " ", f"- {name}:"))]) == 1
-    assert "shah2013: takes scale='known'" in text
+    assert "shah2013: this method takes scale='known'" in text
     assert "Certified globally optimal: the certified answer costs" in text
     assert "Started from wang2022's linear systems, with the scale: lom." in text
 

@@ -183,7 +183,7 @@ def test_bad_input() -> None:
         local_on_manifold(simulation.problem, simulation.X, {"sensor1": simulation.Y["sensor1"]})
     with pytest.raises(MeasurementsNotKeptError):
         local_on_manifold(rig(keep_measurements=False).problem, *start)
-    with pytest.raises(ScaleError, match="one scale for all"):
+    with pytest.raises(ScaleError, match="scale='per_target'"):
         local_on_manifold(rig(scale="per_target").problem, *start)
     with pytest.raises(FrameError, match="has motions"):
         local_on_manifold(rig(odometry=1).problem, *start)

@@ -1,0 +1,80 @@
+"""Levenberg and Marquardt's method, for small problems whose normal equations fit into one matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+
+Point = TypeVar("Point")
+#: The point x (m,) of parameters p (k,), and its derivatives (m, k).
+Chart = Callable[[Array], tuple[Array, Array]]
+
+#: Damping of the first step, relative to the Hessian's diagonal; a failed step multiplies it by 10, a good one by 0.1.
+FIRST_DAMPING = 1e-6
+#: With more damping than this the steps are rounding.
+MOST_DAMPING = 1e9
+#: Largest entry of a step (rad, m) that is taken although rounding hides whether the cost falls.
+FLAT_STEP = 1e-7
+#: Largest entry (rad, m) of the last step.
+LAST_STEP = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Half a sum of squares at a point: its value, its gradient g (k,) and Gauss-Newton Hessian H (k, k) by a step."""
+
+    cost: float
+    g: Array
+    H: Array
+
+
+@dataclass(frozen=True)
+class Descent(Generic[Point]):
+    """Where a descent ended, the cost there, the number of steps, and whether it converged before the step limit."""
+
+    point: Point
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def descend(
+    linearised: Callable[[Point], Linearised],
+    moved: Callable[[Point, Array], Point],
+    start: Point,
+    max_iterations: int,
+) -> Descent[Point]:
+    """Find a local minimum from ``start``; ``moved`` takes a step (k,) from a point to the next point."""
+    point, here, damping = start, linearised(start), FIRST_DAMPING
+    for iteration in range(1, max_iterations + 1):
+        while True:
+            H = here.H + damping * np.diag(np.diagonal(here.H))
+            step = -np.linalg.lstsq(H, here.g, rcond=1e-15)[0]  # a chart's H may be singular
+            length = float(np.abs(step).max())
+            tried = moved(point, step)
+            ahead = linearised(tried)
+            if ahead.cost <= here.cost or (length < FLAT_STEP and np.isfinite(ahead.cost)):
+                break
+            damping *= 10.0
+            if damping > MOST_DAMPING:  # no step reduces the cost: rounding
+                return Descent(point, here.cost, iteration, converged=True)
+        point, here, damping = tried, ahead, max(0.1 * damping, 1e-12)
+        if length < LAST_STEP:
+            return Descent(point, here.cost, iteration, converged=True)
+    return Descent(point, here.cost, max_iterations, converged=False)
+
+
+def descend_on_chart(form: Array, chart: Chart, start: Array, max_iterations: int) -> Array:
+    """Parameters (k,) of a local minimum of x(p)' Q x(p), for a form Q (m, m), from ``start`` (k,)."""
+
+    def linearised(p: Array) -> Linearised:
+        x, J = chart(p)
+        Qx = form @ x
+        return Linearised(0.5 * float(x @ Qx), J.T @ Qx, J.T @ form @ J)
+
+    return descend(linearised, lambda p, step: p + step, start, max_iterations).point
