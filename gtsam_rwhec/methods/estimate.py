@@ -1,4 +1,4 @@
-"""What methods answer: the outcome of a method's own function, and the estimate that its user gets."""
+"""What methods answer: the outcome of a method's own function, and the estimate that the user gets."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class Outcome(Generic[X]):
     X, Y : poses by name, or the one pose (4, 4) of A X = X B
         Metres.
     cost : float or None
-        The method's own; None: that by which the call compares all methods.
+        The method's own cost; None when it is the cost by which the call compares all methods.
     cost_name : str
-        Which cost that is.
+        The name of ``cost``.
     lower_bound : float or None
-        Proven, of the same cost.
+        A proven lower bound on ``cost``.
     is_optimal : bool or None
-        Whether the bound proves the answer, where the method has its own rule for that.
+        Whether the bound proves the answer, where the method has its own rule.
     scale, free_directions, starts_from, notes
         As in ``Estimate``; free directions where the method finds them itself.
     """
@@ -56,9 +56,9 @@ class Proof:
     Attributes
     ----------
     cost : float
-        Of the answer.
+        The answer's cost.
     cost_name : str
-        Which cost that is; it need not be the estimate's.
+        The name of this cost, which may differ from ``Estimate.cost_name``.
     lower_bound : float
         No answer costs less.
     is_optimal : bool
@@ -78,35 +78,36 @@ class Proof:
 
 @dataclass(frozen=True)
 class Estimate(Generic[X]):
-    """A method's answer, evaluated as those of all others are.
+    """A method's answer; all methods' answers are evaluated alike.
 
     Attributes
     ----------
     method : str
+        The method's name.
     X : dict of str to gtsam.Pose3, or gtsam.Pose3
         T_targetcarrier_target of each target, metres; of A X = X B the one pose, T_c_h with C_i X = X H_i.
     Y : dict of str to gtsam.Pose3
-        T_sensorcarrier_sensor of each sensor, metres; none of A X = X B.
+        T_sensorcarrier_sensor of each sensor, metres; empty for A X = X B.
     scale : float or dict of str to float
         t_B (t_C of C X = X H) = scale * (true length); 1 when known.
     cost : float
-        By which the answers of ``methods.run`` are compared, J of the certified objective (eq. 18), whatever the
-        method itself minimised; of ``handeye.solve``, the cost that ``cost_name`` says.
+        From ``methods.run``: J of the certified objective (eq. 18), whatever cost the method itself minimised. From
+        ``handeye.solve``: the cost that ``cost_name`` names.
     cost_name : str
     proof : Proof or None
         None where the method proves nothing.
     free_directions : tuple of FreeDirection
-        What the measurements leave undetermined, judged by this answer's residuals; empty when nothing.
+        What the measurements leave undetermined, by this answer's residuals.
     seconds : float
-        The method's own time; of ``handeye.solve``, with checks and evaluation.
+        The method's own time; from ``handeye.solve`` with checks and evaluation.
     residuals : dict of (target, sensor) to Residual
-        Empty of A X = X B.
+        Empty for A X = X B.
     alpha : float or None
-        1/m, the weight of translations that A X = X B was solved with, given or estimated; None of A X = Y B.
+        1/m, the weight of translations in A X = X B, given or estimated; None for A X = Y B.
     starts_from : str or None
         What an iteration started from; None for closed forms and global methods.
     notes : tuple of str
-        What the method says of this answer.
+        The method's remarks on this answer.
     """
 
     method: str
@@ -125,7 +126,7 @@ class Estimate(Generic[X]):
 
     @property
     def lower_bound(self) -> float | None:
-        """No answer has a lower cost, of the cost that ``proof`` names; None where the method proves nothing."""
+        """``proof.lower_bound``; None where the method proves nothing."""
         return None if self.proof is None else self.proof.lower_bound
 
     @property
@@ -135,5 +136,5 @@ class Estimate(Generic[X]):
 
     @property
     def is_optimal(self) -> bool | None:
-        """Whether the answer is proven optimal for the method's own cost; None where the method proves nothing."""
+        """``proof.is_optimal``; None where the method proves nothing."""
         return None if self.proof is None else self.proof.is_optimal

@@ -1,4 +1,4 @@
-"""Li, Wang and Wu 2010: all 24 entries at once by a Kronecker product; and dual quaternions."""
+"""Li, Wang and Wu 2010: all 24 entries of X and Y at once by a Kronecker product, and dual quaternions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT, conjugate, dual_parts, left, to_rotations
 from gtsam_rwhec.methods.absolute import Stack, plain_form, rotations_up_to_sign
 from gtsam_rwhec.methods.estimate import Outcome, Poses
-from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
+from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.normal_equations import solve_scaled
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.problem.problem import Problem
@@ -20,9 +20,9 @@ _SOURCE = (
 
 
 def kronecker(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """A X = Y B in least squares over all entries of X and Y, linear; then the matrices are projected to rotations.
+    """Solve A X = Y B by linear least squares over all entries of X and Y, then project the matrices to rotations.
 
-    The translations are those of the linear system, which belong to the matrices before their projection.
+    The translations belong to the matrices before the projection.
     """
     stack = Stack.of(problem)
     form = plain_form(stack)
@@ -39,7 +39,7 @@ def kronecker(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
 
 
 def _rows() -> Array:
-    """The equations' coefficients (16, 8, 16): of the features [q_A, q'_A, q_B, q'_B], in [q_X, q'_X, q_Y, q'_Y].
+    """The equations' coefficients (16, 8, 16): [feature of q_A, q'_A, q_B, q'_B; equation; q_X, q'_X, q_Y, q'_Y].
 
     q_A q_X - q_Y q_B = 0 and q_A q'_X + q'_A q_X - q_Y q'_B - q'_Y q_B = 0.
     """
@@ -55,11 +55,11 @@ _ROWS = _rows()
 
 
 def dual_quaternions(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """The homogeneous linear system of two dual quaternions, 8 equations a measurement.
+    """Solve the homogeneous linear system of two dual quaternions, 8 equations a measurement.
 
-    Exact data leave two dimensions, (q, q') and (0, q) of both frames, so the answer is sought among the combinations
-    of the two smallest singular vectors: the one whose real and dual parts are orthogonal (of two, the one with the
-    larger real part), each frame then made a unit dual quaternion of its own.
+    Exact data leave two dimensions, (q, q') and (0, q) of both frames. So the answer is a combination of the two
+    smallest singular vectors whose real and dual parts are orthogonal. Of two such combinations it has the larger real
+    part. Each frame is then made a unit dual quaternion.
     """
     stack = Stack.of(problem)
     q_A, q_B = paired_quaternions(stack)
@@ -83,9 +83,9 @@ def dual_quaternions(problem: Problem, options: MethodOptions) -> Outcome[Poses]
 
 
 def _isotropic(P: Array) -> Array:
-    """Unit vectors (2, 2) with u' P u = 0, or as near as there is, for a symmetric P (2, 2)."""
+    """Two unit vectors u (2, 2) with u' P u = 0 or nearest to 0, for a symmetric P (2, 2)."""
     (small, large), axes = np.linalg.eigh(P)
-    if small * large >= 0.0:  # definite, by noise: the smaller of both values
+    if small * large >= 0.0:  # definite, by noise: the smaller eigenvalue
         nearest = axes[:, int(abs(small) > abs(large))]
         return np.array([nearest, nearest])
     c, s = np.sqrt(large), np.sqrt(-small)
@@ -93,21 +93,21 @@ def _isotropic(P: Array) -> Array:
     return u
 
 
-# The RWHEC paper's Section 2 counts Li's among the methods that solve rotations and translations apart. Both systems
-# have both in them, and translations move the rotations found: joint, by its mathematics.
+# The RWHEC paper's Section 2 says that Li's methods solve rotations and translations apart. But both systems hold both,
+# and measured translations affect the rotations found: the methods are joint.
 KRONECKER = Method(
     name="li2010_kronecker",
     properties=Properties("matrices"),
     source=_SOURCE,
-    assumes="All measurements alike, a radian as much as a metre. X and Y are any matrices until the end, so a target "
-    "must not be seen in the same place all the time (a camera that turns about it tells 24 entries nothing).",
+    assumes=f"{UNWEIGHTED} The target's position in the sensor's frame changes: a camera that only turns about the "
+    "target does not determine the 24 entries of X and Y.",
     function=kronecker,
 )
 DUAL_QUATERNIONS = Method(
     name="li2010_dq",
     properties=Properties("dual quaternions"),
     source=_SOURCE,
-    assumes="All measurements alike, a radian as much as a metre; quaternions whose signs fit together; carriers' "
-    "origins near the data, as the dual parts' errors grow with the distance.",
+    assumes=f"{UNWEIGHTED} Signs of quaternions must fit. Carriers' origins are near the data: dual parts' errors grow "
+    "with the distance.",
     function=dual_quaternions,
 )

@@ -1,6 +1,6 @@
-"""Shah 2013 and Wang 2022: all rotations by one linear system, then all translations by another.
+"""Shah 2013 and Wang 2022: a linear system for all rotations, then a linear system for all translations.
 
-Their answer is also where the methods that descend start, unless the user says otherwise.
+Methods that descend start from this answer, unless the user gives a start.
 """
 
 from __future__ import annotations
@@ -18,20 +18,14 @@ def linear_method(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
 
 
 def start_of(problem: Problem, options: MethodOptions) -> tuple[Poses, Poses, float, str]:
-    """X, Y, scale, and a sentence that says where they are from.
+    """X, Y, scale, and the words for where they are from: the given start, else Wang's answer.
 
-    Left out, the start is Wang's answer; for several of both sides, or an unknown scale, which Wang's method has not,
-    that of the same linear systems extended to them.
-
-    Raises
-    ------
-    FrameError, PoseError, ScaleError
-        When the given start lacks a frame, or has something else than poses and a scale.
-    UnderdeterminedError
-        When the linear systems do not determine one.
+    Wang's method has neither several Xs and Ys nor an unknown scale; its linear systems are extended to them. Raises
+    FrameError, PoseError or ScaleError for a given start that lacks a frame or has other values than poses and a scale,
+    and UnderdeterminedError when the linear systems do not determine a start.
     """
     if options.start is not None:
-        return *checked_start(problem, options.start), "the given start"
+        return *checked_start(problem.targets, problem.sensors, options.start), "the given start"
     stack = Stack.of(problem)
     R_X, R_Y = linear_rotations(stack)
     unknown = problem.scale != "known"
@@ -42,7 +36,7 @@ def start_of(problem: Problem, options: MethodOptions) -> tuple[Poses, Poses, fl
     return poses_by_name(stack.targets, R_X, t_X), poses_by_name(stack.sensors, R_Y, t_Y), alpha, words
 
 
-_ASSUMES = "Rotations without the translations' help, all measurements alike; at least two axes of rotation."
+_ASSUMES = "All measurements equally accurate, at least two axes of rotation. Translations do not help the rotations."
 
 SHAH = Method(
     name="shah2013",

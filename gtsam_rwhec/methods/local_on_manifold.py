@@ -1,11 +1,11 @@
 """LOM, the RWHEC paper's local on-manifold method (Appendix C): the baseline that needs a good start.
 
-A residual of its own, not the refinement's: rotation and translation apart (eq. 76),
+Its residual is not the refinement's: it has rotation and translation apart (eq. 76),
 
     e_R = log(R_X' R_A' R_Y R_B),    e_t = R_A t_X + alpha t_A - R_Y t_B - t_Y,
 
-over rotations and translations apart, t_X and t_Y in the measured unit (alpha times metres). Its weights are the
-paper's: sigma_R = 1/sqrt(kappa), where this library's noise has 1/sqrt(2 kappa).
+and so are its variables, with t_X and t_Y in the measured unit (alpha times metres). Its weights are the paper's:
+sigma_R = 1/sqrt(kappa), where this library's noise model has 1/sqrt(2 kappa).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import NoiseError, OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.methods.applicability import check_problem
+from gtsam_rwhec.methods.certified import SOURCE
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, Takes, checked_start
@@ -32,16 +33,16 @@ LomWeights = Literal["paper", "matched"]
 
 @dataclass(frozen=True)
 class LomOptions:
-    """How to weigh and when to stop.
+    """Weights and the step limit.
 
     Attributes
     ----------
     weights : "paper", "matched" or (float, float)
-        sigma_R = 1/sqrt(kappa), as Appendix C; or 1/sqrt(2 kappa), the standard deviation about each axis that belongs
-        to kappa; both with each measurement's own sigma. Two numbers: (sigma_R rad, sigma_t m) of every measurement in
-        place of its own.
+        "paper": sigma_R = 1/sqrt(kappa), as in Appendix C. "matched": 1/sqrt(2 kappa), the standard deviation about
+        each axis that belongs to kappa. Both use each measurement's own sigma. Two numbers: (sigma_R rad, sigma_t m)
+        of all measurements.
     max_iterations : int
-        1000, as in Section 8; a start near the answer takes ten.
+        1000, as in Section 8; from a start near the answer ten suffice.
     """
 
     weights: LomWeights | tuple[float, float] = "paper"
@@ -61,15 +62,15 @@ class LomOptions:
 
 @dataclass(frozen=True)
 class LomSolution:
-    """Where the local solver stopped: proven nothing.
+    """Where the local solver stopped; it proves nothing.
 
     Attributes
     ----------
     X, Y : dict of str to gtsam.Pose3
-        T_targetcarrier_target by target, T_sensorcarrier_sensor by sensor; true metres, that is divided by the scale.
+        T_targetcarrier_target by target, T_sensorcarrier_sensor by sensor; metres, divided by the scale.
     scale : float
-        alpha, t_B = alpha * (true length). From a poor start it may come out negative, with all poses meaningless: a
-        local minimum that this method cannot tell from the answer.
+        alpha, t_B = alpha * (true length). A negative scale is a local minimum far from the answer: the poses are
+        wrong.
     initial_cost, cost : float
         Half of eq. 78, before and after.
     iterations : int
@@ -91,12 +92,12 @@ def local_on_manifold(
     scale: float = 1.0,
     options: LomOptions | None = None,
 ) -> LomSolution:
-    """Problem 9 of the RWHEC paper (eq. 78), from a start, by Levenberg-Marquardt with Ceres' settings.
+    """Solve Problem 9 of the RWHEC paper (eq. 78) from a start, by Levenberg-Marquardt with Ceres' settings.
 
     Parameters
     ----------
     problem : Problem
-        Of known or shared scale, with its raw measurements, without fixed frames and priors.
+        Known or shared scale, raw measurements, no fixed frames, no priors.
     X, Y : dict of str to pose
         The start, T_targetcarrier_target by target and T_sensorcarrier_sensor by sensor, in true metres.
     scale : float
@@ -106,15 +107,15 @@ def local_on_manifold(
     Raises
     ------
     FrameError
-        For a frame without a start, or motions (A Y = Y B), which the method has no equation for.
+        When a frame has no start, or a sensor has motions (A Y = Y B).
     ScaleError, NoiseError, PriorError
-        For a scale by target, full covariances, fixed frames or priors: Problem 9 cannot hold them.
+        For a scale for each target, full covariances, fixed frames or priors: Problem 9 has none of them.
     MeasurementsNotKeptError
-        When there are moments only.
+        When the problem has moments only.
     """
     chosen = LomOptions() if options is None else options
     check_problem(METHOD, problem)
-    X, Y, scale = checked_start(problem, (X, Y, scale))
+    X, Y, scale = checked_start(problem.targets, problem.sensors, (X, Y, scale))
     scale_key = gtsam.symbol("s", 0) if problem.scale == "shared" else None
     alpha = 1.0 if scale_key is None else scale
     frames = {name: FrameKeys(gtsam.symbol("x", i), gtsam.symbol("u", i)) for i, name in enumerate(problem.targets)}
@@ -157,18 +158,15 @@ def local_on_manifold(
 
 
 def refuse_covariances(problem: Problem) -> None:
-    """Refuse what Problem 9 cannot weigh by.
-
-    Raises
-    ------
-    NoiseError
-    """
+    """Raise NoiseError for a problem with covariances: Problem 9 has sigma and kappa only."""
     if problem.has_covariances:
-        raise NoiseError("LOM weighs by sigma and kappa, and there are covariances; use refine(residual='geodesic')")
+        raise NoiseError(
+            "this method weighs by sigma and kappa, and the problem has covariances; use refine(residual='geodesic')"
+        )
 
 
 def standard_deviations(raw: Measurements, weights: LomWeights | tuple[float, float]) -> tuple[Array, Array]:
-    """sigma_R (N,) in rad and sigma_t (N,) in the measured unit."""
+    """Standard deviations of each measurement: sigma_R (N,) in rad and sigma_t (N,) in the measured unit."""
     if isinstance(weights, tuple):
         return np.full(len(raw.A), weights[0]), np.full(len(raw.A), weights[1])
     sigma_R: Array = 1.0 / np.sqrt(raw.kappa if weights == "paper" else 2.0 * raw.kappa)
@@ -186,11 +184,11 @@ class FrameKeys:
 def lom_factor(
     X: FrameKeys, Y: FrameKeys, scale_key: int | None, A: Array, B: Array, sigma_R: Array, sigma_t: Array
 ) -> gtsam.CustomFactor:
-    """One pair's residuals (eq. 76) over their standard deviations, six rows a measurement, unit noise.
+    """The factor of one pair's residuals (eq. 76) over their standard deviations: six rows a measurement, unit noise.
 
-    Keys in the order R_X, t_X, R_Y, t_Y, alpha. Jacobians by right perturbations R Expmap(omega). Unlike eq. 77's they
-    have the inverse right Jacobian of the logarithm; without it the gradient is the same (J_r(e)' e = e), and
-    so are the minima, but Gauss-Newton's Hessian is not.
+    The keys are R_X, t_X, R_Y, t_Y, alpha. Jacobians are by right perturbations R Expmap(omega). Unlike eq. 77 they
+    have the inverse right Jacobian of the logarithm. Without it the gradient (J_r(e)' e = e) and the minima are the
+    same, but the Gauss-Newton Hessian is wrong.
     """
     R_A, t_A, R_B, t_B = A[:, :3, :3], A[:, :3, 3], B[:, :3, :3], B[:, :3, 3]
     rows = 6 * len(A)
@@ -221,19 +219,19 @@ def lom_factor(
 
 
 def _stacked(rotation: Array, translation: Array, weight: Array) -> Array:
-    """Rows of e_R over those of e_t, measurement by measurement, weighed: (6 N, d) as GTSAM takes it."""
+    """Weighed rows of e_R over rows of e_t, measurement by measurement: (6 N, d) in GTSAM's layout."""
     stacked = np.concatenate([rotation, translation], axis=1) * weight[:, :, None]
     return np.asfortranarray(stacked.reshape(-1, stacked.shape[2]))
 
 
 def lom(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """Problem 9 with the paper's weights, from a start or from a closed form's answer."""
+    """Solve Problem 9 with the paper's weights, from the given start or from a closed form's answer."""
     X, Y, scale, starts_from = start_of(problem, options)
     found = local_on_manifold(problem, X, Y, scale, LomOptions(max_iterations=options.max_iterations))
     if found.scale <= 0.0:
         raise ScaleError(
-            f"LOM, started from {starts_from}, ended at scale {found.scale:.6g}: a local minimum that is no "
-            "calibration; give another start"
+            f"LOM, started from {starts_from}, ended at scale {found.scale:.6g}, but a scale is positive: a wrong "
+            "local minimum; give another start"
         )
     return Outcome(found.X, found.Y, found.scale, starts_from=starts_from)
 
@@ -242,8 +240,7 @@ METHOD = Method(
     name="lom",
     function=lom,
     properties=Properties("SE(3)", probabilistic=True, multiple="Xs and Ys", monocular=True),
-    source="E. Wise et al., A certifiably correct algorithm for generalized robot-world and hand-eye calibration, "
-    "arXiv 2507.23045, Appendix C",
+    source=f"{SOURCE}, Appendix C",
     assumes="A start near the answer; isotropic noise on B, exact A.",
     takes=frozenset({Takes.SHARED_SCALE}),
     check=refuse_covariances,

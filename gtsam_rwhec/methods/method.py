@@ -1,8 +1,8 @@
-"""What a method of calibration is: its name and source, what it assumes, what it takes.
+"""The record of a calibration method: its name, its source, what it assumes, what it takes.
 
-One record serves A X = Y B (``gtsam_rwhec.methods``) and A X = X B (``gtsam_rwhec.handeye``). A method's function makes
-an ``Outcome``; the package's one call checks what is given against the record first, and makes an ``Estimate`` of the
-outcome. Targets' poses are the X of A X = Y B, sensors' poses the Y.
+The record serves A X = Y B (``gtsam_rwhec.methods``) and A X = X B (``gtsam_rwhec.handeye``). ``run`` and
+``handeye.solve`` check the input against the record, call the method's function for an ``Outcome``, and make an
+``Estimate`` of the outcome. In A X = Y B targets' poses are X and sensors' poses are Y.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.problem.problem import Problem
 
 Arguments = ParamSpec("Arguments")
-#: How many frames a method solves for at once (RWHEC paper, Table 1): one X and one Y; several of one side with one
-#: of the other; several of both.
+#: Frames that a method solves for at once (RWHEC paper, Table 1). Empty: one X and one Y; "Xs": several Xs and one Y.
 Multiple = Literal["", "Xs or Ys", "Xs", "Xs and Ys"]
 
 #: What most methods assume of the noise (``Method.assumes``).
@@ -29,7 +28,7 @@ UNWEIGHTED = "All measurements equally accurate, a radian weighs as much as a me
 
 
 class Takes(Enum):
-    """What a method can use besides poses (or motions) of known scale."""
+    """What a method takes besides poses (or motions) of known scale."""
 
     SHARED_SCALE = "an unknown scale"
     SCALE_PER_TARGET = "an unknown scale for each target"
@@ -48,17 +47,17 @@ class Properties:
     Attributes
     ----------
     representation : str
-        Of the poses.
+        How the method writes a pose.
     joint : bool
-        Whether rotations and translations are estimated together, so that the translations measured move the
-        rotations found.
+        Rotations and translations are estimated together: measured translations affect the rotations found.
     probabilistic : bool
-        Whether the problem is an estimate under a model of the noise.
+        The method has a noise model.
     certifiable : bool
-        Whether the answer comes with a proof of optimality for the method's own cost.
+        The answer comes with a proof of optimality for the method's own cost.
     multiple : "", "Xs or Ys", "Xs" or "Xs and Ys"
+        The frames that the method solves for at once.
     monocular : bool
-        Whether an unknown scale, shared by all targets, is estimated too.
+        The method estimates an unknown scale that all targets share.
     """
 
     representation: str
@@ -78,15 +77,15 @@ class Method(Generic[Arguments]):
     name : str
         Its key in ``METHODS``.
     function : callable
-        Makes an ``Outcome``: of (problem, options) for A X = Y B, of a ``handeye.Request`` for A X = X B.
+        Makes an ``Outcome`` from (problem, options) for A X = Y B, from a ``handeye.Request`` for A X = X B.
     properties : Properties
     source : str
-        Where it was published.
+        The publication.
     assumes : str
-        What must hold for its answer to be what it claims, and where it fails.
+        What must hold for a correct answer, and where the method fails.
     takes : frozenset of Takes
     check : callable, optional
-        Raises a ``RwhecError`` for a problem that it cannot handle for another reason.
+        Raises a ``RwhecError`` for a problem that the method cannot solve for another reason.
     """
 
     name: str
@@ -100,17 +99,17 @@ class Method(Generic[Arguments]):
 
 @dataclass(frozen=True)
 class MethodOptions:
-    """What a method may be told; each uses what it has a use for.
+    """Options of all methods; a method ignores the options that it does not need.
 
     Attributes
     ----------
     start : (X, Y, scale), optional
-        Poses by name, in true metres, and alpha, for methods that descend from a start. Left out: a closed form's
-        answer; ``Estimate.starts_from`` says which.
+        Poses by name, metres, and alpha, for methods that descend from a start. Left out, they start from a closed
+        form's answer; ``Estimate.starts_from`` names the closed form.
     seed : int
-        Of what is drawn at random.
+        Seed of random numbers.
     max_iterations : int
-        Of methods that iterate.
+        Most iterations of methods that iterate.
     """
 
     start: tuple[Poses, Poses, float] | None = None
@@ -118,28 +117,28 @@ class MethodOptions:
     max_iterations: int = 1000
 
     def __post_init__(self) -> None:
-        if self.start is not None:
-            given = self.start if isinstance(self.start, tuple) and len(self.start) == 3 else (None, None, None)
-            if not (isinstance(given[0], Mapping) and isinstance(given[1], Mapping) and isinstance(given[2], Real)):
-                raise OptionError(
-                    f"MethodOptions.start={self.start!r:.100}; give (X, Y, scale): poses of targets and of sensors by "
-                    "name, and a scale (1.0 if known)"
-                )
+        start = self.start
+        if start is not None and not (
+            isinstance(start, tuple)
+            and len(start) == 3
+            and all(isinstance(part, kind) for part, kind in zip(start, (Mapping, Mapping, Real), strict=True))
+        ):
+            raise OptionError(
+                f"MethodOptions.start={start!r:.100}; give (X, Y, scale): poses of targets and of sensors by name, and "
+                "a scale (1.0 if known)"
+            )
         for name, least in (("seed", 0), ("max_iterations", 1)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
                 raise OptionError(f"MethodOptions.{name}={value!r}; give a whole number of at least {least}")
 
 
-def checked_start(problem: Problem, start: tuple[Poses, Poses, float]) -> tuple[Poses, Poses, float]:
-    """A start that has every frame of the problem.
-
-    Raises
-    ------
-    FrameError, ScaleError
-    """
+def checked_start(
+    targets: tuple[str, ...], sensors: tuple[str, ...], start: tuple[Poses, Poses, float]
+) -> tuple[Poses, Poses, float]:
+    """The start, if it has every target and sensor (else FrameError) and a positive scale (else ScaleError)."""
     X, Y, scale = start
-    for what, poses, names in (("X", X, problem.targets), ("Y", Y, problem.sensors)):
+    for what, poses, names in (("X", X, targets), ("Y", Y, sensors)):
         missing = [name for name in names if name not in poses]
         if missing:
             raise FrameError(f"the start's {what} has no {missing[0]}; it has {', '.join(poses) or 'none'}")

@@ -1,8 +1,8 @@
-"""Signs of quaternions that each measurement's two rotations must share.
+"""Signs of quaternions that fit together in each measurement.
 
-In q_A q_X = q_Y q_B the signs of q_X and q_Y are the answer's own, but those of each q_A and q_B are chosen, and an
-equation with the wrong sign says something else. The sign chosen here is the one with which the answer of the linear
-rotation system, which has no signs, satisfies the equation.
+In q_A q_X = q_Y q_B the signs of q_X and q_Y belong to the answer. The signs of each q_A and q_B must be chosen, and an
+equation with the wrong sign is wrong. The linear rotation system has no signs: its answer chooses here, so that it
+satisfies each equation.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gtsam_rwhec.methods.absolute import Stack, linear_rotations
 
 
 def paired_quaternions(stack: Stack) -> tuple[Array, Array]:
-    """q_A and q_B (N, 4) whose signs fit together: <q_A q_X, q_Y q_B> > 0 for the linear system's rotations."""
+    """q_A and q_B (N, 4) with signs that fit: <q_A q_X, q_Y q_B> > 0 for the linear system's rotations."""
     R_X, R_Y = linear_rotations(stack)
     q_A, q_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])
     q_X, q_Y = of_rotations(R_X)[stack.target], of_rotations(R_Y)[stack.sensor]

@@ -1,4 +1,4 @@
-"""Every method by name, and one call for all of them."""
+"""All methods by name, and the call that runs a method."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from gtsam_rwhec.problem.problem import Problem
 
 #: The cost by which all answers are compared.
 COST_NAME = "J (RWHEC paper, eq. 18)"
-#: In the order in which ``gtsam-rwhec compare`` shows them: closed forms, iterations, global methods.
+#: All methods: closed forms, then iterations, then global methods.
 METHODS: dict[str, Method[[Problem, MethodOptions]]] = {
     method.name: method
     for method in (
@@ -64,14 +64,14 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
     Parameters
     ----------
     name : str
-        One of ``METHODS``.
+        A key of ``METHODS``.
     problem : Problem
     options : MethodOptions, optional
 
     Raises
     ------
     OptionError
-        When the name is unknown, or the options are no ``MethodOptions``.
+        When the name is unknown, or ``options`` is not a ``MethodOptions``.
     CountError, FrameError, MeasurementsNotKeptError, NoiseError, PriorError, ScaleError
         When the method cannot solve the problem; the message says why.
     UnderdeterminedError
@@ -88,12 +88,7 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
 
 
 def method_of(name: str) -> Method[[Problem, MethodOptions]]:
-    """A method by its name.
-
-    Raises
-    ------
-    OptionError
-    """
+    """The method of a name; OptionError for an unknown name."""
     try:
         return METHODS[name]
     except (KeyError, TypeError):
@@ -101,7 +96,7 @@ def method_of(name: str) -> Method[[Problem, MethodOptions]]:
 
 
 def estimate_of(name: str, problem: Problem, found: Outcome[Poses], seconds: float) -> Estimate[dict[str, gtsam.Pose3]]:
-    """A method's answer under the certified objective."""
+    """A method's answer, evaluated under the certified objective."""
     scale = found.scale if isinstance(found.scale, float) else dict(found.scale)
     evaluation = evaluate(problem, found.X, found.Y, scale)
     proof = None
@@ -124,5 +119,4 @@ def estimate_of(name: str, problem: Problem, found: Outcome[Poses], seconds: flo
 
 
 def _pose3(pose: PoseLike, name: str) -> gtsam.Pose3:
-    T = one_transform(pose, name)
-    return gtsam.Pose3(gtsam.Rot3(T[:3, :3]), T[:3, 3])
+    return gtsam.Pose3(one_transform(pose, name))

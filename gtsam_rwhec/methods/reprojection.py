@@ -1,8 +1,8 @@
-"""Reprojection errors of A X = Y B: corners in pixels in place of measured poses.
+"""Calibration by reprojection errors: corners in pixels replace the measured poses of A X = Y B.
 
-A corner p of a target is seen at the pixel of Y^-1 A X p, with A the carriers' pose at that image. The sum of squared
-differences over all corners, images, cameras and targets, least over all X and Y, is the cost of Evangelista et al.
-2023 and of Tabb and Ahmad Yousef's rp1 where intrinsics are known.
+A camera sees a target's corner p at the pixel of Y^-1 A X p, with the image's A. The cost is the sum of squared
+reprojection errors over all corners, images, cameras and targets. Evangelista et al. 2023 and, for known intrinsics,
+Tabb and Ahmad Yousef's rp1 minimise this cost over all X and Y.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from gtsam_rwhec.geometry.poses import (
 from gtsam_rwhec.methods.estimate import Poses
 from gtsam_rwhec.methods.levenberg_marquardt import Linearised, descend
 from gtsam_rwhec.methods.linear_methods import start_of
-from gtsam_rwhec.methods.method import MethodOptions
+from gtsam_rwhec.methods.method import MethodOptions, checked_start
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.vision.camera import Camera
 
-#: Rounds of choosing between a flat target's two poses by the calibration so far.
+#: Rounds of choosing between a flat target's two poses by the calibration of the round before.
 ROUNDS = 3
-#: Corners out of their plane by more than this share of the target's size make it no flat one.
+#: Distance of the corners from a plane, as a share of the target's size, up to which the target is flat.
 FLAT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Images of one target by one camera: A (N, 4, 4), pixels (N, n, 2), nan where a corner was not seen."""
+    """Images of one target by one camera: A (N, 4, 4), metres; pixels (N, n, 2), nan where a corner was not seen."""
 
     A: Array
     pixels: Array
@@ -78,15 +78,17 @@ class Observations:
         views: Mapping[tuple[str, str], tuple[PosesLike, ArrayLike]],
         corner_px: float = 0.1,
     ) -> Observations:
-        """Check and make them.
+        """Make checked observations.
 
         Parameters
         ----------
         cameras : dict of str to Camera
         corners : dict of str to (n, 3)
+            Metres.
         views : dict of (target, sensor) to (A, pixels)
             A = T_sensorcarrier_targetcarrier of each image, pixels (N, n, 2).
         corner_px : float
+            Standard deviation of a corner along each axis, pixels.
 
         Raises
         ------
@@ -123,29 +125,29 @@ class Observations:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """Names that were seen."""
+        """Names of the targets that were seen."""
         return tuple(dict.fromkeys(target for target, _ in self.views))
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names that saw."""
+        """Names of the cameras that saw a target."""
         return tuple(dict.fromkeys(sensor for _, sensor in self.views))
 
     def poses(self, predicted: Mapping[tuple[str, str], Array] | None = None) -> Problem:
-        """The same as a problem of poses: each image's own, by its corners alone, with covariances.
+        """A problem of poses: each image's pose by its corners alone, with covariances.
 
         Parameters
         ----------
         predicted : dict of (target, sensor) to (N, 4, 4), optional
-            T_camera_target as a calibration has it: of a flat target's two poses the nearer one is taken. Left out: the
-            one of less reprojection error.
+            T_camera_target by a calibration, metres. Each image takes the nearer of a flat target's two poses. Left
+            out, each image takes the pose with less reprojection error.
 
         Raises
         ------
         TargetError
-            For a target that is not flat.
+            When a target is not flat.
         CameraError
-            For an image whose corners have no pose.
+            When an image's corners have no pose.
         """
         from gtsam_rwhec.vision.pose import plane_poses
 
@@ -168,10 +170,10 @@ class Observations:
             lost = np.flatnonzero(~np.isfinite(T[at, choice]).all(axis=(1, 2)))
             if lost.size:
                 raise CameraError(f"image {lost[0]} of {target} by {sensor} has no pose: are its corners on one line?")
-            # of the right perturbation in the flat frame; in the target's, a congruence with the adjoint
+            # from right perturbations of the flat frame to those of the target's frame: by the adjoint
             ad = se3.adjoint(np.broadcast_to(T_target_flat, (len(T), 4, 4)))
-            covariance = ad @ found.covariance[at, choice] @ ad.transpose(0, 2, 1)
-            problem.add(target, sensor, view.A, T[at, choice], covariances=0.5 * (covariance + _transposed(covariance)))
+            covariance = ad @ found.covariance[at, choice] @ ad.mT
+            problem.add(target, sensor, view.A, T[at, choice], covariances=0.5 * (covariance + covariance.mT))
         return problem
 
 
@@ -184,12 +186,13 @@ class ReprojectionAnswer:
     X, Y : dict of str to gtsam.Pose3
         T_targetcarrier_target and T_sensorcarrier_sensor, metres.
     cost : float
-        Half of the sum of squares over corner_px^2.
+        Half the sum of squared reprojection errors over corner_px^2.
     rms_px : float
-        Root mean square of the corners' errors, of their length.
+        Root mean square length of the corners' reprojection errors, pixels.
     iterations : int
     converged : bool
     starts_from : str
+        What the descent started from.
     """
 
     X: dict[str, gtsam.Pose3]
@@ -202,10 +205,10 @@ class ReprojectionAnswer:
 
 
 def calibrate(observations: Observations, options: MethodOptions | None = None) -> ReprojectionAnswer:
-    """Least reprojection error over all X and Y by Levenberg-Marquardt on the manifold.
+    """Minimise the reprojection error over all X and Y, by Levenberg-Marquardt on the manifold.
 
     Without a start in the options, the descent starts at a closed form's answer (``linear_methods.start_of``) for the
-    images' poses. A flat target has two poses in an image; the one that this answer predicts is then taken.
+    images' poses. A flat target has two poses in an image; this answer chooses between them.
 
     Raises
     ------
@@ -247,11 +250,7 @@ def calibrate(observations: Observations, options: MethodOptions | None = None) 
 
 def _start(observations: Observations, options: MethodOptions) -> tuple[Poses, Poses, str]:
     if options.start is not None:
-        X, Y, _ = options.start
-        missing = [name for name in observations.targets if name not in X]
-        missing += [name for name in observations.sensors if name not in Y]
-        if missing:
-            raise FrameError(f"the start has no {missing[0]}; it has {', '.join([*X, *Y]) or 'none'}")
+        X, Y, _ = checked_start(observations.targets, observations.sensors, options.start)
         return X, Y, "the given start"
     problem = observations.poses()
     for _ in range(ROUNDS):
@@ -306,28 +305,19 @@ def linearised(observations: Observations, T: Array) -> Linearised:
 
 
 def _in_plane(points: Array, name: str) -> tuple[Array, Array]:
-    """Corners of a flat target with z = 0, and T_target_flat.
-
-    Raises
-    ------
-    TargetError
-    """
+    """A flat target's corners with z = 0, and T_target_flat; TargetError for a target that is not flat."""
     middle = points.mean(axis=0)
     _, singular, Vt = np.linalg.svd(points - middle)
     if singular[2] > FLAT * singular[0]:
         raise TargetError(
-            f"the corners of {name} lie in no plane (off by {singular[2] / np.sqrt(len(points)):.3g} m), and poses of "
-            "single images are found for flat targets only; give a start by MethodOptions.start"
+            f"the corners of {name} lie in no plane (off by {singular[2] / np.sqrt(len(points)):.3g} m), and only flat "
+            "targets have poses from single images; give a start by MethodOptions.start"
         )
     if singular[1] <= FLAT * singular[0]:
-        raise TargetError(f"the corners of {name} lie on one line; no pose follows from them")
+        raise TargetError(f"the corners of {name} lie on one line, which determines no pose; give corners in a plane")
     R = Vt.T * np.array([1.0, 1.0, np.linalg.det(Vt)])
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, middle
     flat = (points - middle) @ R
     flat[:, 2] = 0.0
     return flat, T
-
-
-def _transposed(M: Array) -> Array:
-    return np.swapaxes(M, -1, -2)

@@ -1,8 +1,8 @@
 """Strobl and Hirzinger 2006: rotation and translation errors weighed by their variances, which are estimated too.
 
 Rotations and translations have Gaussian errors of unknown standard deviations sigma_R (rad an axis) and sigma_t (m an
-axis), the same in all measurements. For given ones the poses are a nonlinear least-squares problem on the manifold; the
-errors that are left estimate them anew, and so on until the weights rest.
+axis), equal in all measurements. For given standard deviations the poses are a nonlinear least-squares problem on the
+manifold. The residuals estimate the standard deviations again, and so on until the weights rest.
 """
 
 from __future__ import annotations
@@ -13,22 +13,24 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array, one_transform
-from gtsam_rwhec.methods.absolute import Stack, linear_outcome, linear_rotations
+from gtsam_rwhec.methods.absolute import Stack
 from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.local_on_manifold import LomOptions, local_on_manifold
-from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, checked_start
+from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.problem.problem import Problem
 
 #: The weights rest when their ratio changes by less than this share.
 SETTLED = 1e-6
+#: Most rounds.
 ROUNDS = 50
-#: Errors below these are rounding: exact data have no variance to weigh by.
-SMALLEST_RAD, SMALLEST_M = 1e-9, 1e-9
+#: Standard deviations (rad and m) below this are rounding: exact data have no variance to weigh by.
+SMALLEST = 1e-9
 
 
 @dataclass(frozen=True)
 class Weighed:
-    """Poses X, Y (4, 4), the standard deviations estimated with them, in rad and m an axis, and the rounds it took."""
+    """Poses X, Y (4, 4), metres; standard deviations, rad and m an axis; rounds, and whether the weights rest."""
 
     X: Array
     Y: Array
@@ -39,25 +41,19 @@ class Weighed:
 
 
 def strobl2006(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """One X, one Y: reweighed until the weights rest."""
-    stack = Stack.of(problem)
-    target, sensor = stack.targets[0], stack.sensors[0]
-    if options.start is None:
-        start = linear_outcome(stack, *linear_rotations(stack))
-        of_X, of_Y, starts_from = start.X, start.Y, "shah2013"
-    else:
-        of_X, of_Y, _ = checked_start(problem, options.start)
-        starts_from = "the given start"
+    """Solve for one X and one Y; weights and poses are estimated in turn until the weights rest."""
+    target, sensor = problem.targets[0], problem.sensors[0]
+    of_X, of_Y, _, starts_from = start_of(problem, options)
     X, Y = one_transform(of_X[target], f"start of {target}"), one_transform(of_Y[sensor], f"start of {sensor}")
-    found = reweighed(stack, X, Y, options.max_iterations)
+    found = reweighed(Stack.of(problem), X, Y, options.max_iterations)
     notes = [f"estimated errors: {np.degrees(found.sigma_R):.3g} deg and {1e3 * found.sigma_t:.3g} mm an axis"]
     if not found.settled:
-        notes.append(f"the weights had not come to rest after {found.rounds} rounds")
+        notes.append(f"the weights still changed after {found.rounds} rounds")
     return Outcome({target: found.X}, {sensor: found.Y}, starts_from=starts_from, notes=tuple(notes))
 
 
 def reweighed(stack: Stack, X: Array, Y: Array, max_iterations: int) -> Weighed:
-    """Poses and variances in turn, from a start X, Y (4, 4); the poses of each round are LOM's with its weights."""
+    """Estimate poses and variances in turn, from X, Y (4, 4); each round's poses are LOM's with the round's weights."""
     A = stack.A.copy()
     A[:, :3, 3] = stack.centred_t_A
     X, Y = X.copy(), Y.copy()
@@ -65,14 +61,14 @@ def reweighed(stack: Stack, X: Array, Y: Array, max_iterations: int) -> Weighed:
     Y[:3, 3] -= stack.gauge.sensor_carrier
     centred = Problem()
     centred.add("X", "Y", A, stack.B)
-    # Both errors have three numbers a measurement and share twelve unknowns, which cancel in the ratio of the weights.
+    # Both errors have three numbers a measurement and share twelve unknowns; these cancel in the ratio of the weights.
     degrees = max(3.0 * len(A) - 6.0, 1.0)
     ratio, settled, rounds = 0.0, False, 0
     while rounds < ROUNDS:
         rounds += 1
         e_R, e_t = errors(A, stack.B, X, Y)
-        sigma_R = max(float(np.sqrt(np.vdot(e_R, e_R) / degrees)), SMALLEST_RAD)
-        sigma_t = max(float(np.sqrt(np.vdot(e_t, e_t) / degrees)), SMALLEST_M)
+        sigma_R = max(float(np.sqrt(np.vdot(e_R, e_R) / degrees)), SMALLEST)
+        sigma_t = max(float(np.sqrt(np.vdot(e_t, e_t) / degrees)), SMALLEST)
         previous, ratio = ratio, sigma_t / sigma_R
         settled = abs(ratio - previous) <= SETTLED * ratio
         if settled:
@@ -95,7 +91,7 @@ METHOD = Method(
     name="strobl2006",
     properties=Properties("SE(3)", probabilistic=True),
     source="K. Strobl and G. Hirzinger, Optimal hand-eye calibration, IROS 2006",
-    assumes="Errors alike in all measurements, whose sizes it finds itself (sigma and kappa are not used); a start "
+    assumes="All measurements equally accurate; the method estimates the accuracy and ignores sigma and kappa. A start "
     "near the answer.",
     function=strobl2006,
 )

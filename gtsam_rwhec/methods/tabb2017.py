@@ -5,9 +5,9 @@
     c1 = sum |A_i X - Y B_i|_F^2            c2 = sum |A_i - Y B_i X^-1|_F^2
 
 A left multiplication by a pose changes no Frobenius norm, so c2 is sum |B_i X^-1 - Y^-1 A_i|_F^2: c1 of the inverted
-equation, quadratic in the entries of the inverses as c1 is in those of X and Y. "Simultaneous" minimises a cost over
-rotations and translations together, "separable" its rotation part first and the translations for those rotations.
-Their third kind, reprojection errors (rp1), needs images: see ``reprojection``.
+equation. c1 is quadratic in the entries of X and Y, c2 in the entries of their inverses. "Simultaneous" minimises a
+cost over rotations and translations together. "Separable" minimises its rotation part first, then finds the
+translations for these rotations. The third cost, reprojection errors (rp1), needs images: see ``reprojection``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gtsam_rwhec.methods.absolute import Stack, linear_translations
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
 from gtsam_rwhec.methods.linear_methods import start_of
-from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
+from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Properties
 from gtsam_rwhec.methods.unit_weights import UnitForm, unit_weights
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.descent import homogeneous
@@ -49,13 +49,7 @@ def tabb2017(
     mode: Mode = "simultaneous",
     parameterisation: Parameterisation = "axis-angle",
 ) -> Outcome[Poses]:
-    """One of the method's variants, from a start, by Levenberg-Marquardt.
-
-    Raises
-    ------
-    OptionError
-        For another cost, mode or parameterisation.
-    """
+    """Solve by a variant of the method, from a start, by Levenberg-Marquardt; OptionError for an unknown variant."""
     for value, known in ((cost, ("c1", "c2")), (mode, ("simultaneous", "separable")), (parameterisation, CHARTS)):
         if value not in known:
             raise OptionError(f"tabb2017: {value!r} is not one of {', '.join(map(repr, known))}")
@@ -97,20 +91,14 @@ def least(form: ReducedForm, R: Array, parameterisation: Parameterisation, max_i
 
 def from_euler(p: Array) -> tuple[Array, Array]:
     """R_z R_y R_x of angles (n, 3) about x, y, z."""
-    factors, derivatives = [], []
-    for axis in (2, 1, 0):
-        generator = se3.hat(np.eye(3)[axis])
-        R = se3.expmap(np.concatenate([p[:, axis, None] * np.eye(3)[axis], np.zeros((len(p), 3))], axis=1))[:, :3, :3]
-        factors.append(R)
-        derivatives.append(R @ generator)
-    z, y, x = factors
-    dz, dy, dx = derivatives
-    columns = [z @ y @ dx, z @ dy @ x, dz @ y @ x]
+    x, y, z = (from_rotation_vectors(p[:, k, None] * np.eye(3)[k])[0] for k in range(3))
+    hat_x, hat_y, hat_z = se3.hat(np.eye(3))
+    columns = [z @ y @ x @ hat_x, z @ y @ hat_y @ x, z @ hat_z @ y @ x]
     return z @ y @ x, np.stack([vec(column) for column in columns], axis=2)
 
 
 def to_euler(R: Array) -> Array:
-    """Angles (n, 3) about x, y, z; at the poles, where two of them are one, the first is zero."""
+    """Angles (n, 3) about x, y, z; at the poles, where x and z turn about one axis, x is zero."""
     y = np.arcsin(np.clip(-R[:, 2, 0], -1.0, 1.0))
     pole = np.abs(R[:, 2, 0]) > 1.0 - 1e-12
     x = np.where(pole, 0.0, np.arctan2(R[:, 2, 1], R[:, 2, 2]))
@@ -119,7 +107,7 @@ def to_euler(R: Array) -> Array:
 
 
 def from_rotation_vectors(p: Array) -> tuple[Array, Array]:
-    """The exponential of (n, 3), and its derivative by the right Jacobian."""
+    """The exponential of rotation vectors (n, 3), and its derivative by the right Jacobian."""
     R = se3.expmap(np.concatenate([p, np.zeros_like(p)], axis=1))[:, :3, :3]
     right_jacobian = np.linalg.inv(se3.so3_left_jacobian_inverse(-p))
     columns = [vec(R @ se3.hat(right_jacobian[:, :, k])) for k in range(3)]
@@ -127,7 +115,7 @@ def from_rotation_vectors(p: Array) -> tuple[Array, Array]:
 
 
 def from_quaternions(p: Array) -> tuple[Array, Array]:
-    """Of quaternions (n, 4), scalar last, divided by their lengths."""
+    """Rotations of quaternions (n, 4), scalar last, divided by their lengths."""
     length = np.linalg.norm(p, axis=1)[:, None]
     q = p / length
     by_q = 2.0 * np.einsum("nd,cdik->ncik", q, ROTATION)
@@ -147,18 +135,16 @@ SOURCE = (
     "A. Tabb and K. Ahmad Yousef, Solving the robot-world hand-eye(s) calibration problem with iterative methods, "
     "Machine Vision and Applications 28, 2017"
 )
-_PLAIN = "Errors alike in all measurements, a radian as bad as a metre; a start near the answer."
 
 
 def _method(cost: Cost, mode: Mode) -> Method[[Problem, MethodOptions]]:
-    separable = mode == "separable"
     return Method(
-        name=f"tabb2017_{cost}" + ("_separable" if separable else ""),
+        name=f"tabb2017_{cost}" + ("_separable" if mode == "separable" else ""),
         properties=Properties(
-            "Euler angles, rotation vectors or quaternions", joint=not separable, multiple="Xs or Ys"
+            "Euler angles, rotation vectors or quaternions", joint=mode == "simultaneous", multiple="Xs or Ys"
         ),
         source=SOURCE,
-        assumes=_PLAIN,
+        assumes=f"{UNWEIGHTED} A start near the answer.",
         function=partial(tabb2017, cost=cost, mode=mode),
     )
 

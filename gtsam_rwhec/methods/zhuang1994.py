@@ -13,14 +13,14 @@ from gtsam_rwhec.methods.normal_equations import FREE
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.problem.problem import Problem
 
-#: A's with a smaller scalar part, half turns, are left out: the equations divide by it.
+#: Measurements whose A has a smaller scalar part (half turns) are left out: the equations divide by it.
 SMALLEST_SCALAR = 1e-3
-#: With Y's scalar part below this (11 degrees off a half turn) the user is told.
+#: Scalar part of Y (11 degrees off a half turn) below which a note warns the user.
 NEAR_HALF_TURN = 0.1
 
 
 def zhuang1994(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """q_A q_X = q_Y q_B with q_X's scalar eliminated and q_Y's divided out; six unknowns.
+    """q_A q_X = q_Y q_B with q_X's scalar part eliminated and q_Y's divided out: six unknowns.
 
     With q = (s, v), the equation's scalar part gives s_X = (s_Y s_B - v_Y.v_B + v_A.v_X) / s_A, and the vector part,
     divided by s_Y, is
@@ -40,9 +40,9 @@ def zhuang1994(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     values = np.linalg.eigvalsh(normal)
     if not usable.any() or values[0] <= FREE * values[-1]:
         raise UnderdeterminedError(
-            "Zhuang's linear system is singular: it divides by the scalar parts of A's and Y's quaternions, and one "
-            "of them is a half turn; or the rotations measured turn about parallel axes. Turn a carrier's frame by a "
-            "known rotation, or use another method"
+            "Zhuang's linear system is singular: an A or Y is a half turn, and the system divides by its quaternion's "
+            "scalar part, or the measured rotations turn about parallel axes. Turn a carrier's frame by a known "
+            "rotation, or use another method"
         )
     ratio = np.linalg.solve(normal, rows.T @ constants)
     s_Y = 1.0 / np.sqrt(1.0 + ratio[3:] @ ratio[3:])
@@ -52,12 +52,12 @@ def zhuang1994(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     R_X = to_rotations(np.array([[*v_X, s_X]]))
     R_Y = to_rotations(np.array([[*v_Y, s_Y]]))
     notes = []
-    # Noise pulls the ratios down, so that the system's own s_Y does not show that it should have been near 0.
+    # Noise pulls the ratios down, so the system's own s_Y does not show a true value near 0.
     scalar_of_Y = abs(of_rotations(linear_rotations(stack)[1])[0, 3])
     if scalar_of_Y < NEAR_HALF_TURN:
-        notes.append(f"Y is near a half turn (scalar part {scalar_of_Y:.3g}), by which it divides: a poor answer")
+        notes.append(f"the answer is poor: Y is near a half turn, and its scalar part {scalar_of_Y:.3g} is a divisor")
     if not usable.all():
-        notes.append(f"{np.sum(~usable)} measurements were left out: A is a half turn, by whose scalar part it divides")
+        notes.append(f"{np.sum(~usable)} measurements were left out: A is a half turn, whose scalar part is a divisor")
     return linear_outcome(stack, R_X, R_Y, notes)
 
 
@@ -66,6 +66,6 @@ METHOD = Method(
     properties=Properties("unit quaternions", joint=False),
     source="H. Zhuang, Z. S. Roth and R. Sudhakar, Simultaneous robot/world and tool/flange calibration by solving "
     "homogeneous transformation equations of the form AX = YB, IEEE T-RA 10(4), 1994",
-    assumes="Neither Y nor any A is a half turn, nor near one: it divides by their quaternions' scalar parts.",
+    assumes="Neither Y nor any A is near a half turn: the scalar parts of their quaternions are divisors.",
     function=zhuang1994,
 )

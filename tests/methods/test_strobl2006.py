@@ -58,7 +58,7 @@ def test_a_given_start_is_taken_and_named() -> None:
     start = (simulation.X, simulation.Y, 1.0)
     found = run("strobl2006", simulation.problem, MethodOptions(start=start))
     assert found.starts_from == "the given start"
-    assert run("strobl2006", simulation.problem).starts_from == "shah2013"
+    assert run("strobl2006", simulation.problem).starts_from == "wang2022"
     assert "deg" in found.notes[0]
     assert largest_errors(simulation, found)[0] < 0.05
     assert METHOD.properties.joint
