@@ -142,6 +142,12 @@ class Log:
                 found[key] = Topic(*key, count, min(firsts, default=None), max(lasts, default=None), unreadable)
         return tuple(found[key] for key in sorted(found))
 
+    def topics_in_words(self) -> str:
+        """The topics and their schemas, for messages: `MOST_NAMED` at most, as a stranger's log may have thousands."""
+        known = self.topics()
+        there = ", ".join(f"{topic.name} ({topic.schema})" for topic in known[:MOST_NAMED]) or "none"
+        return there + (f" and {len(known) - MOST_NAMED} others" if len(known) > MOST_NAMED else "")
+
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records of all files by name; the last record of a name counts.
 
@@ -254,9 +260,7 @@ class Log:
         wanted = {topics} if isinstance(topics, str) else set(topics)
         known = self.topics()
         for name in sorted(wanted - {topic.name for topic in known}):
-            there = ", ".join(f"{topic.name} ({topic.schema})" for topic in known[:MOST_NAMED]) or "none"
-            there += f" and {len(known) - MOST_NAMED} others" if len(known) > MOST_NAMED else ""
-            raise LogError(f"{self.files[0].path} has no topic {name}; it has: {there}.")
+            raise LogError(f"{self.files[0].path} has no topic {name}; it has: {self.topics_in_words()}.")
         for topic in known:
             if topic.name in wanted and topic.unreadable:
                 raise LogError(f"{self.files[0].path}, topic {topic.name}: {topic.unreadable}.")

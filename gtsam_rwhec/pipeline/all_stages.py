@@ -1,4 +1,4 @@
-"""All stages in a row: from a log and a rig file to a folder with the calibration in every form."""
+"""All stages, one after the other: from a log and a rig file to a folder with the calibration in every form."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def solve_into(
     images: Images = "copy",
     progress: Progress | None = None,
 ) -> Calibrated:
-    """Solve from a cleaned log; write ``result.json``, and ``clean.mcap`` with the solution in it, into a folder.
+    """Solve from a cleaned log; write ``result.json``, and ``clean.mcap`` with the solution, into a folder.
 
     Raises
     ------
@@ -139,12 +139,12 @@ def solve_into(
 
 
 def export_solved(solved_path: str | Path, out: str | Path, *, progress: Progress | None = None) -> list[Path]:
-    """Write what others read, and plots, from a solved log into a folder; the files' paths.
+    """Write the files for other programs, and plots, from a solved log into a folder; return their paths.
 
     Raises
     ------
     LogError
-        The log has no solution in it.
+        The log has no solution.
     FileFormatError
         A file cannot be written.
     """

@@ -15,40 +15,38 @@ from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-#: Where stamps go back by more than this, in the order of the log, a clock was set while it was recorded.
+#: Seconds. If stamps go back by more than this in the order of the log, a clock was set during the recording.
 BACKWARDS_S = 1.0
-#: Stamps must be before this (the year 2116), so that differences and time offsets fit into 64 bits.
+#: Nanoseconds. Stamps must be below this (the year 2116): then differences and time offsets fit into 64 bits.
 LATEST_NS = 1 << 62
-#: Topics that an error lists, at most: a stranger's log may have thousands.
-MOST_NAMED = 50
 
 
 @dataclass(frozen=True, eq=False)
 class CarrierMotion:
-    """The carriers' motion: A over time, T_sensorcarrier_targetcarrier, and its noise as the rig file has it."""
+    """The carriers' motion: A = T_sensorcarrier_targetcarrier over time, and its noise if the rig file states it."""
 
     trajectory: Trajectory
     noise: CarrierNoise | None
 
     def A_where_known(self, stamps_ns: np.ndarray, max_gap_s: float) -> Array:
-        """A (N, 4, 4) at stamps (N,); nan outside the trajectory and in gaps of more than `max_gap_s`."""
+        """A (N, 4, 4) at stamps (N,); nan outside the trajectory and in gaps above `max_gap_s`."""
         A, gap_s = self.trajectory.at(stamps_ns)
         return np.where((gap_s > max_gap_s)[:, None, None], np.nan, A)
 
 
 def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
-    """Read the carriers' motion from where the rig file says it is.
+    """Read the carriers' motion from the tf frames or the topic that the rig file names.
 
     Raises
     ------
     LogError
-        A topic that is not there, or has no such poses; no transforms at all.
+        The topic is missing or has no poses of these frames, or the log has no transforms.
     TransformError
-        Frames that no chain of transforms joins, or that never move against each other.
+        No chain of transforms joins the frames, or the frames never move against each other.
     StampError
-        Stamps that are all the same, or of a clock that was set back meanwhile.
+        All stamps are the same, or a clock was set back during the recording.
     """
-    source = rig.carriers.poses
+    source, noise = rig.carriers.poses, rig.carriers.noise
     parent, child = source.frames
     if source.topic is None:
         where = f"tf {parent} to {child}"
@@ -56,15 +54,13 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     else:
         where = f"topic {source.topic}"
         stamps, T = _from_topic(log, source.topic)
-    child_carries_sensors = child == rig.carriers.sensors
-    if child_carries_sensors:  # the log has T_targetcarrier_sensorcarrier
-        T = se3.inverse(T)
-    noise = rig.carriers.noise
-    if noise is None:
-        return CarrierMotion(Trajectory.of(stamps, T, where), None)
-    # What is reported of a child frame is off in the child's own axes.
-    about: Literal["sensorcarrier", "targetcarrier"] = "sensorcarrier" if child_carries_sensors else "targetcarrier"
-    carrier_noise = CarrierNoise(float(np.radians(noise.rotation_deg)), 1e-3 * noise.translation_mm, about=about)
+    # The pose of a child frame is noisy about and along the child's own axes.
+    about: Literal["sensorcarrier", "targetcarrier"] = "targetcarrier"
+    if child == rig.carriers.sensors:  # the log has T_targetcarrier_sensorcarrier
+        about, T = "sensorcarrier", se3.inverse(T)
+    carrier_noise = None
+    if noise is not None:
+        carrier_noise = CarrierNoise(float(np.radians(noise.rotation_deg)), 1e-3 * noise.translation_mm, about=about)
     return CarrierMotion(Trajectory.of(stamps, T, where), carrier_noise)
 
 
@@ -85,24 +81,21 @@ def _from_tf(log: Log, parent: str, child: str) -> tuple[np.ndarray, Array]:
         raise TransformError(f"{where}: {error}") from error
     if len(stamps) < 2:
         why = "one pose" if len(stamps) else "static transforms"
-        raise TransformError(
-            f"{where}: joined by {why} only ({chain}): a carrier that does not move calibrates nothing"
-        )
-    known = np.isfinite(gap_s)  # before the first and after the last of a link nothing is known
+        raise TransformError(f"{where}: {why} only ({chain}): a carrier that does not move calibrates nothing")
+    known = np.isfinite(gap_s)  # nothing is known before the first and after the last transform of a link
     if not known.any():
         raise TransformError(f"{where}: the links of the chain have no time in common: {chain}")
     return stamps[known], T[known]
 
 
 def _no_transforms(log: Log, topics: list[Topic]) -> str:
-    """What there is in place of transforms."""
+    """Why the log has no transforms, and the topics that it has."""
     said = [f"{t.name} ({t.unreadable or f'{t.count} messages, none of which can be read'})" for t in topics]
     if said:
         return f"no transforms can be read; topics of transforms: {', '.join(said)}"
-    there = ", ".join(f"{t.name} ({t.schema})" for t in log.topics()[:MOST_NAMED]) or "none"
     return (
-        f"the log has no transforms; its topics: {there}. Record /tf and /tf_static too, or name a topic of poses in "
-        "the rig file: poses: {topic: ..., parent: ..., child: ...}"
+        f"the log has no transforms; its topics: {log.topics_in_words()}. Record /tf and /tf_static too, or name a "
+        "topic of poses in the rig file: poses: {topic: ..., parent: ..., child: ...}"
     )
 
 
@@ -110,18 +103,18 @@ def _from_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
     in_order = [r.stamp_ns for r in log.records([topic]) if isinstance(r, PoseRecord)]
     check_order(np.array(in_order, dtype=np.int64), f"topic {topic}")
     series = log.poses(topic)
-    # Of poses with one stamp the last counts, as in tf.
+    # Of several poses with the same stamp, the last one counts, as in tf.
     last = np.append(np.diff(series.stamps_ns) != 0, True)
     return series.stamps_ns[last], series.T[last]
 
 
 def check_order(stamps_ns: np.ndarray, where: str) -> None:
-    """Refuse stamps (N,), one of each message, in the order in which they were logged, that tell no time.
+    """Check the stamps (N,) of the messages of a topic, in the order in which they were logged.
 
     Raises
     ------
     StampError
-        All one (zero, most often); before 1970 or after 2116; or going back by more than `BACKWARDS_S`.
+        Stamps are all the same (most often zero), before 1970, after 2116, or go back by more than `BACKWARDS_S`.
     """
     if not len(stamps_ns):
         return
@@ -129,15 +122,15 @@ def check_order(stamps_ns: np.ndarray, where: str) -> None:
     if len(wrong):
         raise StampError(
             f"{where}: stamp {stamps_ns[wrong[0]]} ns (message {wrong[0] + 1}) is before 1970 or after 2116; does the "
-            "driver write nanoseconds, or seconds and nanoseconds, as the schema has it?"
+            "driver write nanoseconds, or seconds and nanoseconds, as its schema says?"
         )
     if not stamps_ns.any():
         raise StampError(f"{where}: every stamp is 0 ({len(stamps_ns)} messages); does the driver fill header.stamp?")
     if len(stamps_ns) > 1 and (stamps_ns == stamps_ns[0]).all():
         raise StampError(
-            f"{where}: all {len(stamps_ns)} messages have the one stamp {stamps_ns[0]} ns: a clock stood still"
+            f"{where}: all {len(stamps_ns)} messages have the same stamp, {stamps_ns[0]} ns: a clock stood still"
         )
-    latest = np.maximum.accumulate(stamps_ns)  # from the latest so far: a clock may go back in small steps, too
+    latest = np.maximum.accumulate(stamps_ns)  # a clock may also go back in many small steps
     late = np.flatnonzero((latest - stamps_ns) * 1e-9 > BACKWARDS_S)
     if len(late):
         i = int(late[0])

@@ -32,7 +32,7 @@ from gtsam_rwhec.results.log_history import CleaningReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-#: Half the time over which the carriers' speed at a stamp is measured.
+#: Nanoseconds; half the time over which the carriers' speed at a stamp is measured.
 SPEED_STEP_NS = 20_000_000
 
 
@@ -46,26 +46,26 @@ def clean_log(
 ) -> CleaningReport:
     """Synchronise detections with the carriers' poses, clean them, and write a log with the pairs.
 
-    What the detected log has is copied. New is ``/calibration/<sensor>/pairs``: a measured pair for every detection
-    that has a pose, with the reason where it is not to be used.
+    The messages of the detected log are copied. The stage adds the topics ``/calibration/<sensor>/pairs``: a measured
+    pair (A, B) for every detection with a pose, and the reason if it is not used.
 
     Parameters
     ----------
     detected_path
-        What ``detect_log`` wrote.
+        The log that ``detect_log`` wrote.
     out_path
         The MCAP file to write; may be `detected_path`.
     rig : Rig, optional
-        Left out, the one that is embedded in the log.
+        By default the rig file embedded in the log.
     images : "copy" or "leave_out"
-        Images that the detected log has.
+        Whether the written log has the images of the detected log.
     progress : callable, optional
 
     Raises
     ------
     LogError, StampError, TransformError
-        The log has no detections or no carriers' poses; clocks have nothing in common; the motion does not determine a
-        time offset; no measurement is left.
+        The log has no detections or no carriers' poses; its clocks have no time in common; the motion does not
+        determine a time offset; or no measurement is left.
     """
     tell = progress or silent
     check_writable(out_path)
@@ -101,26 +101,25 @@ def clean_log(
 
 
 def clean_track(track: Track, path: Trajectory, rig: Rig, offset_s: float) -> MeasuredPairs:
-    """Synchronise a track with the carriers' path, and give a reason to what should not be used."""
+    """Synchronise a track with the carriers' path, and give a reason to each measurement that is not used."""
     options = rig.cleaning
     A, kept = synchronise(
-        path,
-        track.stamps_ns,
-        time_offset_s=offset_s,
-        max_gap_s=rig.carriers.max_gap_s,
-        needs_overlap=False,
+        path, track.stamps_ns, time_offset_s=offset_s, max_gap_s=rig.carriers.max_gap_s, needs_overlap=False
     )
     pairs = MeasuredPairs(**vars(track), A=A).marked(kept, np.arange(len(A)))
     stamps = pairs.stamps_ns
     if options.max_rotation_deg_s is not None or options.max_translation_m_s is not None:
         at = np.flatnonzero(pairs.used)
         turning, moving = speeds(path, stamps[at] + round(1e9 * offset_s))
+        turning_limit_deg_s, moving_limit_m_s = (
+            np.inf if limit is None else limit for limit in (options.max_rotation_deg_s, options.max_translation_m_s)
+        )
         fast = without_fast(
             turning,
             moving,
             stamps[at],
-            max_turning_rad_s=_or_infinite(options.max_rotation_deg_s, np.pi / 180.0),
-            max_moving_m_s=_or_infinite(options.max_translation_m_s, 1.0),
+            max_turning_rad_s=float(np.radians(turning_limit_deg_s)),
+            max_moving_m_s=moving_limit_m_s,
         )
         pairs = pairs.marked(fast, at)
     if options.thin:
@@ -152,26 +151,22 @@ def speeds(path: Trajectory, stamps_ns: np.ndarray) -> tuple[Array, Array]:
 
 
 def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track]) -> tuple[float, float | None]:
-    """The time offset of a sensor as given; or estimated from turning rates, with its standard deviation."""
+    """The time offset of a sensor as stated, or estimated from turning rates; the standard deviation of an estimate."""
     given = rig.sensors[sensor].time_offset
     if given != "estimate":
         return float(given), None
     usable = [(track.stamps_ns[track.used], track.B[track.used]) for track in tracks if track.used.sum() >= 2]
     if not usable:
         raise StampError(
-            f"{sensor}: its time offset is to be estimated, but no target was seen twice; set time_offset to what is "
-            "known"
+            f"{sensor}: no target was seen twice, and without this the time offset cannot be estimated; state "
+            "time_offset in the rig file"
         )
     found = coarse_time_offset(path, usable, max_gap_s=rig.carriers.max_gap_s, where=sensor)
     return found.offset_s, found.sigma_s
 
 
 def _check_overlap(tracks: list[Track], path: Trajectory, sensor: str, offset_s: float) -> None:
-    """Check that some of what a sensor saw is within the carriers' path; a single target may be outside."""
+    """Refuse a sensor all of whose stamps are outside the carriers' path; a single target may be outside."""
     if tracks:
         stamps = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
         synchronise(path, stamps, time_offset_s=offset_s, where=sensor)
-
-
-def _or_infinite(value: float | None, unit: float) -> float:
-    return np.inf if value is None else value * unit

@@ -35,8 +35,8 @@ def detect_log(
 ) -> DetectionReport:
     """Detect the targets, and write a log with the detections.
 
-    The raw messages are copied as they are (images on request). New are the topics
-    ``/calibration/<sensor>/detections``, ``.../annotations`` and ``.../poses``, and in the metadata the rig file, the
+    Raw messages are copied as they are (images on request). The stage adds the topics
+    ``/calibration/<sensor>/detections``, ``.../annotations`` and ``.../poses``, and metadata: the rig file, the
     intrinsics and a report.
 
     Parameters
@@ -47,15 +47,15 @@ def detect_log(
     out_path
         The MCAP file to write.
     images : "copy" or "leave_out"
+        Whether the written log has the images too.
     workers : int, optional
-        Threads, and for long logs processes; left out, one for each core.
+        Threads, and for long logs processes; by default one for each core.
     progress : callable, optional
-        Told what is done.
 
     Raises
     ------
     LogError, StampError, TransformError, CameraError, FrameError
-        The log lacks what the rig file names, or the carriers' poses; or no target was detected in any image.
+        The log lacks a topic of the rig file or the carriers' poses, or no target was detected.
     """
     tell = progress or silent
     check_writable(out_path)
@@ -84,8 +84,7 @@ def _write_detections(out: LogWriter, sensor: str, records: list[DetectionRecord
     of_image: dict[int, list[DetectionRecord]] = defaultdict(list)
     for record in records:
         of_image[record.stamp_ns].append(record)
-    for stamp in sorted(of_image):
-        seen = of_image[stamp]
+    for stamp, seen in sorted(of_image.items()):
         out.detections(detections_topic(sensor), stamp, seen[0].frame, seen)
         outlines = [(r.label, r.corners_px) for r in seen if r.corners_px is not None and len(r.corners_px)]
         if outlines:

@@ -1,4 +1,4 @@
-"""The images of a log with what was detected in them, as PNG files in a folder."""
+"""Pictures of the detections in the images of a log, as PNG files in a folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, open_log
-from gtsam_rwhec.pipeline.log_contract import detections_topic
+from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
 from gtsam_rwhec.pipeline.log_metadata import read_cameras, read_embedded_rig
 from gtsam_rwhec.pipeline.output_paths import made_folder
 from gtsam_rwhec.vision.drawn_detections import draw
@@ -19,22 +19,18 @@ from gtsam_rwhec.vision.images import decode_gray
 
 
 def draw_log(
-    log_path: str | Path,
-    detected_path: str | Path,
-    folder: str | Path,
-    *,
-    progress: Progress | None = None,
+    log_path: str | Path, detected_path: str | Path, folder: str | Path, *, progress: Progress | None = None
 ) -> int:
-    """Draw every image that can be decoded: ``<sensor>_<stamp>.png``; how many.
+    """Draw the detections in every image that can be decoded, as ``<sensor>_<stamp>.png``; return how many.
 
     Parameters
     ----------
     log_path
-        Where the images are.
+        The log with the images.
     detected_path
-        What ``detect_log`` made of it.
+        The log that ``detect_log`` made of it.
     folder
-        Made if it is not there.
+        It is made if it does not exist.
     progress : callable, optional
 
     Raises
@@ -49,22 +45,19 @@ def draw_log(
     count = 0
     with open_log(detected_path) as detected, open_log(log_path) as log:
         rig, cameras = read_embedded_rig(detected), read_cameras(detected)
-        there = {topic.name for topic in detected.topics()}
         for sensor, source in rig.sensors.items():
             if source.images is None:
                 continue
             of_stamp: dict[int, list[DetectionRecord]] = defaultdict(list)
-            topic = detections_topic(sensor)
-            for record in detected.records([topic] if topic in there else []):
-                if isinstance(record, DetectionRecord):
-                    of_stamp[record.stamp_ns].append(record)
+            for record in records_of(detected, [detections_topic(sensor)], DetectionRecord):
+                of_stamp[record.stamp_ns].append(record)
             for image in log.records([source.images]):
                 if not isinstance(image, ImageRecord):
                     continue
                 try:
                     gray = decode_gray(image)
                 except ImageError:
-                    continue  # detection has counted and named it
+                    continue  # the report of detection names it
                 picture = draw(gray, of_stamp[image.stamp_ns], cameras[sensor])
                 path = folder / f"{sensor.replace('/', '_')}_{image.stamp_ns}.png"
                 _, data = cv2.imencode(".png", picture)

@@ -1,4 +1,4 @@
-"""Detections of a driver: poses are computed from its corners with the rig file's sizes, or taken as they are."""
+"""The detections of a driver: poses come from its corners and the rig file's sizes, or from the driver."""
 
 from __future__ import annotations
 
@@ -19,27 +19,28 @@ from gtsam_rwhec.vision.pose import plane_poses
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import Target
 
-#: Drivers do not say how well they find corners; as for our own, only proportions count with estimated noise.
+#: Pixels; assumed standard deviation of a driver's corners, which drivers do not state. If the noise is estimated, only
+#: the proportions between covariances count.
 CORNER_PX = 0.1
-#: Sizes as near as this, of their length, are one: some messages have them in single precision.
+#: Two sizes are the same if they differ by less than this share: some messages have them in single precision.
 SAME_SIZE = 1e-4
 
 
 def read_driver_detections(log: Log, rig: Rig, sensor: str, camera: Camera | None) -> SensorDetections:
     """Read the detections of a sensor from the topic of its driver.
 
-    With intrinsics, poses are made anew from the corners and the rig file's sizes (a driver's may be configured to
-    others); of the two that a plane has, the one nearer to the driver's where it has one, else the one of smaller
-    reprojection error. Without, the driver's poses stand, and its size.
+    With intrinsics, poses are computed from the corners and the rig file's sizes; the driver may have used other
+    sizes. A plane has two poses: the one nearer to the driver's pose is taken, or, without a driver's pose, the one of
+    smaller reprojection error. Without intrinsics, the driver's poses and sizes are taken.
 
     Raises
     ------
     LogError
-        The topic is not there, or has no detections; poses that the driver made with another size than the rig file's.
+        The topic is missing or has no detections, or the driver made poses with a size other than the rig file's.
     StampError
-        Stamps that tell no time.
+        As `check_order`.
     CameraError
-        There are neither poses nor intrinsics to make them.
+        There are no poses, and no intrinsics from which to make them.
     """
     source = rig.sensors[sensor]
     assert source.detections is not None
@@ -56,8 +57,7 @@ def read_driver_detections(log: Log, rig: Rig, sensor: str, camera: Camera | Non
             continue
         result.append(_made(record, target, camera, sensor))
     check_order(np.array([stamp for _, stamp in messages], dtype=np.int64), f"topic {source.detections}")
-    count = message_count(log, source.detections)
-    return SensorDetections(result, count, strangers)
+    return SensorDetections(result, message_count(log, source.detections), strangers)
 
 
 def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor: str) -> DetectionRecord:
@@ -72,14 +72,14 @@ def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor
         if driver_m is not None and not np.isclose(driver_m, target.length_m, rtol=SAME_SIZE, atol=0.0):
             raise LogError(
                 f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver made its pose of {target.name} with a "
-                f"size of {driver_m:g} m, and the rig file says {target.length_m:g} m. Give the driver's size there, "
-                f"or intrinsics of sensor {sensor}, with which poses are made anew from corners"
+                f"size of {driver_m:g} m, and the rig file says {target.length_m:g} m. Give the driver's size in the "
+                f"rig file, or the intrinsics of sensor {sensor}: with them poses are computed from corners"
             )
         return record
     poses = plane_poses(camera, [target.corners()], [_in_our_order(record.corners_px)], corner_px=CORNER_PX)
     which = 0
     if record.T_camera_tag is not None:
-        # Only the normal tells the two apart, and drivers turn a tag's axes as they like: up to its sign.
+        # Only the direction of the normal tells the two poses apart: drivers choose a tag's axes as they like.
         normal = record.T_camera_tag[:3, 2]
         which = int(np.argmax([abs(float(T[:3, 2] @ normal)) for T in np.nan_to_num(poses.T[0])]))
     T = poses.T[0, which]
@@ -94,7 +94,7 @@ def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor
 
 
 def _in_our_order(corners_px: np.ndarray) -> np.ndarray:
-    """Clockwise as seen, from wherever the driver begins: the AprilTag library goes the other way round."""
+    """Corners clockwise in the image, from the driver's first corner: the AprilTag library goes counterclockwise."""
     first, second = corners_px[2] - corners_px[0], corners_px[3] - corners_px[1]
     clockwise = first[0] * second[1] - first[1] * second[0] > 0.0  # with y down
     return corners_px if clockwise else corners_px[::-1]

@@ -1,4 +1,4 @@
-"""Whether the files in a folder are an earlier output of the same log, so that they may be replaced without asking."""
+"""Whether the files in a folder are an earlier output of the same log: only then they are replaced without asking."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gtsam_rwhec.results.result_file import read_result
 def check_replaceable(folder: Path, log_name: str) -> None:
     """Refuse a folder in which `calibrate_log` would replace files of another log, or of unknown origin.
 
-    Files that it does not write are left alone, whatever they are.
+    Files that `calibrate_log` does not write do not matter.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def check_replaceable(folder: Path, log_name: str) -> None:
     Raises
     ------
     LogError
-        There is a file that is not of that log; nothing was changed.
+        A file is not an output of this log. Nothing was changed.
     """
     known = [folder / name for name in (RESULT_FILE, CLEAN_LOG, DETECTED_LOG) if (folder / name).exists()]
     others = [folder / name for name in FILES if (folder / name).exists()]
@@ -40,7 +40,7 @@ def check_replaceable(folder: Path, log_name: str) -> None:
 
 
 def _sources(path: Path) -> tuple[str, ...]:
-    """The names of the logs that a result or a stage's log was made of; none where it is neither."""
+    """The names of the logs that a result or a stage's log was made from; empty for any other file."""
     try:
         if path.name == RESULT_FILE:
             log = read_result(path).log

@@ -1,10 +1,9 @@
-"""Detection in the images of all cameras; of the two poses of a detection the one that its whole track supports."""
+"""Detection in the images of all cameras; a detection gets the one of its two poses that its whole track supports."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -20,20 +19,11 @@ from gtsam_rwhec.vision.ambiguity import choose_over_time
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.detection import Detection, Detector
 from gtsam_rwhec.vision.many_images import DetectedImage, detect_in_images, measured_corner_px
-from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import Target
 
-#: After so many images the stamps of a camera are checked, so that nobody waits long for a log that cannot be used.
+#: The stamps of a camera are checked after so many images: nobody waits long for a log that cannot be used.
 CHECKED_AFTER = (10, 100, 1000, 10_000)
-
-
-@dataclass(frozen=True, eq=False)
-class _Stamped:
-    """A detection and the stamp of its image."""
-
-    stamp_ns: int
-    detection: Detection
 
 
 def detect_in_log(
@@ -45,14 +35,14 @@ def detect_in_log(
     workers: int | None,
     progress: Progress,
 ) -> dict[str, SensorDetections]:
-    """Detect in the images of every sensor that has images.
+    """The detections of every sensor that has images.
 
     Raises
     ------
     LogError
-        A topic has no images, or not one image of a sensor can be used.
+        A topic has no images, or no image of a sensor can be used.
     StampError
-        Stamps that tell no time.
+        As `check_order`.
     """
     sensor_of = {source.images: name for name, source in rig.sensors.items() if source.images is not None}
     images: dict[str, list[DetectedImage]] = {topic: [] for topic in sensor_of}
@@ -73,10 +63,9 @@ def _detected(
     workers: int | None,
     progress: Progress,
 ) -> Iterator[DetectedImage]:
-    """Every image, in no order; stamps are checked while images are read."""
+    """The detections of every image, in any order; stamps are checked while images are read."""
     if not sensor_of:
         return
-    options = detection_options(rig)
     stamps: dict[str, list[int]] = defaultdict(list)
 
     def images() -> Iterator[ImageRecord]:
@@ -90,7 +79,8 @@ def _detected(
             yield record
 
     makers = {
-        topic: partial(Detector, cameras[sensor], rig.target_list, options) for topic, sensor in sensor_of.items()
+        topic: partial(Detector, cameras[sensor], rig.target_list, rig.detection_options)
+        for topic, sensor in sensor_of.items()
     }
     total = sum(topic.count for topic in log.topics() if topic.name in sensor_of)
     yield from detect_in_images(
@@ -104,22 +94,22 @@ def _of_sensor(log: Log, rig: Rig, sensor: str, images: list[DetectedImage], mot
     faults = tuple(image.fault for image in images if image.found is None)
     if len(faults) == len(images):
         topic = rig.sensors[sensor].images
-        why = f"the first: {faults[0]}" if faults else "not one can be read as its schema says"
+        why = f"the first: {faults[0]}" if faults else "none can be read as its schema says"
         raise LogError(
             f"{log.files[0].path}, topic {topic}: none of the {message_count(log, topic)} images of {sensor} can "
             f"be used; {why}"
         )
     strangers: Counter[tuple[str, str]] = Counter()
-    detections: list[_Stamped] = []
+    tracks: dict[str, list[tuple[int, Detection]]] = defaultdict(list)
     for image in images:
         if image.found is not None:
             strangers.update({(family, str(i)): n for (family, i), n in image.found.strangers.items()})
-            detections += [_Stamped(image.stamp_ns, detection) for detection in image.found.detections]
+            for detection in image.found.detections:
+                tracks[detection.target].append((image.stamp_ns, detection))
     records: list[DetectionRecord] = []
     corner_px: dict[str, float] = {}
     for target in rig.target_list:
-        track = [stamped for stamped in detections if stamped.detection.target == target.name]
-        of_target, measured_px = _of_track(track, target, sensor, rig, motion)
+        of_target, measured_px = _of_track(tracks[target.name], target, sensor, rig, motion)
         records += of_target
         if measured_px is not None:
             corner_px[f"{target.name}/{sensor}"] = measured_px
@@ -127,39 +117,40 @@ def _of_sensor(log: Log, rig: Rig, sensor: str, images: list[DetectedImage], mot
 
 
 def _of_track(
-    track: list[_Stamped], target: Target, sensor: str, rig: Rig, motion: CarrierMotion
+    track: list[tuple[int, Detection]], target: Target, sensor: str, rig: Rig, motion: CarrierMotion
 ) -> tuple[list[DetectionRecord], float | None]:
-    """Each detection of a target with the one of its two poses that the whole track supports; the corners' noise."""
-    options = detection_options(rig)
-    chosen: dict[int, tuple[int, Rejection | None]] = {}
+    """Each stamped detection of a target with the pose that the whole track supports; the noise of the corners."""
+    options = rig.detection_options
+    chosen = [0] * len(track)
+    rejections = [detection.rejection for _, detection in track]
     factor, corner_px = 1.0, None
-    good = [stamped for stamped in track if stamped.detection.rejection is None]
+    good = [i for i, rejection in enumerate(rejections) if rejection is None]
     if good:
-        squared = np.array([stamped.detection.squared_px for stamped in good])
+        detections = [track[i][1] for i in good]
+        squared = np.array([detection.squared_px for detection in detections])
         corner_px = rig.corner_px or measured_corner_px(
-            squared[:, 0], np.array([len(stamped.detection.indices) for stamped in good])
+            squared[:, 0], np.array([len(detection.indices) for detection in detections])
         )
         factor = (corner_px / options.corner_px) ** 2
-        stamps = np.array([stamped.stamp_ns for stamped in good], dtype=np.int64)
+        stamps = np.array([track[i][0] for i in good], dtype=np.int64)
         choice = choose_over_time(
             stamps,
-            np.array([stamped.detection.T for stamped in good]),
+            np.array([detection.T for detection in detections]),
             squared,
-            factor * np.array([stamped.detection.covariance for stamped in good]),
+            factor * np.array([detection.covariance for detection in detections]),
             corner_px,
             motion.A_where_known(stamps, rig.carriers.max_gap_s),
         )
-        for stamped, which, margin in zip(good, choice.which.tolist(), choice.margin.tolist(), strict=True):
-            chosen[id(stamped)] = which, Rejection.AMBIGUOUS if margin < options.ambiguity_margin else None
+        for i, which, margin in zip(good, choice.which.tolist(), choice.margin.tolist(), strict=True):
+            chosen[i] = which
+            rejections[i] = Rejection.AMBIGUOUS if margin < options.ambiguity_margin else None
     records = []
-    for stamped in track:
-        detection = stamped.detection
-        which, rejection = chosen.get(id(stamped), (0, detection.rejection))
+    for (stamp_ns, detection), which, rejection in zip(track, chosen, rejections, strict=True):
         has_pose = bool(np.isfinite(detection.T[which]).all() and np.isfinite(detection.covariance[which]).all())
         records.append(
             DetectionRecord(
-                logged_ns=stamped.stamp_ns,
-                stamp_ns=stamped.stamp_ns,
+                logged_ns=stamp_ns,
+                stamp_ns=stamp_ns,
                 topic=detections_topic(sensor),
                 frame=rig.frame_of(sensor),
                 family=target.family,
@@ -176,17 +167,6 @@ def _of_track(
     return records, corner_px
 
 
-def detection_options(rig: Rig) -> DetectionOptions:
-    """The section ``detection`` of the rig file.
-
-    Raises
-    ------
-    OptionError
-        A value that cannot be used.
-    """
-    return replace(DetectionOptions(), **rig.detection)
-
-
 def message_count(log: Log, topic: str | None) -> int:
-    """How many messages of a topic there are, with those that cannot be read."""
+    """How many messages a topic has, with those that cannot be read."""
     return sum(t.count for t in log.topics() if t.name == topic)

@@ -1,4 +1,4 @@
-"""What the stages know of a log beside its messages, kept in its metadata: rig file, intrinsics and reports."""
+"""The metadata of a log that a stage wrote: rig file, intrinsics and reports."""
 
 from __future__ import annotations
 
@@ -21,16 +21,18 @@ Report = TypeVar("Report", bound=BaseModel)
 
 @dataclass(frozen=True, eq=False)
 class LogMetadata:
-    """What a log of detections or of pairs says of itself.
+    """The metadata of a log of detections or of pairs.
 
     Attributes
     ----------
     rig : Rig
         The rig file that the last stage worked with.
     cameras : dict of sensor to Camera
+        Intrinsics that detection used.
     detection : DetectionReport
+        The report of detection.
     cleaning : CleaningReport or None
-        None before cleaning.
+        The report of cleaning; None before cleaning.
     """
 
     rig: Rig
@@ -39,7 +41,7 @@ class LogMetadata:
     cleaning: CleaningReport | None = None
 
     def write(self, out: LogWriter) -> None:
-        """Write it into a log."""
+        """Write the metadata into a log."""
         out.metadata(RIG_METADATA, {"yaml": rig_text(self.rig)})
         entries = {
             sensor: json.dumps(
@@ -54,43 +56,30 @@ class LogMetadata:
 
 
 def read_metadata(log: Log) -> LogMetadata:
-    """Read what the stages so far wrote.
+    """Read the metadata that the stages so far wrote.
 
     Raises
     ------
     LogError
-        No stage wrote it, or it is damaged.
+        No stage wrote the log, or its metadata is damaged.
     """
-    rig, cameras = read_embedded_rig(log), read_cameras(log)
+    cleaning = read_cleaning_report(log) if CLEANING_METADATA in log.metadata() else None
     detection = _report(log, DETECTION_METADATA, DetectionReport)
-    cleaning = _report(log, CLEANING_METADATA, CleaningReport) if CLEANING_METADATA in log.metadata() else None
-    return LogMetadata(rig, cameras, detection, cleaning)
+    return LogMetadata(read_embedded_rig(log), read_cameras(log), detection, cleaning)
 
 
 def read_cleaning_report(log: Log) -> CleaningReport:
-    """The report of cleaning.
-
-    Raises
-    ------
-    LogError
-        The log was not cleaned, or the report is damaged.
-    """
+    """The report of cleaning; `LogError` if the log was not cleaned, or the report is damaged."""
     return _report(log, CLEANING_METADATA, CleaningReport)
 
 
 def read_embedded_rig(log: Log) -> Rig:
-    """The rig file that the last stage worked with.
-
-    Raises
-    ------
-    LogError
-        There is none.
-    """
+    """The rig file that the last stage worked with; `LogError` if the log has none."""
     found = log.metadata().get(RIG_METADATA)
     if found is None or "yaml" not in found:
         raise LogError(
-            f"{log.files[0].path} has no rig file in it: it was not written by gtsam-rwhec detect or clean, or is not "
-            "whole. Begin with detect (again)"
+            f"{log.files[0].path} has no rig file in it: gtsam-rwhec detect or clean did not write it, or it is not "
+            "whole. Begin with gtsam-rwhec detect"
         )
     return parse_rig(found["yaml"], f"{log.files[0].path}, metadata {RIG_METADATA}")
 
@@ -101,7 +90,7 @@ def read_cameras(log: Log) -> dict[str, Camera]:
     Raises
     ------
     LogError
-        They are damaged.
+        The intrinsics are damaged.
     """
     where = f"{log.files[0].path}, metadata {CAMERAS_METADATA}"
     cameras = {}
@@ -120,8 +109,8 @@ def _report(log: Log, name: str, kind: type[Report]) -> Report:
     where = f"{log.files[0].path}, metadata {name}"
     if found is None or "json" not in found:
         raise LogError(
-            f"{where} is not there: the stage before this one did not write this log, or it is not whole. The stages "
-            "are detect, clean, solve, export; each takes the log that the one before it wrote"
+            f"{where} is missing: the stage before this one did not write this log, or the log is not whole. The "
+            "stages are detect, clean, solve and export; each reads the log that the stage before it wrote"
         )
     try:
         return kind.model_validate_json(found["json"])

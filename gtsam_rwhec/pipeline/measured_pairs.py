@@ -1,4 +1,4 @@
-"""Measured pairs (A, B): written into a cleaned log, read from it as arrays, and stated as a problem."""
+"""Measured pairs (A, B): written into a cleaned log, read back as arrays, and stated as a problem."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from gtsam_rwhec.errors import NoiseError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, LogWriter, PairRecord
-from gtsam_rwhec.pipeline.log_contract import pairs_topic
+from gtsam_rwhec.pipeline.log_contract import pairs_topic, records_of
 from gtsam_rwhec.pipeline.tracks import Track
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -27,7 +27,7 @@ class MeasuredPairs(Track):
     A: Array
 
     def at(self, path: Trajectory, offset_s: float) -> MeasuredPairs:
-        """With A taken anew from the carriers' path; the sensor's stamp t is the carriers' t + offset."""
+        """The pairs with A at another time offset: the sensor's stamp t is the carriers' t + offset."""
         A, _ = path.at(self.stamps_ns + round(1e9 * offset_s))
         return replace(self, A=A)
 
@@ -56,12 +56,10 @@ def write_pairs(out: LogWriter, pairs: Iterable[MeasuredPairs]) -> None:
 
 
 def read_pairs(log: Log, rig: Rig) -> dict[Pair, MeasuredPairs]:
-    """Read the pairs of a cleaned log by (target, sensor), in order of time; those that the rig file has."""
-    there = {topic.name for topic in log.topics()}
-    topics = [topic for topic in map(pairs_topic, rig.sensors) if topic in there]
+    """Read the pairs of the rig file's sensors and targets from a cleaned log, in order of time."""
     found: dict[Pair, list[PairRecord]] = defaultdict(list)
-    for record in log.records(topics):
-        if isinstance(record, PairRecord) and record.target in rig.targets and record.sensor in rig.sensors:
+    for record in records_of(log, map(pairs_topic, rig.sensors), PairRecord):
+        if record.target in rig.targets and record.sensor in rig.sensors:
             found[Pair(record.target, record.sensor)].append(record)
     return {pair: _stacked(pair, sorted(found[pair], key=lambda r: r.stamp_ns)) for pair in sorted(found)}
 
@@ -85,39 +83,39 @@ def problem_of(
     offsets_s: Mapping[str, float],
     free_sizes: Collection[str] = (),
 ) -> Problem:
-    """The problem that the used pairs state.
+    """The problem that the used pairs state, with stamps on the carriers' clock.
 
     Parameters
     ----------
     pairs : dict of (target, sensor) to MeasuredPairs
     rig : Rig
-        For its noise.
+        States the noise.
     offsets_s : dict of sensor to float
-        The time offsets at which A was taken: the stamps of the problem are those of the carriers' clock.
+        The time offsets at which A was taken, seconds.
     free_sizes : collection of str
         Targets whose size is estimated.
 
     Raises
     ------
     NoiseError
-        Where ``noise: {corner_px: ...}`` is asked for and a measurement has no covariance; a covariance is not positive
-        definite.
+        The rig file says ``noise: {corner_px: ...}`` and a measurement has no covariance, or a covariance is not
+        positive definite.
     """
     problem = Problem("per_target" if free_sizes else "known")
+    noise = rig.noise
+    stated: dict[str, object] = {}
+    if noise != "estimate" and noise.rotation_deg is not None and noise.translation_mm is not None:
+        stated = {"sigma": 1e-3 * noise.translation_mm, "kappa": 1.0 / (2.0 * np.radians(noise.rotation_deg) ** 2)}
     has_covariances = all(measured.covariance is not None for measured in pairs.values())
     for pair, measured in pairs.items():
         used = measured.used
         if not used.any():
             continue
-        weights: dict[str, object] = {}
-        noise = rig.noise
-        if noise != "estimate" and noise.rotation_deg is not None and noise.translation_mm is not None:
-            deviation_rad = np.radians(noise.rotation_deg)
-            weights = {"sigma": 1e-3 * noise.translation_mm, "kappa": 1.0 / (2.0 * deviation_rad**2)}
-        elif has_covariances:
+        weights = stated
+        if not stated and has_covariances:
             assert measured.covariance is not None
             weights = {"covariances": measured.covariance[used]}
-        elif noise != "estimate":
+        elif not stated and noise != "estimate":
             raise NoiseError(
                 f"{pair}: noise: {{corner_px: ...}} needs corners, and the detections of {pair.sensor} are poses "
                 "without a covariance; give rotation_deg and translation_mm, or estimate"
@@ -133,8 +131,8 @@ def problem_of(
             )
         except NoiseError as error:
             raise NoiseError(
-                f"{error}. These are the log's: noise: {{rotation_deg: ..., translation_mm: ...}} in the rig file "
-                "takes their place"
+                f"{error}. The covariances are the log's; to replace them, give noise: {{rotation_deg: ..., "
+                "translation_mm: ...}} in the rig file"
             ) from error
     if free_sizes:
         for target in problem.targets:

@@ -1,4 +1,4 @@
-"""The message for a log in which no target was detected: what was looked at, and what was seen instead."""
+"""The message for a log in which no target was detected: how much was searched, and which tags are there."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from gtsam_rwhec.logs import Log
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 
-#: Of the tags that are no target, so many are named.
+#: Tags that belong to no target and that a message names, at most.
 MOST_NAMED = 20
 
 
 def no_detections(log: Log, rig: Rig, report: DetectionReport) -> str:
-    """The message: how much was looked at, why detections were rejected, which tags there are instead."""
-    parts = [f"{count} images or messages of {sensor}" for sensor, count in report.images.items()]
-    said = [f"looked at {', '.join(parts)}"]
+    """The message: how much was searched, why detections were rejected, which other tags there are."""
+    looked_at = [f"{count} images or messages of {sensor}" for sensor, count in report.images.items()]
+    said = [f"looked at {', '.join(looked_at)}"]
     said += [
         f"{len(faults)} of {sensor} not decoded, the first: {faults[0]}" for sensor, faults in report.undecoded.items()
     ]
@@ -29,13 +29,13 @@ def no_detections(log: Log, rig: Rig, report: DetectionReport) -> str:
             others = tags_of_any_family(log, rig)
             said.append(f"tags of other families, in a few of the images: {_named(others) if others else 'none'}")
     return (
-        f"{log.files[0].path}: no target of the rig file was detected in a way that can be used. {'; '.join(said)}. "
-        "Are the families, ids and topics in the rig file right? (gtsam-rwhec init LOG says which tags it finds)"
+        f"{log.files[0].path}: no usable detection of a target of the rig file. {'; '.join(said)}. "
+        "Are the families, ids and topics in the rig file right? (gtsam-rwhec init LOG names the tags that it finds)"
     )
 
 
 def tags_of_any_family(log: Log, rig: Rig) -> dict[str, int]:
-    """Tags in some of the images: how many images each was in; those of a single one may be chance."""
+    """Tags of all families in some of the images: in how many images each was. Tags in a single image may be chance."""
     seen: Counter[str] = Counter()
     topics = {source.images for source in rig.sensors.values()}
     surveyed = [images for topic, images in read_contents(log).images.items() if topic in topics]

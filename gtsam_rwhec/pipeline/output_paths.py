@@ -11,13 +11,7 @@ from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG
 
 
 def check_writable(path: str | Path) -> None:
-    """Check that a file can be written.
-
-    Raises
-    ------
-    LogError
-        There is no such folder, no right to write into it, or a folder of this name.
-    """
+    """Raise `LogError` if a file cannot be written: its folder is missing or closed, or a folder has its name."""
     path = Path(path)
     folder = path.absolute().parent
     if not folder.is_dir():
@@ -29,25 +23,13 @@ def check_writable(path: str | Path) -> None:
 
 
 def check_is_not_read(log: Log, path: str | Path) -> None:
-    """Check that a file is not one of those from which the log is read.
-
-    Raises
-    ------
-    LogError
-        It is one of them.
-    """
+    """Raise `LogError` if a file is one of those from which the log is read."""
     if any(os.path.realpath(path) == os.path.realpath(file.path) for file in log.files):
-        raise LogError(f"{path} is the log that is read: a raw log stays as it is; give another file or folder.")
+        raise LogError(f"{path} is the raw log, and a raw log is never changed; give another file or folder.")
 
 
 def made_folder(path: str | Path) -> Path:
-    """The folder, made if it is not there.
-
-    Raises
-    ------
-    LogError
-        It cannot be made, or files cannot be written into it.
-    """
+    """The folder, which is made if it does not exist; `LogError` if files cannot be written into it."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,9 @@
-"""The detections of one sensor, from its images or from a driver, and what the report says of them."""
+"""The detections of one sensor, from its images or from a driver, and the report on the detections of all sensors."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from gtsam_rwhec.logs import DetectionRecord, Log
@@ -18,15 +18,15 @@ class SensorDetections:
     Attributes
     ----------
     records : list of DetectionRecord
-        Of the targets; those that are not used have a reason.
+        Detections of the targets. A detection that is not used has a reason.
     count : int
-        Images, or messages of the driver, that the log has.
+        Number of images, or of messages of the driver, in the log.
     strangers : Counter
-        How often tags that are no target were seen, by family and id.
+        Tags that belong to no target, by family and id: how often each was seen.
     faults : tuple of str
-        Why an image could not be used, one sentence for each such image.
+        One sentence for each image that could not be used.
     corner_px : dict of str to float
-        Standard deviation of a corner along each axis, pixels, by target/sensor, as measured.
+        Measured standard deviation of a corner along each axis, pixels, by target/sensor.
     """
 
     records: list[DetectionRecord]
@@ -51,10 +51,9 @@ def detection_report(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) 
     )
 
 
-def _counts(sensor: str, records: list[DetectionRecord]) -> list[TrackCount]:
-    counts = []
-    for target in sorted({record.id for record in records}):
-        reasons = Counter(record.reason for record in records if record.id == target)
-        used = reasons.pop("", 0)
-        counts.append(TrackCount(target=target, sensor=sensor, used=used, removed=dict(reasons)))
-    return counts
+def _counts(sensor: str, records: list[DetectionRecord]) -> Iterator[TrackCount]:
+    reasons: dict[str, Counter[str]] = defaultdict(Counter)
+    for record in records:
+        reasons[record.id][record.reason] += 1
+    for target, removed in sorted(reasons.items()):
+        yield TrackCount(target=target, sensor=sensor, used=removed.pop("", 0), removed=dict(removed))

@@ -1,4 +1,4 @@
-"""A solved log as pictures: frames, residuals over time, corners in images, standard deviations."""
+"""Pictures of a solved log: frames, residuals over time, corners in images, standard deviations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log, open_log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
-from gtsam_rwhec.pipeline.log_contract import detections_topic
+from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solving_stage import Solved
@@ -25,24 +25,12 @@ from gtsam_rwhec.report.plots import (
     plot_residuals,
 )
 
+#: File names of the pictures.
 FRAMES, RESIDUALS, COVERAGE, DEVIATIONS = "frames.png", "residuals.png", "coverage.png", "deviations.png"
 
 
 def plot_all(solved: Solved, solved_path: str | Path, folder: Path) -> list[Path]:
-    """Draw every picture into a folder that is there; their paths.
-
-    Parameters
-    ----------
-    solved : Solved
-    solved_path
-        The log it was read from: the corners are there.
-    folder : Path
-
-    Raises
-    ------
-    FileFormatError
-        A file cannot be written.
-    """
+    """Draw every picture into an existing folder; their paths. The log at `solved_path` has the corners."""
     frames = frames_of(solved)
     names = {name: solved.rig.frame_of(name) for name in solved.refined.Y} | {name: name for name in solved.refined.X}
     covariances = {frame: solved.refined.covariance(name) for name, frame in names.items()}
@@ -64,7 +52,7 @@ def plotted_residuals(solved: Solved) -> dict[Pair, PlottedMeasurement]:
     result = {}
     for pair, measured in solved.pairs.items():
         if pair.target not in solved.refined.X or pair.sensor not in solved.refined.Y:
-            continue  # nothing of this pair was used
+            continue  # no measurement of this pair was used
         degrees, millimetres = residuals_of(solved, pair, measured)
         result[pair] = PlottedMeasurement(
             stamps_s=(measured.stamps_ns - first) * 1e-9,
@@ -77,7 +65,7 @@ def plotted_residuals(solved: Solved) -> dict[Pair, PlottedMeasurement]:
 
 
 def residuals_of(solved: Solved, pair: Pair, measured: MeasuredPairs) -> tuple[Array, Array]:
-    """Degrees (N,) and millimetres (N,) between B and Y^-1 A X."""
+    """Degrees (N,) and millimetres (N,) between B and its prediction Y^-1 A X."""
     predicted = predicted_B(solved, pair, measured.A)
     predicted[:, :3, 3] *= scale_of(solved, pair.target)
     off = se3.inverse(predicted) @ measured.B
@@ -86,24 +74,23 @@ def residuals_of(solved: Solved, pair: Pair, measured: MeasuredPairs) -> tuple[A
 
 
 def predicted_B(solved: Solved, pair: Pair, A: Array) -> Array:
-    """Y^-1 A X, (N, 4, 4), true metres."""
+    """The prediction Y^-1 A X of B, (N, 4, 4), in true metres."""
     X, Y = solved.refined.X[pair.target].matrix(), solved.refined.Y[pair.sensor].matrix()
     predicted: Array = np.linalg.inv(Y) @ A @ X
     return predicted
 
 
 def scale_of(solved: Solved, target: str) -> float:
-    """stated / true length of a target."""
+    """Stated / true length of a target."""
     scale = solved.refined.scale
     return scale if isinstance(scale, float) else scale[target]
 
 
 def plotted_corners(solved: Solved, log: Log) -> dict[str, PlottedCorners]:
-    """By camera: corners of the detections that were used, and their distance from where the calibration has them."""
+    """By camera: the corners of used detections, and their reprojection errors under the calibration."""
     path = read_carrier_motion(log, solved.rig).trajectory
     targets = {target.name: target for target in solved.rig.target_list}
     offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
-    there = {topic.name for topic in log.topics()}
     seen: dict[str, list[Array]] = defaultdict(list)
     errors: dict[str, list[Array]] = defaultdict(list)
     used = {
@@ -111,21 +98,15 @@ def plotted_corners(solved: Solved, log: Log) -> dict[str, PlottedCorners]:
         for pair, measured in solved.pairs.items()
         for stamp in measured.stamps_ns[measured.used].tolist()
     }
-    for sensor in solved.refined.Y:
-        topic = detections_topic(sensor)
-        if topic not in there or sensor not in solved.cameras:
+    for sensor, camera in solved.cameras.items():
+        if sensor not in solved.refined.Y:
             continue
-        camera = solved.cameras[sensor]
-        for record in log.records([topic]):
-            if (
-                not isinstance(record, DetectionRecord)
-                or record.corners_px is None
-                or record.corner_indices is None
-                or (Pair(record.id, sensor), record.stamp_ns) not in used
-            ):
+        for record in records_of(log, [detections_topic(sensor)], DetectionRecord):
+            pair = Pair(record.id, sensor)
+            if record.corners_px is None or record.corner_indices is None or (pair, record.stamp_ns) not in used:
                 continue
             A, _ = path.at(np.array([record.stamp_ns + round(1e9 * offsets.get(sensor, 0.0))]))
-            T = predicted_B(solved, Pair(record.id, sensor), A)[0]
+            T = predicted_B(solved, pair, A)[0]
             points = targets[record.id].corners()[list(record.corner_indices)] / scale_of(solved, record.id)
             seen[sensor].append(record.corners_px)
             errors[sensor].append(record.corners_px - camera.project(points @ T[:3, :3].T + T[:3, 3]))

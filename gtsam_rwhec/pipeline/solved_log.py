@@ -1,4 +1,4 @@
-"""The cleaned log with its solution in it, for viewers and for the export: written, and read back."""
+"""The solved log: the cleaned log with its solution, for viewers and for the export; written, and read back."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from gtsam_rwhec.pipeline.log_contract import (
     CERTIFICATE_METADATA,
     RESULT_FILE,
     SOLUTION_TOPIC,
+    records_of,
     topics_up_to_detection,
 )
 from gtsam_rwhec.pipeline.log_metadata import LogMetadata, read_cameras, read_embedded_rig
@@ -18,7 +19,7 @@ from gtsam_rwhec.pipeline.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
 from gtsam_rwhec.results.result_file import parse_result, refined_json
 
-#: Added to the name of a calibrated frame where the raw log has transforms of a frame of that name.
+#: Added to the name of a calibrated frame if the raw log has transforms of a frame with this name.
 CALIBRATED = "_calibrated"
 
 
@@ -30,10 +31,12 @@ def write_solved(
     Parameters
     ----------
     clean_path
-        What ``clean_log`` wrote; may be `out_path`.
+        The log that ``clean_log`` wrote; may be `out_path`.
     calibrated : Calibrated
     out_path
+        The MCAP file to write.
     images : "copy" or "leave_out"
+        Whether the written log has the images of the cleaned log.
 
     Raises
     ------
@@ -46,12 +49,11 @@ def write_solved(
         write_pairs(out, pairs)
         first_ns = min(int(measured.stamps_ns.min()) for measured in pairs)
         taken = _raw_children(log)
-        frames = [
-            (rig.carriers.sensors, free_name(rig.frame_of(name), taken), pose.matrix())
-            for name, pose in refined.Y.items()
-        ]
-        frames += [(rig.carriers.targets, free_name(name, taken), pose.matrix()) for name, pose in refined.X.items()]
-        out.transforms(SOLUTION_TOPIC, first_ns, frames)
+        frames = [(rig.carriers.sensors, rig.frame_of(name), pose.matrix()) for name, pose in refined.Y.items()]
+        frames += [(rig.carriers.targets, name, pose.matrix()) for name, pose in refined.X.items()]
+        # A calibrated frame gets a name of its own if the raw log has one of its name.
+        named = [(parent, child + CALIBRATED if child in taken else child, T) for parent, child, T in frames]
+        out.transforms(SOLUTION_TOPIC, first_ns, named)
         LogMetadata(rig, calibrated.cameras, calibrated.log.detection, calibrated.log.cleaning).write(out)
         certificate = refined.solution.certificate
         out.metadata(
@@ -69,41 +71,30 @@ def write_solved(
 
 
 def read_solved(path: str | Path) -> Solved:
-    """Read what `write_solved` wrote.
+    """Read the log that `write_solved` wrote.
 
     Raises
     ------
     LogError
-        It has no result in it, or not the one of its measurements.
+        The log has no result in it, or a result that is not of its measurements.
     """
     with open_log(path) as log:
         content = log.attachment(RESULT_FILE)
         if content is None:
-            raise LogError(
-                f"{path} has no {RESULT_FILE} attached: it was not written by gtsam-rwhec solve or calibrate"
-            )
+            raise LogError(f"{path} has no {RESULT_FILE} attached: gtsam-rwhec solve or calibrate did not write it")
         result = parse_result(content, f"{path}, attachment {RESULT_FILE}")
         if result.log is None or result.refined is None:
-            raise LogError(f"{path}, attachment {RESULT_FILE}: it is no refined calibration of a log")
+            raise LogError(f"{path}, attachment {RESULT_FILE}: it is not the refined calibration of a log")
         rig = read_embedded_rig(log)
         refined, pairs = result.refined, read_pairs(log, rig)
     strangers = [*(set(refined.X) - set(rig.targets)), *(set(refined.Y) - set(rig.sensors))]
     if strangers or not pairs:
-        why = (
-            f"frames that its rig file has not: {', '.join(sorted(strangers)[:10])}" if strangers else "no measurements"
-        )
-        raise LogError(f"{path} has a {RESULT_FILE}, and {why}: its parts are not of one calibration")
+        why = f"frames that its rig file lacks: {', '.join(sorted(strangers)[:10])}" if strangers else "no measurements"
+        raise LogError(f"{path} has a {RESULT_FILE}, and {why}: they are not of one calibration")
     return Solved(refined, result.solution, pairs, result.log, read_cameras(log), rig)
-
-
-def free_name(frame: str, taken: set[str]) -> str:
-    """A frame's name, told apart from one that the raw log has already."""
-    return frame + CALIBRATED if frame in taken else frame
 
 
 def _raw_children(log: Log) -> set[str]:
     """Child frames of the raw log's transforms."""
-    raw = [
-        topic.name for topic in log.topics() if topic.is_tf and not topic.unreadable and topic.name != SOLUTION_TOPIC
-    ]
-    return {record.child for record in log.records(raw) if isinstance(record, PoseRecord)} if raw else set()
+    raw = [t.name for t in log.topics() if t.is_tf and not t.unreadable and t.name != SOLUTION_TOPIC]
+    return {record.child for record in records_of(log, raw, PoseRecord)}

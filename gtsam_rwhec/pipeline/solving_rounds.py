@@ -1,4 +1,4 @@
-"""Solving in rounds: outliers and time offsets by turns until neither changes, and the targets' sizes."""
+"""Solving in rounds: outliers, then time offsets, again and again until both stay the same; the targets' sizes."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from gtsam_rwhec.solving.certified_solution import solve
 Pairs = dict[Pair, MeasuredPairs]
 #: What a solution is for: to find outliers, to estimate time offsets, or to be the answer.
 Purpose = Literal["outliers", "time offsets", "answer"]
-#: Rounds, at most: of outliers and time offsets by turns, and of A taken anew at the time offsets.
+#: Rounds of outliers and time offsets, at most, and of A at new time offsets.
 ROUNDS = 6
-#: A change of all time offsets below this (s) ends the rounds.
+#: Seconds. If no time offset changes by more than this, the rounds end.
 SETTLED_S = 2e-5
-#: A change of all time offsets below this (s) does not change which measurements are outliers.
+#: Seconds. If no time offset changes by more than this, the same measurements are outliers.
 SAME_OUTLIERS_S = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class SynchronisedPairs:
-    """Measured pairs by (target, sensor), with A at the time offsets of their sensors (s)."""
+    """Measured pairs by (target, sensor), with A at their sensors' time offsets; these offsets, seconds."""
 
     pairs: Pairs
     offsets_s: dict[str, float]
@@ -45,16 +45,7 @@ class SynchronisedPairs:
 
 @dataclass(frozen=True, eq=False)
 class SolvingRounds:
-    """Solves and refines again and again; what stays the same from one solution to the next.
-
-    Attributes
-    ----------
-    rig : Rig
-    motion : CarrierMotion
-    estimated : tuple of str
-        Sensors whose time offset is estimated.
-    progress : callable
-    """
+    """Solves and refines the problem of a log again and again; `estimated` has the sensors with a free time offset."""
 
     rig: Rig
     motion: CarrierMotion
@@ -69,7 +60,7 @@ class SolvingRounds:
     def settled(self, given: SynchronisedPairs, free_sizes: Collection[str]) -> SynchronisedPairs:
         """Mark outliers and estimate time offsets until neither changes.
 
-        By turns: outliers with the time offsets as they are, then time offsets without the outliers.
+        Each round finds outliers at the present time offsets, then time offsets without the outliers.
         """
         outliers: dict[Pair, np.ndarray] = {}
         everything = marked = given
@@ -95,7 +86,7 @@ class SolvingRounds:
         return marked
 
     def at(self, pairs: Pairs, offsets_s: Mapping[str, float]) -> SynchronisedPairs:
-        """Take A anew at the estimated time offsets; other sensors' pairs stay as cleaning left them."""
+        """The pairs with A at new time offsets; pairs of sensors with a stated offset stay as they are."""
         path = self.motion.trajectory
         moved = {
             pair: measured.at(path, offsets_s[measured.sensor]) if measured.sensor in self.estimated else measured
@@ -106,8 +97,8 @@ class SolvingRounds:
     def refined(self, given: SynchronisedPairs, free_sizes: Collection[str], purpose: Purpose) -> Refined:
         """One certified solution, refined.
 
-        On the way to the answer, the noise of A is propagated into each measurement on its own. In the answer,
-        measurements of one instant share it, which is slow and makes the covariances right.
+        In the answer, measurements of one instant share the noise of A: this is slow, and makes the covariances right.
+        For all other purposes the noise of A is propagated into each measurement separately.
         """
         problem = problem_of(given.pairs, self.rig, given.offsets_s, free_sizes)
         robust = self.rig.cleaning.robust
@@ -129,16 +120,16 @@ class SolvingRounds:
             return refine(problem, solution, options, progress=self.progress)
 
     def sizes(self, given: SynchronisedPairs) -> tuple[tuple[SizeFields, ...], SynchronisedPairs]:
-        """Estimate all targets' sizes: what is found of each, and the time offsets that go with them.
+        """Estimate the sizes of all targets, and the time offsets that go with these sizes.
 
-        A size is free in the answer where it is to be estimated, or where the measurements contradict it.
+        A size is free in the answer if the rig file says estimate, or if the measurements contradict the stated size.
         """
         self.progress("looking at the targets' sizes")
         is_check = self.rig.sizes == "check"
         marked = given
         try:
             with warnings.catch_warnings():
-                if is_check:  # only the warnings of the answer are told
+                if is_check:  # users get only the warnings of the answer
                     warnings.simplefilter("ignore", RwhecWarning)
                 marked = self.settled(given, self.targets)
                 refined = self.refined(marked, self.targets, "time offsets")
@@ -151,12 +142,12 @@ class SolvingRounds:
         return sizes, self.at(given.pairs, marked.offsets_s)
 
     def sizes_as_seen(self, given: SynchronisedPairs) -> tuple[SizeFields, ...]:
-        """What the used measurements say of sizes that were taken as known; nothing where they cannot tell."""
+        """Estimates of sizes that count as known; empty if the measurements do not determine them."""
         self.progress("looking at the targets' sizes")
         try:
             return self._sizes_in(self.refined(given, self.targets, "time offsets"))
         except RwhecError:
-            return ()  # with free sizes there is no answer, and none was asked for
+            return ()  # the answer, with sizes as stated, does not need this one
 
     def _sizes_in(self, refined: Refined) -> tuple[SizeFields, ...]:
         assert not isinstance(refined.scale, float)
@@ -174,13 +165,13 @@ class SolvingRounds:
 
 
 def sigma_of(refined: Refined, unknown: Unknown) -> float | None:
-    """The standard deviation of a scalar; None where it is infinite."""
+    """The standard deviation of a scalar; None if it is infinite."""
     variance = float(refined.covariance(unknown)[0, 0])
     return math.sqrt(variance) if math.isfinite(variance) else None
 
 
 def with_outliers_marked(pairs: Pairs, inliers: Mapping[Pair, np.ndarray]) -> Pairs:
-    """Mark the outliers; `inliers` has a boolean for each measurement of a pair that was used."""
+    """The pairs with their outliers marked; `inliers` has a boolean for each used measurement of a pair."""
     result = {}
     for pair, measured in pairs.items():
         reasons = list(measured.reasons)
@@ -192,7 +183,7 @@ def with_outliers_marked(pairs: Pairs, inliers: Mapping[Pair, np.ndarray]) -> Pa
 
 
 def without_outlier_marks(pairs: Pairs) -> Pairs:
-    """Take the marks of outliers away: a log that was solved before is solved anew."""
+    """The pairs without marks of outliers: a log that was solved before is solved from the beginning."""
     return {
         pair: replace(measured, reasons=tuple("" if why == RemovalReason.OUTLIER else why for why in measured.reasons))
         for pair, measured in pairs.items()

@@ -1,4 +1,4 @@
-"""The third stage: from synchronised pairs to a certified, refined calibration, with sizes and time offsets checked."""
+"""The third stage: from synchronised pairs to a certified, refined calibration with checked sizes and time offsets."""
 
 from __future__ import annotations
 
@@ -30,15 +30,17 @@ class Solved:
     Attributes
     ----------
     refined : RefinedPoses
-        Poses, covariances, scales; ``time_offsets_s`` in full, not against the first guess.
+        Poses, covariances, scales; ``time_offsets_s`` has the whole offsets, not changes of a first estimate.
     solution : Solution
-        With its certificate.
+        The certified solution, with its certificate.
     pairs : dict of (target, sensor) to MeasuredPairs
-        Every measurement, with A at the final time offsets, and the reason for those that are not used.
+        Every measurement, with A at the final time offsets, and the reason if it is not used.
     log : LogFields
-        Where they came from and what became of them.
+        The reports of all stages.
     cameras : dict of sensor to Camera
+        Intrinsics.
     rig : Rig
+        The rig file that was used.
     """
 
     refined: RefinedPoses
@@ -51,7 +53,7 @@ class Solved:
 
 @dataclass(frozen=True, eq=False)
 class Calibrated(Solved):
-    """A calibration from a log, just computed: `refined` is a `Refined`."""
+    """A calibration that was just computed: `refined` is a `Refined`, with all that refinement found."""
 
     refined: Refined
 
@@ -62,17 +64,17 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     Parameters
     ----------
     clean_path
-        What ``clean_log`` wrote.
+        The log that ``clean_log`` wrote.
     rig : Rig, optional
-        Left out, the one that is embedded in the log.
+        By default the rig file embedded in the log.
     progress : callable, optional
 
     Raises
     ------
     LogError
-        The log has no pairs to use, or was not cleaned.
+        The log has no usable pairs, or was not cleaned.
     RwhecError
-        What ``solve`` and ``refine`` raise.
+        As ``solve`` and ``refine`` do.
     """
     with open_log(clean_path) as log:
         rig = rig_for_solving(log, rig)
@@ -80,14 +82,14 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         pairs = read_pairs(log, rig)
         used_sensors = {measured.sensor for measured in pairs.values() if measured.used.any()}
         if not used_sensors:
-            raise LogError(f"{clean_path}: no pair of measurements in it is to be used")
+            raise LogError(f"{clean_path}: it has no usable pair of measurements")
         motion = read_carrier_motion(log, rig)
     estimated = tuple(
         name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used_sensors
     )
     missing = [name for name in estimated if name not in cleaning.time_offsets_s]
     if missing:
-        raise LogError(f"{clean_path}, metadata {CLEANING_METADATA}: it has no time offset of {', '.join(missing)}")
+        raise LogError(f"{clean_path}, metadata {CLEANING_METADATA}: no time offset of {', '.join(missing)}")
     rounds = SolvingRounds(rig, motion, estimated, progress or silent)
     given = rounds.at(without_outlier_marks(pairs), cleaning.time_offsets_s)
     sizes: tuple[SizeFields, ...] = ()
@@ -133,14 +135,14 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
 
 
 def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:
-    """A free size as the answer has it, with the others known."""
+    """A free size as the answer has it; the answer takes the sizes that are not free as known."""
     assert not isinstance(refined.scale, float)
     scale = refined.scale[size.target]
     return size.model_copy(update={"scale": scale, "sigma": sigma_of(refined, Unknown(UnknownKind.SCALE, size.target))})
 
 
 def _outlier_count(measured: MeasuredPairs) -> OutlierCount:
-    """What robust estimation used and left out."""
+    """How many measurements robust estimation used and left out."""
     count = measured.count
     left_out = count.removed.get(RemovalReason.OUTLIER, 0)
     return OutlierCount(target=count.target, sensor=count.sensor, used=count.used, left_out=left_out)

@@ -1,4 +1,4 @@
-"""Tracks: all measurements of one target by one sensor, in order of time; each that is not used has a reason."""
+"""Tracks: all measurements of one target by one sensor, in order of time, with the reason if one is not used."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import check_order
-from gtsam_rwhec.pipeline.log_contract import detections_topic
+from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
 from gtsam_rwhec.results.log_history import TrackCount
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.rejection import Rejection
@@ -29,14 +29,15 @@ class Track:
     Attributes
     ----------
     target, sensor : str
+        Names of the target and the sensor.
     stamps_ns : (N,) integers
-        The sensor's, increasing.
+        The sensor's stamps, increasing.
     B : (N, 4, 4) array
-        T_sensor_target, metres; the identity where there is none (and a reason).
+        T_sensor_target, metres; the identity for a measurement without a pose, which has a reason.
     covariance : (N, 6, 6) array or None
-        None where not every measurement has one.
+        Covariances of B; None if a measurement has no covariance.
     reasons : tuple of N str
-        Why each is not used (`Rejection`, `RemovalReason`); empty where it is used.
+        Why a measurement is not used (`Rejection`, `RemovalReason`); empty if it is used.
     """
 
     target: str
@@ -48,17 +49,17 @@ class Track:
 
     @property
     def used(self) -> np.ndarray:
-        """(N,) booleans."""
+        """Which measurements are used, (N,) booleans."""
         return np.array([not reason for reason in self.reasons], dtype=bool)
 
     @property
     def count(self) -> TrackCount:
-        """For a report."""
+        """How many measurements are used, and how many are removed for each reason."""
         removed = Counter(reason for reason in self.reasons if reason)
         return TrackCount(target=self.target, sensor=self.sensor, used=int(self.used.sum()), removed=dict(removed))
 
     def marked(self, kept: Kept, at: np.ndarray) -> Self:
-        """With what a step of cleaning removed of the measurements `at`; what has a reason already keeps it."""
+        """The track after a step of cleaning on the measurements `at`; a measurement keeps its first reason."""
         reasons = list(self.reasons)
         for item in kept.removed:
             i = int(at[item.index])
@@ -67,27 +68,16 @@ class Track:
 
 
 def read_tracks(log: Log, rig: Rig, sensor: str) -> list[Track]:
-    """Read the detections of a sensor, one track for each target; detections of no target are left out.
-
-    Raises
-    ------
-    StampError
-        Stamps that tell no time.
-    FrameError
-        A tag whose driver does not say its family, where two targets have its id.
-    """
+    """Read the detections of a sensor, one track for each target. Raises `StampError` as `check_order`."""
     of_target: dict[str, list[DetectionRecord]] = defaultdict(list)
     stamps = []
     targets = rig.target_list
-    topic = detections_topic(sensor)
-    for record in log.records([topic] if topic in {t.name for t in log.topics()} else []):
-        if not isinstance(record, DetectionRecord):
-            continue
+    for record in records_of(log, [detections_topic(sensor)], DetectionRecord):
         stamps.append(record.stamp_ns)
         target = target_of(record, targets)
         if target is not None:
             of_target[target.name].append(record)
-    # Tags of one image have one stamp.
+    # All tags of an image have the same stamp.
     check_order(np.array([stamp for stamp, _ in groupby(stamps)], dtype=np.int64), f"detections of {sensor}")
     return [_track(name, sensor, of_target[name]) for name in sorted(of_target)]
 
@@ -98,7 +88,7 @@ def _track(target: str, sensor: str, records: list[DetectionRecord]) -> Track:
     poses = [record.T_camera_tag for record in records]
     reasons = [r.reason or (Rejection.NO_POSE if r.T_camera_tag is None else "") for r in records]
     usable = Counter(stamp for stamp, reason in zip(stamps.tolist(), reasons, strict=True) if not reason)
-    # Of two measurements of one target in one message one at least is wrong.
+    # If a message has two measurements of one target, at least one of them is wrong.
     reasons = [
         RemovalReason.SEEN_TWICE if not why and usable[s] > 1 else why
         for s, why in zip(stamps.tolist(), reasons, strict=True)
@@ -112,18 +102,15 @@ def _track(target: str, sensor: str, records: list[DetectionRecord]) -> Track:
 
 
 def target_of(record: DetectionRecord, targets: Iterable[Target]) -> Target | None:
-    """The target that a detection is of: by its name (as this library writes it), or by family and id.
+    """The target of a detection, found by its name (which this library writes) or by family and id.
 
     Raises
     ------
     FrameError
-        Its driver does not say the family, and two targets have the id.
+        The driver does not say the family, and two targets have the id.
     """
     targets = list(targets)
-    named = next((t for t in targets if t.name == record.id), None)
-    if named is not None:
-        return named
-    mine = [
+    mine = [t for t in targets if t.name == record.id] or [
         t
         for t in targets
         if isinstance(t, Tag)

@@ -14,6 +14,7 @@ from gtsam_rwhec.rig.contradictions import contradictions
 from gtsam_rwhec.rig.field_types import Name
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Section, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
+from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.targets import Target
 
 
@@ -40,6 +41,11 @@ class RigFile(Section):
     def corner_px(self) -> float | None:
         """Standard deviation of a corner along each axis, pixels; None where the rig file does not give it."""
         return None if self.noise == "estimate" else self.noise.corner_px
+
+    @property
+    def detection_options(self) -> DetectionOptions:
+        """The options of detection, with the values of the section ``detection``."""
+        return DetectionOptions(**self.detection)
 
     def frame_of(self, sensor: str) -> str:
         """The name of a sensor's frame."""

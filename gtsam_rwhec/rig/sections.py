@@ -89,16 +89,17 @@ class Intrinsics(Section):
         if (self.kalibr is None) != (self.camera is None):
             raise ValueError("kalibr and camera go together: {kalibr: camchain.yaml, camera: cam0}")
         if numbers:
-            self._check_numbers()
+            self.camera_of_numbers("these numbers")
         return self
 
-    def _check_numbers(self) -> None:
+    def camera_of_numbers(self, where: str) -> Camera:
+        """The camera of model, width, height, K and D; `ValueError` if a number is missing or absurd."""
         if self.width is None or self.height is None or self.K is None or self.model is None:
             missing = [name for name in ("model", "width", "height", "K") if getattr(self, name) is None]
             raise ValueError(f"{' and '.join(missing)} missing")
         fx, fy, cx, cy = self.K
         K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-        Camera.of(self.width, self.height, self.model, K, self.D or (), "these numbers")
+        return Camera.of(self.width, self.height, self.model, K, self.D or (), where)
 
 
 class Sensor(Section):

@@ -179,7 +179,7 @@ def test_no_intrinsics(tmp_path: Path) -> None:
     messages = [m for m in images(picture()) if m.topic != "/cam_0/camera_info"] + MOVING
     refused(
         tmp_path, messages, LogError, "sensor cam_0", "no topic /cam_0/camera_info",
-        "topics of intrinsics in it: /cam_1/camera_info", "/cam_0/image", "{file: ...}", **WITH_IMAGES,
+        "Topics of intrinsics in it: /cam_1/camera_info", "/cam_0/image", "{file: ...}", **WITH_IMAGES,
     )  # fmt: skip
     broken = [replace(made.camera_info("cam_0"), data=b"{]"), *messages]
     with pytest.warns(LogWarning, match="/cam_0/camera_info"):
