@@ -5,20 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.compat.stations import Stations, all_earlier
-from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.methods.normal_equations import solve_scaled
 from gtsam_rwhec.solver.rotations import project
 
 #: An eigenvalue below this of the scaled normal equations is rounding.
 SINGULAR = 1e-15
+#: What to tell a user whose poses leave entries of the rotation free.
+LENGTH_UNKNOWN = (
+    "{} linear system finds the rotation's length from the translations, and these do not determine it: the gripper "
+    "only turned, or hardly moved; move the gripper, or use another method"
+)
 
 
 def andreff(stations: Stations) -> tuple[Array, Array]:
     """Least squares of (I - R_A (x) R_B) vec(R) = 0 and (I (x) t_B') vec(R) + (I - R_A) t = t_A (their eq. 11).
 
-    vec takes rows. R is then the nearest rotation; t stays as the linear system gave it, as observed of OpenCV 4.
-    The 12 x 12 normal equations are sums over pairs of products of what the two stations give: with
-    D_j = R_G,j' (x) R_C,j the product R_A (x) R_B is D_j D_i'.
+    vec takes rows. R is the nearest rotation; t stays as in the linear system: observed of OpenCV 4. The 12 x 12 normal
+    equations are sums over pairs of products of the two stations' features: with D_j = R_G,j' (x) R_C,j the product
+    R_A (x) R_B is D_j D_i'. Raises UnderdeterminedError when the translations do not determine the rotation's length.
     """
     R_G, t_G, R_C, u, count = stations.R_G, stations.t_G, stations.R_C, stations.u, len(stations.u)
     t_C = stations.t_C
@@ -67,23 +72,5 @@ def andreff(stations: Stations) -> tuple[Array, Array]:
     normal[9:, :9] = normal[:9, 9:].T
     normal[9:, 9:] = 2.0 * pairs * np.eye(3) - sum_R_A - sum_R_A.T
     right = np.concatenate([tB_tA.T.reshape(9), sum_tA - RA_tA])
-    # One length for all unknowns, so that millimetres and metres are solved to the same number of digits.
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    normal = normal * scale * scale[:, None]
-    check_determined(normal, "Andreff's")
-    x = scale * np.linalg.solve(normal, right * scale)
+    x = solve_scaled(normal, right, LENGTH_UNKNOWN.format("Andreff's"), SINGULAR)
     return project(x[:9].reshape(1, 3, 3))[0], x[9:]
-
-
-def check_determined(normal: Array, whose: str) -> None:
-    """Refuse linear systems (normal equations, scaled) that leave entries of the rotation free.
-
-    Raises
-    ------
-    UnderdeterminedError
-    """
-    if np.linalg.eigvalsh(normal)[0] <= SINGULAR:
-        raise UnderdeterminedError(
-            f"{whose} linear system takes the rotation's length from the translations, and here they say nothing of "
-            "it: the gripper only turned, or hardly moved beside the length unit; move it, or take another method"
-        )

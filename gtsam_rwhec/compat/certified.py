@@ -1,4 +1,4 @@
-"""The library's certified solution behind OpenCV's calls: from the poses themselves, no pairs of them."""
+"""The library's certified solution with OpenCV's arguments: from the poses themselves, without pairs of poses."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
-#: Residuals below this, in radians or spreads of the translations, are rounding: exact poses have no weights.
+#: Residuals (radians, or lengths over the spread of the translations) below this are rounding: exact poses.
 LEAST_RESIDUAL = 1e-6
 
 
 def certified_hand_eye(stations: Stations) -> tuple[Array, Array]:
-    """Certified pose of the camera in the gripper.
+    """The certified pose of the camera in the gripper.
 
-    The target has its own origin back: what the camera measures with an error of its own is where that is. With an
-    origin elsewhere each error of the rotation would move it.
+    The target's own origin is restored: the camera measures the position of this origin. About another origin each
+    rotation error would move the position.
     """
     R_A = stations.R_G.transpose(0, 2, 1)  # gripper_T_base
     t_A = -np.einsum("nab,nb->na", R_A, stations.t_G)
@@ -29,17 +29,17 @@ def certified_hand_eye(stations: Stations) -> tuple[Array, Array]:
 
 
 def certified_robot_world(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> tuple[Array, Array, Array, Array]:
-    """Certified base2world and gripper2cam, from world2cam (A, the measurement) and base2gripper (B)."""
+    """The certified base2world and gripper2cam, from world2cam (A, the measurement) and base2gripper (B)."""
     X, Z = (np.linalg.inv(T) for T in certified_poses(R_B, t_B, R_A, t_A))
     return X[:3, :3], X[:3, 3], Z[:3, :3], Z[:3, 3]
 
 
 def certified_poses(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> tuple[Array, Array]:
-    """X and Y (4, 4) of A X = Y B, solved twice: with unit weights, then with those of the first answer's residuals.
+    """X and Y (4, 4) of A X = Y B, solved with unit weights, then with weights from the first answer's residuals.
 
-    OpenCV's calls have no place for the noise; the residuals of any consistent answer tell rotation's and
-    translation's apart. An isotropic rotation of rms angle s has s / sqrt(3) an axis and kappa = 1 / (2 sigma_R^2).
-    Nor do they name a unit: inside, lengths are in spreads of the given translations.
+    OpenCV's calls have no argument for the noise; the residuals of a consistent answer estimate the noise of rotations
+    and of translations. An isotropic rotation of rms angle s has s / sqrt(3) an axis and kappa = 1 / (2 sigma_R^2).
+    OpenCV's calls name no unit either: the solver's unit of length is the spread of the given translations.
     """
     unit = float(np.sqrt(t_A.var(axis=0).sum() + t_B.var(axis=0).sum())) or 1.0
     A, B = _transforms(R_A, t_A / unit), _transforms(R_B, t_B / unit)

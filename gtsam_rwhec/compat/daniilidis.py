@@ -1,4 +1,4 @@
-"""Daniilidis 1999 over all pairs of stations, and DQOpt over the same."""
+"""Daniilidis 1999 over all pairs of stations, and the dual quaternions of these pairs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DQOpt over all pairs of stations: the DQ paper's cost (8) of the motions that OpenCV's methods take, minimised."""
+"""DQOpt over all pairs of stations: the minimum of the DQ paper's cost (8) over OpenCV's motions."""
 
 from __future__ import annotations
 
@@ -13,20 +13,15 @@ from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
 from gtsam_rwhec.handeye.signs import UNCERTAIN
 
-#: Solutions after the first, each with alpha from the residuals of the one before.
+#: Solutions after the first solution, each with alpha from the residuals of the solution before.
 ROUNDS = 3
 
 
 def dqopt(stations: Stations) -> tuple[Array, Array]:
-    """DQOpt (Algorithm 1), with alpha the ratio of the rotation's residual to the translation's.
+    """DQOpt (Algorithm 1), with alpha the ratio of the rotation's residual to the translation's residual.
 
-    Motions of nearly half a turn, whose quaternions' signs are uncertain, are left out: others of the same stations
-    remain.
-
-    Raises
-    ------
-    UnderdeterminedError
-        When no motion is left.
+    Motions near half a turn are left out, because the signs of their quaternions are uncertain; other motions of the
+    same stations remain. Raises UnderdeterminedError when fewer than two motions remain.
     """
     AA, BA, BB, used = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), 0
     for a, b, dual_a, dual_b, weight in screws(stations):
@@ -37,10 +32,11 @@ def dqopt(stations: Stations) -> tuple[Array, Array]:
         AA, BA, BB, used = AA + sums.AA, BA + sums.BA, BB + sums.BB, used + rows.shape[1]
     if used < 2:
         raise UnderdeterminedError(
-            f"{used} motions between the poses are not about half a turn, and two are needed; add poses that turn less"
+            f"{used} motions between the poses are far enough from half a turn, and two are needed; add poses that "
+            "turn less"
         )
     moments = MotionMoments(AA, BA, BB, used)
-    # To begin with, a translation as long as the motions' own counts as much as a rotation of about a radian.
+    # The first alpha: a translation as long as the motions' weighs as much as a rotation of about a radian.
     alpha = np.sqrt(used / max(float(np.trace(BB)), np.finfo(float).tiny))
     found = minimum(moments.cost(alpha))
     for _ in range(ROUNDS):

@@ -9,35 +9,25 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
-from gtsam_rwhec.geometry.poses import LARGEST_M, ROTATION_TOLERANCE, Array
+from gtsam_rwhec.geometry.poses import LARGEST_M, ROTATION_TOLERANCE, Array, determinant, orthonormality
 
 #: Fewest poses that hold two motions about different axes; OpenCV asks for as many.
 FEWEST_POSES = 3
-#: Smallest over largest (or over all possible) turning of the axes that is more than rounding.
+#: Share of the largest possible turning of the axes below which turning is rounding.
 PARALLEL = 1e-13
 #: Second row times third row, entries (1, 2), (2, 0), (0, 1), then (2, 1), (0, 2), (1, 0): their cross product.
 _NEXT, _AFTER = [4, 5, 3, 5, 3, 4], [8, 6, 7, 7, 8, 6]
 _DTYPE, _SHAPE = attrgetter("dtype"), attrgetter("shape")
+#: Shapes of a 3-vector.
+_VECTORS = ((3,), (3, 1), (1, 3))
 
 
 def checked_poses(R: Any, t: Any, names: tuple[str, str]) -> tuple[Array, Array]:
-    """Rotations (N, 3, 3) and translations (N, 3) of one argument pair.
+    """Rotations (N, 3, 3) and translations (N, 3) of the two arguments with these names.
 
-    Parameters
-    ----------
-    R : sequence or array of N rotations
-        Each (3, 3), or a rotation vector of shape (3,), (3, 1) or (1, 3) in radians; both may occur in one list.
-    t : sequence or array of N translations
-        Each of shape (3,), (3, 1) or (1, 3).
-    names : (str, str)
-        The arguments' names, for messages.
-
-    Raises
-    ------
-    PoseError
-        Other shapes, entries that are not finite, a matrix that is not a rotation.
-    CountError
-        Different numbers of rotations and translations.
+    A rotation is (3, 3), or a rotation vector (3,), (3, 1) or (1, 3) in radians; a list may hold both. A translation is
+    (3,), (3, 1) or (1, 3). Raises PoseError for other shapes, entries that are not finite and matrices that are not
+    rotations, CountError for different numbers of rotations and translations.
     """
     rotations, translations = _rotations(R, names[0]), _translations(t, names[1])
     if len(rotations) != len(translations):
@@ -49,7 +39,7 @@ def checked_poses(R: Any, t: Any, names: tuple[str, str]) -> tuple[Array, Array]
 
 
 def check_counts(first: int, second: int, names: tuple[str, str]) -> None:
-    """Refuse unequal numbers of poses, or fewer than three (CountError)."""
+    """Raise CountError for unequal numbers of poses, or fewer than three poses."""
     if first != second:
         raise CountError(f"{names[0]} has {first} poses and {names[1]} {second}; give both for every station")
     if first < FEWEST_POSES:
@@ -59,28 +49,18 @@ def check_counts(first: int, second: int, names: tuple[str, str]) -> None:
 
 
 def check_axes(R: tuple[Array, Array], where: tuple[str, str]) -> None:
-    """Refuse motions that leave the answer free whatever the method.
+    """Raise UnderdeterminedError for motions R_j' R_i that leave every method's answer free.
 
-    Over all ordered pairs, the sum of I - R_j' R_i is N^2 I - (sum R)'(sum R): its null space is what every motion's
-    axis leaves unturned. Zero: nothing rotates. Rank two: one axis for all motions.
-
-    Parameters
-    ----------
-    R : two (N, 3, 3) arrays
-        R_j' R_i being the motions of each.
-    where : two str
-
-    Raises
-    ------
-    UnderdeterminedError
+    Over all ordered pairs, the sum of I - R_j' R_i is N^2 I - (sum R)'(sum R). No motion turns a vector of its null
+    space. The matrix is zero when nothing rotates, and has rank two when all motions rotate about one axis.
     """
     for rotations, name in zip(R, where, strict=True):
         count = len(rotations)
         least, most = least_and_most_turning(np.einsum("nij->ij", rotations), count)
         if most <= PARALLEL * count**2:
             raise UnderdeterminedError(
-                f"{name}: no motion rotates, so neither the rotation about the common direction nor the translation "
-                "can be told; add poses that turn about two different axes"
+                f"{name}: no motion rotates, so the rotation and the translation are not determined; add poses that "
+                "turn about two different axes"
             )
         if least <= PARALLEL * most:
             raise UnderdeterminedError(
@@ -90,11 +70,10 @@ def check_axes(R: tuple[Array, Array], where: tuple[str, str]) -> None:
 
 
 def least_and_most_turning(total: Array, count: int) -> tuple[float, float]:
-    """Of N^2 I - S'S: the determinant over the sum of its 2 x 2 minors (its least eigenvalue where that is small), and
-    its trace.
+    """The determinant of N^2 I - S'S over the sum of its 2 x 2 minors, and its trace.
 
-    Motions about one axis turn two directions alike, so two eigenvalues are never small and one large. In plain
-    numbers: this is asked of three poses as of a million, and NumPy's call alone would take longer.
+    The quotient is the least eigenvalue where this is small: motions about one axis turn two directions alike, so two
+    eigenvalues are never small beside a large eigenvalue. Plain numbers, since NumPy's call alone would take longer.
     """
     (a, b, c), (d, e, f), (g, h, i) = (total.T @ total).tolist()
     square = float(count) ** 2
@@ -107,60 +86,59 @@ def least_and_most_turning(total: Array, count: int) -> tuple[float, float]:
 
 
 def _rotations(values: Any, where: str) -> Array:
-    array = _as_array(values, where)
+    array = _as_array(values, where, "rotations")
     if array is None:  # matrices and vectors in one list
         return np.concatenate([_rotations([value], f"{where}[{index}]") for index, value in enumerate(values)])
-    if array.size and array.ndim == 3 and array.shape[1:] == (3, 3):
+    if array.ndim == 3 and array.shape[1:] == (3, 3):
         if not are_rotations(array):
             _check_finite(array, where)
             _check_rotations(array, where)
         return array
-    if array.size and array.shape[1:] in ((3,), (3, 1), (1, 3)):
+    if array.shape[1:] in _VECTORS:
         _check_finite(array, where)
         vectors = array.reshape(-1, 3)
         rotations: Array = se3.expmap(np.concatenate([vectors, np.zeros_like(vectors)], axis=1))[:, :3, :3]
         return rotations
-    if array.size == 0:
-        raise CountError(f"{where}: no rotations; at least {FEWEST_POSES} are needed")
     raise PoseError(
-        f"{where}: shape {array.shape} is no list of rotations; give matrices (3, 3) or rotation vectors (3,), (3, 1), "
-        "(1, 3), one for every pose"
+        f"{where}: shape {array.shape} is not a list of rotations; give matrices (3, 3) or rotation vectors (3,), "
+        "(3, 1), (1, 3), one for every pose"
     )
 
 
 def _translations(values: Any, where: str) -> Array:
-    array = _as_array(values, where)
+    array = _as_array(values, where, "translations")
     if array is None:
         return np.concatenate([_translations([value], f"{where}[{index}]") for index, value in enumerate(values)])
-    if array.size == 0:
-        raise CountError(f"{where}: no translations; at least {FEWEST_POSES} are needed")
-    if array.shape[1:] not in ((3,), (3, 1), (1, 3)):
+    if array.shape[1:] not in _VECTORS:
         raise PoseError(
-            f"{where}: shape {array.shape} is no list of translations; give (3,), (3, 1) or (1, 3) for every pose"
+            f"{where}: shape {array.shape} is not a list of translations; give (3,), (3, 1) or (1, 3) for every pose"
         )
     _check_finite(array, where)
     return array.reshape(-1, 3)
 
 
-def _as_array(values: Any, where: str) -> Array | None:
+def _as_array(values: Any, where: str, what: str) -> Array | None:
     """An array of doubles; None where the entries have different shapes."""
-    joined = _joined(values) if isinstance(values, (list, tuple)) else None
-    if joined is not None:
-        return joined
+    array = _joined(values) if isinstance(values, (list, tuple)) else None
+    if array is not None:
+        return array
     try:
         if np.iscomplexobj(values):
             raise TypeError("complex numbers")
-        return np.asarray(values, dtype=np.float64)
+        array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         if isinstance(values, (list, tuple)) and len({np.shape(value) for value in values}) > 1:
             return None
         raise PoseError(f"{where}: cannot be read as numbers ({error}); give arrays of numbers") from error
+    if array.size == 0:
+        raise CountError(f"{where}: no {what}; at least {FEWEST_POSES} are needed")
+    return array
 
 
 def _joined(values: list[Any] | tuple[Any, ...]) -> Array | None:
-    """Arrays of doubles, all of one shape and contiguous, in one; None for anything else.
+    """Contiguous arrays of doubles of one shape as one array; None for other values.
 
-    Several times faster than ``numpy.asarray``, which takes longer than some of the methods.
+    It is several times faster than ``numpy.asarray``, which takes longer than some of the methods.
     """
     first = values[0] if values else None
     if not isinstance(first, np.ndarray) or not first.size:
@@ -169,7 +147,7 @@ def _joined(values: list[Any] | tuple[Any, ...]) -> Array | None:
         if set(map(_DTYPE, values)) != {np.dtype(np.float64)} or set(map(_SHAPE, values)) != {first.shape}:
             return None
         return np.frombuffer(b"".join(values)).reshape(len(values), *first.shape)
-    except (AttributeError, TypeError, BufferError):  # no arrays, or none whose bytes are in this order
+    except (AttributeError, TypeError, BufferError):  # not arrays, or not contiguous
         return None
 
 
@@ -183,9 +161,9 @@ def _check_finite(array: Array, where: str) -> None:
 
 
 def are_rotations(R: Array) -> bool:
-    """Whether all matrices (N, 3, 3) are rotations to about 4e-4; False may still be one to the tolerance.
+    """Whether all matrices (N, 3, 3) are rotations to about 4e-4; a quick test before ``_check_rotations``.
 
-    With |R|^2 = 3 and det R = 1 no singular value differs from 1: their squares' mean then is their product's root.
+    With |R|^2 = 3 and det R = 1 all singular values are 1: the mean of their squares equals their product's root.
     """
     rows = np.ascontiguousarray(R.reshape(-1, 9).T)
     squares = np.einsum("kn,kn->n", rows, rows)
@@ -196,17 +174,17 @@ def are_rotations(R: Array) -> bool:
 
 
 def _check_rotations(R: Array, where: str) -> None:
-    deviation = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3))
+    columns = R.transpose(2, 1, 0).reshape(9, -1)
+    deviation, handed = orthonormality(columns), determinant(columns)
     if deviation.max() > ROTATION_TOLERANCE:
-        index = int(deviation.max(axis=(1, 2)).argmax())
+        index = int(deviation.argmax())
         raise PoseError(
-            f"{where}: the rotation of pose {index} is off by {deviation[index].max():.3g} (largest entry of R'R - I; "
-            f"up to {ROTATION_TOLERANCE:g} is let through):\n{R[index]}"
+            f"{where}: the rotation of pose {index} is off by {deviation[index]:.3g} (largest entry of R'R - I; the "
+            f"limit is {ROTATION_TOLERANCE:g}); check the matrix:\n{R[index]}"
         )
-    handed = (np.cross(R[:, 0], R[:, 1]) * R[:, 2]).sum(axis=1)
     if handed.min() < 0.0:
         index = int(handed.argmin())
         raise PoseError(
-            f"{where}: the rotation of pose {index} is left-handed (determinant {handed[index]:.6f}): a mirrored axis; "
-            "check the axis convention"
+            f"{where}: the rotation of pose {index} is left-handed (determinant {handed[index]:.6f}): an axis is "
+            "mirrored; check the axis convention"
         )

@@ -1,12 +1,12 @@
 """OpenCV's hand-eye calls with its names, arguments, frames, shapes and constants; OpenCV 5's package has none.
 
-``from gtsam_rwhec.compat import opencv as cv2`` is the one line to change. OpenCV's own methods give its answers (from
-the same motions between all pairs of poses), in a fraction of its time; beside them two of this library:
-DQOpt over the same pairs, and the certified solution, which needs no pairs.
+Change one line: ``from gtsam_rwhec.compat import opencv as cv2``. OpenCV's methods give OpenCV's answers (from the same
+motions between all pairs of poses) in a fraction of its time. Two methods are this library's: DQOpt over the same
+pairs, and the certified solution, which needs no pairs.
 
-Differences, all where OpenCV returns a pose that means nothing: input that determines no answer is refused by name
-(fewer than three poses, motions about parallel axes or without rotation, Tsai's method without two motions in its
-range of angles), and so is an unknown method. Lists of lists are taken as well.
+OpenCV returns a meaningless pose for input that determines no answer; these calls raise an error: for fewer than three
+poses, motions about parallel axes or without rotation, fewer than two motions in Tsai's range of angles. They also
+raise an error for an unknown method. They take lists of lists too.
 """
 
 from __future__ import annotations
@@ -69,15 +69,15 @@ def calibrateHandEye(
 ) -> tuple[Array, Array]:
     """Pose of a camera on a gripper, from poses of the gripper and of a fixed target in the camera.
 
-    x2y is OpenCV's for T_y_x, which takes points of frame x to frame y. For a fixed camera that sees a target on the
-    gripper (eye-to-hand), give the base's pose in the gripper (base2gripper) first, and get the camera's in the base.
+    x2y is OpenCV's name of T_y_x, which takes points of frame x to frame y. For a fixed camera that sees a target on
+    the gripper (eye-to-hand), give base2gripper in place of gripper2base; the answer is the camera's pose in the base.
 
     Parameters
     ----------
     R_gripper2base, R_target2cam : sequence or array of N rotations
         Matrices (3, 3), or rotation vectors (3,), (3, 1), (1, 3) in radians.
     t_gripper2base, t_target2cam : sequence or array of N translations
-        (3,), (3, 1) or (1, 3), in the unit that the answer will have.
+        (3,), (3, 1) or (1, 3); the answer has the same unit.
     R_cam2gripper, t_cam2gripper : (3, 3) and (3, 1) float64 arrays, optional
         Filled and returned when they have these shapes, as in OpenCV.
     method : int
@@ -95,7 +95,7 @@ def calibrateHandEye(
         Fewer than three poses, or different numbers.
     UnderdeterminedError
         Motions about one axis only, or without rotation; Tsai with fewer than two motions of 17 to 116 degrees,
-        or about one axis among those; Andreff without translations.
+        or with such motions about one axis only; Andreff without translations.
     OptionError
         An unknown method.
     """
@@ -128,7 +128,7 @@ def calibrateRobotWorldHandEye(
     R_world2cam, R_base2gripper : sequence or array of N rotations
         Matrices (3, 3), or rotation vectors (3,), (3, 1), (1, 3) in radians.
     t_world2cam, t_base2gripper : sequence or array of N translations
-        (3,), (3, 1) or (1, 3), in the unit that the answer will have.
+        (3,), (3, 1) or (1, 3); the answer has the same unit.
     R_base2world, t_base2world, R_gripper2cam, t_gripper2cam : float64 arrays, optional
         (3, 3), (3, 1), (3, 3), (3, 1): filled and returned when they have these shapes, as in OpenCV.
     method : int
@@ -160,7 +160,7 @@ def calibrateRobotWorldHandEye(
 
 
 def _into(given: Array | None, answer: Array) -> Array:
-    """Fill a caller's array that can hold the answer; another one is left as it is."""
+    """The caller's array, filled, if it can hold the answer; else the answer."""
     if isinstance(given, np.ndarray) and given.shape == answer.shape and given.dtype == np.float64:
         given[...] = answer
         return given

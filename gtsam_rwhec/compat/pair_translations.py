@@ -9,7 +9,7 @@ from gtsam_rwhec.geometry.poses import Array
 
 
 def translation_features(stations: Stations) -> Array:
-    """What each station gives to the sums over the pairs that it begins, (N, 46)."""
+    """Features (N, 46) of each station for the sums over the pairs that begin at it."""
     R_G, t_G, u, count = stations.R_G, stations.t_G, stations.u, len(stations.u)
     return np.concatenate(
         [
@@ -25,21 +25,12 @@ def translation_features(stations: Stations) -> Array:
 
 
 def translation_of(stations: Stations, R: Array, sums: Array | None = None) -> Array:
-    """Minimise the sum of |(R_A - I) t - (R t_B - t_A)|^2 over pairs (Tsai & Lenz 1989, eq. 15).
+    """The t (3,) of the least sum of |(R_A - I) t - (R t_B - t_A)|^2 over pairs (Tsai & Lenz 1989, eq. 15).
 
     With p_j = R t_C,j + R_G,j' t_G,j and Z_j = R_G,j R R_C,j the right-hand side of a pair is
     e = p_j - R R_C,j u_i - R_G,j' t_G,i, and R_A' e = R_G,i' (R_G,j p_j - Z_j u_i - t_G,i): all bilinear in i and j.
-
-    Parameters
-    ----------
-    stations : Stations
-    R : (3, 3) array
-    sums : (N, 46) array, optional
-        ``translation_features`` summed over the earlier stations that are paired with each; all of them by default.
-
-    Returns
-    -------
-    (3,) array, in the translations' unit.
+    ``sums`` (N, 46) are the ``translation_features`` summed over the earlier stations of each station's pairs; all
+    earlier stations by default.
     """
     R_G = stations.R_G
     R_RC = R @ stations.R_C

@@ -1,7 +1,7 @@
 """Rotation first, translation second: Tsai & Lenz 1989, Park & Martin 1994, Horaud & Dornaika 1995.
 
-Over all pairs of stations, as OpenCV takes them. The rotations of a pair enter through signs of quaternions,
-logarithms or thresholds, so they are computed pair by pair, in blocks; translations need sums over stations only.
+They use all pairs of stations, as OpenCV does. A pair's rotations enter by signs of quaternions, logarithms or
+thresholds, so they are computed pair by pair, in blocks. Translations need sums over stations only.
 """
 
 from __future__ import annotations
@@ -16,20 +16,17 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, to_rotations
 from gtsam_rwhec.solver.rotations import project
 
-#: Tsai's motions have 2 sin(angle / 2) between these, by both sensors; observed of OpenCV 4, to 1e-14, by bisection.
-TSAI_LEAST, TSAI_MOST = 0.3, 1.7
+#: Least 2 sin(angle / 2) of a motion that Tsai's method uses, by both sensors; observed of OpenCV 4 to 1e-14.
+TSAI_LEAST = 0.3
+#: Most 2 sin(angle / 2) of such a motion.
+TSAI_MOST = 1.7
 
 
 def tsai(stations: Stations) -> tuple[Array, Array]:
     """Tsai & Lenz 1989: Skew(P_A + P_B) P' = P_B - P_A by least squares (eq. 12), P = 2 sin(angle/2) axis.
 
-    Only motions of 17 to 116 degrees are used, as by OpenCV 4, where it returns the identity when fewer than two are
-    left.
-
-    Raises
-    ------
-    UnderdeterminedError
-        When fewer than two motions are in that range, or all that are rotate about one axis.
+    Only motions of 17 to 116 degrees are used, as by OpenCV 4. Raises UnderdeterminedError when fewer than two motions
+    are in this range (OpenCV then returns the identity), or when they all rotate about one axis.
     """
     count = len(stations.u)
     features = translation_features(stations)
@@ -49,14 +46,14 @@ def tsai(stations: Stations) -> tuple[Array, Array]:
     if used < 2:
         raise UnderdeterminedError(
             f"Tsai's method uses motions with 2 sin(angle/2) between {TSAI_LEAST} and {TSAI_MOST} (17 to 116 degrees) "
-            f"by both sensors; {used} of the {count * (count - 1) // 2} motions are, and two are needed; "
-            "add poses that turn further, or take another method"
+            f"by both sensors; {used} of the {count * (count - 1) // 2} motions are in this range, and two are needed; "
+            "add poses that turn further, or use another method"
         )
     normal = np.trace(outer) * np.eye(3) - outer  # Skew(s)'Skew(s) = |s|^2 I - s s'
     if np.linalg.eigvalsh(normal)[0] <= PARALLEL * np.trace(outer):
         raise UnderdeterminedError(
-            f"Tsai's method uses motions of 17 to 116 degrees, and the {used} of these all rotate about one axis; add "
-            "poses that turn about another axis, or take another method"
+            f"Tsai's method uses motions of 17 to 116 degrees, and these {used} motions all rotate about one axis; add "
+            "poses that turn about another axis, or use another method"
         )
     x = np.linalg.solve(normal, sums)
     R = to_rotations(np.append(x, 1.0))
@@ -75,7 +72,7 @@ def park(stations: Stations) -> tuple[Array, Array]:
 def horaud(stations: Stations) -> tuple[Array, Array]:
     """Horaud & Dornaika 1995: q minimises the sum of |v_A q - q v_B|^2 (eq. 31), v the quaternions' vector parts.
 
-    Vector parts carry sin(angle/2), which weighs the axes of larger motions more, as in OpenCV.
+    Vector parts have length sin(angle/2), so the axes of larger motions weigh more, as in OpenCV.
     """
     M = np.zeros((3, 3))
     for block in pair_blocks(stations):
@@ -92,7 +89,7 @@ def _moment(a: Array, weight: Array, b: Array) -> Array:
 
 
 def _log_factor(q: Array) -> Array:
-    """What takes a quaternion's vector part to the rotation vector, for scalar parts that are not negative."""
+    """The factor from a quaternion's vector part to the rotation vector, for nonnegative scalar parts."""
     length = np.sqrt((q[:3] ** 2).sum(axis=0))
     safe = np.maximum(length, 1e-150)
     factor: Array = np.where(length > 1e-8, 2.0 * np.arctan2(length, q[3]) / safe, 2.0)

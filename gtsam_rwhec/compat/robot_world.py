@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gtsam_rwhec.compat.andreff import check_determined
+from gtsam_rwhec.compat.andreff import LENGTH_UNKNOWN, SINGULAR
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.methods.normal_equations import solve_scaled
 from gtsam_rwhec.solver.rotations import project
 
 RobotWorld = tuple[Array, Array, Array, Array]
@@ -38,7 +39,7 @@ class PoseMeans(NamedTuple):
 
 
 def pose_means(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> PoseMeans:
-    """The means, by one GEMM."""
+    """Compute the means by one matrix product."""
     count = len(R_A)
     F = np.empty((count, 25))
     F[:, :9], F[:, 9:12], F[:, 12:15] = R_A.reshape(count, 9), t_A, t_B
@@ -58,11 +59,9 @@ def pose_means(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> PoseMeans:
 
 
 def shah(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
-    """Shah 2013: rotations from the largest singular pair of the sum of R_B (x) R_A, translations by least squares.
+    """R_X, t_X, R_Z, t_Z of A X = Z B by Shah 2013.
 
-    Returns
-    -------
-    R_X, t_X, R_Z, t_Z of A X = Z B.
+    Rotations are the largest singular pair of the sum of R_B (x) R_A; translations are found by least squares.
     """
     m = pose_means(R_A, t_A, R_B, t_B)
     U, _, Vt = np.linalg.svd(m.R_A_R_B.transpose(2, 0, 3, 1).reshape(9, 9))  # R_A R_X R_B' = R_Z, vec by columns
@@ -75,17 +74,14 @@ def shah(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
 
 
 def li(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
-    """Li, Wang & Wu 2010 (Kronecker form): both rotations and translations by one linear least squares.
+    """R_X, t_X, R_Z, t_Z of A X = Z B by Li, Wang & Wu 2010 (Kronecker form): one linear least squares for all.
 
     (R_A (x) I) vec(R_X) - (I (x) R_B') vec(R_Z) = 0 and (I (x) t_B') vec(R_Z) - R_A t_X + t_Z = t_A, vec by rows.
-    Rotations are then the nearest ones; the translations stay those of the linear system, as observed of OpenCV 4.
-
-    Returns
-    -------
-    R_X, t_X, R_Z, t_Z of A X = Z B.
+    The nearest rotations follow; the translations stay as in the linear system: observed of OpenCV 4. Raises
+    UnderdeterminedError when the translations do not determine the rotations' length.
     """
     m = pose_means(R_A, t_A, R_B, t_B)
-    # vec(R_X) is eliminated: R_A, an orthogonal factor, leaves the identity in its block, R_X = mean of R_A' R_Z R_B.
+    # vec(R_X) is eliminated: its block is the identity, since R_A is orthogonal, and R_X = mean of R_A' R_Z R_B.
     K = m.R_A_R_B.transpose(1, 3, 0, 2).reshape(9, 9)
     normal = np.zeros((15, 15))  # vec(R_Z), t_X, t_Z
     normal[:9, :9] = np.eye(9) - K.T @ K
@@ -97,23 +93,19 @@ def li(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
     normal[9:12, 12:] = -m.R_A.T
     normal[range(9, 15), range(9, 15)] = 1.0
     right = np.concatenate([m.t_A_t_B.ravel(), -np.einsum("aba->b", m.R_A_t_A), m.t_A])
-    # One length for all unknowns, so that millimetres and metres are solved to the same number of digits.
-    scale = 1.0 / np.sqrt(normal.diagonal())
-    upper = normal * scale * scale[:, None]
-    symmetric = np.triu(upper) + np.triu(upper, 1).T
-    check_determined(symmetric, "Li's")
-    z = scale * np.linalg.solve(symmetric, right * scale)
+    normal = np.triu(normal) + np.triu(normal, 1).T
+    z = solve_scaled(normal, right, LENGTH_UNKNOWN.format("Li's"), SINGULAR)
     R_X, R_Z = project(np.stack([K @ z[:9], z[:9]]).reshape(2, 3, 3))
     return R_X, z[9:12], R_Z, z[12:]
 
 
 def _rotations_of_vec(vectors: Array) -> Array:
-    """The rotations (2, 3, 3) of singular vectors (2, 9), each of which is a multiple, of either sign, of one."""
+    """The rotations (2, 3, 3) of singular vectors (2, 9), which are multiples, of either sign, of rotations."""
     U, s, Wt = np.linalg.svd(vectors.reshape(2, 3, 3).transpose(0, 2, 1))
     if s.min() < 1e-6:
         raise UnderdeterminedError(
-            "the largest singular pair of the sum of R_B (x) R_A is that of no rotation; add poses that turn about two "
-            "different axes"
+            "the largest singular pair of the sum of R_B (x) R_A is not a pair of rotations; add poses that turn about "
+            "two different axes"
         )
     R: Array = U @ Wt
     for rotation, ((a, b, c), (d, e, f), (g, h, i)) in zip(R, R.tolist(), strict=True):

@@ -1,12 +1,12 @@
-"""The poses of a hand-eye problem, station by station, and what the motions between all pairs of them add up to.
+"""The poses of a hand-eye problem, station by station, and the motions between all pairs of stations.
 
-A motion is that from station i to a later station j: A = G_j^-1 G_i and B = C_j C_i^-1 with A X = X B, where G is the
-gripper's pose in the base, C the target's in the camera and X the camera's in the gripper. That this direction and all
-pairs i < j are OpenCV's was found by comparing answers on noisy poses.
+The motion from station i to a later station j is A = G_j^-1 G_i and B = C_j C_i^-1 with A X = X B. G is the gripper's
+pose in the base, C the target's pose in the camera, X the camera's pose in the gripper. OpenCV uses this direction and
+all pairs i < j: answers on noisy poses show it.
 
-Everything bilinear in the two stations (translations, products of rotations) is summed in linear time: the sum over
-i < j of f_i g_j is that of g_j and the running sum of f. What is not (signs of quaternions, logarithms, thresholds) is
-computed for blocks of pairs, one GEMM for each block, so memory stays linear too.
+Terms that are bilinear in the two stations (translations, products of rotations) are summed in linear time: the sum
+over i < j of f_i g_j needs g_j and the running sum of f. Other terms (signs of quaternions, logarithms, thresholds) are
+computed for blocks of pairs, one matrix product for each block, so memory is linear too.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ BLOCK_PAIRS = 1 << 15
 class Stations:
     """Poses of N stations.
 
-    Parameters
+    Attributes
     ----------
     R_G, t_G : (N, 3, 3) and (N, 3) arrays
-        Gripper in the base; the base's origin is moved to the mean.
+        The gripper in the base, about the mean of t_G.
     R_C : (N, 3, 3) array
-        Target in the camera.
+        The target in the camera.
     u : (N, 3) array
-        R_C' t_C, minus the camera's position in the target's frame, whose origin is moved to the mean.
+        R_C' t_C (minus the camera's position in the target's frame), about its mean.
     origin : (3,) array
-        The mean that was taken from u.
+        The mean of R_C' t_C.
     """
 
     R_G: Array
@@ -47,20 +47,20 @@ class Stations:
 
     @property
     def t_C(self) -> Array:
-        """Translations of the target, its origin moved to the mean, in the camera, (N, 3)."""
+        """(N, 3) translations of the target in the camera, about the mean ``origin``."""
         t: Array = np.einsum("nab,nb->na", self.R_C, self.u)
         return t
 
 
 def stations_of(R_G: Array, t_G: Array, R_C: Array, t_C: Array) -> Stations:
-    """Stations about the mean origins, which no motion depends on and rounding does."""
+    """Stations about the mean origins: motions do not depend on origins, but rounding does."""
     u = np.einsum("nba,nb->na", R_C, t_C)
     origin = u.mean(axis=0)
     return Stations(R_G, t_G - t_G.mean(axis=0), R_C, u - origin, origin)
 
 
 def all_earlier(features: Array) -> Array:
-    """Sums over all earlier stations."""
+    """Each station's sum of the features over all earlier stations."""
     sums = np.zeros_like(features)
     np.cumsum(features[:-1], axis=0, out=sums[1:])
     return sums
@@ -68,18 +68,18 @@ def all_earlier(features: Array) -> Array:
 
 @dataclass(frozen=True)
 class PairBlock:
-    """Rotations of a block of pairs, as quaternions with scalar parts that are not negative.
+    """Rotations of a block of pairs, as quaternions with nonnegative scalar parts.
 
-    Parameters
+    Attributes
     ----------
     first, last : int
         The later stations are first, ..., last - 1.
     a, b : (4, J, I) arrays
         Quaternions (xyzw) of A and of B between the later stations (J) and all stations before ``last`` (I).
     signs : two (J, I) arrays
-        What A's and B's quaternions were multiplied by.
+        The factors +-1 that make the scalar parts of A and of B nonnegative.
     weight : (J, I) array
-        1 for pairs of a station and an earlier one, else 0.
+        1 for pairs of a station and an earlier station, else 0.
     """
 
     first: int
@@ -91,7 +91,7 @@ class PairBlock:
 
 
 def pair_blocks(stations: Stations) -> Iterator[PairBlock]:
-    """All pairs, block by block; q_A = q_G,j* (x) q_G,i and q_B = q_C,j (x) q_C,i*, each block by one GEMM."""
+    """All pairs, block by block; q_A = q_G,j* (x) q_G,i and q_B = q_C,j (x) q_C,i*, a matrix product a block."""
     q_G, q_C = of_rotations(stations.R_G), of_rotations(stations.R_C)
     left_G, left_C = left(conjugate(q_G)), left(q_C)
     right_G, right_C = q_G.T, conjugate(q_C).T
