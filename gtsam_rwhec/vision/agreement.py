@@ -1,10 +1,10 @@
 """The choice between a plane's two poses by one extrinsic rotation for the whole track.
 
-A_i X = Y B_i in every image, so R_A R_X = R_Y R_B with one R_X and one R_Y: what the carriers did and these two say
-how the target is turned in each image, to a degree or so, and its two poses are tens of degrees apart. Rotations and
-choices are found in turns. The mirror images of a whole track agree among themselves nearly as well as the right poses
-do (with R_Y turned by half a turn about the line of sight), so both are tried: the translations and the reprojection
-errors of all images together tell them apart, or else nobody can.
+A_i X = Y B_i in every image, so R_A R_X = R_Y R_B with one R_X and one R_Y. The carriers' rotations, R_X and R_Y
+predict the target's rotation in each image to about a degree; its two candidate poses are tens of degrees apart.
+Rotations and choices are found in turns. The mirror images of a whole track agree with each other nearly as well as the
+right poses do (with R_Y turned by half a turn about the line of sight). Therefore both tracks are tried: only the
+translations and the reprojection errors of all images together tell them apart.
 """
 
 from __future__ import annotations
@@ -17,24 +17,32 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
 
-#: With fewer images two rotations agree with too many choices.
+#: Least number of images: with fewer images, R_X and R_Y agree with too many choices.
 LEAST_IMAGES = 12
-#: Rounds of choices, and of the two rotations in each: by turns, then by Gauss-Newton.
-ROUNDS, TURNS, STEPS = 10, 4, 4
-#: All choices are tried for so many images, whose carriers are turned far from one another; the best are starts.
-FEW, BEST = 4, 3
-#: Images apart whose turning is compared for a first R_Y.
+#: Rounds of choices, at most.
+ROUNDS = 10
+#: Rounds of R_X and R_Y in turns, in each round of choices.
+TURNS = 4
+#: Steps of Gauss-Newton on R_X and R_Y, in each round of choices.
+STEPS = 4
+#: Images for which all choices are tried; their carriers' rotations are far apart.
+FEW = 4
+#: The number of best choices that become starts.
+BEST = 3
+#: Two images are compared for a first R_Y if their numbers differ by one of these.
 LAGS = (1, 2, 4, 8, 16, 32)
-#: Of a translation, as a share of the distance: the tag's size, clocks, corner noise.
+#: Standard deviation of a translation, as a share of the distance: the tag's size, clocks, corner noise.
 SIGMA_SHARE = 0.03
+#: Angles of two turns that differ by less (rad) can be one turn, seen by the carriers and by the camera.
+ALIKE_RAD = float(np.radians(6.0))
 
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """Of n images: R_A (n, 3, 3), t_A (n, 3), candidates R_B (n, 2, 3, 3), t_B (n, 2, 3).
+    """R_A (n, 3, 3) and t_A (n, 3) of n images, with the candidates R_B (n, 2, 3, 3) and t_B (n, 2, 3).
 
-    information (n, 2, 3, 3) of a candidate's rotation (rad^-2, right perturbation), image (n, 2) what each costs by its
-    own image; no cost above `most`.
+    `information` (n, 2, 3, 3) is the inverse covariance of a candidate's rotation (rad^-2, right perturbation), `image`
+    (n, 2) the cost of a candidate in its own image, and `most` the largest cost of a disagreement.
     """
 
     R_A: Array
@@ -48,7 +56,7 @@ class _Track:
 
 @dataclass(frozen=True, eq=False)
 class _Answer:
-    """Choices (n,), what both candidates cost (n, 2), what all of it costs."""
+    """Choices (n,), the costs of both candidates (n, 2), and the total cost of the choices."""
 
     which: np.ndarray
     cost: Array
@@ -58,7 +66,7 @@ class _Answer:
 def choose_by_agreement(
     T: Array, carrier: Array, covariance: Array, image: Array, which: np.ndarray, *, most: float
 ) -> tuple[np.ndarray, Array]:
-    """Choices (n,) and margins (n,) as in `ambiguity.Choice`.
+    """Return choices (n,) and margins (n,) as in `ambiguity.Choice`.
 
     Parameters
     ----------
@@ -67,13 +75,13 @@ def choose_by_agreement(
     carrier : (n, 4, 4) array
         T_sensorcarrier_targetcarrier.
     covariance : (n, 2, 3, 3) array
-        Of each candidate's rotation (rad^2, right perturbation), clocks and carriers included.
+        Covariance of each candidate's rotation (rad^2, right perturbation), with the errors of clocks and carriers.
     image : (n, 2) array
-        What each costs by its own image (negative log-likelihood), infinite for what is none.
+        Cost of each candidate in its own image (negative log-likelihood); infinite where a candidate is missing.
     which : (n,) integers
         A first choice.
     most : float
-        No image's disagreement costs more than this.
+        The largest cost of an image's disagreement.
     """
     B = np.nan_to_num(T)
     information = np.linalg.inv(covariance)
@@ -94,7 +102,7 @@ def choose_by_agreement(
 
 
 def _starts(track: _Track) -> list[np.ndarray]:
-    """Choices (n,) that agree with one for each of a few images, of all choices there the best."""
+    """First choices (n,): the best over all combinations in a few images, and what agrees with them elsewhere."""
     few = _apart(track.R_A)
     found: list[tuple[float, np.ndarray]] = []
     for picked in itertools.product((0, 1), repeat=len(few)):
@@ -107,7 +115,7 @@ def _starts(track: _Track) -> list[np.ndarray]:
 
 
 def _apart(R: Array) -> np.ndarray:
-    """`FEW` of the rotations (n, 3, 3), far from one another."""
+    """Numbers of `FEW` of the rotations (n, 3, 3) that are far apart."""
     chosen = [0]
     nearest = np.full(len(R), np.inf)
     for _ in range(FEW):
@@ -118,7 +126,7 @@ def _apart(R: Array) -> np.ndarray:
 
 
 def _disagreement(track: _Track, R_X: Array, R_Y: Array) -> Array:
-    """What each candidate's rotation costs (n, 2), if the extrinsics are these."""
+    """Costs (n, 2) of the candidates' rotations, for given rotations of the extrinsics."""
     off = _off(track.R_A, track.R_B, R_X, R_Y)
     cost: Array = np.minimum(0.5 * np.einsum("nci,ncij,ncj->nc", off, track.information, off), track.most)
     return cost
@@ -135,7 +143,7 @@ def _settled(track: _Track, which: np.ndarray) -> _Answer:
         disagreement = _disagreement(track, R_X, R_Y)
         cost = track.image + disagreement
         before, which = which, np.argmin(cost, axis=1)
-        # Those that cost the most are somebody else's tag, or a clock that jumped.
+        # Images with the largest cost do not count: another tag with this id, or a clock that jumped.
         sure = np.trace(track.information[each, which], axis1=1, axis2=2)
         weight = np.where(disagreement[each, which] < track.most, sure, 0.0)
         if not weight.any():
@@ -146,7 +154,7 @@ def _settled(track: _Track, which: np.ndarray) -> _Answer:
 
 
 def _off(R_A: Array, R_B: Array, R_X: Array, R_Y: Array) -> Array:
-    """(n, c, 3) rotation vectors from the predicted R_Y' R_A R_X to R_B (n, c, 3, 3), in the target's frame."""
+    """Rotation vectors (n, c, 3) from the predicted R_Y' R_A R_X to R_B (n, c, 3, 3), in the target's frame."""
     predicted = R_Y.T @ R_A @ R_X
     return se3.so3_logmap((predicted[:, None].swapaxes(-1, -2) @ R_B).reshape(-1, 3, 3)).reshape(*R_B.shape[:2], 3)
 
@@ -160,7 +168,8 @@ def _rotations(R_A: Array, R_B: Array, weight: Array, R_X: Array, R_Y: Array) ->
     root = np.sqrt(weight)
     for _ in range(STEPS):
         off = _off(R_A, R_B[:, None], R_X, R_Y)[:, 0]
-        # R_X Exp(x), R_Y Exp(y): the prediction P turns by x - P' y. Of minimum norm, where one axis leaves some free.
+        # R_X Exp(x), R_Y Exp(y): the prediction P turns by x - P' y. Turns about a single axis leave x and y partly
+        # free: lstsq takes the step of minimum norm.
         P = R_Y.T @ R_A @ R_X
         J = np.concatenate([np.broadcast_to(np.eye(3), P.shape), -P.swapaxes(1, 2)], axis=2)
         rows, right = (root[:, None, None] * J).reshape(-1, 6), (root[:, None] * off).ravel()
@@ -172,18 +181,18 @@ def _rotations(R_A: Array, R_B: Array, weight: Array, R_X: Array, R_Y: Array) ->
 
 
 def _first_rotation(R_A: Array, R_B: Array) -> Array:
-    """R_Y that turns the axes about which the target turned into the carriers' (R_A R_A' = R_Y R_B R_B' R_Y')."""
+    """R_Y that turns the axes of the target's motions onto the carriers': R_A R_A' = R_Y R_B R_B' R_Y'."""
     M = np.zeros((3, 3))
     for lag in LAGS:
         if lag < len(R_A):
             a, b = (se3.so3_logmap(R[:-lag] @ R[lag:].swapaxes(1, 2)) for R in (R_A, R_B))
-            alike = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1)) < np.radians(6.0)
+            alike = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1)) < ALIKE_RAD
             M += a[alike].T @ b[alike]
     return _rotation(M)
 
 
 def _translations(track: _Track, R_Y: Array, which: np.ndarray) -> float:
-    """What is left of R_A t_X + t_A = R_Y t_B scale + t_Y with the best t_X, t_Y and scale."""
+    """Cost of R_A t_X + t_A = R_Y t_B scale + t_Y with the best t_X, t_Y and scale."""
     n = len(which)
     turned = track.t_B[np.arange(n), which] @ R_Y.T
     matrix: Array = np.concatenate([track.R_A, np.broadcast_to(-np.eye(3), (n, 3, 3)), -turned[..., None]], axis=2)

@@ -1,12 +1,12 @@
-"""The choice between a plane's two poses, made over a whole track and not image by image.
+"""The choice between a plane's two poses, over a whole track.
 
 A far or nearly frontal plane looks almost the same in two poses, mirror images of each other about the line of sight.
-One image tells them apart by its reprojection errors alone, a little. A track tells more: between two images the
-target turns against the camera by the same angle as the carriers turn against each other, whatever the extrinsics
-(A_i^-1 A_j and B_i B_j^-1 are conjugate), and a wrong choice changes that angle. So the most likely choice is that of
-the whole track: a chain with two states an image, by dynamic programming; the cost of the best chain through the other
-state says how sure each choice is. Where the carriers' poses are known in enough images, one extrinsic rotation for all
-of them then says more than angles between neighbours do (`agreement`).
+The reprojection errors of one image hardly tell them apart. A track tells more: between two images the target turns
+against the camera by the same angle as the carriers turn against each other, for any extrinsics (A_i^-1 A_j and
+B_i B_j^-1 are conjugate), and a wrong choice changes that angle. Dynamic programming finds the most likely choice of
+the whole track, a chain with two states for each image; the cost of the best chain through the other state says how
+sure each choice is. Where the carriers' poses are known in enough images, one extrinsic rotation for all images tells
+more than the angles between neighbours do (`agreement`).
 """
 
 from __future__ import annotations
@@ -19,23 +19,31 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.agreement import LEAST_IMAGES, choose_by_agreement
 
-#: Standard deviation of an angle between two images beyond corner noise (rad): time offsets, errors of the arm.
+#: Standard deviation of an angle between two images (rad), without corner noise: time offsets, errors of the arm.
 SIGMA_TURN_RAD = float(np.radians(3.0))
-#: How fast a target turns against the camera (rad/s, standard deviation) where the carriers' turning is not known.
+#: Standard deviation of a target's angular velocity against the camera (rad/s) where the carriers' poses are not known.
 SIGMA_RATE_RAD_S = float(np.radians(60.0))
 #: Two images further apart in time than this are not compared.
 LONGEST_LINK_S = 3.0
-#: The most (log-likelihood) that the comparison of two images may cost, so that it cannot outweigh all others.
+#: Largest cost (log-likelihood) of the comparison of two images, so that one comparison cannot outweigh the others.
 MOST_OF_A_LINK = 8.0
-#: The most (log-likelihood) that one image may cost, for the same reason.
+#: Largest cost (log-likelihood) of one image, so that one image cannot outweigh the others.
 MOST_OF_AN_IMAGE = 30.0
-#: Two candidates whose rotations differ by less are one pose.
+#: Candidates whose rotations differ by less (rad) are one pose.
 SAME_RAD = float(np.radians(0.2))
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Which candidate (n,), 0 or 1, and by what log-likelihood the best track with the other one is worse, (n,)."""
+    """The candidates chosen in n images of a track.
+
+    Attributes
+    ----------
+    which : (n,) array of int
+        The chosen candidate, 0 or 1.
+    margin : (n,) array
+        By how much log-likelihood the best track with the other candidate in this image is worse.
+    """
 
     which: np.ndarray
     margin: Array
@@ -56,15 +64,15 @@ def choose_over_time(
     stamps_ns : (n,) integers
         Increasing.
     T : (n, 2, 4, 4) array
-        Candidates T_camera_target; the second nan where there is only one.
+        Candidates T_camera_target; the second is nan where there is only one.
     squared_px : (n, 2) array
         Sums of squared reprojection errors.
     covariance : (n, 2, 6, 6) array
-        Of the candidates.
+        Covariances of the candidates.
     corner_px : float
-        Standard deviation of a corner along each axis.
+        Standard deviation of a corner along each axis, pixels.
     carrier : (n, 4, 4) array, optional
-        A = T_sensorcarrier_targetcarrier at the stamps, nan where not known.
+        A = T_sensorcarrier_targetcarrier at the stamps; nan where it is not known.
     """
     n = len(stamps_ns)
     image = np.nan_to_num(0.5 * squared_px / corner_px**2, nan=np.inf)
@@ -73,7 +81,7 @@ def choose_over_time(
     image = np.minimum(image - image.min(axis=1, keepdims=True), MOST_OF_AN_IMAGE)
     image[~np.isfinite(T).all(axis=(2, 3))] = np.inf
     link = _links(stamps_ns, T, covariance, carrier)
-    # forward[i, a]: of the best chain up to and with image i in state a; backward: of the best from there on.
+    # forward[i, a]: cost of the best chain up to image i in state a; backward[i, a]: of the best chain after it.
     forward, backward = image.copy(), np.zeros((n, 2))
     for i in range(1, n):
         forward[i] += (forward[i - 1][:, None] + link[i - 1]).min(axis=0)
@@ -98,7 +106,7 @@ def choose_over_time(
 
 
 def _links(stamps_ns: np.ndarray, T: Array, covariance: Array, carrier: Array | None) -> Array:
-    """Cost (n - 1, 2, 2) of each state after each, by how much the angle between them is not the carriers'."""
+    """Costs (n - 1, 2, 2) of each state after each: how far the angle between them is from the carriers' angle."""
     seconds = np.diff(stamps_ns) * 1e-9
     R = np.nan_to_num(T[..., :3, :3])
     between = R[:-1, :, None] @ np.swapaxes(R[1:, None], -1, -2)  # B_i B_j^-1

@@ -1,4 +1,4 @@
-"""Corners of boards: blur does not move the points where two dark squares meet."""
+"""Corners of boards, the points where two dark squares meet: blur does not move them."""
 
 from __future__ import annotations
 
@@ -11,20 +11,26 @@ from gtsam_rwhec.vision.dictionaries import dictionary
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard
 
-#: Of cornerSubPix: rounds, and the step (pixels) that ends them.
+#: End of cornerSubPix: 30 rounds, or a step of 1e-3 pixels.
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
-#: A corner that refinement moves by more than this share of its window is taken for another corner.
+#: A corner that refinement moves by more than this share of its window is another corner, and is not used.
 MOST_MOVED = 0.8
-#: Windows at an AprilGrid's corners, half their size as shares of a tag's side, and of the gap between tags at most:
-#: first to find the corner (where black squares touch OpenCV's contours go astray by pixels), then to measure it.
-FIND, FIND_GAP, MEASURE, MEASURE_GAP = 0.2, 0.7, 0.13, 0.55
-#: A corner further than this (pixels) from where the other corners predict it is not used.
+#: Half window that finds an AprilGrid's corner, as a share of a tag's side: OpenCV's contours are wrong by pixels where
+#: black squares touch.
+FIND = 0.2
+#: Largest half window that finds a corner, as a share of the gap between tags.
+FIND_GAP = 0.7
+#: Half window that measures a found corner, as a share of a tag's side.
+MEASURE = 0.13
+#: Largest half window that measures a corner, as a share of the gap between tags.
+MEASURE_GAP = 0.55
+#: A corner further than this (pixels) from the place that the other corners predict is not used.
 ASTRAY_PX = 1.5
-#: Windows at a checkerboard's corners, half their size as a share of a square.
+#: Half window at a checkerboard's corner, as a share of a square's side.
 OF_SQUARE = 0.4
-#: How far a marker's edge reaches out of it, by blur and by the gradient's own window, pixels.
+#: How far blur and the gradient's window carry a marker's edge outwards, pixels.
 GRADIENT_PX = 0.5
-#: A checkerboard's outermost squares differ by no less than this share of what its inner ones do.
+#: Least contrast of a checkerboard's outermost squares, as a share of the contrast of its inner squares.
 LEAST_CONTRAST = 0.3
 
 
@@ -42,8 +48,8 @@ def charuco_corners(
 ) -> tuple[np.ndarray, Array]:
     """Indices (n,) and places (n, 2) of a board's inner corners, from its markers' ids (m,) and corners (m, 4, 2).
 
-    OpenCV's windows reach into the markers where a board is turned or slanted, and corners are tenths of a pixel off:
-    measured again in windows that do not.
+    OpenCV's windows reach into the markers of a turned or slanted board, and its corners are wrong by tenths of a
+    pixel. The corners are therefore measured again in smaller windows.
     """
     if len(ids) == 0:
         return np.zeros(0, dtype=int), np.zeros((0, 2))
@@ -58,7 +64,7 @@ def charuco_corners(
 
 
 def _to_the_markers(board: Charuco, plane: Array, pixels: Array) -> float:
-    """How far from a corner (n, 2) the nearest marker begins, pixels along x or y, at the least."""
+    """Least distance from a corner (n, 2) to the nearest marker, pixels along x or y."""
     if len(plane) < 4:
         return 0.0
     H, _ = cv2.findHomography(plane, pixels)
@@ -73,8 +79,8 @@ def _to_the_markers(board: Charuco, plane: Array, pixels: Array) -> float:
 def aprilgrid_corners(gray: Gray, board: AprilGrid, ids: np.ndarray, tags_px: Array) -> tuple[np.ndarray, Array]:
     """Indices (n,) and places (n, 2) of a grid's corners, from its tags' ids (m,) and corners (m, 4, 2).
 
-    Printed tags are turned against OpenCV's by a multiple of a right angle, which differs between generators: the turn
-    under which all corners together fit a plane best is taken.
+    Generators print tags turned by different multiples of a right angle. The turn is taken with which all corners
+    together fit a plane best.
     """
     unique, counts = np.unique(ids, return_counts=True)
     once = np.isin(ids, unique[counts == 1])
@@ -87,17 +93,17 @@ def aprilgrid_corners(gray: Gray, board: AprilGrid, ids: np.ndarray, tags_px: Ar
     corners = np.roll(tags_px, int(np.argmin(fits)), axis=1)
     side = float(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min())
     rough = corners.reshape(-1, 2)
-    # Inside the windows only this corner's two black squares: a tag's border is a fifth of it.
+    # A window holds only the corner's two black squares: a tag's border is a fifth of its side.
     half = int(np.clip(min(FIND, FIND_GAP * board.spacing) * side, 3, 12))
     found = refined_corners(gray, rough, half)
     moved = np.linalg.norm(found - rough, axis=1)
-    kept = (moved > 0.0) & (moved < MOST_MOVED * half)  # where it does not converge OpenCV returns what it was given
+    kept = (moved > 0.0) & (moved < MOST_MOVED * half)  # OpenCV returns its input if it does not converge
     half = int(np.clip(min(MEASURE, MEASURE_GAP * board.spacing) * side, 2, 8))
     return indices[kept], refined_corners(gray, found[kept], half)
 
 
 def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndarray:
-    """Which (n,) of a board's corners (n, 3), seen at (n, 2), agree with most of them; all where there are too few."""
+    """Which (n,) of a board's corners (n, 3), seen at (n, 2), agree with most corners; all if there are under six."""
     everyone = np.ones(len(corners_m), dtype=bool)
     x = camera.undistort(corners_px)
     if len(corners_m) < 6 or not np.isfinite(x).all():
@@ -112,7 +118,7 @@ def checkerboard_corners(gray: Gray, board: Checkerboard) -> Array:
 
     The top is where the first corner's outer square is black: a half turn changes its colour.
     """
-    # OpenCV takes an outer edge for inner corners now and then; with other options it does not, or elsewhere.
+    # OpenCV sometimes takes an outer edge for inner corners: the contrast shows it, and other options can avoid it.
     for flags in (cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY, 0):
         found, corners = cv2.findChessboardCornersSB(gray, (board.columns, board.rows), flags=flags)
         if not found:
@@ -131,9 +137,9 @@ def checkerboard_corners(gray: Gray, board: Checkerboard) -> Array:
 
 
 def _contrast(gray: Gray, grid: Array) -> float:
-    """How much lighter squares beside black ones are, with the first corner's outer square black; negative if white.
+    """How much lighter the white squares are if the first corner's outer square is black; negative if it is white.
 
-    0 where the outermost squares in the image do not alternate: then an outer edge was taken for inner corners.
+    0 where the outermost squares in the image do not alternate: an outer edge was taken for inner corners.
     """
     beyond = np.pad(grid, ((1, 1), (1, 1), (0, 0)), mode="reflect", reflect_type="odd")
     middles = 0.25 * (beyond[1:, 1:] + beyond[1:, :-1] + beyond[:-1, 1:] + beyond[:-1, :-1])
@@ -153,13 +159,13 @@ def _contrast(gray: Gray, grid: Array) -> float:
 
 
 def refined_corners(gray: Gray, corners: Array, half: int) -> Array:
-    """Places (n, 2) of corners where two dark squares meet, to a fraction of a pixel; windows of 2 half + 1 pixels."""
+    """Places (n, 2) of corners where two dark squares meet, in windows of 2 half + 1 pixels."""
     places = np.ascontiguousarray(corners.reshape(-1, 1, 2), dtype=np.float32)
     return cv2.cornerSubPix(gray, places, (half, half), (-1, -1), CRITERIA).reshape(-1, 2).astype(float)
 
 
 def _plane_error(plane: Array, pixels: Array) -> float:
-    """Mean squared error of the best homography, pixels^2; by least squares over all points."""
+    """Mean squared error of the least-squares homography of all points, pixels^2."""
     H, _ = cv2.findHomography(plane, pixels)
     if H is None:
         return float("inf")

@@ -1,4 +1,4 @@
-"""Detection of targets in images: corners, poses, and for each detection that is not used the reason."""
+"""Detection of targets in images: corners, poses, and the reason why a detection is not used."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from gtsam_rwhec.vision.pose import PlanePoses, plane_poses
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
 
-#: Family and border of tags; ids of tags and their corners (n, 4, 2) in pixels.
+#: Family of tags, and the modules of their border.
 _Kind: TypeAlias = tuple[str, int]
+#: Ids of n tags, and their corners (n, 4, 2), pixels.
 _Tags: TypeAlias = tuple[list[int], Array]
 
 
@@ -33,23 +34,26 @@ class Detection:
     Attributes
     ----------
     target : str
+        Name of the target.
     corners_px : (n, 2) array
-        Those of its corners that were seen.
+        The corners that were seen, pixels.
     indices : (n,) integers
-        Which they are, of ``Target.corners``.
+        Rows of these corners in ``Target.corners``.
     T : (2, 4, 4) array
-        T_camera_target, metres: a plane's two candidates, the one of smaller reprojection error first; nan where there
-        is none.
-    squared_px, reprojection_px : (2,) arrays
-        Sum of squared reprojection errors, and their root mean square.
+        T_camera_target, metres: a plane's two candidates, the candidate of smaller reprojection error first; nan where
+        a candidate is missing.
+    squared_px : (2,) array
+        Sum of squared reprojection errors, px^2.
+    reprojection_px : (2,) array
+        Root mean square of the reprojection errors, pixels.
     covariance : (2, 6, 6) array
-        From corner noise; right perturbation, rotation first.
+        Covariance of the right perturbation [omega (rad), v (m)], from corner noise.
     side_px : float
-        The shortest side of a tag, of a board's bounding box.
+        The shortest side of a tag, or of a board's bounding box, pixels.
     blur_px : float
-        Standard deviation of the blur across a tag's edges; nan for boards.
+        Standard deviation of the blur across a tag's edges, pixels; nan for boards.
     rejection : Rejection or None
-        Why it is not to be used; None if it is.
+        Why the detection is not used; None if it is used.
     """
 
     target: str
@@ -66,7 +70,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class ImageDetections:
-    """What was detected in one image: targets, and how many tags of no target, by family and id."""
+    """The targets detected in one image, and the number of tags of no target, by family and id."""
 
     detections: tuple[Detection, ...]
     strangers: dict[tuple[str, int], int]
@@ -84,7 +88,7 @@ class _Sighting:
 
 
 class Detector:
-    """Finds a camera's targets in its images. Not for two threads at once.
+    """Finds a camera's targets in its images. Two threads must not use one detector at once.
 
     Parameters
     ----------
@@ -99,7 +103,7 @@ class Detector:
         self._owners = {(*_kind(t), i) for t in targets for i in t.ids}
         kinds = sorted({_kind(target) for target in targets if target.ids})
         self._ids = {kind: sorted(i for *of, i in self._owners if tuple(of) == kind) for kind in kinds}
-        #: By border, as OpenCV has one for all families that it looks for at once.
+        #: One detector for each border: OpenCV looks for several families at once.
         self._detectors = {
             border: detector_of({family: ids for (family, b), ids in self._ids.items() if b == border}, border)
             for border in sorted({border for _, border in kinds})
@@ -110,9 +114,9 @@ class Detector:
         self._charuco = {t.name: boards.charuco_detector(t) for t in targets if isinstance(t, Charuco)}
 
     def __call__(self, images: Sequence[Gray]) -> list[ImageDetections]:
-        """Detect in images (height, width) of 8 bits.
+        """Detect targets in images (height, width) of 8 bits.
 
-        Many at once cost less: OpenCV goes through them one by one, edges and poses are refined together.
+        Many images at once take less time: their edges and poses are refined together.
         """
         sightings: list[list[_Sighting]] = [[] for _ in images]
         tags = self._tags_in(images)
@@ -138,7 +142,7 @@ class Detector:
         ]
 
     def _tags_in(self, images: Sequence[Gray]) -> dict[_Kind, list[_Tags]]:
-        """Targets' tags of each kind in each image, corners in pixels to about one."""
+        """Targets' tags of each kind in each image, with corners right to about a pixel."""
         tags: dict[_Kind, list[_Tags]] = {kind: [] for kind in self._ids}
         for gray in images:
             for border, detector in self._detectors.items():
@@ -155,7 +159,7 @@ class Detector:
     def _strangers(
         self, images: Sequence[Gray], tags: dict[_Kind, list[_Tags]]
     ) -> Iterator[dict[tuple[str, int], int]]:
-        """How many tags of the targets' families are no target's, in each image."""
+        """The tags in each image that have a target's family and belong to no target: how many, by family and id."""
         for k, gray in enumerate(images):
             quads = quadrangles(gray) if tags else np.zeros((0, 4, 2))
             quads = unlike(quads, np.concatenate([quads[:0], *(found[k][1] for found in tags.values())]))
@@ -166,7 +170,7 @@ class Detector:
             yield dict(strange)
 
     def _single_tags(self, images: Sequence[Gray], kind: _Kind, found: list[_Tags]) -> Iterator[tuple[int, _Sighting]]:
-        """Targets that are one tag, with the number of their image."""
+        """Sightings of targets that are single tags, with the numbers of their images."""
         mine = [(k, j) for k, (ids, _) in enumerate(found) for j, i in enumerate(ids) if (*kind, i) in self._tags]
         if not mine:
             return
@@ -193,11 +197,11 @@ class Detector:
         return boards.aprilgrid_corners(gray, board, numbers, corners[mine])
 
     def _judged(self, sightings: list[_Sighting]) -> list[Detection]:
-        """Poses of all sightings: those of tags together, and those of boards, which have more corners."""
+        """Detections with poses: all tags together, then all boards together, which have more corners."""
         result: dict[int, Detection] = {}
         for of_tags in (True, False):
             places = [i for i, s in enumerate(sightings) if isinstance(s.target, Tag) == of_tags]
-            usable = [i for i in places if len(sightings[i].indices) >= 4]  # a plane's pose needs four points
+            usable = [i for i in places if len(sightings[i].indices) >= 4]  # A plane's pose needs four points.
             poses = plane_poses(
                 self.camera,
                 [sightings[i].target.corners()[sightings[i].indices] for i in usable],
@@ -236,14 +240,14 @@ class Detector:
 
 
 def grazing_rad(T_camera_target: Array) -> float:
-    """Angle between the line of sight to a target's origin and its normal; 0 is seen from the front."""
+    """Angle between the line of sight to a target's origin and the target's normal; 0 is from the front."""
     t = T_camera_target[:3, 3]
     cosine = -float(T_camera_target[:3, 2] @ t) / float(np.linalg.norm(t))
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def _kind(target: Target) -> _Kind:
-    """Family and border of a target's tags: what one run of OpenCV's detector finds."""
+    """Family and border of a target's tags."""
     return target.family, 2 if isinstance(target, AprilGrid) else 1
 
 

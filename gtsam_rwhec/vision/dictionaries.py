@@ -1,4 +1,4 @@
-"""OpenCV's dictionaries and detectors by the names of families."""
+"""OpenCV's dictionaries and detectors of tags, by the names of families."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ def dictionary(family: str) -> cv2.aruco.Dictionary:
 
 
 def modules(family: str, border_bits: int = 1) -> int:
-    """Along a tag's side, borders included."""
+    """The number of modules along a tag's side, with both borders."""
     return int(dictionary(family).markerSize) + 2 * border_bits
 
 
 def tag_detector(family: str, border_bits: int = 1) -> cv2.aruco.ArucoDetector:
-    """A detector of a family's tags. Not safe to use from two threads."""
+    """A detector of a family's tags. Two threads must not use one detector at once."""
     return cv2.aruco.ArucoDetector(dictionary(family), _parameters(border_bits))
 
 
 def detector_of(ids: Mapping[str, Sequence[int]], border_bits: int = 1) -> cv2.aruco.ArucoDetector:
-    """A detector of some tags of several families, for ``detectMarkersMultiDict``. Not safe to use from two threads.
+    """A detector of some tags of several families, for ``detectMarkersMultiDict``.
 
-    What it calls an id is a place among the family's `ids`, and a dictionary's index is the family's place.
+    The detector returns an id as an index into the family's `ids`, and a family as an index into the families. Two
+    threads must not use one detector at once.
     """
     some = []
     for family, wanted in ids.items():
@@ -43,6 +44,6 @@ def detector_of(ids: Mapping[str, Sequence[int]], border_bits: int = 1) -> cv2.a
 
 def _parameters(border_bits: int) -> cv2.aruco.DetectorParameters:
     parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # done by us, from the edges
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # we refine the corners from the edges
     parameters.markerBorderBits = border_bits
     return parameters

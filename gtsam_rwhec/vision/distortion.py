@@ -11,14 +11,14 @@ from gtsam_rwhec.geometry.poses import Array
 
 Model = Literal["pinhole", "radtan", "equidistant"]
 
-#: Newton's steps, at most.
+#: Steps of Newton's method, at most.
 STEPS = 30
-#: A step of less than this, normalised, ends them.
+#: A smaller step, in normalised coordinates, ends the iteration.
 NEAR = 1e-10
 
 
 def distorted(model: Model, D: Array, x: Array) -> tuple[Array, Array]:
-    """Distorted coordinates (..., 2) of x (..., 2), and their derivatives (..., 2, 2) by x."""
+    """Distorted coordinates (..., 2) of normalised coordinates x (..., 2), and their derivatives (..., 2, 2) by x."""
     if model == "equidistant":
         return _equidistant(x, D)
     if model == "radtan":
@@ -27,7 +27,7 @@ def distorted(model: Model, D: Array, x: Array) -> tuple[Array, Array]:
 
 
 def undistorted(model: Model, D: Array, wanted: Array, ring: float) -> Array:
-    """x (..., 2) whose distorted coordinates are `wanted`, by Newton; nan where there is none within `ring`."""
+    """Coordinates x (..., 2) whose distorted coordinates are `wanted`, by Newton; nan where none is within `ring`."""
     if model == "pinhole":
         return wanted
     if model == "equidistant":
@@ -38,15 +38,11 @@ def undistorted(model: Model, D: Array, wanted: Array, ring: float) -> Array:
             bent, J = distorted(model, D, x)
             det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
             off = wanted - bent
-            step = np.stack(
-                [
-                    J[..., 1, 1] * off[..., 0] - J[..., 0, 1] * off[..., 1],
-                    J[..., 0, 0] * off[..., 1] - J[..., 1, 0] * off[..., 0],
-                ],
-                axis=-1,
-            )
-            step /= det[..., None]
-            # Beyond the ring where distortion folds back (det <= 0) nothing is seen.
+            # J^-1 off by Cramer's rule
+            first = J[..., 1, 1] * off[..., 0] - J[..., 0, 1] * off[..., 1]
+            second = J[..., 0, 0] * off[..., 1] - J[..., 1, 0] * off[..., 0]
+            step = np.stack([first, second], axis=-1) / det[..., None]
+            # Nothing is seen beyond the ring where distortion folds back (det <= 0).
             x = np.where(det[..., None] > 0.0, x + step, np.nan)
             if not np.nanmax(np.abs(step), initial=0.0) > NEAR:
                 break
@@ -56,7 +52,7 @@ def undistorted(model: Model, D: Array, wanted: Array, ring: float) -> Array:
 
 
 def _undistorted_fisheye(D: Array, wanted: Array, ring: float) -> Array:
-    """As `undistorted`, by Newton on the angle, since tan runs away."""
+    """As `undistorted`, by Newton on the angle: tan grows too fast near 90 degrees."""
     k1, k2, k3, k4 = D
     curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4])
     slope = curve.deriv()
@@ -74,7 +70,7 @@ def _undistorted_fisheye(D: Array, wanted: Array, ring: float) -> Array:
 
 
 def folding_radius(model: Model, D: Array) -> float:
-    """The radius |x| at which the radial distortion folds back (or has a pole); infinite where it never does."""
+    """The radius |x| at which the radial distortion folds back or has a pole; infinite if it does neither."""
     if model == "pinhole":
         return float("inf")
     if model == "equidistant":
@@ -89,8 +85,8 @@ def folding_radius(model: Model, D: Array) -> float:
 
 
 def _first_root(polynomial: Polynomial) -> float:
-    """Smallest real root above 0 of a polynomial that is 1 at 0; infinite if it has none."""
-    # Of its reciprocals: the last coefficients may be next to nothing, the first is not.
+    """Smallest positive root of a polynomial that is 1 at 0; infinite if no root is real and positive."""
+    # numpy finds the reciprocals of the roots here: the last coefficients can be almost 0, the first coefficient is 1.
     roots = np.roots(polynomial.coef)
     inverse = float(roots[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)].real.max(initial=0.0))
     return 1.0 / inverse if inverse > 1e-12 else float("inf")

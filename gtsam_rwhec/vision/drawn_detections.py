@@ -1,4 +1,4 @@
-"""Detections drawn into their images, for people who want to see what was used and what was not."""
+"""Drawings of detections in their images, which show what was used and what was not used."""
 
 from __future__ import annotations
 
@@ -13,29 +13,32 @@ from gtsam_rwhec.logs.records import DetectionRecord
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.images import Gray
 
-#: Blue and vermilion of Okabe and Ito's palette, which the colour-blind can tell apart; OpenCV has blue first.
-USED, NOT_USED = (178, 114, 0), (0, 94, 213)
-AXES = ((0, 94, 213), (115, 158, 0), (178, 114, 0))
-#: Places are drawn to 1/16 of a pixel.
+#: Colour of a used detection, (blue, green, red): blue of Okabe and Ito's palette, for colour-blind people.
+USED = (178, 114, 0)
+#: Colour of a detection that is not used: vermilion of the same palette.
+NOT_USED = (0, 94, 213)
+#: Colours of the axes x, y, z.
+AXES = (NOT_USED, (115, 158, 0), USED)
+#: Bits of a place below the pixel: 1/16 of a pixel.
 SHIFT = 4
-#: An axis' length over the distance.
+#: Length of an axis over the target's distance.
 AXIS = 0.08
 
 
 def draw(gray: Gray, detections: Iterable[DetectionRecord], camera: Camera) -> NDArray[np.uint8]:
-    """Draw outlines (of boards the corners), axes of those that are used, and names with reasons.
+    """Draw outlines of tags, corners of boards, axes of used detections, and names with reasons.
 
     Parameters
     ----------
     gray : (height, width) uint8
     detections : iterable of DetectionRecord
-        Of this image.
+        The detections in this image.
     camera : Camera
 
     Returns
     -------
     (height, width, 3) uint8
-        Blue first, as OpenCV writes it.
+        Colours (blue, green, red), as OpenCV writes them.
     """
     picture = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     for record in detections:
@@ -68,5 +71,5 @@ def _draw_axes(picture: NDArray[np.uint8], T: Array, camera: Camera) -> None:
 
 
 def _fixed(pixels: Array) -> NDArray[np.int32]:
-    """OpenCV's fixed-point places; far outside they do not fit."""
+    """OpenCV's fixed-point places; clipped, since places far outside do not fit."""
     return np.rint(np.clip(pixels, -1e4, 1e5) * (1 << SHIFT)).astype(np.int32)

@@ -1,8 +1,8 @@
-"""Width and height of compressed images as their headers state them: for a look before a file becomes gigabytes.
+"""Width and height of compressed images from their headers, to refuse huge images before OpenCV decodes them.
 
-The size must be no smaller than what OpenCV will decode. Measured on 2026-11-22
-(tests/benchmarks/own_code_against_libraries.py): of TIFFs that give their width twice imagesize 2.0.1 takes the last,
-and OpenCV the first. Of 771 damaged images that OpenCV 5 decodes, Pillow 13.0.0 refuses 5 and this module none.
+The stated size must not be smaller than the size that OpenCV decodes. Measured on 2026-11-22
+(tests/benchmarks/own_code_against_libraries.py): if a TIFF gives its width twice, imagesize 2.0.1 takes the last
+width and OpenCV the first. Of 771 damaged images that OpenCV 5 decodes, Pillow 13.0.0 refuses 5 and this module none.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-#: How files begin.
+#: First bytes of files.
 PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG, _BMP, _RIFF = b"\xff\xd8", b"BM", b"RIFF"
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
@@ -22,7 +22,7 @@ Size = tuple[int, int]
 
 
 def stated_size(data: bytes) -> Size | None:
-    """(width, height) in pixels of a PNG, JPEG, WebP, TIFF or BMP file; None for anything else, or a broken header."""
+    """(width, height) in pixels of a PNG, JPEG, WebP, TIFF or BMP file; None for another file or a broken header."""
     readers: list[tuple[bool, Callable[[bytes], Size | None]]] = [
         (data.startswith(PNG), _png),
         (data.startswith(_JPEG), _jpeg),
@@ -33,7 +33,7 @@ def stated_size(data: bytes) -> Size | None:
     try:
         return next((read(data) for begins, read in readers if begins), None)
     except struct.error:
-        return None  # it ends before its size
+        return None  # the file ends before its size
 
 
 def _png(data: bytes) -> Size:
@@ -47,7 +47,7 @@ def _jpeg(data: bytes) -> Size | None:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
         if data[at] != 0xFF:
             return None
-        if marker == 0xFF:  # fills up
+        if marker == 0xFF:  # a fill byte
             at += 1
             continue
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
@@ -58,7 +58,7 @@ def _jpeg(data: bytes) -> Size | None:
 
 
 def _webp(data: bytes) -> Size:
-    if data[12:16] == b"VP8X":  # the only one that can state more than 16384 x 16384
+    if data[12:16] == b"VP8X":  # only this kind can state more than 16384 x 16384
         if len(data) < 30:
             raise struct.error("no canvas")
         return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
@@ -66,7 +66,7 @@ def _webp(data: bytes) -> Size:
 
 
 def _tiff(data: bytes) -> Size | None:
-    """Of the first directory; of a tag given twice the larger value."""
+    """The size in the first directory; the larger value if a tag is given twice."""
     order = _TIFF[data[:4]]
     (at,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, at)

@@ -1,4 +1,4 @@
-"""Images of a log to gray pixels: JPEG, PNG and the like, and the raw encodings of ROS and Foxglove."""
+"""Gray pixels from a log's images: compressed (JPEG, PNG and others) or in raw encodings of ROS and Foxglove."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gtsam_rwhec.vision.image_sizes import PNG, stated_size
 
 Gray = NDArray[np.uint8]
 
-#: Channels and bytes a channel of raw encodings, and OpenCV's conversion to gray (None: it is gray).
+#: Raw encodings: channels, bytes in a channel, and OpenCV's conversion to gray (None for gray images).
 _RAW: dict[str, tuple[int, int, int | None]] = {
     "mono8": (1, 1, None), "8uc1": (1, 1, None), "mono16": (1, 2, None), "16uc1": (1, 2, None),
     "rgb8": (3, 1, cv2.COLOR_RGB2GRAY), "8uc3": (3, 1, cv2.COLOR_BGR2GRAY), "bgr8": (3, 1, cv2.COLOR_BGR2GRAY),
@@ -28,14 +28,12 @@ RAW_ENCODINGS = tuple(_RAW)
 
 
 def decode_gray(image: ImageRecord) -> Gray:
-    """Pixels (height, width), 8 bits, of an image of a log.
-
-    16-bit images are scaled so that their brightest pixel is 255.
+    """Pixels (height, width), 8 bits, of a log's image; 16 bits are scaled so that the brightest pixel is 255.
 
     Raises
     ------
     ImageError
-        For an image that cannot be decoded, is larger than `MOST_PIXELS`, or has an encoding that is not supported.
+        The image cannot be decoded, has more than `MOST_PIXELS`, or has an encoding that is not supported.
     """
     where = f"topic {image.topic}, image at {image.stamp_ns} ns"
     return _compressed(image, where) if image.is_compressed else _raw(image, where)
@@ -46,25 +44,25 @@ def _compressed(image: ImageRecord, where: str) -> Gray:
     what = f"{where}: {len(image.data)} bytes that begin with {begins} and claim to be {claims!r}"
     size = stated_size(image.data)
     if size is None:
-        raise ImageError(f"{what} are no JPEG, PNG, WebP, TIFF or BMP, or do not state a size")
+        raise ImageError(f"{what} are not a JPEG, PNG, WebP, TIFF or BMP file with a size")
     if size[0] * size[1] > MOST_PIXELS:
         raise ImageError(f"{where}: {size[0]} x {size[1]} pixels are more than the {MOST_PIXELS} that are decoded")
-    if image.data.startswith(PNG) and b"IEND" not in image.data:  # libpng would say so on the terminal, for each
-        raise ImageError(f"{where}: {len(image.data)} bytes of a PNG that goes on")
+    if image.data.startswith(PNG) and b"IEND" not in image.data:  # libpng would print a line for each
+        raise ImageError(f"{where}: {len(image.data)} bytes of a PNG file that is cut short")
     buffer = np.frombuffer(image.data, dtype=np.uint8)
-    # The lens does not turn with the viewer's wish: no EXIF orientation. More than 8 bits stay until they are scaled.
+    # Intrinsics are for the pixels as recorded: ignore EXIF's orientation. Keep more than 8 bits until they are scaled.
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         gray = cv2.imdecode(buffer, flags)
-    except cv2.error:  # 4 and 5 raise for some of what they cannot decode, and return nothing for the rest
+    except cv2.error:  # OpenCV 4 and 5 raise for some broken images and return None for others
         gray = None
     if gray is None:
-        raise ImageError(f"{what} are no image that OpenCV can decode")
+        raise ImageError(f"{what}: OpenCV cannot decode them")
     return gray.astype(np.uint8, copy=False) if gray.dtype == np.uint8 else _eight_bits(gray)
 
 
 def _eight_bits(wide: NDArray[np.generic]) -> Gray:
-    """Scaled so that the brightest pixel is 255; what is negative or no number is black."""
+    """Pixels scaled so that the brightest pixel is 255; negative and non-finite pixels become black."""
     values = np.nan_to_num(wide.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
     brightest = float(values.max(initial=0.0))
     gray: Gray = np.rint(np.maximum(values, 0.0) * (255.0 / brightest if brightest > 0.0 else 0.0)).astype(np.uint8)
@@ -81,7 +79,7 @@ def _raw(image: ImageRecord, where: str) -> Gray:
     channels, size, code = _RAW[encoding]
     if width < 1 or height < 1 or step < width * channels * size or len(image.data) < step * height:
         raise ImageError(
-            f"{where}: {width} x {height} pixels of {encoding} in rows of {step} bytes do not fit {len(image.data)}"
+            f"{where}: {width} x {height} pixels of {encoding} in rows of {step} bytes do not fit {len(image.data)} bytes"
         )
     if width * height > MOST_PIXELS:
         raise ImageError(f"{where}: {width} x {height} pixels are more than the {MOST_PIXELS} that are decoded")

@@ -1,7 +1,7 @@
-"""Detection in all images of a log, on all cores; only the few images in work are held in memory.
+"""Detection in all images of a log, on all cores; memory holds only the few images in work.
 
-Threads begin at once, and work on all of a short log. They share Python's lock, and half of the work is NumPy's: in a
-long log processes take over, whose start takes a second or two.
+Threads start at once, and do all the work of a short log. They share Python's lock, and half of the work is NumPy's:
+in a long log processes take over, which need a second or two to start.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from loky import ProcessPoolExecutor, cpu_count
 
 from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.logs.records import ImageRecord
+from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.detection import Detector, ImageDetections
 from gtsam_rwhec.vision.images import Gray, decode_gray
 
-#: Images that are looked at together: enough for the refinement to be cheap, few enough to hold.
+#: Images in a batch: enough that their common refinement is cheap, few enough for the memory.
 BATCH = 32
-#: Images that threads look at, before processes are started for the others.
+#: Images for the threads, before processes start for the other images.
 FEW = 320
-#: What processes find in their environment: one thread each for linear algebra, as there is one of them for each core.
+#: Environment of the processes: linear algebra uses one thread in each, since each core has its process.
 _ONE_THREAD = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
@@ -34,7 +35,7 @@ _ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True)
 class DetectedImage:
-    """One image: what was detected in it, or why nothing could be."""
+    """One image with its detections, or with the fault that prevented detection."""
 
     topic: str
     stamp_ns: int
@@ -50,20 +51,20 @@ def detect_in_images(
     few: int = FEW,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[DetectedImage]:
-    """Decode and detect.
+    """Decode images and detect targets in them.
 
     Parameters
     ----------
     images
-        Of any of the topics, in any order; read as they are needed.
+        Images of these topics, in any order; read when they are needed.
     make_detector : dict of topic to function
-        Called once in each thread or process: detectors are not for several.
+        Called once in each thread or process, since two threads must not use one detector.
     workers : int, optional
-        Threads or processes at work; left out, as many as there are cores for this process.
+        Number of threads or processes; by default the number of cores that this process may use.
     few : int
-        Beyond so many images processes take over from threads.
+        After this many images processes take over from threads.
     progress : callable, optional
-        Told how many images are done.
+        Called with the number of images that are done.
 
     Yields
     ------
@@ -71,12 +72,6 @@ def detect_in_images(
         One for each image, in batches of a topic.
     """
     count = workers or cpu_count()
-    local = threading.local()
-
-    def look(batch: list[ImageRecord]) -> list[DetectedImage]:
-        detectors = local.__dict__.setdefault("detectors", {})
-        return _look(batch, _kept(detectors, batch[0].topic, make_detector[batch[0].topic]))
-
     done = 0
 
     def results(future: Future[list[DetectedImage]]) -> list[DetectedImage]:
@@ -87,14 +82,15 @@ def detect_in_images(
             progress(done)
         return of_batch
 
-    with _quiet_on_one_thread(), ThreadPoolExecutor(count) as threads, _Processes(count) as processes:
+    with _opencv_as_before(), ThreadPoolExecutor(count) as threads, _Processes(count) as processes:
+        _quiet_on_one_thread()
         waiting: deque[Future[list[DetectedImage]]] = deque()
         try:
             for number, batch in enumerate(_batches(images)):
                 if count > 1 and number * BATCH >= few and processes.are_ready():
                     waiting.append(processes.submit(batch, make_detector[batch[0].topic]))
                 else:
-                    waiting.append(threads.submit(look, batch))
+                    waiting.append(threads.submit(_look, batch, make_detector[batch[0].topic]))
                 while len(waiting) > count + 1 or (waiting and waiting[0].done()):
                     yield from results(waiting.popleft())
             while waiting:
@@ -105,7 +101,7 @@ def detect_in_images(
 
 
 class _Processes:
-    """Started when they are first asked for; killed when what needs them ends early."""
+    """Processes that start when they are first asked for, and are killed when the detection ends early."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -113,15 +109,15 @@ class _Processes:
         self._starting: list[Future[int]] = []
 
     def are_ready(self) -> bool:
-        """Whether they can take work at once; what imports take there goes on beside the threads' work."""
+        """Whether the processes can take work at once. They start, and import, while the threads work."""
         if self._pool is None:
-            self._pool = ProcessPoolExecutor(self.count, env=_ONE_THREAD)
-            self._starting = [self._pool.submit(_nothing) for _ in range(self.count)]
+            self._pool = ProcessPoolExecutor(self.count, env=_ONE_THREAD, initializer=_quiet_on_one_thread)
+            self._starting = [self._pool.submit(int) for _ in range(self.count)]
         return all(future.done() for future in self._starting)
 
     def submit(self, batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> Future[list[DetectedImage]]:
         assert self._pool is not None
-        future: Future[list[DetectedImage]] = self._pool.submit(_look_in_process, batch, make_detector)
+        future: Future[list[DetectedImage]] = self._pool.submit(_look, batch, make_detector)
         return future
 
     def __enter__(self) -> _Processes:
@@ -132,53 +128,43 @@ class _Processes:
             self._pool.shutdown(wait=True, kill_workers=kind is not None or not self.are_ready())
 
 
-def _nothing() -> int:
-    """What a process does first: import this module."""
-    return cv2.getNumThreads()
+#: Detectors by topic, in each thread. A thread, and a process, works for one call of `detect_in_images` only.
+_of_thread = threading.local()
 
 
-#: Of this process, which has work of one call of `detect_in_images` only.
-_detectors: dict[str, Detector] = {}
-
-
-def _look_in_process(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> list[DetectedImage]:
-    with _quiet_on_one_thread():
-        return _look(batch, _kept(_detectors, batch[0].topic, make_detector))
-
-
-def _kept(detectors: dict[str, Detector], topic: str, make_detector: Callable[[], Detector]) -> Detector:
+def _look(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> list[DetectedImage]:
+    """Detect in images of one topic, with a detector of this thread."""
+    detectors: dict[str, Detector] = _of_thread.__dict__.setdefault("detectors", {})
+    topic = batch[0].topic
     if topic not in detectors:
         detectors[topic] = make_detector()
-    return detectors[topic]
-
-
-def _look(batch: list[ImageRecord], detector: Detector) -> list[DetectedImage]:
-    grays: list[Gray | None] = []
-    faults: list[str] = []
-    wanted = detector.camera.height, detector.camera.width
-    for image in batch:
-        gray, fault = None, ""
-        try:
-            gray = decode_gray(image)
-        except ImageError as error:
-            fault = str(error)
-        if gray is not None and gray.shape != wanted:
-            fault = (
-                f"topic {image.topic}, image at {image.stamp_ns} ns: {gray.shape[1]} x {gray.shape[0]} pixels, but the "
-                f"intrinsics are for {wanted[1]} x {wanted[0]}"
-            )
-            gray = None
-        grays.append(gray)
-        faults.append(fault)
-    found = iter(detector([gray for gray in grays if gray is not None]))
+    camera = detectors[topic].camera
+    decoded = [_decoded(image, camera) for image in batch]
+    found = iter(detectors[topic]([gray for gray in decoded if not isinstance(gray, str)]))
     return [
-        DetectedImage(image.topic, image.stamp_ns, None if gray is None else next(found), fault)
-        for image, gray, fault in zip(batch, grays, faults, strict=True)
+        DetectedImage(topic, image.stamp_ns, None, gray)
+        if isinstance(gray, str)
+        else DetectedImage(topic, image.stamp_ns, next(found))
+        for image, gray in zip(batch, decoded, strict=True)
     ]
 
 
+def _decoded(image: ImageRecord, camera: Camera) -> Gray | str:
+    """The pixels of an image, or the reason why there are none."""
+    try:
+        gray = decode_gray(image)
+    except ImageError as error:
+        return str(error)
+    if gray.shape == (camera.height, camera.width):
+        return gray
+    return (
+        f"topic {image.topic}, image at {image.stamp_ns} ns: {gray.shape[1]} x {gray.shape[0]} pixels, but the "
+        f"intrinsics are for {camera.width} x {camera.height}"
+    )
+
+
 def _batches(images: Iterable[ImageRecord]) -> Iterator[list[ImageRecord]]:
-    """Up to `BATCH` images of one topic."""
+    """Batches of up to `BATCH` images of one topic."""
     open_batches: dict[str, list[ImageRecord]] = {}
     for image in images:
         batch = open_batches.setdefault(image.topic, [])
@@ -189,11 +175,9 @@ def _batches(images: Iterable[ImageRecord]) -> Iterator[list[ImageRecord]]:
 
 
 @contextmanager
-def _quiet_on_one_thread() -> Iterator[None]:
-    """OpenCV's own threads would fight with ours, and faults are told by us."""
+def _opencv_as_before() -> Iterator[None]:
+    """Give OpenCV its number of threads and its log level back."""
     threads, level = cv2.getNumThreads(), cv2.utils.logging.getLogLevel()
-    cv2.setNumThreads(1)
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
     finally:
@@ -201,23 +185,29 @@ def _quiet_on_one_thread() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
+def _quiet_on_one_thread() -> None:
+    """Let OpenCV use one thread, since each core has one of ours, and print nothing: we report the faults."""
+    cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
 def measured_corner_px(squared_px: np.ndarray, corners: np.ndarray, least_px: float = 0.02) -> float:
-    """Standard deviation of a corner along each axis, from what reprojection leaves.
+    """Standard deviation of a corner along each axis, from reprojection errors.
 
     Parameters
     ----------
     squared_px : (n,)
-        Sums of squared errors of n poses of one target in one camera.
+        Sums of squared errors of n poses of one target in one camera, px^2.
     corners : (n,)
-        How many corners each rests on: 2 corners - 6 equations to spare.
+        Number of corners of each pose; 2 corners - 6 degrees of freedom.
     least_px : float
-        Nothing is seen better than this, however few data say so.
+        The least result: few data can give too small a result.
     """
-    spare = 2 * corners - 6
-    mask = np.isfinite(squared_px) & (spare > 0)
+    freedom = 2 * corners - 6
+    mask = np.isfinite(squared_px) & (freedom > 0)
     if not mask.any():
         return least_px
-    # A few wrong ones must not count: those above six times the median are left out.
-    each = squared_px[mask] / spare[mask]
+    # A few wrong poses must not count: poses above six times the median are left out.
+    each = squared_px[mask] / freedom[mask]
     kept = each <= 6.0 * np.median(each) + 1e-12
-    return max(least_px, float(np.sqrt(squared_px[mask][kept].sum() / spare[mask][kept].sum())))
+    return max(least_px, float(np.sqrt(squared_px[mask][kept].sum() / freedom[mask][kept].sum())))

@@ -1,4 +1,4 @@
-"""Every tag of every family in an image, each place once: small families are found inside the tags of larger ones."""
+"""A survey of the tags of all families in an image. Each place counts once: larger tags contain smaller families."""
 
 from __future__ import annotations
 
@@ -12,20 +12,32 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.dictionaries import tag_detector
 from gtsam_rwhec.vision.images import Gray
 
-#: From the family whose code is least likely to be met by chance: many bits, few tags, far from one another.
+#: Families by trust: the first family's codes are the least likely by chance (many bits, few tags, far apart).
 BY_TRUST = (
     "tag36h11", "aruco_mip_36h12", "aruco_7x7_1000", "aruco_6x6_1000", "tag36h10", "tag25h9", "aruco_5x5_1000",
     "aruco_original", "tag16h5", "aruco_4x4_1000",
 )  # fmt: skip
-#: Kalibr prints AprilGrids of this one, with a double border.
+#: The family of Kalibr's AprilGrids, which have a double border.
 DOUBLE = "tag36h11"
-#: Pixels of a flattened tag.
+#: Side of a flattened tag, pixels.
 SIDE = 50
 
 
 @dataclass(frozen=True, eq=False)
 class SeenTag:
-    """A tag, and whether it reads with an AprilGrid's double border; its middle and side in pixels."""
+    """A tag in an image.
+
+    Attributes
+    ----------
+    family : str
+    id : int
+    is_double : bool
+        Whether the tag has an AprilGrid's double border.
+    middle_px : (2,) array
+        Mean of the corners, pixels.
+    side_px : float
+        Longest side, pixels.
+    """
 
     family: str
     id: int
@@ -35,9 +47,9 @@ class SeenTag:
 
 
 def tags_in_image(gray: Gray, families: Iterable[str] = BY_TRUST) -> list[SeenTag]:
-    """Look for tags of some of the families in `BY_TRUST`.
+    """Tags of some of the families in `BY_TRUST`.
 
-    A place (middles less than half a side apart) where two families are read is the more trustworthy one's.
+    Where two families are read at one place (middles less than half a side apart), the more trustworthy family counts.
     """
     wanted = set(families)
     found: list[SeenTag] = []
@@ -64,9 +76,9 @@ def _of_family(gray: Gray, family: str, border_bits: int) -> list[SeenTag]:
 def _has_double_border(gray: Gray, quad: Array) -> bool:
     """Whether a tag is black in its first and second tenth from the edge, all around.
 
-    With a double border (10 modules) black reaches to 0.2; with a single one (8) there is the code's outer ring from
-    0.125 on, which no tag of the family has all black. (OpenCV reads either tag with either border, so well does it
-    correct errors, and from squares inside and around the tag too.)
+    A double border (10 modules along the side) is black to 0.2 of the side. A single border (8 modules) ends at 0.125,
+    where the code's outer ring begins; no tag of the family has an all black ring. OpenCV's detector cannot tell: its
+    error correction reads either tag with either border.
     """
     square = np.array([[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE]], dtype=np.float32) - 0.5
     flat = cv2.warpPerspective(gray, cv2.getPerspectiveTransform(quad.astype(np.float32), square), (SIDE, SIDE))

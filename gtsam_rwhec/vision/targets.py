@@ -1,7 +1,7 @@
-"""What is printed: tags, ChArUco boards, AprilGrids (Kalibr's) and checkerboards, and where their corners are.
+"""Targets and the places of their corners: tags, ChArUco boards, Kalibr's AprilGrids and checkerboards.
 
-One frame for all: its origin is in the middle of the tag or of the board's pattern, x to the right and y up as
-printed, z out of the paper. Corners of a tag are in OpenCV's order: top left, top right, bottom right, bottom left.
+All targets have the same frame: the origin is the middle of the tag or of the board's pattern, x points to the right
+and y up as printed, z out of the paper. OpenCV orders a tag's corners: top left, top right, bottom right, bottom left.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ import numpy as np
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.geometry.poses import Array
 
-#: How many tags each family has.
+#: Number of tags in each family.
 FAMILIES: dict[str, int] = {
     "tag16h5": 30, "tag25h9": 35, "tag36h10": 2320, "tag36h11": 587,
     **{f"aruco_{n}x{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
     "aruco_original": 1024, "aruco_mip_36h12": 250,
 }  # fmt: skip
+#: Lengths of targets are below this (m): longer lengths are probably millimetres.
 LARGEST_M = 10.0
 
 
@@ -38,12 +39,12 @@ class Tag:
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """The one id."""
+        """The id, as a tuple."""
         return (self.id,)
 
     @property
     def length_m(self) -> float:
-        """The length that its scale is about."""
+        """The length that a scale multiplies."""
         return self.size_m
 
     def corners(self) -> Array:
@@ -53,9 +54,9 @@ class Tag:
 
 @dataclass(frozen=True)
 class Charuco:
-    """A ChArUco board of columns x rows squares; markers in the white ones, counted from first_id.
+    """A ChArUco board of columns x rows squares, with markers in the white squares, numbered from first_id.
 
-    Its corners are the inner corners of the chessboard, numbered as OpenCV does: left to right, from the top.
+    Its corners are the inner corners of the chessboard in OpenCV's order: left to right, from the top.
     """
 
     name: str
@@ -70,19 +71,16 @@ class Charuco:
         _check_grid(self.name, self.columns, self.rows, 2)
         _check(self.name, self.family, self.ids, {"square_m": self.square_m, "marker_m": self.marker_m})
         if not self.marker_m < self.square_m:
-            raise TargetError(
-                f"marker_m = {self.marker_m:g} must be less than square_m = {self.square_m:g}",
-                self.name,
-            )
+            raise TargetError(f"marker_m = {self.marker_m:g} must be less than square_m = {self.square_m:g}", self.name)
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """Of its markers."""
+        """Ids of the markers."""
         return tuple(range(self.first_id, self.first_id + self.columns * self.rows // 2))
 
     @property
     def length_m(self) -> float:
-        """The length that its scale is about."""
+        """The length that a scale multiplies."""
         return self.square_m
 
     def corners(self) -> Array:
@@ -94,7 +92,7 @@ class Charuco:
 class AprilGrid:
     """Kalibr's AprilGrid: columns x rows tags with a double black border, spacing = gap / tag_m.
 
-    Ids count from first_id at the bottom left, to the right, then up. Corners are the tags', four each, in that order.
+    Ids count from first_id at the bottom left, to the right, then up. Corners are the tags' corners in that order.
     """
 
     name: str
@@ -110,18 +108,18 @@ class AprilGrid:
         _check(self.name, self.family, self.ids, {"tag_m": self.tag_m})
         if not 0.0 < self.spacing <= 10.0:
             raise TargetError(
-                f"spacing = {self.spacing!r}; Kalibr's is gap / tag size, 0.3 as a rule",
+                f"spacing = {self.spacing!r}; give gap / tag size, above 0 and at most 10 (Kalibr's default is 0.3)",
                 self.name,
             )
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """Of its tags."""
+        """Ids of the tags."""
         return tuple(range(self.first_id, self.first_id + self.columns * self.rows))
 
     @property
     def length_m(self) -> float:
-        """The length that its scale is about."""
+        """The length that a scale multiplies."""
         return self.tag_m
 
     def corners(self) -> Array:
@@ -136,8 +134,7 @@ class AprilGrid:
 class Checkerboard:
     """A checkerboard of columns x rows inner corners, numbered left to right, from the top.
 
-    Unless one of the two is even and the other odd, a board turned by half a turn looks the same, and poses may be of
-    either.
+    One of columns and rows must be even and the other odd: any other board looks the same after half a turn.
     """
 
     name: str
@@ -167,7 +164,7 @@ class Checkerboard:
 
     @property
     def length_m(self) -> float:
-        """The length that its scale is about."""
+        """The length that a scale multiplies."""
         return self.square_m
 
     def corners(self) -> Array:
@@ -188,7 +185,7 @@ def is_same_print(first: str, second: str) -> bool:
 
 
 def family_named(word: str) -> str | None:
-    """The family that a driver means by a word; None if it is none of `FAMILIES`."""
+    """The family of `FAMILIES` that a driver means by a word; None if there is none."""
     bare = _bare(word)
     return next((family for family in (f"tag{bare}", f"aruco_{bare}") if family in FAMILIES), None)
 

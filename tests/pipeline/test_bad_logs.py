@@ -353,7 +353,7 @@ def test_a_drivers_size_that_is_not_the_rig_files(tmp_path: Path) -> None:
     ("data", "words"),
     [
         (b"no picture at all", "17 bytes that begin with 6e6f20706963"),
-        (picture()[:60], "60 bytes of a PNG that goes on"),
+        (picture()[:60], "60 bytes of a PNG file that is cut short"),
     ],
 )
 def test_images_that_do_not_decode(tmp_path: Path, data: bytes, words: str) -> None:

@@ -82,7 +82,7 @@ FAULTS = [
     ("marker_m: 0.03075", "marker_m: 0.05", 26, "targets.board: marker_m = 0.05 must be less than square_m ="),
     ("columns: 9, rows: 6", "columns: 8, rows: 6", 28, "targets.chess: a checkerboard of 8 x 6 inner corners looks"),
     ("columns: 9, rows: 6", "columns: 9000000000, rows: 6", 28, "targets.chess: 9000000000 columns and 6 rows; each"),
-    ("spacing: 0.3", "spacing: 30", 27, "targets.grid: spacing = 30.0; Kalibr's is gap / tag size, 0.3 as a rule"),
+    ("spacing: 0.3", "spacing: 30", 27, "targets.grid: spacing = 30.0; give gap / tag size, above 0 and at most 10"),
     ("sizes: check", "  chess_b: {type: checkerboard, columns: 6, rows: 9, square_m: 1}", 29, "like chess: no image"),
     ("sizes: check", "  t: {type: tag, family: aruco_5x5_50, id: 16, size_m: 1}", 29, "belong to target board"),
     ("noise: estimate", "noise: guess", 30, "noise: 'guess'; give 'estimate' or a section"),

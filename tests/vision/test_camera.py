@@ -211,7 +211,7 @@ def changed(row: int, column: int, value: float) -> np.ndarray:
         ((640, 480), "plumb_bob", changed(0, 1, 0.5), (), "must be"),
         ((640, 480), "plumb_bob", changed(2, 2, 0.0), (), "must be"),
         ((640, 480), "plumb_bob", changed(0, 0, -420.0), (), "fx = -420"),
-        ((640, 480), "plumb_bob", changed(1, 1, 0.0036), (), "fy = 0.0036 .* another unit"),
+        ((640, 480), "plumb_bob", changed(1, 1, 0.0036), (), "fy = 0.0036 .* is the unit pixels"),
         ((640, 480), "plumb_bob", changed(0, 0, 1e6), (), r"fx = 1e\+06"),
         ((640, 480), "plumb_bob", changed(0, 2, 2000.0), (), "cx = 2000"),
         ((640, 480), "plumb_bob", changed(1, 2, -600.0), (), "cy = -600"),
