@@ -1,4 +1,4 @@
-"""Images of a log to poses of tags and boards, each with its covariance and what was rejected, with OpenCV."""
+"""Poses of tags and boards from the images of a log, with covariances and the reasons of rejected detections."""
 
 import lazy_loader
 

@@ -1,10 +1,6 @@
-# Targets and cameras.
-# The steps of detection: corners to a fraction of a pixel, poses, the choice between a plane's two poses.
 from .ambiguity import Choice as Choice
 from .ambiguity import choose_over_time as choose_over_time
 from .camera import Camera as Camera
-
-# Detection, in one image or in all images of a log.
 from .detection import Detection as Detection
 from .detection import Detector as Detector
 from .detection import ImageDetections as ImageDetections

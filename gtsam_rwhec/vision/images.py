@@ -79,7 +79,8 @@ def _raw(image: ImageRecord, where: str) -> Gray:
     channels, size, code = _RAW[encoding]
     if width < 1 or height < 1 or step < width * channels * size or len(image.data) < step * height:
         raise ImageError(
-            f"{where}: {width} x {height} pixels of {encoding} in rows of {step} bytes do not fit {len(image.data)} bytes"
+            f"{where}: {width} x {height} pixels of {encoding} in rows of {step} bytes do not fit {len(image.data)} "
+            "bytes"
         )
     if width * height > MOST_PIXELS:
         raise ImageError(f"{where}: {width} x {height} pixels are more than the {MOST_PIXELS} that are decoded")

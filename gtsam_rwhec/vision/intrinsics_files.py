@@ -1,12 +1,13 @@
-"""Intrinsics from files: Kalibr's camchains, ROS's camera_info YAML, and what OpenCV's FileStorage writes.
+"""Intrinsics from files: Kalibr's camchains, ROS's camera_info YAML, and YAML of OpenCV's FileStorage.
 
-OpenCV's own reader is not used: it gives no lines, and takes nearly anything.
+OpenCV's own reader is not used: it gives no line numbers and accepts nearly any content.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,7 +18,7 @@ from gtsam_rwhec.files.yaml_lines import OPENCV_MATRIX, KeyPath, YamlFile, parse
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import MODELS, Camera
 
-#: Kalibr's words for distortion of its camera model pinhole.
+#: Kalibr's distortion models of its camera model pinhole.
 KALIBR_DISTORTIONS = ("none", "radtan", "equidistant")
 _KALIBR_CAMERA = re.compile(r"cam\d+")
 #: Keys of intrinsics, in lower case and without underscores, as ROS, OpenCV's samples and people write them.
@@ -25,6 +26,10 @@ _WIDTH, _HEIGHT = ("imagewidth", "width"), ("imageheight", "height")
 _MATRIX = ("cameramatrix", "k")
 _COEFFICIENTS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "d")
 _MODEL = ("distortionmodel", "cameramodel")
+#: Names of the needed fields, for messages.
+_FIELDS = {
+    _WIDTH: "image_width", _HEIGHT: "image_height", _MATRIX: "camera_matrix", _COEFFICIENTS: "distortion_coefficients",
+}  # fmt: skip
 
 
 def read_kalibr_camchain(path: str | Path) -> dict[str, Camera]:
@@ -34,19 +39,19 @@ def read_kalibr_camchain(path: str | Path) -> dict[str, Camera]:
     ----------
     path
         Each camera has camera_model (pinhole), intrinsics [fu, fv, pu, pv], distortion_model (none, radtan or
-        equidistant), distortion_coeffs and resolution [width, height]. Poses and time shifts are passed over.
+        equidistant), distortion_coeffs and resolution [width, height]. Poses and time shifts are not read.
 
     Returns
     -------
     dict of str to Camera
-        By Kalibr's names, ``cam0`` and so on.
+        By Kalibr's names: ``cam0``, ``cam1`` and so on.
 
     Raises
     ------
     FileFormatError
-        It cannot be read or is no camchain, a field is missing or is not what it should be; with its line.
+        The file cannot be read or is not a camchain, or a field is missing or wrong. The message has the line.
     CameraError
-        The intrinsics are those of no camera.
+        No camera has these intrinsics.
     """
     file = read_yaml(path)
     chain = file.data if isinstance(file.data, dict) else {}
@@ -65,19 +70,12 @@ def _kalibr_camera(file: YamlFile, name: str) -> Camera:
         if key not in section:
             _refuse(file, (name, key), "is missing")
     if section["camera_model"] != "pinhole":
-        _refuse(
-            file,
-            (name, "camera_model"),
-            f"{shown(section['camera_model'])} is not supported, only pinhole is; calibrate with Kalibr's "
-            "pinhole-radtan or, for wide lenses, pinhole-equi",
-        )
+        advice = "calibrate with Kalibr's pinhole-radtan or, for wide lenses, pinhole-equi"
+        words = f"{shown(section['camera_model'])} is not supported, only pinhole is; {advice}"
+        _refuse(file, (name, "camera_model"), words)
     model = section["distortion_model"]
     if model not in KALIBR_DISTORTIONS:
-        _refuse(
-            file,
-            (name, "distortion_model"),
-            f"{shown(model)} is not supported; supported are {', '.join(KALIBR_DISTORTIONS)}",
-        )
+        _refuse(file, (name, "distortion_model"), _unsupported(model, KALIBR_DISTORTIONS))
     fu, fv, pu, pv = _numbers(file, (name, "intrinsics"), section["intrinsics"], 4)
     resolution = _numbers(file, (name, "resolution"), section["resolution"], 2)
     width, height = (_pixels(file, (name, "resolution"), float(side)) for side in resolution)
@@ -88,23 +86,23 @@ def _kalibr_camera(file: YamlFile, name: str) -> Camera:
 
 
 def read_calibration_yaml(path: str | Path) -> Camera:
-    """Read a camera from ROS's camera_info YAML (``ost.yaml``) or from what OpenCV's FileStorage writes.
+    """Read a camera from ROS's camera_info YAML (``ost.yaml``) or from YAML of OpenCV's FileStorage.
 
     Parameters
     ----------
     path
-        With image_width, image_height, camera_matrix, distortion_coefficients, and distortion_model. Where there is no
-        distortion_model, fisheye_model (OpenCV's sample) tells; five coefficients or more are OpenCV's radtan.
+        Has image_width, image_height, camera_matrix, distortion_coefficients, and distortion_model. Without a
+        distortion_model, fisheye_model (of OpenCV's sample) tells the model; five coefficients or more are radtan.
 
     Raises
     ------
     FileFormatError
-        It cannot be read, a field is missing or is not what it should be, or four coefficients could be of either
-        model; with the line.
+        The file cannot be read, a field is missing or wrong, or four coefficients fit two models. The message has the
+        line.
     CameraError
-        The intrinsics are those of no camera.
+        No camera has these intrinsics.
     """
-    # OpenCV's "%YAML:1.0" is no directive of YAML's.
+    # OpenCV begins with "%YAML:1.0", which is not valid YAML.
     text = re.sub(r"\A%YAML:", "%YAML ", read_text(path))
     file = parse_yaml(text, str(path), tags=(OPENCV_MATRIX,))
     fields = file.data if isinstance(file.data, dict) else {}
@@ -123,11 +121,7 @@ def _model(file: YamlFile, D: Array) -> str:
     if key is not None:
         word = fields[key]
         if not isinstance(word, str) or word.strip().lower() not in MODELS:
-            _refuse(
-                file,
-                (key,),
-                f"{shown(word)} is not supported; supported are {', '.join(word for word in MODELS if word)}",
-            )
+            _refuse(file, (key,), _unsupported(word, filter(None, MODELS)))
         return word
     fisheye = _found(fields, ("fisheyemodel",))
     if fisheye is not None:
@@ -135,17 +129,14 @@ def _model(file: YamlFile, D: Array) -> str:
             _refuse(file, (fisheye,), f"{shown(fields[fisheye])}; give 0 or 1")
         return "fisheye" if fields[fisheye] else "radtan"
     if len(D) == 4 and D.any():
-        _refuse(
-            file,
-            (_key(file, _COEFFICIENTS),),
-            "four coefficients, which OpenCV's fisheye model has and its other one can have; add a line "
-            "distortion_model: fisheye, or distortion_model: radtan",
-        )
+        words = "four coefficients can be of OpenCV's fisheye model or of its radtan model; add a line "
+        words += "distortion_model: fisheye, or distortion_model: radtan"
+        _refuse(file, (_key(file, _COEFFICIENTS),), words)
     return "radtan"
 
 
 def _found(fields: dict[str, Any], names: tuple[str, ...]) -> str | None:
-    """The key that stands for one of `names`, if there is one."""
+    """The key of the file that stands for one of `names`, or None."""
     plain = {key.lower().replace("_", ""): key for key in reversed(fields)}
     return next((plain[name] for name in names if name in plain), None)
 
@@ -153,25 +144,17 @@ def _found(fields: dict[str, Any], names: tuple[str, ...]) -> str | None:
 def _key(file: YamlFile, names: tuple[str, ...]) -> str:
     key = _found(file.data, names) if isinstance(file.data, dict) else None
     if key is None:
-        _refuse(
-            file,
-            (),
-            f"no {_SAID[names]}; a calibration with image_width, image_height, camera_matrix and "
-            "distortion_coefficients was expected (as ROS's camera_info and OpenCV's samples have it)",
-        )
+        words = f"no {_FIELDS[names]}; give a calibration with {', '.join(_FIELDS.values())}, as ROS's camera_info and "
+        _refuse(file, (), words + "OpenCV's samples have it")
     return key
 
 
-_SAID = {
-    _WIDTH: "image_width",
-    _HEIGHT: "image_height",
-    _MATRIX: "camera_matrix",
-    _COEFFICIENTS: "distortion_coefficients",
-}
+def _unsupported(value: Any, supported: Iterable[str]) -> str:
+    return f"{shown(value)} is not supported; supported are {', '.join(supported)}"
 
 
 def _matrix(file: YamlFile, key: str, count: int | None) -> Array:
-    """Numbers of a matrix: {rows, cols, data}, a list, or a list of rows."""
+    """The numbers of a matrix, given as {rows, cols, data}, as a list, or as a list of rows."""
     value, path = file.data[key], (key,)
     if not isinstance(value, dict):
         if isinstance(value, tuple) and value and all(isinstance(row, tuple) for row in value):

@@ -176,9 +176,9 @@ Target: TypeAlias = Tag | Charuco | AprilGrid | Checkerboard
 
 
 def is_same_print(first: str, second: str) -> bool:
-    """Whether tags with the same id look the same in two families, which drivers may name in their own words.
+    """Whether tags with the same id look the same in two families, named by drivers' words.
 
-    ArUco's smaller dictionaries are the beginning of its larger ones: their sizes do not matter.
+    ArUco's larger dictionaries begin with the tags of its smaller dictionaries: their sizes do not matter.
     """
     a, b = (re.sub(r"^(\dx\d)_\d+$", r"\1", _bare(word)) for word in (first, second))
     return a == b
@@ -191,7 +191,7 @@ def family_named(word: str) -> str | None:
 
 
 def _bare(word: str) -> str:
-    """36h11 of tag36h11, tagStandard36h11 and DICT_APRILTAG_36h11: what the words of drivers for a family share."""
+    """The core of a driver's word: 36h11 for tag36h11, tagStandard36h11 and DICT_APRILTAG_36h11."""
     return re.sub(r"^(dict_)?(apriltag_|aruco_)?(tag)?(standard)?", "", word.strip().lower())
 
 

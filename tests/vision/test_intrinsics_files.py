@@ -179,7 +179,7 @@ def test_other_names(path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("image_width: 640\n", "", "line 1: no image_width; a calibration with image_width, image_height"),
+        ("image_width: 640\n", "", "line 1: no image_width; give a calibration with image_width, image_height"),
         ("image_height: 480\n", "", "line 1: no image_height"),
         ("image_width: 640", "image_width: wide", "line 1: image_width: 'wide'; a whole number of pixels was expected"),
         ("camera_matrix:", "camera_matrices:", "line 1: no camera_matrix"),
