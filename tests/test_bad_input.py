@@ -11,11 +11,12 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from rwhec_factors.se3 import inverse, pose
 
 import gtsam_rwhec as rw
 from gtsam_rwhec import errors
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.simulate.transforms import inverse, pose, random_poses
+from gtsam_rwhec.simulate.transforms import random_poses
 
 GENERATOR = np.random.default_rng(5)
 X_TRUE, Y_TRUE = random_poses(2, 1.0, GENERATOR)

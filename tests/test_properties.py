@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_cost import naive_cost
+from rwhec_factors.se3 import inverse, pose
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
-from gtsam_rwhec.simulate.transforms import inverse, pose, random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.transforms import random_poses, rotations_of_vectors
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.forms import Forms

@@ -36,14 +36,18 @@ def hat(v: Array) -> Array:
 HATS = hat(np.eye(3))
 
 
+def pose(R: Any, t: Any) -> Array:
+    """T_a_b (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3), whose leading dimensions are broadcast."""
+    rotation, translation = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    T = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation, translation, 1.0
+    return T
+
+
 def inverse(T: Array) -> Array:
-    """T_b_a from T_a_b."""
-    Rt = T[:, :3, :3].transpose(0, 2, 1)
-    result = np.zeros_like(T)
-    result[:, :3, :3] = Rt
-    result[:, :3, 3] = -np.einsum("nij,nj->ni", Rt, T[:, :3, 3])
-    result[:, 3, 3] = 1.0
-    return result
+    """T_b_a (..., 4, 4) from T_a_b."""
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    return pose(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
 
 
 def adjoint(T: Array) -> Array:
@@ -101,12 +105,9 @@ def expmap(xi: Array) -> Array:
     angle = np.linalg.norm(omega, axis=1)
     b, c, _ = _coefficients(angle)
     a = np.sinc(angle / np.pi)
-    result = np.zeros((len(xi), 4, 4))
-    result[:, :3, :3] = np.eye(3) + a[:, None, None] * W + b[:, None, None] * W2
+    R = np.eye(3) + a[:, None, None] * W + b[:, None, None] * W2
     left_jacobian = np.eye(3) + b[:, None, None] * W + c[:, None, None] * W2
-    result[:, :3, 3] = np.einsum("nij,nj->ni", left_jacobian, xi[:, 3:])
-    result[:, 3, 3] = 1.0
-    return result
+    return pose(R, np.einsum("nij,nj->ni", left_jacobian, xi[:, 3:]))
 
 
 def logmap(T: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Poses as users give them, checked; and covariances of poses between frames and conventions."""
+"""Poses as users give them, checked; quaternions; covariances of poses in other frames and conventions."""
 
 import lazy_loader
 

@@ -1,7 +1,7 @@
-"""What users give as poses, brought to one shape and checked.
+"""Poses as users give them, brought to one shape and checked.
 
-Accepted: arrays (N, 4, 4), sequences of ``gtsam.Pose3``, arrays (N, 7) of a quaternion and a translation with the
-order of the quaternion named. Checks run on blocks, so that memory beyond the input does not grow with N.
+Poses may be arrays (N, 4, 4), sequences of ``gtsam.Pose3``, or arrays (N, 7) of a quaternion of named order and a
+translation. Checks run on blocks, so that memory beyond the input does not grow with N.
 """
 
 from __future__ import annotations
@@ -12,25 +12,27 @@ from typing import Any, Literal
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from rwhec_factors import se3
 
 from gtsam_rwhec.errors import PoseError
+from gtsam_rwhec.geometry.quaternions import to_rotations
 
-#: Arrays of real numbers; double precision unless said otherwise.
+#: Arrays of real numbers, in double precision unless a docstring says otherwise.
 Array = NDArray[np.floating[Any]]
 QuaternionOrder = Literal["wxyz", "xyzw"]
 PoseLike = ArrayLike | gtsam.Pose3
 PosesLike = ArrayLike | Sequence[gtsam.Pose3]
 
-#: A rotation block further than this from R'R = I (largest entry) is refused; a nearer one is projected.
+#: A rotation whose R'R differs by more than this from I (largest entry) is refused; a closer one is projected.
 ROTATION_TOLERANCE = 1e-3
-#: Translations beyond this are no poses: their squares would drown everything.
+#: Larger translations (m) are refused: their squares would drown all others.
 LARGEST_M = 1e15
-#: Deviations below this are rounding and are left as they are.
+#: Differences of R'R from I below this are rounding, and the rotation stays as it is.
 ROTATION_ROUNDING = 1e-13
 
 
 def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -> Array:
-    """Bring poses to an (N, 4, 4) array, without looking at the values of the matrices.
+    """Poses as an (N, 4, 4) array. The values of matrices are not checked.
 
     Parameters
     ----------
@@ -39,11 +41,12 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
     order : "wxyz" or "xyzw" or None
         Order of the quaternion's entries; needed for rows of 7 only.
     where : str
-        Said in errors: which argument of which pair.
+        For errors: which argument of which pair.
 
     Returns
     -------
-    (N, 4, 4) float64 array; the input itself where it has this form already.
+    (N, 4, 4) array
+        The input itself, not a copy, where it has this form already.
 
     Raises
     ------
@@ -68,7 +71,7 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
         raise PoseError(
             f"{where}: cannot be read as numbers ({error}); give (N,4,4), (N,7) or a list of gtsam.Pose3"
         ) from error
-    if array.ndim == 2 and array.shape == (4, 4):
+    if array.shape == (4, 4):
         return array[None]
     if array.ndim == 3 and array.shape[1:] == (4, 4):
         if order is not None:
@@ -80,7 +83,7 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
         return _from_quaternion_rows(array, order, where)
     if array.size == 0:
         return np.empty((0, 4, 4))
-    raise PoseError(f"{where}: shape {array.shape} is not one of (N, 4, 4), (N, 7) and no list of gtsam.Pose3")
+    raise PoseError(f"{where}: shape {array.shape} is not a pose's; give (N, 4, 4), (N, 7) or a list of gtsam.Pose3")
 
 
 def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str) -> Array:
@@ -94,29 +97,15 @@ def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str
             f"{where}: measurement {bad[0]} has an entry that is NaN or infinite: {rows[bad[0]]}; "
             "leave the measurement out"
         )
-    w, x, y, z = rows[:, [0, 1, 2, 3] if order == "wxyz" else [3, 0, 1, 2]].T
-    norm_squared = w * w + x * x + y * y + z * z
-    off = np.flatnonzero(np.abs(np.sqrt(norm_squared) - 1.0) > 1e-2)
+    norm = np.linalg.norm(rows[:, :4], axis=1)
+    off = np.flatnonzero(np.abs(norm - 1.0) > 1e-2)
     if off.size:
         i = off[0]
         raise PoseError(
-            f"{where}: the quaternion of measurement {i} has norm {np.sqrt(norm_squared[i]):.6g}, not 1 "
+            f"{where}: the quaternion of measurement {i} has norm {norm[i]:.6g}, not 1 "
             f"({rows[i, :4]}); normalise it, or check the columns and order={order!r}"
         )
-    s = 2.0 / norm_squared
-    transforms = np.zeros((len(rows), 4, 4))
-    transforms[:, 0, 0] = 1.0 - s * (y * y + z * z)
-    transforms[:, 0, 1] = s * (x * y - w * z)
-    transforms[:, 0, 2] = s * (x * z + w * y)
-    transforms[:, 1, 0] = s * (x * y + w * z)
-    transforms[:, 1, 1] = 1.0 - s * (x * x + z * z)
-    transforms[:, 1, 2] = s * (y * z - w * x)
-    transforms[:, 2, 0] = s * (x * z - w * y)
-    transforms[:, 2, 1] = s * (y * z + w * x)
-    transforms[:, 2, 2] = 1.0 - s * (x * x + y * y)
-    transforms[:, :3, 3] = rows[:, 4:]
-    transforms[:, 3, 3] = 1.0
-    return transforms
+    return se3.pose(to_rotations(rows[:, [1, 2, 3, 0] if order == "wxyz" else [0, 1, 2, 3]]), rows[:, 4:])
 
 
 def checked_rows(block: Array, first: int, where: str, out: Array | None = None) -> tuple[Array, int]:
@@ -126,22 +115,23 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
     ----------
     block : (b, 4, 4) array
     first : int
-        Index of the block's first measurement, for messages.
+        Index of the block's first measurement, for errors.
     where : str
+        For errors: which argument of which pair.
     out : (12, b) array, optional
-        Where the rows go; given, nothing is copied twice.
+        Takes the rows, which saves a copy.
 
     Returns
     -------
     rows : (12, b) array
-        vec(R), column after column, then t: each entry a contiguous row.
+        vec(R), column after column, then t: each entry is a contiguous row.
     projected : int
-        How many rotations were off by more than rounding and were projected to SO(3).
+        Number of rotations that were off by more than rounding and were projected to SO(3).
 
     Raises
     ------
     PoseError
-        NaN or infinite entries, a last row other than 0 0 0 1, a block that is no rotation, a left-handed one.
+        For NaN or infinite entries, a last row other than 0 0 0 1, or a block that is not a right-handed rotation.
     """
     rows = np.empty((12, len(block))) if out is None else out
     for column in range(4):
@@ -153,7 +143,7 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
             f"{where}: measurement {first + index} has an entry that is NaN, infinite or too large; "
             f"leave the measurement out:\n{block[index]}"
         )
-    # Almost always exact; asked entry by entry, which takes half the time of one pass over a strided block.
+    # The last row is almost always exact. Asking entry by entry takes half the time of one pass over a strided block.
     exact = not (block[:, 3, 0].any() or block[:, 3, 1].any() or block[:, 3, 2].any() or (block[:, 3, 3] != 1.0).any())
     last = 0.0 if exact else np.abs(block[:, 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=1)
     if not np.max(last) <= 1e-9:  # NaN is refused too
@@ -168,7 +158,7 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
         index = int(deviation.argmax())
         raise PoseError(
             f"{where}: the rotation of measurement {first + index} is off by {deviation[index]:.3g} "
-            f"(largest entry of R'R - I; up to {ROTATION_TOLERANCE:g} is let through and projected); check the layout "
+            f"(largest entry of R'R - I; up to {ROTATION_TOLERANCE:g} is projected); check the layout "
             f"of the matrices, or give quaternions:\n{block[index, :3, :3]}"
         )
     handed = determinant(rows)
@@ -187,7 +177,7 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
 
 
 def orthonormality(rows: Array) -> Array:
-    """Largest entry of |R'R - I| of each column of ``rows`` (12 or 9, b)."""
+    """Largest entry of |R'R - I| (b,) of ``rows`` (12 or 9, b)."""
     c = rows[:9].reshape(3, 3, -1)
     deviation: Array = np.abs((c[0] * c[0]).sum(axis=0) - 1.0)
     for i, j in ((1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
@@ -196,14 +186,14 @@ def orthonormality(rows: Array) -> Array:
 
 
 def determinant(rows: Array) -> Array:
-    """Determinant of each column of ``rows`` (12 or 9, b)."""
+    """Determinants (b,) of ``rows`` (12 or 9, b)."""
     (a0, a1, a2), (b0, b1, b2), (c0, c1, c2) = rows[:9].reshape(3, 3, -1)
     result: Array = a0 * (b1 * c2 - b2 * c1) + a1 * (b2 * c0 - b0 * c2) + a2 * (b0 * c1 - b1 * c0)
     return result
 
 
 def polar_step(rows: Array) -> Array:
-    """One Newton-Schulz step R (3 I - R'R) / 2 toward the nearest rotation (Higham 2008, eq. 8.20)."""
+    """One Newton-Schulz step R (3 I - R'R) / 2 towards the nearest rotation (Higham 2008, eq. 8.20), (9, b)."""
     c = rows[:9].reshape(3, 3, -1)  # c[j] is column j of R
     gram = np.einsum("jib,kib->jkb", c, c)
     step: Array = 1.5 * c - 0.5 * np.einsum("jib,jkb->kib", c, gram)
@@ -211,13 +201,7 @@ def polar_step(rows: Array) -> Array:
 
 
 def one_transform(pose: PoseLike, where: str) -> Array:
-    """One pose as a checked (4, 4) array.
-
-    Raises
-    ------
-    PoseError
-        When it is no pose.
-    """
+    """One pose as a checked (4, 4) array; a PoseError when it is not a valid pose."""
     transforms = as_transforms([pose] if isinstance(pose, gtsam.Pose3) else np.asarray(pose), None, where)
     if len(transforms) != 1:
         raise PoseError(f"{where}: {len(transforms)} poses where one is expected; give one")
@@ -227,11 +211,9 @@ def one_transform(pose: PoseLike, where: str) -> Array:
 
 
 def rows_to_transforms(rows: Array) -> Array:
-    """The inverse of the layout of ``checked_rows``: (12, b) to (b, 4, 4)."""
-    transforms = np.zeros((rows.shape[1], 4, 4))
-    transforms[:, :3, :] = rows.reshape(4, 3, -1).transpose(2, 1, 0)
-    transforms[:, 3, 3] = 1.0
-    return transforms
+    """Poses (b, 4, 4) of the rows (12, b) of ``checked_rows``."""
+    columns = rows.reshape(4, 3, -1)
+    return se3.pose(columns[:3].transpose(2, 1, 0), columns[3].T)
 
 
 def to_pose3(R: Array, t: Array) -> Any:

@@ -1,15 +1,14 @@
 """Unit quaternions of rotations, scalar last (xyzw), and the matrices of their products.
 
-A rotation has two quaternions, q and -q. q (x) p is the product that turns vectors by q's rotation after p's.
+q and -q are one rotation. The product q (x) p turns vectors by the rotation of p, then by the rotation of q.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from rwhec_factors.se3 import Array
 
-from gtsam_rwhec.geometry.poses import Array
-
-#: LEFT[c] and RIGHT[c] (4, 4): multiplication by the c-th unit of (i, j, k, 1), from the left and from the right.
+#: LEFT[c] and RIGHT[c] (4, 4) multiply by unit c of (i, j, k, 1), from the left and from the right.
 LEFT = np.zeros((4, 4, 4))
 RIGHT = np.zeros((4, 4, 4))
 for _c in range(3):
@@ -22,7 +21,7 @@ LEFT[3] = RIGHT[3] = np.eye(4)
 _TURNED = np.einsum("cij,dkj->cdik", LEFT, RIGHT)[:, :, :3, :3]  # v -> q (x) v (x) q*
 #: R[i, j] = sum of q_c q_d ROTATION[c, d, i, j] for a unit quaternion q; symmetric in c and d.
 ROTATION = 0.5 * (_TURNED + _TURNED.transpose(1, 0, 2, 3))
-#: 4 q q' - I is linear in R, by the same table: row 4 c + d of this one times vec R (column after column).
+#: 4 q q' - I is linear in R, by the same table: entry 4 c + d is row 4 c + d times vec R (column after column).
 _PRODUCTS = np.ascontiguousarray(ROTATION.transpose(0, 1, 3, 2).reshape(16, 9))
 _ONES = np.eye(4).reshape(16, 1)
 _DIAGONAL = [0, 5, 10, 15]
@@ -48,9 +47,9 @@ def conjugate(q: Array) -> Array:
 
 
 def of_rows(rows: Array) -> Array:
-    """Unit quaternions (4, N), of either sign, of rotations as columns of vec R (9, N), column after column.
+    """Unit quaternions (4, N), of either sign, of rotations vec R (9, N), column after column.
 
-    Of the four columns of 4 q q' that of q's largest entry is taken: it is accurate for every angle.
+    Of the four columns of 4 q q', the column of q's largest entry is taken: it is accurate for every angle.
     """
     products = _PRODUCTS @ rows
     products += _ONES
@@ -68,8 +67,9 @@ def of_rotations(R: Array) -> Array:
 
 def to_rotations(q: Array) -> Array:
     """Rotations (..., 3, 3) of quaternions (..., 4) of any length but zero."""
-    R: Array = np.einsum("...c,...d,cdij->...ij", q, q, ROTATION) / (q * q).sum(axis=-1)[..., None, None]
-    return R
+    products = (q[..., :, None] * q[..., None, :]).reshape(*q.shape[:-1], 16)
+    R: Array = products @ ROTATION.reshape(16, 9) / (q * q).sum(axis=-1, keepdims=True)
+    return R.reshape(*q.shape[:-1], 3, 3)
 
 
 def of_vectors(v: Array) -> Array:

@@ -21,25 +21,21 @@ def bipartite_edges(
     seed: Seed,
     edge_probability: float = 0.3,
 ) -> list[Edge]:
-    """List the edges of a graph between targets and sensors.
+    """List the edges of a graph between targets and sensors, as (target index, sensor index).
 
     Parameters
     ----------
-    graph
-        ``"complete"``: every sensor sees every target. ``"star"``: as few edges as connect everything, all at sensor 0
-        or at target 0 (with one target or one sensor a true star, otherwise two joined stars). ``"random"``: a random
-        spanning tree, and every other edge with probability ``edge_probability``. Or the edges themselves, which need
-        neither be connected nor touch every frame.
-    targets, sensors
-        How many there are.
-    seed
-        Seed, or a generator to draw from; used by ``"random"`` alone.
-    edge_probability
+    graph : "complete", "star", "random", or edges
+        ``"complete"``: every sensor sees every target. ``"star"``: the fewest edges that connect all frames, all at
+        sensor 0 or at target 0 (two joined stars, or one star where there is one target or one sensor). ``"random"``: a
+        random spanning tree, and every other edge with probability ``edge_probability``. Given edges keep their order;
+        they may leave parts unconnected and frames alone.
+    targets, sensors : int
+        Number of targets and of sensors.
+    seed : int or numpy.random.Generator
+        Seed, or a generator to draw from; only ``"random"`` uses it.
+    edge_probability : float
         Probability of an edge outside the tree.
-
-    Returns
-    -------
-    Pairs (target index, sensor index); given ones in the given order.
 
     Raises
     ------
@@ -65,8 +61,8 @@ def bipartite_edges(
     for j, k in edges:
         if not (0 <= j < targets and 0 <= k < sensors):
             raise OptionError(
-                f"graph: edge ({j}, {k}) is outside {targets} targets and {sensors} sensors; indices start at 0 and "
-                "the target comes first"
+                f"graph: edge ({j}, {k}) is outside {targets} targets and {sensors} sensors; give (target, sensor), "
+                "each counted from 0"
             )
     if len(set(edges)) < len(edges):
         twice = next(edge for edge in edges if edges.count(edge) > 1)
@@ -77,8 +73,8 @@ def bipartite_edges(
 def _random_connected(
     targets: int, sensors: int, generator: np.random.Generator, edge_probability: float
 ) -> list[Edge]:
-    # Each frame is joined to a random one of the other kind that is in the tree already; the first two are of both
-    # kinds, so that there always is one.
+    # Each frame is joined to a random frame of the other kind in the tree. The tree starts with one frame of each kind,
+    # so there always is one.
     tree_targets = [int(generator.integers(targets))]
     tree_sensors = [int(generator.integers(sensors))]
     edges = {(tree_targets[0], tree_sensors[0])}

@@ -5,22 +5,21 @@ Every noise acts on the right of a pose T_a_b = (R_a_b, t_a_b), as in the RWHEC 
     R_noisy = R_a_b R_eps          R_eps close to the identity, axes of frame b
     t_noisy = t_a_b + eps          eps in metres, axes of frame a
 
-Two models are offered, because the paper's published experiments were run with other noise than its text states:
+There are two models, because the paper's published experiments were run with other noise than its text states:
 
 ``stated``
-    What the text says: R_eps ~ Langevin(I, kappa), eps ~ N(0, sigma^2 I). For honest statistics: the cost that the
-    library minimises is this noise's negative log-likelihood.
+    As the text says: R_eps ~ Langevin(I, kappa), eps ~ N(0, sigma^2 I). Use it for honest statistics: the library's
+    cost is the negative log-likelihood of this noise.
 ``released``
-    What reproduces the paper's Tables 2-5: R_eps turns about a uniform axis by an angle from von Mises(0, kappa), with
-    the density exp(kappa cos t) in place of exp(2 kappa cos t) (1 - cos t). Its mean square is 1/kappa in place of
-    3/(2 kappa): angles smaller by sqrt(3/2). eps has one random length along a random direction of the positive
-    octant, or its opposite, by a rule of its own in each of Sections 8.1 and 8.2.
+    Reproduces the paper's Tables 2-5. R_eps turns about a uniform axis by an angle from von Mises(0, kappa), whose
+    density is exp(kappa cos t) in place of exp(2 kappa cos t) (1 - cos t). Its mean square is 1/kappa in place of
+    3/(2 kappa): angles are smaller by sqrt(3/2). eps has one random length along a random direction of the positive
+    octant, or against it. Sections 8.1 and 8.2 have different rules for the length.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, TypedDict, get_args
 
@@ -28,39 +27,37 @@ import numpy as np
 from numpy.random import Generator
 
 from gtsam_rwhec.errors import NoiseError, OptionError
-from gtsam_rwhec.simulate.transforms import (
-    FloatArray,
-    random_directions,
-    rotations_of_quaternions,
-    rotations_of_vectors,
-)
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.quaternions import to_rotations
+from gtsam_rwhec.simulate.transforms import random_directions, rotations_of_vectors
 
 NoiseModel = Literal["stated", "released"]
+#: The RWHEC paper's section whose rule gives the lengths of released translations.
+Section = Literal["8.1", "8.2"]
 Seed = int | Generator
-ReleasedTranslations = Callable[[int, float, Generator], FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
     """Size and model of the noise on a pose.
 
-    Parameters
+    Attributes
     ----------
-    sigma_m
-        Standard deviation of the translation along each axis, metres. (With ``released`` noise only a scale: the
-        lengths that it gives are not Gaussian in three dimensions.)
-    kappa
-        Concentration of the rotation, no unit. Large ones mean a standard deviation of 1/sqrt(2 kappa) rad about each
-        axis for ``stated`` noise.
-    model
-        ``"stated"`` (default, because it is the one that the cost assumes) or ``"released"``; see the module.
+    sigma_m : float
+        Standard deviation of the translation along each axis, metres. With ``released`` noise it is only a scale: those
+        lengths are not Gaussian in three dimensions.
+    kappa : float
+        Concentration of the rotation, no unit. A large kappa of ``stated`` noise means a standard deviation of
+        1/sqrt(2 kappa) rad about each axis.
+    model : "stated" or "released"
+        See the module. The default is the model that the cost assumes.
 
     Raises
     ------
     NoiseError
         If sigma_m or kappa is not positive and finite.
     OptionError
-        If the model is not one of the two.
+        If the model is unknown.
     """
 
     sigma_m: float
@@ -78,32 +75,33 @@ class Noise:
             raise OptionError(f"Noise: model is {self.model!r}; choose one of {', '.join(get_args(NoiseModel))}")
 
 
-def langevin_rotations(count: int, kappa: float, seed: Seed) -> FloatArray:
+def langevin_rotations(count: int, kappa: float, seed: Seed) -> Array:
     """Draw from the isotropic Langevin distribution Langevin(I, kappa) on SO(3), exactly.
 
-    The density is proportional to exp(kappa tr R) in the Haar measure, so the axis is uniform and the angle t has
+    The density is proportional to exp(kappa tr R) in the Haar measure. So the axis is uniform, and the angle t has a
     density proportional to exp(2 kappa cos t) (1 - cos t) on [0, pi]. As a unit quaternion (w, v), tr R = 3 - 4 |v|^2:
-    a Bingham distribution with density exp(-4 kappa |v|^2), which is sampled by rejection from an angular central
-    Gaussian envelope (Kent, Ganeiber, Mardia: A new unified approach for the simulation of a wide class of
-    directional distributions, 2018); 44 draws in 100 or more are accepted, at any kappa >= 0.
+    a Bingham distribution with density exp(-4 kappa |v|^2). It is sampled by rejection from an angular central Gaussian
+    envelope (Kent, Ganeiber, Mardia: A new unified approach for the simulation of a wide class of directional
+    distributions, 2018). At least 44 draws in 100 are accepted, at any kappa >= 0.
 
     Parameters
     ----------
-    count
+    count : int
         Number of rotations N.
-    kappa
+    kappa : float
         Concentration; 0 gives uniform rotations.
-    seed
+    seed : int or numpy.random.Generator
         Seed, or a generator to draw from.
 
     Returns
     -------
-    (N, 3, 3) rotation matrices.
+    (N, 3, 3) array
+        Rotation matrices.
     """
     generator = np.random.default_rng(seed)
     bingham = np.array([0.0, 4.0 * kappa, 4.0 * kappa, 4.0 * kappa])
-    # The envelope of the highest acceptance has 1/b + 3/(b + 8 kappa) = 1; of the two ways to write the positive root,
-    # the one that subtracts no like numbers.
+    # The envelope with the most acceptances has 1/b + 3/(b + 8 kappa) = 1. Of the two ways to write its positive root,
+    # each is taken where it does not cancel.
     linear = 8.0 * kappa - 4.0
     root = math.hypot(linear, math.sqrt(32.0 * kappa))
     b = 16.0 * kappa / (linear + root) if linear > 0.0 else (root - linear) / 2.0
@@ -120,99 +118,69 @@ def langevin_rotations(count: int, kappa: float, seed: Seed) -> FloatArray:
         accepted = proposals[np.log1p(-generator.random(len(proposals))) < log_ratio][: count - filled]
         quaternions_wxyz[filled : filled + len(accepted)] = accepted
         filled += len(accepted)
-    return rotations_of_quaternions(quaternions_wxyz)
+    return to_rotations(quaternions_wxyz[:, [1, 2, 3, 0]])
 
 
-def released_rotations(count: int, kappa: float, seed: Seed) -> FloatArray:
-    """Draw rotations as the paper's experiments were run: a uniform axis, an angle from von Mises(0, kappa).
-
-    Returns
-    -------
-    (N, 3, 3) rotation matrices.
-    """
+def released_rotations(count: int, kappa: float, seed: Seed) -> Array:
+    """Rotations (N, 3, 3) of ``released`` noise: a uniform axis, and an angle from von Mises(0, kappa)."""
     generator = np.random.default_rng(seed)
     axes = random_directions(count, generator)
-    angles = generator.vonmises(0.0, kappa, (count, 1))
-    return rotations_of_vectors(angles * axes)
+    return rotations_of_vectors(generator.vonmises(0.0, kappa, (count, 1)) * axes)
 
 
-def gaussian_translations(count: int, sigma_m: float, seed: Seed) -> FloatArray:
-    """Draw from N(0, sigma^2 I): (N, 3) translations in metres."""
-    return np.random.default_rng(seed).normal(0.0, sigma_m, (count, 3))
+def released_translations(count: int, sigma_m: float, seed: Seed, section: Section) -> Array:
+    """Translations (N, 3) of ``released`` noise, metres, with u uniform on [0,1]^3 and z standard normal.
 
-
-def released_sphere_translations(count: int, sigma_m: float, seed: Seed) -> FloatArray:
-    """Draw translations as Section 8.1 was run: u sigma z / (u'u), u uniform on [0,1]^3, z standard normal.
-
-    Returns
-    -------
-    (N, 3) translations in metres. Their lengths sigma |z| / |u| have heavy tails: |u| comes close to zero.
+    Section 8.1 has u sigma z / (u'u). Its lengths sigma |z| / |u| have heavy tails, since |u| comes close to zero.
+    Section 8.2 has sigma z u / |u|.
     """
     generator = np.random.default_rng(seed)
     u = generator.random((count, 3))
     z = generator.standard_normal((count, 1))
-    translations: FloatArray = u * sigma_m * z / np.sum(u * u, axis=1, keepdims=True)
+    length = np.linalg.norm(u, axis=1, keepdims=True)
+    translations: Array = sigma_m * z * u / (length**2 if section == "8.1" else length)
     return translations
 
 
-def released_camera_translations(count: int, sigma_m: float, seed: Seed) -> FloatArray:
-    """Draw translations as Section 8.2 was run: sigma z u/|u|, u uniform on [0,1]^3, z standard normal.
-
-    Returns
-    -------
-    (N, 3) translations in metres.
-    """
-    generator = np.random.default_rng(seed)
-    u = generator.random((count, 3))
-    z = generator.standard_normal((count, 1))
-    translations: FloatArray = sigma_m * z * u / np.linalg.norm(u, axis=1, keepdims=True)
-    return translations
-
-
-def perturb(
-    poses: FloatArray,
-    noise: Noise | None,
-    seed: Seed,
-    released_translations: ReleasedTranslations | None = None,
-) -> FloatArray:
+def perturb(poses: Array, noise: Noise | None, seed: Seed, section: Section | None = None) -> Array:
     """Add noise to poses on the right: R_a_b R_eps, t_a_b + eps.
 
     Parameters
     ----------
-    poses
-        (N, 4, 4) poses T_a_b, metres; not changed.
-    noise
-        The noise; ``None`` returns a copy.
-    seed
+    poses : (N, 4, 4) array
+        T_a_b, metres; not changed.
+    noise : Noise or None
+        ``None`` returns a copy.
+    seed : int or numpy.random.Generator
         Seed, or a generator to draw from.
-    released_translations
-        The rule for the translations of ``released`` noise: :func:`released_sphere_translations` or
-        :func:`released_camera_translations`. ``stated`` noise does not use it.
+    section : "8.1" or "8.2", optional
+        Whose rule for translations ``released`` noise follows. ``stated`` noise does not use it.
 
     Returns
     -------
-    (N, 4, 4) noisy poses.
+    (N, 4, 4) array
+        Noisy poses.
 
     Raises
     ------
     OptionError
-        If the noise is ``released`` and there is no rule for its translations.
+        If the noise is ``released`` and no section is given.
     """
-    noisy = np.array(poses, dtype=np.float64)
+    noisy: Array = np.array(poses, dtype=np.float64)
     if noise is None:
         return noisy
     generator = np.random.default_rng(seed)
     count = len(noisy)
     if noise.model == "stated":
         rotations = langevin_rotations(count, noise.kappa, generator)
-        translations = gaussian_translations(count, noise.sigma_m, generator)
-    elif released_translations is not None:
+        translations: Array = generator.normal(0.0, noise.sigma_m, (count, 3))
+    elif section is not None:
         rotations = released_rotations(count, noise.kappa, generator)
-        translations = released_translations(count, noise.sigma_m, generator)
+        translations = released_translations(count, noise.sigma_m, generator, section)
     else:
         raise OptionError(
-            'Noise: model is "released", whose translations are defined only for the paper\'s Sections 8.1 and 8.2 '
-            '(simulate.sphere, simulate.cameras); use model="stated" here'
+            'Noise: model is "released", but only the simulations of the paper\'s Sections 8.1 and 8.2 '
+            '(simulate.sphere, simulate.cameras) have its translations; use model="stated" here'
         )
     noisy[:, :3, :3] = noisy[:, :3, :3] @ rotations
     noisy[:, :3, 3] += translations
@@ -220,12 +188,12 @@ def perturb(
 
 
 class Weights(TypedDict):
-    """What ``Problem.add`` takes as weights."""
+    """The arguments of ``Problem.add`` that weigh measurements."""
 
     sigma: float | None
     kappa: float | None
 
 
 def weights_of(noise: Noise | None) -> Weights:
-    """The weights that belong to the noise; none for exact measurements."""
+    """The weights that belong to the noise; ``None`` for exact measurements."""
     return {"sigma": None, "kappa": None} if noise is None else {"sigma": noise.sigma_m, "kappa": noise.kappa}

@@ -1,4 +1,4 @@
-"""Any number of sensors on a moving carrier among any number of targets, with the noise where sensors have it."""
+"""Simulated rigs: any number of sensors on a moving carrier, any number of targets, noise on the measurements."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
 import numpy as np
+from rwhec_factors.se3 import inverse
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.problem.knowledge import ScaleMode
@@ -16,14 +17,15 @@ from gtsam_rwhec.simulate.motion import Motion, MotionKind, carrier_poses
 from gtsam_rwhec.simulate.noise import Noise, Seed, perturb, weights_of
 from gtsam_rwhec.simulate.scales import true_scales
 from gtsam_rwhec.simulate.simulation import Simulation
-from gtsam_rwhec.simulate.transforms import inverse, random_poses
+from gtsam_rwhec.simulate.transforms import random_poses
 
 Value = TypeVar("Value")
 
-#: Largest coordinate of a target in the world, and of a sensor on the rig: a room, and a rig that a person can carry.
+#: Largest coordinate of a target in the world, m: a room.
 TARGETS_WITHIN_M = 2.0
+#: Largest coordinate of a sensor on the rig, m: a person can carry it.
 SENSORS_WITHIN_M = 0.5
-#: Time between two poses of the rig: ten a second.
+#: Time between two poses of the rig, ns: ten poses a second.
 PERIOD_NS = 100_000_000
 
 
@@ -48,50 +50,50 @@ def general(
     """Simulate sensors "sensor0", ... on a moving rig that see targets "target0", ... in a fixed world.
 
     The carriers are the rig (of the sensors) and the world (of the targets): A = T_rig_world, X = T_world_target,
-    Y = T_rig_sensor, and B = T_sensor_target is what the sensor sees, with the noise in its place. X is drawn within
-    2 m and Y within 0.5 m of their carriers, rotations uniformly.
+    Y = T_rig_sensor. The sensor measures B = T_sensor_target, and B has the noise. X is drawn within 2 m and Y within
+    0.5 m of their carriers; rotations are uniform.
 
     Parameters
     ----------
-    targets, sensors
-        How many of each. No targets: odometry alone.
-    seed
+    targets, sensors : int
+        Number of each. With no targets there is only odometry.
+    seed : int or numpy.random.Generator
         Seed, or a generator to draw from. One seed gives the same frames, graph and motion at every noise level.
-    graph
-        ``"complete"``, ``"star"``, ``"random"`` (connected), or pairs (target index, sensor index); see
-        :func:`gtsam_rwhec.simulate.graphs.bipartite_edges`.
-    edge_probability
-        Of the edges beyond the spanning tree of a ``"random"`` graph.
-    motion
+    graph : "complete", "star", "random", or pairs (target index, sensor index)
+        See :func:`gtsam_rwhec.simulate.graphs.bipartite_edges`.
+    edge_probability : float
+        Probability of the edges beyond the spanning tree of a ``"random"`` graph.
+    motion : Motion or kind of motion
         The rig's motion, T_world_rig; a kind stands for ``Motion(kind)``.
-    number_of_measurements
-        For every pair, or by pair of names (target, sensor). The rig makes one trajectory, as long as the largest of
-        them; a pair with fewer measurements has a random part of its poses.
-    noise
-        ``stated`` noise on B as it is given, that is after the scale: sigma_m is its true standard deviation at every
-        scale. One for all, or by pair of names. It also gives the weights. ``None``: exact B, unit weights.
-    noise_in_A
-        ``stated`` noise on the right of A, one draw for each pose of the rig (pairs measured at one stamp share the
-        motion capture's error). It has no part in the weights. Default: exact.
-    scale
-        ``"known"``, ``"shared"`` or ``"per_target"``.
-    true_scale
+    number_of_measurements : int, or mapping of (target, sensor) to int
+        For every pair, or by pair of names. The rig has one trajectory, as long as the largest number. A pair with
+        fewer measurements has a random part of its poses.
+    noise : Noise, mapping of (target, sensor) to Noise, or None
+        ``stated`` noise on B, added after the scale: sigma_m is the true standard deviation at every scale. It also
+        gives the weights. ``None``: exact B, unit weights.
+    noise_in_A : Noise or None
+        ``stated`` noise on the right of A, one draw for each pose of the rig: pairs with one stamp share the motion
+        capture's error. It has no part in the weights.
+    scale : "known", "shared" or "per_target"
+        The problem's scale mode.
+    true_scale : float, or mapping of str to float, optional
         alpha, t_B = alpha * (true length): a number for ``"shared"`` (default 0.5), a mapping from target name to
         number for ``"per_target"`` (default: log-uniform in [1/2, 2], and 1 for the known sizes). With ``"per_target"``
-        each sensor's odometry has a scale of its own too, under the sensor's name.
-    known_sizes
+        each sensor's odometry also has its own scale, under the sensor's name.
+    known_sizes : iterable of str
         With ``"per_target"``, the targets (and sensors' odometries) whose scale the problem is told.
-    odometry
+    odometry : int
         Number of AX = XB measurements for each sensor: A = T_rig_before_after and B = T_sensor_before_after between
-        consecutive poses of a trajectory of their own.
-    odometry_noise
-        ``stated`` noise on the B of the odometry, and its weights. ``None``: exact, unit weights.
-    keep_measurements
+        consecutive poses of a separate trajectory.
+    odometry_noise : Noise or None
+        ``stated`` noise on the odometry's B, and its weights. ``None``: exact, unit weights.
+    keep_measurements : bool
         Passed to :class:`gtsam_rwhec.Problem`.
 
     Returns
     -------
-    The simulation; its truth has the frames that occur in the problem.
+    Simulation
+        Its truth has the frames that occur in the problem.
 
     Raises
     ------
@@ -115,7 +117,7 @@ def general(
     counts = {pair: _of_pair(number_of_measurements, pair, "number_of_measurements") for pair in pairs}
     for pair, count in counts.items():
         if count < 1:
-            raise OptionError(f"general: number_of_measurements of {pair} is {count}; ask for at least one, or no edge")
+            raise OptionError(f"general: number_of_measurements of {pair} is {count}; give at least one")
 
     X = {f"target{j}": T for j, T in enumerate(random_poses(targets, TARGETS_WITHIN_M, frames))}
     Y = {f"sensor{k}": T for k, T in enumerate(random_poses(sensors, SENSORS_WITHIN_M, frames))}

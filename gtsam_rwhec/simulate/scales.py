@@ -12,7 +12,7 @@ from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate.noise import Seed
 
-#: The paper's monocular simulations use it too.
+#: alpha of a shared scale, unless it is given; also the scale of the paper's monocular simulations.
 SHARED_SCALE = 0.5
 
 
@@ -23,25 +23,26 @@ def true_scales(
     known_sizes: tuple[str, ...],
     seed: Seed,
 ) -> float | dict[str, float]:
-    """Check the scales that a caller gives, and draw those that it leaves out.
+    """Check the scales that a caller gives, and draw the scales that it leaves out.
 
     Parameters
     ----------
-    names
-        Targets, and sensors with odometry: what has a scale of its own with ``"per_target"``.
-    mode
+    names : list of str
+        Targets, and sensors with odometry: each has its own scale with ``"per_target"``.
+    mode : "known", "shared" or "per_target"
         The problem's scale mode.
-    given
-        A number for one scale, a mapping for ``"per_target"``; ``None``: 1 (known), 0.5 (shared), or log-uniform in
-        [1/2, 2] with 1 for known sizes.
-    known_sizes
+    given : float, mapping of str to float, or None
+        One scale, or a mapping for ``"per_target"``. ``None``: 1 (known), 0.5 (shared), or log-uniform in [1/2, 2]
+        with 1 for known sizes.
+    known_sizes : tuple of str
         Names whose scale the problem is told.
-    seed
+    seed : int or numpy.random.Generator
         Seed, or a generator to draw from.
 
     Returns
     -------
-    alpha, or alpha by name with ``"per_target"``.
+    float or dict of str to float
+        alpha, or alpha by name with ``"per_target"``.
 
     Raises
     ------
@@ -57,7 +58,7 @@ def true_scales(
     if known_sizes:
         raise OptionError(f'true_scale: known_sizes need scale="per_target", not {mode!r}')
     if isinstance(given, Mapping):
-        raise OptionError(f"true_scale: a mapping is given, but with scale={mode!r} there is one scale")
+        raise OptionError(f"true_scale: a mapping is given, but with scale={mode!r} there is one scale; give a number")
     default = 1.0 if mode == "known" else SHARED_SCALE
     alpha = _positive(default if given is None else given, "all targets")
     if mode == "known" and alpha != 1.0:
@@ -74,14 +75,14 @@ def _scales_by_name(
     unknown = [name for name in known_sizes if name not in names]
     if unknown:
         raise OptionError(f"true_scale: known_sizes has {', '.join(unknown)}, but only {', '.join(names)} have a scale")
-    drawn = np.exp(generator.uniform(-math.log(2.0), math.log(2.0), len(names)))
     if given is None:
+        drawn = np.exp(generator.uniform(-math.log(2.0), math.log(2.0), len(names)))
         return {n: 1.0 if n in known_sizes else float(alpha) for n, alpha in zip(names, drawn, strict=True)}
     if not isinstance(given, Mapping):
         raise OptionError(f'true_scale: {given!r} is given; with scale="per_target" give a mapping from name to scale')
     missing = [name for name in names if name not in given]
     if missing:
-        raise OptionError(f"true_scale: nothing is given for {', '.join(missing)}; give one for every target")
+        raise OptionError(f"true_scale: no scale is given for {', '.join(missing)}; give one for every target")
     return {name: _positive(given[name], name) for name in names}
 
 

@@ -1,4 +1,4 @@
-"""What every simulator returns: a problem, the truth behind it, and how far an answer is from that truth."""
+"""The result of every simulator: a problem, its truth, and the errors of an answer against the truth."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from typing import Protocol
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
+from rwhec_factors.se3 import so3_logmap
 
 from gtsam_rwhec.errors import FrameError, ScaleError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
-
-FloatArray = NDArray[np.float64]
 
 
 class PosesAndScale(Protocol):
-    """Anything with poses by name and a scale; ``gtsam_rwhec.Solution`` is one."""
+    """An answer with poses by name and a scale, such as a ``gtsam_rwhec.Solution``."""
 
     @property
     def X(self) -> Mapping[str, gtsam.Pose3]:
@@ -39,9 +38,9 @@ class FrameDistance:
 
     Attributes
     ----------
-    translation_m
+    translation_m : float
         |t_estimated - t_true|, metres.
-    rotation_rad
+    rotation_rad : float
         Angle of R_true' R_estimated (the geodesic distance on SO(3)), radians, in [0, pi].
     """
 
@@ -65,10 +64,10 @@ class CalibrationErrors:
 
     Attributes
     ----------
-    X, Y
-        Error of each target's and of each sensor's frame, by name.
-    relative_scale
-        |alpha_estimated - alpha_true| / alpha_true; one number, or one by target (scale mode ``"per_target"``).
+    X, Y : dict of str to FrameDistance
+        Error of each target's frame (X) and of each sensor's frame (Y), by name.
+    relative_scale : float or dict of str to float
+        |alpha_estimated - alpha_true| / alpha_true, by target in scale mode ``"per_target"``.
     """
 
     X: dict[str, FrameDistance]
@@ -78,23 +77,23 @@ class CalibrationErrors:
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """A simulated calibration problem and the truth behind it.
+    """A simulated calibration problem and its truth.
 
     Attributes
     ----------
-    problem
+    problem : Problem
         The measurements, ready for ``gtsam_rwhec.solve``.
-    X
-        True T_targetcarrier_target by target, (4, 4), metres; read-only arrays.
-    Y
-        True T_sensorcarrier_sensor by sensor, (4, 4), metres; read-only arrays.
-    scale
-        True alpha, t_B = alpha * (true length): one number, or one by target (scale mode ``"per_target"``).
+    X : dict of str to (4, 4) array
+        True T_targetcarrier_target by target, metres; read-only.
+    Y : dict of str to (4, 4) array
+        True T_sensorcarrier_sensor by sensor, metres; read-only.
+    scale : float or dict of str to float
+        True alpha, t_B = alpha * (true length), by target in scale mode ``"per_target"``.
     """
 
     problem: Problem
-    X: dict[str, FloatArray]
-    Y: dict[str, FloatArray]
+    X: dict[str, Array]
+    Y: dict[str, Array]
     scale: float | dict[str, float]
 
     def __post_init__(self) -> None:
@@ -103,19 +102,14 @@ class Simulation:
                 pose.setflags(write=False)
 
     def errors(self, answer: PosesAndScale) -> CalibrationErrors:
-        """Compare an answer with the truth.
-
-        Parameters
-        ----------
-        answer
-            A solution of ``problem``, by this library or any other method.
+        """Errors of an answer to ``problem``, from this library or any other method.
 
         Raises
         ------
         FrameError
             If the answer lacks one of the simulation's frames or one of its scales.
         ScaleError
-            If the answer has one scale for all where the problem has one for each target, or the other way round.
+            If the answer has one scale and the problem has a scale for each target, or the other way round.
         """
         return CalibrationErrors(
             X=_frame_distances(answer.X, self.X, "X"),
@@ -124,17 +118,10 @@ class Simulation:
         )
 
 
-def frame_distance(estimate: FloatArray, truth: FloatArray) -> FrameDistance:
+def frame_distance(estimate: Array, truth: Array) -> FrameDistance:
     """Distance between two (4, 4) poses of one frame."""
-    R_true_estimate = truth[:3, :3].T @ estimate[:3, :3]
-    # |R - R'|/2 and (tr R - 1)/2 are the angle's sine and cosine: with both, small angles keep all their digits.
-    skew = R_true_estimate - R_true_estimate.T
-    sine = math.sqrt(skew[0, 1] ** 2 + skew[0, 2] ** 2 + skew[1, 2] ** 2) / 2.0
-    cosine = (float(np.trace(R_true_estimate)) - 1.0) / 2.0
-    return FrameDistance(
-        translation_m=float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3])),
-        rotation_rad=math.atan2(sine, cosine),
-    )
+    turn = so3_logmap((truth[:3, :3].T @ estimate[:3, :3])[None])
+    return FrameDistance(float(np.linalg.norm(estimate[:3, 3] - truth[:3, 3])), float(np.linalg.norm(turn)))
 
 
 def _require(names: Iterable[str], present: Mapping[str, object], what: str) -> None:
@@ -147,7 +134,7 @@ def _require(names: Iterable[str], present: Mapping[str, object], what: str) -> 
 
 
 def _frame_distances(
-    estimates: Mapping[str, gtsam.Pose3], truth: Mapping[str, FloatArray], what: str
+    estimates: Mapping[str, gtsam.Pose3], truth: Mapping[str, Array], what: str
 ) -> dict[str, FrameDistance]:
     _require(truth, estimates, what)
     return {name: frame_distance(estimates[name].matrix(), truth[name]) for name in truth}
@@ -159,7 +146,7 @@ def _scale_errors(
     if isinstance(truth, Mapping):
         if not isinstance(estimate, Mapping):
             raise ScaleError(
-                f"Simulation.errors: the answer's scale is {estimate!r}, but this problem has one for each target; "
+                f"Simulation.errors: the answer's scale is {estimate!r}, but this problem has a scale for each target; "
                 "pass a mapping from target to scale"
             )
         _require(truth, estimate, "scale")

@@ -48,10 +48,11 @@ from paper_tables import (
     simulated,
     wide_console,
 )
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.methods.local_on_manifold import LomOptions, LomWeights, local_on_manifold
 from gtsam_rwhec.simulate import Simulation
-from gtsam_rwhec.simulate.transforms import pose, random_directions, random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.transforms import random_directions, random_poses, rotations_of_vectors
 
 Start = Literal["close", "random"]
 Reading = Literal["stated", "inferred"]

@@ -25,6 +25,7 @@ import numpy as np
 from bars import Row, benchmark_parser, print_rows
 from dataset import utias_folder
 from numpy.typing import NDArray
+from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import OutlierError, RwhecWarning
@@ -32,7 +33,7 @@ from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.graduated import graduated
 from gtsam_rwhec.refinement.truncated_least_squares import NoiseScale
 from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, general, perturb
-from gtsam_rwhec.simulate.transforms import inverse, random_poses
+from gtsam_rwhec.simulate.transforms import random_poses
 
 Kind = Literal["random", "structured", "one pair"]
 Masks = dict[tuple[str, str], NDArray[np.bool_]]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
+from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.cross_validation import cross_validate
@@ -16,7 +17,6 @@ from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, OptionError
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.report.cross_validation_table import print_cross_validation
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.simulate.transforms import inverse
 
 NOISE = Noise(sigma_m=0.005, kappa=3000.0)
 PAIR = ("target0", "sensor0")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rwhec_factors.se3 import inverse, pose
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.identifiability.free_directions import (
@@ -17,7 +18,7 @@ from gtsam_rwhec.identifiability.free_directions import (
     reason_for,
 )
 from gtsam_rwhec.simulate import Motion, Noise, carrier_poses, perturb
-from gtsam_rwhec.simulate.transforms import inverse, pose, rotations_of_vectors
+from gtsam_rwhec.simulate.transforms import rotations_of_vectors
 
 NOISE = Noise(0.005, 5000.0)
 

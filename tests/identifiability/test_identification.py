@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from places import GOLDEN
+from rwhec_factors.se3 import inverse, pose
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotUniqueWarning, RwhecWarning, ScaleError
 from gtsam_rwhec.identifiability import FreeKind, FreeReason
 from gtsam_rwhec.simulate import Motion, Noise, carrier_poses, general, perturb, sphere
-from gtsam_rwhec.simulate.transforms import inverse, pose, random_poses
+from gtsam_rwhec.simulate.transforms import random_poses
 
 GOLDEN_FIGURE_8 = GOLDEN / "utias_figure_8.txt"
 NOISE = Noise(0.01, 1250.0)  # 1 cm, 0.02 rad

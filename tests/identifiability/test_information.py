@@ -7,6 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from rwhec_factors.se3 import inverse, pose
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.identifiability.information import (
@@ -18,7 +19,7 @@ from gtsam_rwhec.identifiability.information import (
     variance_factors,
 )
 from gtsam_rwhec.simulate import Noise, general, perturb
-from gtsam_rwhec.simulate.transforms import inverse, pose, random_poses
+from gtsam_rwhec.simulate.transforms import random_poses
 from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.residuals import PairPoses, costs_of_pairs

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from refinement_problems import rig
+from rwhec_factors.se3 import pose
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import (
@@ -28,7 +29,7 @@ from gtsam_rwhec.methods.local_on_manifold import (
     standard_deviations,
 )
 from gtsam_rwhec.simulate import Noise, Simulation, frame_distance, sphere
-from gtsam_rwhec.simulate.transforms import pose, random_directions, random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.transforms import random_directions, random_poses, rotations_of_vectors
 
 X, Y, SCALE = FrameKeys(0, 1), FrameKeys(2, 3), 4
 

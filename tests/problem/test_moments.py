@@ -10,11 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive_cost import naive_cost
+from rwhec_factors.se3 import pose
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments, edge_forms
 from gtsam_rwhec.simulate import Noise, general
-from gtsam_rwhec.simulate.transforms import pose, random_poses
+from gtsam_rwhec.simulate.transforms import random_poses
 from gtsam_rwhec.solver.forms import Forms
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.variables import Answer, as_variables

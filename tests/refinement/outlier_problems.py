@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, Simulation, perturb
-from gtsam_rwhec.simulate.transforms import inverse, random_poses
+from gtsam_rwhec.simulate.transforms import random_poses
 
 Pair = tuple[str, str]
 Kind = Literal["random", "structured"]

@@ -13,43 +13,39 @@ from scipy.special import ive
 from scipy.stats import kstest, norm, vonmises
 
 from gtsam_rwhec.errors import NoiseError, OptionError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, langevin_rotations, perturb
-from gtsam_rwhec.simulate.noise import (
-    gaussian_translations,
-    released_camera_translations,
-    released_rotations,
-    released_sphere_translations,
-)
-from gtsam_rwhec.simulate.transforms import FloatArray, random_poses
+from gtsam_rwhec.simulate.noise import Section, released_rotations, released_translations
+from gtsam_rwhec.simulate.transforms import random_poses
 
-Draw = Callable[[int, float, int], FloatArray]
+Draw = Callable[[int, float, int], Array]
 
 COUNT = 20_000
 # Seeds are fixed, so a test either passes always or never; a tail this small is no chance of the seed.
 SMALLEST_P_VALUE = 1e-3
 
 
-def angles_of(rotations: FloatArray) -> FloatArray:
+def angles_of(rotations: Array) -> Array:
     skew = rotations - rotations.transpose(0, 2, 1)
     sines = np.linalg.norm(np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]]), axis=0) / 2.0
-    angles: FloatArray = np.arctan2(sines, (np.trace(rotations, axis1=1, axis2=2) - 1.0) / 2.0)
+    angles: Array = np.arctan2(sines, (np.trace(rotations, axis1=1, axis2=2) - 1.0) / 2.0)
     return angles
 
 
-def axes_of(rotations: FloatArray) -> FloatArray:
+def axes_of(rotations: Array) -> Array:
     skew = rotations - rotations.transpose(0, 2, 1)
     axes = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
-    unit: FloatArray = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    unit: Array = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     return unit
 
 
-def langevin_distribution(kappa: float, angles: FloatArray) -> FloatArray:
+def langevin_distribution(kappa: float, angles: Array) -> Array:
     """P(angle <= t) of the density exp(2 kappa cos t) (1 - cos t), by integration on a grid."""
     top = min(np.pi, 12.0 / np.sqrt(2.0 * kappa)) if kappa > 0.0 else np.pi
     grid = np.linspace(0.0, top, 200_001)
     density = np.exp(2.0 * kappa * (np.cos(grid) - 1.0)) * (1.0 - np.cos(grid))
     cumulative = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2.0)])
-    probabilities: FloatArray = np.interp(angles, grid, cumulative / cumulative[-1])
+    probabilities: Array = np.interp(angles, grid, cumulative / cumulative[-1])
     return probabilities
 
 
@@ -99,20 +95,20 @@ def test_released_angles_are_smaller_by_the_root_of_three_halves() -> None:
 
 
 def test_stated_translations_are_normal() -> None:
-    translations = gaussian_translations(COUNT, 0.05, 7)
+    translations = perturb(np.tile(np.eye(4), (COUNT, 1, 1)), Noise(0.05, 12.0), 7)[:, :3, 3]
     assert kstest(translations.ravel(), norm(scale=0.05).cdf).pvalue > SMALLEST_P_VALUE
     assert np.allclose(np.cov(translations.T), 0.05**2 * np.eye(3), atol=1e-4)
 
 
-@pytest.mark.parametrize("draw", [released_sphere_translations, released_camera_translations])
-def test_released_translations_lie_along_one_octant(draw: Draw) -> None:
-    translations = draw(COUNT, 0.05, 8)
+@pytest.mark.parametrize("section", ["8.1", "8.2"])
+def test_released_translations_lie_along_one_octant(section: Section) -> None:
+    translations = released_translations(COUNT, 0.05, 8, section)
     assert np.all((translations >= 0.0).all(axis=1) | (translations <= 0.0).all(axis=1))
     assert abs(np.mean(translations[:, 0] > 0.0) - 0.5) < 4.0 * 0.5 / np.sqrt(COUNT)
 
 
 def test_released_camera_lengths_are_half_normal() -> None:
-    lengths = np.linalg.norm(released_camera_translations(COUNT, 0.05, 9), axis=1)
+    lengths = np.linalg.norm(released_translations(COUNT, 0.05, 9, "8.2"), axis=1)
     assert kstest(lengths / 0.05, lambda x: 2.0 * norm.cdf(x) - 1.0).pvalue > SMALLEST_P_VALUE
 
 
@@ -123,7 +119,7 @@ def test_released_sphere_lengths_are_longer_than_those_of_the_cameras() -> None:
         return float(np.arcsinh(1.0 / max(np.hypot(x, y), 1e-300)))
 
     expected = quad(lambda x: quad(chord, 0.0, 1.0, args=(x,))[0], 0.0, 1.0)[0]
-    lengths = np.linalg.norm(released_sphere_translations(COUNT, 1.0, 10), axis=1)
+    lengths = np.linalg.norm(released_translations(COUNT, 1.0, 10, "8.1"), axis=1)
     error = lengths.std() / np.sqrt(COUNT)
     assert abs(lengths.mean() - expected * np.sqrt(2.0 / np.pi)) < 4.0 * error
 
@@ -134,7 +130,7 @@ def test_noise_acts_on_the_right() -> None:
     noisy = perturb(poses, noise, 12)
     generator = np.random.default_rng(12)
     rotations = langevin_rotations(50, noise.kappa, generator)
-    translations = gaussian_translations(50, noise.sigma_m, generator)
+    translations = generator.normal(0.0, noise.sigma_m, (50, 3))
     assert np.array_equal(noisy[:, :3, :3], poses[:, :3, :3] @ rotations)
     assert np.array_equal(noisy[:, :3, 3], poses[:, :3, 3] + translations)
     assert np.array_equal(noisy[:, 3], poses[:, 3])
@@ -151,9 +147,9 @@ def test_noisy_poses_are_poses_and_repeat_with_the_seed(seed: int, sigma_m: floa
     poses = random_poses(5, 1.0, np.random.default_rng(seed))
     before = poses.copy()
     noise = Noise(sigma_m, kappa, model)  # type: ignore[arg-type]
-    noisy = perturb(poses, noise, seed, released_camera_translations)
+    noisy = perturb(poses, noise, seed, "8.2")
     assert np.array_equal(poses, before)
-    assert np.array_equal(noisy, perturb(poses, noise, np.random.default_rng(seed), released_camera_translations))
+    assert np.array_equal(noisy, perturb(poses, noise, np.random.default_rng(seed), "8.2"))
     rotations = noisy[:, :3, :3]
     assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-13)
     assert np.all(np.linalg.det(rotations) > 0.0)

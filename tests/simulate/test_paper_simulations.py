@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rwhec_factors.se3 import inverse
 
 from gtsam_rwhec import solve
 from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, Simulation, cameras, sphere
 from gtsam_rwhec.simulate.camera_on_sphere import sphere_trajectory
 from gtsam_rwhec.simulate.fixed_cameras import CAMERA_POSITIONS_IN_I_M, T_BASE_I, fixed_camera_poses, hand_trajectory
-from gtsam_rwhec.simulate.transforms import FloatArray, inverse
 
 
 def largest_residual(simulation: Simulation) -> float:
@@ -75,7 +76,7 @@ def test_the_path_is_a_smooth_cubic_spline_of_one_knot_a_second() -> None:
 
 
 def test_one_sphere_or_two() -> None:
-    def radii(simulation: Simulation) -> FloatArray:
+    def radii(simulation: Simulation) -> Array:
         B = simulation.problem.measurements("camera", "marker").B
         assert isinstance(simulation.scale, float)
         return np.asarray(np.linalg.norm(B[:, :3, 3], axis=1) / simulation.scale, dtype=np.float64)
@@ -189,7 +190,7 @@ def test_released_noise_gives_the_errors_of_the_tables(
 def test_seeds_repeat_and_differ() -> None:
     noise = Noise(0.01, 125.0)
 
-    def measured(seed: int | np.random.Generator) -> FloatArray:
+    def measured(seed: int | np.random.Generator) -> Array:
         B = sphere(noise, seed).problem.measurements("camera", "marker").B
         return np.asarray(B, dtype=np.float64)
 

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError, ScaleError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Motion, Noise, Simulation, carrier_poses, general
 from gtsam_rwhec.simulate.graphs import Edge, bipartite_edges
 from gtsam_rwhec.simulate.motion import MotionKind
-from gtsam_rwhec.simulate.transforms import FloatArray
 
 Pair = tuple[str, str]
 
 
-def residuals(simulation: Simulation, pair: Pair) -> FloatArray:
+def residuals(simulation: Simulation, pair: Pair) -> Array:
     """B of a pair less what the truth says it is: (N, 4, 4), scaled as B is."""
     target, sensor = pair
     X = simulation.Y[sensor] if target == sensor else simulation.X[target]
@@ -27,7 +27,7 @@ def residuals(simulation: Simulation, pair: Pair) -> FloatArray:
     measured = simulation.problem.measurements(target, sensor)
     expected = np.linalg.inv(simulation.Y[sensor]) @ measured.A @ X
     expected[:, :3, 3] *= scale
-    difference: FloatArray = measured.B - expected
+    difference: Array = measured.B - expected
     return difference
 
 
@@ -106,7 +106,7 @@ def test_given_edges_may_leave_parts_and_frames_alone() -> None:
 def test_motions_turn_about_what_they_say() -> None:
     axis = np.array([1.0, 2.0, 2.0]) / 3.0
 
-    def drawn(kind: MotionKind) -> tuple[FloatArray, FloatArray]:
+    def drawn(kind: MotionKind) -> tuple[Array, Array]:
         poses = carrier_poses(Motion(kind, axis=(1.0, 2.0, 2.0), extent_m=3.0), 200, 2)
         return poses[:, :3, :3], poses[:, :3, 3]
 

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rwhec_factors.se3 import pose
 
 from gtsam_rwhec.errors import FrameError, ScaleError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Simulation, frame_distance, general
-from gtsam_rwhec.simulate.transforms import FloatArray, pose, random_poses, rotations_of_vectors
+from gtsam_rwhec.simulate.transforms import random_poses, rotations_of_vectors
 
 
 @dataclass
@@ -33,7 +35,7 @@ def exact(simulation: Simulation) -> Estimate:
     )
 
 
-def moved(T: FloatArray, vector_rad: list[float], offset_m: list[float]) -> gtsam.Pose3:
+def moved(T: Array, vector_rad: list[float], offset_m: list[float]) -> gtsam.Pose3:
     R = T[:3, :3] @ rotations_of_vectors(vector_rad)
     return gtsam.Pose3(pose(R, T[:3, 3] + np.array(offset_m)))
 

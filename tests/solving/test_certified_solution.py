@@ -10,11 +10,12 @@ import gtsam
 import numpy as np
 import pytest
 from naive_cost import naive_cost
+from rwhec_factors.se3 import pose
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotCertifiedWarning, RwhecWarning, WeightsWarning
 from gtsam_rwhec.simulate import Motion, Noise, Simulation, general
-from gtsam_rwhec.simulate.transforms import pose, random_poses
+from gtsam_rwhec.simulate.transforms import random_poses
 from gtsam_rwhec.solver import Cause, Start
 from gtsam_rwhec.solver.parts import parts_of
 
