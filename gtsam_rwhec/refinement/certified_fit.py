@@ -13,7 +13,7 @@ from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables
+from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables, scales_of
 
 #: Above this many free frames a gap is left open on the way: the semidefinite relaxation would take most of the time,
 #: and only the last, full solution's certificate is claimed.
@@ -51,9 +51,7 @@ def certified_fit(problem: Problem, previous: CertifiedFit | None) -> CertifiedF
             T[:3, :3], T[:3, 3] = R, t + part.frame_shift(name)
             poses[name] = T
         poses |= {name: problem.fixed[name] for name in part.fixed}
-        alpha |= dict.fromkeys(part.names, answer.scale if part.scale != "per_target" else 1.0)
-        own = dict(zip(part.free, answer.own_scale, strict=True))
-        alpha |= part.fixed_scales | {name: float(own[name]) for name in part.scale_owners}
+        alpha |= scales_of(part, answer)
     return CertifiedFit(poses, alpha, certified)
 
 

@@ -35,7 +35,7 @@ from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
 from gtsam_rwhec.solver.verified import UNIT, arrow_is_positive_definite, cholesky_allowance, gamma
 
-#: Above this size the eigenvalues of a failed certificate are found by Lanczos, not densely.
+#: Above this size Lanczos finds the eigenvalue of a failed certificate, not a dense decomposition.
 DENSE_EIGEN_SIZE = 700
 #: Factor between one margin of definiteness and the next that is tried; a power of two, so that it does not round.
 MORE_ROOM = 16.0
@@ -50,7 +50,7 @@ class Bound:
     lower_bound : float
         Never above the optimum of the stored reduced form.
     value : float
-        x' Z x, without any allowance: what the bound would be in exact arithmetic with Z_rr positive definite.
+        x' Z x, without any allowance: the bound in exact arithmetic if Z_rr is positive definite.
     definite : bool
         Whether Z_rr (without one entry, for an unknown scale) is proven positive definite: the optimum is unique.
     semidefinite : bool
@@ -58,7 +58,7 @@ class Bound:
     eigenvalue : float
         A proven lower bound on the smallest eigenvalue of Z_rr.
     direction : (9 n,) array or None
-        Where Z_rr is negative: an eigenvector, for a better start.
+        An eigenvector of a negative eigenvalue of Z_rr, for a better start.
     """
 
     lower_bound: float = -np.inf
@@ -70,8 +70,8 @@ class Bound:
 
 
 def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
-    """The bound that multipliers (n, 20) and a point r (9 n,) give; any will do, optimal ones give a tight one."""
-    if not (np.isfinite(multipliers).all() and np.isfinite(r).all()):  # of a solver that failed
+    """The bound from multipliers (n, 20) and a point r (9 n,): true for any, tight for optimal ones."""
+    if not (np.isfinite(multipliers).all() and np.isfinite(r).all()):  # a solver failed
         return Bound()
     L, n = form.leaves, form.rotations
     value, z, value_error, z_error = lagrangian(form, multipliers, np.append(r, 1.0))
@@ -106,8 +106,8 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
     if proven(leaf_unit, border_unit, pin):
         room = np.r_[leaf_unit.ravel(), border_unit]
         by_room = float((reach**2 / room).sum()) * (1.0 + 1e-10)
-        by_size = of_g if pin is None else np.inf  # with a large g and little room, z'Z_rr z >= 0 is worth more
-        # Each try costs a factorisation: more room is asked for only where g is so large that it matters.
+        by_size = of_g if pin is None else np.inf  # better with a large g and little room: z'Z_rr z >= 0
+        # Each try needs a factorisation: try for more room only where g is large enough to matter.
         more = MORE_ROOM
         while min(by_room, by_size) > 1e-9 * abs(float(value)) + 1e-17 * size * form.magnitude:
             if not proven(more * leaf_unit, more * border_unit, pin):
@@ -134,7 +134,7 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
             if proven(-slack_leaf, -slack_border):
                 break
             extra = 1.5 * extra + 4.0 * float(max(leaf_unit.max(initial=0.0), border_unit.max(initial=0.0)))
-        else:  # an estimate of the eigenvalue that is off by 1.5^60: nothing is claimed
+        else:  # the estimate of the eigenvalue is wrong by 1.5^60: claim nothing
             return Bound(value=float(value), direction=direction)
     slack = np.r_[slack_leaf.ravel(), slack_border].reshape(n, 9)
     loss = float((slack.max(axis=1) * size_z**2).sum())
@@ -163,7 +163,7 @@ def _round_down(value: Any) -> float:
 
 
 def _curvature(form: ReducedForm, multipliers: Array) -> tuple[Array, Array, Array, Array]:
-    """Z_rr as arrow (D, C, E), G left aside; last, a diagonal that dominates what its forming rounded (9 n,)."""
+    """Z_rr before G'G is subtracted, as arrow (D, C, E); last, a diagonal (9 n,) that dominates its rounding."""
     L, n = form.leaves, form.rotations
     Lambda = (multipliers @ CONSTRAINTS_FLAT).reshape(n, 10, 10)[:, :9, :9]
     size = (np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)).reshape(n, 10, 10)[:, :9, :9].copy()
@@ -174,7 +174,7 @@ def _curvature(form: ReducedForm, multipliers: Array) -> tuple[Array, Array, Arr
         block = slice(9 * p, 9 * p + 9)
         size[L + p] += np.abs(E[block, block])
         E[block, block] -= Lambda[L + p]
-    # At most 20 products a multiplier's entry (integers: the products are exact) and one subtraction.
+    # Each entry sums at most 20 products (exact, as the constraints' entries are integers) and one subtraction.
     rounded = gamma(22) * size.sum(axis=2).ravel()
     return D, form.C[:, :, :-1], E, rounded
 

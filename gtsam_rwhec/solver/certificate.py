@@ -1,4 +1,4 @@
-"""What is proven about an answer."""
+"""The certificate of an answer: its cost, the lower bound, and what the two prove."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Objective:
     ----------
     form : "direct" or "inverse"
         "direct" is the cost of A X = Y B (eq. 18). "inverse" is the cost of B X^-1 = Y^-1 A, which a scale for each
-        target, and priors on translations with an unknown scale, need (design facts 7 and 11): half of it is no
-        chi-square, and refining finds the exact model's optimum from there.
+        target, and priors on translations with an unknown scale, need (design facts 7 and 11). The inverse cost is not
+        half a chi-square; ``refine`` finds the optimum of the exact model from its answer.
     has_priors : bool
-        Whether priors are part of it.
+        Whether the cost has terms for priors.
     """
 
     form: Kind
@@ -40,7 +40,7 @@ _OBJECTIVES: dict[Kind, str] = {
 
 @dataclass(frozen=True)
 class Certificate:
-    """A proof, or how far from one.
+    """The proof that an answer is optimal, or how far its cost is from a proof.
 
     Attributes
     ----------
@@ -48,25 +48,25 @@ class Certificate:
     cause : Cause
         Why it is proven, or why not.
     figures : dict of str to float
-        The numbers behind the cause, by name, as its sentence has them.
+        The numbers in the sentence of the cause, by name.
     objective : Objective
-        Which cost it is about.
+        Which cost the certificate is about.
     path : SearchPath
-        From which start the answer came, and which multipliers gave the bound.
+        The start of the descent to the answer, and the multipliers of the bound.
     cost : float
         J at the answer (eq. 18; half a chi-square when the weights are true).
     lower_bound : float
-        No answer costs less: rigorous in floating point, for the reduced form as stored.
+        No answer costs less; rigorous in floating point, for the reduced form as stored.
     float_bound : float
-        The same without the allowance for rounding.
+        The lower bound without the allowance for rounding.
     min_eigenvalue : float
         A lower bound on the smallest eigenvalue of the certificate matrix Z (0 in exact arithmetic when certified).
     tolerance : float
-        The absolute gap up to which the status says certified.
+        The absolute gap up to which the answer counts as optimal.
     is_relative : bool
-        Whether unit weights were used: the cost then has no statistical meaning.
+        Whether all weights are 1: the cost then has no statistical meaning.
     seconds : dict of str to float
-        Time of each stage.
+        Time of each stage, in s.
     words : str
         The reason in a file of format version 3 or older, which has no cause; empty otherwise.
     """
@@ -99,7 +99,7 @@ class Certificate:
 
     @property
     def is_optimal(self) -> bool:
-        """Whether the cost is proven optimal, whether or not the answer is the only one."""
+        """Whether the cost is proven optimal; other answers may cost the same."""
         return self.status in (Status.CERTIFIED, Status.CERTIFIED_NOT_UNIQUE)
 
     @property
@@ -132,7 +132,7 @@ class Certificate:
 
     @staticmethod
     def merged(certificates: list[Certificate]) -> Certificate:
-        """One certificate for parts that were solved apart: costs and bounds add, the worst cause counts."""
+        """One certificate for parts that were solved apart: the sums of costs and bounds, and the worst cause."""
         if len(certificates) == 1:
             return certificates[0]
         statuses, causes = list(Status), list(Cause)

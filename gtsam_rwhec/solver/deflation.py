@@ -1,12 +1,12 @@
-"""A lower bound on the smallest eigenvalue of a nearly singular Z_rr, far tighter than a verified test of all of it.
+"""A lower bound on the smallest eigenvalue of a nearly singular Z_rr, far tighter than a verified test of all of Z_rr.
 
 Let V (N, k) be approximate eigenvectors of the smallest eigenvalues and M = Z + c V V' >= m > 0, verified with room.
 Any z is V a + w with V'w = 0, so w'Zw = w'Mw >= m |w|^2, and with R = Z V - V diag(lambda), w'Z V a = w'R a::
 
     z'Zz >= a'(V'ZV)a - 2 |a| |R| |w| + m |w|^2 >= -(nu + |R|^2 / m) |a|^2,      |a|^2 <= |z|^2 / (1 - |V'V - I|)
 
-with -nu a lower bound on the eigenvalues of V'ZV (Gershgorin: it is nearly diagonal). V'ZV and R are evaluated in
-extended precision; that V is only approximate costs |R|^2.
+with -nu a lower bound on the eigenvalues of V'ZV (Gershgorin: V'ZV is nearly diagonal). V'ZV and R are evaluated in
+extended precision. The term |R|^2 is there because V is only approximate.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ import scipy.linalg
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.lagrangian import WIDE_UNIT, Wide, lagrangian
 from gtsam_rwhec.solver.reduced_form import ReducedForm
-from gtsam_rwhec.solver.verified import arrow_is_positive_definite, cholesky_allowance, gamma
+from gtsam_rwhec.solver.verified import cholesky_allowance, gamma, is_positive_definite
 
-#: Eigenvectors are taken out up to this many times what the verified test allows for rounding.
+#: Eigenvectors are taken out up to this many times the verified test's allowance for rounding.
 REACH = 100.0
+#: Covers the rounding of the few operations in the bounds themselves.
 _SAFETY = 1.0 + 1e-9
 
 
@@ -34,11 +35,11 @@ def deflated_eigenvalue(
     form : ReducedForm
     multipliers : (n, 20) array
     arrow_part : (9 n, 9 n) array
-        Z_rr without its product of few rows, G left aside.
+        Z_rr before G'G is subtracted.
     rounded : (9 n,) array
-        A diagonal that dominates what forming ``arrow_part`` rounded.
+        A diagonal that dominates the rounding in ``arrow_part``.
     slack : (n, 9) array
-        What the verified test allows: the size of eigenvalues that it cannot tell from zero.
+        The verified test's allowance: it cannot tell smaller eigenvalues from zero.
     """
     N = len(arrow_part)
     G = form.G[:, :-1]
@@ -51,15 +52,14 @@ def deflated_eigenvalue(
     if k == 0 or k == N:
         return -np.inf
 
-    # M - m > 0, with what forming M rounded subtracted too.
+    # M - m > 0, with the rounding in M subtracted too.
     c = float(np.abs(np.diagonal(Z)).max())
     M = Z + c * (V @ V.T)
     of_G, of_V_rows = np.abs(G), np.abs(V)
     formed = gamma(len(G) + 6) * (of_G.T @ of_G.sum(axis=1)) + gamma(k + 6) * c * (of_V_rows @ of_V_rows.sum(axis=0))
     formed += 8.0 * gamma(1) * np.abs(M).sum(axis=1) + 8.0 * gamma(1) * np.abs(arrow_part).sum(axis=1)
     room = cholesky_allowance(np.diagonal(M), N)
-    nothing = np.zeros((0, 1, 1)), np.zeros((0, 1, N))
-    if not arrow_is_positive_definite(*nothing, M, np.zeros((0, 1)), room + rounded + _SAFETY * formed):
+    if not is_positive_definite(M, room + rounded + _SAFETY * formed):
         return -np.inf
 
     # V'ZV and the residual, column by column in extended precision.

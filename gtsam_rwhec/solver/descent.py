@@ -1,7 +1,7 @@
 """Riemannian second-order descent on SO(3)^n for f(R) = x' Q' x, with Q' in arrow form.
 
 Newton's method on the manifold, damped (Levenberg) where the Hessian is not positive definite or the step does not
-descend. A step costs one arrow factorisation with 3 x 3 leaves.
+descend. A step needs one arrow factorisation with 3 x 3 leaves.
 """
 
 from __future__ import annotations
@@ -20,11 +20,10 @@ _I3 = np.eye(3)
 
 @dataclass(frozen=True)
 class Descent:
-    """Where the descent ended: rotations (n, 3, 3), cost, gradient norm per rad, iterations, whether it converged."""
+    """The end of a descent: rotations (n, 3, 3), cost, iterations, whether it converged."""
 
     R: Array
     cost: float
-    gradient_norm: float
     iterations: int
     converged: bool
 
@@ -49,7 +48,6 @@ def descend(form: ReducedForm, R: Array, max_iterations: int) -> Descent:
     rounding = 1e-15 * max(form.magnitude, 1e-300)
     floor = max(1e-9 * form.magnitude / form.size, 1e-290)  # a form of motions at rest is zero
     damping = 0.0
-    gradient = np.zeros(0)
     for iteration in range(max_iterations):
         basis = tangent_basis(R)
         gradient = np.matmul(basis.transpose(0, 2, 1), q[:-1].reshape(-1, 9, 1))  # half of the gradient, (n, 3, 1)
@@ -73,17 +71,17 @@ def descend(form: ReducedForm, R: Array, max_iterations: int) -> Descent:
                     x_new = homogeneous(candidate)
                     q_new = form.apply(x_new)
                     cost_new = float(x_new @ q_new)
-                    # Close to the end the cost is flat to rounding; a Newton step is taken on the gradient's word.
+                    # Close to the end the cost is flat up to rounding: a short Newton step is accepted as it is.
                     if cost_new <= cost + max(rounding, 1e-14 * abs(cost)) or length < 1e-7:
                         break
             damping = max(4.0 * damping, floor)
             if not damping <= 1e6 * form.magnitude:
-                return Descent(R, cost, float(np.linalg.norm(gradient)), iteration, converged=False)
+                return Descent(R, cost, iteration, converged=False)
         R, x, q, cost = candidate, x_new, q_new, cost_new
         damping = 0.0 if damping <= floor else damping / 8.0
         if (length < 1e-9 or decrease < 1e-2 * rounding) and damping <= floor:
-            return Descent(R, cost, float(np.linalg.norm(gradient)), iteration + 1, converged=True)
-    return Descent(R, cost, float(np.linalg.norm(gradient)), max_iterations, converged=False)
+            return Descent(R, cost, iteration + 1, converged=True)
+    return Descent(R, cost, max_iterations, converged=False)
 
 
 def _hessian(form: ReducedForm, R: Array, basis: Array, q: Array) -> tuple[Array, Array, Array, Array, Array]:

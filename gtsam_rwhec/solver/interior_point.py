@@ -1,4 +1,4 @@
-"""The semidefinite relaxation by a primal-dual interior-point method that uses the constraints' blocks.
+"""The semidefinite relaxation, solved by a primal-dual interior-point method that uses the constraints' blocks.
 
 ::
 
@@ -6,7 +6,7 @@
     dual     max gamma     s.t. Z = Q' - sum lambda_ik A_ik - gamma e_h e_h' >= 0
 
 The HKM direction with Mehrotra's predictor and corrector (Helmberg, Rendl, Vanderbei, Wolkowicz 1996; Todd 2001),
-from strictly feasible points of both sides, known in closed form (DESIGN fact 6). The Schur complement needs only
+from strictly feasible points of both sides, known in closed form (design fact 6). The Schur complement needs only
 10 x 10 blocks of X and Z^-1 (``local_blocks.gram``), where a general solver would treat every pair of constraints as
 dense: 481 constraints on a 217 x 217 matrix, the real dataset, take a fraction of a second.
 """
@@ -33,10 +33,10 @@ class Relaxation:
     Attributes
     ----------
     X : (9 n + 1, 9 n + 1) array
-        Of the primal; rank one where the relaxation is tight.
+        The primal variable; it has rank one where the relaxation is tight.
     multipliers : (n, 20) array
     scale_multiplier : float
-        Of alpha >= 0, where that was asked for.
+        The multiplier of alpha >= 0; zero without this constraint.
     primal, dual : float
         <Q', X> and gamma.
     iterations : int
@@ -56,7 +56,7 @@ class Relaxation:
 def solve_by_blocks(Q: Array, tolerance: float, max_iterations: int, progress: Progress | None = None) -> Relaxation:
     """Solve the relaxation of Q' (9 n + 1 square, symmetric) to a relative gap of ``tolerance``.
 
-    Stops earlier where double precision ends; the gap between ``primal`` and ``dual`` says how far it came.
+    The method stops earlier where double precision ends: see the gap between ``primal`` and ``dual``.
     """
     size = len(Q)
     scale = float(np.abs(Q).max()) or 1.0
@@ -71,7 +71,7 @@ def solve_by_blocks(Q: Array, tolerance: float, max_iterations: int, progress: P
             break
         try:
             system = _Newton.at(point)
-            # Mehrotra: how far the pure Newton step gets tells how much centring the real one needs.
+            # Mehrotra: the length of the pure Newton step decides how much centring the real step gets.
             affine = system.direction(0.0, None)
             a_primal, a_dual = _step_length(point.X, affine.X, 1.0), _step_length(point.Z, affine.Z, 1.0)
             after = float(np.vdot(point.X + a_primal * affine.X, point.Z + a_dual * affine.Z)) / gap
@@ -79,7 +79,7 @@ def solve_by_blocks(Q: Array, tolerance: float, max_iterations: int, progress: P
             step = system.direction(sigma * gap / size, affine.X @ affine.Z)
             a_primal, a_dual = _step_length(point.X, step.X, 0.95), _step_length(point.Z, step.Z, 0.95)
         except np.linalg.LinAlgError:
-            break  # the end of what double precision gives
+            break  # double precision ends here
         if max(a_primal, a_dual) < 1e-6:
             break
         point = _Point(
@@ -102,7 +102,7 @@ def solve_by_blocks(Q: Array, tolerance: float, max_iterations: int, progress: P
 
 @dataclass(frozen=True)
 class _Point:
-    """An iterate, or a step from one: X, lambda (n, 20), gamma, Z."""
+    """An iterate, or a step from an iterate: X, lambda (n, 20), gamma, Z."""
 
     X: Array
     multipliers: Array
@@ -111,7 +111,7 @@ class _Point:
 
 
 def _strictly_feasible(C: Array) -> _Point:
-    """The mean of SO(3) with its spread; and lambda on R'R = I so negative that Z is dominated by its diagonal."""
+    """X of the uniform distribution on SO(3), and lambda on R'R = I so negative that Z is diagonally dominant."""
     n = (len(C) - 1) // 9
     c = 1.1 * float(np.abs(C).sum(axis=1).max())
     multipliers = np.zeros((n, 20))
@@ -138,8 +138,8 @@ class _Newton:
         lower = scipy.linalg.cho_factor(point.Z, lower=True, check_finite=False)
         W = _symmetric(scipy.linalg.cho_solve(lower, np.eye(len(point.Z)), check_finite=False))
         M = _schur(family, point.X, W)
-        # X tends to rank one and M to a singular matrix: what rounding took from its diagonal is given back, no more
-        # than needed. The next step mends what that leaves of infeasibility.
+        # X tends to rank one and M to a singular matrix. The smallest addition that makes M positive definite replaces
+        # what rounding took from its diagonal. The next step corrects the infeasibility that this causes.
         diagonal = np.diagonal(M).copy()
         for relative in (0.0, 1e-14, 1e-12, 1e-10):
             M[np.diag_indices_from(M)] = diagonal * (1.0 + relative)
@@ -168,7 +168,7 @@ def _schur(family: Array, X: Array, W: Array) -> Array:
     n, c = family.shape[:2]
     M = np.empty((n * c + 1, n * c + 1))
     M[:-1, :-1] = gram(family, X, W)
-    # A = e_h e_h': tr(A_ik X e_h e_h' W) = W_h' A_ik X_h, symmetrised as the rest is.
+    # A = e_h e_h': tr(A_ik X e_h e_h' W) = W_h' A_ik X_h, symmetrised like the rest.
     outer = np.outer(X[:, -1], W[-1])
     M[:-1, -1] = M[-1, :-1] = traces(family, 0.5 * (outer + outer.T)).ravel()
     M[-1, -1] = X[-1, -1] * W[-1, -1]

@@ -1,4 +1,4 @@
-"""Z = Q' - Lambda applied to a vector in extended precision, with what that may have rounded."""
+"""The product of Z = Q' - Lambda and a vector in extended precision, with a bound on its rounding."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
 from gtsam_rwhec.solver.verified import gamma
 
-#: numpy's widest real number: 80 bits on x86, 128 on aarch64 Linux, plain double elsewhere (bounds then are looser).
+#: numpy's widest real number: 80 bits on x86, 128 on aarch64 Linux, plain double elsewhere (looser bounds).
 Wide = np.longdouble
+#: Its unit roundoff.
 WIDE_UNIT = float(np.finfo(Wide).eps) / 2.0
 
 
@@ -28,7 +29,7 @@ def lagrangian(form: ReducedForm, multipliers: Array, x: Array) -> tuple[Any, Ar
     wide_x = x.astype(Wide)
 
     def evaluate(y: Array, stored: tuple[Array, ...], Lambda: Array, minus: int) -> Array:
-        """(D, C, E) y - G'(G y) - Lambda y; with absolute values and minus = -1, what bounds the rounding."""
+        """(D, C, E) y - G'(G y) - Lambda y; with absolute values and minus = -1, the size that bounds the rounding."""
         D, C, E, G = stored
         leaf, border = y[:split], y[split:]
         local = np.empty((n, 10), dtype=y.dtype)
@@ -47,7 +48,7 @@ def lagrangian(form: ReducedForm, multipliers: Array, x: Array) -> tuple[Any, Ar
     z = evaluate(wide_x, tuple(m.astype(Wide) for m in stored), Lambda, 1)
     size_Lambda = (np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)).reshape(n, 10, 10)
     size = evaluate(np.abs(x), tuple(np.abs(m) for m in stored), size_Lambda, -1)
-    # No entry of z is made by more operations than this; sums within sums add their counts.
+    # At most this many operations make an entry of z; sums within sums add their counts.
     unit = gamma(2 * form.size + len(form.G) + 60, WIDE_UNIT)
     z_error = unit * size * (1.0 + gamma(4 * form.size))
     value = wide_x @ z

@@ -1,8 +1,8 @@
-"""Constraint algebra: symmetric matrices that touch one rotation's nine entries and h, all n rotations at once.
+"""Algebra of the constraints' matrices, as blocks of ten rows and columns, for all n rotations at once.
 
-Every multiplier's matrix is zero outside the ten rows and columns [vec R_i, h] of its rotation (DESIGN fact 6). A
-family of them is an array (n, c, 10, 10), c matrices for each rotation. The Gram matrices that interior-point methods
-need, tr(A W B V), then come from 10 x 10 blocks of W and V: O(n^2) small products instead of O(n^2 c^2) large ones.
+The matrix of a constraint is zero outside the ten rows and columns [vec R_i, h] of its rotation (design fact 6). A
+family of them is an array (n, c, 10, 10), c matrices for each rotation. The Gram matrices tr(A W B V) of interior-point
+methods then need 10 x 10 blocks of W and V only: O(n^2) small products instead of O(n^2 c^2) large products.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def local_indices(n: int) -> np.ndarray:
 
 
 def scatter(blocks: Array) -> Array:
-    """Sum of local matrices (n, 10, 10), as one (9 n + 1, 9 n + 1) matrix."""
+    """The sum of local matrices (n, 10, 10), as one (9 n + 1, 9 n + 1) matrix."""
     n = len(blocks)
     full = np.zeros((9 * n + 1, 9 * n + 1))
     np.einsum("iaib->iab", full[:-1, :-1].reshape(n, 9, n, 9))[...] = blocks[:, :9, :9]
@@ -43,10 +43,7 @@ def traces(family: Array, W: Array) -> Array:
 
 
 def gram(family: Array, W: Array, V: Array) -> Array:
-    """(n c, n c): tr(A_ik W A_jl V), for symmetric W and V; symmetric itself.
-
-    The sum is symmetric in (ik), (jl) when W and V are symmetric, as tr(M) = tr(M').
-    """
+    """(n c, n c): tr(A_ik W A_jl V) for symmetric W and V; symmetric in (ik), (jl), as tr(M) = tr(M')."""
     n, c = family.shape[:2]
     index = local_indices(n)
     flat = family.reshape(n, c, 100)
@@ -58,7 +55,7 @@ def gram(family: Array, W: Array, V: Array) -> Array:
         V_i = V[index[later, :, None], rows[None, None, :]]  # [j, d, a]
         AW = np.matmul(family[i].reshape(1, c * 10, 10), W_i).reshape(-1, c, 10, 10)  # [j, k, a, c]
         VAW = np.matmul(V_i[:, None], AW)  # [j, k, d, c]
-        # A_jl is symmetric, so contracting [c, d] or [d, c] is the same.
+        # A_jl is symmetric: [c, d] and [d, c] give the same contraction.
         block = np.matmul(VAW.reshape(-1, c, 100), flat[later].transpose(0, 2, 1))  # [j, k, l]
         result[i, :, later] = block.transpose(1, 0, 2)
         result[later, :, i] = block.transpose(0, 2, 1)

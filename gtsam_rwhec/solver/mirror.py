@@ -1,9 +1,9 @@
-"""The mirror image that planar motion cannot tell from the truth when the scale is unknown.
+"""The mirror image of an answer, which costs the same when the motion is planar and the scale unknown.
 
 Let every A turn about one axis, u_s in the sensor carrier, u_t in the target carrier, A u_t = u_s, and move across it.
-Then the parts of the residuals along the axis and across it are apart, and a half turn of all frames about the axis
-changes the sign of the parts across, as a change of the scale's sign does: (H R, -alpha) costs what (R, alpha) costs.
-Both have det R = 1, only one of them has a positive scale.
+Then each residual is a component along the axis plus an independent component across it. A half turn of all frames
+about the axis changes the sign of the component across, and so does a negative scale: (H R, -alpha) and (R, alpha) cost
+the same. Both have det R = 1, but only one of them has a positive scale.
 """
 
 from __future__ import annotations

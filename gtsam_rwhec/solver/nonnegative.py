@@ -1,13 +1,14 @@
 """The variant with alpha >= 0 as a constraint (RWHEC paper Section 4.3), for very noisy data.
 
 (R, t, alpha) and (-R, -t, -alpha) cost the same, but only one of them has det R = 1, so noise can put the optimum at a
-negative scale. With all but the scale eliminated the cost is x'Q'x + (alpha - a)^2 / s, a = row . r the best scale for
-the rotations (eq. 47), s = ``scale_spread``. alpha >= 0 enters the relaxation as one linear inequality on h alpha, with
-one multiplier nu >= 0. For any nu, eliminating the scale from cost - nu h alpha gives, on alpha >= 0::
+negative scale. With all but rotations and scale eliminated, the cost is x'Q'x + (alpha - a)^2 / s, where a = row . r is
+the best scale for the rotations (eq. 47) and s = ``scale_spread``. alpha >= 0 enters the relaxation as one linear
+inequality on h alpha, with one multiplier nu >= 0. For any nu, the elimination of the scale from cost - nu h alpha
+gives, on alpha >= 0::
 
     cost >= x'Q'x - nu h a - nu^2 s h^2 / 4
 
-which is a form like Q' and is bounded as Q' is.
+The right side is a form like Q', and ``bound`` bounds it in the same way.
 """
 
 from __future__ import annotations
@@ -31,23 +32,23 @@ from gtsam_rwhec.solver.small_dual import stationary_multipliers
 from gtsam_rwhec.solver.variables import answer_of
 from gtsam_rwhec.solver.verified import gamma
 
-#: Clarabel's cone grows with the fourth power of this.
+#: Up to this many frames the relaxation is solved: the size of Clarabel's cone grows with the fourth power.
 MAX_FRAMES = 8
 
 
 def scale_row(form: ReducedForm) -> Array:
-    """alpha = scale_row . r for homogeneous forms (eq. 47), (9 n,)."""
+    """The row (9 n,) with best scale alpha = row . r, for homogeneous forms (eq. 47)."""
     row: Array = -(form.border_factor[-1] @ form.G)[:-1]
     return row
 
 
 def scale_spread(form: ReducedForm) -> float:
-    """s: moving the scale by d from the best costs d^2 / s."""
+    """s: a scale that is d away from the best scale costs d^2 / s more."""
     return float(form.border_factor[-1] @ form.border_factor[-1])
 
 
 def with_scale_multiplier(form: ReducedForm, nu: float) -> ReducedForm:
-    """The form that costs no more than the cost does wherever alpha >= 0."""
+    """A form whose cost is at most the true cost wherever alpha >= 0."""
     half = 0.5 * nu * scale_row(form)
     split = 9 * form.leaves
     C, E = form.C.copy(), form.E.copy()
@@ -59,14 +60,14 @@ def with_scale_multiplier(form: ReducedForm, nu: float) -> ReducedForm:
 
 
 def run_with_nonnegative_scale(search: Search) -> Found:
-    """Solve with alpha >= 0 as a constraint; the unconstrained optimum is the answer where it satisfies it.
+    """Solve with alpha >= 0 as a constraint; the answer is the unconstrained optimum where that has a positive scale.
 
     Raises
     ------
     ScaleError
-        When no positive scale costs as little as scale zero does: that is no calibration.
+        When scale zero costs less than every positive scale that was found.
     OptionError
-        For more frames than the constrained relaxation takes.
+        For more than ``MAX_FRAMES`` frames.
     """
     found = search.run("auto", None)
     if search.part.kind != "direct":
@@ -90,7 +91,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
     with search.stages.of("descent"):
         starts = round_to_rotations(relaxation) + search.random_starts(options.random_starts)
         at_zero = _descend(without_scale(form), starts, options.max_descent_iterations)
-        # From where the scale is held at zero the cost may fall to the positive side.
+        # From a scale held at zero the cost may fall towards positive scales.
         ends = _descend(form, starts + [end.R for end in at_zero], options.max_descent_iterations)
     positive = [end for end in ends if answer_of(search.part, form, end.R).scale > 0.0]
     with search.stages.of("dual certificate"):
@@ -119,20 +120,20 @@ def run_with_nonnegative_scale(search: Search) -> Found:
 
 
 def without_scale(form: ReducedForm) -> ReducedForm:
-    """Q' with the scale held at zero: the row of G that the scale's elimination took is put back."""
+    """Q' with the scale held at zero: the row of G from the elimination of the scale is taken out."""
     of_scale = form.border_factor[-1] / np.linalg.norm(form.border_factor[-1])
     return dataclasses.replace(form, G=form.G - np.outer(of_scale, of_scale @ form.G))
 
 
 def _descend(form: ReducedForm, starts: list[Array], max_iterations: int) -> list[Descent]:
-    """Where descents end, the lowest first."""
+    """The ends of the descents, the lowest first."""
     return sorted((descend(form, start, max_iterations) for start in starts), key=lambda end: end.cost)
 
 
 def _bounds(form: ReducedForm, relaxation: Relaxation, at_zero: Array) -> list[Bound]:
-    """From the relaxation's multipliers at its own point, and polished at the best point of scale zero."""
+    """Bounds from the relaxation's multipliers: at the relaxation's own point, and at the best point of scale zero."""
     r = vec(at_zero).ravel()
-    # There the multiplier of the scale is the slope of the cost.
+    # At scale zero the multiplier of the scale is the slope of the cost.
     of_slope = max(-2.0 * float(scale_row(form) @ r) / scale_spread(form), 0.0)
     bounds = []
     for nu, point in (
@@ -149,7 +150,7 @@ def _bounds(form: ReducedForm, relaxation: Relaxation, at_zero: Array) -> list[B
 
 
 def _rounding(form: ReducedForm, nu: float) -> float:
-    """What forming ``with_scale_multiplier`` may have rounded, at any rotations: their entries are at most 1."""
+    """A bound on the rounding in ``with_scale_multiplier`` at any rotations: their entries are at most 1."""
     of_row = np.abs(form.border_factor[-1]) @ np.abs(form.G)
     linear = nu * float(of_row.sum()) + 2.0 * float(np.abs(form.C[:, :, -1]).sum() + np.abs(form.E[:-1, -1]).sum())
     constant = nu * nu * scale_spread(form) + abs(float(form.E[-1, -1]))

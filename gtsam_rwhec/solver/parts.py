@@ -1,4 +1,4 @@
-"""From a Problem to the parts that are solved apart: who is connected, which side are the leaves, about which gauge."""
+"""The parts of a problem that are solved apart: their frames, which side is eliminated first, and their gauge."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.priors import Prior
 from gtsam_rwhec.problem.problem import Problem
 
-#: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" the inverse equation, B X^-1 = Y^-1 A, which
-#: a scale for each target needs (DESIGN fact 7).
+#: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" is the inverse equation, B X^-1 = Y^-1 A, which a
+#: scale for each target needs (design fact 7).
 Kind = Literal["direct", "inverse"]
-#: Beyond this many times the translations' spread, moving the gauge costs digits (its square, of sixteen).
+#: A gauge that moves by more than this many times the spread of the translations loses four or more of the 16 digits:
+#: the square of this.
 FAR = 100.0
 
 
@@ -29,17 +30,26 @@ class Part:
     Attributes
     ----------
     leaves, centers : tuple of str
-        Free frames; leaves are the larger side, and are joined to centers only.
+        Free frames; leaves are the larger side, and each leaf meets centers only.
     targets, sensors : tuple of str
         All frames of the part, fixed ones too.
     pairs : tuple of Pair
-        Its edges.
+        The pairs that join the frames.
     moments : MomentStack
         Of the pairs in their order, about ``gauge``.
     fixed : dict of str to (4, 4) array
         Known poses, about ``gauge``.
     priors : dict of str to list of Prior
         About ``gauge``.
+    fixed_scales : dict of str to float
+        Known scales of targets, and of sensors with motions of their own.
+    gauge : Gauge
+        The reference points of moments and poses.
+    kind : "direct" or "inverse"
+        Which equation's residuals the form has.
+    scale : "known", "shared" or "per_target"
+    is_relative : bool
+        Whether all weights are 1, so that costs have no statistical meaning.
     """
 
     leaves: tuple[str, ...]
@@ -68,30 +78,30 @@ class Part:
 
     @property
     def number_of_measurements(self) -> int:
-        """Of all pairs."""
+        """The sum over all pairs."""
         return int(self.moments.count.sum())
 
     @property
     def scale_owners(self) -> tuple[str, ...]:
-        """With a scale per target: frames whose scale is unknown (targets, and sensors with motions of their own)."""
+        """Frames with an unknown scale of their own: targets, and sensors with motions of their own."""
         if self.scale != "per_target":
             return ()
         return tuple(dict.fromkeys(t for t, _ in self.pairs if t not in self.fixed_scales))
 
     @property
     def number_of_unknowns(self) -> int:
-        """Degrees of freedom: six a free frame, and the scales."""
+        """Six for each free frame, and one for each unknown scale."""
         return 6 * len(self.free) + (self.scale == "shared") + len(self.scale_owners)
 
     def frame_shift(self, name: str) -> Array:
-        """What the gauge subtracted from a frame's translation, in metres."""
+        """The translation that the gauge has subtracted from a frame's, in metres."""
         return self.gauge.target_carrier if name in self.targets else self.gauge.sensor_carrier
 
 
 def parts_of(problem: Problem) -> list[Part]:
-    """Split a problem into connected parts and check what only the whole can show.
+    """Split a problem into connected parts, and check the problem as a whole.
 
-    With one scale shared by all targets the scale joins everything, so there is one part for the solver.
+    A scale that all targets share joins all frames to one part.
 
     Raises
     ------
@@ -115,7 +125,7 @@ def parts_of(problem: Problem) -> list[Part]:
 
 
 def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
-    """Frames of each connected part of the graph, in order of first appearance."""
+    """The frames of each connected part of the graph, in order of first appearance."""
     neighbours: dict[str, set[str]] = {}
     for target, sensor in pairs:
         neighbours.setdefault(target, set()).add(sensor)
@@ -170,10 +180,10 @@ def _part(problem: Problem, members: frozenset[str]) -> Part:
 
 
 def _centred(problem: Problem, pairs: tuple[Pair, ...]) -> tuple[Gauge, MomentStack]:
-    """A part's moments about its own gauge (DESIGN fact 9).
+    """A part's gauge, and its moments about this gauge (design fact 9).
 
-    Moving moments is exact in formula, but a move far beyond the spread of the translations cancels digits, as when
-    the first measurements were all but one pose. Then the raw measurements, where kept, are summed anew.
+    The formula that moves moments is exact, but a move far beyond the spread of the translations loses digits. This
+    happens when the first measurements were nearly one pose. Then the raw measurements, if kept, are summed again.
     """
     motion = [pair.is_motion for pair in pairs]
     moments = MomentStack.of([problem.moments(*pair) for pair in pairs], motion)
@@ -198,13 +208,11 @@ def _moved(T: Array, origin: Array) -> Array:
 def _sides(
     targets: tuple[str, ...], sensors: tuple[str, ...], pairs: tuple[Pair, ...], fixed: dict[str, Array]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The larger side is eliminated first; a frame that only moves by itself has no pivot of its own: a center."""
+    """Leaves and centers: the larger side is eliminated first, without frames that have motions of their own only."""
     paired = {name for pair in pairs if not pair.is_motion for name in pair}
     free_targets = tuple(name for name in targets if name not in fixed)
     free_sensors = tuple(name for name in sensors if name not in fixed)
-    larger, smaller = (free_targets, free_sensors)
-    if len(free_sensors) > len(free_targets):
-        larger, smaller = free_sensors, free_targets
+    smaller, larger = sorted((free_sensors, free_targets), key=len)
     leaves = tuple(name for name in larger if name in paired)
     return leaves, smaller + tuple(name for name in larger if name not in paired)
 

@@ -1,8 +1,8 @@
 """The reduced form Q' (RWHEC paper eq. 48): translations and scales eliminated, rotations and h left.
 
-x = [vec R of the leaves, vec R of the centers, h]. A leaf's own translation is eliminated where it stands, which keeps
-the arrow shape; the centers' translations and the scale couple everything, so their elimination is kept as a product
-of few rows: Q' = arrow(D, C, E) - G'G. A star costs time linear in its leaves, whichever side is the star.
+x = [vec R of the leaves, vec R of the centers, h]. Each leaf's own translation is eliminated first, which keeps the
+arrow shape. The centers' translations and the shared scale couple everything: their elimination subtracts a product of
+few rows, Q' = arrow(D, C, E) - G'G. The time grows linearly with the leaves, whether they are targets or sensors.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.full_form import FullForm
 
-#: Directions of translation and scale whose pivot is smaller than this, after scaling to a unit diagonal, are
-#: rounding: eq. 48's pseudo-inverse leaves them out.
+#: With a unit diagonal, a smaller eigenvalue of the eliminated block is rounding: the pseudo-inverse of eq. 48 leaves
+#: its direction out.
 RANK_TOLERANCE = 1e-12
-#: A variable whose diagonal is this small beside the largest is not there: the square of what rounding leaves of a
-#: zero, and far below any ratio of weights.
+#: A variable with a smaller diagonal, relative to the largest, is absent: this is the square of the rounding of a zero,
+#: and far below any ratio of weights.
 ABSENT = 1e-26
 
 
@@ -28,9 +28,9 @@ ABSENT = 1e-26
 class ReducedForm:
     """Q' = arrow(D, C, E) - G'G over x = [leaves (9 L), centers (9 P), h (1)], and the way back to translations.
 
-    D (L, 9, 9) and E (9 P + 1, 9 P + 1), exactly symmetric, C (L, 9, 9 P + 1), G (k, 9 L + 9 P + 1). The factors lead
-    back to what was eliminated; the null vectors are the translations and scales that no measurement determines,
-    whatever the rotations.
+    D (L, 9, 9) and E (9 P + 1, 9 P + 1), exactly symmetric, C (L, 9, 9 P + 1), G (k, 9 L + 9 P + 1). The factors and
+    rows give the eliminated variables; the null vectors are the translations and scales that no measurement
+    determines, at any rotations.
     """
 
     D: Array
@@ -75,7 +75,7 @@ class ReducedForm:
 
     @cached_property
     def magnitude(self) -> float:
-        """A scale for costs: the sum of the diagonal, what a grossly wrong answer would cost."""
+        """A scale for costs: the sum of the diagonal, about the cost of a grossly wrong answer."""
         return float(np.einsum("lii->", self.D) + np.trace(self.E))
 
     def apply(self, x: Array) -> Array:
@@ -97,8 +97,8 @@ class ReducedForm:
     def recover(self, x: Array) -> tuple[Array, Array, Array]:
         """Translations and scales of the optimum given the rotations (eq. 47): leaf (L, 4), center (P, 4), alpha.
 
-        The four numbers are [t, own scale]. Where the measurements leave a scale open, the pseudo-inverse's choice
-        may be zero, which is no scale: it is set to 1, and the translations follow along the same cost.
+        The four numbers are [t, own scale]. Where the measurements leave a scale free, the pseudo-inverse may choose
+        zero, which is not a valid scale. Then the scale becomes 1, and the translations follow at the same cost.
         """
         split = 9 * self.leaves
         w = -self.border_factor @ (self.G @ x)
@@ -150,18 +150,18 @@ def reduce(form: FullForm) -> ReducedForm:
     G = np.empty((factor.shape[1], 9 * L + b - w))
     G[:, : 9 * L] = np.matmul(C[:, :, :w], factor).reshape(9 * L, factor.shape[1]).T
     G[:, 9 * L :] = factor.T @ E[:w, w:]
-    # Exactly symmetric: a factorisation reads one triangle, and what it proves is to be of the form that is evaluated.
+    # Exactly symmetric: a factorisation reads one triangle, and its proof must be about the form as it is evaluated.
     symmetric = 0.5 * (E[w:, w:] + E[w:, w:].T)
     D = 0.5 * (D + D.transpose(0, 2, 1))
     return ReducedForm(D, np.ascontiguousarray(C[:, :, w:]), symmetric, G, factor, leaf_factor, rows, null, leaf_null)
 
 
 def generalised_inverse_factor(M: Array) -> tuple[Array, Array]:
-    """F (s, m, m) with F F' a generalised inverse of each positive semidefinite M (s, m, m), and its null vectors.
+    """F (s, m, m), where F F' is a generalised inverse of each positive semidefinite M (s, m, m), and M's null vectors.
 
-    Rows and columns are scaled to a unit diagonal first, so that metres and scales compare. Zero columns of F stand
-    for directions that the measurements leave open; the other matrix has those as columns, zero elsewhere. Variables
-    that the problem does not have (zero diagonal) are in neither.
+    Rows and columns are scaled to a unit diagonal first, so that metres and scales compare. F has zero columns for the
+    directions that the measurements leave free, and the second matrix has these directions as columns, zero elsewhere.
+    Variables that the problem does not have (zero diagonal) are in neither.
     """
     diagonal = np.einsum("sii->si", M)
     largest = diagonal.max(axis=1, keepdims=True, initial=0.0)
@@ -177,7 +177,7 @@ def generalised_inverse_factor(M: Array) -> tuple[Array, Array]:
 
 
 def _toward_unit_scale(w: Array, null: Array, scales: np.ndarray) -> Array:
-    """The step along null directions that brings each scale they can move to 1; zero where they move none."""
+    """The step along null directions that brings each scale that they move to 1; zero if they move none."""
     along = null[scales]
     size = np.linalg.norm(null, axis=0)
     open_ones = (np.abs(along) > 1e-6 * np.where(size > 0.0, size, 1.0)).any(axis=1) if null.size else np.zeros(0, bool)

@@ -1,7 +1,7 @@
-"""The semidefinite relaxation of Problem 6 with all 21 constraints a rotation (eqs. 19, 50, 70-73).
+"""The semidefinite relaxation of Problem 6 with all 21 constraints for each rotation (eqs. 19, 50, 70-73).
 
-Clarabel solves it where its cone fits, the block method of ``interior_point`` elsewhere. Clarabel also takes the
-variant with alpha >= 0 (Section 4.3): with alpha as a variable of its own, h alpha is an entry of X, to be nonnegative.
+Clarabel solves small relaxations, the block method of ``interior_point`` solves large ones. Clarabel also solves the
+variant with alpha >= 0 (Section 4.3): alpha becomes a variable, and the entry h alpha of X must be nonnegative.
 """
 
 from __future__ import annotations
@@ -18,51 +18,28 @@ from gtsam_rwhec.solver.interior_point import Relaxation, solve_by_blocks
 from gtsam_rwhec.solver.local_blocks import local_indices
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, project, unvec
 
-#: Clarabel holds a dense block of order N (N + 1) / 2 for an N x N cone: up to this N it fits and is quick.
+#: Clarabel holds a dense block of order N (N + 1) / 2 for an N x N cone: up to this N it is quick.
 CLARABEL_SIZE = 46
 
 
-def solve_relaxation(
-    Q: Array,
-    tolerance: float,
-    max_iterations: int,
-    progress: Progress | None = None,
-) -> Relaxation:
-    """Solve the relaxation of Q' (9 n + 1 square).
-
-    Parameters
-    ----------
-    Q : (9 n + 1, 9 n + 1) array
-    tolerance : float
-        Relative gap at which to stop.
-    max_iterations : int
-    progress : callable, optional
-        Told what it does.
-    """
+def solve_relaxation(Q: Array, tolerance: float, max_iterations: int, progress: Progress | None = None) -> Relaxation:
+    """Solve the relaxation of Q' (9 n + 1 square) to a relative gap of ``tolerance``."""
     if len(Q) <= CLARABEL_SIZE:
         return solve_by_clarabel(Q, tolerance, max_iterations)
     return solve_by_blocks(Q, tolerance, max_iterations, progress)
 
 
 def solve_by_clarabel(Q: Array, tolerance: float, max_iterations: int) -> Relaxation:
-    """The dual, max gamma s.t. Z(lambda) >= 0, as Clarabel's problem; its cone's dual variable is X."""
+    """Solve the dual, max gamma s.t. Z(lambda) >= 0, by Clarabel; X is the dual variable of its cone."""
     scale = float(np.abs(Q).max()) or 1.0
     X, y, iterations = _clarabel(Q / scale, (len(Q) - 1) // 9, tolerance, max_iterations)
     return _relaxation(Q, X, y, scale, 0.0, iterations)
 
 
 def solve_with_scale(Q: Array, row: Array, spread: float, tolerance: float, max_iterations: int) -> Relaxation:
-    """With alpha >= 0: of x'Q'x + (alpha - row . r)^2 / spread, the cost before the scale is eliminated.
+    """Solve the relaxation with alpha >= 0 of x'Q'x + (alpha - row . r)^2 / spread, the cost with the scale kept.
 
-    Parameters
-    ----------
-    Q : (9 n + 1, 9 n + 1) array
-    row : (9 n,) array
-        The best scale of rotations r is row . r (eq. 47).
-    spread : float
-        How weakly the cost holds the scale there.
-    tolerance, max_iterations
-        As in ``solve_relaxation``.
+    ``row`` (9 n,): the best scale of rotations r is row . r (eq. 47). ``spread``: see ``nonnegative.scale_spread``.
     """
     size = len(Q)
     scale = float(np.abs(Q).max()) or 1.0
@@ -88,7 +65,7 @@ def _relaxation(Q: Array, X: Array, y: Array, scale: float, nu: float, iteration
 
 
 def _clarabel(C: Array, n: int, tolerance: float, max_iterations: int) -> tuple[Array, Array, int]:
-    """X, multipliers and iterations; C is over [r, h], or over [r, h, alpha]: then X's entry h alpha is nonnegative."""
+    """X, multipliers and iterations, for C over [r, h] or over [r, h, alpha] with the entry h alpha nonnegative."""
     A, b = _constraint_columns(n, len(C)), stacked(C)
     cones = [clarabel.PSDTriangleConeT(len(C))]
     if len(C) == 9 * n + 2:  # nu >= 0, the multiplier of h alpha
@@ -105,7 +82,7 @@ def _clarabel(C: Array, n: int, tolerance: float, max_iterations: int) -> tuple[
 
 
 def _constraint_columns(n: int, size: int) -> scipy.sparse.csc_matrix:
-    """svec of each constraint's matrix as a column: 20 a rotation, then e_h e_h'."""
+    """svec of each constraint's matrix as a column: 20 for each rotation, then e_h e_h'."""
     index = local_indices(n)
     k, p, q = np.nonzero(CONSTRAINTS)
     values = CONSTRAINTS[k, p, q]
@@ -122,7 +99,7 @@ def _constraint_columns(n: int, size: int) -> scipy.sparse.csc_matrix:
 
 
 def round_to_rotations(relaxation: Relaxation) -> list[Array]:
-    """Rotations (n, 3, 3) from X: its h column, which is x itself where X has rank one, and its leading eigenvector."""
+    """Rotations (n, 3, 3) from X: from its h column, which is x where X has rank one, and its leading eigenvector."""
     X = relaxation.X
     starts = [project(unvec(X[:-1, -1] / X[-1, -1]))]
     leading = np.linalg.eigh(X)[1][:, -1]

@@ -1,6 +1,7 @@
 """Residuals of an answer in the physical model, pair by pair, from moments.
 
-Whatever form was solved, they are of R_A t_X + t_A - t_Y - R_Y t_B / alpha and of R_A R_X against R_Y R_B (eq. 18).
+For the direct form and the inverse form alike, the residuals are R_A t_X + t_A - t_Y - R_Y t_B / alpha and the
+difference of R_A R_X and R_Y R_B (eq. 18).
 """
 
 from __future__ import annotations
@@ -13,15 +14,20 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import edge_forms
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.variables import Answer
+from gtsam_rwhec.solver.variables import Answer, scales_of
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Root mean squares of a pair's residuals (number_of_measurements of them), weighted as the cost weighs them.
+    """Root mean squares of a pair's residuals, weighted as in the cost.
 
-    translation_rms_m is of |R_A t_X + t_A - t_Y - R_Y t_B / scale| in true metres, rotation_rms_rad of the angle of
-    R_A R_X against R_Y R_B.
+    Attributes
+    ----------
+    number_of_measurements : int
+    translation_rms_m : float
+        Of |R_A t_X + t_A - t_Y - R_Y t_B / scale|, in true metres.
+    rotation_rms_rad : float
+        Of the angle between R_A R_X and R_Y R_B, in rad.
     """
 
     number_of_measurements: int
@@ -31,7 +37,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class PairPoses:
-    """An answer as each pair sees it: R_X, R_Y (E, 3, 3), t_X, t_Y (E, 3) about the gauge, scale alpha (E,)."""
+    """An answer, pair by pair: R_X, R_Y (E, 3, 3), t_X, t_Y (E, 3) about the gauge, scale alpha (E,)."""
 
     R_X: Array
     t_X: Array
@@ -44,18 +50,12 @@ class PairPoses:
         """Free frames from the answer, fixed ones from the part."""
         frames = {name: (R, t) for name, R, t in zip(part.free, answer.R, answer.t, strict=True)}
         frames |= {name: (T[:3, :3], T[:3, 3]) for name, T in part.fixed.items()}
-        alphas = dict.fromkeys(part.names, answer.scale if part.scale == "shared" else 1.0) | part.fixed_scales
-        own = dict(zip(part.free, answer.own_scale, strict=True))
-        alphas |= {name: float(own[name]) for name in part.scale_owners}
-        X = [frames[target] for target, _ in part.pairs]
-        Y = [frames[sensor] for _, sensor in part.pairs]
-        return PairPoses(
-            np.array([R for R, _ in X]),
-            np.array([t for _, t in X]),
-            np.array([R for R, _ in Y]),
-            np.array([t for _, t in Y]),
-            np.array([alphas[target] for target, _ in part.pairs]),
+        alphas = scales_of(part, answer)
+        (R_X, t_X), (R_Y, t_Y) = (
+            [np.array(each) for each in zip(*(frames[name] for name in side), strict=True)]
+            for side in zip(*part.pairs, strict=True)
         )
+        return PairPoses(R_X, t_X, R_Y, t_Y, np.array([alphas[target] for target, _ in part.pairs]))
 
 
 def costs_of_pairs(part: Part, poses: PairPoses) -> tuple[Array, Array]:
@@ -69,7 +69,7 @@ def costs_of_pairs(part: Part, poses: PairPoses) -> tuple[Array, Array]:
     translation, rotation = edge_forms(part.moments.translation, part.moments.rotation, part.moments.kappa)
     J_t = np.einsum("ei,eij,ej->e", x, translation, x)
     J_R = np.einsum("ei,eij,ej->e", x, rotation, x)
-    return np.maximum(J_t, 0.0), np.maximum(J_R, 0.0)  # zero may round to just below
+    return np.maximum(J_t, 0.0), np.maximum(J_R, 0.0)  # zero may round to a negative number
 
 
 def residuals_of_pairs(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> dict[Pair, Residual]:

@@ -1,7 +1,7 @@
-"""SO(3) as the certificates see it: 21 quadratic constraints a rotation, tangents, projection, retraction.
+"""SO(3) for certificates: 21 quadratic constraints for each rotation, tangents, projection, retraction.
 
-A stack of rotations is (n, 3, 3); as part of x = [vec R_1, ..., vec R_n, 1] each is its columns, one after the other.
-Constraints act on the ten numbers [vec R, h], h the homogenising entry.
+A stack of rotations is (n, 3, 3); in x = [vec R_1, ..., vec R_n, 1], vec R has the columns of R one after the other.
+A constraint is about the ten numbers [vec R, h], with h the homogenising entry.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def _constraints() -> Array:
     matrices = []
 
     def add(*terms: tuple[int, int, int]) -> None:
-        """Add the matrix A of y' A y = sum of value * (2 if p != q else 1) * y_p y_q."""
+        """Append the matrix A of y' A y = sum of value * (2 if p != q else 1) * y_p y_q."""
         A = np.zeros((10, 10))
         for p, q, value in terms:
             A[p, q] += value
@@ -30,7 +30,7 @@ def _constraints() -> Array:
     for a, b in pairs:  # eq. 50b: R'R = h^2 I (columns)
         add(*[(entry[i, a], entry[i, b], 1) for i in range(3)], *([(h, h, -1)] if a == b else []))
     rows = [(0, 1), (0, 2), (1, 2), (0, 0), (1, 1)]
-    # The traces of R'R and R R' coincide: one diagonal entry of R R' depends on the others and comes last.
+    # R'R and R R' have the same trace: one diagonal entry of R R' depends on the others and comes last.
     for a, b in rows:  # eq. 50a: R R' = h^2 I (rows)
         add(*[(entry[a, j], entry[b, j], 1) for j in range(3)], *([(h, h, -1)] if a == b else []))
     for a, b, c in [(0, 1, 2), (1, 2, 0), (2, 0, 1)]:  # eq. 50c: R_a x R_b = h R_c
@@ -43,8 +43,9 @@ def _constraints() -> Array:
 
 #: All 21 constraints (21, 10, 10); the first 6 are R'R = I, the last depends on the others.
 ALL_CONSTRAINTS = _constraints()
-#: The 20 independent ones.
+#: The 20 independent constraints.
 CONSTRAINTS = ALL_CONSTRAINTS[:20]
+#: The same as rows (20, 100).
 CONSTRAINTS_FLAT = CONSTRAINTS.reshape(20, 100)
 
 
@@ -71,7 +72,7 @@ def tangent_basis(R: Array) -> Array:
 
 
 def retract(R: Array, w: Array) -> Array:
-    """R exp(w^), brought back to SO(3) by one Newton-Schulz step so that rounding does not add up."""
+    """R exp(w^); one Newton-Schulz step brings it back to SO(3), so that rounding does not add up."""
     theta2 = (w * w).sum(axis=1)[:, None, None]
     theta = np.sqrt(theta2)
     W = np.zeros_like(R)
@@ -108,13 +109,12 @@ def random_rotations(count: int, generator: np.random.Generator) -> Array:
 
 
 def kkt_multipliers(R: Array, gradient: Array) -> Array:
-    """(n, 20) multipliers of the constraints at a critical point: S_i = sym(R_i' G_i) on R'R = I (DESIGN fact 3).
+    """(n, 20) multipliers of the constraints at a critical point: S_i = sym(R_i' G_i) on R'R = I (design fact 3).
 
     gradient is (n, 9), the rotations' part of Q'x.
     """
     S = R.transpose(0, 2, 1) @ unvec(gradient)
     S = 0.5 * (S + S.transpose(0, 2, 1))
     multipliers = np.zeros((len(R), 20))
-    for k, (a, b) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
-        multipliers[:, k] = S[:, a, b]
+    multipliers[:, :6] = S[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     return multipliers

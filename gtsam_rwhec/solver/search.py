@@ -159,7 +159,7 @@ class _Attempt:
 
     def __init__(self, search: Search, starts: list[Array], start: Start) -> None:
         self.search, self.form, self.stages = search, search.form, search.stages
-        self.best = Descent(starts[0], np.inf, np.inf, 0, converged=False)
+        self.best = Descent(starts[0], np.inf, 0, converged=False)
         self.start, self.multipliers, self.bound = start, Multipliers.KKT, NOTHING_YET
         self.descend(starts, start)
         self.first_cost = self.best.cost

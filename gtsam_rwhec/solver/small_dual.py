@@ -1,12 +1,12 @@
-"""The small dual (DESIGN fact 4a): better multipliers of all constraints at the same point.
+"""The small dual (design fact 4a): better multipliers of all constraints at the same point.
 
-At a critical point x the multipliers of R'R = I are unique, those of all 20 independent constraints are not: each
-rotation has a family of combinations N with N x = 0, 14 of them. Adding them moves Z = Q' - Lambda without touching
-Z x = 0, and may make it positive semidefinite: maximise t subject to Z(y) >= t P across x. A log-barrier Newton method
-on (y, t); it stops as soon as t is safely positive, since any such y proves the same.
+At a critical point x the multipliers of R'R = I are unique, but the multipliers of all 20 independent constraints are
+not: for each rotation, 14 combinations N of the constraints have N x = 0. Adding them changes Z = Q' - Lambda, keeps
+Z x = 0, and may make Z positive semidefinite: maximise t subject to Z(y) >= t P across x. The method is log-barrier
+Newton on (y, t). It stops as soon as t is safely positive, since any such y proves the same.
 
-P sets the measure: Q' itself, a little more on its diagonal. Weights of translations and rotations differ by powers of
-ten, and the directions in question are those in which Q' is smallest; against the identity they would drown.
+P sets the measure: Q' with a little added to its diagonal. Weights of translations and rotations differ by powers of
+ten, and the directions that matter are those in which Q' is smallest; the identity as measure would hide them.
 """
 
 from __future__ import annotations
@@ -15,30 +15,33 @@ import numpy as np
 import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.local_blocks import gram, scatter, traces
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, vec
 
-#: With Z above this much of P the verified test has room, whatever the rounding.
+#: Where Z is above this much of P, the verified test succeeds despite rounding.
 ENOUGH = 1e-2
 
 
 def null_multipliers(R: Array) -> Array:
     """(n, 14, 20): orthonormal combinations of the constraints whose matrix N has N x = 0 at x = [vec R, 1]."""
-    local = np.c_[vec(R), np.ones(len(R))]
-    # Column k is A_k x; its rank is 6, the normal space of SO(3) (Theorem 6). Rows of h follow from x'A_k x = 0.
-    columns = np.einsum("kpq,nq->npk", CONSTRAINTS, local)[:, :9]
-    _, _, Vt = np.linalg.svd(columns)
+    # The rank of the normals is 6, the dimension of the normal space of SO(3) (Theorem 6).
+    _, _, Vt = np.linalg.svd(_normals(R))
     return Vt[:, 6:, :]
+
+
+def _normals(R: Array) -> Array:
+    """(n, 9, 20): A_k x without the row of h, which follows from x'A_k x = 0."""
+    columns: Array = np.einsum("kpq,nq->npk", CONSTRAINTS, np.c_[vec(R), np.ones(len(R))])[:, :9]
+    return columns
 
 
 def stationary_multipliers(form: ReducedForm, R: Array, multipliers: Array) -> Array:
     """The multipliers (n, 20) nearest to the given ones with Z x = 0 at x = [vec R, 1], a critical point."""
-    local = np.c_[vec(R), np.ones(len(R))]
-    x = np.append(local[:, :9].ravel(), 1.0)
-    columns = np.einsum("kpq,nq->npk", CONSTRAINTS, local)[:, :9]
-    residual = form.apply(x)[:-1].reshape(-1, 9) - np.einsum("npk,nk->np", columns, multipliers)
-    correction = np.matmul(np.linalg.pinv(columns, rcond=1e-9), residual[:, :, None])[:, :, 0]
+    normals = _normals(R)
+    residual = form.apply(homogeneous(R))[:-1].reshape(-1, 9) - np.einsum("npk,nk->np", normals, multipliers)
+    correction = np.matmul(np.linalg.pinv(normals, rcond=1e-9), residual[:, :, None])[:, :, 0]
     result: Array = multipliers + correction
     return result
 
@@ -59,13 +62,13 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
     multipliers : (n, 20) array
         Still with Z x = 0.
     t : float
-        What they reach: Z - t P is positive definite across x. Positive: they prove x optimal. Minus infinity, with
-        the multipliers as given, where rounding has left Q' with a negative eigenvalue.
+        Z - t P is positive definite across x; a positive t proves x optimal. Minus infinity, with the multipliers as
+        given, where rounding has left Q' with a negative eigenvalue.
     """
     n = len(R)
     null = null_multipliers(R)
     family = np.einsum("nmk,kpq->nmpq", null, CONSTRAINTS)
-    x = np.append(vec(R).ravel(), 1.0)
+    x = homogeneous(R)
     Q = form.dense()
     Z0 = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
     Z0 = 0.5 * (Z0 + Z0.T)
@@ -76,9 +79,9 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
     P[np.diag_indices_from(P)] += 1e-9 * np.abs(np.diagonal(P)) + 1e-12
     try:
         np.linalg.cholesky(P)
-    except np.linalg.LinAlgError:  # an ill-conditioned reduction has rounded Q' below zero: there is no measure
+    except np.linalg.LinAlgError:  # an ill-conditioned reduction has rounded Q' below zero: P is no measure
         return multipliers, -np.inf
-    # Added along P x it takes x out of the question and leaves what is across x, z'P x = 0, as it is.
+    # A term along P x excludes x from the test and leaves all z across x, z'P x = 0, unchanged.
     along_x = P @ x / np.sqrt(float(x @ P @ x))
     try:
         t = float(scipy.linalg.eigh(Z0, P, eigvals_only=True, subset_by_index=[0, 0], check_finite=False)[0])
@@ -121,7 +124,7 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
             break
         decrement = float(np.sqrt(max(-(gradient @ step), 0.0) / weight))
         direction = scatter(np.einsum("nm,nmpq->npq", step[:-1].reshape(n, 14), family)) - step[-1] * P
-        # The damped step is safe and short; four times it mostly stays inside too.
+        # The damped step is safe and short; a step four times as long mostly stays inside too.
         length = 1.0 if decrement < 0.25 else 4.0 / (1.0 + decrement)
         length = _stay_inside(Z - t * P, direction, length)
         y = y + length * step[:-1]

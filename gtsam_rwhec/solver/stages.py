@@ -1,4 +1,4 @@
-"""The stages of a search: their times, and who is told when one begins."""
+"""The stages of a search: their names, reported as they begin, and their times."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Stages:
 
     @contextmanager
     def of(self, name: str) -> Iterator[None]:
-        """Tell that a stage begins, and time it."""
+        """Report that a stage begins, and add its time."""
         if self.progress is not None:
             self.progress(name)
         start = time.perf_counter()

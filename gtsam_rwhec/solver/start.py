@@ -1,4 +1,4 @@
-"""Starting points: the spectral solution of the rotation residuals, the unconstrained solution of Q', random ones."""
+"""Starting points of descents: the spectral solution of the rotation residuals, and the unconstrained one of Q'."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from gtsam_rwhec.solver.rotations import project, unvec, vec
 def spectral_start(part: Part, rotation_form: FullForm) -> list[Array]:
     """Rotations that minimise the rotation residuals over all matrices, projected to SO(3); (n, 3, 3) each.
 
-    With exact data the minimisers are a line through the truth (Corollary 2), so the smallest eigenvector is the
-    truth up to its sign. Leaves are eliminated first, so the eigenvalue problem is the smaller side's. Known frames
-    and priors give h a say; then both signs are returned, and the cost decides.
+    With exact data the minimisers are a line through the truth (Corollary 2), so the smallest eigenvector is the truth
+    up to its sign. Leaves are eliminated first, so the eigenvalue problem is about the centers only. Known frames and
+    priors add terms with h; then both signs are returned, and the cost decides.
     """
     L, P = rotation_form.leaves, rotation_form.centers
-    if P == 0:  # every center is a known frame: each leaf has its own linear problem
+    if P == 0:  # every center is a fixed frame: each leaf has its own linear problem
         solution = -np.linalg.solve(rotation_form.leaf[:, 4:, 4:], rotation_form.leaf_tail[:, 4:, 1, None])
         return [project(unvec(solution))]
     D = rotation_form.leaf[:, 4:, 4:]
@@ -41,7 +41,7 @@ def spectral_start(part: Part, rotation_form: FullForm) -> list[Array]:
     if anchored:
         border[:] = _smallest_eigenvector(S)
     else:
-        # Parts that only the shared scale joins have an eigenvector, and a sign, each.
+        # Components that only the shared scale joins each have an eigenvector and a sign.
         for block in _center_blocks(part):
             at = (9 * block[:, None] + np.arange(9)).ravel()
             r = _smallest_eigenvector(S[at[:, None], at])
@@ -56,7 +56,7 @@ def spectral_start(part: Part, rotation_form: FullForm) -> list[Array]:
 
 
 def _smallest_eigenvector(S: Array) -> Array:
-    """Of a symmetric matrix; a small one has all of its eigenvectors before a subset's driver is set up."""
+    """The smallest eigenvector of a symmetric matrix; for a small matrix, all eigenvectors cost less than a subset."""
     if len(S) <= 64:
         return np.linalg.eigh(S)[1][:, 0]
     vectors: Array = scipy.linalg.eigh(S, subset_by_index=[0, 0], check_finite=False)[1]
@@ -78,8 +78,8 @@ def _center_blocks(part: Part) -> list[np.ndarray]:
 def unconstrained_start(form: ReducedForm) -> list[Array]:
     """Minimisers of x'Q'x over all matrices: with h = 1 where Q' has linear terms, else the smallest eigenvector.
 
-    Translations take part, so it can do better where rotations alone are poorly excited; the eigenvector comes by
-    inverse iteration on the arrow factor.
+    Q' has the translation residuals too, so these starts can be better where rotations alone are poorly excited. The
+    eigenvector comes from inverse iteration on the arrow factor.
     """
     C, E = form.C[:, :, :-1], form.E[:-1, :-1]
     shift = 1e-12 * form.magnitude

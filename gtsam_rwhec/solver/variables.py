@@ -1,4 +1,4 @@
-"""Between the form's variables and poses: X, Y and scales from rotations and eliminated translations, and back."""
+"""Poses and scales from the variables of the form, and back."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from gtsam_rwhec.solver.rotations import vec
 
 @dataclass(frozen=True)
 class Answer:
-    """Poses about a part's gauge, as the user's frames see them: X or Y, not inverted, in metres.
+    """Poses X and Y of the free frames about a part's gauge (never inverted), in metres.
 
-    R (n, 3, 3) and t (n, 3) in the order of ``part.free``; own_scale (n,) with nan where a frame has none; scale the
-    shared one. A scale that the measurements leave open is set to 1.
+    R (n, 3, 3) and t (n, 3) in the order of ``part.free``; own_scale (n,), nan for a frame without an own scale; scale,
+    the shared scale. A scale that the measurements leave free is 1.
     """
 
     R: Array
@@ -30,7 +30,7 @@ class Answer:
 
 
 def answer_of(part: Part, form: ReducedForm, R: Array) -> Answer:
-    """The optimal translations and scales for given rotations (eq. 47), the scale divided out."""
+    """The answer with the optimal translations and scales for given rotations of the form (eq. 47)."""
     leaf, center, alpha = form.recover(homogeneous(R))
     numbers = np.concatenate([leaf, center])
     t, s = numbers[:, :3], numbers[:, 3]
@@ -45,6 +45,13 @@ def answer_of(part: Part, form: ReducedForm, R: Array) -> Answer:
         scale = float(1.0 / alpha[0]) if part.scale == "shared" else 1.0
     inverse_R = R.transpose(0, 2, 1)
     return Answer(inverse_R, -np.einsum("nij,nj->ni", inverse_R, t), own_scale, scale)
+
+
+def scales_of(part: Part, answer: Answer) -> dict[str, float]:
+    """The scale alpha of each frame's measurements: shared, known, or the frame's own."""
+    own = dict(zip(part.free, answer.own_scale.tolist(), strict=True))
+    scales = dict.fromkeys(part.names, answer.scale if part.scale == "shared" else 1.0) | part.fixed_scales
+    return scales | {name: own[name] for name in part.scale_owners}
 
 
 def as_variables(part: Part, answer: Answer) -> tuple[Array, Array, Array]:
@@ -67,14 +74,14 @@ def as_variables(part: Part, answer: Answer) -> tuple[Array, Array, Array]:
 
 
 def rotations_as_variables(part: Part, R: Array) -> Array:
-    """Rotations of frames as the form's: transposed where frames are inverted."""
+    """Rotations of frames as the form has them: transposed in the inverse form."""
     return R if part.kind == "direct" else np.ascontiguousarray(R.transpose(0, 2, 1))
 
 
 def given_answer(
     part: Part, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float]
 ) -> Answer:
-    """The user's poses about the part's gauge."""
+    """The user's poses as an answer, about the part's gauge."""
     transforms = []
     for name in part.free:
         poses, what = (X, "X") if name in part.targets else (Y, "Y")

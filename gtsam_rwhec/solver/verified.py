@@ -1,14 +1,14 @@
-"""Verified tests of positive definiteness in floating point (Rump 2006), on arrow matrices and on dense ones.
+"""Verified tests of positive definiteness in floating point (Rump 2006), for arrow matrices and dense matrices.
 
-A Cholesky factorisation that runs to its end in double precision proves that the matrix plus its backward error is
-positive definite. The backward error has an a-priori bound (Higham 2002, theorem 10.3, any order of summation; Rump
-2006, "Verification of positive definiteness", lemma 2.1), entry by entry::
+A Cholesky factorisation that completes in double precision proves that the matrix plus its backward error is positive
+definite. The backward error has an a-priori bound (Higham 2002, theorem 10.3, any order of summation; Rump 2006,
+"Verification of positive definiteness", lemma 2.1), entry by entry::
 
     |dA_ij| <= g / (1 - g) sqrt(a_ii a_jj),   g = gamma_{N+1} = (N + 1) u / (1 - (N + 1) u)
 
-so dA is dominated by the diagonal matrix N g / (1 - g) a_ii. Subtract that (and what forming the matrix may have
-rounded) from the diagonal first: if the factorisation then succeeds, the matrix as stated is positive definite. It is
-a sufficient test: a failure proves nothing.
+so the diagonal matrix N g / (1 - g) a_ii dominates dA. Subtract this matrix (and a bound on the rounding of forming
+the matrix) from the diagonal first: if the factorisation then succeeds, the matrix as stated is positive definite. The
+test is sufficient: a failure proves nothing.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from gtsam_rwhec.solver import arrow
 
 #: Unit roundoff of double precision.
 UNIT = 2.0**-53
-_SAFETY = 1.0 + 1e-10  # covers the rounding of the bounds' own few operations
-_TINY = 1e-290  # covers underflow
+#: Covers the rounding of the few operations in the bounds themselves.
+_SAFETY = 1.0 + 1e-10
+#: Covers underflow.
+_TINY = 1e-290
 
 
 def gamma(terms: int, unit: float = UNIT) -> float:
@@ -32,23 +34,20 @@ def gamma(terms: int, unit: float = UNIT) -> float:
 
 
 def cholesky_allowance(diagonal: Array, size: int) -> Array:
-    """What the factorisation of a matrix of this size and diagonal may have rounded, as a diagonal matrix."""
+    """A bound on the rounding in the factorisation of a matrix of this size and diagonal, as a diagonal matrix."""
     g = gamma(size + 1)
     allowance: Array = _SAFETY * size * g / (1.0 - g) * np.abs(diagonal) + _TINY
     return allowance
 
 
-def is_positive_definite(matrix: Array) -> bool:
-    """Whether a symmetric matrix, exactly as stored, is proven positive definite. False proves nothing.
+def is_positive_definite(matrix: Array, margin: Array | float = 0.0) -> bool:
+    """Whether a symmetric matrix, exactly as stored, minus diag(margin) is proven positive definite.
 
-    Parameters
-    ----------
-    matrix : (N, N) array
-        Its lower triangle counts.
+    Only its lower triangle is read. False proves nothing.
     """
     size = len(matrix)
-    empty = np.zeros((0, 1, 1)), np.zeros((0, 1, size))
-    return arrow_is_positive_definite(*empty, matrix, np.zeros((0, 1)), np.zeros(size))
+    leaves = np.zeros((0, 1, 1)), np.zeros((0, 1, size))
+    return arrow_is_positive_definite(*leaves, matrix, np.zeros((0, 1)), np.broadcast_to(margin, size))
 
 
 def arrow_is_positive_definite(D: Array, C: Array, E: Array, leaf_margin: Array, border_margin: Array) -> bool:
@@ -58,7 +57,7 @@ def arrow_is_positive_definite(D: Array, C: Array, E: Array, leaf_margin: Array,
     ----------
     D, C, E : (L, m, m), (L, m, b), (b, b) arrays
     leaf_margin, border_margin : (L, m), (b,) arrays
-        Subtracted from the diagonal; negative to ask for less.
+        Subtracted from the diagonal; negative for a weaker test.
     """
     size = D.shape[0] * D.shape[1] + len(E)
     leaf_diagonal = np.einsum("lii->li", D)
@@ -68,7 +67,7 @@ def arrow_is_positive_definite(D: Array, C: Array, E: Array, leaf_margin: Array,
         (np.einsum("lii->li", D_shifted), leaf_diagonal, leaf_margin),
         (np.einsum("ii->i", E_shifted), border_diagonal, border_margin),
     ):
-        # The subtraction itself rounds by at most u times its result.
+        # The subtraction rounds by at most u times its result.
         reach = np.abs(diagonal) + np.abs(margin)
         shifted -= margin + cholesky_allowance(reach, size) + 4.0 * UNIT * reach
     return arrow.cholesky(D_shifted, C, E_shifted) is not None

@@ -1,4 +1,4 @@
-"""What ``solve`` and ``certify`` are given, and the checks of it."""
+"""Checks of the arguments of ``solve`` and ``certify``."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gtsam_rwhec.solver.options import SolveOptions
 Poses = Mapping[str, PoseLike]
 Scale = float | Mapping[str, float]
 
-#: An answer's known frames (entries, rad and m) and scales may differ from the problem's by this much: files round.
+#: An answer's fixed frames (entries, rad and m) and scales may differ from the problem's by this much: files round.
 ROUNDING = 1e-9
 
 
 def check_types(problem: Problem, options: SolveOptions | None) -> None:
-    """Refuse what is no problem and no options, before its first attribute is missed."""
+    """Raise an ``OptionError`` for a problem or options of a wrong type."""
     if not isinstance(problem, Problem):
         raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
     if options is not None and not isinstance(options, SolveOptions):
@@ -28,7 +28,7 @@ def check_types(problem: Problem, options: SolveOptions | None) -> None:
 
 
 def check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) -> None:
-    """Refuse an answer that is another than the problem says is known: its cost would not be that of the answer."""
+    """Raise an error for an answer that lacks a frame, or contradicts a fixed frame or scale of the problem."""
     for what, poses, names in (("X", X, problem.targets), ("Y", Y, problem.sensors)):
         if not isinstance(poses, Mapping):
             raise OptionError(f"{what} is a {type(poses).__name__}; give poses by name: {{name: pose}}")

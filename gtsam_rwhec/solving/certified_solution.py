@@ -1,11 +1,9 @@
-"""``solve``: a problem in, a proven calibration out."""
+"""``solve``, which returns the proven calibration of a problem, and ``certify``, which tests a given answer."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-
-import gtsam
 
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OptionError, WeightsWarning
 from gtsam_rwhec.files.progress import Progress
@@ -20,7 +18,7 @@ from gtsam_rwhec.solver.options import Method, SolveOptions, check_method
 from gtsam_rwhec.solver.parts import connected_components, parts_of
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.variables import as_variables, given_answer, rotations_as_variables
+from gtsam_rwhec.solver.variables import as_variables, given_answer, rotations_as_variables, scales_of
 from gtsam_rwhec.solving.arguments import Poses, Scale, check_against_knowledge, check_types
 from gtsam_rwhec.solving.part_solution import PartSolution
 from gtsam_rwhec.solving.solution import Solution, SolvedPart
@@ -35,14 +33,14 @@ def solve(
     options: SolveOptions | None = None,
     progress: Progress | None = None,
 ) -> Solution:
-    """Calibrate: the globally optimal poses and scale, with a proof (RWHEC paper, Algorithm 1).
+    """Find the globally optimal poses and scale, with a proof (RWHEC paper, Algorithm 1).
 
     Parameters
     ----------
     problem : Problem
     method : "auto", "sdp" or "local"
-        "auto" descends from a spectral start, certifies by duality, and looks further only where that does not
-        suffice; "sdp" always solves the semidefinite relaxation; "local" descends from ``initial``.
+        "auto" descends from a spectral start, certifies by duality, and searches further only if this does not prove
+        the answer. "sdp" always solves the semidefinite relaxation. "local" descends from ``initial``.
     initial : (X, Y, scale), optional
         Poses by name, for "local".
     options : SolveOptions, optional
@@ -52,15 +50,15 @@ def solve(
     Returns
     -------
     Solution
-        With a warning when the measurements leave something free (``NotUniqueWarning``) or optimality is not
-        proven (``NotCertifiedWarning``).
+        With a warning when the measurements leave a direction free (``NotUniqueWarning``), when the answer is not
+        proven optimal (``NotCertifiedWarning``), or when the residuals contradict the weights (``WeightsWarning``).
 
     Raises
     ------
     CountError, FrameError, PriorError, UnderdeterminedError
         For a problem that cannot be solved.
     ScaleError
-        When the scale is not positive at the optimum.
+        When a scale is not positive at the optimum.
     """
     check_method(method)
     check_types(problem, options)
@@ -100,7 +98,7 @@ def certify(
     options: SolveOptions | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
-    """Certify a given answer: its cost against a rigorous bound on what any answer costs.
+    """Certify a given answer: compare its cost with a rigorous lower bound on the cost of every answer.
 
     Parameters
     ----------
@@ -115,7 +113,7 @@ def certify(
     Returns
     -------
     Certificate
-        Of the answer as given. ``Cause.BETTER_ANSWER`` says that the search found a better one.
+        Of the answer as given. ``Cause.BETTER_ANSWER`` means that the search found a better answer.
 
     Raises
     ------
@@ -150,25 +148,15 @@ def certify(
 
 
 def _merge(problem: Problem, results: list[PartSolution]) -> Solution:
-    X: dict[str, gtsam.Pose3] = {}
-    Y: dict[str, gtsam.Pose3] = {}
+    """One solution of all parts, with the warnings."""
+    poses = {name: to_pose3(T[:3, :3], T[:3, 3]) for name, T in problem.fixed.items()}
     scales: dict[str, float] = {}
     residuals: dict[Pair, Residual] = {}
     for result in results:
-        part = result.part
-        poses = {
-            name: to_pose3(R, t + part.frame_shift(name))
-            for name, R, t in zip(part.free, result.answer.R, result.answer.t, strict=True)
-        }
-        for name in part.fixed:
-            T = problem.fixed[name]
-            poses[name] = to_pose3(T[:3, :3], T[:3, 3])
-        X |= {name: poses[name] for name in part.targets}
-        Y |= {name: poses[name] for name in part.sensors}
-        if problem.scale == "per_target":
-            scales |= part.fixed_scales
-            own = dict(zip(part.free, result.answer.own_scale, strict=True))
-            scales |= {name: float(own[name]) for name in part.scale_owners}
+        part, answer = result.part, result.answer
+        for name, R, t in zip(part.free, answer.R, answer.t, strict=True):
+            poses[name] = to_pose3(R, t + part.frame_shift(name))
+        scales |= scales_of(part, answer)
         residuals |= result.residuals
     certificate = Certificate.merged([result.certificate for result in results])
     _warn_of_weights(problem, results)
@@ -188,8 +176,8 @@ def _merge(problem: Problem, results: list[PartSolution]) -> Solution:
     elif problem.scale == "shared":
         scale = results[0].answer.scale
     return Solution(
-        X={name: X[name] for name in problem.targets},
-        Y={name: Y[name] for name in problem.sensors},
+        X={name: poses[name] for name in problem.targets},
+        Y={name: poses[name] for name in problem.sensors},
         scale=scale,
         scale_mode=problem.scale,
         cost=certificate.cost,
@@ -203,7 +191,7 @@ def _merge(problem: Problem, results: list[PartSolution]) -> Solution:
 
 def _warn_of_weights(problem: Problem, results: list[PartSolution]) -> None:
     """Warn where the residuals contradict the weights."""
-    # The cost of the inverse equation weighs otherwise than the physical model, whose minimum is then elsewhere.
+    # The cost of the inverse equation has other weights than the physical model, whose minimum is then elsewhere.
     if problem.is_relative or any(result.part.kind == "inverse" for result in results):
         return
     cost = sum(result.residual_cost for result in results)

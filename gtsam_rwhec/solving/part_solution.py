@@ -1,4 +1,4 @@
-"""The solution of one part: answer, residuals, identifiability and certificate put together."""
+"""The solution of one part: its answer, residuals, identifiability and certificate."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
 from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.variables import Answer, answer_of, as_variables
+from gtsam_rwhec.solver.variables import Answer, answer_of, as_variables, scales_of
 
 TWIN = FreeDirection(FreeKind.TWIN, FreeReason.SYMMETRY)
 
@@ -35,13 +35,7 @@ class PartSolution:
 
     @staticmethod
     def of(search: Search, found: Found) -> PartSolution:
-        """Translations and scales, residuals, identifiability, and the certificate of what a search found.
-
-        Raises
-        ------
-        ScaleError
-            For a scale that is not positive.
-        """
+        """Complete what a search found; a ``ScaleError`` for a scale that is not positive."""
         part = search.part
         with search.stages.of("identifiability"):
             answer = answer_of(part, search.form, found.R)
@@ -88,10 +82,9 @@ class PartSolution:
 
 
 def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
+    of_frame = scales_of(part, answer)
     scales = {"the scale": answer.scale} if part.scale == "shared" else {}
-    for name, value in zip(part.free, answer.own_scale, strict=True):
-        if name in part.scale_owners:
-            scales[f"the scale of {name}"] = float(value)
+    scales |= {f"the scale of {name}": of_frame[name] for name in part.free if name in part.scale_owners}
     for what, value in scales.items():
         if not (np.isfinite(value) and value > 0.0):
             raise ScaleError(

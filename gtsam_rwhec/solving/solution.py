@@ -1,4 +1,4 @@
-"""What solving returns: poses, scale, cost, certificate, identifiability, residuals."""
+"""The solution of a problem: poses, scale, cost, certificate, identifiability, residuals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gtsam_rwhec.solver.residuals import Residual
 
 @dataclass(frozen=True)
 class SolvedPart:
-    """The frames of one unconnected part (their names) and its own certificate."""
+    """The names of the frames of one unconnected part, and the certificate of this part."""
 
     names: tuple[str, ...]
     certificate: Certificate
@@ -32,18 +32,18 @@ class Solution:
     Y : dict of str to gtsam.Pose3
         T_sensorcarrier_sensor of each sensor, metres.
     scale : float or dict of str to float
-        t_B = scale * true length: 1 when known, one number when shared, one for each target otherwise (and for
+        t_B = scale * true length: 1 when known, one number when shared, else one number for each target (and for
         each sensor with motions of its own).
     scale_mode : "known", "shared" or "per_target"
     cost : float
         J; half a chi-square when the weights are true.
     is_relative : bool
-        Whether unit weights were used, which makes costs (and covariances) relative.
+        Whether all weights are 1: costs and covariances then have no statistical meaning.
     certificate : Certificate
     identifiability : Identifiability
     residuals : dict of (target, sensor) to Residual
     parts : tuple of SolvedPart
-        The unconnected parts that were solved apart; one when all is connected.
+        The unconnected parts, which were solved apart; one part when all frames are connected.
     """
 
     X: dict[str, gtsam.Pose3]

@@ -1,26 +1,19 @@
-"""One rule about weights: when the residuals contradict what sigma and kappa claim of the noise."""
+"""The rule that decides whether the residuals contradict the weights, sigma and kappa."""
 
 from __future__ import annotations
 
 from scipy.special import chdtrc
 
-#: Residuals may cost this many times what the weights predict: the noise is then larger by the square root, 1.4.
+#: Residuals may cost this many times the prediction of the weights; the noise is then 1.4 times larger, the root.
 UNLIKELY = 2.0
-#: With few degrees of freedom, chance makes such a cost often; it must be rarer than this to count.
+#: With few degrees of freedom, chance often makes such a cost; its probability must be smaller than this.
 CHANCE = 1e-3
 
 
 def contradicted_by(cost: float, degrees_of_freedom: int) -> float | None:
-    """How many times what true weights predict the residuals cost, where that is beyond doubt too much; else None.
+    """The cost over its expectation with true weights, where the cost is surely too large; else None.
 
-    With true weights twice the cost is a chi-square with that many degrees of freedom.
-
-    Parameters
-    ----------
-    cost : float
-        Half the squared residuals over their variances.
-    degrees_of_freedom : int
-        Equations minus unknowns.
+    With true weights, twice the cost is a chi-square with ``degrees_of_freedom``, equations minus unknowns.
     """
     if degrees_of_freedom <= 0:
         return None

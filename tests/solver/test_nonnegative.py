@@ -143,7 +143,7 @@ class TestSolving:
             found, cost, lower = outcome(seed)
             outcomes[found is not None] += 1
             proven += cost - lower < 1e-4 * cost
-            assert free.lower_bound - 1e-9 <= lower <= cost * (1.0 + 1e-4)
+            assert free.bound.lower_bound - 1e-9 <= lower <= cost * (1.0 + 1e-4)
             if found is not None:
                 assert answer_of(search.part, search.form, found.R).scale > 0.0
                 assert found.path.start is Start.NONNEGATIVE_SCALE

@@ -187,7 +187,7 @@ class TestGrossNoise:
         problem = simulated(2, 1, 3, noise=GROSS_NOISE, number_of_measurements=4).problem
         first, second = (searched(problem).run(method, None) for _ in range(2))
         np.testing.assert_array_equal(first.R, second.R)
-        assert (first.cost, first.lower_bound, first.path) == (second.cost, second.lower_bound, second.path)
+        assert (first.cost, first.bound.lower_bound, first.path) == (second.cost, second.bound.lower_bound, second.path)
 
 
 def pair_alone(problem: rw.Problem, target: str, sensor: str) -> rw.Problem:
@@ -251,7 +251,7 @@ class TestRealDataset:
         # certify() says of that local minimum what it is.
         stuck = searched(alone).run("local", from_spectral.R)
         assert stuck.cost == pytest.approx(from_spectral.cost)
-        assert stuck.lower_bound < stuck.cost
+        assert stuck.bound.lower_bound < stuck.cost
 
 
 class TestMethods:
@@ -284,7 +284,7 @@ class TestMethods:
             (search.run("local", random_rotations(2, generator)) for _ in range(20)), key=lambda found: found.cost
         )
         assert stuck.cost > best.cost + 1e-3
-        assert stuck.lower_bound <= best.cost
+        assert stuck.bound.lower_bound <= best.cost
         assert not stuck.is_closed
         assert stuck.cause is Cause.LOCAL_MINIMUM_POSSIBLE
 
