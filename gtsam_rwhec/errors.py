@@ -1,4 +1,4 @@
-"""Errors and warnings. Each message says what was wrong, where, the value, and what to do."""
+"""Errors and warnings. Each message says what is wrong, where, the value, and what to do."""
 
 from __future__ import annotations
 
@@ -8,79 +8,79 @@ class RwhecError(ValueError):
 
 
 class PoseError(RwhecError):
-    """A pose that is not one: NaN, a rotation block that is no rotation, a zero quaternion, a wrong shape."""
+    """A pose is not valid: NaN, a block that is not a rotation, a zero quaternion, or a wrong shape."""
 
 
 class CountError(RwhecError):
-    """Different numbers of A and B, or of weights, stamps and covariances for them; or none at all."""
+    """The counts of A, B, weights, stamps and covariances differ, or there are no measurements."""
 
 
 class StampError(RwhecError):
-    """Stamps that are all zero, out of order, of another clock, or do not tell what is asked of them."""
+    """Stamps are all zero, out of order or of another clock, or do not determine what is asked."""
 
 
 class NoiseError(RwhecError):
-    """A sigma or kappa that is not a positive, finite number; a covariance that is not positive definite."""
+    """A sigma or kappa is not positive and finite, or a covariance is not positive definite."""
 
 
 class FrameError(RwhecError):
-    """A frame name that is unknown, empty, or used for both a target and a sensor."""
+    """A frame's name is unknown, empty, or used for both a target and a sensor."""
 
 
 class PriorError(RwhecError):
-    """Fixed frames or priors that contradict one another, or that the problem cannot hold."""
+    """Fixed frames or priors contradict one another, or do not fit the problem."""
 
 
 class UnderdeterminedError(RwhecError):
-    """Fewer equations than unknowns: no method can answer."""
+    """There are fewer equations than unknowns: no method can solve the problem."""
 
 
 class ScaleError(RwhecError):
-    """A scale that is not positive, in the input or at the optimum."""
+    """A scale is not positive, in the input or at the optimum."""
 
 
 class OptionError(RwhecError):
-    """An option, a method or a starting point that cannot be used."""
+    """An option, a method or a starting point cannot be used."""
 
 
 class MeasurementsNotKeptError(RwhecError):
-    """Raw measurements are asked for and the problem was told not to keep them."""
+    """Raw measurements are needed, but the problem was made with ``keep_measurements=False``."""
 
 
 class OutlierError(RwhecError):
-    """Too few measurements agree with one another for any answer."""
+    """Too few measurements agree with one another for an answer."""
 
 
 class FileFormatError(RwhecError):
-    """A file that cannot be read as what it should be; the message has the file and the line or field."""
+    """A file cannot be read in its format; the message has the file and the line or field."""
 
 
 class RigError(FileFormatError):
-    """A rig file that cannot be used, each fault with its line; or a log of which none can be made."""
+    """A rig file cannot be used (the message has each fault with its line), or cannot be made from a log."""
 
 
 class LogError(FileFormatError):
-    """A log that cannot be read, or lacks what is asked of it; or one that could not be written."""
+    """A log cannot be read or written, or lacks what is asked of it."""
 
 
 class MessageError(LogError):
-    """A message of a log that cannot be read as its schema says, or whose content makes no sense."""
+    """A message of a log does not fit its schema, or has values that are not valid."""
 
 
 class TransformError(RwhecError):
-    """Frames that no chain of transforms joins, or that go round in a loop; the message has the chain."""
+    """No chain of transforms joins two frames, or the chain is a loop; the message has the chain."""
 
 
 class CameraError(RwhecError):
-    """Intrinsics that are those of no camera, or of a model that is not supported; a point no lens can have seen."""
+    """Intrinsics are not valid or of an unsupported model, or no lens can have seen a point."""
 
 
 class ImageError(RwhecError):
-    """An image that cannot be decoded, or is not what its camera takes; the message has topic and stamp."""
+    """An image cannot be decoded or does not fit its camera; the message has topic and stamp."""
 
 
 class TargetError(RwhecError):
-    """A target that cannot be printed: an unknown family, an id that it lacks, a size that is none."""
+    """A target cannot be printed: an unknown family, an id that the family lacks, or a size that is not valid."""
 
     def __init__(self, fault: str, target: str = "") -> None:
         super().__init__(f"target {target}: {fault}" if target else fault)
@@ -88,11 +88,11 @@ class TargetError(RwhecError):
 
 
 class ResultVersionError(FileFormatError):
-    """A result file that another version of the format wrote."""
+    """A result file has an unknown version of the format."""
 
 
 class FetchError(RwhecError):
-    """A download that failed or whose content is not what was expected."""
+    """A download failed, or its content is not the expected one."""
 
 
 class RwhecWarning(UserWarning):
@@ -100,15 +100,15 @@ class RwhecWarning(UserWarning):
 
 
 class LogWarning(RwhecWarning):
-    """Parts of a log that could not be read: what, how much, why."""
+    """Parts of a log could not be read; the message says which, how many and why."""
 
 
 class UnitsWarning(RwhecWarning):
-    """Numbers that look as if they had another unit."""
+    """Numbers look as if they had another unit."""
 
 
 class NotUniqueWarning(RwhecWarning):
-    """The measurements leave the answer free in some direction."""
+    """The measurements do not determine the answer in some direction."""
 
 
 class NotCertifiedWarning(RwhecWarning):
@@ -116,16 +116,16 @@ class NotCertifiedWarning(RwhecWarning):
 
 
 class WeightsWarning(RwhecWarning):
-    """Residuals far beyond what the stated weights predict."""
+    """Residuals are far larger than the stated weights predict."""
 
 
 class OutliersWarning(RwhecWarning):
-    """Less than half of a frame's measurements, or of all, agree with the rest."""
+    """Fewer than half of a frame's measurements, or of all measurements, agree with the rest."""
 
 
 class NotConvergedWarning(RwhecWarning):
-    """An iteration that stopped at its limit."""
+    """An iteration stopped at its limit."""
 
 
 class RotationsProjectedWarning(RwhecWarning):
-    """Rotation blocks were slightly off and were projected to the nearest rotation."""
+    """Matrices that were not quite rotations were projected to the nearest rotation."""

@@ -266,10 +266,10 @@ BAD: dict[str, tuple[Callable[[rw.Problem], Any], type[Exception], list[str]]] =
         errors.PriorError,
         ["cam0", "180 deg apart", "kappa of 100 and 200", "remove one"],
     ),
-    "a prior that says nothing": (
+    "a prior without sigma and kappa": (
         lambda p: p.add_prior("cam0", Y_TRUE),
         errors.PriorError,
-        ["the prior of cam0", "says nothing", "give one of them"],
+        ["the prior of cam0", "neither sigma nor kappa", "give sigma, kappa or both"],
     ),
     "a prior of negative sigma": (
         lambda p: p.add_prior("cam0", Y_TRUE, sigma=-1.0),

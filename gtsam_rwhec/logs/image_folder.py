@@ -1,11 +1,11 @@
-"""A folder of images and a text file of poses, the form in which older tools take data, made a log.
+"""Logs made of a folder of images and a text file of poses, the form in which older tools take data.
 
-Each line of the file is one pose: what it belongs to, then seven numbers, with commas or blanks between; lines that
-begin with # and a line of column names are passed over. What it belongs to is
+Each line of the file is one pose: a name or a stamp, then seven numbers, with commas or blanks between. A line of
+column names and lines that begin with # are passed over. The first field is
 
-- an image's file name, with or without its ending: that image was taken there. Images get stamps 1 s apart;
-- or a stamp, in seconds (``1700000000.25``) or integer nanoseconds (16 digits or more): then images are named with
-  theirs (``1700000000250000000.png``), and poses may come at another rate.
+- the file name of an image, with or without its ending: the image was taken at this pose. Images get stamps 1 s apart;
+- or a stamp, in seconds (``1700000000.25``) or integer nanoseconds (16 digits or more). Then the images' file names are
+  stamps too (``1700000000250000000.png``), and poses may come at another rate.
 """
 
 from __future__ import annotations
@@ -19,17 +19,20 @@ from typing import Literal
 import numpy as np
 
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.logs.checked_poses import transforms
 from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.records import Array
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
+#: Foxglove's names of the formats of images, by the files' ending.
 FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
+#: Digits of a stamp in nanoseconds, at least.
 NANOSECOND_DIGITS = 16
 
 
 def is_image_folder(path: str | Path) -> bool:
-    """Whether a folder has images, and nothing of a bag."""
+    """Whether a folder has images and no file of a bag."""
     names = [file.suffix.lower() for file in Path(path).glob("*")]
     return any(suffix in FORMATS for suffix in names) and not {".db3", ".bag", ".mcap"} & set(names)
 
@@ -52,7 +55,7 @@ def write_image_folder(
     Parameters
     ----------
     images
-        The folder; files that end otherwise than `FORMATS` are passed over.
+        The folder; files with other endings than `FORMATS` are passed over.
     poses
         The text file, T_parent_child in metres and unit quaternions.
     path
@@ -70,16 +73,17 @@ def write_image_folder(
     Raises
     ------
     LogError
-        A folder without images, a line that is no pose, names that do not fit; with file and line.
+        The folder has no images, a line is not a pose, or a name is neither an image nor a stamp. The message has the
+        file and the line.
     """
     images, poses = Path(images), Path(poses)
-    files = sorted((f for f in images.glob("*") if f.suffix.lower() in FORMATS), key=lambda f: _natural(f.name))
+    files = sorted((f for f in images.glob("*") if f.suffix.lower() in FORMATS), key=lambda f: natural_key(f.name))
     if not files:
         raise LogError(f"{images} has no images ({', '.join(FORMATS)}).")
     names, T = _read_poses(poses, columns)
     image_stamps, pose_stamps = _stamps(files, names, poses)
-    entries = [(stamp, 1, i) for i, stamp in enumerate(image_stamps)]
-    entries += [(stamp, 0, i) for i, stamp in enumerate(pose_stamps)]
+    entries = [(stamp, True, i) for i, stamp in enumerate(image_stamps)]
+    entries += [(stamp, False, i) for i, stamp in enumerate(pose_stamps)]
     with LogWriter(path) as out:
         for stamp, is_image, i in sorted(entries):
             if not is_image:
@@ -98,9 +102,7 @@ def _read_poses(path: Path, columns: Columns) -> tuple[list[str], Array]:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise LogError(f"{path} cannot be read as text: {error}.") from error
-    names: list[str] = []
-    rows: list[list[float]] = []
-    numbers: list[int] = []
+    found: list[tuple[int, str, list[float]]] = []
     has_header = False
     for number, line in enumerate(lines, start=1):
         fields = re.split(r"\s*,\s*|\s+", line.strip())
@@ -111,28 +113,24 @@ def _read_poses(path: Path, columns: Columns) -> tuple[list[str], Array]:
         except ValueError:
             row = []
         if len(row) != 7:
-            if not names and not has_header and re.search(r"[A-Za-z]", "".join(fields[1:])):
+            if not found and not has_header and re.search(r"[A-Za-z]", "".join(fields[1:])):
                 has_header = True
                 continue
             raise LogError(f"{path}, line {number}: not a name or stamp and {columns}: {line[:80]!r}.")
-        names.append(fields[0])
-        rows.append(row)
-        numbers.append(number)
-    if not rows:
+        found.append((number, fields[0], row))
+    if not found:
         raise LogError(f"{path} has no poses; each line is a name or stamp, then {columns}.")
-    order = columns.split()
-    table = dict(zip(order, np.array(rows).T, strict=True))
-    T, faults = transforms(
-        np.stack([table[f"t{axis}"] for axis in "xyz"], axis=1),
-        np.stack([table[f"q{axis}"] for axis in "xyzw"], axis=1),
-    )
+    numbers, names, rows = zip(*found, strict=True)
+    column = columns.split().index
+    table = np.array(rows)
+    T, faults = transforms(table[:, [column(f"t{a}") for a in "xyz"]], table[:, [column(f"q{a}") for a in "xyzw"]])
     for i, fault in faults.items():
         raise LogError(f"{path}, line {numbers[i]}: {fault}. Are the columns {columns}?")
-    return names, T
+    return list(names), T
 
 
 def _stamps(files: Sequence[Path], names: Sequence[str], poses: Path) -> tuple[list[int], list[int]]:
-    """Stamps of images and of poses."""
+    """The stamps of the images and the stamps of the poses."""
     known = {file.name: i for i, file in enumerate(files)} | {file.stem: i for i, file in enumerate(files)}
     if all(name in known for name in names):
         if len(set(names)) < len(names):
@@ -151,7 +149,7 @@ def _stamps(files: Sequence[Path], names: Sequence[str], poses: Path) -> tuple[l
 
 
 def _as_ns(text: str) -> int | None:
-    """Exact nanoseconds of a stamp in seconds (with a point) or in nanoseconds; None for any other name."""
+    """Exact nanoseconds of a stamp in seconds (with a decimal point) or in nanoseconds; None for any other name."""
     if re.fullmatch(rf"\d{{{NANOSECOND_DIGITS},19}}", text, flags=re.ASCII):
         stamp = int(text)
     elif re.fullmatch(r"\d{1,10}\.\d{1,15}", text, flags=re.ASCII):
@@ -159,8 +157,3 @@ def _as_ns(text: str) -> int | None:
     else:
         return None
     return stamp if stamp < 1 << 63 else None
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Numbers in names count as numbers: image_2 before image_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -1,4 +1,4 @@
-"""Logs in MCAP: what is in them, and their messages as records in the order of time.
+"""Logs in MCAP: their topics, and their messages as records in the order of time.
 
 log = open_log("run.mcap")
 for topic in log.topics():
@@ -30,9 +30,9 @@ from gtsam_rwhec.logs.message_kinds import IMAGE_SCHEMAS, TF_TOPICS, TRANSFORM_S
 from gtsam_rwhec.logs.records import Array, PoseRecord, Record
 
 OnBad = Literal["warn", "raise"]
-#: Messages that are decoded together.
+#: Number of messages that are decoded together.
 SLICE = 4096
-#: Opened blocks that overlap in time are held together, up to this many bytes.
+#: Bytes of opened blocks that overlap in time and are held together, at most.
 MOST_OPEN_BYTES = 1 << 30
 #: Topics that an error lists, at most: a stranger's log may have thousands.
 MOST_NAMED = 50
@@ -43,9 +43,14 @@ _Decoder = Callable[[str, Sequence[bytes | memoryview], list[int]], list[foxglov
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a log; first and last are log times, of the chunks that have it where the file is indexed.
+    """A topic of a log.
 
-    `unreadable` is empty where its messages become records, else why they do not.
+    Attributes
+    ----------
+    first_ns, last_ns : int or None
+        First and last log time; where the file has an index, of the chunks that have the topic.
+    unreadable : str
+        Why the messages cannot become records; empty where they can.
     """
 
     name: str
@@ -58,7 +63,7 @@ class Topic:
 
     @property
     def is_tf(self) -> bool:
-        """Whether it has transforms of the log's tree of frames."""
+        """Whether the topic has transforms of the log's tree of frames."""
         return self.name.rpartition("/")[2] in TF_TOPICS or self.schema in TRANSFORM_SCHEMAS
 
     @property
@@ -126,7 +131,7 @@ class Log:
             file.close()
 
     def topics(self) -> tuple[Topic, ...]:
-        """Every topic, by name; one that has several schemas or encodings is there as often."""
+        """Every topic, by name; a topic with several schemas or encodings has one entry for each."""
         found: dict[tuple[str, str, str], Topic] = {}
         for number, file in enumerate(self.files):
             for channel in file.channels.values():
@@ -178,14 +183,14 @@ class Log:
         topics
             None for all that can be read.
         on_bad
-            What to do with messages that cannot be read and blocks that are damaged: ``"warn"`` leaves them out and
-            says how many of which topic, and why the first, in one `LogWarning` at the end; ``"raise"`` stops.
+            ``"warn"`` leaves out messages that cannot be read and blocks that are damaged. One `LogWarning` at the end
+            says how many each topic lost, and the first fault. ``"raise"`` stops at the first fault.
 
         Raises
         ------
         LogError
-            A topic that is not in the log (the message has those that are) or that cannot be read; blocks that overlap
-            in time beyond `MOST_OPEN_BYTES`.
+            A topic is not in the log (the message has the log's topics) or cannot be read; or blocks of more than
+            `MOST_OPEN_BYTES` overlap in time.
         MessageError
             With ``on_bad="raise"``.
         """
@@ -232,7 +237,7 @@ class Log:
         Raises
         ------
         LogError
-            As `records`; or there are none, or of several pairs of frames (the message has them).
+            As `records`; or the topic has no poses, or poses of several pairs of frames (the message has the pairs).
         """
         stamps: list[int] = []
         pairs: dict[tuple[str, str], None] = {}
@@ -317,7 +322,7 @@ class Log:
 
 
 class _Bad:
-    """What could not be read while going through a log."""
+    """Counts and first faults of what could not be read in a log."""
 
     def __init__(self, on_bad: OnBad) -> None:
         self._on_bad = on_bad

@@ -1,10 +1,10 @@
-"""Logs written in MCAP: another log's messages untouched, and beside them what was made of them.
+"""Logs written in MCAP: messages copied from another log, and messages of this library beside them.
 
     with open_log("run.mcap") as log, LogWriter("clean.mcap") as out:
         out.copy(log, images="leave_out")
         out.transforms("/calibration", stamp_ns, [("rig", "cam_0", T_rig_cam)])
 
-The file has its name only once it is whole: it is written beside, and an error leaves what was there before.
+The file gets its name once it is whole (``files.atomic_write``): an error leaves the earlier file as it was.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ class LogWriter:
     Parameters
     ----------
     path
-        Replaced, if it is there, when the block ends without an error.
+        A file of this name is replaced when the block ends without an error.
 
     Raises
     ------
     LogError
-        The file cannot be written (no such folder, no right to, disk full): here, or from any method.
+        The file cannot be written: no such folder, no permission, disk full. Every method raises it too.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -81,16 +81,16 @@ class LogWriter:
             self._writer.finish()  # type: ignore[no-untyped-call]
 
     def copy(self, log: Log, topics: Iterable[str] | None = None, images: Images = "copy") -> int:
-        """Copy messages byte for byte, with their schemas, channels and times; metadata and attachments stay behind.
+        """Copy messages byte for byte, with their schemas, channels and times, but no metadata and no attachments.
 
         Parameters
         ----------
         log
-            Its damaged blocks are left out (``log.losses`` and `Log.records` say them).
+            Damaged blocks are left out (``log.losses`` and `Log.records` name them).
         topics
             None for all.
         images
-            ``"leave_out"``: without the topics of images, which are large.
+            ``"leave_out"`` leaves out the topics of images, which are large.
 
         Returns
         -------
@@ -121,18 +121,14 @@ class LogWriter:
 
     def transforms(self, topic: str, stamp_ns: int, transforms: Iterable[tuple[str, str, Array]]) -> None:
         """Write a ``foxglove.FrameTransforms`` of (parent, child, T_parent_child)."""
-        parts = []
-        for parent, child, T in transforms:
-            pose = _pose(T)
-            parts.append(
-                {
-                    "timestamp": _time(stamp_ns),
-                    "parent_frame_id": parent,
-                    "child_frame_id": child,
-                    "translation": pose["position"],
-                    "rotation": pose["orientation"],
-                }
-            )
+        time = _time(stamp_ns)
+        parts = [
+            {
+                "timestamp": time, "parent_frame_id": parent, "child_frame_id": child,
+                **dict(zip(("translation", "rotation"), _pose(T).values(), strict=True)),
+            }
+            for parent, child, T in transforms
+        ]  # fmt: skip
         self._write(topic, "foxglove.FrameTransforms", stamp_ns, {"transforms": parts})
 
     def poses(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
@@ -142,26 +138,20 @@ class LogWriter:
 
     def compressed_image(self, topic: str, stamp_ns: int, frame: str, encoding: str, data: bytes) -> None:
         """Write a ``foxglove.CompressedImage``; `encoding` is ``jpeg``, ``png`` or the like."""
-        message = {
-            "timestamp": _time(stamp_ns),
-            "frame_id": frame,
-            "data": base64.b64encode(data).decode(),
-            "format": encoding,
-        }
+        content = base64.b64encode(data).decode()
+        message = {"timestamp": _time(stamp_ns), "frame_id": frame, "data": content, "format": encoding}
         self._write(topic, "foxglove.CompressedImage", stamp_ns, message)
 
     def calibration(self, intrinsics: IntrinsicsRecord) -> None:
-        """Write a ``foxglove.CameraCalibration`` to its topic; numbers come back as they were, to the last bit.
+        """Write a ``foxglove.CameraCalibration`` to its topic; every number comes back to the last bit.
 
-        `intrinsics.model` is written as it is; Foxglove knows ``plumb_bob`` (k1, k2, p1, p2, k3),
+        `intrinsics.model` is written unchanged; Foxglove knows ``plumb_bob`` (k1, k2, p1, p2, k3),
         ``rational_polynomial`` (k1, k2, p1, p2, k3 to k6) and ``kannala_brandt`` (OpenCV's fisheye, k1 to k4).
         """
         message = {
             "timestamp": _time(intrinsics.stamp_ns), "frame_id": intrinsics.frame,
-            "width": int(intrinsics.width), "height": int(intrinsics.height),
-            "distortion_model": intrinsics.model, "D": np.ravel(intrinsics.D).tolist(),
-            "K": np.ravel(intrinsics.K).tolist(), "R": np.ravel(intrinsics.R).tolist(),
-            "P": np.ravel(intrinsics.P).tolist(),
+            "width": int(intrinsics.width), "height": int(intrinsics.height), "distortion_model": intrinsics.model,
+            **{name: np.ravel(getattr(intrinsics, name)).tolist() for name in "DKRP"},
         }  # fmt: skip
         self._write(intrinsics.topic, "foxglove.CameraCalibration", intrinsics.stamp_ns, message)
 
@@ -170,7 +160,7 @@ class LogWriter:
         time = _time(stamp_ns)
         points, texts = [], []
         for label, corners in outlines:
-            places = [{"x": float(x), "y": float(y)} for x, y in corners]
+            places = _points(corners)
             points.append(
                 {
                     "timestamp": time, "type": _LINE_LOOP, "points": places, "outline_color": _GREEN,
@@ -186,30 +176,27 @@ class LogWriter:
         self._write(topic, "foxglove.ImageAnnotations", stamp_ns, {"circles": [], "points": points, "texts": texts})
 
     def detections(self, topic: str, stamp_ns: int, frame: str, tags: Iterable[DetectionRecord]) -> None:
-        """Write a ``gtsam_rwhec.TagDetections`` of one image; stamp and frame are the arguments, not the records'."""
-        parts = []
-        for tag in tags:
-            part: dict[str, Any] = {"family": tag.family, "id": tag.id}
-            if tag.size_m is not None:
-                part["size_m"] = float(tag.size_m)
-            if tag.corners_px is not None:
-                part["corners_px"] = [{"x": float(x), "y": float(y)} for x, y in tag.corners_px]
-            if tag.corner_indices is not None:
-                part["corner_indices"] = list(tag.corner_indices)
-            if tag.T_camera_tag is not None:
-                part["pose"] = _pose(tag.T_camera_tag)
-            if tag.covariance is not None:
-                part["covariance"] = np.ravel(tag.covariance).tolist()
-            if tag.reprojection_px is not None:
-                part["reprojection_px"] = float(tag.reprojection_px)
-            if tag.reason:
-                part["reason"] = tag.reason
-            parts.append(part)
-        message = {"timestamp": _time(stamp_ns), "frame_id": frame, "detections": parts}
+        """Write a ``gtsam_rwhec.TagDetections`` of one image; the records' own stamps and frames are not used."""
+        parts = [
+            {
+                "size_m": tag.size_m,
+                "corners_px": None if tag.corners_px is None else _points(tag.corners_px),
+                "corner_indices": tag.corner_indices,
+                "pose": None if tag.T_camera_tag is None else _pose(tag.T_camera_tag),
+                "covariance": None if tag.covariance is None else np.ravel(tag.covariance).tolist(),
+                "reprojection_px": tag.reprojection_px,
+                "reason": tag.reason or None,
+                "family": tag.family,
+                "id": tag.id,
+            }
+            for tag in tags
+        ]
+        known = [{name: value for name, value in part.items() if value is not None} for part in parts]
+        message = {"timestamp": _time(stamp_ns), "frame_id": frame, "detections": known}
         self._write(topic, TAG_DETECTIONS, stamp_ns, message)
 
     def pair(self, pair: PairRecord) -> None:
-        """Write a ``gtsam_rwhec.MeasuredPair`` to its topic; numbers come back as they were, to the last bit."""
+        """Write a ``gtsam_rwhec.MeasuredPair`` to its topic; every number comes back to the last bit."""
         message: dict[str, Any] = {
             "timestamp": _time(pair.stamp_ns), "target": pair.target, "sensor": pair.sensor,
             "A": np.ravel(pair.A).tolist(), "B": np.ravel(pair.B).tolist(),
@@ -239,7 +226,7 @@ class LogWriter:
             self._writer.add_message(channel, stamp_ns, data, stamp_ns)
 
     def _copied_channel(self, file: Any, channel_id: int, wanted: set[str] | None, images: Images) -> int | None:
-        """The channel here that takes over one of a file's; None if it is not to be copied."""
+        """The channel of this log for a channel of `file`; None if its messages are not copied."""
         channel = file.channels.get(channel_id)
         if channel is None or (wanted is not None and channel.topic not in wanted):
             return None
@@ -271,9 +258,13 @@ class LogWriter:
             raise LogError(f"{self.path} cannot be written: {error.strerror}.") from error
 
 
+def _points(corners: Array) -> list[dict[str, float]]:
+    return [{"x": float(x), "y": float(y)} for x, y in corners]
+
+
 def _time(stamp_ns: int) -> dict[str, int]:
     if not 0 <= stamp_ns < 1 << 64:
-        raise LogError(f"stamp {stamp_ns} ns cannot be written: it must be between 0 and 2^64")
+        raise LogError(f"stamp {stamp_ns} ns cannot be written: give a stamp between 0 and 2^64 ns")
     return {"sec": int(stamp_ns) // 10**9, "nsec": int(stamp_ns) % 10**9}
 
 

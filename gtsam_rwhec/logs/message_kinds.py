@@ -1,12 +1,12 @@
-"""Names of topics and schemas that say what messages hold: transforms, images, intrinsics, detections, pairs."""
+"""Names of topics and schemas by their content: transforms, images, intrinsics, detections, pairs."""
 
 from __future__ import annotations
 
-#: Last words of the names of ROS's topics of transforms.
+#: The last words of ROS's topics of transforms.
 TF_TOPICS = ("tf", "tf_static")
 TRANSFORM_SCHEMAS = ("foxglove.FrameTransforms", "foxglove.FrameTransform")
 INTRINSICS_SCHEMAS = ("sensor_msgs/msg/CameraInfo", "sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
-#: Last words of the names of the schemas of images that can be decoded, in ROS and in Foxglove.
+#: The last words of the schemas of images that can be decoded, in ROS and in Foxglove.
 IMAGE_SCHEMAS = ("Image", "CompressedImage", "RawImage")
 VIDEO_SCHEMAS = ("CompressedVideo",)
 #: This library's own schemas.
@@ -15,5 +15,5 @@ MEASURED_PAIR = "gtsam_rwhec.MeasuredPair"
 
 
 def schema_word(schema: str) -> str:
-    """``Image`` of ``sensor_msgs/msg/Image`` and of ``foxglove.Image``."""
+    """The last word of a schema's name: ``Image`` of ``sensor_msgs/msg/Image`` and of ``foxglove.Image``."""
     return schema.replace("/", ".").rpartition(".")[2]

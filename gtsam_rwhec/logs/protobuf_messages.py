@@ -1,4 +1,4 @@
-"""Protobuf messages of a log, by the descriptors that it carries."""
+"""Protobuf messages of a log, parsed with the descriptors in the log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from gtsam_rwhec.errors import MessageError
 
-#: What descriptors from a stranger's file raise when they are put into a pool.
+#: What a pool raises for wrong descriptors in a stranger's file.
 _FAULTS = (McapError, DecodeError, TypeError, ValueError, KeyError, RecursionError)
 
 
@@ -22,7 +22,7 @@ def parser(schema: Schema) -> Callable[[bytes | memoryview], Any]:
     Raises
     ------
     MessageError
-        The descriptors cannot be read or lack the schema; from the function, where the bytes are no such message.
+        The descriptors cannot be read or lack the schema. The function raises it for bytes that are not a message.
     """
     try:
         decode = DecoderFactory().decoder_for("protobuf", schema)

@@ -1,8 +1,8 @@
-"""Records: what the messages of a log are read as, checked and in SI units, one class for each kind of content.
+"""Records of a log's messages, checked and in SI units: one class for each kind of content.
 
-Transforms are ``T_parent_child`` (4, 4), metres. Stamps are the messages' own (``header.stamp``, ``timestamp``),
-`logged_ns` is when the recorder wrote the message; both are integer nanoseconds. Arrays are views of larger ones that
-were decoded together: copy what is kept for long out of a long log.
+Transforms are ``T_parent_child`` (4, 4), in metres. `stamp_ns` is the message's own time (``header.stamp``,
+``timestamp``); `logged_ns` is the time at which the recorder wrote the message; both are integer nanoseconds. Arrays
+are views of larger arrays that were decoded together: copy an array to keep it without the rest of a long log.
 """
 
 from __future__ import annotations
@@ -18,10 +18,16 @@ Array: TypeAlias = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseRecord:
-    """A pose or transform, T = T_parent_child (4, 4).
+    """A pose or transform.
 
-    `child` is empty where the message names one frame only (``PoseStamped``, ``PoseInFrame``). `covariance` is (6, 6)
-    as GTSAM has it: rotation first, right perturbation ``T * Expmap(xi)``; None where the message has none.
+    Attributes
+    ----------
+    T : (4, 4) array
+        T_parent_child, in metres.
+    child : str
+        Empty where the message names one frame only (``PoseStamped``, ``PoseInFrame``).
+    covariance : (6, 6) array or None
+        As GTSAM has it: rotation first, right perturbation ``T * Expmap(xi)``. None: the message has no covariance.
     """
 
     logged_ns: int
@@ -34,7 +40,7 @@ class PoseRecord:
 
     @property
     def is_static(self) -> bool:
-        """Whether it came by ROS's topic for transforms that never change."""
+        """Whether the message was on ``tf_static``, ROS's topic of transforms that never change."""
         return self.topic.rpartition("/")[2] == "tf_static"
 
 
@@ -42,8 +48,14 @@ class PoseRecord:
 class ImageRecord:
     """An image, not decoded.
 
-    `encoding` is a pixel format (``mono8``, ``rgb8``, ...) of a raw image, whose rows are `step` bytes apart, or the
-    format (``jpeg``, ``png``) of a compressed one, for which `width`, `height` and `step` are None.
+    Attributes
+    ----------
+    encoding : str
+        Pixel format (``mono8``, ``rgb8``, ...) of a raw image; format (``jpeg``, ``png``) of a compressed image.
+    width, height : int or None
+        Pixels of a raw image; None for a compressed image.
+    step : int or None
+        Bytes from one row of a raw image to the next; None for a compressed image.
     """
 
     logged_ns: int
@@ -59,16 +71,24 @@ class ImageRecord:
 
     @property
     def is_compressed(self) -> bool:
-        """Whether `data` is a JPEG, PNG or the like."""
+        """Whether `data` is a file in JPEG, PNG or another format of images."""
         return self.step is None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IntrinsicsRecord:
-    """A camera's intrinsics as the log states them: K (3, 3) and P (3, 4) in pixels, R (3, 3), D (n,).
+    """A camera's intrinsics as the log states them; the camera model checks the numbers later.
 
-    `model` is the log's own word (``plumb_bob``, ``equidistant``, ``kannala_brandt``, ...). Whether the numbers make
-    sense is for the camera model to say.
+    Attributes
+    ----------
+    model : str
+        The log's own word: ``plumb_bob``, ``equidistant``, ``kannala_brandt``, ...
+    K, P : (3, 3) and (3, 4) arrays
+        Camera matrix and projection matrix of the rectified image, in pixels.
+    R : (3, 3) array
+        Rotation from the camera to the rectified camera.
+    D : (n,) array
+        Distortion coefficients, in the order of the model.
     """
 
     logged_ns: int
@@ -86,12 +106,24 @@ class IntrinsicsRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionRecord:
-    """A tag as a driver saw it; a message with several tags becomes as many records.
+    """A tag or board that was detected; a message with several tags gives one record for each.
 
-    `family` is empty where the message does not say. `id` is a number, or a board's name. `corners_px` is (4, 2) in
-    the driver's order (of a board as many as were seen), `T_camera_tag` (4, 4), `covariance` (6, 6) as in `PoseRecord`,
-    `reprojection_px` the root mean square over the corners, `corner_indices` says which of a target's corners (as its
-    class numbers them) those in `corners_px` are. `reason` says why it is not used; empty where it is.
+    Attributes
+    ----------
+    family : str
+        Empty where the message does not name it.
+    id : str
+        The tag's number, or the board's name.
+    corners_px : (4, 2) array or None
+        Pixels, in the driver's order; (n, 2) of a board, with the corners that were seen.
+    T_camera_tag, covariance : (4, 4) and (6, 6) arrays or None
+        The pose in metres and its covariance as in `PoseRecord`.
+    size_m, reprojection_px : float or None
+        The tag's side in metres; the root mean square of the reprojection error over the corners, in pixels.
+    reason : str
+        Why the detection is not used; empty where it is used.
+    corner_indices : tuple of int or None
+        The number of each row of `corners_px` among the corners of the target, as the target's class numbers them.
     """
 
     logged_ns: int
@@ -110,15 +142,22 @@ class DetectionRecord:
 
     @property
     def label(self) -> str:
-        """What stands beside it in a picture."""
+        """The text beside the detection in a picture."""
         return f"{self.id}: {self.reason}" if self.reason else self.id
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairRecord:
-    """A synchronised measurement as this library writes it: A = T_sensorcarrier_targetcarrier, B = T_sensor_target.
+    """A synchronised measurement as this library writes it.
 
-    `covariance` is B's, (6, 6) as in `PoseRecord`. `reason` says why it is no inlier; empty where it is one.
+    Attributes
+    ----------
+    A, B : (4, 4) arrays
+        T_sensorcarrier_targetcarrier and T_sensor_target, in metres.
+    reason : str
+        Why the measurement is an outlier; empty for an inlier.
+    covariance : (6, 6) array or None
+        The covariance of B, as in `PoseRecord`.
     """
 
     logged_ns: int

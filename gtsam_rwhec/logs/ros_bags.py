@@ -1,6 +1,6 @@
-"""ROS 1 bags and ROS 2 db3 bags made MCAP, with the `rosbags` library (an optional extra: ``gtsam-rwhec[rosbags]``).
+"""ROS 1 bags and ROS 2 db3 bags converted to MCAP by the `rosbags` library (the extra ``gtsam-rwhec[rosbags]``).
 
-ROS 1 messages are re-encoded as CDR, the same fields and numbers; ROS 2's are copied as they are.
+ROS 1 messages are encoded as CDR with the same fields and numbers; ROS 2 messages are copied byte for byte.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
     bag
         A ROS 1 ``.bag`` file, or the folder of a ROS 2 bag.
     path
-        Replaced, if it is there, once all is written.
+        The MCAP file. A file of this name is replaced once all is written.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
         from rosbags.typesys import Stores, TypesysError, get_typestore
     except ImportError as error:
         raise LogError("rosbags is not installed: pip install gtsam-rwhec[rosbags]") from error
-    # The last ones are what rosbags raises for damaged bags that it does not recognise as such.
+    # rosbags raises the last five for damaged bags that it does not recognise as damaged.
     faults = (
         AnyReaderError, Ros1Error, Ros2Error, SerdeError, TypesysError, apsw.Error,
         AssertionError, ValueError, KeyError, IndexError, struct.error,
@@ -58,7 +58,7 @@ def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
         with AnyReader([bag]) as reader, atomic_stream(path) as stream:
             writer = McapWriter(stream, CHUNK_BYTES)
             writer.start(profile="ros2", library="gtsam-rwhec")
-            # ROS 2's Header lacks ROS 1's seq; with it, the rest of the definitions are the bag's own.
+            # ROS 2's Header lacks ROS 1's seq. All other definitions are the bag's own.
             definitions = dict(reader.typestore.fielddefs)
             if not reader.is2:
                 definitions["std_msgs/msg/Header"] = get_typestore(Stores.LATEST).fielddefs["std_msgs/msg/Header"]
@@ -81,5 +81,5 @@ def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
         what = str(error) or type(error).__name__
         raise LogError(f"{bag} cannot be read as a ROS bag: {what}") from error
     except OSError as error:
-        raise LogError(f"{bag} could not be made {path}: {error.strerror or error}") from error
+        raise LogError(f"{bag} cannot be converted to {path}: {error.strerror or error}") from error
     return count

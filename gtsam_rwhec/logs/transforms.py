@@ -1,4 +1,4 @@
-"""Frames that hang on one another, as tf has them: chains of static and moving transforms composed at given stamps."""
+"""The tree of frames of a log, as tf has it: chains of static and moving transforms, composed at given stamps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Stamps: TypeAlias = NDArray[np.int64]
 
 @dataclass
 class _Link:
-    """T_parent_child over time; a static one has one transform and no stamps."""
+    """T_parent_child over time; a static link has one transform and no stamps."""
 
     parent: str
     child: str
@@ -30,7 +30,7 @@ class _Link:
     sorted: tuple[Stamps, Array] | None = None
 
     def by_stamp(self) -> tuple[Stamps, Array]:
-        """Strictly increasing stamps; of transforms with the same stamp the last counts."""
+        """Strictly increasing stamps and their transforms; the last transform of a stamp counts."""
         if self.sorted is None:
             stamps = np.array(self.stamps_ns, dtype=np.int64)
             order = np.argsort(stamps, kind="stable")
@@ -40,7 +40,7 @@ class _Link:
 
 
 class TfBuffer:
-    """Transforms of a log, to be asked for T_a_b of any two frames that a chain joins."""
+    """Transforms of a log. `at` gives T_a_b of any two frames that a chain joins."""
 
     def __init__(self, records: Iterable[object] = ()) -> None:
         self._links: dict[str, _Link] = {}
@@ -49,7 +49,7 @@ class TfBuffer:
                 self.add(record)
 
     def add(self, record: PoseRecord) -> None:
-        """Take a transform; static if it came by ``tf_static``.
+        """Take a transform; a transform on the topic ``tf_static`` is static.
 
         Raises
         ------
@@ -59,7 +59,7 @@ class TfBuffer:
         parent, child = record.parent, record.child
         if not child or not parent:
             raise TransformError(
-                f"topic {record.topic}: a pose of {child or 'no frame'} in {parent or 'no frame'} is no transform "
+                f"topic {record.topic}: a pose of {child or 'no frame'} in {parent or 'no frame'} is not a transform "
                 "between two named frames"
             )
         if parent == child:
@@ -94,38 +94,27 @@ class TfBuffer:
         Raises
         ------
         TransformError
-            An unknown frame, a missing link, or a loop; with the chains as far as they go.
+            A frame is unknown, a link is missing, or there is a loop. The message has the chains as far as they go.
         """
         up_from_parent, up_from_child = self._up(parent), self._up(child)
         common = next((frame for frame in up_from_parent if frame in set(up_from_child)), None)
         if common is None:
             raise TransformError(
                 f"no chain of transforms from {parent} to {child}: {_arrows(up_from_parent)} ends there, and "
-                f"{_arrows(up_from_child)} does; one link between the two is missing"
+                f"{_arrows(up_from_child)} does; a link between the two chains is missing"
             )
         down = up_from_child[: up_from_child.index(common)]
         return (*up_from_parent[: up_from_parent.index(common) + 1], *reversed(down))
 
     def stamps(self, parent: str, child: str) -> Stamps:
-        """Every stamp at which a moving link of the chain has a transform, (N,) increasing; none if all are static.
-
-        Raises
-        ------
-        TransformError
-            As `chain`.
-        """
-        moving = [link.by_stamp()[0] for link in self._moving(parent, child)]
+        """Every stamp at which a moving link of the chain has a transform, (N,) increasing; errors as in `chain`."""
+        moving = [link.by_stamp()[0] for link, _ in self._links_of(parent, child) if not link.is_static]
         return np.unique(np.concatenate(moving)) if moving else np.zeros(0, dtype=np.int64)
 
     def stamps_as_logged(self, parent: str, child: str) -> dict[str, Stamps]:
-        """The stamps of each moving link of the chain, by its child, in the order in which they were added.
-
-        Raises
-        ------
-        TransformError
-            As `chain`.
-        """
-        return {link.child: np.array(link.stamps_ns, dtype=np.int64) for link in self._moving(parent, child)}
+        """The stamps of each moving link, by its child, in the order in which they were added; errors as in `chain`."""
+        links = [link for link, _ in self._links_of(parent, child) if not link.is_static]
+        return {link.child: np.array(link.stamps_ns, dtype=np.int64) for link in links}
 
     def at(self, parent: str, child: str, stamps_ns: Stamps) -> tuple[Array, Array]:
         """T_parent_child at stamps.
@@ -141,8 +130,8 @@ class TfBuffer:
         T : (M, 4, 4)
             Each moving link interpolated on SE(3) between its neighbours in time, T_i Expmap(tau Log(T_i^-1 T_i+1)).
         gap_s : (M,)
-            The longest time between two such neighbours; 0 where all links are static or met, infinite where a link
-            has no transforms on both sides (T then has the nearest).
+            The longest time between two such neighbours. It is 0 where each link is static or has a transform at
+            the stamp, and infinite where a link has no transform before or after (T then has the nearest).
 
         Raises
         ------
@@ -152,20 +141,17 @@ class TfBuffer:
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         T = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
         gap_s = np.zeros(len(stamps_ns))
-        frames = self.chain(parent, child)
-        for a, b in itertools.pairwise(frames):
-            # Going down the link hangs on b, going up on a.
-            down = b in self._links and self._links[b].parent == a
-            T_link, gap_link = _at(self._links[b if down else a], stamps_ns)
-            T = T @ (T_link if down else se3.inverse(T_link))
+        for link, is_down in self._links_of(parent, child):
+            T_link, gap_link = _at(link, stamps_ns)
+            T = T @ (T_link if is_down else se3.inverse(T_link))
             gap_s = np.maximum(gap_s, gap_link)
         return np.array(T), gap_s
 
-    def _moving(self, parent: str, child: str) -> list[_Link]:
-        """The links of the chain that are not static."""
-        frames = self.chain(parent, child)
-        below = [b if b in self._links and self._links[b].parent == a else a for a, b in itertools.pairwise(frames)]
-        return [self._links[name] for name in below if not self._links[name].is_static]
+    def _links_of(self, parent: str, child: str) -> list[tuple[_Link, bool]]:
+        """The links of the chain, each with whether the chain goes down the link, from its parent to its child."""
+        steps = list(itertools.pairwise(self.chain(parent, child)))
+        down = [b in self._links and self._links[b].parent == a for a, b in steps]
+        return [(self._links[b if is_down else a], is_down) for (a, b), is_down in zip(steps, down, strict=True)]
 
     def _up(self, frame: str) -> list[str]:
         """The frame, its parent, and so on to the root."""

@@ -1,14 +1,14 @@
-"""JSON schemas of the messages that this library writes: Foxglove's well-known ones, and two of our own.
+"""JSON schemas of the messages that this library writes: Foxglove's well-known schemas and two of this library.
 
 ``gtsam_rwhec.TagDetections``
     Tags seen in one image. ``frame_id`` is the camera's frame; each detection has ``family``, ``id`` and, where known,
-    ``size_m``, ``corners_px`` (four points; of a board, those that were seen: ``corner_indices``), ``pose``
-    (T_camera_tag), ``covariance`` (36 numbers, row-major; rotation first, radians and metres, right perturbation of the
-    pose), ``reprojection_px`` (root mean square) and, if it is not used, ``reason``.
+    ``size_m``, ``corners_px`` (four points; of a board the corners that were seen, which ``corner_indices`` names),
+    ``pose`` (T_camera_tag), ``covariance`` (36 numbers, row-major; rotation first, radians and metres, right
+    perturbation of the pose), ``reprojection_px`` (root mean square) and, if the detection is not used, ``reason``.
 ``gtsam_rwhec.MeasuredPair``
     A synchronised measurement of A X = Y B: ``A`` = T_sensorcarrier_targetcarrier and ``B`` = T_sensor_target, 16
-    numbers each, row-major, metres; ``target`` and ``sensor``; ``is_inlier``, and if it is none, ``reason``; where
-    known, B's ``covariance`` as above.
+    numbers each, row-major, metres; ``target`` and ``sensor``; ``is_inlier``; ``reason``, which is empty for an
+    inlier; and B's ``covariance`` as above, where known.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Moments of all pairs of a problem, about one gauge that the first measurements choose."""
+"""Moments of all pairs of a problem, about one gauge that the first measurements determine."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
 from gtsam_rwhec.problem.pairs import Pair
 
-#: The gauge may move, and everything be summed anew, until this many measurements are there: a single one says nothing
-#: of where a trajectory is centred. Later ones are summed about the gauge as it then is.
+#: Up to this number of measurements the gauge moves and all moments are summed anew: one measurement does not tell the
+#: centre of a trajectory. Later measurements are summed about the gauge as it then is.
 OPENING = 64
 
 
@@ -28,16 +28,16 @@ class Batch:
 
     @property
     def sample(self) -> Array:
-        """At most a block of A, from all over the batch: logs begin at rest, which tells no centre."""
+        """At most `BLOCK` poses from all over A: a log begins at rest, and its first poses tell no centre."""
         return self.A[:: -(-len(self.A) // BLOCK)]
 
     def moments(self, gauge: Gauge) -> Moments:
-        """Checked and summed about a gauge."""
+        """The moments about a gauge, with every pose checked."""
         return Moments.of(self.A, self.B, self.weight, self.kappa, gauge, self.pair.is_motion, self.where)
 
 
 class Accumulator:
-    """Moments by pair. Nothing in it changes: what is added makes another."""
+    """Moments by pair. An accumulator does not change: adding a batch makes a new accumulator."""
 
     def __init__(self, gauge: Gauge | None = None, moments: dict[Pair, Moments] | None = None) -> None:
         self.gauge = gauge or Gauge()
@@ -45,12 +45,12 @@ class Accumulator:
         self._opening: list[Batch] | None = [] if gauge is None else None
 
     def added(self, batch: Batch) -> tuple[Accumulator, int]:
-        """This and a batch; and how many of its rotations had to be projected to SO(3).
+        """The accumulator with a batch added, and how many of the batch's rotations were projected to SO(3).
 
         Raises
         ------
         PoseError
-            For a pose that is none.
+            The batch has a pose that is not valid.
         """
         if self._opening is None:
             gauge = self.gauge
@@ -71,7 +71,7 @@ class Accumulator:
             moments[b.pair] = moments[b.pair] + fresh if b.pair in moments else fresh
         result = Accumulator(gauge, moments)
         if sum(len(b.A) for b in batches) < OPENING:
-            # Kept for a while: the caller's arrays may change meanwhile.
+            # Copied: the caller's arrays may change before the gauge settles.
             result._opening = [*self._opening, replace(batch, A=batch.A.copy(), B=batch.B.copy())]
         return result, fresh.projected
 
@@ -79,7 +79,7 @@ class Accumulator:
         return any(not pair.is_motion for pair in self.moments)
 
     def merged(self, other: Accumulator) -> Accumulator:
-        """Both together, about the gauge of the one that has settled."""
+        """Both accumulators' moments, about the gauge of the accumulator whose gauge has settled."""
         settled, rest = (self, other) if self._opening is None or other._opening is not None else (other, self)
         if rest._opening is not None:
             result = settled

@@ -1,4 +1,4 @@
-"""What is known before anything is measured: fixed frames, priors of frames, known scales."""
+"""Knowledge of a problem before any measurement: fixed frames, priors of frames, known scales."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ ScaleMode = Literal["known", "shared", "per_target"]
 
 
 class Knowledge:
-    """Frames and scales that are known, exactly or by a belief; the part of a `Problem` that is not measured.
+    """Frames and scales that are known exactly or by a prior; the part of a `Problem` that is not measured.
 
     Attributes
     ----------
     scale : "known", "shared" or "per_target"
+        As in `Problem`.
     fixed : dict of str to (4, 4) array
         Poses of frames on their carriers, metres.
     priors : dict of str to list of Prior
+        Priors of frames, by the frame's name.
     fixed_scales : dict of str to float
-        Measured over true length, by target (or sensor with motions of its own).
+        Measured over true length, by target (or by sensor for motions).
     """
 
     def __init__(self, scale: ScaleMode) -> None:
@@ -43,13 +45,13 @@ class Knowledge:
         Raises
         ------
         PriorError
-            When it is fixed at another pose already, or a prior contradicts it.
+            The frame is fixed at another pose already, or a prior contradicts the pose.
         """
         T = one_transform(T_carrier_frame, f"the pose at which {name} is fixed")
         known = self.fixed.get(name)
         if known is not None and np.abs(known - T).max() > 1e-9:
             raise PriorError(
-                f"{name} is fixed already, at another pose ({difference(known, T)}); remove one of the two"
+                f"{name} is fixed already, at another pose ({difference(known, T)}); remove one of the two poses"
             )
         for prior in self.priors.get(name, []):
             check_agreement(name, Prior(T, 0.0, np.inf), prior)
@@ -58,26 +60,26 @@ class Knowledge:
     def add_prior(
         self, name: str, T_carrier_frame: PoseLike, sigma: float | None = None, kappa: float | None = None
     ) -> None:
-        """Add a belief about a frame's pose on its carrier: a MAP estimate in place of a maximum-likelihood one.
+        """Add a prior of a frame's pose on its carrier: the estimate is then MAP in place of maximum likelihood.
 
         Parameters
         ----------
         name : str
         T_carrier_frame : pose
         sigma : float, optional
-            Standard deviation of the translation, each axis, in metres; None leaves the translation free.
+            Standard deviation of the translation along each axis, in metres; None leaves the translation free.
         kappa : float, optional
-            Concentration of the rotation, 1 / (2 s^2) for s rad an axis; None leaves the rotation free.
+            Concentration of the rotation, 1 / (2 s^2) for s rad about each axis; None leaves the rotation free.
 
         Raises
         ------
         PriorError
-            When it contradicts what is known of the frame already, or says nothing.
+            The prior contradicts the fixed pose or another prior of the frame, or has neither sigma nor kappa.
         """
         where = f"the prior of {name}"
         T = one_transform(T_carrier_frame, where)
         if sigma is None and kappa is None:
-            raise PriorError(f"{where} has neither sigma nor kappa and says nothing; give one of them")
+            raise PriorError(f"{where} has neither sigma nor kappa; give sigma, kappa or both")
         prior = Prior(
             T,
             None if sigma is None else float(positive_weights(sigma, 0, "sigma", where)),
@@ -90,23 +92,24 @@ class Knowledge:
         self.priors.setdefault(name, []).append(prior)
 
     def fix_scale(self, name: str, scale: float = 1.0) -> None:
-        """Say that a target's size (or, for motions, a sensor's odometry scale) is known, with scale="per_target".
+        """Say that the size of a target (for motions, the odometry scale of a sensor) is known, in "per_target".
 
         Raises
         ------
         ScaleError
-            When the scale is not positive, or the problem's scale is not "per_target".
+            The scale is not positive, it is fixed at another value, or the problem's scale is not "per_target".
         """
         if self.scale != "per_target":
             raise ScaleError(f"fix_scale({name!r}) needs scale='per_target'; this problem has scale={self.scale!r}")
         if not (isinstance(scale, Real) and np.isfinite(scale) and scale > 0):
             raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number (measured / true length)")
         if self.fixed_scales.get(name, scale) != scale:
-            raise ScaleError(f"the scale of {name} is fixed at {self.fixed_scales[name]} already, and now at {scale}")
+            known = self.fixed_scales[name]
+            raise ScaleError(f"the scale of {name} is fixed at {known} already, and now at {scale}; fix it once")
         self.fixed_scales[name] = float(scale)
 
     def _learn(self, other: Knowledge) -> None:
-        """Take over what another problem knows, where the two agree."""
+        """Add the knowledge of another problem, which must not contradict the knowledge here."""
         for name, T in other.fixed.items():
             self.fix(name, T)
         for name, priors in other.priors.items():
@@ -116,7 +119,7 @@ class Knowledge:
             self.fix_scale(name, scale)
 
     def _take_knowledge(self, other: Knowledge, *, frames: Collection[str] = (), scales: Collection[str] = ()) -> None:
-        """Have copies of what another problem knows, except of the frames and scales named."""
+        """Copy the knowledge of another problem, without the frames and scales named."""
         self.fixed = {name: T for name, T in other.fixed.items() if name not in frames}
         self.priors = {name: list(priors) for name, priors in other.priors.items() if name not in frames}
         self.fixed_scales = {name: scale for name, scale in other.fixed_scales.items() if name not in scales}

@@ -1,9 +1,9 @@
-"""Measurements of one pair: as users give them, as they are kept, and the checks in between."""
+"""Measurements of one pair: as users give them, as they are kept, and the checks of them."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,15 +12,27 @@ from gtsam_rwhec.errors import CountError, NoiseError, UnitsWarning
 from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, as_transforms
 from gtsam_rwhec.problem.moments import BLOCK, Gauge
 
-#: sigma and kappa below this, or above its inverse, lose everything else in rounding.
+#: sigma and kappa below this or above its inverse are refused: other terms of a sum would be lost to rounding.
 SMALLEST_WEIGHT = 1e-15
-#: Translations with a median beyond this are taken for millimetres (a camera sees no tag at 100 m).
+#: Translations with a median size beyond this, in metres, look like millimetres: no camera sees a tag at 100 m.
 MILLIMETRES_M = 100.0
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Raw measurements of one edge: A, B (N, 4, 4), sigma (N,) in m, kappa (N,), stamps (N,) in ns, 6x6 covariances."""
+    """Raw measurements of one pair.
+
+    Attributes
+    ----------
+    A, B : (N, 4, 4) arrays
+        T_sensorcarrier_targetcarrier and T_sensor_target, metres.
+    sigma, kappa : (N,) arrays
+        Standard deviation of B's translation in metres; concentration of B's rotation, 1 / rad^2.
+    stamps_ns : (N,) array or None
+        Integer nanoseconds.
+    covariances : (N, 6, 6) array or None
+        Covariances of B, rotation first, right perturbation.
+    """
 
     A: Array
     B: Array
@@ -30,7 +42,7 @@ class Measurements:
     covariances: Array | None = None
 
     def covariance_of_B(self) -> Array:
-        """(N, 6, 6), rotation first: as given, or 1 / (2 kappa) and sigma^2 an axis."""
+        """(N, 6, 6), rotation first: as given, or diagonal with 1 / (2 kappa) and sigma^2."""
         if self.covariances is not None:
             return self.covariances
         variances = np.repeat(np.column_stack([0.5 / self.kappa, self.sigma**2]), 3, axis=1)
@@ -38,18 +50,12 @@ class Measurements:
         return covariance
 
     def selected(self, mask: np.ndarray) -> Measurements:
-        """Those marked."""
-        return Measurements(
-            self.A[mask],
-            self.B[mask],
-            self.sigma[mask],
-            self.kappa[mask],
-            None if self.stamps_ns is None else self.stamps_ns[mask],
-            None if self.covariances is None else self.covariances[mask],
-        )
+        """The measurements where ``mask`` (N,) is true."""
+        arrays = {part.name: getattr(self, part.name) for part in fields(self)}
+        return replace(self, **{name: array[mask] for name, array in arrays.items() if array is not None})
 
     def kept(self) -> KeptMeasurements:
-        """Copied, since the caller's arrays may change; sigma and kappa are one for each measurement then."""
+        """A copy, since the caller's arrays may change, with one sigma and one kappa for each measurement."""
         sigma, kappa = (np.broadcast_to(value, len(self.A)) for value in (self.sigma, self.kappa))
         copied = replace(self, A=self.A.copy(), B=self.B.copy(), sigma=sigma, kappa=kappa)
         return KeptMeasurements((copied,), self.covariances is not None)
@@ -57,7 +63,7 @@ class Measurements:
 
 @dataclass(frozen=True)
 class KeptMeasurements:
-    """Raw measurements of a pair, batch by batch, as far as they are kept; whether covariances came with any."""
+    """Raw measurements of a pair that are kept, batch by batch, and whether any batch had covariances."""
 
     batches: tuple[Measurements, ...] = ()
     has_covariances: bool = False
@@ -67,11 +73,11 @@ class KeptMeasurements:
 
     @property
     def count(self) -> int:
-        """How many are kept."""
+        """The number of measurements that are kept."""
         return sum(len(batch.A) for batch in self.batches)
 
     def joined(self) -> Measurements:
-        """All in one, in the order in which they were added."""
+        """All batches in one, in the order in which they were added; stamps only where every batch has them."""
         batches = self.batches
         stamps = [b.stamps_ns for b in batches if b.stamps_ns is not None]
         return Measurements(
@@ -86,7 +92,7 @@ class KeptMeasurements:
 
 @dataclass(frozen=True)
 class GivenMeasurements:
-    """Measurements as ``Problem.add`` is given them: nothing is checked. Its documentation says what each is."""
+    """The arguments of ``Problem.add``, not checked."""
 
     A: PosesLike
     B: PosesLike
@@ -99,21 +105,21 @@ class GivenMeasurements:
 
     @property
     def has_noise(self) -> bool:
-        """Whether the noise of both rotation and translation is stated."""
+        """Whether the noise of both the rotation and the translation is stated."""
         return self.covariances is not None or (self.sigma is not None and self.kappa is not None)
 
     def checked(self, where: str) -> Measurements:
-        """The arrays that they are; one sigma or kappa for all stays one number.
+        """The arguments as arrays; a single sigma or kappa for all measurements stays one number.
 
         Raises
         ------
         PoseError, CountError, NoiseError
-            For poses, stamps or noise that are none, that are not one for each measurement, or noise given twice.
+            Poses, stamps or noise are not valid, do not have one entry for each measurement, or noise is given twice.
         """
         A = as_transforms(self.A, self.order, f"A of {where}")
         B = as_transforms(self.B, self.order, f"B of {where}")
         if len(A) != len(B):
-            raise CountError(f"{where}: {len(A)} poses in A and {len(B)} in B; they come in pairs")
+            raise CountError(f"{where}: {len(A)} poses in A and {len(B)} in B; give as many in A as in B, in pairs")
         if len(A) == 0:
             raise CountError(f"{where}: no measurements; leave the pair out instead")
         stamps_ns = checked_stamps(self.stamps_ns, len(A), where)
@@ -122,9 +128,8 @@ class GivenMeasurements:
         if covariances is not None:
             if sigma is not None or kappa is not None:
                 raise NoiseError(
-                    f"{where}: covariances and {'sigma' if sigma is not None else 'kappa'} are given, which may "
-                    "contradict one another; give the one or the other (of covariances, the certified solution takes "
-                    "the mean variance of each block)"
+                    f"{where}: covariances and {'sigma' if sigma is not None else 'kappa'} are given; give covariances "
+                    "alone, or sigma and kappa (the certified solution uses the mean variance of each block)"
                 )
             variances = np.einsum("nii->ni", covariances)
             sigma, kappa = np.sqrt(variances[:, 3:].mean(axis=1)), 0.5 / variances[:, :3].mean(axis=1)
@@ -139,7 +144,7 @@ class GivenMeasurements:
 
 
 def positive_weights(value: ArrayLike | None, count: int, name: str, where: str) -> Array:
-    """sigma or kappa as a () or (count,) array of positive numbers; left out: 1."""
+    """sigma or kappa as a () or (count,) array of positive numbers; 1 where the value is None."""
     if value is None:
         return np.array(1.0)
     try:
@@ -157,20 +162,14 @@ def positive_weights(value: ArrayLike | None, count: int, name: str, where: str)
     if unlikely.size:
         value_there = array.flat[unlikely[0]]
         raise NoiseError(
-            f"{where}: {name} is {value_there:.3g}; beyond {SMALLEST_WEIGHT:g} to {1.0 / SMALLEST_WEIGHT:g} no double "
-            "precision sum holds it. sigma is in metres, kappa is 1 / (2 s^2) for s in radians"
+            f"{where}: {name} is {value_there:.3g}; give a number from {SMALLEST_WEIGHT:g} to "
+            f"{1.0 / SMALLEST_WEIGHT:g}. sigma is in metres, kappa is 1 / (2 s^2) for s in radians"
         )
     return array
 
 
 def checked_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.ndarray | None:
-    """Stamps as (count,) integer nanoseconds.
-
-    Raises
-    ------
-    CountError
-        For another count, or for numbers that are not integers.
-    """
+    """Stamps as (count,) integer nanoseconds; a CountError for another count or other numbers."""
     if stamps_ns is None:
         return None
     stamps = np.asarray(stamps_ns)
@@ -182,13 +181,7 @@ def checked_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.nd
 
 
 def checked_covariances(covariances: ArrayLike | None, count: int, where: str) -> Array | None:
-    """Covariances of B as (count, 6, 6), positive definite.
-
-    Raises
-    ------
-    CountError, NoiseError
-        For another shape, or for what is no covariance.
-    """
+    """Covariances of B as (count, 6, 6); a CountError or NoiseError where they are not positive definite matrices."""
     if covariances is None:
         return None
     array = np.array(covariances, dtype=np.float64)
@@ -215,8 +208,8 @@ def checked_covariances(covariances: ArrayLike | None, count: int, where: str) -
 
 
 def warn_of_millimetres(A: Array, B: Array, gauge: Gauge, motion: bool, where: str) -> None:
-    """Warn where translations look as if they were in millimetres."""
-    # About the gauge, so that a world origin far away is no millimetre; B is what a sensor sees, never far away.
+    """Warn where translations look like millimetres."""
+    # A is taken about the gauge, so that a distant world origin gives no warning. What a sensor sees (B) is never far.
     c = gauge.sensor_carrier if motion else gauge.target_carrier
     centred_A = A[:BLOCK, :3, 3] + A[:BLOCK, :3, :3] @ c - gauge.sensor_carrier
     spread_A = float(np.median(np.abs(centred_A).max(axis=1)))
@@ -224,8 +217,8 @@ def warn_of_millimetres(A: Array, B: Array, gauge: Gauge, motion: bool, where: s
     for name, size in (("A", spread_A), ("B", size_B)):
         if size > MILLIMETRES_M:
             warnings.warn(
-                f"{where}: translations of {name} have a median size of {size:.4g}; that looks like millimetres. "
-                "This library takes metres; divide by 1000 if so",
+                f"{where}: translations of {name} have a median size of {size:.4g}; this looks like millimetres. "
+                "Give metres: divide by 1000",
                 UnitsWarning,
                 stacklevel=4,
             )

@@ -1,10 +1,10 @@
-"""What the cost needs to know of an edge's measurements: a few moments, and the 25 x 25 form they make.
+"""Moments of a pair's measurements, which are all that the cost needs, and the 25 x 25 forms that they give.
 
-Moments are sums over the measurements, so they add: batches, logs and machines may be merged, in any order. They are
-sums about a reference (``Gauge``): with the world's origin far away, products of uncentred translations would lose
-the digits that the answer is made of.
+Moments are sums over the measurements, so they add: batches, logs and the results of several machines may be merged in
+any order. They are sums about a reference (``Gauge``): with a distant world origin, products of uncentred translations
+would lose the digits of the answer.
 
-One column of features per measurement, 25 of them::
+Each measurement has one column of 25 features::
 
     f = [vec R_A (9), t_A (3), vec R_B (9), t_B (3), 1]          (vec stacks columns)
 
@@ -14,16 +14,16 @@ the inverse equation (one scale per target); ``rotation = sum kappa vec(R_A) vec
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import LARGEST_M, Array, checked_rows
 
 R_A, T_A, R_B, T_B, ONE = slice(0, 9), slice(9, 12), slice(12, 21), slice(21, 24), 24
-#: The features of the inverse equation, B X^-1 = Y^-1 A: A and B change places.
+#: The order of the features for the inverse equation, B X^-1 = Y^-1 A, in which A and B change places.
 SWAPPED = np.r_[12:24, 0:12, 24]
-#: Measurements handled at once: blocks of this many stay in the processor's cache.
+#: Measurements that are summed at once: a block of this size stays in the processor's cache.
 BLOCK = 2048
 I3 = np.eye(3)
 I9 = np.eye(9)
@@ -32,9 +32,9 @@ _UPPER = np.triu_indices(25, 1)
 
 @dataclass(frozen=True)
 class Gauge:
-    """Origins to which translations are referred: A -> T(-sensor_carrier) A T(target_carrier), in metres.
+    """The reference points of the moments: A -> T(-sensor_carrier) A T(target_carrier), in metres.
 
-    X moves to T(-target_carrier) X and Y to T(-sensor_carrier) Y: the answer is shifted back exactly.
+    X becomes T(-target_carrier) X and Y becomes T(-sensor_carrier) Y; the answer is shifted back exactly.
     """
 
     sensor_carrier: Array = field(default_factory=lambda: np.zeros(3))
@@ -44,9 +44,9 @@ class Gauge:
     def of(A: Array, motion: np.ndarray) -> Gauge:
         """The reference that makes the translations of ``A`` (N, 4, 4) small: min |R_A c + t_A - a|^2 over a, c.
 
-        Where ``motion`` (N,) says so, both ends are the sensor's carrier (AX = XB): c = a. A component that the
-        motions leave open stays small (minimum norm). Numbers too large for poses, which ``Problem.add`` refuses later,
-        give the gauge zero.
+        Where ``motion`` (N,) is true, both ends are the sensor's carrier (AX = XB), and c = a. The solution has the
+        minimum norm, so a component that the motions do not determine is zero. Numbers too large for poses give the
+        gauge zero; ``Problem.add`` refuses them later.
         """
         if not np.abs(A).max() <= LARGEST_M:
             return Gauge()
@@ -59,7 +59,7 @@ class Gauge:
 
     @staticmethod
     def target_origin(A: Array, sensor_carrier: Array) -> Array:
-        """The best target carrier's origin (3,) when the sensor carrier's is settled."""
+        """The best reference point of the target carrier (3,) for a given one of the sensor carrier."""
         if not np.abs(A).max() <= LARGEST_M:
             return np.zeros(3)
         origin: Array = np.einsum("nji,nj->ni", A[:, :3, :3], sensor_carrier - A[:, :3, 3]).mean(axis=0)
@@ -72,7 +72,7 @@ class Gauge:
 
 @dataclass(frozen=True)
 class Moments:
-    """Sums over the measurements of one edge. Additive: ``a + b`` is the moments of both.
+    """Sums over the measurements of one pair; ``a + b`` is the moments of both.
 
     Attributes
     ----------
@@ -96,19 +96,10 @@ class Moments:
 
     @staticmethod
     def of(A: Array, B: Array, weight: Array, kappa: Array, gauge: Gauge, motion: bool, where: str) -> Moments:
-        """Moments of N measurements, block by block, checking every pose on the way (``poses.checked_rows``).
+        """Moments of N measurements, block by block; every pose is checked (``poses.checked_rows``).
 
-        Parameters
-        ----------
-        A, B : (N, 4, 4) arrays
-        weight : () or (N,) array
-            1 / sigma^2, in 1/m^2.
-        kappa : () or (N,) array
-        gauge : Gauge
-        motion : bool
-            Whether both carriers are the sensor's (AX = XB).
-        where : str
-            For messages.
+        A, B are (N, 4, 4); weight is 1 / sigma^2 (1/m^2) and kappa, both () or (N,). ``motion`` says that both carriers
+        are the sensor's (AX = XB); ``where`` is the name in messages.
         """
         translation = np.zeros((25, 25))
         rotation = np.zeros((9, 9))
@@ -137,7 +128,7 @@ class Moments:
 
     @staticmethod
     def none() -> Moments:
-        """Of no measurement."""
+        """The moments of no measurement."""
         return Moments(0, 0.0, np.zeros((25, 25)), np.zeros((9, 9)))
 
     def __add__(self, other: Moments) -> Moments:
@@ -150,13 +141,13 @@ class Moments:
         )
 
     def shifted(self, a: Array, c: Array) -> Moments:
-        """The same measurements about a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
+        """The moments about a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
         shift = _shift(a, c)
-        return Moments(self.count, self.kappa, shift @ self.translation @ shift.T, self.rotation, self.projected)
+        return replace(self, translation=shift @ self.translation @ shift.T)
 
 
 def _shift(a: Array, c: Array) -> Array:
-    """t_A' = t_A + R_A c - a is linear in the features, so that moments change by a congruence with this."""
+    """The matrix of t_A' = t_A + R_A c - a, which is linear in the features; moments change by a congruence with it."""
     shift = np.eye(25)
     for i in range(3):
         shift[T_A, R_A][:, 3 * i : 3 * i + 3] = c[i] * I3
@@ -166,7 +157,7 @@ def _shift(a: Array, c: Array) -> Array:
 
 @dataclass(frozen=True)
 class MomentStack:
-    """Moments of E edges: count (E,), kappa (E,), translation (E, 25, 25), rotation (E, 9, 9); motion (E,) booleans."""
+    """Moments of E pairs: count (E,), kappa (E,), translation (E, 25, 25), rotation (E, 9, 9); motion (E,) booleans."""
 
     count: np.ndarray
     kappa: Array
@@ -176,14 +167,10 @@ class MomentStack:
 
     @staticmethod
     def of(moments: list[Moments], motion: list[bool]) -> MomentStack:
-        """Stack them."""
-        return MomentStack(
-            np.array([edge.count for edge in moments]),
-            np.array([edge.kappa for edge in moments]),
-            np.array([edge.translation for edge in moments]),
-            np.array([edge.rotation for edge in moments]),
-            np.array(motion),
-        )
+        """Stack the moments of several pairs."""
+        names = ("count", "kappa", "translation", "rotation")
+        stacked = {name: np.array([getattr(pair, name) for pair in moments]) for name in names}
+        return MomentStack(**stacked, motion=np.array(motion))
 
     @property
     def weight(self) -> Array:
@@ -191,9 +178,9 @@ class MomentStack:
         return self.translation[:, ONE, ONE]
 
     def best_shift(self) -> tuple[Array, Array]:
-        """The shift (a, c) that centres all edges together: min sum |t_A + R_A c - a|^2 / sigma^2, minimum norm."""
+        """The shift (a, c) that centres all pairs together: min sum |t_A + R_A c - a|^2 / sigma^2, minimum norm."""
         G, still = self.translation, ~self.motion
-        # R_A' summed: entry (i, k) is R_A[k, i], which vec keeps at 3 i + k.
+        # The sum of R_A': entry (i, k) is R_A[k, i], which vec has at 3 i + k.
         Rt = G[:, R_A, ONE].reshape(-1, 3, 3)
         Rt_t = np.einsum("eikk->ei", G[:, R_A, T_A].reshape(-1, 3, 3, 3))
         t = G[:, T_A, ONE]
@@ -210,10 +197,9 @@ class MomentStack:
         return solution[:3], solution[3:]
 
     def shifted(self, a: Array, c: Array) -> MomentStack:
-        """About a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
+        """The moments about a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
         shift = np.where(self.motion[:, None, None], _shift(a, a), _shift(a, c))
-        moved = shift @ self.translation @ shift.transpose(0, 2, 1)
-        return MomentStack(self.count, self.kappa, moved, self.rotation, self.motion)
+        return replace(self, translation=shift @ self.translation @ shift.transpose(0, 2, 1))
 
     def spread(self) -> float:
         """Root mean square of t_A about the gauge, in metres."""
@@ -222,7 +208,7 @@ class MomentStack:
 
 
 def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array, Array]:
-    """Quadratic forms of E edges over x = [t_X, t_Y, alpha, vec R_X, vec R_Y] (DESIGN fact 1; eqs. 24-33).
+    """Quadratic forms of E pairs over x = [t_X, t_Y, alpha, vec R_X, vec R_Y] (design fact 1; eqs. 24-33).
 
     Parameters
     ----------
@@ -235,7 +221,7 @@ def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array
     Returns
     -------
     translation_form, rotation_form : (E, 25, 25) arrays
-        x' form x is the edge's J_t and J_R (eq. 18), the 1/2 included.
+        x' form x is the pair's J_t and J_R (eq. 18), with the factor 1/2.
     """
     G = translation
     edges = len(G)

@@ -1,4 +1,4 @@
-"""Who saw whom: a sensor and a target, or a sensor and its own motion."""
+"""Names of pairs: a target and the sensor that saw it, or a sensor with motions of its own."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ Value = TypeVar("Value")
 
 
 class Pair(NamedTuple):
-    """A target and the sensor that saw it; for motions of a sensor's own (A Y = Y B), twice that sensor.
+    """A target and the sensor that saw it; for motions of a sensor (A Y = Y B), the sensor's name twice.
 
-    It is a tuple, so that ``solution.residuals["tag_0", "cam_0"]`` finds it.
+    A pair is a tuple, so ``solution.residuals["tag_0", "cam_0"]`` finds it.
     """
 
     target: str
@@ -19,22 +19,22 @@ class Pair(NamedTuple):
 
     @property
     def is_motion(self) -> bool:
-        """Whether both ends are one sensor (AX = XB)."""
+        """Whether the measurements are motions of one sensor (AX = XB)."""
         return self.target == self.sensor
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The names of its frames: two, or a motion's one."""
+        """The names of the frames: target and sensor, or the sensor alone for motions."""
         return (self.sensor,) if self.is_motion else tuple(self)
 
     @property
     def label(self) -> str:
-        """How messages and tables write it: "tag_0-cam_0", or "the motions of cam_0"; also ``str(pair)``."""
+        """The pair's name in messages and tables: "tag_0-cam_0" or "the motions of cam_0"; also ``str(pair)``."""
         return f"the motions of {self.sensor}" if self.is_motion else f"{self.target}-{self.sensor}"
 
     def __str__(self) -> str:
         return self.label
 
 
-#: What users give for each pair: bare tuples do.
+#: Values by pair as users give them: a key may be a plain tuple.
 ByPair: TypeAlias = Mapping[Pair, Value] | Mapping[tuple[str, str], Value]

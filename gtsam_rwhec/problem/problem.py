@@ -1,4 +1,4 @@
-"""What the user states: who measured what of whom, and (``knowledge``) what is known beforehand."""
+"""The problem as the user states it: measurements by pair, and the knowledge of frames and scales."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class Problem(Knowledge):
     Parameters
     ----------
     scale : "known", "shared" or "per_target"
-        Whether lengths in B are true, or true times one unknown factor, or times one for each target
-        (t_B = scale * true length). With "per_target", ``fix_scale`` names targets of known size.
+        Whether lengths in B are true, or true times one unknown factor, or true times one unknown factor for each
+        target (t_B = scale * true length). With "per_target", ``fix_scale`` names targets of known size.
     keep_measurements : bool
-        Whether raw pairs are kept beside the moments. Refinement under richer noise needs them; the certified
-        solution does not. Without them memory does not grow with the number of measurements.
+        Whether raw measurements are kept beside the moments. Refinement with covariances, time offsets or outliers
+        needs them; the certified solution does not. Without them memory does not grow with their number.
     """
 
     def __init__(self, scale: ScaleMode = "known", *, keep_measurements: bool = True) -> None:
@@ -53,7 +53,7 @@ class Problem(Knowledge):
         self._kept: dict[Pair, KeptMeasurements] = {}
         self._accumulator = Accumulator()
 
-    # -- what is in it ------------------------------------------------------------------------------------------
+    # -- contents -----------------------------------------------------------------------------------------------
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -67,33 +67,31 @@ class Problem(Knowledge):
 
     @property
     def pairs(self) -> tuple[Pair, ...]:
-        """Who was seen by whom, in order of first appearance."""
+        """The pairs that have measurements, in order of first appearance."""
         return tuple(self._kept)
 
     @property
     def number_of_measurements(self) -> int:
-        """Measurements of all pairs together."""
+        """The number of measurements of all pairs."""
         return sum(moments.count for moments in self._accumulator.moments.values())
 
     @property
     def has_covariances(self) -> bool:
-        """Whether any measurement came with a full covariance (used in refinement only)."""
+        """Whether any measurement has a full covariance (refinement alone uses it)."""
         return any(kept.has_covariances for kept in self._kept.values())
 
     @property
     def has_measurements(self) -> bool:
-        """Whether every raw measurement is still here."""
+        """Whether every raw measurement was kept."""
         return sum(kept.count for kept in self._kept.values()) == self.number_of_measurements
 
     def require_pairs(self) -> None:
-        """Raise a CountError where nothing was measured."""
+        """Raise a CountError where the problem has no measurements."""
         if not self._kept:
-            raise CountError(
-                "the problem is empty: no measurements; add some with problem.add(target, sensor, A, B, ...)"
-            )
+            raise CountError("the problem is empty; add measurements with problem.add(target, sensor, A, B, ...)")
 
     def require_raw_measurements(self, what: str) -> None:
-        """Raise a MeasurementsNotKeptError where they are not all here; ``what`` needs them."""
+        """Raise a MeasurementsNotKeptError where raw measurements, which ``what`` needs, were not kept."""
         if not self.has_measurements:
             raise MeasurementsNotKeptError(
                 f"{what} needs the raw measurements, and they were not kept (keep_measurements=False); make the "
@@ -102,7 +100,7 @@ class Problem(Knowledge):
 
     @property
     def gauge(self) -> Gauge:
-        """The origins that moments are about."""
+        """The reference points that the moments are summed about."""
         return self._accumulator.gauge
 
     def moments(self, target: str, sensor: str) -> Moments:
@@ -115,7 +113,7 @@ class Problem(Knowledge):
         Raises
         ------
         MeasurementsNotKeptError
-            When the problem was made with ``keep_measurements=False``.
+            The problem was made with ``keep_measurements=False``.
         """
         pair = self._pair(target, sensor)
         kept = self._kept[pair]
@@ -157,23 +155,23 @@ class Problem(Knowledge):
         A, B : (N, 4, 4) arrays, lists of gtsam.Pose3, or (N, 7) rows of quaternion and translation
             A = T_sensorcarrier_targetcarrier, B = T_sensor_target; metres.
         sigma : float or (N,), optional
-            Standard deviation of B's translation, each axis, in metres. Left out: 1, and costs are relative.
+            Standard deviation of B's translation along each axis, in metres. Left out: 1, and costs are relative.
         kappa : float or (N,), optional
-            Concentration of B's rotation; a standard deviation of s rad an axis is kappa = 1 / (2 s^2).
+            Concentration of B's rotation: 1 / (2 s^2) for a standard deviation of s rad about each axis.
         order : "wxyz" or "xyzw"
             Order of the quaternions, for rows of 7.
         stamps_ns : (N,) integers, optional
             Nanoseconds; kept for refinement.
         covariances : (N, 6, 6), optional
-            Of B, rotation first, right perturbation (GTSAM's order), in place of sigma and kappa: refinement takes them
-            whole, the certified solution the mean variance of each block.
+            Covariances of B in place of sigma and kappa: rotation first, right perturbation (GTSAM's order).
+            Refinement uses the whole matrix, the certified solution the mean variance of each block.
         source : str, optional
-            Where they came from (a file, a topic), said in errors.
+            Where the measurements come from (a file, a topic); errors name it.
 
         Raises
         ------
         PoseError, CountError, NoiseError, FrameError
-            For bad input; nothing of the batch is added then.
+            A name, pose, weight, stamp or covariance is not valid; nothing of the batch is added then.
         """
         pair = Pair(target, sensor)
         if pair.is_motion:
@@ -193,9 +191,9 @@ class Problem(Knowledge):
         covariances: ArrayLike | None = None,
         source: str | None = None,
     ) -> None:
-        """Add motions seen by a sensor's own odometry: A Y = Y B (AX = XB), A the carrier's, B the sensor's.
+        """Add motions of a sensor and its carrier: A Y = Y B (AX = XB). Arguments and errors as in ``add``.
 
-        Both are T_before_after. Arguments and errors as in ``add``.
+        A is the carrier's motion and B the motion that the sensor measured, both T_before_after.
         """
         given = GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source)
         self._add(Pair(sensor, sensor), given)
@@ -214,7 +212,7 @@ class Problem(Knowledge):
                 stacklevel=3,
             )
         warn_of_millimetres(raw.A, raw.B, accumulator.gauge, pair.is_motion, where)
-        # Only now, with everything checked and warned of (warnings may be errors), does the problem change.
+        # The problem changes only after all checks and warnings: a warning may be raised as an error.
         self._accumulator = accumulator
         self.is_relative = self.is_relative or not given.has_noise
         self._kind |= {pair.target: "target", pair.sensor: "sensor"}  # a motion's one name is its sensor's
@@ -234,25 +232,24 @@ class Problem(Knowledge):
             raise FrameError(f"{where}: {pair.sensor!r} is a target; only sensors have motions of their own")
 
     def with_measurements(self, measurements: Mapping[Pair, Measurements]) -> Problem:
-        """The same knowledge with other measurements of the same frames.
+        """A problem with the same knowledge and other measurements of the same frames.
 
-        Their poses were checked when they were added; moments are summed again, about the same gauge. Of what is known
-        (fixed frames, priors, fixed scales) only what concerns frames that keep a measurement stays: a frame without
-        one is not in the problem that comes back.
+        The moments are summed again, about the same gauge. A frame without a measurement is not in the new problem,
+        and neither are its fixed pose, priors and fixed scale.
 
         Raises
         ------
         CountError
-            When there are none.
+            There are no measurements.
         """
         if not measurements:
-            raise CountError(f"nothing is left of {self}: no measurement was to be kept")
+            raise CountError(f"nothing is left of {self}: keep at least one measurement")
         moments = {
             pair: Moments.of(raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, self.gauge, pair.is_motion, pair.label)
             for pair, raw in measurements.items()
         }
         lost_frames = self._kind.keys() - {name for pair in measurements for name in pair}
-        # A scale is of what its measurements' lengths are of.
+        # A scale belongs to the first name of a pair: the target, or the sensor of motions.
         lost_scales = {pair.target for pair in self.pairs} - {pair.target for pair in measurements}
         result = copy.copy(self)
         result._kind = {name: kind for name, kind in self._kind.items() if name not in lost_frames}
@@ -266,7 +263,7 @@ class Problem(Knowledge):
     # -- joining ------------------------------------------------------------------------------------------------
 
     def __add__(self, other: Problem) -> Problem:
-        """Both problems' measurements and knowledge in one: logs can be processed apart and joined."""
+        """One problem with the measurements and knowledge of both: logs can be processed apart and joined."""
         if not isinstance(other, Problem):
             return NotImplemented
         if self.scale != other.scale:

@@ -1,7 +1,6 @@
-"""Part of a problem's measurements, or all of them weighed anew, under the same knowledge of frames and scales.
+"""Problems with some of the measurements of another problem, or with other weights, and the same knowledge.
 
-A frame that loses its last measurement is not in the problem that comes back (``Problem.with_measurements``), and the
-caller says what that means.
+A frame that loses its last measurement is not in the new problem (``Problem.with_measurements``).
 """
 
 from __future__ import annotations
@@ -19,39 +18,33 @@ from gtsam_rwhec.problem.variance_factors import AS_STATED, VarianceFactors
 
 
 def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
-    """The problem with only some of its measurements.
+    """The problem with some of its measurements only.
 
     Parameters
     ----------
     problem : Problem
         With its raw measurements; it is not changed.
     keep : dict of (target, sensor) to (N,) booleans
-        Which measurements of a pair stay, in the order of ``problem.measurements``. Pairs that it lacks stay whole.
+        True for measurements that stay, in the order of ``problem.measurements``. Pairs without an entry stay whole.
 
     Returns
     -------
     Problem
-        Frames in the same order. Pairs without a measurement are left out, and so are frames without one.
+        Frames in the same order, without the pairs and frames that have no measurement left.
 
     Raises
     ------
     MeasurementsNotKeptError
-        When the problem was made with ``keep_measurements=False``.
+        The problem was made with ``keep_measurements=False``.
     FrameError, CountError
-        For a pair that the problem does not have, a mask of another length or kind, or when nothing is left.
+        The problem does not have a pair, a mask is not one boolean for each measurement, or nothing is left.
     """
-    _check_pairs(problem, keep)
-    edges: dict[Pair, Measurements] = {}
-    for pair in problem.pairs:
-        if pair not in keep:
-            edges[pair] = problem.measurements(*pair)
-            continue
-        raw, mask = problem.measurements(*pair), np.asarray(keep[pair])
-        if mask.shape != (len(raw.A),) or mask.dtype != np.bool_:
-            raise CountError(f"keep of {pair} has shape {mask.shape} of {mask.dtype}; give {len(raw.A)} booleans")
-        if mask.any():
-            edges[pair] = raw if mask.all() else raw.selected(mask)
-    return problem.with_measurements(edges)
+    masks = {Pair(*pair): np.asarray(mask) for pair, mask in keep.items()}
+    for pair, mask in masks.items():
+        count = problem.moments(*pair).count
+        if mask.shape != (count,) or mask.dtype != np.bool_:
+            raise CountError(f"keep of {pair} has shape {mask.shape} of {mask.dtype}; give {count} booleans")
+    return reweighted(problem, masks)
 
 
 def reweighted(
@@ -66,26 +59,27 @@ def reweighted(
     problem : Problem
         With its raw measurements; it is not changed.
     weights : dict of (target, sensor) to (N,) array
-        At least zero; a measurement of weight w has sigma / sqrt(w) and w kappa, and with w = 0 it is left out. Pairs
-        that it lacks keep their weights.
+        At least zero. A measurement of weight w > 0 gets sigma / sqrt(w) and w kappa; weight 0 leaves it out. A pair
+        without an entry keeps its weights.
     factors : VarianceFactors
-        Every kappa is divided by the rotation's, every sigma^2 multiplied by the translation's.
+        Each kappa is divided by ``factors.rotation``, each sigma^2 multiplied by ``factors.translation``.
 
     Returns
     -------
     Problem
-        Frames in the same order; pairs and frames without a measurement are left out.
+        Frames in the same order, without the pairs and frames that have no measurement left.
 
     Raises
     ------
     MeasurementsNotKeptError
-        When the problem was made with ``keep_measurements=False``.
+        The problem was made with ``keep_measurements=False``.
     FrameError, CountError, NoiseError
-        For a pair that the problem does not have, weights of another number or below zero, or when nothing is left.
+        The problem does not have a pair, weights have another count or are negative, or nothing is left.
     """
-    _check_pairs(problem, weights)
+    for target, sensor in weights:
+        problem.moments(target, sensor)
     if not all(np.isfinite(factor) and factor > 0.0 for factor in factors):
-        raise NoiseError(f"{factors}: a variance factor is positive and finite")
+        raise NoiseError(f"{factors}: give variance factors that are positive and finite")
     edges: dict[Pair, Measurements] = {}
     for pair in problem.pairs:
         raw = problem.measurements(*pair)
@@ -101,11 +95,6 @@ def reweighted(
             kept, w = (raw, w) if positive.all() else (raw.selected(positive), w[positive])
             edges[pair] = _weighed(kept, w, factors)
     return problem.with_measurements(edges)
-
-
-def _check_pairs(problem: Problem, given: ByPair[ArrayLike]) -> None:
-    for target, sensor in given:
-        problem.moments(target, sensor)
 
 
 def _weighed(raw: Measurements, w: np.ndarray, factors: VarianceFactors) -> Measurements:

@@ -1,4 +1,4 @@
-"""How noisy measurements are over what was stated of them."""
+"""How noisy the measurements are, as a multiple of the stated noise."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class VarianceFactors(NamedTuple):
-    """By what the stated variances of B's rotations and translations are multiplied; 1: the noise is as stated."""
+    """Factors of the stated variances of B's rotations and translations; 1 means that the noise is as stated."""
 
     rotation: float
     translation: float

@@ -88,7 +88,7 @@ def test_missing_links_and_loops_show_the_chain() -> None:
         (record("c", "b", np.eye(4)), "two parents, a .* and c"),
         (record("a", "b", np.eye(4), topic="/tf"), "static and moving"),
         (record("b", "b", np.eye(4)), "its own parent"),
-        (record("a", "", np.eye(4)), "no transform between two named frames"),
+        (record("a", "", np.eye(4)), "not a transform between two named frames"),
     ],
 )
 def test_contradictions(second: PoseRecord, words: str) -> None:
