@@ -17,7 +17,7 @@ RUNS = {
     "tightness_neighbourhood": (["--problems", "2", "--step", "45"], "all constraints: the first loss at"),
     "sparsity": (["--leaves", "2", "4"], r"8 X: ([\d.]+)% of Q' filled before, \1% after"),
     "certify_other_solver": (["--runs", "4"], "After local descent: certified"),
-    "covariance_report": ([], r"cam_1 .* free .*[^$]*Not determined: translation of cam_0 along its own y axis"),
+    "covariance_report": ([], r"Not determined: translation of cam_0 along its own y axis[^$]*cam_1 .* free "),
     "log_in_a_viewer": ([], "certified: cost 1"),
     "slam_graph": ([], r"Batch and iSAM2 agree to [\d.]+e-0[4-9] mm"),
 }

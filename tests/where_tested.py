@@ -105,9 +105,9 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/report": {
         "calibration/test_cross_validation.py": "cross_validation_table",
-        "cli/test_wheel.py": "log_report",
+        "cli/test_wheel.py": "advice log_report",
         "methods/test_comparison.py": "comparison_report",
-        "report/test_solution_report.py": "pose_table sentences",
+        "report/test_solution_report.py": "pose_table printing sentences",
     },
     "gtsam_rwhec/report/plots": {
         "report/plots/test_drawing.py": "labels",

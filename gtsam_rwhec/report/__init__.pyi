@@ -8,4 +8,4 @@ from .pose_table import sensor_table as sensor_table
 from .pose_table import target_table as target_table
 from .sentences import certificate_sentence as certificate_sentence
 from .solution_report import print_solution as print_solution
-from .solution_report import report_console as report_console
+from .printing import report_console as report_console

@@ -1,22 +1,22 @@
-"""Methods side by side: a line for each that applies, and the reason for each that does not."""
+"""The report of a comparison: a line for each method with an answer, and the reason for each method without one."""
 
 from __future__ import annotations
 
 import math
 
 from rich.console import Console
-from rich.text import Text
 
 from gtsam_rwhec.methods.comparison import Compared, Comparison
+from gtsam_rwhec.report.advice import print_advice
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.sentences import certificate_sentence, identifiability_sentences
-from gtsam_rwhec.report.solution_report import report_console
+from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
+from gtsam_rwhec.report.sentences import certificate_sentence
 
 HEADINGS = ("cost J", "gap", "gap %", "rms mm", "rms°", "ms")
 LEGEND = (
-    "cost J: of the certified objective, whatever the method itself minimised. gap: by how much it costs more than any "
-    "answer must, by the certificate's bound; 0 where that proves it optimal. rms: residuals over all measurements. "
-    "ms: the method's own time."
+    "cost J: cost of the answer by the certified objective, whatever the method itself minimises. gap: this cost minus "
+    "the certificate's lower bound; 0: proven optimal. rms: root mean square residual over all measurements. ms: time "
+    "of the method."
 )
 
 
@@ -27,42 +27,41 @@ def comparison_table(comparison: Comparison) -> FrameTable:
 
 
 def print_comparison(comparison: Comparison, console: Console | None = None) -> None:
-    """Print the table, what each answer rests on, and the methods without an answer.
+    """Print what is proven, the table, the notes on each answer, and the methods without an answer.
 
     Parameters
     ----------
     comparison : Comparison
+        The result of `gtsam_rwhec.methods.compare`.
     console : rich.console.Console, optional
-        Standard output if left out.
+        Where to print; standard output by default.
     """
     console = report_console() if console is None else console
-    wrap = not console.is_terminal
+    if comparison.certificate is None:
+        print_sentence(console, f"No lower bound of the cost: {comparison.error}", "bold red")
+    else:
+        style = "bold green" if comparison.certificate.is_certified else "bold red"
+        sentence = certificate_sentence(comparison.certificate).replace("this answer", "the certified answer", 1)
+        print_sentence(console, sentence, style)
+    if comparison.solution is not None:
+        print_advice(console, comparison.solution.identifiability.free_directions)
+    console.print()
     table = comparison_table(comparison)
     if table.rows:
-        console.print(table)
-        console.print(Text(LEGEND, style="dim"), soft_wrap=wrap)
-        console.print()
+        print_tables(console, [table], LEGEND)
     for sentence in _remarks(comparison):
-        console.print(Text(sentence), soft_wrap=wrap)
-    without = [row for row in comparison.rows if row.estimate is None]
-    if without:
-        console.print(Text("No answer:", style="bold"))
-        for row in without:
-            console.print(Text(f"  - {row.method.name}: {row.error}"), soft_wrap=wrap)
-        console.print()
-    if comparison.certificate is None:
-        console.print(Text(f"No bound on the cost: {comparison.error}", style="bold red"), soft_wrap=wrap)
-        return
-    style = "bold green" if comparison.certificate.is_certified else "bold red"
-    sentence = certificate_sentence(comparison.certificate).replace("this answer", "the certified answer", 1)
-    console.print(Text(sentence, style=style), soft_wrap=wrap)
-    if comparison.solution is not None:
-        for words in identifiability_sentences(comparison.solution):
-            console.print(Text(words, style="bold red"), soft_wrap=wrap)
+        print_sentence(console, sentence)
+    reasons: dict[str, list[str]] = {}
+    for row in comparison.rows:
+        if row.estimate is None:
+            reasons.setdefault(str(row.error), []).append(row.method.name)
+    if reasons:
+        print_heading(console, "Methods without an answer")
+        print_list(console, (f"{', '.join(names)}: {reason}" for reason, names in reasons.items()))
 
 
 def _remarks(comparison: Comparison) -> list[str]:
-    """Where the iterations started, and what methods say of their answers."""
+    """Where the iterations started, and what the methods note about their answers."""
     starts: dict[str, list[str]] = {}
     notes = []
     for row in comparison.rows:

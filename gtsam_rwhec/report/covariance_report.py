@@ -1,4 +1,4 @@
-"""The covariance report: how well every frame, relative pose, scale and time offset is known."""
+"""The report of a refined calibration: how well each frame, relative pose, scale and time offset is known."""
 
 from __future__ import annotations
 
@@ -14,68 +14,51 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.refinement.unknowns import UnknownKind
-from gtsam_rwhec.report.log_report import doubts, print_log
+from gtsam_rwhec.report.advice import print_advice
+from gtsam_rwhec.report.log_report import print_log
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, RESIDUAL_LEGEND, FrameTable, pose_cells, residual_table
-from gtsam_rwhec.report.solution_report import (
-    print_heading,
-    print_sentence,
-    print_solution_details,
-    print_tables,
-    print_verdict,
-    report_console,
-)
+from gtsam_rwhec.report.printing import print_heading, print_sentence, print_tables, print_verdict, report_console
+from gtsam_rwhec.report.solution_report import print_solution_details
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.verdict import judge
 
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
 LEGEND = (
-    "Poses: metres; roll, pitch, yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation along, and "
-    "about, the x, y, z of the frame itself; free: infinite, as a direction that the measurements leave free reaches "
-    "this axis. Moved: from the certified solution."
+    "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation, along "
+    "and about the axes of the frame itself; free: infinite, because the measurements leave a direction free. moved: "
+    "change from the certified answer."
 )
 
 
 def print_refined(refined: Refined, console: Console | None = None, *, log: LogFields | None = None) -> None:
-    """Print the verdict, the refined poses with their standard deviations, what to do, and the details.
+    """Print the verdict, what to do, the refined poses with their standard deviations, and the details.
 
     Parameters
     ----------
-    refined
-        What `gtsam_rwhec.refine` returned.
-    console
-        Where to; None for standard output.
-    log
-        What became of the measurements, where they come from a log.
+    refined : Refined
+        The result of `gtsam_rwhec.refine`.
+    console : rich.console.Console, optional
+        Where to print; standard output by default.
+    log : LogFields, optional
+        What became of the measurements, if they come from a log.
     """
     console = report_console() if console is None else console
     solution = refined.solution
     print_verdict(console, judge(solution, refined, log))
+    print_advice(console, refined.free_directions or solution.identifiability.free_directions, log)
+    print_heading(console, "Poses")
     tables = (
-        _frame_table("Sensors in the frame that carries them", "sensor", refined.Y, refined),
-        _frame_table("Targets in the frame that carries them", "target", refined.X, refined),
+        _frame_table("Sensors in the frame of their carrier", "sensor", refined.Y, refined),
+        _frame_table("Targets in the frame of their carrier", "target", refined.X, refined),
     )
     print_tables(console, tables, LEGEND)
     for sentence in scale_and_offset_sentences(refined):
         print_sentence(console, sentence)
-    free = refined.free_directions or solution.identifiability.free_directions
-    advice = doubts(log) if log is not None else []
-    if free or advice:
-        print_heading(console, "What to do")
-    for direction in free:
-        print_sentence(console, f"Not determined: {direction}", "bold red")
-    if free:
-        print_sentence(console, "Turn further while measuring, about two different axes or more; or fix known frames.")
-    for sentence in advice:
-        print_sentence(console, sentence, "bold yellow")
     print_heading(console, "Details")
     if log is not None:
         print_log(log, console)
-    print_tables(
-        console,
-        [_relative_table(kind, poses, refined) for kind, poses in (("sensor", refined.Y), ("target", refined.X))]
-        + [residual_table(solution)],
-        RESIDUAL_LEGEND,
-    )
+    relative = [_relative_table(kind, poses, refined) for kind, poses in (("sensor", refined.Y), ("target", refined.X))]
+    print_tables(console, [*relative, residual_table(solution)], RESIDUAL_LEGEND)
     console.print()
     noise = noise_table(refined)
     if len(noise.rows) > 1:
@@ -87,7 +70,7 @@ def print_refined(refined: Refined, console: Console | None = None, *, log: LogF
 
 
 def scale_and_offset_sentences(refined: Refined) -> list[str]:
-    """What is used beside the poses: scales and time offsets."""
+    """The scales and time offsets, with their standard deviations."""
     sentences = []
     for unknown in refined.unknowns:
         if unknown.kind is UnknownKind.FRAME:
@@ -101,20 +84,20 @@ def scale_and_offset_sentences(refined: Refined) -> list[str]:
         else:
             offset = 1e3 * refined.time_offsets_s[owner]
             sentences.append(
-                f"Time offset of {owner}: {offset:+.3f} ± {_cell(1e3 * deviation, 3)} ms (the carriers' time is its "
-                "stamps' plus this)."
+                f"Time offset of {owner}: {offset:+.3f} ± {_cell(1e3 * deviation, 3)} ms (a stamp of {owner} + this = "
+                "the carriers' time)."
             )
     return sentences
 
 
 def refined_sentences(refined: Refined) -> list[str]:
-    """What the standard deviations rest on: noise, cost, outliers."""
+    """The noise, the cost and the outliers, which decide the standard deviations."""
     sentences = [_noise_sentence(refined), _carrier_noise_sentence(refined)]
     loss = "" if refined.options.robust in ("none", "gnc") else f", {refined.options.robust} loss"
     steps = f"{refined.iterations} iteration{'' if refined.iterations == 1 else 's'}"
     sentences.append(
-        f"Cost in the weights of the refinement (not the certified one's): {refined.cost:.6g} after {steps}, "
-        f"{refined.initial_cost:.6g} at the certified solution ({refined.options.residual} residual{loss})."
+        f"Cost of the refinement: {refined.cost:.6g} after {steps}, {refined.initial_cost:.6g} at the certified answer "
+        f"({refined.options.residual} residual{loss}). Its weights differ from the weights of the certified cost."
     )
     if refined.inlier_counts:
         sentences.append(_outlier_sentence(refined.inlier_counts))
@@ -122,33 +105,33 @@ def refined_sentences(refined: Refined) -> list[str]:
 
 
 def _noise_sentence(refined: Refined) -> str:
-    """Where the noise comes from; its size too where it is the same for all pairs, which else the table has."""
+    """The source of the noise, and its size if all pairs have the same noise."""
     source = "estimated from the residuals" if refined.noise_source == "estimated" else "as given"
     rows = noise_table(refined).rows
     if len(rows) != 1:
-        return f"Noise of B: {source}; in the table."
+        return f"Noise of B: {source}; see the table."
     rotation, translation, *behind = next(iter(rows.values()))
     backing = f", with {behind[0]} and {behind[1]} degrees of freedom" if behind else ""
-    return f"Noise of B: {rotation}° and {translation} mm an axis, {source}{backing}."
+    return f"Noise of B: {rotation}° and {translation} mm for each axis, {source}{backing}."
 
 
 def _carrier_noise_sentence(refined: Refined) -> str:
     noise = refined.options.carrier_noise
     if noise is None:
         return (
-            "Noise of A: left out; where the carriers' poses are not exact, these standard deviations are too small "
-            "(a rig file gives it as carriers: noise:)."
+            "Noise of A: none, the carriers' poses count as exact. If they are not, the standard deviations above are "
+            "too small. A rig file states this noise under carriers: noise."
         )
     if noise.covariances is not None:
         return "Noise of A: the covariances given for each measurement."
     return (
-        f"Noise of A: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm an axis of the "
-        f"{noise.about.removesuffix('carrier')} carrier, as given."
+        f"Noise of A: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm for each axis "
+        f"of the {noise.about.removesuffix('carrier')} carrier, as given."
     )
 
 
 def _outlier_sentence(counts: Mapping[Pair, tuple[int, int]]) -> str:
-    """How many measurements were left out, and of which pairs."""
+    """How many measurements of which pairs were left out."""
     total = sum(number for _, number in counts.values())
     out = {pair: number - kept for pair, (kept, number) in counts.items() if kept < number}
     if not out:
@@ -158,22 +141,21 @@ def _outlier_sentence(counts: Mapping[Pair, tuple[int, int]]) -> str:
 
 
 def noise_table(refined: Refined) -> FrameTable:
-    """The noise of B: a line for all pairs, for each sensor, or for each pair, as few as tell all."""
+    """The noise of B: one line for all pairs, or one for each sensor or each pair where they differ."""
     noises = {pair: _noise_cells(noise) for pair, noise in refined.noise.items()}
     kinds: tuple[tuple[str, Callable[[Pair], str]], ...] = (
         ("", lambda pair: "all"),
         ("sensor", lambda pair: pair.sensor),
         ("pair", str),
     )
-    kind, label = next(
-        (kind, label)
-        for kind, label in kinds
-        if label is str
-        or len({(label(pair), cells) for pair, cells in noises.items()}) == len({label(pair) for pair in noises})
+    choices = ((kind, label, {label(pair): cells for pair, cells in noises.items()}) for kind, label in kinds)
+    kind, rows = next(
+        (kind, rows)
+        for kind, label, rows in choices
+        if all(rows[label(pair)] == cells for pair, cells in noises.items())
     )
-    rows = {label(pair): cells for pair, cells in noises.items()}
     headings = ("±°", "±mm") if refined.noise_source == "given" else ("±°", "±mm", "d.o.f. (°)", "d.o.f. (mm)")
-    title = "Noise of B an axis" + ("" if refined.noise_source == "given" else ", and degrees of freedom")
+    title = "Noise of B for each axis" + ("" if refined.noise_source == "given" else ", and degrees of freedom")
     return FrameTable(title, kind, headings, {name: rows[name] for name in sorted(rows, key=natural_key)})
 
 
@@ -196,18 +178,18 @@ def _frame_table(title: str, kind: str, poses: Mapping[str, object], refined: Re
 
 
 def _relative_table(kind: str, poses: Mapping[str, object], refined: Refined) -> FrameTable:
-    """Every frame as seen from the first one on its carrier."""
+    """The pose of each frame in the first frame of the same carrier."""
     names = sorted(poses, key=natural_key)
     rows = {}
     for name in names[1:]:
         pose, covariance = refined.relative(names[0], name)
         rows[name] = (*pose_cells(pose), *deviation_cells(covariance))
-    title = f"The {kind}s as seen from {names[0]}" if names else ""
+    title = f"Other {kind}s in the frame of {names[0]}" if names else ""
     return FrameTable(title, kind, (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows)
 
 
 def deviation_cells(covariance: Array) -> tuple[str, ...]:
-    """Standard deviations of a pose, translations (mm) before rotations (degrees), as poses are printed."""
+    """Standard deviations of a pose: translations in millimetres, then rotations in degrees."""
     degrees, millimetres = standard_deviations(covariance)
     return *(_cell(value, 2) for value in millimetres), *(_cell(value, 3) for value in degrees)
 

@@ -1,4 +1,4 @@
-"""Hold-out errors as tables: overall, of each sensor and target, and where asked for of each pair."""
+"""Hold-out errors as tables: of all measurements, of each sensor and target, and of each pair on request."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ import math
 from collections.abc import Mapping
 
 from rich.console import Console
-from rich.text import Text
 
 from gtsam_rwhec.calibration.cross_validation import CrossValidation
 from gtsam_rwhec.calibration.prediction_errors import HoldOutError
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.report.pose_table import FrameTable
-from gtsam_rwhec.report.solution_report import report_console
+from gtsam_rwhec.report.printing import print_list, print_sentence, print_tables, report_console
 
 HEADINGS = ("rms mm", "median", "95%", "rms°", "median", "95%", "seen mm", "seen°", "n")
 LEGEND = (
-    "Predicted against measured poses of targets, held out of the calibration that predicts them: translation in true "
-    "millimetres, angle in degrees; root mean square, median, 95th percentile. seen: root mean square of the same "
-    "measurements when none is held out. n: measurements predicted (of those there are)."
+    "Difference between the measured pose of a target and the pose that a calibration without this measurement "
+    "predicts, in true millimetres and degrees. rms: root mean square. 95%: 95th percentile. seen: rms of the same "
+    "measurements when the calibration uses all of them. n: predicted measurements."
 )
 SPLITS = {
     "time": "{folds} blocks, contiguous in {time}, each predicted from the others",
@@ -28,7 +27,7 @@ SPLITS = {
 
 
 def cross_validation_tables(result: CrossValidation, *, pairs: bool = False) -> list[FrameTable]:
-    """Tables of the whole and the sensors, of the targets, and with ``pairs`` of the pairs."""
+    """A table of all measurements and the sensors, one of the targets, and with ``pairs`` one of the pairs."""
     tables = [
         FrameTable(
             "Hold-out error by sensor", "sensor", HEADINGS, {"all": _cells(result.overall), **_rows(result.sensors)}
@@ -43,25 +42,22 @@ def cross_validation_tables(result: CrossValidation, *, pairs: bool = False) -> 
 
 
 def print_cross_validation(result: CrossValidation, console: Console | None = None, *, pairs: bool = False) -> None:
-    """Print the tables and what they are of.
+    """Print what was held out, and the tables.
 
     Parameters
     ----------
     result : CrossValidation
+        The result of `gtsam_rwhec.cross_validate`.
     console : rich.console.Console, optional
-        Standard output if left out.
+        Where to print; standard output by default.
     pairs : bool
-        Whether every pair has a line too.
+        Print a line for each pair as well.
     """
     console = report_console() if console is None else console
-    wrap = not console.is_terminal
-    console.print(Text(f"Hold-out error: {split_sentence(result)}", style="bold"), soft_wrap=wrap)
+    print_sentence(console, f"Hold-out error: {split_sentence(result)}", "bold")
     console.print()
-    for table in cross_validation_tables(result, pairs=pairs):
-        console.print(table)
-    console.print(Text(LEGEND, style="dim"), soft_wrap=wrap)
-    for note in result.notes:
-        console.print(Text(f"  - {note}", style="yellow"), soft_wrap=wrap)
+    print_tables(console, cross_validation_tables(result, pairs=pairs), LEGEND)
+    print_list(console, result.notes, "yellow")
 
 
 def split_sentence(result: CrossValidation) -> str:

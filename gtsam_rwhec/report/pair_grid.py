@@ -1,4 +1,4 @@
-"""The RWHEC paper's Figure 8: for every sensor and target, was the pair seen, and would it do on its own?"""
+"""The grid of the RWHEC paper's Figure 8: which pairs were seen, and which are determined on their own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gtsam_rwhec.problem.pairs import Pair
 
 @dataclass(frozen=True)
 class Symbol:
-    """What one state of a pair looks like: told apart by shape first, so that colour is never needed."""
+    """The sign for one state of a pair. The shapes differ, so that nobody needs to see the colours."""
 
     symbol: str
     ascii_symbol: str
@@ -26,26 +26,26 @@ class Symbol:
 
 
 # Blue and vermillion of Okabe and Ito's palette, which people with any form of colour blindness tell apart.
-DETERMINED = Symbol("■", "#", Style(color="#0072B2"), "determined")
-NOT_DETERMINED = Symbol("□", "o", Style(color="#D55E00"), "seen, but not determined without others")
+DETERMINED = Symbol("■", "#", Style(color="#0072B2"), "determined by its own measurements")
+NOT_DETERMINED = Symbol("□", "o", Style(color="#D55E00"), "seen, but not determined by its own measurements")
 NOT_OBSERVED = Symbol("·", ".", Style(dim=True), "not seen")
 
 
 @dataclass(frozen=True)
 class PairGrid:
-    """Sensors downwards, targets across; prints itself to any width, in as many blocks as that takes."""
+    """A grid with a row for each sensor and a column for each target. It prints itself to any width, in blocks."""
 
     identifiability: Identifiability
 
     def state(self, target: str, sensor: str) -> Symbol:
-        """What is known of one pair."""
+        """The state of one pair."""
         pair = self.identifiability.pairs.get(Pair(target, sensor))
         if pair is None:
             return NOT_OBSERVED
         return DETERMINED if pair.is_unique else NOT_DETERMINED
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Print the grid, then what its symbols mean and how many there are of each."""
+        """Print the grid, then the meaning of its signs with their counts."""
         observed = [pair for pair in self.identifiability.pairs if not pair.is_motion]
         targets = sorted({target for target, _ in observed}, key=natural_key)
         sensors = sorted({sensor for _, sensor in observed}, key=natural_key)
@@ -61,7 +61,7 @@ class PairGrid:
                     line.append(" " * _width(label)).append(symbol, state.style)
                 yield line
         states = [self.state(target, sensor) for target in targets for sensor in sensors]
-        legend = Text(f"Across: targets{f' ({prefix}*)' if prefix else ''}; down: sensors. Each pair by itself is")
+        legend = Text(f"Columns: targets{f' ({prefix}*)' if prefix else ''}. Rows: sensors. The pair is")
         for kind in (DETERMINED, NOT_DETERMINED, NOT_OBSERVED):
             symbol = kind.ascii_symbol if options.ascii_only else kind.symbol
             legend.append("\n").append(symbol, kind.style).append(f" {kind.meaning}: {states.count(kind)}")
@@ -71,11 +71,11 @@ class PairGrid:
 
 
 def _motions(identifiability: Identifiability) -> Iterator[Text]:
-    """The edges A Y = Y B have no target, and so no square."""
+    """A sentence for each sensor's own motion A Y = Y B, which has no target and so no place in the grid."""
     for pair, alone in identifiability.pairs.items():
         if pair.is_motion:
             verdict = "determined" if alone.is_unique else "not determined"
-            yield Text(f"{pair.sensor} from its own motion: {verdict} on its own")
+            yield Text(f"{pair.sensor} from its own motion: {verdict}")
 
 
 def _width(label: str) -> int:
@@ -83,7 +83,7 @@ def _width(label: str) -> int:
 
 
 def _without_common_prefix(names: Sequence[str]) -> tuple[str, list[str]]:
-    """("tag_", ["1", "20"]) of tag_1 and tag_20: what names have in common is said once, below the grid."""
+    """("tag_", ["1", "20"]) of tag_1 and tag_20: the legend names the common beginning once."""
     first, last = min(names, default=""), max(names, default="")
     same = sum(1 for _ in takewhile(lambda letters: letters[0] == letters[1], zip(first, last, strict=False)))
     prefix = first[:same].rstrip("0123456789")
@@ -95,7 +95,7 @@ def _without_common_prefix(names: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def _blocks(columns: Sequence[tuple[str, str]], width: int) -> Iterator[list[tuple[str, str]]]:
-    """Cut the columns into blocks of at most `width` characters, at least one column each."""
+    """Cut the columns into blocks of at most `width` characters, with at least one column each."""
     block: list[tuple[str, str]] = []
     used = 0
     for target, label in columns:

@@ -1,4 +1,4 @@
-"""Tables of calibrated frames: where each one is, and how well its measurements agree with that."""
+"""Tables of calibrated frames: their poses, and the residuals of their measurements."""
 
 from __future__ import annotations
 
@@ -17,24 +17,20 @@ from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solving.solution import Solution
 
-RESIDUAL_LEGEND = "Residuals: root mean square over the n measurements of a frame, in millimetres and degrees."
-POSE_LEGEND = (
-    "Translations in metres; rotations as roll, pitch, yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll). "
-    + RESIDUAL_LEGEND
-)
+RESIDUAL_LEGEND = "rms: root mean square residual over the n measurements of a frame, in millimetres and degrees."
+POSE_LEGEND = "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). " + RESIDUAL_LEGEND
 
 POSE_HEADINGS = ("x m", "y m", "z m", "roll°", "pitch°", "yaw°")
 RESIDUAL_HEADINGS = ("rms mm", "rms°", "n")
+#: Columns of a narrower table.
 SPLIT = len(POSE_HEADINGS)
-"""Columns of a narrower table."""
 
 
 @dataclass(frozen=True)
 class FrameTable:
-    """Frames with numbers under headings; prints itself to any width without cutting a number or a name.
+    """Frames with numbers under headings. The table prints itself to any width and never cuts a number or a name.
 
-    One table where it fits, else poses and what follows them apart, six columns each, where that fits, and else a
-    paragraph for each frame.
+    It prints one table if that fits; otherwise several tables of six columns each, or a paragraph for each frame.
     """
 
     title: str
@@ -43,28 +39,27 @@ class FrameTable:
     rows: Mapping[str, tuple[str, ...]]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Choose the widest layout that fits."""
+        """Print the widest layout that fits."""
+        yield Text(self.title, style="italic")
         layouts = (
             [slice(0, None)],
             [slice(0, SPLIT), slice(SPLIT, None)],
             [slice(0, SPLIT), slice(SPLIT, 2 * SPLIT), slice(2 * SPLIT, None)],
         )
         for cuts in layouts:
-            tables = [self._table(cut, self.title if cut.start == 0 else None) for cut in cuts if self.headings[cut]]
+            tables = [self._table(cut) for cut in cuts if self.headings[cut]]
             unlimited = options.update(max_width=10_000)
             if all(console.measure(table, options=unlimited).maximum <= options.max_width for table in tables):
                 yield from tables
                 return
-        yield Text(self.title, style="italic")
         for name, cells in self.rows.items():
             numbers = [f"{heading} {cell}" for heading, cell in zip(self.headings, cells, strict=True)]
             yield Text("\n".join(_filled(f"{name}:", numbers, options.max_width)))
         yield Text()
 
-    def _table(self, columns: slice, title: str | None) -> Table:
-        # One space between columns and none outside: with short names the whole fits 80 columns.
+    def _table(self, columns: slice) -> Table:
+        # One space between columns: with short names the table fits 80 columns.
         table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-        table.title, table.title_justify = title, "left"
         table.add_column(self.kind, no_wrap=True)
         for heading in self.headings[columns]:
             table.add_column(heading, justify="right", no_wrap=True)
@@ -74,7 +69,7 @@ class FrameTable:
 
 
 def _filled(start: str, numbers: Iterable[str], width: int) -> list[str]:
-    """Lines up to a width; a number stays with its heading."""
+    """Fill lines up to a width; a number stays with its heading."""
     lines = [start]
     for piece in numbers:
         if len(lines[-1]) + 1 + len(piece) + 1 <= width:
@@ -86,25 +81,23 @@ def _filled(start: str, numbers: Iterable[str], width: int) -> list[str]:
 
 
 def sensor_table(solution: Solution) -> FrameTable:
-    """The poses Y = T_sensorcarrier_sensor, one line for each sensor."""
-    return _frame_table("Sensors in the frame that carries them", "sensor", solution.Y, solution)
+    """The poses Y = T_sensorcarrier_sensor, a line for each sensor."""
+    return _frame_table("Sensors in the frame of their carrier", "sensor", solution.Y, solution)
 
 
 def target_table(solution: Solution) -> FrameTable:
-    """The poses X = T_targetcarrier_target, one line for each target."""
-    return _frame_table("Targets in the frame that carries them", "target", solution.X, solution)
+    """The poses X = T_targetcarrier_target, a line for each target."""
+    return _frame_table("Targets in the frame of their carrier", "target", solution.X, solution)
 
 
 def residual_table(solution: Solution) -> FrameTable:
     """How well each frame's measurements fit the certified answer."""
     rows = {
-        name: _residual_cells(
-            pooled_residual(residual for pair, residual in solution.residuals.items() if name in pair)
-        )
+        name: _residual_cells(solution, name)
         for poses in (solution.Y, solution.X)
         for name in sorted(poses, key=natural_key)
     }
-    return FrameTable("Certified residuals", "frame", RESIDUAL_HEADINGS, rows)
+    return FrameTable("Residuals of the certified answer", "frame", RESIDUAL_HEADINGS, rows)
 
 
 def _frame_table(title: str, kind: str, poses: Mapping[str, gtsam.Pose3], solution: Solution) -> FrameTable:
@@ -112,9 +105,8 @@ def _frame_table(title: str, kind: str, poses: Mapping[str, gtsam.Pose3], soluti
     own_scales = any(name in scales for name in poses)
     rows = {}
     for name in sorted(poses, key=natural_key):
-        pooled = pooled_residual(residual for pair, residual in solution.residuals.items() if name in pair)
         scale = (f"{scales[name]:.5f}" if name in scales else "-",) if own_scales else ()
-        rows[name] = (*pose_cells(poses[name]), *_residual_cells(pooled), *scale)
+        rows[name] = (*pose_cells(poses[name]), *_residual_cells(solution, name), *scale)
     return FrameTable(title, kind, (*POSE_HEADINGS, *RESIDUAL_HEADINGS, *(("scale",) if own_scales else ())), rows)
 
 
@@ -138,7 +130,8 @@ def pose_cells(pose: gtsam.Pose3) -> tuple[str, ...]:
     return *translation, *(f"{value:z.2f}" for value in np.degrees(pose.rotation().rpy()))
 
 
-def _residual_cells(residual: Residual) -> tuple[str, ...]:
+def _residual_cells(solution: Solution, name: str) -> tuple[str, ...]:
+    residual = pooled_residual(residual for pair, residual in solution.residuals.items() if name in pair)
     if residual.number_of_measurements == 0:
         return "-", "-", "0"
     return (

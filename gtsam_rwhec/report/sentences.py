@@ -1,4 +1,4 @@
-"""A solution in words: what is proven, what is left free, what the numbers may be used for."""
+"""A solution in words: what is proven, its parts, its scale and its weights."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gtsam_rwhec.solving.solution import Solution
 
 
 def summary_sentence(solution: Solution) -> str:
-    """How much was solved: "16 targets, 8 sensors, 73 pairs, 3230 measurements"."""
+    """The size of the problem: "16 targets, 8 sensors, 73 pairs, 3230 measurements"."""
     measurements = sum(residual.number_of_measurements for residual in solution.residuals.values())
     counts = (
         (len(solution.X), "target"),
@@ -23,7 +23,7 @@ def summary_sentence(solution: Solution) -> str:
 
 
 def certificate_sentence(certificate: Certificate) -> str:
-    """What is proven about the cost, in one sentence."""
+    """What the certificate proves about the cost."""
     proof = (
         f"this answer costs {certificate.cost:.10g}, and no answer can cost less than {certificate.lower_bound:.10g} "
         f"(relative gap {certificate.relative_gap:.1e}; by {certificate.path})"
@@ -31,38 +31,27 @@ def certificate_sentence(certificate: Certificate) -> str:
     if certificate.status is Status.CERTIFIED:
         return f"Certified globally optimal: {proof}."
     if certificate.status is Status.CERTIFIED_NOT_UNIQUE:
-        return f"Certified, but not unique: {proof}; other answers fit as well, up to noise."
+        return f"Certified, but not unique: {proof}; other answers fit equally well, up to noise."
     if certificate.status is Status.GAP:
         return f"Not certified: {proof}; {certificate.reason}."
     return f"Not certified: this answer costs {certificate.cost:.10g}; {certificate.reason}."
 
 
-def identifiability_sentences(solution: Solution) -> Iterator[str]:
-    """What the measurements do not determine; nothing when they determine everything."""
-    identifiability = solution.identifiability
-    if identifiability.is_unique:
-        return
-    yield "Not determined by these measurements (do not use these numbers):"
-    for direction in identifiability.free_directions:
-        yield f"  - {direction}"
-    yield "What helps: turn further, about at least two different axes, while measuring; or fix frames that are known."
-
-
 def part_sentences(solution: Solution) -> Iterator[str]:
-    """One sentence for each unconnected part, when there are several."""
+    """A sentence for each unconnected part, if there are several parts."""
     if len(solution.parts) < 2:
         return
-    yield f"The measurements fall into {len(solution.parts)} unconnected parts, each solved on its own:"
+    yield f"The measurements fall into {len(solution.parts)} unconnected parts. Each was solved by itself:"
     for part in solution.parts:
         yield f"  - {', '.join(sorted(part.names, key=natural_key))}: {certificate_sentence(part.certificate)}"
 
 
 def scale_sentence(solution: Solution) -> str:
-    """What the scale is and what that means for lengths."""
+    """The scale and its meaning for lengths."""
     if solution.scale_mode == "known":
-        return "Scale: known, 1."
+        return "Scale: 1, known."
     if isinstance(solution.scale, Mapping):
-        return "Scale: one for each target, in the table; measured length = scale x true length."
+        return "Scale: the table has the scale of each target; measured length = scale x true length."
     longer = 100.0 * (solution.scale - 1.0)
     comparison = "longer" if longer >= 0 else "shorter"
     return (
@@ -72,15 +61,18 @@ def scale_sentence(solution: Solution) -> str:
 
 
 def weights_sentence(solution: Solution) -> str:
-    """What the cost may be compared with."""
+    """What the weights are, and what they make of the cost."""
     if solution.is_relative:
-        return "Weights: sigma or kappa was not given, and 1 (m) was used; costs and covariances are relative."
+        return (
+            "Weights: sigma or kappa was not given and 1 was used, so costs and covariances are relative. Give both "
+            "for absolute numbers."
+        )
     if solution.certificate.objective.form == "inverse":
-        return "Weights: as given; the cost is that of the inverse equation B X^-1 = Y^-1 A, which is no chi-square."
-    return "Weights: as given; if they are true, the cost is half a chi-square."
+        return "Weights: as given. The cost is not a chi-square: it is of the inverse equation B X^-1 = Y^-1 A."
+    return "Weights: as given. If they are true, the cost is half a chi-square."
 
 
 def time_sentence(certificate: Certificate) -> str:
-    """Where the time went."""
+    """How long each step took."""
     stages = ", ".join(f"{stage} {seconds:.3f}" for stage, seconds in certificate.seconds.items())
     return f"Time: {sum(certificate.seconds.values()):.3f} s ({stages})."

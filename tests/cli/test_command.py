@@ -194,7 +194,7 @@ def test_not_unique_is_status_3(tmp_path: Path) -> None:
     done = run("calibrate", folder, "--sigma", 0.005, "--kappa", 6000, "-o", tmp_path / "result.json")
     assert done.returncode == 3
     assert "Certified, but not unique" in done.stdout
-    assert "do not use these numbers" in done.stdout
+    assert done.stdout.startswith("Do not use these poses: ")
     assert rw.read_solution(tmp_path / "result.json").certificate.status is rw.Status.CERTIFIED_NOT_UNIQUE
 
 
@@ -205,7 +205,7 @@ def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("Use these poses: ")
     assert done.stdout.index("±x mm") < done.stdout.index("Details") < done.stdout.index("Certified globally optimal")
-    assert "Noise of B: 0.5° and 5 mm an axis, as given." in done.stdout
+    assert "Noise of B: 0.5° and 5 mm for each axis, as given." in done.stdout
     refined = rw.read_refined(result)
     for name in refined.Y:
         (row, *_) = [line for line in done.stdout.splitlines() if line.startswith(f" {name} ")]
@@ -213,7 +213,7 @@ def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
             [float(cell) for cell in row.split()[7:10]], refined.standard_deviations(name)[1], atol=0.0051
         )
     noisier = run(*given, "--carrier-noise-deg", 0.3, "--carrier-noise-mm", 2, "-o", tmp_path / "noisier.json")
-    assert "Noise of A: 0.3° and 2 mm an axis of the target carrier, as given." in noisier.stdout
+    assert "Noise of A: 0.3° and 2 mm for each axis of the target carrier, as given." in noisier.stdout
     wider = rw.read_refined(tmp_path / "noisier.json")
     assert (wider.standard_deviations("cam_0")[1] > refined.standard_deviations("cam_0")[1]).all()
     again = run("calibrate", DEMO, "--method", "local", "--initial", result)  # the certified part of the file
@@ -243,7 +243,7 @@ def test_refined_and_free_is_status_3(tmp_path: Path) -> None:
     assert done.returncode == 3
     assert without_stages(done.stderr) == [f"Written to {tmp_path / 'r.json'}."]
     assert " free " in done.stdout
-    (direction,) = [line for line in done.stdout.splitlines() if line.startswith("Not determined: ")]
+    (direction,) = [line for line in done.stdout.splitlines() if "Not determined: " in line]
     assert all(name in direction for name in ("tag_0", "tag_1", "cam_0", "cam_1"))  # they move together
     assert done.stdout.startswith("Do not use these poses: ")
     assert np.isinf(rw.read_refined(tmp_path / "r.json").covariance("cam_0")).any()

@@ -87,7 +87,7 @@ def test_a_number_stays_with_its_heading_on_a_narrow_terminal(rig: rw.Refined) -
             assert re.fullmatch(r"(±?[xyz] ?m{0,2}°?|roll°|pitch°|yaw°|moved mm|moved°) -?[\d.]+", piece), line
 
 
-@pytest.mark.parametrize("title", ["Sensors in the frame", "Targets in the frame", "The targets as seen from target0"])
+@pytest.mark.parametrize("title", ["Sensors in the frame", "Targets in the frame", "Other targets in the frame"])
 def test_columns_are_aligned_under_their_headings(rig: rw.Refined, title: str) -> None:
     head, *rows = rows_under(printed(rig), title)
     for heading in HEADINGS:
@@ -107,7 +107,7 @@ def test_cells_are_the_refined_numbers(rig: rw.Refined) -> None:
         np.testing.assert_allclose([float(cell) for cell in cells[9:12]], degrees, atol=0.00051)
         assert float(cells[12]) == pytest.approx(rig.moved[name].translation_mm, abs=0.0051)
         assert float(cells[13]) == pytest.approx(rig.moved[name].rotation_deg, abs=0.00051)
-    (row,) = rows_under(text, "The sensors as seen from sensor0")[1:]
+    (row,) = rows_under(text, "Other sensors in the frame of sensor0")[1:]
     pose, covariance = rig.relative("sensor0", "sensor1")
     np.testing.assert_allclose([float(cell) for cell in row.split()[1:4]], pose.translation(), atol=0.51e-4)
     assert tuple(row.split()[7:]) == deviation_cells(covariance)
@@ -117,7 +117,7 @@ def test_what_is_free_is_called_free(planar: rw.Refined) -> None:
     text = printed(planar)
     for line in rows_under(text, "Sensors in the frame")[1:] + rows_under(text, "Targets in the frame")[1:]:
         assert "free" in line.split()[7:10]
-    for title in ("The sensors as seen from sensor0", "The targets as seen from target0"):
+    for title in ("Other sensors in the frame of sensor0", "Other targets in the frame of target0"):
         (line,) = rows_under(text, title)[1:]
         assert "free" not in line
     assert "inf" not in text.replace("infinite", "")
@@ -163,27 +163,27 @@ def test_time_offsets_have_deviations() -> None:
     (sentence,) = [s for s in scale_and_offset_sentences(refined) if s.startswith("Time offset")]
     offset, deviation = refined.time_offsets_s["sensor0"], math.sqrt(refined.covariance("time_offset:sensor0")[0, 0])
     assert sentence == (
-        f"Time offset of sensor0: {1e3 * offset:+.3f} ± {1e3 * deviation:.3f} ms (the carriers' time is its stamps' "
-        "plus this)."
+        f"Time offset of sensor0: {1e3 * offset:+.3f} ± {1e3 * deviation:.3f} ms (a stamp of sensor0 + this = "
+        "the carriers' time)."
     )
 
 
 def test_noise_in_one_sentence_where_it_is_one(rig: rw.Refined, planar: rw.Refined) -> None:
-    assert "Noise of B: 0.5° and 5 mm an axis, as given." in refined_sentences(planar)
+    assert "Noise of B: 0.5° and 5 mm for each axis, as given." in refined_sentences(planar)
     noise = next(iter(rig.noise.values()))
     assert (
-        f"Noise of B: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm an axis, "
+        f"Noise of B: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm for each axis, "
         f"estimated from the residuals, with {noise.degrees_of_freedom[0]:.0f} and {noise.degrees_of_freedom[1]:.0f} "
         "degrees of freedom."
     ) in refined_sentences(rig)
-    assert "Noise of B an axis" not in printed(rig)
+    assert "Noise of B for each axis" not in printed(rig)
 
 
 def test_noise_by_sensor_and_by_pair_in_a_table(rig: rw.Refined) -> None:
     by_sensor = {pair: PairNoise(0.01 if pair[1] == "sensor0" else 0.02, 0.003, (40.0, 38.0)) for pair in rig.noise}
     text = printed(dataclasses.replace(rig, noise=by_sensor))
-    assert "Noise of B: estimated from the residuals; in the table." in text
-    assert [row.split() for row in rows_under(text, "Noise of B an axis")[1:]] == [
+    assert "Noise of B: estimated from the residuals; see the table." in text
+    assert [row.split() for row in rows_under(text, "Noise of B for each axis")[1:]] == [
         ["sensor0", "0.573", "3", "40", "38"],
         ["sensor1", "1.15", "3", "40", "38"],
     ]
@@ -197,11 +197,11 @@ def test_noise_by_sensor_and_by_pair_in_a_table(rig: rw.Refined) -> None:
 
 def test_it_says_whether_the_carriers_are_taken_for_exact(rig: rw.Refined) -> None:
     (sentence,) = [s for s in refined_sentences(rig) if s.startswith("Noise of A")]
-    assert sentence.startswith("Noise of A: left out; where the carriers' poses are not exact")
+    assert sentence.startswith("Noise of A: none, the carriers' poses count as exact")
     noise = rw.CarrierNoise(rotation_rad=math.radians(0.3), translation_m=0.002)
     options = dataclasses.replace(rig.options, carrier_noise=noise)
     sentences = refined_sentences(dataclasses.replace(rig, options=options))
-    assert "Noise of A: 0.3° and 2 mm an axis of the target carrier, as given." in sentences
+    assert "Noise of A: 0.3° and 2 mm for each axis of the target carrier, as given." in sentences
 
 
 def test_outliers_are_counted(rig: rw.Refined) -> None:
@@ -218,8 +218,8 @@ def test_cost_names_residual_and_loss(rig: rw.Refined) -> None:
     options = dataclasses.replace(rig.options, robust="cauchy")
     once = dataclasses.replace(rig, options=options, iterations=1, cost=12.0, initial_cost=13.5)
     assert (
-        "Cost in the weights of the refinement (not the certified one's): 12 after 1 iteration, "
-        "13.5 at the certified solution (geodesic residual, cauchy loss)."
+        "Cost of the refinement: 12 after 1 iteration, 13.5 at the certified answer (geodesic residual, cauchy loss). "
+        "Its weights differ from the weights of the certified cost."
     ) in refined_sentences(once)
 
 
@@ -234,7 +234,7 @@ def test_a_fixed_frame_is_called_fixed() -> None:
 def test_a_file_gets_one_line_for_each_sentence(rig: rw.Refined, planar: rw.Refined) -> None:
     for refined in (rig, planar):
         lines = printed(refined, 80).splitlines()
-        for sentence in (*refined_sentences(refined), *(f"Not determined: {s}" for s in refined.free_directions)):
+        for sentence in (*refined_sentences(refined), *(f"  - Not determined: {s}" for s in refined.free_directions)):
             assert sentence in lines
 
 

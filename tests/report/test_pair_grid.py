@@ -45,9 +45,9 @@ def test_three_states_aligned_under_their_targets_in_natural_order() -> None:
         "      2 10",
         "cam_0 ■  □",
         "cam_1 ·  ■",
-        "Across: targets (tag_*); down: sensors. Each pair by itself is",
-        "■ determined: 2",
-        "□ seen, but not determined without others: 1",
+        "Columns: targets (tag_*). Rows: sensors. The pair is",
+        "■ determined by its own measurements: 2",
+        "□ seen, but not determined by its own measurements: 1",
         "· not seen: 1",
     ]
 
@@ -55,7 +55,7 @@ def test_three_states_aligned_under_their_targets_in_natural_order() -> None:
 def test_plain_characters_where_there_are_no_others() -> None:
     lines = lines_of(grid(THREE_STATES), encoding="ascii")
     assert lines[1:3] == ["cam_0 #  o", "cam_1 .  #"]
-    assert "o seen, but not determined without others: 1" in lines
+    assert "o seen, but not determined by its own measurements: 1" in lines
 
 
 def test_colours_are_those_that_everybody_tells_apart() -> None:
@@ -76,7 +76,7 @@ def test_a_narrow_terminal_gets_several_blocks() -> None:
 def test_names_without_anything_in_common_are_written_out() -> None:
     lines = lines_of(grid({("door", "left"): True, ("window", "left"): False}))
     assert lines[:2] == ["     door window", "left    ■      □"]
-    assert lines[2].startswith("Across: targets; down: sensors.")
+    assert lines[2].startswith("Columns: targets. Rows: sensors.")
 
 
 def test_only_whole_words_are_taken_off_names() -> None:
@@ -87,11 +87,11 @@ def test_only_whole_words_are_taken_off_names() -> None:
 def test_a_sensors_own_motion_has_no_square() -> None:
     lines = lines_of(grid({("tag_0", "cam_0"): True, ("cam_0", "cam_0"): False}))
     assert lines[0] == "      tag_0"
-    assert lines[-1] == "cam_0 from its own motion: not determined on its own"
+    assert lines[-1] == "cam_0 from its own motion: not determined"
 
 
 def test_nothing_but_motions() -> None:
-    assert lines_of(grid({("imu", "imu"): True})) == ["imu from its own motion: determined on its own"]
+    assert lines_of(grid({("imu", "imu"): True})) == ["imu from its own motion: determined"]
 
 
 def test_no_line_is_cut() -> None:

@@ -1,0 +1,104 @@
+"""What a person should do about a calibration: where it needs other measurements, and what is odd about its log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from rich.console import Console
+
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.report.printing import print_heading, print_list
+from gtsam_rwhec.results.log_history import LogFields
+
+#: Standard deviations by which an estimated size must differ from the stated size before it is named.
+SIZE_SIGMAS = 3.0
+#: Largest difference of the targets' scales that a common cause explains.
+COMMON_SCALE = 0.005
+#: Unknown tags are named up to this number.
+MOST_NAMED = 10
+
+
+def print_advice(console: Console, free: Sequence[FreeDirection], log: LogFields | None = None) -> None:
+    """Print the section "What to do", if there is anything to do."""
+    doubts = [] if log is None else log_advice(log)
+    if not free and not doubts:
+        return
+    print_heading(console, "What to do")
+    print_list(console, (f"Not determined: {direction}" for direction in free), "bold red")
+    if free:
+        help_ = "Measure again, and turn the carriers about at least two different axes. Or fix frames that you know."
+        print_list(console, [help_])
+    print_list(console, doubts, "bold yellow")
+
+
+def log_advice(log: LogFields) -> list[str]:
+    """What is odd about a log or its rig file, and what to do about it."""
+    advice = [
+        f"{len(faults)} images of {sensor} could not be used. The first: {faults[0]}"
+        for sensor, faults in log.detection.undecoded.items()
+        if faults
+    ]
+    advice += _without_answer(log)
+    contradicted = {counts.frame for counts in log.contradicted}
+    given = [clock.sensor for clock in log.time_offsets if clock.sigma_s is None and clock.sensor in contradicted]
+    if given:
+        advice.append(
+            f"The time offset of {', '.join(given)} was not estimated. If the clock may be late, write time_offset: "
+            "estimate in the rig file."
+        )
+    advice += _sizes(log)
+    if log.detection.strangers:
+        names = [f"{name} ({count} times)" for name, count in list(log.detection.strangers.items())[:MOST_NAMED]]
+        advice.append(f"The images show tags that the rig file does not name: {', '.join(names)}.")
+    return advice
+
+
+def _without_answer(log: LogFields) -> list[str]:
+    """Sensors and targets of the rig file that the answer lacks."""
+    advice = []
+    used = {name for count in log.outliers if count.used for name in count.pair}
+    for sensor, count in log.detection.images.items():
+        if sensor not in used:
+            seen = sum(track.used for track in log.detection.tracks if track.sensor == sensor)
+            why = f"all of its {seen} detections were left out" if seen else f"its {count} images show no target"
+            advice.append(f"{sensor} has no pose: {why}.")
+    if log.detection.unseen:
+        advice.append(f"No sensor saw {', '.join(log.detection.unseen)}.")
+    targets = dict.fromkeys(track.target for track in log.detection.tracks)
+    return advice + [
+        f"{name} has no pose: all of its detections were left out." for name in targets if name not in used
+    ]
+
+
+def _sizes(log: LogFields) -> list[str]:
+    """Stated sizes that do not fit the motion, or that the motion does not check."""
+    advice = []
+    free = [size for size in log.sizes if size.is_free]
+    doubted = [size for size in log.sizes if size.is_doubted and not size.is_free]
+    for size in free + doubted:
+        off = size.percent_too_large
+        fact = (
+            f"The stated size of {size.target} is {abs(off):.2f} % too {'large' if off > 0 else 'small'}: the rig file "
+            f"says {1e3 * size.stated_m:.3f} mm, the motion says {1e3 * size.stated_m / size.scale:.3f} mm."
+        )
+        if size in doubted:
+            advice.append(
+                f"{fact} The poses use the rig file's size and may be wrong. Measure the target, or write sizes: check "
+                "in the rig file."
+            )
+        elif size.sigma is not None and abs(size.scale - 1.0) > SIZE_SIGMAS * size.sigma:
+            advice.append(f"{fact} The poses use the motion's size. Measure the target and correct the rig file.")
+    unchecked = [size.target for size in log.sizes if size.sigma is None]
+    if unchecked:
+        advice.append(
+            f"The motion is too small to check the size of {', '.join(unchecked)}. Measure it with care: the "
+            "calibration does not show if it is wrong."
+        )
+    suspects = free or doubted
+    if len(suspects) > 1 and len(suspects) == len(log.sizes) and np.ptp([s.scale for s in suspects]) < COMMON_SCALE:
+        advice.append(
+            "All sizes are wrong by nearly the same factor. More probably the carriers' unit of length or the focal "
+            "lengths are wrong."
+        )
+    return advice

@@ -1,0 +1,54 @@
+"""How reports are printed: the console, the verdict, headings, tables and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rich.console import Console
+from rich.text import Text
+
+from gtsam_rwhec.files.terminal_text import printable
+from gtsam_rwhec.report.pose_table import FrameTable
+from gtsam_rwhec.results.verdict import Judgement, Verdict
+
+#: Columns for tables in a file. Sentences in a file are not wrapped.
+PLAIN_WIDTH = 160
+#: The colour of each verdict.
+STYLES = {Verdict.USE: "bold green", Verdict.CARE: "bold yellow", Verdict.DO_NOT_USE: "bold red"}
+
+
+def report_console() -> Console:
+    """A console on standard output; in a file it is plain and as wide as the tables need."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH, no_color=True)
+
+
+def print_verdict(console: Console, judgement: Judgement) -> None:
+    """Print whether to use the poses: every report begins with this sentence."""
+    print_sentence(console, str(judgement), STYLES[judgement.verdict])
+
+
+def print_heading(console: Console, words: str) -> None:
+    """Print the heading of a section."""
+    console.print()
+    console.print(Text(words, style="bold"))
+    console.print()
+
+
+def print_tables(console: Console, tables: Iterable[FrameTable], legend: str) -> None:
+    """Print the tables that have rows, and the meaning of their columns."""
+    for table in tables:
+        if table.rows:
+            console.print(table)
+    print_sentence(console, legend, "dim")
+
+
+def print_list(console: Console, words: Iterable[str], style: str = "") -> None:
+    """Print sentences as the items of a list."""
+    for sentence in words:
+        print_sentence(console, f"  - {sentence}", style)
+
+
+def print_sentence(console: Console, words: str, style: str = "") -> None:
+    """Print a sentence: wrapped on a terminal, in one line in a file, where people search for words."""
+    console.print(Text(printable(words), style=style), soft_wrap=not console.is_terminal)
