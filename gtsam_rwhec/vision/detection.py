@@ -121,20 +121,19 @@ class Detector:
         sightings: list[list[_Sighting]] = [[] for _ in images]
         tags = self._tags_in(images)
         for kind, found in tags.items():
-            for k, (gray, (ids, corners)) in enumerate(zip(images, found, strict=True)):
-                for board in self._boards:
-                    if _kind(board) == kind:
-                        indices, seen_px = self._board(gray, board, ids, corners)
-                        if len(indices):
-                            kept = boards.on_one_plane(self.camera, board.corners()[indices], seen_px)
-                            sightings[k].append(_Sighting(board, indices[kept], seen_px[kept]))
+            for board in (board for board in self._boards if _kind(board) == kind):
+                for of_image, gray, (ids, corners) in zip(sightings, images, found, strict=True):
+                    indices, seen_px = self._board(gray, board, ids, corners)
+                    if len(indices):
+                        kept = boards.on_one_plane(self.camera, board.corners()[indices], seen_px)
+                        of_image.append(_Sighting(board, indices[kept], seen_px[kept]))
             for k, sighting in self._single_tags(images, kind, found):
                 sightings[k].append(sighting)
         for checkerboard in self._checkerboards:
-            for k, gray in enumerate(images):
+            for of_image, gray in zip(sightings, images, strict=True):
                 seen_px = boards.checkerboard_corners(gray, checkerboard)
                 if len(seen_px):
-                    sightings[k].append(_Sighting(checkerboard, np.arange(len(seen_px)), seen_px))
+                    of_image.append(_Sighting(checkerboard, np.arange(len(seen_px)), seen_px))
         judged = iter(self._judged([sighting for of_image in sightings for sighting in of_image]))
         return [
             ImageDetections(tuple(next(judged) for _ in of_image), strangers)
@@ -201,29 +200,23 @@ class Detector:
         result: dict[int, Detection] = {}
         for of_tags in (True, False):
             places = [i for i, s in enumerate(sightings) if isinstance(s.target, Tag) == of_tags]
-            usable = [i for i in places if len(sightings[i].indices) >= 4]  # A plane's pose needs four points.
             poses = plane_poses(
                 self.camera,
-                [sightings[i].target.corners()[sightings[i].indices] for i in usable],
-                [sightings[i].corners_px for i in usable],
+                [sightings[i].target.corners()[sightings[i].indices] for i in places],
+                [sightings[i].corners_px for i in places],
                 corner_px=self.options.corner_px,
             )
-            row = {i: k for k, i in enumerate(usable)}
-            result |= {i: self._detection(sightings[i], poses, row.get(i)) for i in places}
+            result |= {i: self._detection(sightings[i], poses, k) for k, i in enumerate(places)}
         return [result[i] for i in range(len(sightings))]
 
-    def _detection(self, sighting: _Sighting, poses: PlanePoses, place: int | None) -> Detection:
-        corners = sighting.corners_px
-        side = _shortest_side(sighting.target, corners)
-        T, squared, rms = np.full((2, 4, 4), np.nan), np.full(2, np.nan), np.full(2, np.nan)
-        covariance = np.full((2, 6, 6), np.nan)
-        if place is not None:
-            T, squared, rms = poses.T[place], poses.squared_px[place], poses.reprojection_px[place]
-            covariance = poses.covariance[place]
-        rejection = sighting.rejection or self._rejection(sighting, side, T[0], float(rms[0]))
+    def _detection(self, sighting: _Sighting, poses: PlanePoses, k: int) -> Detection:
+        """The detection of a sighting, whose pose is number k of `poses`."""
+        T, rms = poses.T[k], poses.reprojection_px[k]
+        side = _shortest_side(sighting.target, sighting.corners_px)
         return Detection(
-            sighting.target.name, corners, sighting.indices, T, squared, rms, covariance, side,
-            float(sighting.blur_px), rejection,
+            sighting.target.name, sighting.corners_px, sighting.indices, T, poses.squared_px[k], rms,
+            poses.covariance[k], side, float(sighting.blur_px),
+            sighting.rejection or self._rejection(sighting, side, T[0], float(rms[0])),
         )  # fmt: skip
 
     def _rejection(self, sighting: _Sighting, side_px: float, T: Array, rms_px: float) -> Rejection | None:

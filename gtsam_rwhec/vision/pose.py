@@ -57,7 +57,7 @@ def plane_poses(
     ----------
     camera : Camera
     corners_m : sequence of (n_i, 3) arrays
-        In each target's frame, z = 0; four corners or more.
+        In each target's frame, z = 0. A target with fewer than four corners has no pose (nan).
     corners_px : sequence of (n_i, 2) arrays
         Where the corners were seen.
     corner_px : float
@@ -83,7 +83,7 @@ def plane_poses(
 def _ippe(points: Array, x: Array) -> Array:
     """IPPE's two poses (2, 4, 4) from normalised coordinates; nan for a pose that is not found."""
     T = np.full((2, 4, 4), np.nan)
-    if not np.isfinite(x).all():
+    if len(x) < 4 or not np.isfinite(x).all():
         return T
     # OpenCV is wrong, or divides by zero, for targets that are exactly frontal or on the axis: add a little noise.
     aside = np.stack([np.cos(np.arange(len(x))), np.sin(2.0 * np.arange(len(x)))], axis=1) * np.ptp(x, axis=0).max()

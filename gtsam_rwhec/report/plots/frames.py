@@ -70,8 +70,8 @@ def plot_frames(frames: RigFrames, covariances: Mapping[str, Array], path: str |
     scenes = []
     with picture(path, 12.0, 10.0) as figure:
         for (what, carrier, poses), row in zip(rows, figure.subplots(2, 2), strict=True):
-            positions = {name: _position_covariance(T, covariances.get(name)) for name, T in poses.items()}
-            scene = _Scene(carrier, dict(poses), positions)
+            known = {name: T for name, T in poses.items() if name in covariances}
+            scene = _Scene(carrier, poses, {name: _of_position(T, covariances[name]) for name, T in known.items()})
             if poses:
                 scenes += [(scene, axes, view) for axes, view in zip(row, scene.views, strict=True)]
             else:
@@ -90,7 +90,7 @@ def plot_frames(frames: RigFrames, covariances: Mapping[str, Array], path: str |
 class _Scene:
     """One carrier and the frames that it carries."""
 
-    def __init__(self, carrier: str, poses: dict[str, Array], covariances: dict[str, Array | None]) -> None:
+    def __init__(self, carrier: str, poses: Mapping[str, Array], covariances: Mapping[str, Array]) -> None:
         self.carrier, self.poses, self.covariances = carrier, poses, covariances
         places = np.array([T[:3, 3] for T in poses.values()]).reshape(-1, 3)
         middle = places.mean(axis=0) if len(places) else np.zeros(3)
@@ -103,16 +103,15 @@ class _Scene:
         self.extent = float(sides.max()) if sides.max() > SMALLEST_M else 0.1
         #: The view from above, and the side view that shows more.
         self.views = ((0, 1), (0, 2) if sides[0] >= sides[1] else (1, 2))
-        largest = max(
-            (_semi_axes(c).max() for c in covariances.values() if c is not None and _is_finite(c)), default=0.0
-        )
+        finite = [covariance for covariance in covariances.values() if _is_finite(covariance)]
+        largest = max((np.sqrt(CHI2_95 * np.linalg.norm(covariance, 2)) for covariance in finite), default=0.0)
         self.times = round_down(max(ELLIPSE_SHARE * self.extent / largest, 1.0)) if largest > 0.0 else 1.0
 
     @property
     def note(self) -> str:
         """How large the ellipsoids are drawn, and whether the origin is in the picture."""
         notes = []
-        if any(c is not None and _is_finite(c) for c in self.covariances.values()):
+        if any(map(_is_finite, self.covariances.values())):
             size = f"drawn {self.times:,.0f} times as large" if self.times > 1.0 else "to scale"
             notes.append(f"95 % confidence ellipsoids of position, {size}")
         if not self.has_origin:
@@ -130,7 +129,7 @@ class _Scene:
             _draw_axes(axes, np.eye(4), view, 0.7 * length, 3.0)
             axes.plot(0.0, 0.0, "s", color=BLACK, markersize=5, zorder=4)
         for name, T in self.poses.items():
-            at, covariance = T[[i, j], 3], self.covariances[name]
+            at, covariance = T[[i, j], 3], self.covariances.get(name)
             _draw_axes(axes, T, view, length, 1.6)
             axes.plot(*at, "o", color=BLACK, markersize=3, zorder=5)
             if covariance is None:
@@ -185,7 +184,7 @@ def _draw_axes(axes: Axes, T: Array, view: tuple[int, int], length: float, width
         axes.plot(*np.array([start, start + step]).T, color=AXIS_COLOURS[k], lw=width, solid_capstyle="round", zorder=3)
 
 
-def _legend(figure: Figure, covariances: list[Array | None]) -> None:
+def _legend(figure: Figure, covariances: list[Array]) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -193,7 +192,7 @@ def _legend(figure: Figure, covariances: list[Array | None]) -> None:
         Line2D([], [], color=colour, lw=2, label=f"{name} axis")
         for name, colour in zip(AXIS_NAMES, AXIS_COLOURS, strict=True)
     ]
-    determined = [_is_finite(covariance) for covariance in covariances if covariance is not None]
+    determined = [_is_finite(covariance) for covariance in covariances]
     if any(determined):
         handles.append(Patch(facecolor=ORANGE, edgecolor=BLACK, alpha=0.45, label="95 % confidence"))
     if not all(determined):
@@ -201,10 +200,8 @@ def _legend(figure: Figure, covariances: list[Array | None]) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
 
 
-def _position_covariance(T: Array, covariance: Array | None) -> Array | None:
-    """Covariance (3, 3) of the position along the carrier's axes; infinite where any direction of it is."""
-    if covariance is None:
-        return None
+def _of_position(T: Array, covariance: Array) -> Array:
+    """Covariance (3, 3) of the position along the carrier's axes; infinite if a direction is not determined."""
     block = checked(covariance)[3:, 3:]
     if not np.isfinite(block).all():
         return np.full((3, 3), np.inf)
@@ -214,11 +211,6 @@ def _position_covariance(T: Array, covariance: Array | None) -> Array | None:
 
 def _is_finite(covariance: Array) -> bool:
     return bool(np.isfinite(covariance).all())
-
-
-def _semi_axes(covariance: Array) -> Array:
-    semi_axes: Array = np.sqrt(CHI2_95 * np.maximum(np.linalg.eigvalsh(covariance), 0.0))
-    return semi_axes
 
 
 def _shadow(covariance: Array) -> Array:

@@ -127,7 +127,7 @@ def test_a_far_origin_does_not_shrink_the_frames(tmp_path: Path) -> None:
     targets = {"a": np.eye(4), "b": np.eye(4)}
     for name, x in (("a", 1000.0), ("b", 1001.0)):
         targets[name][0, 3] = x
-    scene = _Scene("base", targets, dict.fromkeys(targets))
+    scene = _Scene("base", targets, {})
     assert (scene.extent, scene.has_origin) == (1.0, False)
     assert "origin of base is out of sight" in scene.note
     assert ink(drawn(tmp_path, plot_frames, RigFrames("hand", "base", {}, targets), {})) > 0.01
