@@ -29,18 +29,18 @@ class Stack:
 
     Attributes
     ----------
-    targets, sensors : tuple of str
-        Names of the frames.
+    targets, sensors, names : tuple of str
+        Names of the frames; ``names`` are targets, then sensors. Arrays of n frames have this order.
     A, B : (N, 4, 4) arrays
         Metres.
     target, sensor : (N,) integer arrays
-        Each measurement's index into ``targets`` and ``sensors``.
+        Each measurement's indices into ``names``.
     pairs : (E, 2) integer array
         The same indices for each pair.
     first : (E + 1,) integer array
         The measurements of pair e are first[e], ..., first[e + 1] - 1.
     gauge : Gauge
-        Origins near the data, metres.
+        Origins near the data, metres; ``origins`` (n, 3) has each frame's.
     """
 
     targets: tuple[str, ...]
@@ -57,14 +57,24 @@ class Stack:
     def of(problem: Problem) -> Stack:
         """The stack of a problem with raw measurements."""
         raw = [problem.measurements(*pair) for pair in problem.pairs]
-        pairs = np.array(
-            [(problem.targets.index(pair.target), problem.sensors.index(pair.sensor)) for pair in problem.pairs]
-        )
+        names = problem.targets + problem.sensors
+        pairs = np.array([(names.index(pair.target), names.index(pair.sensor)) for pair in problem.pairs])
         counts = [len(measurements.A) for measurements in raw]
         target, sensor = np.repeat(pairs, counts, axis=0).T
         A, B = (np.concatenate([getattr(measurements, side) for measurements in raw]) for side in "AB")
         first = np.concatenate([[0], np.cumsum(counts)])
         return Stack(problem.targets, problem.sensors, A, B, target, sensor, pairs, first, problem.gauge)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Targets, then sensors."""
+        return self.targets + self.sensors
+
+    @property
+    def origins(self) -> Array:
+        """(n, 3) origins near the data, metres."""
+        gauges = np.array([self.gauge.target_carrier, self.gauge.sensor_carrier])
+        return np.repeat(gauges, [len(self.targets), len(self.sensors)], axis=0)
 
     @property
     def counts(self) -> np.ndarray:
@@ -78,18 +88,14 @@ class Stack:
         return centred
 
     def outcome(
-        self,
-        R_X: Array,
-        t_X: Array,
-        R_Y: Array,
-        t_Y: Array,
-        *,
-        starts_from: str | None = None,
-        notes: Iterable[str] = (),
+        self, R: Array, t: Array, scale: float = 1.0, *, starts_from: str | None = None, notes: Iterable[str] = ()
     ) -> Outcome[Poses]:
-        """Rotations (n, 3, 3) and translations (n, 3), metres, of targets and sensors as a method's outcome."""
-        X, Y = poses_by_name(self.targets, R_X, t_X), poses_by_name(self.sensors, R_Y, t_Y)
-        return Outcome(X, Y, starts_from=starts_from, notes=tuple(notes))
+        """Rotations (n, 3, 3) and translations (n, 3), metres, as a method's outcome."""
+        T = np.tile(np.eye(4), (len(R), 1, 1))
+        T[:, :3, :3], T[:, :3, 3] = R, t
+        poses = dict(zip(self.names, T, strict=True))
+        X, Y = ({name: poses[name] for name in names} for names in (self.targets, self.sensors))
+        return Outcome(X, Y, scale, starts_from=starts_from, notes=tuple(notes))
 
     def sums(self, rows: Array) -> Array:
         """(E, ...) sums of (N, ...) rows over each pair's measurements."""
@@ -101,13 +107,6 @@ class Stack:
         return np.split(rows, self.first[1:-1])
 
 
-def poses_by_name(names: tuple[str, ...], R: Array, t: Array) -> dict[str, Array]:
-    """Rotations (n, 3, 3) and translations (n, 3) as (4, 4) poses by name."""
-    T = np.tile(np.eye(4), (len(names), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = R, t
-    return dict(zip(names, T, strict=True))
-
-
 def rotation_products(stack: Stack) -> Array:
     """K (E, 9, 9), the sum of R_B (x) R_A over each pair: vec(R_Y)' K vec(R_X) is the sum of <R_A R_X R_B', R_Y>."""
     R_A, R_B = (stack.by_pair(T[:, :3, :3].reshape(-1, 9)) for T in (stack.A, stack.B))
@@ -115,24 +114,23 @@ def rotation_products(stack: Stack) -> Array:
     return K.transpose(0, 1, 3, 2, 4).reshape(-1, 9, 9)
 
 
-def linear_rotations(stack: Stack) -> tuple[Array, Array]:
-    """R_X (n_X, 3, 3) and R_Y (n_Y, 3, 3) of least |R_A R_X - R_Y R_B|, as matrices of unit norm, then projected.
+def linear_rotations(stack: Stack) -> Array:
+    """R (n, 3, 3) of least |R_A R_X - R_Y R_B|, as matrices of unit norm, then projected.
 
     The answer is the smallest eigenvector of the normal equations, component by component. With one X and one Y it
     consists of the two singular vectors of the largest singular value of K (Shah 2013), since the diagonal blocks are
     N I. Raises UnderdeterminedError when the smallest eigenvalue is not alone, as with parallel axes.
     """
-    n_X = len(stack.targets)
-    names = stack.targets + stack.sensors
-    H = np.zeros((len(names), 9, len(names), 9))
+    n = len(stack.names)
+    H = np.zeros((n, 9, n, 9))
     for (j, k), count, K in zip(stack.pairs, stack.counts, rotation_products(stack), strict=True):
         H[j, :, j] += count * np.eye(9)
-        H[n_X + k, :, n_X + k] += count * np.eye(9)
-        H[n_X + k, :, j] -= K
-        H[j, :, n_X + k] -= K.T
-    R = np.empty((len(names), 3, 3))
-    for component in connected_components(tuple(Pair(stack.targets[j], stack.sensors[k]) for j, k in stack.pairs)):
-        at = np.array([names.index(name) for name in component])
+        H[k, :, k] += count * np.eye(9)
+        H[k, :, j] -= K
+        H[j, :, k] -= K.T
+    R = np.empty((n, 3, 3))
+    for component in connected_components(tuple(Pair(stack.names[j], stack.names[k]) for j, k in stack.pairs)):
+        at = np.array([stack.names.index(name) for name in component])
         values, vectors = np.linalg.eigh(H[at][:, :, at].reshape(9 * len(at), 9 * len(at)))
         if values[1] <= FREE * values[-1]:
             raise UnderdeterminedError(
@@ -140,7 +138,7 @@ def linear_rotations(stack: Stack) -> tuple[Array, Array]:
                 "rotations are all the same, turn about parallel axes, or are half turns; turn about a second axis"
             )
         R[at] = rotations_up_to_sign(vectors[:, 0].reshape(-1, 3, 3).transpose(0, 2, 1))
-    return R[:n_X], R[n_X:]
+    return R
 
 
 def rotations_up_to_sign(V: Array) -> Array:
@@ -149,33 +147,25 @@ def rotations_up_to_sign(V: Array) -> Array:
     return project(signs[:, None, None] * V)
 
 
-def linear_outcome(stack: Stack, R_X: Array, R_Y: Array, notes: Iterable[str] = ()) -> Outcome[Poses]:
+def linear_outcome(stack: Stack, R: Array, notes: Iterable[str] = ()) -> Outcome[Poses]:
     """The outcome of a method that finds rotations first: ``linear_translations`` completes the poses."""
-    t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
-    return stack.outcome(R_X, t_X, R_Y, t_Y, notes=notes)
+    return stack.outcome(R, *linear_translations(stack, R), notes=notes)
 
 
-def linear_translations(
-    stack: Stack, R_X: Array, R_Y: Array, *, unknown_scale: bool = False
-) -> tuple[Array, Array, float]:
-    """t_X (n_X, 3), t_Y (n_Y, 3) in metres and alpha of least |R_A t_X - t_Y + alpha t_A - R_Y t_B| (eq. 8b).
+def linear_translations(stack: Stack, R: Array, *, unknown_scale: bool = False) -> tuple[Array, float]:
+    """t (n, 3) in metres and alpha of least |R_A t_X - t_Y + alpha t_A - R_Y t_B| (eq. 8b), for rotations R (n, 3, 3).
 
-    Raises
-    ------
-    UnderdeterminedError
-        When the rotations measured do not determine them (or, with unknown scale, the translations do not).
-    ScaleError
-        When the scale comes out zero or negative.
+    Raises UnderdeterminedError when the rotations measured do not determine t (or, with unknown scale, the translations
+    do not determine alpha), and ScaleError when alpha is not positive.
     """
-    n_X = len(stack.targets)
-    n = n_X + len(stack.sensors)
-    b = np.einsum("nij,nj->ni", R_Y[stack.sensor], stack.B[:, :3, 3])
+    n = len(R)
+    b = np.einsum("nij,nj->ni", R[stack.sensor], stack.B[:, :3, 3])
     minus_I = np.broadcast_to(-np.eye(3), (len(b), 3, 3))
     rows = np.concatenate([stack.A[:, :3, :3], minus_I, stack.centred_t_A[:, :, None], b[:, :, None]], axis=2)
-    sums = np.zeros((3 * n + 2, 3 * n + 2))  # of all t_X, all t_Y, alpha, and the right-hand side
+    sums = np.zeros((3 * n + 2, 3 * n + 2))  # of all t, alpha, and the right-hand side
     for (j, k), pair_rows in zip(stack.pairs, stack.by_pair(rows), strict=True):
         own = pair_rows.reshape(-1, 8)
-        at = np.r_[3 * j : 3 * j + 3, 3 * (n_X + k) : 3 * (n_X + k) + 3, 3 * n, 3 * n + 1]
+        at = np.r_[3 * j : 3 * j + 3, 3 * k : 3 * k + 3, 3 * n, 3 * n + 1]
         sums[np.ix_(at, at)] += own.T @ own
     undetermined = "the translations are not determined: the rotations measured leave a direction free"
     if unknown_scale:
@@ -186,8 +176,7 @@ def linear_translations(
         numbers, alpha = solve_scaled(sums[:-2, :-2], sums[:-2, -1] - sums[:-2, -2], undetermined), 1.0
     if alpha <= 0.0:
         raise ScaleError(f"the linear system for the translations has scale {alpha:.6g}; a real scale is positive")
-    t = numbers[: 3 * n].reshape(n, 3) / alpha
-    return t[:n_X] + stack.gauge.target_carrier, t[n_X:] + stack.gauge.sensor_carrier, alpha
+    return numbers[: 3 * n].reshape(n, 3) / alpha + stack.origins, alpha
 
 
 def plain_form(stack: Stack) -> Array:

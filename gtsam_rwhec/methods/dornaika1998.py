@@ -29,7 +29,7 @@ def closed_form(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     q_A, q_B = paired_quaternions(stack)
     C = np.einsum("cd,cji,djk->ik", q_A.T @ q_B, LEFT, RIGHT)
     U, _, Vt = np.linalg.svd(C)
-    return linear_outcome(stack, to_rotations(U[:, :1].T), to_rotations(Vt[:1]))
+    return linear_outcome(stack, to_rotations(np.array([U[:, 0], Vt[0]])))
 
 
 def nonlinear(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
@@ -39,16 +39,14 @@ def nonlinear(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     time does not grow with the number of measurements. The matrices found are projected to rotations.
     """
     stack = Stack.of(problem)
-    target, sensor = stack.targets[0], stack.sensors[0]
     X, Y, _, starts_from = start_of(problem, options)
-    T_X, T_Y = one_transform(X[target], f"start of {target}"), one_transform(Y[sensor], f"start of {sensor}")
-    t_X, t_Y = T_X[:3, 3] - stack.gauge.target_carrier, T_Y[:3, 3] - stack.gauge.sensor_carrier
-    start = np.concatenate([t_X, t_Y, T_X[:3, :3].T.ravel(), T_Y[:3, :3].T.ravel()])
+    starts = (X[stack.targets[0]], Y[stack.sensors[0]])
+    T = np.array([one_transform(pose, f"start of {name}") for name, pose in zip(stack.names, starts, strict=True)])
+    start = np.concatenate([(T[:, :3, 3] - stack.origins).ravel(), T[:, :3, :3].transpose(0, 2, 1).ravel()])
     form = block_diag(2.0 * plain_form(stack), PENALTY * np.eye(18))
     x = descend_on_chart(form, _with_deviations, start, options.max_iterations)
-    R = rotations_up_to_sign(x[6:24].reshape(2, 3, 3).transpose(0, 2, 1))
-    t_X, t_Y = x[None, :3] + stack.gauge.target_carrier, x[None, 3:6] + stack.gauge.sensor_carrier
-    return stack.outcome(R[:1], t_X, R[1:], t_Y, starts_from=starts_from)
+    R = rotations_up_to_sign(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
+    return stack.outcome(R, x[:6].reshape(2, 3) + stack.origins, starts_from=starts_from)
 
 
 def _with_deviations(p: Array) -> tuple[Array, Array]:

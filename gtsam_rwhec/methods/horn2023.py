@@ -89,7 +89,6 @@ def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned")
     """Solve for several Xs or several Ys of known scale."""
     stack = Stack.of(problem)
     found = solve_dual_quaternions(stack, signs, options.seed)
-    n_X = len(stack.targets)
     notes = [f"relative gap to the bound of its own relaxation: {found.gap:.1e}"]
     if found.contradicted:
         notes.append(
@@ -98,9 +97,8 @@ def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned")
         )
     if found.smallest_margin < np.cos(0.5 * np.radians(UNCERTAIN_DEG)):
         notes.append(f"a residual is larger than {UNCERTAIN_DEG:g} degrees: the measurement's sign cannot be told")
-    outcome = stack.outcome(found.R[:n_X], found.t[:n_X], found.R[n_X:], found.t[n_X:], notes=notes)
     return replace(
-        outcome,
+        stack.outcome(found.R, found.t, notes=notes),
         cost=found.cost,
         cost_name="|a x - y b|^2 of dual quaternions, with the signs chosen",
         lower_bound=found.lower_bound,
@@ -128,7 +126,7 @@ def solve_dual_quaternions(
         Q = form_of(stack, rows_X, sign[:, None, None] * rows_Y)
         found = relaxed(Q, len(Q) // 8)
         q, t, cost = polished(Q, found.q, found.t)
-        products = agreement(q_A, q[stack.target], q[len(stack.targets) + stack.sensor], q_B)
+        products = agreement(q_A, q[stack.target], q[stack.sensor], q_B)
         # The common sign of a pair belongs to its frames.
         whole = np.sign(stack.sums(sign * products))[np.repeat(np.arange(len(stack.pairs)), stack.counts)]
         fitting = np.where(whole * products < 0.0, -1.0, 1.0)
@@ -185,12 +183,11 @@ def residual_rows(stack: Stack, q_A: Array, q_B: Array, residual: Residual = "a 
 
 def form_of(stack: Stack, rows_X: Array, rows_Y: Array) -> Array:
     """Q (8 n, 8 n): z'Qz is the sum of the squared residuals M_X z_X - M_Y z_Y."""
-    n_X = len(stack.targets)
-    size = 8 * (n_X + len(stack.sensors))
+    size = 8 * len(stack.names)
     Q = np.zeros((size, size))
     for (j, k), of_X, of_Y in zip(stack.pairs, stack.by_pair(rows_X), stack.by_pair(rows_Y), strict=True):
         rows = np.concatenate([of_X.reshape(-1, 8), -of_Y.reshape(-1, 8)], axis=1)
-        at = np.r_[8 * j : 8 * j + 8, 8 * (n_X + k) : 8 * (n_X + k) + 8]
+        at = np.r_[8 * j : 8 * j + 8, 8 * k : 8 * k + 8]
         Q[np.ix_(at, at)] += rows.T @ rows
     return Q
 

@@ -34,8 +34,7 @@ def kronecker(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     )
     x = solve_scaled(form[np.ix_(unknown, unknown)], -form[unknown, 6], undetermined)
     R = rotations_up_to_sign(x[6:].reshape(2, 3, 3).transpose(0, 2, 1))
-    gauge = stack.gauge
-    return stack.outcome(R[:1], x[None, :3] + gauge.target_carrier, R[1:], x[None, 3:6] + gauge.sensor_carrier)
+    return stack.outcome(R, x[:6].reshape(2, 3) + stack.origins)
 
 
 def _rows() -> Array:
@@ -78,8 +77,7 @@ def dual_quaternions(problem: Problem, options: MethodOptions) -> Outcome[Poses]
     q, dual = q / length, dual / length
     dual = dual - np.einsum("fi,fi->f", q, dual)[:, None] * q
     t = 2.0 * np.einsum("fij,fj->fi", left(dual), conjugate(q))[:, :3]
-    R = to_rotations(q)
-    return stack.outcome(R[:1], t[:1], R[1:], t[1:])
+    return stack.outcome(to_rotations(q), t)
 
 
 def _isotropic(P: Array) -> Array:

@@ -5,7 +5,7 @@ Methods that descend start from this answer, unless the user gives a start.
 
 from __future__ import annotations
 
-from gtsam_rwhec.methods.absolute import Stack, linear_outcome, linear_rotations, linear_translations, poses_by_name
+from gtsam_rwhec.methods.absolute import Stack, linear_outcome, linear_rotations, linear_translations
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.method import Method, MethodOptions, Properties, checked_start
 from gtsam_rwhec.problem.problem import Problem
@@ -14,7 +14,7 @@ from gtsam_rwhec.problem.problem import Problem
 def linear_method(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     """Closed form. With one X and one Y, Wang's method is Shah's: singular vectors of a sum of Kronecker products."""
     stack = Stack.of(problem)
-    return linear_outcome(stack, *linear_rotations(stack))
+    return linear_outcome(stack, linear_rotations(stack))
 
 
 def start_of(problem: Problem, options: MethodOptions) -> tuple[Poses, Poses, float, str]:
@@ -27,13 +27,14 @@ def start_of(problem: Problem, options: MethodOptions) -> tuple[Poses, Poses, fl
     if options.start is not None:
         return *checked_start(problem.targets, problem.sensors, options.start), "the given start"
     stack = Stack.of(problem)
-    R_X, R_Y = linear_rotations(stack)
     unknown = problem.scale != "known"
-    t_X, t_Y, alpha = linear_translations(stack, R_X, R_Y, unknown_scale=unknown)
+    R = linear_rotations(stack)
+    t, alpha = linear_translations(stack, R, unknown_scale=unknown)
+    start = stack.outcome(R, t)
     words = "wang2022"
     if unknown or min(len(stack.targets), len(stack.sensors)) > 1:
         words = "wang2022's linear systems, " + ("with the scale" if unknown else "for several Xs and Ys")
-    return poses_by_name(stack.targets, R_X, t_X), poses_by_name(stack.sensors, R_Y, t_Y), alpha, words
+    return start.X, start.Y, alpha, words
 
 
 _ASSUMES = "All measurements equally accurate, at least two axes of rotation. Translations do not help the rotations."

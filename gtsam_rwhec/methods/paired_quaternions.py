@@ -16,10 +16,9 @@ from gtsam_rwhec.methods.absolute import Stack, linear_rotations
 
 def paired_quaternions(stack: Stack) -> tuple[Array, Array]:
     """q_A and q_B (N, 4) with signs that fit: <q_A q_X, q_Y q_B> > 0 for the linear system's rotations."""
-    R_X, R_Y = linear_rotations(stack)
     q_A, q_B = of_rotations(stack.A[:, :3, :3]), of_rotations(stack.B[:, :3, :3])
-    q_X, q_Y = of_rotations(R_X)[stack.target], of_rotations(R_Y)[stack.sensor]
-    return q_A, np.where(agreement(q_A, q_X, q_Y, q_B) < 0.0, -1.0, 1.0)[:, None] * q_B
+    q = of_rotations(linear_rotations(stack))
+    return q_A, np.where(agreement(q_A, q[stack.target], q[stack.sensor], q_B) < 0.0, -1.0, 1.0)[:, None] * q_B
 
 
 def agreement(q_A: Array, q_X: Array, q_Y: Array, q_B: Array) -> Array:

@@ -270,8 +270,7 @@ def linearised(observations: Observations, T: Array) -> Linearised:
     The cost is infinite where a corner that was seen is behind its camera.
     """
     targets, sensors = observations.targets, observations.sensors
-    n = len(T)
-    H, g = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
+    H, g = np.zeros((6 * len(T), 6 * len(T))), np.zeros(6 * len(T))
     cost = 0.0
     for (target, sensor), view in observations.views.items():
         i, j = targets.index(target), len(targets) + sensors.index(sensor)
@@ -281,7 +280,7 @@ def linearised(observations: Observations, T: Array) -> Linearised:
         seen = p @ R.transpose(0, 2, 1) + to_camera[:, None, :3, 3]
         known = view.known
         if (seen[known][:, 2] <= 1e-9).any():
-            return Linearised(np.inf, g.ravel(), H.reshape(6 * n, 6 * n))
+            return Linearised(np.inf, g, H)
         z = np.where(known, seen[:, :, 2], 1.0)
         x = np.where(known[:, :, None], seen[:, :, :2] / z[:, :, None], 0.0)
         pixels, D = camera.pixel_jacobian(x)
@@ -292,16 +291,12 @@ def linearised(observations: Observations, T: Array) -> Linearised:
         # X Expmap([w, v]) moves the point by R (w x p + v), Y Expmap([w, v]) by -(w x P + v).
         J_X = by_point @ (R[:, None] @ np.concatenate([-se3.hat(p), np.tile(np.eye(3), (len(p), 1, 1))], axis=2))
         at_P = np.concatenate([se3.hat(seen), np.broadcast_to(-np.eye(3), (*seen.shape, 3))], axis=-1)
-        rows_X, rows_Y, e = J_X.reshape(-1, 6), (by_point @ at_P).reshape(-1, 6), error.ravel()
-        H[i, :, i] += rows_X.T @ rows_X
-        H[j, :, j] += rows_Y.T @ rows_Y
-        cross = rows_X.T @ rows_Y
-        H[i, :, j] += cross
-        H[j, :, i] += cross.T
-        g[i] += rows_X.T @ e
-        g[j] += rows_Y.T @ e
+        rows, e = np.concatenate([J_X, by_point @ at_P], axis=-1).reshape(-1, 12), error.ravel()
+        at = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
+        H[np.ix_(at, at)] += rows.T @ rows
+        g[at] += rows.T @ e
         cost += 0.5 * float(e @ e)
-    return Linearised(cost, g.ravel(), H.reshape(6 * n, 6 * n))
+    return Linearised(cost, g, H)
 
 
 def _in_plane(points: Array, name: str) -> tuple[Array, Array]:

@@ -13,7 +13,6 @@ translations for these rotations. The third cost, reprojection errors (rp1), nee
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -23,12 +22,11 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, of_rotations, to_rotations
-from gtsam_rwhec.methods.absolute import Stack, linear_translations
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
 from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import UNWEIGHTED, Method, MethodOptions, Properties
-from gtsam_rwhec.methods.unit_weights import UnitForm, unit_weights
+from gtsam_rwhec.methods.unit_weights import UnitForm
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.reduced_form import ReducedForm
@@ -57,20 +55,8 @@ def tabb2017(
     X, Y, _, starts_from = start_of(problem, options)
     form = UnitForm.of(problem, turned=turned)
     R = form.rotations_of(X, Y)
-    if mode == "simultaneous":
-        R = least(form.reduced, R, parameterisation, options.max_iterations)
-        return form.outcome(R, starts_from)
-    R = least(form.rotations_alone, R, parameterisation, options.max_iterations)
-    stack = Stack.of(unit_weights(problem, turned=True) if turned else problem)
-    by_name = dict(zip(form.part.free, R, strict=True))
-    R_X = np.array([by_name[name] for name in stack.targets])
-    R_Y = np.array([by_name[name] for name in stack.sensors])
-    t_X, t_Y, _ = linear_translations(stack, R_X, R_Y)
-    found = stack.outcome(R_X, t_X, R_Y, t_Y, starts_from=starts_from)
-    if not turned:
-        return found
-    X, Y = ({name: np.linalg.inv(np.asarray(T)) for name, T in poses.items()} for poses in (found.X, found.Y))
-    return replace(found, X=X, Y=Y)
+    cost_of_rotations = form.reduced if mode == "simultaneous" else form.rotations_alone
+    return form.outcome(least(cost_of_rotations, R, parameterisation, options.max_iterations), starts_from)
 
 
 def least(form: ReducedForm, R: Array, parameterisation: Parameterisation, max_iterations: int) -> Array:

@@ -49,16 +49,14 @@ def zhuang1994(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
     v_X, v_Y = s_Y * ratio[:3], s_Y * ratio[3:]
     scalar = s_Y * s_B[:, 0] - v_B @ v_Y + v_A @ v_X  # s_A s_X of each measurement
     s_X = s_A[:, 0] @ scalar / (s_A[:, 0] @ s_A[:, 0])
-    R_X = to_rotations(np.array([[*v_X, s_X]]))
-    R_Y = to_rotations(np.array([[*v_Y, s_Y]]))
     notes = []
     # Noise pulls the ratios down, so the system's own s_Y does not show a true value near 0.
-    scalar_of_Y = abs(of_rotations(linear_rotations(stack)[1])[0, 3])
+    scalar_of_Y = abs(of_rotations(linear_rotations(stack))[1, 3])
     if scalar_of_Y < NEAR_HALF_TURN:
         notes.append(f"the answer is poor: Y is near a half turn, and its scalar part {scalar_of_Y:.3g} is a divisor")
     if not usable.all():
         notes.append(f"{np.sum(~usable)} measurements were left out: A is a half turn, whose scalar part is a divisor")
-    return linear_outcome(stack, R_X, R_Y, notes)
+    return linear_outcome(stack, to_rotations(np.array([[*v_X, s_X], [*v_Y, s_Y]])), notes)
 
 
 METHOD = Method(

@@ -43,21 +43,20 @@ def test_shahs_rotations_are_singular_vectors() -> None:
 def test_linear_translations_are_those_of_least_squares(unknown_scale: bool) -> None:
     simulation = four_targets(Noise(0.05, 12.0, "released"))
     stack = Stack.of(simulation.problem)
-    R_X = np.array([T[:3, :3] for T in simulation.X.values()])
-    R_Y = np.array([T[:3, :3] for T in simulation.Y.values()])
+    R = np.array([T[:3, :3] for poses in (simulation.X, simulation.Y) for T in poses.values()])
     rows, right = np.zeros((len(stack.A), 3, 16)), np.empty((len(stack.A), 3))
     for i, (A, B) in enumerate(zip(stack.A, stack.B, strict=True)):
         j, k = stack.target[i], stack.sensor[i]
         rows[i, :, 3 * j : 3 * j + 3] = A[:3, :3]
-        rows[i, :, 12 + 3 * k : 15 + 3 * k] = -np.eye(3)
+        rows[i, :, 3 * k : 3 * k + 3] = -np.eye(3)
         rows[i, :, 15] = A[:3, 3]
-        right[i] = R_Y[k] @ B[:3, 3]
+        right[i] = R[k] @ B[:3, 3]
     if unknown_scale:
         x = np.linalg.lstsq(rows.reshape(-1, 16), right.ravel())[0]
     else:
         x = np.append(np.linalg.lstsq(rows[..., :15].reshape(-1, 15), (right - rows[..., 15]).ravel())[0], 1.0)
-    t_X, t_Y, alpha = linear_translations(stack, R_X, R_Y, unknown_scale=unknown_scale)
-    np.testing.assert_allclose(np.concatenate([t_X, t_Y]).ravel(), x[:15] / x[15], atol=1e-10)
+    t, alpha = linear_translations(stack, R, unknown_scale=unknown_scale)
+    np.testing.assert_allclose(t.ravel(), x[:15] / x[15], atol=1e-10)
     assert alpha == pytest.approx(x[15], rel=1e-12)
 
 

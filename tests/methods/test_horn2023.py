@@ -191,7 +191,7 @@ def test_the_other_residual_is_x_against_what_each_measurement_makes_of_y() -> N
     z = np.concatenate([np.concatenate(dual_quaternion(T)) for T in frames])
     expected = 0.0
     for i in range(len(stack.A)):
-        made = np.linalg.inv(stack.A[i]) @ frames[4 + stack.sensor[i]] @ stack.B[i]
+        made = np.linalg.inv(stack.A[i]) @ frames[stack.sensor[i]] @ stack.B[i]
         x, y = z[8 * stack.target[i] :][:8], np.concatenate(dual_quaternion(made))
         # Signs as the form has them: those of q_A, q_B and the frames.
         real = left(left(conjugate(q_A[i])) @ z[32:36]) @ q_B[i]
