@@ -1,21 +1,19 @@
-"""Folders of CSV files: one pair of files for every target and sensor that saw each other.
+"""Folders of CSV files: two files for every pair of a target and a sensor.
 
-The format is the one in which the RWHEC paper's dataset was published. A folder holds files named
+The RWHEC paper's dataset was published in this format. A folder holds files named
 
     <targets>_<id>_<sensors>_<id>_A.csv      A_i = T_sensorcarrier_targetcarrier
     <targets>_<id>_<sensors>_<id>_B.csv      B_i = T_sensor_target
 
 for example ``tag_17_cam_2_A.csv`` and ``tag_17_cam_2_B.csv``. There is no header; each line is one pose,
 ``qw,qx,qy,qz,tx,ty,tz`` (unit quaternion, scalar first; metres), and line i of A and line i of B are one measurement
-of A_i X = Y B_i. Which word of the file names stands for the targets and which for the sensors is for the caller to
-say; either may come first in the names.
+of A_i X = Y B_i. The caller names the words for targets and sensors; either word may come first in the file names.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable
 from pathlib import Path
 from typing import NoReturn
 
@@ -30,12 +28,14 @@ from gtsam_rwhec.problem.problem import Problem
 
 COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 
+#: A quaternion's norm may be this far from 1, as in `geometry.poses`; the check here can name the line.
 QUATERNION_TOLERANCE = 1e-2
-"""How far a quaternion's norm may be from 1, as in `poses`; checked here too because only here the line is known."""
+#: A line of a file, for messages.
+ROW = ",".join(COLUMNS)
 
 
 class CsvWarning(RwhecWarning):
-    """Something in the folder was not read; says what."""
+    """Files and folders that were not read, by name."""
 
 
 def read_csv(
@@ -53,7 +53,7 @@ def read_csv(
     Parameters
     ----------
     folder
-        Where the files are; folders inside it are not entered.
+        Where the files are; folders inside it are not read.
     scale
         ``"known"``, ``"shared"`` or ``"per_target"``, as in `Problem`.
     sigma
@@ -62,10 +62,10 @@ def read_csv(
         Concentration of a measured rotation, 1 / rad^2: about each axis its standard deviation is 1 / sqrt(2 kappa)
         radians; None for unit weights.
     targets, sensors
-        The words that stand for targets and for sensors in the file names. The frames are named with them:
-        ``tag_0``, ``cam_0``. Exchange them and the roles are exchanged.
+        The words for targets and for sensors in the file names, which are in the frames' names too: ``tag_0``,
+        ``cam_0``. Exchange the words to exchange the roles.
     keep_measurements
-        False to keep only what the certified solution needs: memory then does not grow with the number of lines.
+        False keeps the moments alone, as in `Problem`: memory then does not grow with the number of lines.
 
     Returns
     -------
@@ -75,15 +75,15 @@ def read_csv(
     Raises
     ------
     FileFormatError
-        No such folder, no such files in it, one file of a pair missing, an empty file, a line that is not seven finite
-        numbers, or two files of a pair with different numbers of lines.
+        The folder or its files do not exist, one file of a pair is missing, a file is empty, a line is not seven
+        finite numbers, or the two files of a pair have different numbers of lines.
     RwhecError
         A pose or a weight that `Problem.add` refuses; its message starts with the names of both files.
 
     Warns
     -----
     CsvWarning
-        Names everything in the folder that is not one of these files.
+        The folder has other entries; the warning names them.
     """
     folder = Path(folder)
     _check_words(targets, sensors)
@@ -93,19 +93,11 @@ def read_csv(
         rows_a, rows_b = read_pose_rows(path_a), read_pose_rows(path_b)
         if len(rows_a) != len(rows_b):
             raise FileFormatError(
-                f"{path_a} has {len(rows_a)} lines and {path_b} has {len(rows_b)}: line i of both is one measurement, "
-                "so the two must have the same number of lines."
+                f"{path_a} has {len(rows_a)} lines and {path_b} has {len(rows_b)}: give both the same number of lines; "
+                "line i of both is one measurement."
             )
-        problem.add(
-            target=target,
-            sensor=sensor,
-            A=rows_a,
-            B=rows_b,
-            order="wxyz",
-            sigma=sigma,
-            kappa=kappa,
-            source=f"{path_a} and {path_b.name}",
-        )
+        source = f"{path_a} and {path_b.name}"
+        problem.add(target, sensor, rows_a, rows_b, sigma, kappa, order="wxyz", source=source)
     return problem
 
 
@@ -120,32 +112,32 @@ def read_pose_rows(path: str | Path) -> NDArray[np.float64]:
     Returns
     -------
     rows : (N, 7) array
-        N >= 1, all finite; quaternions of norm 1 but for rounding, which `Problem.add` takes away.
+        N >= 1, all finite; quaternions of norm 1 up to `QUATERNION_TOLERANCE`, which `Problem.add` normalises.
 
     Raises
     ------
     FileFormatError
-        The file cannot be read, is empty, or has a line that is not seven finite numbers or whose quaternion is far
-        from norm 1; names the file and the line.
+        The file cannot be read or is empty, or a line is not seven finite numbers or has a quaternion whose norm is not
+        1. The message has the file and the line.
     """
     path = Path(path)
     try:
         lines = path.read_text(encoding="utf-8-sig").rstrip().split("\n")
     except UnicodeDecodeError as error:
         raise FileFormatError(
-            f"{path} is not a text file in UTF-8 (byte {error.start}); expected lines of {_row()}."
+            f"{path} is not a text file in UTF-8 (byte {error.start}); give lines of {ROW}."
         ) from error
     except OSError as error:
         raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
     if lines == [""]:
         raise FileFormatError(
-            f"{path} is empty; expected lines of {_row()}. Delete both files of a pair without measurements."
+            f"{path} is empty; give lines of {ROW}. Delete both files of a pair without measurements."
         )
     try:
         rows = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2, dtype=np.float64)
     except ValueError as error:
         _raise_for_first_bad_line(path, lines, str(error))
-    # loadtxt passes over blank lines and accepts nan: both would put A and B out of step, or worse, without a word.
+    # loadtxt passes over blank lines and accepts nan: A and B would no longer fit, without a message.
     if rows.shape != (len(lines), len(COLUMNS)) or not np.isfinite(rows).all():
         _raise_for_first_bad_line(path, lines, f"read {rows.shape[0]} rows of {rows.shape[1]} numbers")
     norms = np.linalg.norm(rows[:, :4], axis=1)
@@ -153,35 +145,28 @@ def read_pose_rows(path: str | Path) -> NDArray[np.float64]:
     if abs(norms[worst] - 1.0) > QUATERNION_TOLERANCE:
         raise FileFormatError(
             f"{path}, line {worst + 1}: the quaternion qw,qx,qy,qz = {','.join(map(str, rows[worst, :4]))} has norm "
-            f"{norms[worst]:.6g} in place of 1. Are the columns in the order {_row()}?"
+            f"{norms[worst]:.6g} in place of 1. Are the columns in the order {ROW}?"
         )
     return rows
 
 
-def _row() -> str:
-    return ",".join(COLUMNS)
-
-
 def _raise_for_first_bad_line(path: Path, lines: list[str], otherwise: str) -> NoReturn:
-    """Find what the fast reader stumbled over; `otherwise` is its own message, for what is not found here."""
+    """Find the line that `np.loadtxt` cannot read; where there is none, the message is `otherwise`."""
     for number, line in enumerate(lines, start=1):
-        where = f"{path}, line {number}"
-        if not line.strip():
-            raise FileFormatError(
-                f"{where}: blank line between poses; a measurement may be missing here. Expected {_row()}."
-            )
         fields = [field.strip() for field in line.split(",")]
-        faults = [
-            f"{name} is {field!r}" for name, field in zip(COLUMNS, fields, strict=False) if not _is_finite_number(field)
-        ]
-        if len(fields) != len(COLUMNS):
-            raise FileFormatError(
-                f"{where}: {len(fields)} fields in place of {len(COLUMNS)} ({_row()}): {_shorten(line)!r}."
-            )
-        if faults:
-            header = " If it is a header, delete it." if number == 1 and len(faults) == len(COLUMNS) else ""
-            raise FileFormatError(f"{where}: not a finite number: {', '.join(faults)}.{header}")
-    raise FileFormatError(f"{path} cannot be read as lines of {_row()}: {otherwise}.")
+        wrong = [(name, field) for name, field in zip(COLUMNS, fields, strict=False) if not _is_finite_number(field)]
+        fault = ""
+        if not line.strip():
+            fault = f"blank line between poses; a measurement may be missing here. Give {ROW}."
+        elif len(fields) != len(COLUMNS):
+            fault = f"{len(fields)} fields in place of {len(COLUMNS)} ({ROW}): {line[:80]!r}."
+        elif wrong:
+            fault = f"not a finite number: {', '.join(f'{name} is {field!r}' for name, field in wrong)}."
+            if number == 1 and len(wrong) == len(COLUMNS):
+                fault += " If it is a header, delete it."
+        if fault:
+            raise FileFormatError(f"{path}, line {number}: {fault}")
+    raise FileFormatError(f"{path} cannot be read as lines of {ROW}: {otherwise}.")
 
 
 def _is_finite_number(field: str) -> bool:
@@ -191,28 +176,25 @@ def _is_finite_number(field: str) -> bool:
         return False
 
 
-def _shorten(line: str, length: int = 80) -> str:
-    return line if len(line) <= length else line[:length] + "..."
-
-
 def _check_words(targets: str, sensors: str) -> None:
     for argument, word in (("targets", targets), ("sensors", sensors)):
         if not word or "/" in word:
             raise FileFormatError(
-                f'{argument}={word!r}: give the word that file names have for them, such as "tag" or "cam".'
+                f'{argument}={word!r}: give the word for {argument} in the file names, such as "tag" or "cam".'
             )
     if f"{targets}_".startswith(f"{sensors}_") or f"{sensors}_".startswith(f"{targets}_"):
         raise FileFormatError(
-            f"targets={targets!r} and sensors={sensors!r} cannot be told apart in file names: one begins with the "
-            "other; rename the files."
+            f"targets={targets!r} and sensors={sensors!r} cannot be told apart in file names, because one word begins "
+            "with the other word; rename the files."
         )
 
 
 def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Path, Path]]:
-    """Both files of every (target, sensor), in natural order; warn of everything else in the folder."""
+    """Both files of every pair, in natural order; warn of all other entries of the folder."""
+    example = f"{targets}_0_{sensors}_0_A.csv"
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
-        raise FileFormatError(f"{folder} {what}; expected a folder with files such as {_example(targets, sensors)}.")
+        raise FileFormatError(f"{folder} {what}; give a folder with files such as {example}.")
     found: dict[Pair, dict[str, Path]] = {}
     unknown = []
     for path in folder.iterdir():
@@ -228,17 +210,18 @@ def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Pa
     if unknown:
         unknown.sort(key=natural_key)
         warnings.warn(
-            f"{folder}: not read, {_count(len(unknown), 'entry', 'entries')} with other names than "
-            f"{_example(targets, sensors)}: {', '.join(unknown)}",
+            f"{folder}: {len(unknown)} {'entry' if len(unknown) == 1 else 'entries'} not read, with other names than "
+            f"{example}: {', '.join(unknown)}",
             CsvWarning,
             stacklevel=3,
         )
     if not found:
         raise FileFormatError(
-            f"{folder} has no files named like {_example(targets, sensors)}. Say which words the names have for "
-            f"targets (now {targets!r}) and sensors (now {sensors!r})."
+            f"{folder} has no files named like {example}. Give the words of the file names for targets (now "
+            f"{targets!r}) and sensors (now {sensors!r})."
         )
-    return {pair: _both(found[pair], folder) for pair in _naturally_sorted(found)}
+    in_order = sorted(found, key=lambda pair: (natural_key(pair.target), natural_key(pair.sensor)))
+    return {pair: _both(found[pair], folder) for pair in in_order}
 
 
 def _both(sides: dict[str, Path], folder: Path) -> tuple[Path, Path]:
@@ -250,7 +233,7 @@ def _both(sides: dict[str, Path], folder: Path) -> tuple[Path, Path]:
 
 
 def _parse_name(name: str, targets: str, sensors: str) -> tuple[str, str, str] | None:
-    """(target, sensor, "A" or "B") of a file name, whichever word comes first; None if it is none of ours."""
+    """(target, sensor, "A" or "B") of a file name, whichever word comes first; None for other files."""
     side = name[-5:-4]
     if side not in ("A", "B") or not name.endswith(f"_{side}.csv"):
         return None
@@ -261,15 +244,3 @@ def _parse_name(name: str, targets: str, sensors: str) -> tuple[str, str, str] |
             names = {first: f"{first}_{ids[0]}", second: f"{second}_{ids[1]}"}
             return names[targets], names[sensors], side
     return None
-
-
-def _naturally_sorted(pairs: Iterable[Pair]) -> list[Pair]:
-    return sorted(pairs, key=lambda pair: (natural_key(pair.target), natural_key(pair.sensor)))
-
-
-def _example(targets: str, sensors: str) -> str:
-    return f"{targets}_0_{sensors}_0_A.csv"
-
-
-def _count(number: int, one: str, many: str) -> str:
-    return f"{number} {one if number == 1 else many}"
