@@ -98,7 +98,6 @@ TABLE: dict[str, dict[str, str]] = {
         "refinement/test_bad_refinement.py": "input_checks",
         "refinement/test_carrier_noise.py": "graph pair_data",
         "refinement/test_coverage.py": "variance_components",
-        "refinement/test_exact_scales.py": "certified_fit",
         "refinement/test_graduated.py": "truncated_least_squares",
         "refinement/test_refine.py": "chordal fit free_space geodesic optimisation options refined refining variables",
         "refinement/test_robust.py": "inliers weighting",
@@ -144,7 +143,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "factors": {
         "factors/test_drop_in.py": "hand_eye",
-        "factors/test_known_carrier_options.py": "measurement",
+        "factors/test_known_carrier_options.py": "arguments measurement",
         "factors/test_priors.py": "values",
         "factors/test_summaries_and_batches.py": "batch edge_summary",
     },

@@ -1,4 +1,4 @@
-"""What joins solving and refinement."""
+"""Cross-validation of a calibration: solving and refinement together."""
 
 import lazy_loader
 

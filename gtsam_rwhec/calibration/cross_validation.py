@@ -1,7 +1,8 @@
-"""Hold-out error: how well a calibration predicts measurements that it has not seen, in mm and degrees.
+"""Cross-validation: the hold-out error of a calibration, in millimetres and degrees.
 
-Residuals flatter: what was fitted has bent towards its own noise, and a wrong sigma or an outlier hides in a sum. Here
-a part is held out, the rest calibrated, and the part predicted: B = Y^-1 A X against what was measured.
+Residuals are too small, because the fitted answer follows its own noise, and their sum hides a wrong sigma or an
+outlier. Here some measurements are held out, the rest is calibrated, and the calibration predicts the held-out
+measurements: B = Y^-1 A X.
 """
 
 from __future__ import annotations
@@ -39,22 +40,22 @@ from gtsam_rwhec.solving.solution import Solution
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """What ``cross_validate`` found.
+    """The result of ``cross_validate``.
 
     Attributes
     ----------
     by : "time", "pair" or "sensor"
     number_of_folds : int
     ordered_by : "stamps" or "order"
-        What time was: stamps, or, for pairs without them, the order in which measurements were added.
+        The time of measurements: their stamps, or, for pairs without stamps, the order in which they were added.
     overall : HoldOutError
     sensors, targets : dict of str to HoldOutError
-        A sensor's includes its own motions.
+        A sensor's error includes its own motions.
     pairs : dict of (target, sensor) to HoldOutError
     translation_errors_m, rotation_errors_rad : dict of (target, sensor) to (N,) array
-        Held out, one by one, in the order of ``problem.measurements``; nan where not predicted.
+        The error of each held-out measurement, in the order of ``problem.measurements``; nan where not predicted.
     notes : tuple of str
-        What could not be predicted and why, and what calibrating the rest warned of.
+        The measurements that could not be predicted, with the reason, and the warnings of the calibrations.
     """
 
     by: Split
@@ -83,37 +84,37 @@ def cross_validate(
     Parameters
     ----------
     problem : Problem
-        With its raw measurements.
+        A problem that kept its raw measurements.
     folds : int
-        With ``by="time"``: into how many blocks each pair is cut. A block is contiguous in time (by stamps; by the
-        order of adding for pairs without), since neighbours share their errors: blind to that, folds drawn at random
-        would be predicted by their own neighbours.
+        With ``by="time"``: the number of blocks into which each pair is cut. A block is contiguous in time (by stamps;
+        without stamps by the order of adding). Neighbours in time share their errors, so random folds would be
+        predicted from their own neighbours.
     by : "time", "pair" or "sensor"
-        "pair": each pair is predicted from all others, as far as these measure both its frames: whether the graph
-        agrees with itself. "sensor": one half in time of all that a sensor saw is predicted from its other half and
-        from what the other sensors saw.
+        "pair": each pair is predicted from all other pairs, if these measure both its frames. This shows whether the
+        graph agrees with itself. "sensor": one half in time of a sensor's measurements is predicted from its other half
+        and from the other sensors.
     options : RefineOptions, optional
-        Refine each calibration with them; left out, it is the certified solution.
+        Refine each calibration with these options. Without them it is the certified solution.
     solve_options : SolveOptions, optional
     progress : callable, optional
-        Told each fold.
+        Is called with the name of each fold.
 
     Returns
     -------
     CrossValidation
-        ``report.print_cross_validation`` prints it. Outliers are predicted too: they are in the root mean squares and
-        the percentiles, not in the medians.
+        ``report.print_cross_validation`` prints it. The errors of outliers are included: they raise the root mean
+        squares and the percentiles, and hardly the medians.
 
     Raises
     ------
     MeasurementsNotKeptError
-        When the problem was made with ``keep_measurements=False``.
+        If the problem was made with ``keep_measurements=False``.
     CountError
-        For more folds than any pair has measurements.
+        If there are more folds than measurements of any pair.
     OptionError
-        For folds or a split that cannot be meant.
+        If ``folds`` or ``by`` is not valid.
     UnderdeterminedError
-        When nothing can be predicted from the rest.
+        If no measurement can be predicted from the rest.
     """
     _check(problem, folds, by)
     raw = {pair: problem.measurements(*pair) for pair in problem.pairs}
@@ -130,7 +131,7 @@ def cross_validate(
         _predict(problem, raw, fold, calibrate, errors, notes)
     if not any(np.isfinite(values).any() for values in errors.values()):
         raise UnderdeterminedError(
-            f"nothing can be predicted with by={by!r}: " + "; ".join(notes) + ". Measure more, or choose another split"
+            f"no measurement can be predicted with by={by!r}: {'; '.join(notes)}. Measure more, or choose another split"
         )
 
     def compare(pairs: list[Pair]) -> HoldOutError:
@@ -173,11 +174,13 @@ def _check(problem: Problem, folds: int, by: str) -> None:
 
 @dataclass(frozen=True)
 class _Calibrator:
+    """Calibrates each fold's problem in the same way."""
+
     options: RefineOptions | None
     solve_options: SolveOptions | None
 
     def __call__(self, problem: Problem, name: str, notes: dict[str, None]) -> Solution | Refined:
-        """Solve, and refine if asked to; warnings become notes."""
+        """The certified solution, refined if there are options; warnings become notes."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             solution = solve(problem, options=self.solve_options)
@@ -198,10 +201,10 @@ def _predict(
     errors: dict[Pair, Array],
     notes: dict[str, None],
 ) -> None:
-    """Calibrate without the fold and fill in its errors."""
+    """Calibrate without the fold, and write its prediction errors into ``errors``."""
     name, held_out = fold
-    if all(held_out[pair].all() if pair in held_out else False for pair in raw):
-        notes.setdefault(f"{name}: nothing is left to predict it from")
+    if all(pair in held_out and held_out[pair].all() for pair in raw):
+        notes.setdefault(f"{name}: no measurement is left to predict it from")
         return
     try:
         answer = calibrate(selected(problem, {pair: ~m for pair, m in held_out.items()}), f"without {name}", notes)
@@ -214,10 +217,7 @@ def _predict(
         predicted = prediction_errors(problem, answer, pair, raw[pair])
         errors[pair][:, mask] = predicted[:, mask]
         if np.isnan(predicted).all():
-            unknown = [frame for frame in pair.frames if not _is_known(problem, answer, frame)]
+            known = set(answer.X) | set(answer.Y) | set(problem.fixed)
+            unknown = [frame for frame in pair.frames if frame not in known]
             lacking = " and ".join(unknown) if unknown else f"the size of {pair.target}"
-            notes.setdefault(f"{pair} ({name}) is not predicted: nothing else measures {lacking}")
-
-
-def _is_known(problem: Problem, answer: Solution | Refined, frame: str) -> bool:
-    return frame in answer.X or frame in answer.Y or frame in problem.fixed
+            notes.setdefault(f"{pair} ({name}) is not predicted: no other measurement determines {lacking}")

@@ -1,4 +1,4 @@
-"""Folds of a cross-validation: which measurements are held out together."""
+"""The folds of a cross-validation: measurements that are held out together."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ Split = Literal["time", "pair", "sensor"]
 
 
 class Fold(NamedTuple):
-    """Measurements that are held out together: (N,) booleans of each pair that has any; named for messages."""
+    """Measurements that are held out together, (N,) booleans of each pair with any, and the fold's name in messages."""
 
     name: str
     held_out: dict[Pair, np.ndarray]
 
 
 def folds_of(raw: Mapping[Pair, Measurements], by: Split, number: int) -> Iterator[Fold]:
-    """The folds of a split; ``number`` of them in time."""
+    """The folds of a split; with ``by="time"`` there are ``number`` folds."""
     if by == "time":
         return _blocks(raw, number)
     return _pairs(raw) if by == "pair" else _halves(raw)
 
 
 def _in_time(one: Measurements) -> np.ndarray:
-    """Rank of each measurement in time, (N,)."""
+    """The rank (N,) of each measurement in time."""
     count = len(one.A)
     if one.stamps_ns is None:
         return np.arange(count)
@@ -38,7 +38,7 @@ def _in_time(one: Measurements) -> np.ndarray:
 
 
 def _blocks(raw: Mapping[Pair, Measurements], folds: int) -> Iterator[Fold]:
-    # The middle of each measurement's share: pairs with fewer measurements than folds are spread over them.
+    # The middle of each measurement's share of the pair: few measurements are spread over all folds.
     block = {pair: ((_in_time(one) + 0.5) * folds / len(one.A)).astype(np.int64) for pair, one in raw.items()}
     for fold in range(folds):
         yield Fold(f"block {fold + 1} of {folds}", {pair: number == fold for pair, number in block.items()})

@@ -1,4 +1,4 @@
-"""How far measurements are from what a calibration predicts of them, in millimetres and degrees."""
+"""Prediction errors: the distances of measurements from a calibration's predictions, in millimetres and degrees."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from gtsam_rwhec.trajectories.local_paths import LocalPaths
 
 @dataclass(frozen=True)
 class PredictionError:
-    """How far predicted measurements are from the measured ones.
+    """The distance of predicted measurements from the measured ones.
 
     Attributes
     ----------
     count : int
-        Measurements that were predicted.
+        Number of predicted measurements.
     translation_rms_mm, translation_median_mm, translation_95_mm : float
-        Root mean square, median and 95th percentile of |t_measured / scale - t_predicted|, true millimetres; nan where
-        nothing was predicted.
+        Root mean square, median and 95th percentile of |t_measured / scale - t_predicted|, true millimetres; nan if
+        no measurement was predicted.
     rotation_rms_deg, rotation_median_deg, rotation_95_deg : float
-        The same of the angle of R_measured' R_predicted.
+        Root mean square, median and 95th percentile of the angle of R_measured' R_predicted, degrees.
     """
 
     count: int
@@ -41,7 +41,7 @@ class PredictionError:
 
     @staticmethod
     def of(translation_m: Array, rotation_rad: Array) -> PredictionError:
-        """Of errors one by one; nan is what was not predicted."""
+        """The statistics of single errors; nan marks a measurement that was not predicted."""
         known = np.isfinite(translation_m)
         mm, deg = 1e3 * translation_m[known], np.degrees(rotation_rad[known])
         return PredictionError(len(mm), *_rms_median_95(mm), *_rms_median_95(deg))
@@ -49,15 +49,15 @@ class PredictionError:
 
 @dataclass(frozen=True)
 class HoldOutError:
-    """Errors of measurements held out, and of the same measurements when the calibration has seen all.
+    """The errors of held-out measurements, and of the same measurements with a calibration from all measurements.
 
     Attributes
     ----------
     held_out, training : PredictionError
-        Far apart: too few measurements, or too many unknowns, for the noise. Both large: outliers, a wrong model
-        (intrinsics, a size, a delay), or much noise.
+        If the two differ much, there are too few measurements, or too many unknowns, for the noise. If both are large,
+        there are outliers, a wrong model (intrinsics, a size, a delay), or much noise.
     not_predicted : int
-        Measurements of frames that the rest does not measure.
+        Number of measurements of frames that the other measurements do not determine.
     """
 
     held_out: PredictionError
@@ -66,7 +66,7 @@ class HoldOutError:
 
 
 def prediction_errors(problem: Problem, answer: Solution | Refined, pair: Pair, one: Measurements) -> Array:
-    """Of predictions of all of a pair's measurements, (2, N): in true metres and in radians; nan without a pose."""
+    """The errors (2, N) of a pair's predicted measurements, in true metres and radians; nan if a pose is not known."""
     poses: dict[str, Array] = {name: pose.matrix() for name, pose in (answer.X | answer.Y).items()}
     poses = {**problem.fixed, **poses}
     scales = answer.scale
@@ -86,8 +86,4 @@ def prediction_errors(problem: Problem, answer: Solution | Refined, pair: Pair, 
 def _rms_median_95(values: Array) -> tuple[float, float, float]:
     if len(values) == 0:
         return np.nan, np.nan, np.nan
-    return (
-        float(np.sqrt(np.mean(values**2))),
-        float(np.median(values)),
-        float(np.percentile(values, 95.0)),
-    )
+    return float(np.sqrt(np.mean(values**2))), float(np.median(values)), float(np.percentile(values, 95.0))

@@ -1,4 +1,4 @@
-"""GTSAM after the certified solution: richer noise, priors, robust losses, time offsets, and honest covariances."""
+"""Refinement in GTSAM after the certified solution: full noise, priors, robust losses, time offsets, covariances."""
 
 import lazy_loader
 

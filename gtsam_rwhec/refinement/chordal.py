@@ -1,4 +1,4 @@
-"""Refinement with the certified cost's own residual: from moments alone, so that its optimum is the certified one."""
+"""Refinement with the chordal residual, from moments alone: its optimum is the certified optimum."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gtsam_rwhec.solver.parts import Part
 
 @dataclass(frozen=True)
 class ChordalModel:
-    """One edge summary a pair."""
+    """The chordal residuals: one edge summary for each pair."""
 
     parts: list[Part]
     variables: Variables
@@ -33,7 +33,7 @@ class ChordalModel:
 
     @property
     def given_noise(self) -> dict[Pair, tuple[float, float]]:
-        """Standard deviations as given, of all measurements of a pair together: rad and (measured) metres an axis."""
+        """Standard deviations as given, one pair's measurements together: rad and (measured) metres an axis."""
         return {
             pair: (
                 float(np.sqrt(0.5 * part.moments.count[e] / part.moments.kappa[e])),
@@ -52,15 +52,15 @@ class ChordalModel:
         return graph
 
     def values(self, state: State) -> gtsam.Values:
-        """An estimate as GTSAM's."""
+        """An estimate as GTSAM's values."""
         return self.variables.values(state)
 
     def information_graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
-        """The graph itself: there is no loss in it."""
+        """The graph itself, which has no loss."""
         return self.graph(state, factors)
 
     def inefficiency(self, state: State, factors: FactorsByPair) -> float:
-        """None: least squares."""
+        """1: least squares has no loss."""
         return 1.0
 
     def next_factors(

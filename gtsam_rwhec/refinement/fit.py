@@ -1,4 +1,4 @@
-"""Optimising until the weights are settled, where they depend on the answer or on the residuals."""
+"""Optimisation in rounds, where the weights depend on the answer or on the residuals, until the weights settle."""
 
 from __future__ import annotations
 
@@ -23,48 +23,51 @@ from gtsam_rwhec.refinement.weighting import FactorsByPair, Group, group_label, 
 
 Model = GeodesicModel | ChordalModel
 
-#: Rounds of re-estimating the noise, and of carrying A's noise into the residuals anew; two to five are usual.
+#: Largest number of rounds, each of which estimates the noise and propagates A's noise again; two to five are usual.
 MAX_ROUNDS = 30
-#: Variance factors are settled when none changes by more than this, of itself.
+#: Largest relative change of a variance factor in a round that counts as settled.
 SETTLED = 1e-4
-#: A time offset is settled when a round changes it by no more than this.
+#: Largest change of a time offset, s, in a round that counts as settled.
 OFFSET_SETTLED_S = 1e-6
 
 
 @dataclass(frozen=True)
 class SettledFit:
-    """The settled optimum: the graph, the information of the unknowns, and what the noise came to."""
+    """The settled optimum: the graph, the information of the unknowns, and the variance factors."""
 
     graph: gtsam.NonlinearFactorGraph
     optimum: Optimum
     information: Array
     factors: FactorsByPair
     degrees_of_freedom: dict[tuple[Group, str], float]
-    initial_cost: float
     iterations: int
 
 
 def fit(
     problem: Problem, model: Model, variables: Variables, start: State, options: RefineOptions, estimates: bool
 ) -> SettledFit:
-    """Optimise, and where weights depend on the answer or on the residuals, again until they are settled."""
+    """The optimum under settled weights."""
     factors: FactorsByPair = dict.fromkeys(problem.pairs, AS_STATED)
     degrees_of_freedom: dict[tuple[Group, str], float] = {}
     state, values = start, model.values(start)
     iterations = 0
     if isinstance(model, GeodesicModel) and model.first_loss is not None:
-        graph = _with_knowledge(model.graph(state, factors, model.first_loss), problem, variables, options)
+        graph = model.graph(state, factors, model.first_loss)
+        graphs.add_knowledge(graph, variables, problem, options.residual)
         optimum = optimise(graph, values, options.max_iterations)
         iterations += optimum.iterations
         state, values = variables.state(optimum.values), optimum.values
     for round_number in range(MAX_ROUNDS):
-        graph = _with_knowledge(model.graph(state, factors), problem, variables, options)
+        graph = model.graph(state, factors)
+        graphs.add_knowledge(graph, variables, problem, options.residual)
         optimum = optimise(graph, values, options.max_iterations)
         iterations += optimum.iterations
         before, state, values = state, variables.state(optimum.values), optimum.values
-        information = _information(problem, model, variables, options, state, factors, values)
+        without_loss = model.information_graph(state, factors)
+        graphs.add_priors(without_loss, variables, problem, options.residual)
+        information = information_of(without_loss, values, variables) / model.inefficiency(state, factors)
         settled = not model.reweighs or round_number > 0
-        # A time offset is linearised where the round began.
+        # A time offset is linearised at its value when the round began.
         settled = settled and all(
             abs(offset - before.offsets_s[name]) < OFFSET_SETTLED_S for name, offset in state.offsets_s.items()
         )
@@ -86,9 +89,9 @@ def fit(
             for group, component in few
         )
         warnings.warn(
-            f"the estimated noise did not settle in {MAX_ROUNDS} rounds; the fewest degrees of freedom have {where}. "
+            f"the estimated noise did not settle in {MAX_ROUNDS} rounds; the fewest degrees of freedom are of {where}. "
             + (
-                "The noise given for A may explain the residuals already: give less, or B's noise (noise='given')"
+                "The noise given for A may already explain the residuals: give less, or give B's noise (noise='given')"
                 if options.carrier_noise is not None
                 else "Join groups (noise_groups='sensor' or 'all'), or give sigma and kappa (noise='given')"
             ),
@@ -102,28 +105,4 @@ def fit(
             NotConvergedWarning,
             stacklevel=3,
         )
-    return SettledFit(
-        graph, optimum, information, factors, degrees_of_freedom, graph.error(model.values(start)), iterations
-    )
-
-
-def _with_knowledge(
-    graph: gtsam.NonlinearFactorGraph, problem: Problem, variables: Variables, options: RefineOptions
-) -> gtsam.NonlinearFactorGraph:
-    graphs.add_priors(graph, variables, problem, options.residual)
-    graphs.add_fixed(graph, variables, problem)
-    return graph
-
-
-def _information(
-    problem: Problem,
-    model: Model,
-    variables: Variables,
-    options: RefineOptions,
-    state: State,
-    factors: FactorsByPair,
-    values: gtsam.Values,
-) -> Array:
-    graph = model.information_graph(state, factors)
-    graphs.add_priors(graph, variables, problem, options.residual)
-    return information_of(graph, values, variables) / model.inefficiency(state, factors)
+    return SettledFit(graph, optimum, information, factors, degrees_of_freedom, iterations)

@@ -1,4 +1,4 @@
-"""Directions that the measurements leave free at a refined answer, as columns over the refinement's unknowns."""
+"""Free directions at a refined answer, as columns over the refinement's unknowns."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses, costs_of_pairs
 from gtsam_rwhec.solver.variables import given_answer
 
-#: A velocity's mean square, in units of what noise makes of it, up to which a carrier counts as standing still.
+#: Mean square of a carrier's velocity over the part that noise explains; up to this number the carrier stands still.
 MOVED = 4.0
 
 #: The one scale of all targets.
@@ -26,9 +26,18 @@ SHARED = Unknown(UnknownKind.SCALE)
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Free directions: basis (d, k) over ``Variables.unknowns`` and as records; unit (d,): what counts as one of each.
+    """Free directions.
 
-    ``shrinkage``: see ``free_offsets``.
+    Attributes
+    ----------
+    basis : (d, k) array
+        The directions over ``Variables.unknowns``.
+    directions : tuple of FreeDirection
+        The same directions as records.
+    unit : (d,) array
+        The unit of each parameter: 1 rad, the typical length (m), a scale's value, 1 s.
+    shrinkage : dict of str to float
+        By sensor: the share by which noise in the carrier's velocity pulls the time offset towards zero.
     """
 
     basis: Array
@@ -44,9 +53,9 @@ def free_space_of(
     data: list[PairData],
     fitted: FactorsByPair | None = None,
 ) -> FreeSpace:
-    """Tested as the certified solution's are (``identifiability``), at the refined answer.
+    """The free directions, by the certified solution's test (``identifiability``), at the refined answer.
 
-    The residuals tell the noise; where a loss holds outliers off, which are among them, the noise as ``fitted`` does.
+    The residuals give the noise. Under a robust loss they contain outliers, so there the ``fitted`` factors give it.
     """
     slots = slots_of(variables.unknowns)
     size = sum(unknown.dimension for unknown in slots)
@@ -56,7 +65,7 @@ def free_space_of(
         answer = given_answer(part, state.X, state.Y, _scales_of(part, state))
         poses = PairPoses.of(part, answer)
         J_t, J_R = costs_of_pairs(part, poses)
-        if fitted is not None:  # what these factors predict, 3 / 2 a measurement
+        if fitted is not None:  # the costs that these factors predict, 3 / 2 for each measurement
             factors = np.array([fitted[pair] for pair in part.pairs])
             J_R, J_t = 1.5 * part.moments.count * factors[:, 0], 1.5 * part.moments.count * factors[:, 1]
         directions += identify(part, poses, J_t, J_R).free_directions
@@ -81,17 +90,10 @@ def free_space_of(
 
 
 def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[FreeDirection], dict[str, float]]:
-    """Time offsets that the carriers' motion does not tell.
+    """Time offsets that the carriers' motion does not determine, and ``FreeSpace.shrinkage`` of the other sensors.
 
-    An offset shows as far as the carrier moves while the sensor looks. Its velocity comes from noisy poses: where its
-    mean square is no more than ``MOVED`` times what their noise alone would make it, the carrier stood still for all
-    that is known.
-
-    Returns
-    -------
-    free : list of FreeDirection
-    shrinkage : dict of str to float
-        Of the other sensors: by what part noise in the velocity pulls the offset towards zero.
+    A carrier must move to determine a time offset. Its velocity comes from noisy poses. If the velocity's mean square
+    is at most ``MOVED`` times the part that the noise of the poses explains, the carrier counts as standing still.
     """
     free: list[FreeDirection] = []
     shrinkage: dict[str, float] = {}

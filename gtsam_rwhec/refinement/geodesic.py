@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -33,10 +32,17 @@ from gtsam_rwhec.refinement.weighting import (
 
 @dataclass(frozen=True)
 class GeodesicModel:
-    """The raw measurements of every pair; ``carriers`` where carrier poses are variables.
+    """The geodesic residuals of the raw measurements.
 
-    inlier_share is the share of its variance that a squared residual keeps when those beyond the inlier threshold are
-    left out.
+    Attributes
+    ----------
+    data : list of PairData
+    variables : Variables
+    options : RefineOptions
+    carriers : CarrierVariables or None
+        The carrier poses, where they are variables.
+    inlier_share : float
+        Share of its variance that a squared residual keeps when residuals beyond the inlier threshold are left out.
     """
 
     data: list[PairData]
@@ -47,21 +53,21 @@ class GeodesicModel:
 
     @staticmethod
     def of(data: list[PairData], variables: Variables, options: RefineOptions) -> GeodesicModel:
-        """Decide whether carrier poses are variables."""
+        """The model; it decides whether carrier poses are variables."""
         check_carriers(data, options)
         carriers = None
-        if options.carrier_noise is not None and options.carrier_model != "propagated":
+        if options.carrier_noise is not None:
             candidates = graphs.CarrierVariables.of(data)
-            if options.carrier_model == "variables" or candidates.is_shared:
+            if options.carrier_model == "variables" or (options.carrier_model == "auto" and candidates.is_shared):
                 carriers = candidates
-        elif options.carrier_noise is not None and graphs.CarrierVariables.of(data).is_shared:
-            warnings.warn(
-                "some measurements share a carrier pose, whose error does not average out between them, but its "
-                "noise is propagated to each on its own: standard deviations are too small; take "
-                "carrier_model='variables'",
-                WeightsWarning,
-                stacklevel=4,
-            )
+            elif candidates.is_shared:
+                warnings.warn(
+                    "some measurements share a carrier pose, but carrier_model='propagated' treats its noise as "
+                    "independent for each measurement. The error of a shared pose does not average out, so standard "
+                    "deviations are too small; take carrier_model='variables'",
+                    WeightsWarning,
+                    stacklevel=4,
+                )
         share = 1.0
         if options.robust == "gnc":  # of a chi-square with 6 degrees of freedom, cut at its quantile
             cut = chdtri(6, 1.0 - options.inlier_confidence)
@@ -75,7 +81,7 @@ class GeodesicModel:
 
     @property
     def reweighs(self) -> bool:
-        """Whether the factors depend on the estimate: A's noise is carried into the residual at it."""
+        """Whether the weights depend on the estimate: A's noise is propagated into the residual there."""
         return self.options.carrier_noise is not None and self.carriers is None
 
     @property
@@ -87,42 +93,34 @@ class GeodesicModel:
             result[item.pair] = (float(np.sqrt(variances[:3].mean())), float(np.sqrt(variances[3:].mean())))
         return result
 
-    def linearize(self, state: State) -> dict[Pair, Linearization]:
-        """Residuals and Jacobians of every pair at an estimate."""
-        return linearized(self.data, self.variables, state)
-
-    def covariances(self, state: State, factors: FactorsByPair) -> dict[Pair, Array]:
-        """(N, 6, 6) of every pair's residuals at an estimate."""
-        at = self.linearize(state)
-        return {i.pair: residual_covariance(i, at[i.pair], factors[i.pair]) for i in self.data}
+    def covariances(self, at: dict[Pair, Linearization], factors: FactorsByPair) -> dict[Pair, Array]:
+        """The covariances (N, 6, 6) of every pair's residuals."""
+        return {item.pair: residual_covariance(item, at[item.pair], factors[item.pair]) for item in self.data}
 
     def graph(self, state: State, factors: FactorsByPair, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
-        """The measurements' factors, weighed as of an estimate; in another loss than the options', if told."""
+        """The measurements' factors, weighted at an estimate; ``robust`` replaces the loss of the options."""
         loss = self.options.robust if robust is None else robust
         graph = gtsam.NonlinearFactorGraph()
-        here = [
-            dataclasses.replace(item, residuals=item.at(state.offsets_s.get(item.pair.sensor, 0.0)))
-            for item in self.data
-        ]
-        rest = here
+        rest = [replace(item, residuals=item.at(state.offsets_s.get(item.pair.sensor, 0.0))) for item in self.data]
         if self.carriers is not None:
-            graphs.add_with_carriers(graph, self.variables, here, self.carriers, factors, loss)
-            rest = [item for item in here if item.pair not in self.carriers.index]
-        covariances = self.covariances(state, factors) if rest else {}
-        if loss in graphs.LOSSES:
-            graphs.add_single(graph, self.variables, rest, covariances, loss)
-        else:
-            roots = {item.pair: square_root_information(covariances[item.pair]) for item in rest}
-            graphs.add_batches(graph, self.variables, rest, roots)
+            graphs.add_with_carriers(graph, self.variables, rest, self.carriers, factors, loss)
+            rest = [item for item in rest if item.pair not in self.carriers.index]
+        if rest:
+            covariances = self.covariances(linearized(self.data, self.variables, state), factors)
+            if loss in graphs.LOSSES:
+                graphs.add_single(graph, self.variables, rest, covariances, loss)
+            else:
+                roots = {item.pair: square_root_information(covariances[item.pair]) for item in rest}
+                graphs.add_batches(graph, self.variables, rest, roots)
         return graph
 
     @property
     def first_loss(self) -> Robust | None:
-        """A loss without local minima to start under, for those that let go of what is far away."""
+        """The loss without local minima that is minimised before the options' loss."""
         return "huber" if self.is_m_estimate and self.options.robust != "huber" else None
 
     def values(self, state: State) -> gtsam.Values:
-        """An estimate with the carrier poses as measured, where they are variables."""
+        """An estimate as GTSAM's values, with the measured carrier poses where they are variables."""
         values = self.variables.values(state)
         if self.carriers is not None:
             for i, A in enumerate(self.carriers.A):
@@ -130,18 +128,23 @@ class GeodesicModel:
         return values
 
     def information_graph(self, state: State, factors: FactorsByPair) -> gtsam.NonlinearFactorGraph:
-        """The measurements' factors without a loss: what the information is of, up to ``inefficiency``."""
+        """The measurements' factors without a loss: the unknowns' information, up to ``inefficiency``."""
         return self.graph(state, factors, "none")
 
     def inefficiency(self, state: State, factors: FactorsByPair) -> float:
-        """By what a loss widens the covariance of least squares: Huber's E psi^2 / (E psi')^2, for 6 dimensions.
+        """The factor by which a loss widens least squares' covariance: Huber's E psi^2 / (E psi')^2, 6 dimensions.
 
         (Huber and Ronchetti, Robust Statistics, eq. 7.87, whose psi' is here the divergence of w(|u|) u over 6.)
         """
         if not self.is_m_estimate:
             return 1.0
         loss = graphs.loss_of(self.options.robust)
-        lengths = np.concatenate([np.linalg.norm(u, axis=1) for u in self._whitened(state, factors).values()])
+        at = linearized(self.data, self.variables, state)
+        whitened = [
+            np.einsum("nij,nj->ni", square_root_information(covariance), at[pair].residual)
+            for pair, covariance in self.covariances(at, factors).items()
+        ]
+        lengths = np.linalg.norm(np.concatenate(whitened), axis=1)
         weight = np.array([loss.weight(d) for d in lengths])
         step = 1e-5
         slope = np.array([(loss.weight(d + step) - loss.weight(max(d - step, 0.0))) for d in lengths]) / (
@@ -153,10 +156,10 @@ class GeodesicModel:
         gain = float(np.mean(weight + slope * lengths / 6.0))
         if not gain > 0.05:
             raise NoiseError(
-                f"robust={self.options.robust!r} leaves next to nothing of the measurements (mean weight "
-                f"{weight.mean():.2g}): half of the residuals are beyond {np.median(lengths):.3g} standard "
-                "deviations, so either the noise is larger than given (noise='estimate') or outliers have pulled the "
-                "start away (robust='gnc' needs none)"
+                f"robust={self.options.robust!r} gives the measurements a mean weight of only {weight.mean():.2g}: "
+                f"half of the residuals are beyond {np.median(lengths):.3g} standard deviations. Either the noise is "
+                "larger than given (take noise='estimate'), or outliers have pulled the certified solution away (take "
+                "robust='gnc', which needs no good start)"
             )
         return square / gain**2
 
@@ -164,36 +167,28 @@ class GeodesicModel:
         self, state: State, joint: JointCovariance, factors: FactorsByPair, groups: NoiseGroups
     ) -> VarianceComponents:
         """Variance factors from the residuals at an estimate."""
-        at = self.linearize(state)
+        at = linearized(self.data, self.variables, state)
         components = from_measurements(
             self.data, at, self.variables, joint, factors, groups, consistency=self.inlier_share
         )
-        if not self.is_m_estimate:
-            return components
-        return VarianceComponents(
-            self._median_factors(state, factors, groups, components), components.degrees_of_freedom
-        )
-
-    def _whitened(self, state: State, factors: FactorsByPair) -> dict[Pair, Array]:
-        at = self.linearize(state)
-        result = {}
-        for item in self.data:
-            covariance = residual_covariance(item, at[item.pair], factors[item.pair])
-            result[item.pair] = np.einsum("nij,nj->ni", square_root_information(covariance), at[item.pair].residual)
-        return result
+        if self.is_m_estimate:
+            components = replace(components, factors=self._median_factors(at, factors, groups, components))
+        return components
 
     def _median_factors(
-        self, state: State, factors: FactorsByPair, groups: NoiseGroups, components: VarianceComponents
+        self,
+        at: dict[Pair, Linearization],
+        factors: FactorsByPair,
+        groups: NoiseGroups,
+        components: VarianceComponents,
     ) -> FactorsByPair:
-        """Where outliers are expected: medians of squared residuals against a chi-square's, 3 dimensions each."""
-        at = self.linearize(state)
+        """Variance factors that withstand outliers: medians of squared residuals over a chi-square's, 3 dimensions."""
         squares: dict[tuple[Group, int], list[Array]] = {}
-        for item in self.data:
-            covariance = residual_covariance(item, at[item.pair], factors[item.pair])
+        for pair, covariance in self.covariances(at, factors).items():
             for i, block in enumerate((slice(0, 3), slice(3, 6))):
-                r = at[item.pair].residual[:, block]
+                r = at[pair].residual[:, block]
                 square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(covariance[:, block, block]), r)
-                squares.setdefault((group_of(item.pair, groups), i), []).append(square)
+                squares.setdefault((group_of(pair, groups), i), []).append(square)
         ratios = {}
         for (group, i), values in squares.items():
             all_squares = np.concatenate(values)
@@ -210,12 +205,9 @@ def linearized(data: list[PairData], variables: Variables, state: State) -> dict
     frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
     result = {}
     for item in data:
+        target, sensor = item.pair
         scale = variables.scale_of_pair.get(item.pair)
-        offset_s = state.offsets_s.get(item.pair.sensor, 0.0)
-        result[item.pair] = item.at(offset_s).linearize(
-            frames[item.pair.target],
-            frames[item.pair.sensor],
-            1.0 if scale is None else state.scales[scale],
-            offset_s,
-        )
+        alpha = 1.0 if scale is None else state.scales[scale]
+        offset_s = state.offsets_s.get(sensor, 0.0)
+        result[item.pair] = item.at(offset_s).linearize(frames[target], frames[sensor], alpha, offset_s)
     return result

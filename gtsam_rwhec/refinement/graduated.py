@@ -1,30 +1,28 @@
-"""Outliers rejected without a good start: truncated least squares, graduated, around the certified solver.
+"""Outlier rejection without a good start: graduated truncated least squares around the certified solver.
 
     minimise  sum_i min(d_i^2, c^2),    d_i^2 = kappa |R_A R_X - R_Y R_B|_F^2 + |alpha (...) - R_Y t_B|^2 / sigma^2
 
-(Yang, Antonante, Tzoumas, Carlone: Graduated non-convexity for robust spatial perception, 2020, Section III; c^2 is
-a quantile of the chi-square distribution with 6 degrees of freedom, which d^2 has at the truth.) For given weights the
-problem is a calibration problem again, solved to its global optimum from moments of the re-weighted measurements; so
-the scheme has no start to depend on. Graduating is a heuristic all the same: afterwards, frames with outliers are put
-to the vote of their own measurements (``voting``).
+(Yang, Antonante, Tzoumas, Carlone: Graduated non-convexity for robust spatial perception, 2020, Section III. At the
+truth d^2 has a chi-square distribution with 6 degrees of freedom; c^2 is a quantile of it.) For given weights the
+problem is again a calibration problem, which is solved to its global optimum from moments of the re-weighted
+measurements. So the scheme does not depend on a start. But graduation is a heuristic: afterwards the measurements of
+each frame with outliers vote on its pose (``voting``).
 
-With noise unknown, d^2 has no unit to begin with: the worst of all measurements would make everything an inlier. Least
-trimmed squares, which keep the better half of each pair, give a first one, the inliers the next. With more than half
-outliers that noise is theirs, and nothing tells.
+If the noise is unknown, d^2 has no unit at first. Least trimmed squares, which keep the better half of each pair, give
+the first noise; the inliers give the next. If more than half of the measurements are outliers, they decide this noise,
+and the estimate is wrong without a sign of it.
 """
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 from scipy.special import chdtri
 
-from gtsam_rwhec.errors import CountError, OptionError, OutlierError, OutliersWarning, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, OutlierError, OutliersWarning, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, silent
-from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import reweighted
@@ -39,11 +37,11 @@ from gtsam_rwhec.refinement.truncated_least_squares import (
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
-#: A frame or pair of which a smaller share of measurements agrees is named in a warning.
+#: Share of agreeing measurements below which a warning names a frame or pair.
 SUSPECT = 0.5
-#: No sensor is this noisy about each axis, rad: an estimate of so much has taken outliers in.
+#: Standard deviation about an axis, rad, above which no sensor is: an estimate above it comes from outliers.
 GROSS_RAD = 0.35
-#: So many of them at most.
+#: Largest number of frames and pairs that a warning names.
 NAMED = 5
 
 
@@ -54,29 +52,26 @@ class Graduated:
     Attributes
     ----------
     solution : Solution
-        Of the inliers, certified in full, under the variance factors.
-    weights : dict of (target, sensor) to (N,) array
-        0 or 1, in the order of ``problem.measurements``.
+        The certified solution of the inliers, under the variance factors.
     inliers : dict of (target, sensor) to (N,) booleans
+        In the order of ``problem.measurements``.
     variance_factors : VarianceFactors
-        Of the noise as given; 1 unless estimated.
+        Factors of the noise as given; 1 unless estimated.
     threshold : float
-        c^2, which inliers' squared residuals do not exceed.
+        c^2, the largest squared residual of an inlier.
     truncated_cost : float
         1/2 sum min(d^2, c^2).
     left_out : tuple of str
         Frames of which no measurement agrees; the solution lacks them.
     suspect : dict of str to (int, int)
-        Frames of which less than half agrees: how many do, of how many.
+        Frames of which less than half of the measurements agree: the number that agrees, and of all.
     suspect_pairs : dict of (target, sensor) to (int, int)
-        The same of pairs, where neither of the two frames is suspect as a whole.
-    iterations : int
-        Re-weighted solutions, of all starts together.
+        The same for pairs of which neither frame is suspect as a whole.
     history : tuple of Iteration
+        The re-weighted solutions, of all starts together.
     """
 
     solution: Solution
-    weights: dict[Pair, Array]
     inliers: dict[Pair, np.ndarray]
     variance_factors: VarianceFactors
     threshold: float
@@ -84,7 +79,6 @@ class Graduated:
     left_out: tuple[str, ...]
     suspect: dict[str, tuple[int, int]]
     suspect_pairs: dict[Pair, tuple[int, int]]
-    iterations: int
     history: tuple[Iteration, ...]
 
 
@@ -93,59 +87,49 @@ def graduated(
     *,
     confidence: float = 0.997,
     noise_scale: NoiseScale = "given",
-    max_iterations: int = 100,
     progress: Progress | None = None,
 ) -> Graduated:
-    """Reject outliers and calibrate from the rest.
+    """Reject outliers and calibrate from the inliers.
 
     Parameters
     ----------
     problem : Problem
-        With its raw measurements.
+        A problem that kept its raw measurements.
     confidence : float
         Probability that a good measurement is kept: c^2 is this quantile of chi-square with 6 degrees of freedom.
     noise_scale : "given" or "estimate"
-        Whether sigma and kappa (or covariances) are believed, or multiplied by variance factors, one for rotations and
-        one for translations, estimated from the inliers.
-    max_iterations : int
-        Of each start.
+        Take sigma and kappa (or covariances) as given; or multiply them by variance factors, one for rotations and one
+        for translations, which are estimated from the inliers.
     progress : callable, optional
-        Told each stage's name.
-
-    Returns
-    -------
-    Graduated
+        Is called with the name of each stage.
 
     Raises
     ------
     MeasurementsNotKeptError
-        When the problem was made with ``keep_measurements=False``.
+        If the problem was made with ``keep_measurements=False``.
     OutlierError
-        When too few measurements agree with one another for any answer.
-    OptionError
-        For a confidence or another option that cannot be meant.
+        If too few measurements agree with each other for an answer.
 
     Warns
     -----
     OutliersWarning
-        Where less than half of a frame's measurements agree, or of all (then sigma and kappa may claim too much). One
-        bad tag among many is no reason to give nothing: its own pose rests on what agrees, and the others do not use
-        the rest.
+        If less than half of a frame's measurements agree, or less than half of all measurements (then sigma and kappa
+        may be too small). One bad tag among many does not stop the calibration: its own pose rests on the measurements
+        that agree, and the other poses do not use the rejected ones.
     """
-    _check_options(confidence, noise_scale, max_iterations)
     tell = progress or silent
-    work = TruncatedLeastSquares(problem, float(chdtri(DOF, 1.0 - confidence)), max_iterations, tell)
+    work = TruncatedLeastSquares(problem, float(chdtri(DOF, 1.0 - confidence)), tell)
     try:
         fit, keep = work.run(noise_scale)
-        weights = work.measured.by_pair(keep.astype(np.float64))
         tell("certifying the inliers' solution")
+        weights = work.measured.by_pair(keep.astype(np.float64))
         solution = solve(reweighted(problem, weights, work.factors), progress=tell)
     except (UnderdeterminedError, CountError) as error:
         raise OutlierError(
             f"too few of the {problem.number_of_measurements} measurements agree for an answer ({error}). With "
-            f"confidence={confidence} a measurement agrees up to {np.sqrt(work.threshold):.3g} standard deviations in "
-            "all; noise='estimate' does not believe sigma and kappa; else check that B = T_sensor_target, that A "
-            "and B are of the same instant, and the names of targets"
+            f"confidence={confidence} a measurement agrees if it is within {np.sqrt(work.threshold):.3g} standard "
+            "deviations. If sigma and kappa may be too small, take noise='estimate'; else check that B = "
+            "T_sensor_target, that A and B are of the same instant, and the names of targets"
         ) from error
     inliers = work.measured.by_pair(keep)
     counts = {name: inlier_count(name, inliers) for name in problem.targets + problem.sensors}
@@ -160,15 +144,14 @@ def graduated(
     rotation_rad = float(np.sqrt(0.5 * work.factors.rotation / np.median(work.measured.kappa)))
     if noise_scale == "estimate" and rotation_rad > GROSS_RAD:
         warnings.warn(
-            f"no majority of the measurements agrees: the noise estimated for them is {np.degrees(rotation_rad):.0f} "
-            "degrees an axis, in which outliers hide. More than half may be wrong; noise='given', with sigma and "
-            "kappa, withstands more",
+            f"the estimated noise, {np.degrees(rotation_rad):.0f} degrees an axis, is too large for a sensor: more "
+            "than half of the measurements may be outliers. Give sigma and kappa and take noise='given', which "
+            "withstands more outliers",
             OutliersWarning,
             stacklevel=2,
         )
     return Graduated(
         solution=solution,
-        weights=weights,
         inliers=inliers,
         variance_factors=work.factors,
         threshold=work.threshold,
@@ -176,7 +159,6 @@ def graduated(
         left_out=left_out,
         suspect=suspect,
         suspect_pairs=suspect_pairs,
-        iterations=len(work.history),
         history=tuple(work.history),
     )
 
@@ -189,7 +171,7 @@ def _warn(
     threshold: float,
     noise_scale: NoiseScale,
 ) -> None:
-    """Say where less than half agrees: of all, or of some frames and pairs."""
+    """Warn if less than half of the measurements agree: of all, or of some frames and pairs."""
     named = [
         f"{name} ({good} of {total}{': left out' if name in left_out else ''})"
         for name, (good, total) in sorted(suspect.items(), key=lambda item: item[1][0] / item[1][1])
@@ -201,24 +183,15 @@ def _warn(
             "deviations; "
         )
         if noise_scale == "given":
-            message += "sigma and kappa may claim too much (noise='estimate'), or the frames may be confused"
+            message += "if sigma and kappa may be too small, take noise='estimate'; else check the names of frames"
         else:
             message += "check the frame convention, the stamps, and the names of targets"
     elif named:
-        more = f" and {len(named) - NAMED} more (suspect, suspect_pairs)" if len(named) > NAMED else ""
+        more = f" and {len(named) - NAMED} more" if len(named) > NAMED else ""
         message = (
-            f"less than half of the measurements agree of {', '.join(named[:NAMED])}{more}: moved, or confused with "
-            "another? Its pose rests on those that do; the others' poses do not rest on what was rejected"
+            f"less than half of the measurements agree with the answer for {', '.join(named[:NAMED])}{more}. Check "
+            "whether the frame has moved, or has another frame's name. The poses rest on the measurements that agree"
         )
     else:
         return
     warnings.warn(message, OutliersWarning, stacklevel=3)
-
-
-def _check_options(confidence: float, noise_scale: str, max_iterations: int) -> None:
-    if not (isinstance(confidence, float) and 0.5 < confidence < 1.0):
-        raise OptionError(f"confidence={confidence!r}; give a probability between 0.5 and 1")
-    if noise_scale not in get_args(NoiseScale):
-        raise OptionError(f"noise_scale={noise_scale!r} is not one of {', '.join(map(repr, get_args(NoiseScale)))}")
-    if not (isinstance(max_iterations, int) and max_iterations > 0):
-        raise OptionError(f"max_iterations={max_iterations!r}; give a positive number")

@@ -30,8 +30,8 @@ from gtsam_rwhec.refinement.weighting import (
 )
 from gtsam_rwhec.solver.parts import Part
 
-#: Tuning constants: 95 % efficient where the noise is Gaussian in six dimensions. (GTSAM weighs a factor by the length
-#: of its whitened residual; its defaults have that efficiency in one dimension, and 40 to 93 % in six.)
+#: GTSAM's losses and their tuning constants, with 95 % efficiency for Gaussian noise in six dimensions. (GTSAM weighs a
+#: factor by the length of its whitened residual. Its defaults have 95 % in one dimension, and 40 to 93 % in six.)
 LOSSES: dict[str, tuple[Any, float]] = {
     "huber": (gtsam.noiseModel.mEstimator.Huber, 1.869),
     "cauchy": (gtsam.noiseModel.mEstimator.Cauchy, 2.862),
@@ -44,9 +44,18 @@ LOSSES: dict[str, tuple[Any, float]] = {
 class CarrierVariables:
     """Carrier poses that are variables: one for each distinct (stamp, A) of the problem.
 
-    index (dict of pair to (N,) integers) tells which one a measurement saw, and first ((pair, i) of M) the other way
-    round; A (M, 4, 4) are the poses as given, and covariance (M, 6, 6) their noise. Sensors whose clocks are off by an
-    unknown time share none with others.
+    Sensors with an unknown time offset share no carrier pose with other sensors.
+
+    Attributes
+    ----------
+    index : dict of Pair to (N,) integers
+        The carrier pose of each measurement.
+    first : list of (Pair, int)
+        The first measurement at each of the M carrier poses.
+    A : (M, 4, 4) array
+        The poses as given, T_sensorcarrier_targetcarrier.
+    covariance : (M, 6, 6) array
+        Their noise.
     """
 
     index: dict[Pair, np.ndarray]
@@ -56,12 +65,12 @@ class CarrierVariables:
 
     @property
     def is_shared(self) -> bool:
-        """Whether two measurements saw one carrier pose."""
+        """Whether two measurements have one carrier pose."""
         return sum(len(index) for index in self.index.values()) > len(self.A)
 
     @staticmethod
     def of(data: list[PairData]) -> CarrierVariables:
-        """Measurements of one stamp and one A, and where there are no stamps those of one A, share a variable."""
+        """Measurements with one stamp and one A share a variable; without stamps, measurements with one A."""
         place: dict[tuple[int, bytes, str], int] = {}
         index: dict[Pair, np.ndarray] = {}
         A: list[Array] = []
@@ -73,7 +82,7 @@ class CarrierVariables:
             of_pair = np.empty(item.count, dtype=np.int64)
             for i, pose in enumerate(item.residuals.A):
                 stamp = -1 if item.stamps_ns is None else int(item.stamps_ns[i])
-                # Rounded well below any noise: the same pose may come out of two interpolations.
+                # Rounded well below any noise, as two interpolations of one pose differ by rounding.
                 clock = item.pair.sensor if item.paths is not None else ""
                 key = (stamp, np.round(pose[:3], 9).tobytes(), clock)
                 if key not in place:
@@ -83,8 +92,8 @@ class CarrierVariables:
                     first.append((item.pair, i))
                 elif not np.allclose(covariance[place[key]], item.carrier[i], rtol=1e-6, atol=0.0):
                     raise NoiseError(
-                        f"{first[place[key]][0]} and {item.pair} saw one carrier pose (measurement "
-                        f"{i} of the latter), and CarrierNoise.covariances gives it two noises; one pose has one"
+                        f"{first[place[key]][0]} and {item.pair} share a carrier pose (its measurement {i}), "
+                        "but CarrierNoise.covariances differ there; give equal covariances for one pose"
                     )
                 of_pair[i] = place[key]
             index[item.pair] = of_pair
@@ -94,7 +103,7 @@ class CarrierVariables:
 def summary_of(
     part: Part, pair_index: int, factors: VarianceFactors, component: Component | None = None
 ) -> EdgeSummary:
-    """A pair's moments as one summary, its variances multiplied by the factors; or of one component alone."""
+    """A pair's moments as one summary, with variances multiplied by the factors; or the summary of one component."""
     moments = part.moments
     one = slice(pair_index, pair_index + 1)
     translation, rotation = edge_forms(moments.translation[one], moments.rotation[one], moments.kappa[one])
@@ -105,7 +114,7 @@ def summary_of(
         form += translation[0] / factors.translation
     target, sensor = part.pairs[pair_index]
     scale = part.fixed_scales.get(target, 1.0)
-    if scale != 1.0:  # the form's variables are measured lengths, the factor's true ones
+    if scale != 1.0:  # the form has measured lengths, the factor true lengths
         unit = np.r_[np.full(7, scale), np.ones(18)]
         form = form * unit[:, None] * unit
     return EdgeSummary(
@@ -117,7 +126,7 @@ def summary_of(
 
 
 def add_summary(graph: gtsam.NonlinearFactorGraph, variables: Variables, pair: Pair, summary: EdgeSummary) -> None:
-    """One chordal factor for all measurements of a pair, from moments (DESIGN fact 2)."""
+    """One chordal factor for all measurements of a pair, from moments (design fact 2)."""
     target, sensor = variables.ends(pair)
     scale_key = variables.scale_key(pair)
     if pair.is_motion:
@@ -132,7 +141,7 @@ def add_batches(
     data: list[PairData],
     roots: dict[Pair, Array],
 ) -> None:
-    """One geodesic factor for each pair, with every measurement in it under its own weight."""
+    """One geodesic factor for each pair, in which every measurement has its own weight."""
     for item in data:
         target, sensor = variables.ends(item.pair)
         graph.add(
@@ -150,7 +159,7 @@ def add_batches(
 
 
 def robust_noise(covariance: Array, robust: Robust) -> gtsam.noiseModel.Base:
-    """A Gaussian (6, 6) in one of GTSAM's losses."""
+    """The noise model of a covariance (6, 6), under one of GTSAM's losses if ``robust`` names one."""
     gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance)
     return gtsam.noiseModel.Robust.Create(loss_of(robust), gaussian) if robust in LOSSES else gaussian
 
@@ -168,7 +177,7 @@ def add_single(
     covariances: dict[Pair, Array],
     robust: Robust,
 ) -> None:
-    """One geodesic factor for each measurement, so that GTSAM's losses weigh each on its own."""
+    """One geodesic factor for each measurement, so that GTSAM's losses weigh each measurement."""
     for item in data:
         target, sensor = variables.ends(item.pair)
         twists = item.residuals.twists
@@ -195,9 +204,9 @@ def add_with_carriers(
     factors: FactorsByPair,
     robust: Robust,
 ) -> None:
-    """Carrier poses as variables, each with a prior at what was measured; one factor for each measurement.
+    """Carrier poses as variables, each with a prior at its measured pose; one factor for each measurement.
 
-    Where a clock is off, the variable is the pose at the true time, and its prior moves along the carrier's path.
+    With a time offset the variable is the pose at the true time, and its prior moves along the carrier's path.
     """
     of_pair = {item.pair: item for item in data}
     for i, ((pair, place), covariance) in enumerate(zip(carriers.first, carriers.covariance, strict=True)):
@@ -227,8 +236,11 @@ def add_with_carriers(
             )
 
 
-def add_fixed(graph: gtsam.NonlinearFactorGraph, variables: Variables, problem: Problem) -> None:
-    """Known frames as hard constraints."""
+def add_knowledge(
+    graph: gtsam.NonlinearFactorGraph, variables: Variables, problem: Problem, residual: ResidualKind
+) -> None:
+    """Priors, and fixed frames as hard constraints."""
+    add_priors(graph, variables, problem, residual)
     for name, T in problem.fixed.items():
         graph.add(gtsam.NonlinearEqualityPose3(variables.frames[name], to_pose3(T[:3, :3], T[:3, 3])))
 
@@ -236,7 +248,7 @@ def add_fixed(graph: gtsam.NonlinearFactorGraph, variables: Variables, problem: 
 def add_priors(
     graph: gtsam.NonlinearFactorGraph, variables: Variables, problem: Problem, residual: ResidualKind
 ) -> None:
-    """Beliefs: |t - t_0|^2 / sigma_0^2, and kappa_0 |R - R_0|_F^2 (DESIGN fact 11) or its angle's 2 kappa_0 theta^2."""
+    """Priors: |t - t_0|^2 / sigma_0^2, and kappa_0 |R - R_0|_F^2 (design fact 11) or 2 kappa_0 theta^2 of the angle."""
     for name, priors in problem.priors.items():
         if name in problem.fixed:
             continue

@@ -1,14 +1,15 @@
-"""Which measurements agree where their noise is no pair of numbers: full covariances of B, and noise in A.
+"""Inliers where sigma and kappa do not hold the whole noise: full covariances of B, and noise in A.
 
-Graduated truncation runs on the certified form, which has one sigma and one kappa a measurement. With covariances that
-are long one way, a fit under their mean is off by many standard deviations the other way, and good measurements would
-go. So it runs under the worst axis first, which keeps every good one and leaves out what is gross, and what is kept is
-then refined and chosen anew under the noise as it is, until the choice stays the same.
+Graduated truncation runs on the certified form, which has one sigma and one kappa a measurement. If a covariance is
+long along one axis, a fit under its mean is off by many standard deviations along another axis, and good measurements
+would be left out. So the truncation first takes the noise of each measurement's worst axis, which keeps every good
+measurement and leaves out gross outliers. The kept measurements are then refined and chosen again under the full noise,
+until the choice stays the same.
 """
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,19 +24,19 @@ from gtsam_rwhec.refinement.weighting import FactorsByPair, residual_covariance
 
 
 def under_worst_axis(problem: Problem, data: list[PairData], variables: Variables, state: State) -> Problem:
-    """The problem with isotropic noise as large as that of B and A together is along its worst axis.
+    """The problem with isotropic noise: the noise of B and A together along its worst axis.
 
-    ``state`` tells how far A's noise reaches, and where the carriers were when a sensor's clock is off.
+    ``state`` gives the lever arms of A's noise, and the carriers' poses when a sensor's clock is off.
     """
     at = linearized(data, variables, state)
     edges = {}
     for item in data:
         C = residual_covariance(item, at[item.pair], AS_STATED)
-        scale = problem.fixed_scales.get(item.pair.target, 1.0)  # the data are in true metres there
+        scale = problem.fixed_scales.get(item.pair.target, 1.0)  # the data are in true metres
         A = item.residuals.A
         if item.paths is not None:
             A = A @ item.paths.motion(state.offsets_s[item.pair.sensor])
-        edges[item.pair] = dataclasses.replace(
+        edges[item.pair] = replace(
             problem.measurements(*item.pair),
             A=A,
             sigma=scale * np.sqrt(np.linalg.eigvalsh(C[:, 3:, 3:])[:, -1]),
@@ -48,7 +49,7 @@ def under_worst_axis(problem: Problem, data: list[PairData], variables: Variable
 def inliers_of(
     data: list[PairData], variables: Variables, state: State, factors: FactorsByPair, threshold: float
 ) -> dict[Pair, np.ndarray]:
-    """Of every pair (N,) booleans: r' C^-1 r is within the threshold. Of frames that the estimate lacks: none."""
+    """By pair, (N,) booleans: r' C^-1 r is within the threshold. False where the estimate lacks a frame."""
     known = set(state.X) | set(state.Y)
     present = [item for item in data if known.issuperset(item.pair)]
     at = linearized(present, variables, state)

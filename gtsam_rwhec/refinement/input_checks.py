@@ -1,4 +1,4 @@
-"""Whether a problem, its solution and the options of a refinement go together."""
+"""Checks that a problem, its solution and the options of a refinement agree."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gtsam_rwhec.solving.solution import Solution
 
 
 def check_inputs(problem: Problem, solution: Solution, options: RefineOptions) -> None:
-    """Refuse what cannot be refined, or not with these options; ``refine`` says what it raises."""
+    """Refuse a problem that cannot be refined from this solution with these options; ``refine`` lists the errors."""
     if not isinstance(problem, Problem):
         raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
     if not isinstance(solution, Solution):
@@ -19,18 +19,18 @@ def check_inputs(problem: Problem, solution: Solution, options: RefineOptions) -
         raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.RefineOptions")
     if solution.scale_mode != problem.scale:
         raise ScaleError(
-            f"the solution is of a problem with scale={solution.scale_mode!r}, this one has scale={problem.scale!r}; "
-            "solve this problem first"
+            f"the solution is of a problem with scale={solution.scale_mode!r}, but this problem has "
+            f"scale={problem.scale!r}; solve this problem first"
         )
     problem.require_pairs()
     try:
         check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
     except FrameError as error:
-        raise FrameError(f"the solution is of another problem; solve this one first ({error})") from error
+        raise FrameError(f"the solution is of another problem; solve this problem first ({error})") from error
     if options.noise == "given" and problem.is_relative:
         raise OptionError(
-            "noise='given', but some measurements were added without sigma or kappa, so that no noise was given; "
-            "take noise='estimate'"
+            "noise='given', but some measurements were added without sigma or kappa; take noise='estimate', or add "
+            "sigma and kappa"
         )
     if options.robust == "gnc":
         problem.require_raw_measurements("robust='gnc'")
@@ -43,6 +43,7 @@ def sensors_with_offset(problem: Problem, options: RefineOptions) -> tuple[str, 
     for name in options.time_offsets:
         if name not in problem.sensors:
             raise FrameError(
-                f"RefineOptions.time_offsets names {name!r}, which is no sensor; there are {', '.join(problem.sensors)}"
+                f"RefineOptions.time_offsets names {name!r}, which is not a sensor; give any of "
+                f"{', '.join(problem.sensors)}"
             )
     return tuple(options.time_offsets)

@@ -1,11 +1,12 @@
-"""From an information matrix with free directions to covariances that are infinite along them.
+"""Covariances from an information matrix with free directions: infinite along these, finite elsewhere.
 
-With F the free directions (``FreeSpace``), a prior of variance tau along them has, for tau to infinity, the covariance
+F are the free directions (``FreeSpace``), and Q spans their orthogonal complement. With a prior of variance tau along F
+the covariance is, for tau to infinity,
 
-    tau F F' + Q (Q' Lambda Q)^-1 Q'          (Q spans F's orthogonal complement)
+    tau F F' + Q (Q' Lambda Q)^-1 Q'
 
-so that whatever F does not touch has a finite covariance, and everything else an infinite one. GTSAM's Marginals throw
-there, or return 1e18.
+so it is finite for every function that F does not change, and infinite for the others. For such a matrix GTSAM's
+Marginals raise an error or return 1e18.
 """
 
 from __future__ import annotations
@@ -20,29 +21,29 @@ from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.refinement.unknowns import Unknown, rows_of, slots_of
 
-#: A linear function whose share along the free directions is below this is called determined (the share below which a
-#: free direction's sentence leaves a frame out).
+#: Share along the free directions below which a linear function is determined. (A free direction's sentence leaves out
+#: frames below the same share.)
 SHARE = 0.05
-#: How far along a free direction an estimate is taken to be from the truth, in units (the typical length).
+#: Distance of an estimate from the truth along a free direction, in units (the typical length).
 DISPLACED = 1.0
-#: Below this, of the largest, an equilibrated information's eigenvalue is rounding.
+#: Share of the largest eigenvalue of an equilibrated information below which an eigenvalue is rounding.
 ROUNDING = 1e-13
 
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """Of all unknowns together: dense, d x d.
+    """The covariance of all unknowns together: dense, d x d.
 
     Attributes
     ----------
     slots : dict of Unknown to slice
-        Rows of each.
+        The rows of each unknown.
     finite : (d, d) array
         Q (Q' Lambda Q)^-1 Q'.
     free : (d, k) array
         Directions of infinite variance, orthonormal in units of ``unit``.
     unit : (d,) array
-        What counts as one: 1 rad, the typical length, ...
+        The unit of each parameter: 1 rad, the typical length (m), a scale's value, 1 s.
     """
 
     slots: dict[Unknown, slice]
@@ -52,27 +53,20 @@ class JointCovariance:
 
     @staticmethod
     def of(unknowns: tuple[Unknown, ...], information: Array, free: Array, unit: Array) -> JointCovariance:
-        """Invert.
+        """The inverse of an information (d, d) of the unknowns in their order.
 
-        Parameters
-        ----------
-        unknowns : tuple of Unknown
-            What the rows are of, in order.
-        information : (d, d) array
-        free : (d, k) array
-            Directions that the measurements leave free, in the parameters' own units; k may be 0.
-        unit : (d,) array
+        ``free`` (d, k) are the free directions in the parameters' own units; k may be 0.
         """
         scaled = information * unit[:, None] * unit
         scaled = 0.5 * (scaled + scaled.T)
         basis = _orthonormal(free / unit[:, None])
         Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if basis.shape[1] else np.eye(len(unit))
         inside = Q.T @ scaled @ Q
-        # Equilibrated, so that rounding is judged by each parameter's own information.
+        # Equilibrated, so that each parameter's own information is the scale of its rounding.
         size = np.sqrt(np.maximum(np.diagonal(inside), 1e-300))
         values, vectors = np.linalg.eigh(inside / size[:, None] / size)
         lost = values <= ROUNDING * values.max(initial=0.0)
-        if lost.any():  # no measurement speaks of these at all
+        if lost.any():  # no measurement depends on these directions
             more = Q @ (vectors[:, lost] / size[:, None])
             return JointCovariance.of(unknowns, information, np.hstack([free, more * unit[:, None]]), unit)
         root = Q @ (vectors / np.sqrt(values) / size[:, None])
@@ -80,27 +74,20 @@ class JointCovariance:
         return JointCovariance(slots_of(unknowns), finite, basis, unit)
 
     def rows(self, unknowns: tuple[Unknown, ...]) -> np.ndarray:
-        """Indices of some unknowns, in the order given.
-
-        Raises
-        ------
-        FrameError
-            For what is not among the unknowns.
-        """
+        """The row indices of some unknowns, in the order given; FrameError for any other name."""
         for unknown in unknowns:
             if unknown not in self.slots:
                 there = ", ".join(map(str, self.slots))
-                raise FrameError(f"there is no {str(unknown)!r} among the unknowns; there are {there}")
+                raise FrameError(f"{str(unknown)!r} is not among the unknowns; they are {there}")
         return rows_of(self.slots, unknowns)
 
     def selector(self, unknowns: tuple[Unknown, ...]) -> Array:
-        """(m, d): picks their rows."""
+        """The matrix (m, d) that selects the rows of some unknowns."""
         selected: Array = np.eye(len(self.unit))[self.rows(unknowns)]
         return selected
 
     def reach(self, G: Array) -> Array:
-        """(m, k): how far the rows of G move when the free directions are gone along until the parameter that moves
-        most has moved by one unit."""
+        """The movement (m, k) of the rows of G along each free direction that moves one parameter by a unit."""
         if self.free.shape[1] == 0:
             return np.zeros((len(G), 0))
         # Many frames that move together share one direction's length.
@@ -109,11 +96,11 @@ class JointCovariance:
         return moved
 
     def covariance_of(self, G: Array) -> Array:
-        """(m, m) covariance of the linear functions G (m, d) of the unknowns.
+        """The covariance (m, m) of the linear functions G (m, d) of the unknowns.
 
-        Infinite in every row that a free direction reaches, and between two such rows of one direction (with the sign
-        of their correlation). A row that it reaches by next to nothing (``SHARE``) has the variance that going along
-        it by ``DISPLACED`` units makes: an estimate is somewhere on the free direction, not anywhere.
+        The variance of every row that a free direction changes is infinite. So is the covariance of two rows that one
+        direction changes, with the sign of their correlation. A row that a direction changes by less than ``SHARE``
+        keeps a finite variance, which includes a displacement by ``DISPLACED`` units along the direction.
         """
         moved = self.reach(G)
         length = np.linalg.norm(G * self.unit, axis=1)
@@ -126,11 +113,11 @@ class JointCovariance:
         return covariance
 
     def information_of(self, unknowns: tuple[Unknown, ...]) -> Array:
-        """(m, m) marginal information: the inverse of the covariance where it is finite, 0 along free directions."""
+        """The marginal information (m, m): the inverse of the finite covariance, and 0 along free directions."""
         chosen = self.selector(unknowns)
         unit = self.unit[self.rows(unknowns)]
         moved = self.reach(chosen) / unit[:, None]
-        # Directions among these that a free one reaches, strongest first; the rest of them counts as displaced.
+        # Functions of these unknowns that free directions change, strongest first; those below SHARE are displaced.
         U, s, _ = np.linalg.svd(moved, full_matrices=True)
         rank = int((s > SHARE).sum())
         turned = block_diag(*(self.turned(unknown) for unknown in unknowns))
@@ -142,10 +129,10 @@ class JointCovariance:
         return marginal
 
     def turned(self, unknown: Unknown) -> Array:
-        """(m, m): what a rotation's error does to a frame that is displaced along a free direction.
+        """The covariance (m, m) that a rotation's error adds to a frame that is displaced along a free direction.
 
-        The direction is known as well as the rotation is: displaced by f, an error omega moves the frame across it by
-        omega x f. Second order, but f is no small perturbation.
+        An error omega of the rotation turns the free direction with it: a frame displaced by f moves by omega x f. The
+        term is of second order, but f is not small.
         """
         rows = self.rows((unknown,))
         result = np.zeros((len(rows), len(rows)))

@@ -1,4 +1,4 @@
-"""GTSAM's optimiser, and the information that the unknowns are left with."""
+"""GTSAM's optimiser, and the information of the unknowns at its optimum."""
 
 from __future__ import annotations
 
@@ -15,30 +15,28 @@ from gtsam_rwhec.refinement.variables import Variables
 
 @dataclass(frozen=True)
 class Optimum:
-    """Values at the optimum, and how the optimiser came there."""
+    """Values at the optimum, their cost, and the optimiser's number of iterations."""
 
     values: gtsam.Values
-    initial_cost: float
     cost: float
     iterations: int
 
 
 def optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, max_iterations: int) -> Optimum:
-    """Levenberg-Marquardt to the last digits: the start is as good as optimal, and steps are cheap."""
+    """Levenberg-Marquardt's optimum, to the last digits: the start is nearly optimal, and steps are cheap."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
     parameters.setRelativeErrorTol(1e-12)
     parameters.setAbsoluteErrorTol(1e-12)
-    initial = graph.error(values)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
     optimum = optimiser.optimize()
-    return Optimum(optimum, initial, optimiser.error(), optimiser.iterations())
+    return Optimum(optimum, optimiser.error(), optimiser.iterations())
 
 
 def information_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, variables: Variables) -> Array:
-    """Gauss-Newton information (d, d) of ``variables.unknowns`` in their order, everything else marginalised.
+    """Gauss-Newton information (d, d) of ``variables.unknowns`` in their order, with all other variables marginalised.
 
-    ``graph`` is without the constraints of fixed frames: known means that their rows are struck out.
+    ``graph`` has no constraints of fixed frames: their rows are left out here.
     """
     linear = graph.linearize(values)
     keys = variables.keys
@@ -49,9 +47,9 @@ def information_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, vari
             linear = linear.marginal([key for key in keys.values() if key in present])
         except RuntimeError as error:  # GTSAM's IndeterminateSystemException
             raise NoiseError(
-                "the carrier poses cannot be told apart from rounding: A's noise, turned about the origin that it is "
-                "given about, moves what is far from it by far more than it says. Give it about the other carrier "
-                "(CarrierNoise.about), or refer the world to an origin nearby"
+                "the carrier poses cannot be computed in double precision: A's rotation noise, about the origin that "
+                "it is given about, moves frames far away by very much. Give the noise about the other carrier "
+                "(CarrierNoise.about), or take a world origin near the measurements"
             ) from error
     seen = slots_of(unknown for unknown, key in keys.items() if key in present)
     ordering = gtsam.Ordering()

@@ -1,4 +1,4 @@
-"""Options of the refinement."""
+"""The options of a refinement, and the noise of carrier poses."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ About = Literal["targetcarrier", "sensorcarrier"]
 
 @dataclass(frozen=True)
 class CarrierNoise:
-    """Noise of the carrier poses A = T_sensorcarrier_targetcarrier, which kinematics and motion capture always have.
+    """Noise of the carrier poses A = T_sensorcarrier_targetcarrier, from kinematics or motion capture.
 
     Attributes
     ----------
     rotation_rad, translation_m : float
-        Standard deviations about and along each axis, in rad and m.
+        Standard deviations about each axis, rad, and along each axis, m.
     covariances : dict of (target, sensor) to (N, 6, 6) array, optional
-        One for each measurement in their place, rotation first.
+        A covariance for each measurement, in place of the standard deviations; rotation first.
     about : "targetcarrier" or "sensorcarrier"
-        In whose axes, and about whose origin, the perturbation is: A Expmap(xi) for the target carrier (an arm's hand
-        that is off in its own frame, with A = T_base_hand), Expmap(xi) A for the sensor carrier.
+        The carrier whose axes and origin the perturbation has: A Expmap(xi) for the target carrier (the error of an
+        arm's hand in its own frame, with A = T_base_hand), Expmap(xi) A for the sensor carrier.
     """
 
     rotation_rad: float = 0.0
@@ -48,8 +48,8 @@ class CarrierNoise:
         if self.covariances is not None:
             if self.rotation_rad or self.translation_m:
                 raise NoiseError(
-                    f"CarrierNoise has covariances and rotation_rad={self.rotation_rad!r}, "
-                    f"translation_m={self.translation_m!r} too; give the one or the other"
+                    f"CarrierNoise has covariances, and also rotation_rad={self.rotation_rad!r} and "
+                    f"translation_m={self.translation_m!r}; give covariances or standard deviations, not both"
                 )
             return
         for name in ("rotation_rad", "translation_m"):
@@ -63,37 +63,39 @@ class CarrierNoise:
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """How to refine.
+    """The options of ``refine``.
 
     Attributes
     ----------
     noise : "auto", "given" or "estimate"
-        Of B: as the measurements' sigma, kappa or covariances say, or those times variance factors, one for rotations
-        and one for translations, estimated from the residuals. "auto": given where there are weights, else estimated.
+        The noise of B. "given": the measurements' sigma, kappa or covariances. "estimate": these times variance
+        factors, one for rotations and one for translations, estimated from the residuals. "auto": given if there are
+        weights, else estimated.
     noise_groups : "all", "sensor" or "pair"
-        Whose residuals share a variance factor.
+        The groups of residuals that share a variance factor.
     residual : "geodesic" or "chordal"
-        Log(B^-1 Y^-1 A X) with any 6 x 6 covariance, from the raw measurements; or the certified cost's own, from
-        moments alone, with which GTSAM's optimum is the certified one.
+        "geodesic": Log(B^-1 Y^-1 A X) with any 6 x 6 covariance, from the raw measurements. "chordal": the certified
+        cost's residual, from moments alone; then GTSAM's optimum is the certified optimum.
     robust : "none", "huber", "cauchy", "tukey", "geman_mcclure" or "gnc"
-        GTSAM's losses (95 % efficient at Gaussian noise; from the certified solution, by way of "huber", which many
-        gross outliers have pulled away); or graduated truncated least squares around the certified solver, which needs
-        no good start, and after which outliers are left out.
+        GTSAM's losses start at the certified solution, by way of "huber", and have 95 % efficiency for Gaussian noise.
+        Many gross outliers pull this start away. "gnc" is graduated truncated least squares around the certified
+        solver. It needs no good start, and leaves outliers out.
     inlier_confidence : float
         With "gnc": probability that a good measurement is kept.
     carrier_noise : CarrierNoise, optional
-        Of A; left out, A is taken for exact, and where it is not, covariances are too small.
+        The noise of A. Without it A counts as exact; if A is not exact, covariances are then too small.
     carrier_model : "auto", "propagated" or "variables"
-        A's noise carried into each residual to first order; or each A a variable, shared between the measurements of
-        one stamp. "auto": variables where measurements share a stamp, else propagated, which is then the same.
+        "propagated": A's noise is propagated into each residual to first order. "variables": each A is a variable,
+        shared by the measurements of one stamp. "auto": variables if measurements share a stamp; else propagated, which
+        is then the same.
     time_offsets : bool or tuple of str
-        Estimate an offset of the clock of each sensor, or of those named: a stamp t is the carriers' t + offset
-        (Kalibr's convention). Needs stamps.
+        Estimate the clock offset of each sensor, or of the named sensors: a sensor's stamp t is the carriers' t +
+        offset (Kalibr's convention). The measurements need stamps.
     carrier_path : Trajectory, optional
-        T_sensorcarrier_targetcarrier over time as it was logged, faster than measurements were made: time offsets move
-        A along it. Left out, the measurements' own A tell how the carriers moved.
+        T_sensorcarrier_targetcarrier over time, logged faster than the measurements were made. Time offsets move A
+        along this path. Without it the measurements' own A give the carriers' motion.
     max_iterations : int
-        Levenberg-Marquardt steps.
+        Largest number of Levenberg-Marquardt steps.
     """
 
     noise: NoiseSource = "auto"
@@ -128,7 +130,7 @@ class RefineOptions:
                 "CarrierNoise(rotation_rad=..., translation_m=...)"
             )
         if self.carrier_path is not None and not self.time_offsets:
-            raise OptionError("RefineOptions.carrier_path is for time offsets; without time_offsets it says nothing")
+            raise OptionError("RefineOptions.carrier_path has no use without time_offsets; give time_offsets too")
         if self.residual == "chordal":
             for name, value in (
                 ("carrier_noise", self.carrier_noise),
@@ -137,7 +139,7 @@ class RefineOptions:
             ):
                 if value:
                     raise OptionError(
-                        f"RefineOptions.{name}={value!r} needs residual='geodesic': the chordal one is made of moments"
+                        f"RefineOptions.{name}={value!r} needs residual='geodesic'; the chordal one has moments only"
                     )
 
 

@@ -1,4 +1,4 @@
-"""A pair's raw measurements with the noise of B and of A, ready for residuals."""
+"""A pair's raw measurements with the noise of B and of A, and the carriers' motion about their stamps."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class PairData:
-    """One pair's measurements, translations of B in true metres where their scale is known.
+    """One pair's measurements; translations of B are in true metres where the scale is known.
 
     Attributes
     ----------
     pair : Pair
     residuals : BatchResiduals
-        Geodesic.
+        The geodesic residuals.
     covariance : (N, 6, 6) array
-        Of B's right perturbation, as given: sigma and kappa (1 / sqrt(2 kappa) rad an axis), or full covariances.
+        Covariances of B's right perturbation, as given: sigma and kappa (1 / sqrt(2 kappa) rad an axis), or full ones.
     carrier : (N, 6, 6) array or None
-        Of A's right perturbation.
+        Covariances of A's right perturbation.
     stamps_ns : (N,) array or None
     paths : LocalPaths or None
         The carriers' motion about each stamp, where the sensor's clock has an offset.
@@ -50,14 +50,14 @@ class PairData:
 
     @staticmethod
     def of(problem: Problem, pair: Pair, options: RefineOptions, paths: LocalPaths | None) -> PairData:
-        """From a problem; with a time offset where there are ``paths``.
+        """A pair of a problem; with ``paths`` the sensor's clock has an offset.
 
         Raises
         ------
         MeasurementsNotKeptError
-            When there are moments only.
+            If the problem kept moments only.
         NoiseError, CountError
-            For carrier covariances that lack this pair or have another count.
+            If the carrier covariances lack this pair or have another count.
         """
         raw = problem.measurements(*pair)
         scale = problem.fixed_scales.get(pair.target, 1.0)
@@ -78,7 +78,7 @@ class PairData:
         )
 
     def at(self, offset_s: float) -> BatchResiduals:
-        """Residuals whose time offset is linearised where it stands: exact there, along the twist of that instant."""
+        """Residuals linearised at a time offset: exact at this offset, with the twists of that instant."""
         if self.paths is None or offset_s == 0.0:
             return self.residuals
         twists = self.paths.twists(offset_s)
@@ -86,7 +86,7 @@ class PairData:
         return BatchResiduals(there @ se3.expmap(-offset_s * twists), self.residuals.B, twists=twists)
 
     def selected(self, mask: np.ndarray) -> PairData:
-        """Of the measurements marked; what is known of A all along (its twists) stays known."""
+        """The measurements that the mask marks, with their twists."""
         return PairData(
             self.pair,
             BatchResiduals(
@@ -106,69 +106,54 @@ def local_paths(
 ) -> dict[Pair, LocalPaths]:
     """The carriers' motion about the stamps of the sensors' pairs.
 
-    From the path as it was logged where it is given; else from the measurements' own poses. The carriers are the same
-    for all sensors and targets, as a rule, so that every pair's poses tell it; where two pairs have different poses at
-    one stamp (several robots), each pair's own do.
+    The motion comes from the logged path if it is given, else from the measurements' own poses. Usually all sensors and
+    targets have the same carriers, so every pair's poses are used together. If two pairs have different poses at one
+    stamp (several robots), the poses of each pair are used alone.
 
     Raises
     ------
     CountError
-        For measurements without stamps, or poses that do not tell a motion.
+        If measurements have no stamps, or their poses do not determine a motion.
     OptionError
-        For a sensor with motions of its own.
+        If a sensor has motions of its own.
     """
-    pairs = [pair for pair in problem.pairs if pair.sensor in sensors]
-    for pair in pairs:
+    stamps_of: dict[Pair, np.ndarray] = {}
+    for pair in [pair for pair in problem.pairs if pair.sensor in sensors]:
         if pair.is_motion:
             raise OptionError(
-                f"a time offset would move both ends of {pair} (add_motion), which is not modelled; leave "
+                f"{pair.sensor} has motions of its own (add_motion), for which time offsets are not modelled; leave "
                 f"{pair.sensor} out of time_offsets"
             )
-        if problem.measurements(*pair).stamps_ns is None:
+        own = problem.measurements(*pair).stamps_ns
+        if own is None:
             raise CountError(f"{pair}: a time offset needs stamps for every measurement; add them with stamps_ns=")
-    if not pairs:
+        stamps_of[pair] = own
+    if not stamps_of:
         return {}
     if carrier_path is not None:
-        stamps_of = {pair: problem.measurements(*pair).stamps_ns for pair in pairs}
-        return {
-            pair: LocalPaths.along(carrier_path, stamps) for pair, stamps in stamps_of.items() if stamps is not None
-        }
-    telling = [problem.measurements(*pair) for pair in problem.pairs if not pair.is_motion]
-    telling = [raw for raw in telling if raw.stamps_ns is not None]
-    A = np.concatenate([raw.A for raw in telling])
-    stamps = np.concatenate([raw.stamps_ns for raw in telling])
+        return {pair: LocalPaths.along(carrier_path, own) for pair, own in stamps_of.items()}
+    stamped = [problem.measurements(*pair) for pair in problem.pairs if not pair.is_motion]
+    stamped = [raw for raw in stamped if raw.stamps_ns is not None]
+    A = np.concatenate([raw.A for raw in stamped])
+    stamps = np.concatenate([raw.stamps_ns for raw in stamped])
     order = np.argsort(stamps, kind="stable")
     same = np.diff(stamps[order]) == 0
     if (np.abs(np.diff(A[order], axis=0))[same] > SAME_POSE).any():
-        return {pair: _paths_of_pair(problem, pair) for pair in pairs}
-    # Of all stamps once, then each pair's own among them.
+        return {pair: LocalPaths.of(problem.measurements(*pair).A, own, pair.label) for pair, own in stamps_of.items()}
     unique, first = np.unique(stamps, return_index=True)
     paths = LocalPaths.of(A[first], unique, "the carriers")
-    of_pairs = {pair: problem.measurements(*pair).stamps_ns for pair in pairs}
-    return {pair: paths.selected(np.searchsorted(unique, s)) for pair, s in of_pairs.items() if s is not None}
-
-
-def _paths_of_pair(problem: Problem, pair: Pair) -> LocalPaths:
-    raw = problem.measurements(*pair)
-    assert raw.stamps_ns is not None
-    return LocalPaths.of(raw.A, raw.stamps_ns, pair.label)
+    return {pair: paths.selected(np.searchsorted(unique, own)) for pair, own in stamps_of.items()}
 
 
 def carrier_covariances(noise: CarrierNoise, pair: Pair, A: Array) -> Array:
-    """Of A's right perturbation, (N, 6, 6), whichever way they were given.
-
-    Raises
-    ------
-    NoiseError, CountError
-        Where the pair has none, or another number of them.
-    """
+    """Covariances (N, 6, 6) of A's right perturbation; NoiseError or CountError if the pair has none or too few."""
     if noise.covariances is None:
         variances = np.r_[np.full(3, noise.rotation_rad**2), np.full(3, noise.translation_m**2)]
         given = np.broadcast_to(np.diag(variances), (len(A), 6, 6))
     else:
         if pair not in noise.covariances:
             there = ", ".join(str(Pair(*known)) for known in noise.covariances)
-            raise NoiseError(f"CarrierNoise.covariances has none for {pair}; it has {there}")
+            raise NoiseError(f"CarrierNoise.covariances lacks {pair}; it has {there}")
         checked = checked_covariances(noise.covariances[pair], len(A), f"CarrierNoise of {pair}")
         if checked is None:
             raise CountError(f"CarrierNoise.covariances of {pair} is None; give {len(A)} of 6 x 6")
@@ -182,16 +167,10 @@ def carrier_covariances(noise: CarrierNoise, pair: Pair, A: Array) -> Array:
 
 
 def check_carriers(data: list[PairData], options: RefineOptions) -> None:
-    """Motions' A's are differences of poses, whose noise is not that of one pose: refused as variables.
-
-    Raises
-    ------
-    OptionError
-        For carrier variables with motions.
-    """
+    """Refuse motions with carrier variables: the A of a motion is a relative pose, which is not one carrier pose."""
     motions = [item.pair for item in data if item.pair.is_motion]
     if motions and options.carrier_model == "variables":
         raise OptionError(
-            f"carrier_model='variables' makes each A a pose, but {motions[0]} have a relative A; take "
-            "carrier_model='propagated'"
+            f"carrier_model='variables' makes each A a variable pose, but {motions[0]} have a relative A; "
+            "take carrier_model='propagated'"
         )

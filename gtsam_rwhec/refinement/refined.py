@@ -1,4 +1,4 @@
-"""What refining returns."""
+"""The refined calibration: poses, covariances, noise, and the GTSAM graph."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gtsam_rwhec.solving.solution import Solution
 
 @dataclass(frozen=True)
 class Movement:
-    """How far a frame moved from the certified solution: translation_mm and rotation_deg."""
+    """The difference of a frame's pose from the certified solution: translation_mm and rotation_deg."""
 
     translation_mm: float
     rotation_deg: float
@@ -32,9 +32,9 @@ class Movement:
 
 @dataclass(frozen=True)
 class PairNoise:
-    """The noise of a pair's B that the covariances rest on, root mean square an axis, and how well it is known.
+    """The noise of a pair's B, root mean square over measurements and axes.
 
-    ``degrees_of_freedom``, (rotation, translation), is how many the noise was estimated with: infinite where given.
+    ``degrees_of_freedom`` (rotation, translation) of the estimated noise; infinite if the noise was given.
     """
 
     rotation_rad: float
@@ -44,11 +44,10 @@ class PairNoise:
 
 @dataclass(frozen=True)
 class RefinedPoses:
-    """Refined poses and how well they are known: what a result file keeps of a `Refined`.
+    """Refined poses with their covariances: the part of a `Refined` that a result file keeps.
 
     Covariances are of right perturbations, T Expmap(xi), xi = [omega (rad), v (m)], in the frame's own axes (GTSAM's
-    convention; ``rw.pose_covariances`` turns them into others). They are infinite along directions that the
-    measurements leave free.
+    convention; ``rw.pose_covariances`` converts them). They are infinite along free directions.
 
     Attributes
     ----------
@@ -57,20 +56,20 @@ class RefinedPoses:
     scale : float or dict of str to float
     scale_mode : "known", "shared" or "per_target"
     time_offsets_s : dict of str to float
-        Of each sensor for which it was estimated: its stamp t is the carriers' t + offset.
+        By sensor, if estimated: the sensor's stamp t is the carriers' t + offset.
     noise_source : "given" or "estimated"
     noise : dict of (target, sensor) to PairNoise
     cost, initial_cost : float
-        Of the graph, at the end and at the certified solution.
+        The graph's cost at the end, and at the certified solution.
     iterations : int
-        Levenberg-Marquardt steps, of all rounds of re-weighting together.
+        Number of Levenberg-Marquardt steps, in all rounds of re-weighting together.
     moved : dict of str to Movement
     inlier_counts : dict of (target, sensor) to (int, int)
-        Inliers, and measurements, with robust="gnc"; else empty.
+        Numbers of inliers and of measurements with robust="gnc"; else empty.
     free_directions : tuple of FreeDirection
-        Empty where everything is determined.
+        Empty if everything is determined.
     joint : JointCovariance
-        Of everything that was unknown.
+        The covariance of all unknowns.
     """
 
     X: dict[str, gtsam.Pose3]
@@ -89,23 +88,20 @@ class RefinedPoses:
     joint: JointCovariance = field(repr=False)
 
     def covariance(self, *names: str | Unknown) -> Array:
-        """Joint covariance of frames, scales and time offsets, in the order given.
+        """The joint covariance (m, m) of frames, scales and time offsets, in the order given.
+
+        It is zero for fixed frames, and infinite in the rows that a free direction changes.
 
         Parameters
         ----------
         names : str or Unknown
-            Frames (six rows each), "scale" or "scale:NAME", "time_offset:SENSOR" (one row each). None: everything
-            that was unknown, in the order of ``names``.
-
-        Returns
-        -------
-        (m, m) array
-            Zero for what is fixed; infinite in the rows that a free direction reaches.
+            Frames (six rows each), "scale" or "scale:NAME", "time_offset:SENSOR" (one row each). Without names: all
+            unknowns, in the order of ``self.names``.
 
         Raises
         ------
         FrameError
-            For a name that there is not.
+            If the problem has no such name.
         """
         asked = [Unknown.of(name) for name in names] or list(self.unknowns)
         if not asked:  # everything is fixed
@@ -118,46 +114,38 @@ class RefinedPoses:
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        """Everything that was unknown."""
+        """All unknowns."""
         return tuple(self.joint.slots)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of everything that was unknown."""
+        """The names of all unknowns."""
         return tuple(map(str, self.unknowns))
 
     def information(self, *names: str | Unknown) -> Array:
         """Marginal information (m, m) of unknowns: the covariance's inverse, and zero along free directions.
 
-        Unlike the covariance it holds everything that is known where a free direction is oblique to the axes.
-
-        Raises
-        ------
-        FrameError
-            For a name that is not among the unknowns.
+        Where a free direction is oblique to the axes the information still holds everything that is known; the
+        covariance does not. FrameError if a name is not among the unknowns, or is given twice.
         """
         asked = tuple(Unknown.of(name) for name in names) or self.unknowns
         if len(set(asked)) != len(asked):
-            raise FrameError(f"the information of {', '.join(map(str, asked))}: name each once, or it is singular")
+            raise FrameError(f"the information of {', '.join(map(str, asked))} is singular; give each name once")
         return self.joint.information_of(asked)
 
     def relative(self, first: str, second: str) -> tuple[gtsam.Pose3, Array]:
         """T_first_second of two frames on one carrier, and the covariance (6, 6) of its right perturbation.
 
-        What two cameras of a rig have between them; often far better known than either on its carrier.
-
-        Raises
-        ------
-        FrameError
-            For names that there are not, or on two carriers.
+        Two cameras of a rig often have a far smaller relative covariance than each camera on its carrier. FrameError if
+        the problem has no such frame, or the frames are on two carriers.
         """
         poses = next((p for p in (self.X, self.Y) if first in p and second in p), None)
         if poses is None:
             for name in (first, second):
                 self._rows_of(Unknown.of(name))
             raise FrameError(
-                f"{first!r} and {second!r} are on two carriers, which move against one another: they have no relative "
-                "pose; ask for two sensors or two targets"
+                f"{first!r} and {second!r} are on two carriers, which move relative to each other, so they have no "
+                "fixed relative pose; ask for two sensors or two targets"
             )
         if first == second:
             raise FrameError(f"{first!r} has no pose relative to itself; ask for two frames")
@@ -166,7 +154,7 @@ class RefinedPoses:
         return poses[first].between(poses[second]), self.joint.covariance_of(G)
 
     def standard_deviations(self, name: str) -> tuple[Array, Array]:
-        """A frame's (3,) in degrees about, and (3,) in millimetres along, its own x, y, z."""
+        """A frame's standard deviations (3,) in degrees about and (3,) in millimetres along its own x, y, z."""
         if name not in self.X and name not in self.Y:
             raise FrameError(
                 f"{name!r} is no frame, and has no axes; there are {', '.join(self.X | self.Y)} (of a scale or an "
@@ -176,13 +164,13 @@ class RefinedPoses:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Equations that the estimated noise rests on, the fewest of any group; infinite where it was given."""
+        """The fewest degrees of freedom of any group's estimated noise; infinite if the noise was given."""
         return min((min(noise.degrees_of_freedom) for noise in self.noise.values()), default=np.inf)
 
     def squared_radius(self, dimension: int, confidence: float = 0.95) -> float:
-        """Up to which xi' covariance^-1 xi is inside the confidence ellipsoid.
+        """The largest xi' covariance^-1 xi inside the confidence ellipsoid.
 
-        A chi-square quantile where the noise was given; where it was estimated, dimension times an F quantile.
+        It is a chi-square quantile if the noise was given; if the noise was estimated, dimension times an F quantile.
         """
         if not 0.0 < confidence < 1.0:
             raise OptionError(f"confidence={confidence!r}; give one between 0 and 1")
@@ -196,7 +184,7 @@ class RefinedPoses:
         Raises
         ------
         FrameError, PoseError
-            For a name or a pose that is none.
+            If the problem has no such frame, or the pose is not valid.
         """
         poses = self.X | self.Y
         if name not in poses:
@@ -207,11 +195,11 @@ class RefinedPoses:
         return bool(xi @ self.information(name) @ xi <= self.squared_radius(6, confidence))
 
     def _rows_of(self, unknown: Unknown) -> Array:
-        """(m, d): its rows of the unknowns; zero for a fixed frame."""
+        """The matrix (m, d) that selects an unknown's rows; zero for a fixed frame."""
         if unknown not in self.joint.slots:
             if unknown == Unknown(UnknownKind.SCALE):
                 why = "it is known, 1" if self.scale_mode == "known" else "each target has its own: 'scale:NAME'"
-                raise FrameError(f"there is no one scale to ask for; {why}")
+                raise FrameError(f"'scale' is not an unknown: {why}")
             known = dict.fromkeys((*self.X, *self.Y, *self.names))
             if str(unknown) not in known:
                 raise FrameError(f"there is no {str(unknown)!r}; there are {', '.join(known)}")
@@ -221,22 +209,19 @@ class RefinedPoses:
 
 @dataclass(frozen=True, repr=False)
 class Refined(RefinedPoses):
-    """A refined calibration, with covariances, and the graph to go on with.
+    """A refined calibration, with everything that `RefinedPoses` has, and the graph.
 
     Attributes
     ----------
     graph, values : gtsam.NonlinearFactorGraph, gtsam.Values
-        To go on with.
+        The graph and its values at the optimum, for further factors.
     keys : dict of str to int
-        The variables' keys in them, by name: frames, "scale" ("scale:NAME" for each with scale="per_target"),
-        "time_offset:SENSOR".
+        The variables' keys by name: frames, "scale" ("scale:NAME" with scale="per_target"), "time_offset:SENSOR".
     inliers : dict of (target, sensor) to (N,) booleans
-        With robust="gnc"; else empty.
+        The inliers with robust="gnc"; else empty.
     solution : Solution
-        The certified solution that was refined (with robust="gnc": of the inliers).
+        The certified solution that was refined; with robust="gnc" it is the inliers' solution.
     options : RefineOptions
-
-    And everything that `RefinedPoses` has.
     """
 
     graph: gtsam.NonlinearFactorGraph
@@ -254,6 +239,6 @@ class Refined(RefinedPoses):
 
     def __reduce__(self) -> str:
         raise TypeError(
-            "a Refined holds a GTSAM graph with Python factors, which can be neither pickled nor copied; "
-            "rw.write_refined keeps everything but the graph"
+            "a Refined has a GTSAM graph with Python factors, which cannot be pickled or copied; rw.write_refined "
+            "writes everything except the graph"
         )

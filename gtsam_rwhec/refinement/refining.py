@@ -1,4 +1,4 @@
-"""``refine``: from the certified solution to poses under the noise that there is, with covariances."""
+"""``refine``: GTSAM's poses and covariances under the full noise model, from the certified solution."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.solving.weights import contradicted_by
 from gtsam_rwhec.trajectories.local_paths import WINDOW_S
 
-#: Times that outliers are chosen anew under the noise as it is; two or three are usual.
+#: Largest number of times that the inliers are chosen again under the full noise; two or three are usual.
 MAX_CHOICES = 10
 
 
@@ -52,41 +52,38 @@ def refine(
     *,
     progress: Progress | None = None,
 ) -> Refined:
-    """Refine a certified solution in GTSAM under the noise that there is, and say how well everything is known.
+    """Refine a certified solution in GTSAM under the full noise model, with covariances of all unknowns.
 
     Parameters
     ----------
     problem : Problem
-        With the raw measurements, unless ``residual="chordal"`` and ``robust="none"``.
+        A problem that kept its raw measurements, unless ``residual="chordal"`` and ``robust="none"``.
     solution : Solution
-        What ``solve`` returned for it; the start.
+        The start: the result of ``solve`` for this problem.
     options : RefineOptions, optional
     progress : callable, optional
-        Told each stage's name.
-
-    Returns
-    -------
-    Refined
+        Is called with the name of each stage.
 
     Raises
     ------
     FrameError, ScaleError, PriorError
-        For a solution of another problem.
+        If the solution is of another problem.
     MeasurementsNotKeptError
-        Where raw measurements are needed and were not kept.
+        If raw measurements are needed and the problem did not keep them.
     NoiseError, OptionError, CountError
-        For noise that cannot be estimated or honoured, or options that do not go together.
+        If the noise cannot be estimated or used, or options contradict each other.
     OutlierError
-        With robust="gnc", where hardly any measurement agrees with another.
+        With robust="gnc", if too few measurements agree with each other.
 
     Warns
     -----
     NotUniqueWarning
-        Where the measurements leave something free, by name; variances are infinite there.
+        If the measurements leave directions free, by name; variances are infinite there.
     WeightsWarning
-        Where the residuals say that the noise as given is too small, or A's noise is shared and is not treated so.
+        If the residuals show that the given noise is too small, or measurements share A's noise and
+        ``carrier_model="propagated"`` does not treat it so.
     NotConvergedWarning
-        Where iterations ended at their limit.
+        If iterations ended at their limit.
     """
     options = RefineOptions() if options is None else options
     tell = progress or silent
@@ -100,7 +97,7 @@ def refine(
         tell("rejecting outliers")
         if data and (problem.has_covariances or options.carrier_noise is not None or everything.offsets):
             guess = everything.start(solution)
-            if everything.offsets:  # a clock that is off looks like outliers wherever the carrier moves
+            if everything.offsets:  # a clock offset makes outliers wherever the carrier moves
                 first = GeodesicModel.of(data, everything, replace(options, robust="huber"))
                 rough = fit(problem, first, everything, guess, options, estimates)
                 guess = everything.state(rough.optimum.values)
@@ -130,13 +127,13 @@ def refine(
             break
         inliers = again
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)  # of this choice; what is wrong with the last one is told
+            warnings.simplefilter("ignore", RwhecWarning)  # only the last choice's warnings matter
             start = solve(selected(whole, inliers))
     tell("covariances")
     space = free_space_of(parts, variables, state, kept, None if options.robust in ("none", "gnc") else settled.factors)
     if space.directions:
         warnings.warn(
-            "the measurements do not determine everything; variances are infinite along: "
+            "the measurements leave directions free, along which variances are infinite: "
             + "; ".join(map(str, space.directions)),
             NotUniqueWarning,
             stacklevel=2,
@@ -170,8 +167,8 @@ def refine(
 
 
 def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit, options: RefineOptions) -> None:
-    """Warn where the residuals contradict the noise as given: covariances then are too small."""
-    if options.robust not in ("none", "gnc"):  # a loss makes another cost
+    """Warn if the residuals contradict the given noise: covariances are then too small."""
+    if options.robust not in ("none", "gnc"):  # a loss changes the cost
         return
     beliefs = [p for name, priors in problem.priors.items() if name not in problem.fixed for p in priors]
     equations = 6 * problem.number_of_measurements + sum(
@@ -190,34 +187,34 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit
 
 
 def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> None:
-    """Where a time offset is biased by more than its standard deviation says, or beyond what poses nearby tell."""
+    """Warn if a time offset is beyond the window of its motion, or its bias exceeds half its standard deviation."""
     for sensor, part in space.shrinkage.items():
         offset_s, what = abs(state.offsets_s[sensor]), f"the time offset of {sensor}"
         unknown = Unknown(UnknownKind.TIME_OFFSET, sensor)
         if offset_s > WINDOW_S:
             warnings.warn(
-                f"{what} is {offset_s:.3g} s, beyond the {WINDOW_S:g} s about each stamp in which the carriers' motion "
-                "is looked at; shift the stamps first (cleaning.coarse_time_offset finds by how much)",
+                f"{what} is {offset_s:.3g} s, but the carriers' motion is known only within {WINDOW_S:g} s of each "
+                "stamp; shift the stamps first (cleaning.coarse_time_offset finds the shift)",
                 NotConvergedWarning,
                 stacklevel=3,
             )
         elif part * offset_s > 0.5 * math.sqrt(joint.covariance_of(joint.selector((unknown,)))[0, 0]):
             warnings.warn(
-                f"{what}: the carriers' velocity is {100.0 * part:.2g} % noise, which pulls the offset towards zero by "
-                f"about {1e3 * part * offset_s:.2g} ms, more than its standard deviation says; move faster, or take "
-                "denser poses",
+                f"{what}: {100.0 * part:.2g} % of the carriers' velocity is noise, which pulls the offset towards zero "
+                f"by about {1e3 * part * offset_s:.2g} ms. This is more than half of its standard deviation; move "
+                "faster, or log poses more often",
                 WeightsWarning,
                 stacklevel=3,
             )
 
 
 def _data(problem: Problem, variables: Variables, options: RefineOptions) -> list[PairData]:
-    """Of every pair; none for the chordal residual, which has moments."""
+    """The raw data of every pair; empty for the chordal residual, which takes moments."""
     if options.residual == "chordal":
         if problem.has_covariances:
             raise OptionError(
-                "some measurements came with full covariances, which the chordal residual cannot hold; take "
-                "residual='geodesic', or add them with sigma and kappa"
+                "some measurements have full covariances, which the chordal residual cannot hold; take "
+                "residual='geodesic', or add the measurements with sigma and kappa"
             )
         return []
     problem.require_raw_measurements("residual='geodesic' (unlike residual='chordal')")

@@ -1,4 +1,4 @@
-"""Squared residuals of every raw measurement, in units of its noise: what tells inliers from outliers."""
+"""Squared residuals of every raw measurement, in units of its noise. They separate inliers from outliers."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Squares:
     Attributes
     ----------
     rotation : (N,) array
-        kappa |R_A R_X - R_Y R_B|_F^2, which is 2 kappa theta^2 for a small angle; of full covariances, the rotation
-        block's. Infinite where a frame has no pose.
+        kappa |R_A R_X - R_Y R_B|_F^2, which is 2 kappa theta^2 for a small angle; or the Mahalanobis distance under the
+        rotation block of a full covariance. Infinite where a frame has no pose.
     translation : (N,) array
-        |alpha (R_A t_X + t_A - t_Y) - R_Y t_B|^2 / sigma^2; or the block's.
+        |alpha (R_A t_X + t_A - t_Y) - R_Y t_B|^2 / sigma^2; or the same under the translation block.
     error : (N, 6) array or None
-        Log(B^-1 Y^-1 A X), lengths as B has them, where full covariances were given.
+        Log(B^-1 Y^-1 A X) in measured lengths, where full covariances were given.
     """
 
     rotation: Array
@@ -37,19 +37,19 @@ class Squares:
 
 @dataclass(frozen=True)
 class Measured:
-    """All raw measurements of a problem, one after the other, pair by pair.
+    """All raw measurements of a problem, pair by pair.
 
     Attributes
     ----------
     pairs : tuple of Pair
     rows : tuple of slice
-        Of each pair.
+        The measurements of each pair.
     A, B : (N, 4, 4) arrays
     sigma, kappa : (N,) arrays
     whitening : (N, 6, 6) array or None
         Inverse Cholesky factors of B's covariances, where full ones were given.
     whitening_of_translation : (N, 3, 3) array or None
-        The same of the translation's block alone.
+        Inverse Cholesky factors of the translation blocks alone.
     """
 
     pairs: tuple[Pair, ...]
@@ -63,9 +63,8 @@ class Measured:
 
     @staticmethod
     def of(problem: Problem) -> Measured:
-        """From a problem that kept its measurements."""
+        """The measurements of a problem that kept them."""
         raw = [problem.measurements(*pair) for pair in problem.pairs]
-        ends = np.cumsum([0] + [len(one.A) for one in raw])
         whitening = whitening_of_translation = None
         if problem.has_covariances:
             covariances = np.concatenate([one.covariance_of_B() for one in raw])
@@ -73,7 +72,7 @@ class Measured:
             whitening_of_translation = np.linalg.inv(np.linalg.cholesky(covariances[:, 3:, 3:]))
         return Measured(
             problem.pairs,
-            tuple(slice(int(first), int(end)) for first, end in pairwise(ends)),
+            _rows_of([len(one.A) for one in raw]),
             np.concatenate([one.A for one in raw]),
             np.concatenate([one.B for one in raw]),
             np.concatenate([one.sigma for one in raw]),
@@ -83,13 +82,12 @@ class Measured:
         )
 
     def of_pairs(self, pairs: list[Pair]) -> Measured:
-        """Those of some pairs alone, in their order."""
+        """The measurements of some pairs alone, in their order."""
         rows = [self.rows[self.pairs.index(pair)] for pair in pairs]
         index = np.concatenate([np.arange(one.start, one.stop) for one in rows]) if rows else np.zeros(0, dtype=int)
-        ends = np.cumsum([0] + [one.stop - one.start for one in rows])
         return Measured(
             tuple(pairs),
-            tuple(slice(int(first), int(end)) for first, end in pairwise(ends)),
+            _rows_of([one.stop - one.start for one in rows]),
             self.A[index],
             self.B[index],
             self.sigma[index],
@@ -103,11 +101,11 @@ class Measured:
         return next(pair for pair, rows in zip(self.pairs, self.rows, strict=True) if index < rows.stop)
 
     def by_pair(self, values: np.ndarray) -> dict[Pair, np.ndarray]:
-        """(N,) values, pair by pair."""
+        """Values (N,) of all measurements, by pair."""
         return {pair: values[rows] for pair, rows in zip(self.pairs, self.rows, strict=True)}
 
     def squares(self, fit: CertifiedFit) -> Squares:
-        """At an answer."""
+        """The squared residuals at an answer."""
         R = np.empty((len(self.A), 3, 3))
         t = np.empty((len(self.A), 3))
         R_Y = np.empty((len(self.A), 3, 3))
@@ -130,19 +128,15 @@ class Measured:
             translation = np.einsum("ni,ni->n", t, t) / self.sigma**2
             error = None
         else:
-            seen = self.B[:, :3, :3].transpose(0, 2, 1) @ R_Y.transpose(0, 2, 1)  # to the axes of the measured target
-            difference = np.zeros((len(self.B), 4, 4))  # B^-1 Y^-1 A X, lengths as B has them
-            difference[:, :3, :3] = seen @ R
-            difference[:, :3, 3] = np.einsum("nij,nj->ni", seen, t)
-            difference[:, 3, 3] = 1.0
-            error = se3.logmap(difference)
-            rotation = _norms(self.whitening[:, :3, :3], error[:, :3])  # L is lower triangular: the block's own
+            seen = self.B[:, :3, :3].transpose(0, 2, 1) @ R_Y.transpose(0, 2, 1)  # into the measured target's axes
+            error = se3.logmap(se3.pose(seen @ R, np.einsum("nij,nj->ni", seen, t)))
+            rotation = _norms(self.whitening[:, :3, :3], error[:, :3])  # L is lower triangular
             translation = _norms(self.whitening_of_translation, error[:, 3:])
             error[~known] = np.inf
         return Squares(np.where(known, rotation, np.inf), np.where(known, translation, np.inf), error)
 
     def together(self, squares: Squares, factors: VarianceFactors) -> Array:
-        """(N,) both together, about chi-square with 6 degrees of freedom at the truth."""
+        """Squared residuals (N,) of all six components, about chi-square with 6 degrees of freedom at the truth."""
         if squares.error is None or self.whitening is None:
             return squares.rotation / factors.rotation + squares.translation / factors.translation
         known = np.isfinite(squares.rotation)
@@ -150,6 +144,11 @@ class Measured:
         result = np.full(len(known), np.inf)
         result[known] = _norms(self.whitening[known], scaled)
         return result
+
+
+def _rows_of(counts: list[int]) -> tuple[slice, ...]:
+    """The rows of each pair, one pair after another."""
+    return tuple(slice(int(first), int(end)) for first, end in pairwise(np.cumsum([0, *counts])))
 
 
 def _norms(whitening: Array, error: Array) -> Array:

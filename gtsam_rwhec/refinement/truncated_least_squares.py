@@ -1,6 +1,6 @@
-"""The minimisation of truncated squares: graduated, trimmed, settled, and put to the vote, in certified solutions.
+"""The minimisation of truncated squares by certified solutions: graduation, trimming, settling and voting.
 
-``graduated`` says what for, and what comes of it.
+``graduated`` has the equation and the reasons.
 """
 
 from __future__ import annotations
@@ -26,17 +26,20 @@ from gtsam_rwhec.refinement.voting import by_vote
 
 NoiseScale = Literal["given", "estimate"]
 
-#: mu grows by this much an iteration (the paper's value).
+#: Factor by which mu grows in an iteration (the paper's value).
 GRADUATION = 1.4
-#: Graduation ends here, with weights between 0 and 1 within some 10 % of c^2 only.
+#: The last mu. Here only residuals within about 10 % of c^2 have weights between 0 and 1.
 LAST_MU = 10.0
-#: Frames of which fewer measurements agree than this are put to the vote.
+#: Share of agreeing measurements below which a frame's measurements vote on its pose.
 VOTED = 0.9
-#: Residuals are not taken for quieter than this (m and rad): exact data would leave nothing to divide by.
+#: Smallest standard deviation of residuals, m and rad, so that exact data can be divided by it.
 QUIETEST = 1e-8
-#: A vote pays when the truncated cost goes down by more than this, relatively.
+#: Relative decrease of the truncated cost above which a vote is accepted.
 PAYS = 1e-6
+#: Degrees of freedom of a measurement: three of rotation, three of translation.
 DOF = 6
+#: Largest number of re-weighted solutions from each start.
+MAX_ITERATIONS = 100
 
 
 @dataclass(frozen=True)
@@ -46,14 +49,15 @@ class Iteration:
     Attributes
     ----------
     stage : str
+        "graduating", "trimming" or "settling".
     mu : float
-        Of the graduation; nan where weights are 0 or 1.
+        The graduation's parameter; nan where weights are 0 or 1.
     truncated_cost : float
         1/2 sum min(d^2, c^2) of all measurements.
     inliers : int
-        Measurements with d^2 <= c^2.
+        Number of measurements with d^2 <= c^2.
     certified : bool
-        Whether the re-weighted problem's optimum was proven on the way.
+        Whether the optimum of the re-weighted problem is certified.
     """
 
     stage: str
@@ -65,11 +69,10 @@ class Iteration:
 
 @dataclass
 class TruncatedLeastSquares:
-    """The stages and what they share; ``factors`` and ``history`` change on the way."""
+    """The stages of the minimisation and their common state: ``factors`` and ``history`` change on the way."""
 
     problem: Problem
     threshold: float
-    max_iterations: int
     tell: Progress
     factors: VarianceFactors = AS_STATED
     history: list[Iteration] = field(default_factory=list)
@@ -92,7 +95,7 @@ class TruncatedLeastSquares:
         return self.settle(fit, estimates=True)
 
     def best(self, starts: list[Callable[[], CertifiedFit]]) -> tuple[CertifiedFit, np.ndarray]:
-        """Each settled to weights of 0 and 1; the smallest truncated cost. A start that ends with too few is none."""
+        """The best fit of all starts, each settled to weights of 0 and 1; a start with too few inliers is left out."""
         ends: list[tuple[float, CertifiedFit, np.ndarray]] = []
         failure: UnderdeterminedError | CountError | None = None
         for start in starts:
@@ -108,7 +111,7 @@ class TruncatedLeastSquares:
         return self.vote(fit, keep)
 
     def vote(self, fit: CertifiedFit, keep: np.ndarray) -> tuple[CertifiedFit, np.ndarray]:
-        """Move single frames to where more of their measurements agree, as long as that pays."""
+        """The fit after single frames moved to where more of their measurements agree, if this lowers the cost."""
         least = self.truncated(self.distances(fit))
         for name in self.problem.targets + self.problem.sensors:
             good, total = inlier_count(name, self.measured.by_pair(keep))
@@ -125,7 +128,7 @@ class TruncatedLeastSquares:
         return fit, keep
 
     def complete(self, fit: CertifiedFit) -> CertifiedFit:
-        """With poses by vote of the frames that lost their last measurement, so that they may come back."""
+        """The fit with poses by vote for frames that lost all their measurements, so that they may come back."""
         for name in self.problem.targets + self.problem.sensors:
             if name not in fit.poses and name not in self.problem.fixed:
                 fit, _ = by_vote(name, self.measured, fit, self.factors, self.threshold)
@@ -144,24 +147,24 @@ class TruncatedLeastSquares:
         return float(np.minimum(distances, self.threshold).sum())
 
     def record(self, stage: str, mu: float, fit: CertifiedFit, distances: Array) -> None:
-        """Remember an iteration."""
+        """Add an iteration to the history."""
         inliers = int((distances <= self.threshold).sum())
         self.history.append(Iteration(stage, mu, 0.5 * self.truncated(distances), inliers, fit.certified))
         self.tell(f"rejecting outliers: {stage}, {inliers} of {len(distances)} agree")
 
     def graduate(self, fit: CertifiedFit) -> CertifiedFit:
-        """From least squares to truncated least squares, mu growing (Remark 5 and eq. 14 of the paper)."""
+        """From least squares to truncated least squares with growing mu (Remark 5 and eq. 14 of the paper)."""
         d = self.distances(fit)
         c2 = self.threshold
         worst = float(d[np.isfinite(d)].max(initial=0.0))
         if worst <= c2:
             return fit
         mu = c2 / (2.0 * worst - c2)
-        for _ in range(self.max_iterations):
+        for _ in range(MAX_ITERATIONS):
             w = truncated_weights(d, mu, c2)
             if not w.any():
                 break
-            fit = self.fit(w / w.max(), fit)  # all small at first: priors would weigh more than what was measured
+            fit = self.fit(w / w.max(), fit)  # all are small at first, and priors would dominate
             d = self.distances(fit)
             self.record("graduating", mu, fit, d)
             mu *= GRADUATION
@@ -170,15 +173,16 @@ class TruncatedLeastSquares:
         return fit
 
     def trim(self, fit: CertifiedFit) -> CertifiedFit:
-        """Least trimmed squares: the better half of each pair, by the noise of the median, until it stays the same."""
+        """Least trimmed squares: the better half of each pair under the median's noise, until it stays the same."""
         keep = np.zeros(len(self.measured.A), dtype=bool)
-        for _ in range(self.max_iterations):
+        for _ in range(MAX_ITERATIONS):
             squares = self.measured.squares(fit)
             self.factors = self._from_median(squares)
             d = self.measured.together(squares, self.factors)
             half = np.zeros_like(keep)
             for rows in self.measured.rows:
-                number = _half(rows.stop - rows.start)
+                count = rows.stop - rows.start
+                number = min(count, count // 2 + 2)  # enough to determine one pair alone
                 half[rows.start + np.argsort(d[rows], kind="stable")[:number]] = True
             if (half == keep).all():
                 break
@@ -190,7 +194,7 @@ class TruncatedLeastSquares:
     def settle(self, fit: CertifiedFit, *, estimates: bool = False) -> tuple[CertifiedFit, np.ndarray]:
         """Weights of 0 and 1 until they stay the same: a local minimum of the truncated cost."""
         keep = np.zeros(len(self.measured.A), dtype=bool)
-        for _ in range(self.max_iterations):
+        for _ in range(MAX_ITERATIONS):
             squares = self.measured.squares(fit)
             d = self.measured.together(squares, self.factors)
             change = 0.0
@@ -214,9 +218,9 @@ class TruncatedLeastSquares:
         )
 
     def _from_inliers(self, squares: Squares, inliers: np.ndarray) -> VarianceFactors:
-        """Mean squares of the inliers, over the share of its variance that a cut chi-square keeps.
+        """The inliers' mean squares over the share of its variance that a truncated chi-square keeps.
 
-        E[chi^2_k; chi^2_k <= c^2] = k F_(k+2)(c^2), F the distribution function.
+        E[chi^2_k; chi^2_k <= c^2] = k F_(k+2)(c^2), with the distribution function F.
         """
         kept = float(chdtr(DOF + 2, self.threshold) / chdtr(DOF, self.threshold))
         number = int(inliers.sum())
@@ -236,7 +240,7 @@ class TruncatedLeastSquares:
 
 
 def truncated_weights(d2: Array, mu: float, c2: float) -> Array:
-    """Weights of the graduated truncated squares, eq. 14: 1, 0, or c / d sqrt(mu (mu + 1)) - mu between the two."""
+    """Weights of the graduated truncated squares, eq. 14: 1 at first, then c / d sqrt(mu (mu + 1)) - mu, then 0."""
     w = np.zeros_like(d2)
     w[d2 <= mu / (mu + 1.0) * c2] = 1.0
     between = (d2 > mu / (mu + 1.0) * c2) & (d2 < (mu + 1.0) / mu * c2)
@@ -244,12 +248,7 @@ def truncated_weights(d2: Array, mu: float, c2: float) -> Array:
     return np.clip(w, 0.0, 1.0)
 
 
-def _half(count: int) -> int:
-    """More than half, and enough for one pair alone to be determined."""
-    return min(count, count // 2 + 2)
-
-
 def inlier_count(name: str, inliers: dict[Pair, np.ndarray]) -> tuple[int, int]:
-    """How many of a frame's measurements agree, of how many."""
+    """The number of a frame's measurements that agree, and of all its measurements."""
     masks = [mask for pair, mask in inliers.items() if name in pair]
     return sum(int(mask.sum()) for mask in masks), sum(len(mask) for mask in masks)

@@ -1,4 +1,4 @@
-"""What a refinement estimates, one record each: how it is written is decided here alone."""
+"""The unknowns of a refinement as records, and their names as users and files write them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class UnknownKind(Enum):
-    """What an unknown is; the value is the word that files and users have for it."""
+    """The kind of an unknown; the value is its word in files and names."""
 
     FRAME = "frame"
     SCALE = "scale"
@@ -20,7 +20,7 @@ class UnknownKind(Enum):
 class Unknown(NamedTuple):
     """The pose of a frame, a scale, or the time offset of a sensor's clock.
 
-    ``owner`` is the frame, target or sensor that it belongs to; empty for one scale that all targets share.
+    ``owner`` is the frame, target or sensor that the unknown belongs to; empty for one scale that all targets share.
     """
 
     kind: UnknownKind
@@ -28,7 +28,7 @@ class Unknown(NamedTuple):
 
     @staticmethod
     def of(name: str | Unknown) -> Unknown:
-        """What users call it: "cam_0", "scale", "scale:tag_0" or "time_offset:cam_0"."""
+        """The unknown of a name: "cam_0", "scale", "scale:tag_0" or "time_offset:cam_0"."""
         if isinstance(name, Unknown):
             return name
         if name == UnknownKind.SCALE.value:
@@ -47,12 +47,12 @@ class Unknown(NamedTuple):
 
     @property
     def dimension(self) -> int:
-        """Parameters that it has: [omega, v] of a frame, or one number."""
+        """The number of parameters: 6 of a frame, [omega, v]; else 1."""
         return 6 if self.kind is UnknownKind.FRAME else 1
 
 
 def slots_of(unknowns: Iterable[Unknown]) -> dict[Unknown, slice]:
-    """Where each one's parameters are when all of them stand one after the other."""
+    """The slice of each unknown's parameters in the vector of all parameters."""
     slots, first = {}, 0
     for unknown in unknowns:
         slots[unknown] = slice(first, first + unknown.dimension)
@@ -61,7 +61,7 @@ def slots_of(unknowns: Iterable[Unknown]) -> dict[Unknown, slice]:
 
 
 def rows_of(slots: Mapping[Unknown, slice], unknowns: Iterable[Unknown]) -> np.ndarray:
-    """The indices (m,) of some of them, in the order given."""
+    """The indices (m,) of the parameters of some unknowns, in the order given."""
     return np.array(
         [row for unknown in unknowns for row in range(slots[unknown].start, slots[unknown].stop)], dtype=np.int64
     )

@@ -1,4 +1,4 @@
-"""What is refined: its keys in the graph, and values in and out of GTSAM."""
+"""The variables of a refinement: their keys in the graph, and estimates as GTSAM's values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gtsam_rwhec.solving.solution import Solution
 
 @dataclass(frozen=True)
 class State:
-    """An estimate: poses (4, 4) by frame, scales as they stand, offsets in seconds by sensor."""
+    """An estimate: poses by frame, scales (measured / true length), time offsets in seconds by sensor."""
 
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
@@ -33,13 +33,13 @@ class Variables:
     targets, sensors : dict of str to int
         Pose3 variables: X = T_targetcarrier_target, Y = T_sensorcarrier_sensor.
     scales : dict of Unknown to int
-        1-vectors: one that is shared, or one for each unknown one with scale="per_target".
+        1-vectors: one shared scale, or the unknown scales with scale="per_target".
     offsets : dict of str to int
         1-vectors in seconds, by sensor.
     fixed : frozenset of str
-        Frames that are known exactly; in the graph, but not unknown.
+        Frames that are known exactly; they are in the graph, but not among the unknowns.
     scale_of_pair : dict of Pair to Unknown
-        Which scale a pair's translations are multiplied by; pairs of known scale are absent.
+        The scale of a pair's translations; pairs of known scale are absent.
     """
 
     targets: dict[str, int]
@@ -51,11 +51,11 @@ class Variables:
 
     @staticmethod
     def of(problem: Problem, time_offsets: tuple[str, ...]) -> Variables:
-        """Of a problem, with time offsets of the sensors named."""
+        """The variables of a problem, with time offsets of the named sensors."""
         for name in problem.targets + problem.sensors:
             if Unknown.of(name).kind is not UnknownKind.FRAME:
                 raise FrameError(
-                    f"a frame is called {name!r}, which is what refinement calls a scale or a time offset; rename it"
+                    f"the frame name {name!r} is the name of a scale or a time offset in refinement; rename the frame"
                 )
         scale_of_pair: dict[Pair, Unknown] = {}
         if problem.scale != "known":
@@ -80,18 +80,18 @@ class Variables:
 
     @property
     def keys(self) -> dict[Unknown, int]:
-        """Every variable's key, those of fixed frames too."""
+        """Every variable's key, with fixed frames."""
         frames = {Unknown(UnknownKind.FRAME, name): key for name, key in self.frames.items()}
         offsets = {Unknown(UnknownKind.TIME_OFFSET, name): key for name, key in self.offsets.items()}
         return frames | self.scales | offsets
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        """Everything that is not known, in the order of ``keys``."""
+        """The unknowns, in the order of ``keys``."""
         return tuple(u for u in self.keys if u.kind is not UnknownKind.FRAME or u.owner not in self.fixed)
 
     def ends(self, pair: Pair) -> tuple[int, int]:
-        """Keys of a pair's target and sensor; of a motion's, twice the sensor's."""
+        """Keys of a pair's target and sensor; for motions the sensor's key twice."""
         return self.frames[pair.target], self.frames[pair.sensor]
 
     def scale_key(self, pair: Pair) -> int | None:
@@ -103,7 +103,7 @@ class Variables:
         return self.offsets.get(pair.sensor)
 
     def values(self, state: State) -> gtsam.Values:
-        """An estimate as GTSAM's."""
+        """An estimate as GTSAM's values."""
         values = gtsam.Values()
         for keys, poses in ((self.targets, state.X), (self.sensors, state.Y)):
             for name, key in keys.items():
@@ -131,6 +131,6 @@ class Variables:
 
 
 def carrier_key(index: int) -> int:
-    """Key of a carrier pose A = T_sensorcarrier_targetcarrier, where A's are variables."""
+    """Key of a carrier pose A = T_sensorcarrier_targetcarrier that is a variable."""
     key: int = gtsam.symbol("a", index)
     return key

@@ -1,10 +1,10 @@
-"""How noisy the measurements really were: variance factors of rotations and translations from the residuals.
+"""Variance factors of rotations and translations, estimated from the residuals.
 
-Restricted maximum likelihood by its fixed point (Helmert's and Foerstner's variance components): at the optimum, with
-C the residuals' covariance and P = C^-1 - C^-1 J Cov J' C^-1, the expectation of r' C^-1 S C^-1 r is tr(P S P C), S
-being the part of C that a factor multiplies. The factor times the ratio of both is the next one. The unknowns that
-were fitted take their share of the residuals away (the J Cov J' term): 6 N equations alone would call 20 measurements
-quieter than they are.
+The method is restricted maximum likelihood by its fixed point (Helmert's and Foerstner's variance components). C is the
+residuals' covariance, S the part of C that a factor multiplies, and P = C^-1 - C^-1 J Cov J' C^-1. At the optimum the
+expectation of r' C^-1 S C^-1 r is tr(P S P C). The next factor is the factor times the ratio of the two numbers. The
+fitted unknowns make the residuals smaller (the J Cov J' term): without this term 20 measurements would seem less noisy
+than they are.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from gtsam_rwhec.refinement.weighting import (
 )
 from gtsam_rwhec.solver.parts import Part
 
-#: No data are taken for quieter than this times what was given (or 1 m and 1 rad, where nothing was).
+#: The smallest variance factor, of the noise as given (or of 1 m and 1 rad, where none was given).
 SMALLEST = 1e-20
 
 
 @dataclass(frozen=True)
 class VarianceComponents:
-    """Factors, and by group and component how many degrees of freedom they rest on."""
+    """Variance factors, and by group and component the degrees of freedom that they are estimated with."""
 
     factors: FactorsByPair
     degrees_of_freedom: dict[tuple[Group, str], float]
@@ -48,8 +48,8 @@ class VarianceComponents:
 
 @dataclass
 class _Sums:
-    """Of a group: r' C^-1 S C^-1 r of rotation and translation, what is expected of them (which is also how many
-    equations they rest on), and the Fisher information of both factors' logarithms."""
+    """Sums over a group: r' C^-1 S C^-1 r of rotation and translation, their expectations, which are also the degrees
+    of freedom, and the Fisher information of the logarithms of both factors."""
 
     found: Array = field(default_factory=lambda: np.zeros(2))
     expected: Array = field(default_factory=lambda: np.zeros(2))
@@ -57,7 +57,7 @@ class _Sums:
 
 
 def jacobian_of(pair: Pair, at: Linearization, variables: Variables, joint: JointCovariance) -> tuple[Array, Array]:
-    """A pair's Jacobian (N, m, u) by the unknowns that it touches, and their rows in ``joint``."""
+    """A pair's Jacobian (N, m, u) by the unknowns in its residuals, and their rows in ``joint``."""
     blocks: dict[Unknown, Array] = {}
     for name, block in ((pair.target, at.target), (pair.sensor, at.sensor)):
         frame = Unknown(UnknownKind.FRAME, name)
@@ -82,20 +82,10 @@ def from_measurements(
     groups: NoiseGroups,
     consistency: float = 1.0,
 ) -> VarianceComponents:
-    """The next factors, from geodesic residuals.
+    """The next factors, from geodesic residuals; NoiseError if a group has no degree of freedom.
 
-    Parameters
-    ----------
-    data, at, variables, joint, factors
-        The pairs, their residuals, and the covariance of the unknowns at the current factors.
-    groups : "all", "sensor" or "pair"
-    consistency : float
-        Share of their variance that residuals keep when those beyond a threshold are left out.
-
-    Raises
-    ------
-    NoiseError
-        When a group has no degree of freedom.
+    ``joint`` is the covariance of the unknowns at the current factors. ``consistency`` is the share of its variance
+    that a residual keeps when residuals beyond a threshold are left out.
     """
     sums: dict[Group, _Sums] = {}
     for item in data:
@@ -103,37 +93,36 @@ def from_measurements(
         C = residual_covariance(item, linear, factors[pair])
         inverse = np.linalg.inv(C)
         J, rows = jacobian_of(pair, linear, variables, joint)
-        left = C - J @ joint.finite[np.ix_(rows, rows)] @ J.transpose(0, 2, 1)  # expected r r'
+        left = C - J @ joint.finite[np.ix_(rows, rows)] @ J.transpose(0, 2, 1)  # the expectation of r r'
         whole = measurement_covariance(item, factors[pair])
         whitened = np.einsum("nij,nj->ni", inverse, linear.residual)
         total = sums.setdefault(group_of(pair, groups), _Sums())
         scaled = []
         for k, block in enumerate((slice(0, 3), slice(3, 6))):
-            # d (D Sigma D) / d log f_k: the rows and columns of its block, half each; without correlations the block.
+            # d (D Sigma D) / d log f_k: half of the block's rows plus half of its columns.
             S = np.zeros_like(whole)
             S[:, block] += 0.5 * whole[:, block]
             S[:, :, block] += 0.5 * whole[:, :, block]
             scaled.append(inverse @ S)
             total.found[k] += float(np.einsum("ni,nij,nj->", whitened, S, whitened))
             total.expected[k] += float(np.einsum("nij,nji->", scaled[k], inverse @ left))
-        for k in range(2):
-            for m in range(2):
-                total.fisher[k, m] += float(np.einsum("nij,nji->", scaled[k], scaled[m]))
+        total.fisher += np.einsum("knij,mnji->km", scaled, scaled)
     steps = {group: _step(group, total, consistency) for group, total in sums.items()}
-    updated = {}
-    for item in data:
-        old, step = factors[item.pair], steps[group_of(item.pair, groups)]
-        updated[item.pair] = VarianceFactors(*(max(float(factor), SMALLEST) for factor in old * step))
-    degrees_of_freedom: dict[tuple[Group, str], float] = {
-        (group, component): float(total.expected[k])
-        for group, total in sums.items()
-        for k, component in enumerate(COMPONENTS)
-    }
-    return VarianceComponents(updated, degrees_of_freedom)
+    return VarianceComponents(
+        {
+            pair: VarianceFactors(*np.maximum(np.array(old) * steps[group_of(pair, groups)], SMALLEST).tolist())
+            for pair, old in factors.items()
+        },
+        {
+            (group, component): float(total.expected[k])
+            for group, total in sums.items()
+            for k, component in enumerate(COMPONENTS)
+        },
+    )
 
 
 def _step(group: Group, total: _Sums, consistency: float) -> Array:
-    """By what the factors of rotation and translation are multiplied, (2,)."""
+    """The numbers (2,) that multiply the factors of rotation and translation."""
     for k, component in enumerate(COMPONENTS):
         _check(group, component, float(total.expected[k]), float(total.fisher.sum()))
     found = total.found / consistency
@@ -142,7 +131,7 @@ def _step(group: Group, total: _Sums, consistency: float) -> Array:
     if abs(total.fisher[0, 1]) < 0.05 * size[0] * size[1]:
         result: Array = np.maximum(ratios, 1e-12)
         return result
-    # Correlated: each factor changes the other's residuals. Their common size first, then Fisher scoring on both.
+    # Correlated: each factor changes both components' residuals. First their common size, then Fisher scoring on both.
     common = float(found.sum() / total.expected.sum())
     if not 0.5 < common < 2.0:
         return np.full(2, max(common, 1e-12))
@@ -157,21 +146,10 @@ def from_moments(
     fitted: dict[Pair, tuple[float, float]],
     groups: NoiseGroups,
 ) -> VarianceComponents:
-    """The next factors, from moments.
+    """The next factors, from moments; NoiseError if a group has no degree of freedom.
 
-    Parameters
-    ----------
-    parts : list of Part
-    costs : dict of pair to (J_R, J_t)
-        At the weights as given.
-    fitted : dict of pair to (float, float)
-        tr(Cov Lambda) of the pair's rotation and translation residuals: the equations that the unknowns used up.
-    groups : "all", "sensor" or "pair"
-
-    Raises
-    ------
-    NoiseError
-        When a group has no degree of freedom.
+    ``costs`` are (J_R, J_t) of each pair at the weights as given. ``fitted`` are tr(Cov Lambda) of its rotation and
+    translation residuals: the number of equations that the unknowns take up.
     """
     sums: dict[tuple[Group, str], list[float]] = {}
     for part in parts:
@@ -184,29 +162,28 @@ def from_moments(
     for (group, kind), (found, expected) in sums.items():
         _check(group, kind, expected, expected)
         ratios[group, kind] = max(found / expected, SMALLEST)
-    pairs = [pair for part in parts for pair in part.pairs]
     return VarianceComponents(
         {
             pair: VarianceFactors(*(ratios[group_of(pair, groups), component] for component in COMPONENTS))
-            for pair in pairs
+            for part in parts
+            for pair in part.pairs
         },
         {key: expected for key, (_, expected) in sums.items()},
     )
 
 
 def _check(group: Group, component: str, degrees_of_freedom: float, weighed: float) -> None:
-    """Refuse to estimate from nothing; ``weighed``: how much of the residuals' variance the factors make up."""
+    """Refuse to estimate without degrees of freedom; ``weighed`` is the part of the residuals' variance from B."""
     if degrees_of_freedom > 0.5:
         return
     where = group_label(group)
     if weighed < 0.5:
         raise NoiseError(
             f"the {component} noise of {where} cannot be estimated: the noise given for A already explains the "
-            "residuals; give less noise of A, or B's own (noise='given')"
+            "residuals. Give less noise of A, or give sigma and kappa of B (noise='given')"
         )
     joined = "" if group == ("all",) else "join groups (noise_groups='all'), "
     raise NoiseError(
-        f"the {component} noise of {where} cannot be estimated: {degrees_of_freedom:.2g} degrees of freedom; measure "
-        f"more, {joined}"
-        "give less noise of A if you gave any, or give sigma and kappa (noise='given')"
+        f"the {component} noise of {where} cannot be estimated with {degrees_of_freedom:.2g} degrees of freedom. "
+        f"Measure more, {joined}give less noise of A if you gave any, or give sigma and kappa (noise='given')"
     )

@@ -1,4 +1,4 @@
-"""A frame's pose by vote: each of its measurements proposes one, and the truncated cost of them all decides."""
+"""A frame's pose by vote: each measurement proposes a pose, and the lowest truncated cost decides."""
 
 from __future__ import annotations
 
@@ -11,31 +11,16 @@ from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement.certified_fit import CertifiedFit
 from gtsam_rwhec.refinement.squared_residuals import Measured
 
-#: Proposals of one frame; more measurements are sampled evenly in the order of their residuals.
+#: Largest number of proposals for a frame, sampled evenly in the order of the residuals.
 PROPOSALS = 50
 
 
 def by_vote(
     name: str, measured: Measured, fit: CertifiedFit, factors: VarianceFactors, threshold: float
 ) -> tuple[CertifiedFit, float]:
-    """The fit with the frame where most of its measurements agree, the other frames staying; and what that saves.
+    """The fit with one frame moved to where most of its measurements agree, and the decrease of sum min(d^2, c^2).
 
-    Parameters
-    ----------
-    name : str
-        A target or sensor; it may lack a pose.
-    measured : Measured
-    fit : CertifiedFit
-    factors : VarianceFactors
-    threshold : float
-        c^2.
-
-    Returns
-    -------
-    fit : CertifiedFit
-        As given where no proposal is better.
-    saved : float
-        By how much sum min(d^2, c^2) went down.
+    The frame may lack a pose before. The fit stays as given where no proposal is better. ``threshold`` is c^2.
     """
     own = measured.of_pairs([pair for pair in measured.pairs if name in pair and not pair.is_motion])
 
@@ -58,7 +43,7 @@ def by_vote(
 
 
 def _proposed(name: str, index: int, own: Measured, fit: CertifiedFit) -> Array | None:
-    """X = A^-1 Y B or Y = A X B^-1 of one measurement, lengths true; None where the pair's other end has no pose."""
+    """X = A^-1 Y B or Y = A X B^-1 of one measurement, true lengths; None if the pair's other frame has no pose."""
     pair = own.pair_of(index)
     other = pair.sensor if pair.target == name else pair.target
     alpha = fit.alpha.get(pair.target, np.nan)

@@ -1,4 +1,4 @@
-"""What weighs each residual: B's noise with its variance factors, and A's carried into the residual."""
+"""The weights of residuals: B's noise with its variance factors, and A's noise propagated into the residual."""
 
 from __future__ import annotations
 
@@ -13,48 +13,44 @@ from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement.options import NoiseGroups
 from gtsam_rwhec.refinement.pair_data import PairData
 
-#: Rotation and translation, the two components of a measurement's noise.
+#: The two components of a measurement's noise.
 Component = Literal["rotation", "translation"]
 COMPONENTS: tuple[Component, Component] = ("rotation", "translation")
-
-
-#: Of each pair.
+#: Pairs that share a variance factor: ("all",), (sensor,) or (target, sensor).
+Group = tuple[str, ...]
+#: The variance factors of each pair.
 FactorsByPair = dict[Pair, VarianceFactors]
 
 
 def largest_change(before: FactorsByPair, after: FactorsByPair) -> float:
-    """Of a factor's logarithm."""
+    """The largest change of a factor's logarithm."""
     ratios = np.array([after[pair] for pair in before]) / np.array(list(before.values()))
     return float(np.abs(np.log(ratios)).max(initial=0.0))
 
 
-#: Whose residuals share a variance factor: ("all",), (sensor,) or (target, sensor).
-Group = tuple[str, ...]
-
-
 def group_of(pair: Pair, groups: NoiseGroups) -> Group:
-    """The group whose residuals a pair's noise is estimated from."""
+    """The group that a pair is in."""
     if groups == "all":
         return ("all",)
     return (pair.sensor,) if groups == "sensor" else pair
 
 
 def group_label(group: Group) -> str:
-    """How messages write it."""
+    """The group's name in messages."""
     if group == ("all",):
         return "the measurements"
     return str(Pair(*group)) if len(group) == 2 else group[0]
 
 
 def measurement_covariance(data: PairData, factors: VarianceFactors) -> Array:
-    """(N, 6, 6) of B: D Sigma D, with the square roots of the factors on D's diagonal."""
+    """B's covariances (N, 6, 6): D Sigma D, with the square roots of the factors on D's diagonal."""
     d = np.sqrt(np.repeat(factors, 3))
     scaled: Array = data.covariance * d[:, None] * d
     return scaled
 
 
 def residual_covariance(data: PairData, at: Linearization, factors: VarianceFactors) -> Array:
-    """(N, 6, 6) of the geodesic residual: that of B, and A's through de/dA, to first order."""
+    """Covariances (N, 6, 6) of the geodesic residual: B's, and A's through de/dA, to first order."""
     covariance = measurement_covariance(data, factors)
     if data.carrier is not None:
         covariance = covariance + at.carrier @ data.carrier @ at.carrier.transpose(0, 2, 1)

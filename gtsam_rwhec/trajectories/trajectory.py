@@ -31,7 +31,7 @@ class Trajectory:
     def of(
         stamps_ns: ArrayLike, poses: PosesLike, where: str = "the trajectory", order: QuaternionOrder | None = None
     ) -> Trajectory:
-        """Check and make one.
+        """A trajectory from checked stamps and poses.
 
         Parameters
         ----------
@@ -41,32 +41,32 @@ class Trajectory:
         where : str
             Topic or file, for messages.
         order : "wxyz" or "xyzw", optional
-            Of quaternions in rows.
+            Order of the quaternions in rows.
 
         Raises
         ------
         PoseError
-            For poses that are none.
+            If there is no pose, or a pose is not valid.
         StampError
-            For stamps that are all zero, not increasing, no integers, or another number of them.
+            If the stamps are all zero, not increasing, not integers, or not as many as the poses.
         """
         transforms = as_transforms(poses, order, where)
         stamps = increasing_stamps(stamps_ns, len(transforms), where)
         if len(transforms) == 0:
-            raise PoseError(f"{where}: no poses")
+            raise PoseError(f"{where}: there are no poses; give at least one")
         rows, _ = checked_rows(transforms, 0, where)
         return Trajectory(stamps, rows_to_transforms(rows), where)
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """First and last stamp, seconds."""
+        """The first and the last stamp, seconds."""
         return float(self.stamps_ns[0]) * 1e-9, float(self.stamps_ns[-1]) * 1e-9
 
     def at(self, stamps_ns: np.ndarray) -> tuple[Array, Array]:
-        """Poses (M, 4, 4) at stamps (M,), and the gap (M,) that each was interpolated over, in seconds.
+        """Poses (M, 4, 4) at stamps (M,), and the gap (M,) in seconds between the two poses that each is between.
 
-        T_i Expmap(tau Log(T_i^-1 T_i+1)) between its neighbours (Barfoot, State Estimation for Robotics, Chapter 8).
-        Where a stamp meets a pose the gap is 0; outside the trajectory it is infinite, and the pose the nearest one.
+        T_i Expmap(tau Log(T_i^-1 T_i+1)) interpolates (Barfoot, State Estimation for Robotics, Chapter 8). At the stamp
+        of a pose the gap is 0. Outside the trajectory the gap is infinite, and the pose is the nearest one.
         """
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 0, len(self.T) - 1)
@@ -84,7 +84,7 @@ class Trajectory:
         return poses, gap_s
 
     def speeds(self) -> tuple[Array, Array]:
-        """Turning (rad/s) and moving (m/s) of each pose, (N,): the faster of the steps before and after it."""
+        """Angular (rad/s) and linear (m/s) speed at each pose, (N,): the faster of the steps before and after it."""
         if len(self.T) < 2:
             return np.zeros(len(self.T)), np.zeros(len(self.T))
         seconds = np.diff(self.stamps_ns) * 1e-9
@@ -98,31 +98,25 @@ class Trajectory:
 
 
 def increasing_stamps(stamps_ns: ArrayLike, count: int, where: str) -> np.ndarray:
-    """(count,) strictly increasing integer nanoseconds.
-
-    Raises
-    ------
-    StampError
-        For what is none.
-    """
+    """The stamps as (count,) strictly increasing integer nanoseconds; StampError for any others."""
     stamps = np.asarray(stamps_ns)
     if stamps.shape != (count,):
-        raise StampError(f"{where}: stamps have shape {stamps.shape} for {count} poses")
+        raise StampError(f"{where}: stamps have shape {stamps.shape} for {count} poses; give one stamp for each pose")
     if count == 0:
         return stamps.astype(np.int64)
     if not np.issubdtype(stamps.dtype, np.integer):
-        raise StampError(f"{where}: stamps are of {stamps.dtype}; give integer nanoseconds")
+        raise StampError(f"{where}: stamps are {stamps.dtype}; give integer nanoseconds")
     stamps = stamps.astype(np.int64)
     if count > 1 and not stamps.any():
         raise StampError(
-            f"{where}: all {count} stamps are 0; does the driver fill header.stamp? Use the log's own time"
+            f"{where}: all {count} stamps are 0, so the driver does not fill header.stamp; use the log's own time"
         )
     step = np.diff(stamps)
     if (step <= 0).any():
         i = int(np.flatnonzero(step <= 0)[0])
         word = "repeats" if step[i] == 0 else "is before"
         raise StampError(
-            f"{where}: stamp {i + 1} ({stamps[i + 1]} ns) {word} the one ahead of it ({stamps[i]} ns); sort the "
-            "messages by header.stamp and leave repeated ones out"
+            f"{where}: stamp {i + 1} ({stamps[i + 1]} ns) {word} the stamp ahead of it ({stamps[i]} ns); sort "
+            "the messages by header.stamp and leave repeated messages out"
         )
     return stamps

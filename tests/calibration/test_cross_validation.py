@@ -151,12 +151,12 @@ def test_what_nothing_else_measures_is_named() -> None:
     assert result.pairs["target1", "sensor0"].not_predicted == 15
     assert np.isnan(result.pairs["target1", "sensor0"].held_out.translation_rms_mm)
     assert result.pairs["target1", "sensor0"].training.count == 0
-    assert any("target1-sensor0" in note and "nothing else measures target1" in note for note in result.notes)
+    assert any("target1-sensor0" in note and "no other measurement determines target1" in note for note in result.notes)
     # Held out, target0-sensor0 leaves two unconnected parts; both frames are known on their carriers all the same.
     assert result.pairs[PAIR].not_predicted == 0
     assert result.overall.held_out.count == 30
     assert "30 of 60" in printed(result)
-    with pytest.raises(UnderdeterminedError, match="nothing is left to predict it from"):
+    with pytest.raises(UnderdeterminedError, match="no measurement is left to predict it from"):
         cross_validate(general(1, 1, seed=0, noise=NOISE).problem, by="pair")
 
 

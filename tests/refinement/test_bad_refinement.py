@@ -45,7 +45,7 @@ def few() -> rw.Problem:
         (
             lambda: rw.refine(rig(3, 2, seed=1).problem, SOLUTION),
             rw.errors.FrameError,
-            "another problem; solve this one first .X has no pose of 'target2'; it has 'target0', 'target1'",
+            "another problem; solve this problem first .X has no pose of 'target2'; it has 'target0', 'target1'",
         ),
         (
             lambda: rw.refine(rig(1, 2, seed=1).problem, SOLUTION),
@@ -55,7 +55,7 @@ def few() -> rw.Problem:
         (
             lambda: rw.refine(rig(seed=1, scale="shared").problem, SOLUTION),
             rw.errors.ScaleError,
-            "scale='known', this one has scale='shared'",
+            "scale='known', but this problem has scale='shared'",
         ),
         (
             lambda: rw.refine(MOMENTS_ONLY, SOLUTION),
@@ -75,7 +75,7 @@ def few() -> rw.Problem:
         (
             lambda: refined(few(), noise="estimate"),
             rw.errors.NoiseError,
-            "noise of the measurements cannot be estimated: .*degrees of freedom",
+            "noise of the measurements cannot be estimated .*degrees of freedom",
         ),
         (lambda: RefineOptions(noise="guess"), rw.errors.OptionError, "noise='guess' is not one of 'auto'"),
         (lambda: RefineOptions(robust="l1"), rw.errors.OptionError, "robust='l1' is not one of"),
@@ -100,7 +100,7 @@ def few() -> rw.Problem:
         (
             lambda: RefineOptions(carrier_path=Trajectory.of([1, 2], np.tile(np.eye(4), (2, 1, 1)))),
             rw.errors.OptionError,
-            "carrier_path is for time offsets",
+            "carrier_path has no use without time_offsets",
         ),
     ],
 )
@@ -113,9 +113,9 @@ def test_refused(call: Callable[[], Any], error: type[Exception], words: str) ->
     ("ask", "words"),
     [
         (lambda r: r.covariance("cam"), "there is no 'cam'; there are target0"),
-        (lambda r: r.covariance("scale"), "no one scale to ask for; it is known, 1"),
+        (lambda r: r.covariance("scale"), "'scale' is not an unknown: it is known, 1"),
         (lambda r: r.standard_deviations("scale"), "'scale' is no frame, and has no axes"),
-        (lambda r: r.information("cam"), "no 'cam' among the unknowns"),
+        (lambda r: r.information("cam"), "'cam' is not among the unknowns"),
         (lambda r: r.contains("cam", np.eye(4)), "there is no frame 'cam'"),
     ],
 )
@@ -130,16 +130,16 @@ def test_bad_confidence() -> None:
 
 
 @pytest.mark.parametrize("name", ["scale", "scale:tag", "time_offset:cam"])
-def test_names_that_refinement_uses_itself(name: str) -> None:
+def test_frame_names_that_are_names_of_scales_or_offsets(name: str) -> None:
     raw = PROBLEM.measurements("target0", "sensor0")
     problem = rw.Problem(scale="shared")
     problem.add(name, "sensor0", raw.A, raw.B, SIGMA_M, KAPPA)
-    with pytest.raises(rw.errors.FrameError, match=f"a frame is called '{name}'"):
+    with pytest.raises(rw.errors.FrameError, match=f"the frame name '{name}'"):
         rw.refine(problem, rw.solve(problem))
 
 
 def test_information_of_one_name_twice() -> None:
-    with pytest.raises(rw.errors.FrameError, match="name each once"):
+    with pytest.raises(rw.errors.FrameError, match="give each name once"):
         rw.refine(PROBLEM, SOLUTION).information("target0", "target0")
 
 

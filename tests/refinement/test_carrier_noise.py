@@ -106,8 +106,12 @@ def test_motions_take_propagated_noise() -> None:
         (lambda: rw.CarrierNoise(), rw.errors.NoiseError, "rotation_rad is 0.0"),
         (lambda: rw.CarrierNoise(0.01, np.nan), rw.errors.NoiseError, "translation_m is nan"),
         (lambda: rw.CarrierNoise(0.01, 0.01, about="world"), rw.errors.OptionError, "about='world'"),
-        (lambda: rw.CarrierNoise(0.01, covariances={}), rw.errors.NoiseError, "the one or the other"),
-        (lambda: rw.CarrierNoise(covariances={}), rw.errors.NoiseError, "has none for"),
+        (
+            lambda: rw.CarrierNoise(0.01, covariances={}),
+            rw.errors.NoiseError,
+            "standard deviations, not both",
+        ),
+        (lambda: rw.CarrierNoise(covariances={}), rw.errors.NoiseError, "lacks"),
         (
             lambda: rw.CarrierNoise(covariances={("target0", "sensor0"): np.tile(np.eye(6), (3, 1, 1))}),
             rw.errors.CountError,
@@ -133,5 +137,5 @@ def test_one_carrier_pose_has_one_noise() -> None:
     problem = rig(1, 2, seed=3).problem
     first, second = problem.pairs
     noises = {first: np.tile(np.eye(6) * 1e-6, (20, 1, 1)), second: np.tile(np.eye(6) * 1e-4, (20, 1, 1))}
-    with pytest.raises(rw.errors.NoiseError, match="target0-sensor0 and target0-sensor1 saw one carrier pose"):
+    with pytest.raises(rw.errors.NoiseError, match="target0-sensor0 and target0-sensor1 share a carrier pose"):
         refined(problem, carrier_noise=rw.CarrierNoise(covariances=noises))

@@ -1,4 +1,4 @@
-"""Outliers rejected around the certified solver, whatever the scale mode, the noise, and the order of samples."""
+"""Outlier rejection around the certified solver, for every scale mode and noise, and any order of samples."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from outlier_problems import Pair, corrupted
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import MeasurementsNotKeptError, OptionError, OutlierError, OutliersWarning
+from gtsam_rwhec.errors import MeasurementsNotKeptError, OutlierError, OutliersWarning
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.graduated import Graduated, graduated
 from gtsam_rwhec.refinement.truncated_least_squares import truncated_weights
@@ -71,9 +71,7 @@ def test_forty_percent_of_outliers_are_found(
     clean = rw.solve(selected(simulation.problem, good))
     # One inlier more or less moves the answer by a part of its error.
     assert largest_error_m(simulation, found.solution) < 1.3 * largest_error_m(simulation, clean) + 1e-4
-    assert found.iterations == len(found.history)
-    for pair, mask in found.inliers.items():
-        np.testing.assert_array_equal(found.weights[pair], mask.astype(float))
+    assert found.history[-1].certified
     if noise_scale == "given":
         assert found.variance_factors == (1.0, 1.0)
     else:
@@ -132,7 +130,7 @@ def test_one_bad_tag_among_others_is_named_and_does_no_harm() -> None:
         assert np.linalg.norm(difference) < 0.005
 
 
-def test_labels_that_one_camera_swaps_are_told_by_pair() -> None:
+def test_labels_that_one_camera_swaps_are_named_by_pair() -> None:
     problem, swap = rw.Problem(), {"target0": "target1", "target1": "target0"}
     simulation = general(5, 3, seed=4, number_of_measurements=10, noise=NOISE)
     for target, sensor in simulation.problem.pairs:
@@ -145,7 +143,7 @@ def test_labels_that_one_camera_swaps_are_told_by_pair() -> None:
     assert largest_error_m(simulation, found.solution) < 0.02
 
 
-def test_a_fixed_frame_that_nothing_agrees_with_is_left_out_by_name() -> None:
+def test_a_fixed_frame_without_agreeing_measurements_is_left_out_and_named() -> None:
     simulation = general(3, 2, seed=6, number_of_measurements=15, noise=NOISE)
     problem = simulation.problem
     wrong = simulation.X["target2"].copy()
@@ -181,7 +179,7 @@ def test_exact_data_has_nothing_to_estimate_and_still_finds_outliers() -> None:
     assert largest_error_m(simulation, found.solution) < 1e-7
 
 
-def test_nothing_agrees_with_anything() -> None:
+def test_measurements_that_do_not_agree_give_an_error() -> None:
     generator = np.random.default_rng(1)
     problem = rw.Problem()
     problem.add("target0", "sensor0", random_poses(6, 1.0, generator), random_poses(6, 1.0, generator), 1e-4, 1e8)
@@ -189,11 +187,7 @@ def test_nothing_agrees_with_anything() -> None:
         graduated(problem)
 
 
-def test_bad_options_and_missing_measurements_are_refused() -> None:
-    problem = general(1, 1, seed=0, noise=NOISE).problem
-    for options in ({"confidence": 1.0}, {"confidence": 95}, {"noise_scale": "guess"}, {"max_iterations": 0}):
-        with pytest.raises(OptionError, match=next(iter(options))):
-            graduated(problem, **options)  # type: ignore[arg-type]
+def test_missing_measurements_are_refused() -> None:
     with pytest.raises(MeasurementsNotKeptError, match="keep_measurements=True"):
         graduated(general(1, 1, seed=0, noise=NOISE, keep_measurements=False).problem)
 

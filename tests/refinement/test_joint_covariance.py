@@ -90,5 +90,5 @@ def test_nothing_measured_is_infinite_everywhere() -> None:
 
 def test_unknown_names_are_refused() -> None:
     joint = JointCovariance.of((A,), np.eye(6), np.zeros((6, 0)), np.ones(6))
-    with pytest.raises(rw.errors.FrameError, match="no 'b' among the unknowns; there are a"):
+    with pytest.raises(rw.errors.FrameError, match="'b' is not among the unknowns; they are a"):
         joint.rows((B,))

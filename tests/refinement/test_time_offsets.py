@@ -178,7 +178,7 @@ def test_motions_have_two_stamps() -> None:
     problem = problem_with({"cam0": 0.0}, count=20)
     raw = problem.measurements("tag", "cam0")
     problem.add_motion("cam0", raw.A, raw.A, SIGMA_M, KAPPA, stamps_ns=raw.stamps_ns)
-    with pytest.raises(rw.errors.OptionError, match="both ends of the motions of cam0"):
+    with pytest.raises(rw.errors.OptionError, match="cam0 has motions of its own"):
         refined(problem, time_offsets=True)
 
 
@@ -186,11 +186,15 @@ def test_motions_have_two_stamps() -> None:
     ("change", "error", "words"),
     [
         ({"stamps_ns": None}, rw.errors.CountError, "tag-cam0: a time offset needs stamps"),
-        ({"stamps_ns": np.zeros(20, dtype=np.int64)}, rw.errors.CountError, "two carrier poses have the stamp 0 ns"),
+        (
+            {"stamps_ns": np.zeros(20, dtype=np.int64)},
+            rw.errors.CountError,
+            "two different carrier poses have the stamp 0 ns",
+        ),
         (
             {"stamps_ns": np.arange(20) * 5 * 10**9},
             rw.errors.CountError,
-            "measurement at 0 ns has no other within 1 s",
+            "measurement at 0 ns has no other measurement within 1 s",
         ),
     ],
 )
@@ -203,7 +207,7 @@ def test_bad_stamps(change: dict[str, object], error: type[Exception], words: st
 
 
 def test_unknown_sensor() -> None:
-    with pytest.raises(rw.errors.FrameError, match="names 'cam9', which is no sensor; there are cam0"):
+    with pytest.raises(rw.errors.FrameError, match="names 'cam9', which is not a sensor; give any of cam0"):
         refined(problem_with({"cam0": 0.0}, count=20), time_offsets=("cam9",))
 
 
@@ -234,7 +238,7 @@ def test_twists_along_a_path_are_its_velocity() -> None:
     t, h = stamps * 1e-9, 1e-5
     expected = se3.logmap(se3.inverse(trajectory(t - h)) @ trajectory(t + h)) / (2 * h)
     np.testing.assert_allclose(twists, expected, atol=1e-4)
-    with pytest.raises(rw.errors.CountError, match="four and more"):
+    with pytest.raises(rw.errors.CountError, match="at least four"):
         LocalPaths.along(fast_path(), np.array([90_000_000_000]))
 
 
