@@ -26,14 +26,14 @@ FISHEYE = Camera.of(320, 240, "equidistant", K_FISH, (-0.02, 6e-3, -4e-3, 8e-4),
 
 @dataclass(frozen=True, eq=False)
 class Print:
-    """What is printed, 0 to 1, its middle the frame's origin; metres a pixel."""
+    """A printed pattern, gray values 0 to 1, with the frame's origin in its middle; metres per pixel."""
 
     picture: np.ndarray
     pixel_m: float
 
 
 def pose(rotation_deg: tuple[float, float, float], t_m: tuple[float, float, float]) -> np.ndarray:
-    """T_camera_target of what looks straight at the camera if it is not turned: its y is up, the camera's down."""
+    """T_camera_target; a target that is not turned faces the camera. The target's y is up, the camera's y is down."""
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(np.radians(np.array(rotation_deg)))[0] @ np.diag([1.0, -1.0, -1.0])
     T[:3, 3] = t_m

@@ -1,4 +1,4 @@
-"""Which of a plane's two poses: where images alone are wrong a quarter of the time, tracks are not."""
+"""The choice between a plane's two poses: single images are wrong in a quarter of the cases, tracks are not."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Track:
 def track(
     seed: int, *, n: int = 100, seconds: float = 0.2, far_m: float = 2.0, tilt_deg: float = 20.0, axes: int = 3
 ) -> Track:
-    """With extrinsics that are anything; the camera turns about all axes, about that of sight, or only shifts."""
+    """With random extrinsics; the camera turns about all axes, turns about the line of sight, or only shifts."""
     generator = np.random.default_rng(seed)
     t = np.arange(n) * seconds
     phase, rate = generator.uniform(0, 2 * np.pi, 6), generator.uniform(0.5, 1.2, 6)
@@ -78,7 +78,7 @@ def test_images_alone_are_wrong_often_and_tracks_are_not() -> None:
     assert not wrong[sure].any()
 
 
-def test_images_far_apart_in_time_help_one_another_through_the_carriers() -> None:
+def test_carriers_link_images_that_are_far_apart_in_time() -> None:
     for seed in range(3):
         it = track(seed, seconds=10.0)
         assert it.wrong(np.zeros(100, dtype=int)).mean() > 0.15
@@ -89,7 +89,7 @@ def test_images_far_apart_in_time_help_one_another_through_the_carriers() -> Non
         assert it.choice(with_carrier=False).which.tolist() == [0] * 100
 
 
-def test_without_carriers_neighbours_in_time_help() -> None:
+def test_without_carriers_neighbouring_images_help() -> None:
     alone = np.concatenate([it.wrong(np.zeros(100, dtype=int)) for it in TRACKS])
     choices = [it.choice(with_carrier=False) for it in TRACKS]
     wrong = np.concatenate([it.wrong(choice.which) for it, choice in zip(TRACKS, choices, strict=True)])
@@ -99,14 +99,14 @@ def test_without_carriers_neighbours_in_time_help() -> None:
 
 
 @pytest.mark.parametrize("n", [2, 5, LEAST_IMAGES - 1])
-def test_a_few_images_are_left_to_the_chain(n: int) -> None:
+def test_few_images_are_chosen_by_the_chain(n: int) -> None:
     it = track(1, n=n)
     choice = it.choice()
     assert choice.which.shape == choice.margin.shape == (n,)
     assert (choice.margin >= 0.0).all()
 
 
-def test_of_short_tracks_few_are_sure_and_wrong() -> None:
+def test_few_choices_in_short_tracks_are_sure_and_wrong() -> None:
     wrong_and_sure, sure = 0, 0
     for seed in range(8):
         it = track(seed, n=20)
@@ -117,7 +117,7 @@ def test_of_short_tracks_few_are_sure_and_wrong() -> None:
     assert wrong_and_sure <= 0.02 * sure
 
 
-def test_a_single_far_image_is_ambiguous_and_a_near_one_is_not() -> None:
+def test_a_far_tag_in_one_image_is_ambiguous_and_a_near_tag_is_not() -> None:
     it = TRACKS[0]
     for k in range(0, 100, 7):
         part = PlanePoses(*(getattr(it.poses, name)[k : k + 1] for name in vars(it.poses)))
@@ -140,7 +140,7 @@ def test_tags_that_turn_about_one_axis_or_not_at_all() -> None:
             assert not it.wrong(choice.which)[choice.margin > SURE].any()
 
 
-def test_somebodys_poster_with_the_same_tag_does_not_turn_the_others() -> None:
+def test_a_poster_with_the_same_tag_does_not_change_the_other_choices() -> None:
     it = TRACKS[1]
     T, B = it.poses.T.copy(), it.B
     generator = np.random.default_rng(0)
@@ -175,7 +175,7 @@ def test_carrier_poses_may_be_missing() -> None:
     np.testing.assert_allclose(nothing.margin, without.margin)
 
 
-def test_a_candidate_that_is_not_there_is_not_chosen() -> None:
+def test_a_missing_candidate_is_not_chosen() -> None:
     it = TRACKS[4]
     for gone in (0, 1):
         T, squared = it.poses.T.copy(), it.poses.squared_px.copy()
@@ -205,7 +205,7 @@ def test_no_single_image_decides_against_all_others() -> None:
     assert (choice.which != right).sum() <= 1
 
 
-def test_nothing_seen_nothing_chosen() -> None:
+def test_no_images_give_no_choices() -> None:
     choice = choose_over_time(
         np.zeros(0, dtype=np.int64), np.zeros((0, 2, 4, 4)), np.zeros((0, 2)), np.zeros((0, 2, 6, 6)), 0.1
     )

@@ -1,4 +1,4 @@
-"""Boards' corners against where they truly are, however the board is turned, its tags are, and the lens bends."""
+"""Boards' corners against their true places, for turned boards, turned tags and all lenses."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def the_detection(camera: Camera, target: Target, image: np.ndarray) -> Detectio
 @pytest.mark.parametrize("blur_px", [0.5, 1.0])
 @CAMERAS
 @pytest.mark.parametrize("target", [BOARD, GRID, CHESS], ids=lambda target: target.name)
-def test_corners_are_where_they_are(target: Target, camera: Camera, far: float, blur_px: float) -> None:
+def test_corners_are_at_their_true_places(target: Target, camera: Camera, far: float, blur_px: float) -> None:
     generator, picture, errors = np.random.default_rng(3), printed(target), []
     for turn in TURNS[::2]:
         T = pose((*generator.uniform(-25, 25, 2), turn), (*generator.uniform(-0.01, 0.01, 2), far))
@@ -44,7 +44,7 @@ def test_corners_are_where_they_are(target: Target, camera: Camera, far: float, 
     np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=4.0 * off.std() / np.sqrt(len(off)))
 
 
-def test_blur_leaves_the_corners_of_boards_where_they_are() -> None:
+def test_blur_does_not_move_the_corners_of_boards() -> None:
     for target in (GRID, CHESS):
         T = pose((15.0, -10.0, 30.0), (0.0, 0.0, 0.3))
         detection = the_detection(PINHOLE, target, render(PINHOLE, [(printed(target), T)], blur_px=2.0))
@@ -96,13 +96,13 @@ def test_an_outer_edge_is_not_taken_for_corners() -> None:
             assert np.abs(corners - projected(PINHOLE, CHESS.corners(), T)).max() < 0.2
 
 
-def test_another_size_of_checkerboard_is_not_this_one() -> None:
+def test_a_checkerboard_of_another_size_is_not_found() -> None:
     T = pose((5.0, 5.0, 5.0), (0.0, 0.0, 0.3))
     for other in (Checkerboard("larger", 6, 5, 0.025), Checkerboard("smaller", 4, 3, 0.03)):
         assert len(boards.checkerboard_corners(render(PINHOLE, [(printed(other), T)]), CHESS)) == 0
 
 
-def test_covered_parts_of_boards_are_missing_and_nothing_else() -> None:
+def test_only_covered_corners_of_boards_are_missing() -> None:
     T = pose((10.0, -15.0, 5.0), (0.0, 0.0, 0.3))
     for target in (BOARD, GRID):
         covered = np.s_[100:, 200:]
@@ -116,7 +116,7 @@ def test_covered_parts_of_boards_are_missing_and_nothing_else() -> None:
     assert len(boards.checkerboard_corners(render(PINHOLE, [(printed(CHESS), T)], covered=np.s_[:, 160:]), CHESS)) == 0
 
 
-def test_corners_that_went_astray_are_left_out() -> None:
+def test_wrong_corners_are_left_out() -> None:
     for camera in (PINHOLE, BARREL, FISHEYE):
         T = pose((20.0, -30.0, 40.0), (0.0, 0.0, 0.25))
         corners = projected(camera, BOARD.corners(), T) + np.random.default_rng(0).normal(scale=0.1, size=(15, 2))
@@ -126,7 +126,7 @@ def test_corners_that_went_astray_are_left_out() -> None:
         assert np.flatnonzero(~kept).tolist() == [3, 11]
 
 
-def test_no_board_no_corners() -> None:
+def test_an_image_without_a_board_has_no_corners() -> None:
     empty = render(PINHOLE, [])
     for target in (BOARD, GRID, CHESS):
         (seen,) = Detector(PINHOLE, [target])([empty])
@@ -134,7 +134,7 @@ def test_no_board_no_corners() -> None:
         assert seen.strangers == {}
 
 
-def test_it_is_the_printed_picture_that_opencv_draws() -> None:
+def test_the_rendered_board_is_the_board_that_opencv_draws() -> None:
     # The AprilGrid that the tests draw is decoded by OpenCV with two border bits, with its ids where Kalibr has them.
     picture: Print = printed(GRID)
     parameters = cv2.aruco.DetectorParameters()

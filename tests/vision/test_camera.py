@@ -1,4 +1,4 @@
-"""Projection against OpenCV's, derivatives in numbers, the way back, and intrinsics that are those of no camera."""
+"""Projection against OpenCV, derivatives against finite differences, undistortion, and wrong intrinsics."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ POINTS = st.lists(
 
 @settings(max_examples=150, deadline=None)
 @given(st.sampled_from([4, 5, 8, 12]).flatmap(coefficients), POINTS)
-def test_radtan_is_opencvs(D: np.ndarray, points: np.ndarray) -> None:
+def test_radtan_projects_as_opencv_does(D: np.ndarray, points: np.ndarray) -> None:
     camera = Camera.of(640, 480, "plumb_bob" if len(D) < 8 else "rational_polynomial", K, D, "test")
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, D)
     found = camera.pixels(points[:, :2] / points[:, 2:])
@@ -55,14 +55,14 @@ def test_radtan_is_opencvs(D: np.ndarray, points: np.ndarray) -> None:
 
 @settings(max_examples=80, deadline=None)
 @given(coefficients(4), POINTS)
-def test_equidistant_is_opencvs(D: np.ndarray, points: np.ndarray) -> None:
+def test_equidistant_projects_as_opencv_does(D: np.ndarray, points: np.ndarray) -> None:
     camera = Camera.of(640, 480, "equidistant", K, D, "test")
     expected, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), K, D)
     np.testing.assert_allclose(camera.pixels(points[:, :2] / points[:, 2:]), expected[:, 0], atol=1e-7)
 
 
 @EVERY
-def test_project_is_pixels_of_what_is_in_front(lens: str) -> None:
+def test_project_gives_pixels_in_front_of_the_camera(lens: str) -> None:
     camera = camera_of(lens)
     points = np.random.default_rng(2).uniform([-0.6, -0.6, 1.0], [0.6, 0.6, 2.0], (5, 8, 3))
     np.testing.assert_allclose(camera.project(points), camera.pixels(points[..., :2] / points[..., 2:]))
@@ -71,7 +71,7 @@ def test_project_is_pixels_of_what_is_in_front(lens: str) -> None:
 @settings(max_examples=150, deadline=None)
 @given(st.sampled_from([4, 5, 8]).flatmap(coefficients), st.booleans())
 @example(np.array([0.1875, 0.0, 0.0, 0.0, -0.26078869, 0.24708576, -0.29433361, -0.11132812]), False)
-def test_the_ring_is_where_the_radius_turns_back(D: np.ndarray, is_fisheye: bool) -> None:
+def test_the_distorted_radius_is_largest_at_the_ring(D: np.ndarray, is_fisheye: bool) -> None:
     D = D[:4] if is_fisheye else np.concatenate([D[:2], [0.0, 0.0], D[4:]])
     camera = Camera.of(640, 480, "equidistant" if is_fisheye else "rational_polynomial", K, D, "test")
     furthest = 30.0 if is_fisheye else 5.0
@@ -94,7 +94,7 @@ def test_the_axis_is_the_principal_point() -> None:
 
 
 @EVERY
-def test_derivatives_in_numbers(lens: str) -> None:
+def test_derivatives_agree_with_finite_differences(lens: str) -> None:
     camera, h = camera_of(lens), 1e-6
     random = np.random.default_rng(0).uniform(-0.8, 0.8, (40, 2))
     near_the_axis = np.random.default_rng(1).normal(size=(20, 2)) * np.repeat(10.0 ** -np.arange(3, 8), 4)[:, None]
@@ -107,7 +107,7 @@ def test_derivatives_in_numbers(lens: str) -> None:
 
 
 @EVERY
-def test_there_and_back(lens: str) -> None:
+def test_undistort_is_the_inverse_of_pixels(lens: str) -> None:
     camera = camera_of(lens)
     u, v = np.meshgrid(np.linspace(-0.5, 639.5, 33), np.linspace(-0.5, 479.5, 25))
     pixels = np.stack([u, v], axis=-1)
@@ -137,7 +137,7 @@ def test_behind_the_camera_nothing_is_seen() -> None:
     ("model", "D", "ring"),
     [("plumb_bob", (-0.28, 0.0, 0.0, 0.0), np.sqrt(1.0 / (3 * 0.28))), ("equidistant", (-0.2, 0.0, 0.0, 0.0), None)],
 )
-def test_beyond_the_ring_where_the_lens_folds_back_no_ray_leads(model: str, D: tuple[float], ring: float) -> None:
+def test_no_ray_leads_beyond_the_ring(model: str, D: tuple[float], ring: float) -> None:
     camera = Camera.of(640, 480, model, K, D, "test")
     if ring is None:  # theta (1 - 0.2 theta^2) is largest where 0.6 theta^2 = 1
         theta = np.sqrt(1.0 / 0.6)
@@ -153,7 +153,7 @@ def test_beyond_the_ring_where_the_lens_folds_back_no_ray_leads(model: str, D: t
         assert np.isnan(camera.undistort(pixels)).all(), share
 
 
-def test_one_pixel_that_no_ray_leads_to_does_not_spoil_others() -> None:
+def test_a_pixel_without_a_ray_does_not_change_the_others() -> None:
     camera = Camera.of(640, 480, "plumb_bob", K, (-0.28, 0.0, 0.0, 0.0), "test")
     x = np.array([[0.1, 0.2], [0.3, -0.1]])
     pixels = np.concatenate([camera.pixels(x), [[5000.0, 5000.0], [np.nan, 3.0]]])
@@ -179,7 +179,7 @@ def test_inside_goes_to_the_pixels_outer_edges() -> None:
         (" equidistant ", "equidistant"),
     ],
 )
-def test_everyones_words_for_models(word: str, model: str) -> None:
+def test_models_have_the_words_of_ros_foxglove_and_kalibr(word: str, model: str) -> None:
     assert Camera.of(640, 480, word, K, (0.1, 0.02, 0.0, 0.0), "test").model == model
 
 
@@ -227,7 +227,7 @@ def changed(row: int, column: int, value: float) -> np.ndarray:
         ((640, 480), "pinhole", K, (0.1, 0.0, 0.0, 0.0), "without a distortion model"),
     ],
 )  # fmt: skip
-def test_what_is_no_camera(
+def test_wrong_intrinsics_are_refused(
     size: tuple[int, int], model: str, matrix: np.ndarray, D: tuple[float, ...], words: str
 ) -> None:
     with pytest.raises(CameraError, match=rf"^/cam/info: .*{words}"):

@@ -1,4 +1,4 @@
-"""Tags that are read by us: any of a family, in perspective and however turned, and nothing else."""
+"""Tags of whole families are read in perspective and in every turn; other quadrangles are not."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_every_tag_of_a_family(family: str, share: float, bends: list[float], tu
     assert number not in identified(image, left, family)
 
 
-def test_a_wrong_bit_is_borne_and_wrong_borders_are_not() -> None:
+def test_a_wrong_bit_is_corrected_and_a_wrong_border_is_not() -> None:
     corners = np.array([[60.0, 60.0], [220.0, 60.0], [220.0, 220.0], [60.0, 220.0]])
     image = tag_in_perspective("tag36h11", 33, corners)
     cell = image[60 + 3 * 20 : 60 + 4 * 20, 60 + 3 * 20 : 60 + 4 * 20]
@@ -54,7 +54,7 @@ def test_a_wrong_bit_is_borne_and_wrong_borders_are_not() -> None:
 
 
 @pytest.mark.parametrize("family", ["tag36h11", "aruco_4x4_50"])
-def test_what_is_no_tag(family: str) -> None:
+def test_quadrangles_without_a_tag_have_no_id(family: str) -> None:
     flat = np.full((100, 100), 90, np.uint8)
     corners = np.array([[[20.0, 20.0], [80.0, 20.0], [80.0, 80.0], [20.0, 80.0]], [[5.0, 5.0]] * 4])
     assert identified(flat, corners, family).tolist() == [-1, -1]

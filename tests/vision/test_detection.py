@@ -1,4 +1,4 @@
-"""What is seen, what of it is not used and why, and what is somebody else's."""
+"""Detections, the reasons of rejected detections, and tags of no target."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def test_a_grids_tags_are_no_single_tags() -> None:
     assert len(grid.indices) >= 12
 
 
-def test_an_empty_image_and_none_at_all() -> None:
+def test_an_empty_image_and_no_images() -> None:
     every = [TAG, BOARD, GRID, Checkerboard("chess", 5, 4, 0.03)]
     for image in (np.zeros((240, 320), np.uint8), np.full((240, 320), 255, np.uint8), picture()):
         assert seen_in(image, *every) == ImageDetections((), {})
@@ -198,7 +198,7 @@ def test_an_empty_image_and_none_at_all() -> None:
     assert seen_in(picture((TAG, NEAR))) == ImageDetections((), {})
 
 
-def test_many_images_are_as_each_alone() -> None:
+def test_many_images_together_give_what_each_gives_alone() -> None:
     other = Tag("other", "tag36h11", 8, 0.05)
     images = [
         picture((TAG, NEAR)),
@@ -237,11 +237,11 @@ def test_grazing_is_the_angle_of_the_line_of_sight() -> None:
         ({"max_grazing_deg": 91.0}, "at most 90"),
     ],
 )
-def test_options_that_make_no_sense(changes: dict[str, float], words: str) -> None:
+def test_wrong_options_are_refused(changes: dict[str, float], words: str) -> None:
     with pytest.raises(OptionError, match=words):
         DetectionOptions(**changes)
 
 
-def test_what_is_printed_is_not_blank() -> None:
+def test_rendered_targets_are_not_blank() -> None:
     assert isinstance(printed(TAG), Print)
     assert 0.2 < printed(TAG).picture.mean() < 0.8

@@ -1,4 +1,4 @@
-"""Tags' corners from their edges: where they truly are, blurred, small, slanted, half covered, through any lens."""
+"""Tags' corners from their edges against the true corners: blurred, small, slanted, half covered, through any lens."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COUNT = 10
 
 
 def views(camera: Camera, far: float, *, slant_deg: float = 40.0, **how: float) -> tuple[list[np.ndarray], np.ndarray]:
-    """Pictures of the tag, turned anyhow, and its corners (n, 4, 2)."""
+    """Pictures of the tag in random turns, and its corners (n, 4, 2)."""
     generator = np.random.default_rng(0)
     images, corners = [], []
     for seed in range(COUNT):
@@ -39,12 +39,12 @@ def refined(images: list[np.ndarray], start: np.ndarray, camera: Camera = PINHOL
 
 
 def disturbed(corners: np.ndarray, by_px: float = 0.9) -> np.ndarray:
-    """As a detector has them: not better than a pixel."""
+    """Corners as a detector finds them, right to about a pixel."""
     return corners + np.random.default_rng(1).uniform(-by_px, by_px, corners.shape)
 
 
 def outward(corners: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """How much too far outside (n, 4)."""
+    """How far the corners are too far outside, (n, 4)."""
     off = truth - truth.mean(axis=1, keepdims=True)
     return ((corners - truth) * off / np.linalg.norm(off, axis=2, keepdims=True)).sum(axis=2)
 
@@ -94,7 +94,7 @@ def test_the_blur_is_measured(blur_px: float) -> None:
     np.testing.assert_allclose(found.blur_px, np.hypot(blur_px, own), rtol=0.12)
 
 
-def test_motion_blurs_two_sides_and_that_is_the_blur() -> None:
+def test_motion_blur_is_measured_on_the_two_blurred_sides() -> None:
     T = pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.3))
     image = render(PINHOLE, [(PICTURE, T)])
     moved = cv2.blur(image, (9, 1))
@@ -124,7 +124,7 @@ def test_a_finger_on_an_edge() -> None:
     np.testing.assert_allclose(found.corners_px[0], truth, atol=0.12)
 
 
-def test_where_there_is_no_edge_there_are_no_corners() -> None:
+def test_a_side_without_an_edge_has_no_corners() -> None:
     images, truth = views(PINHOLE, 0.4)
     blank = render(PINHOLE, [])
     noise = np.random.default_rng(0).integers(0, 256, (240, 320)).astype(np.uint8)
@@ -138,7 +138,7 @@ def test_where_there_is_no_edge_there_are_no_corners() -> None:
     np.testing.assert_allclose(found.corners_px[4], truth[0], atol=0.1)
 
 
-def test_one_that_is_not_there_does_not_disturb_the_others() -> None:
+def test_a_missing_tag_does_not_change_the_others() -> None:
     images, truth = views(PINHOLE, 0.4)
     alone = refined(images[:1], disturbed(truth[:1]))
     bad = np.array([np.full((4, 2), np.nan), np.full((4, 2), 50.0), np.full((4, 2), 1e9), -disturbed(truth[:1])[0]])
@@ -163,7 +163,7 @@ def test_at_the_images_rim() -> None:
     np.testing.assert_allclose(found.corners_px[0], truth, atol=0.12)
 
 
-def test_no_tags_no_corners() -> None:
+def test_no_tags_give_no_corners() -> None:
     found = refine_corners(
         [np.zeros((240, 320), np.uint8)], np.zeros(0, dtype=int), np.zeros((0, 4, 2)), PINHOLE, MODULES
     )
@@ -186,7 +186,7 @@ def test_a_profile_of_the_model_is_fitted_in_a_few_rounds(edge: float, blur: flo
     assert fitted.rms < 0.01
 
 
-def test_the_square_behind_four_corners() -> None:
+def test_from_unit_square_maps_to_the_corners() -> None:
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     corners = unit + np.random.default_rng(2).uniform(-0.2, 0.2, (6, 4, 2))
     H = from_unit_square(corners)
@@ -197,7 +197,7 @@ def test_the_square_behind_four_corners() -> None:
     np.testing.assert_allclose(mapped(H, np.array([1.0, 0.0]), 1.0), corners[:, 2:], atol=1e-12)
 
 
-def test_lines_and_where_they_meet() -> None:
+def test_lines_through_points_and_their_crossings() -> None:
     corners = np.array([[[3.0, 1.0], [40.0, 6.0], [38.0, 50.0], [-1.0, 44.0]]])
     share = np.linspace(0.1, 0.9, 18)[:, None]
     points = corners[:, :, None] * (1 - share) + np.roll(corners, -1, axis=1)[:, :, None] * share

@@ -1,4 +1,4 @@
-"""Gray pixels of every encoding, and what no decoder may be fooled by."""
+"""Gray pixels from every encoding, and damaged or malicious images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def compressed(data: bytes, encoding: str = "jpeg") -> ImageRecord:
 def raw(
     pixels: np.ndarray, encoding: str, *, padding: int = 0, is_bigendian: bool = False, width: int | None = None
 ) -> ImageRecord:
-    """Of rows of bytes or of 16-bit numbers."""
+    """A raw image from rows of bytes or of 16-bit numbers."""
     rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
     rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=0xEE)
     columns = pixels.shape[1] if width is None else width
@@ -127,7 +127,7 @@ def test_sixteen_bits_compressed_are_scaled_alike() -> None:
         )
 
 
-def test_floating_point_is_scaled_and_what_is_no_number_is_black() -> None:
+def test_floating_point_is_scaled_and_nan_is_black() -> None:
     pixels = (GRAY / 1000.0).astype(np.float32)
     pixels[0, :3] = np.nan, np.inf, -1.0
     gray = decode_gray(compressed(encoded(pixels, ".tiff"), "tiff"))
@@ -136,7 +136,7 @@ def test_floating_point_is_scaled_and_what_is_no_number_is_black() -> None:
     np.testing.assert_allclose(gray, expected, atol=0.51)
 
 
-def test_orientation_is_the_viewers() -> None:
+def test_exif_orientation_is_ignored() -> None:
     jpeg = encoded(GRAY, ".jpg")
     # TIFF header, one entry: orientation (0x0112), short, 6: turned by 90 degrees.
     exif = b"Exif\0\0" + b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)
@@ -186,7 +186,7 @@ def jpeg_that_claims(width: int, height: int, before: bytes = b"") -> bytes:
         (ImageRecord(5, 1234, "/cam", "cam", "mono8", bytes(9), None, 3, 3), "without width, height or step"),
     ],
 )  # fmt: skip
-def test_what_is_no_image(image: ImageRecord, words: str) -> None:
+def test_wrong_images_are_refused(image: ImageRecord, words: str) -> None:
     with pytest.raises(ImageError, match=words) as caught:
         decode_gray(image)
     assert str(caught.value).startswith("topic /cam, image at 1234 ns: ")

@@ -1,4 +1,4 @@
-"""Intrinsics from Kalibr's, ROS's and OpenCV's files, and every fault with its line."""
+"""Intrinsics from files of Kalibr, ROS and OpenCV; every fault has its line."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def test_calibration_faults(path: Path, old: str, new: str, words: str) -> None:
     assert str(caught.value).startswith(f"{path}, {words}")
 
 
-def test_four_coefficients_without_a_model_could_be_either(path: Path) -> None:
+def test_four_coefficients_need_a_model(path: Path) -> None:
     text = ROS.replace("distortion_model: plumb_bob\n", "").replace("cols: 5", "cols: 4")
     text = text.replace(", 0]\nrect", "]\nrect")
     path.write_text(text)
@@ -224,7 +224,7 @@ def test_a_camera_that_was_not_calibrated(path: Path) -> None:
         read_calibration_yaml(path)
 
 
-def test_the_one_for_the_other(path: Path) -> None:
+def test_a_camchain_and_a_calibration_are_not_exchanged(path: Path) -> None:
     path.write_text(ROS)
     with pytest.raises(FileFormatError, match=r"no cameras cam0, cam1, \.\.\. \(it has a camera matrix"):
         read_kalibr_camchain(path)

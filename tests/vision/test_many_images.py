@@ -1,4 +1,4 @@
-"""Whole logs of images: the same on any number of cores, faults said, no more held than is looked at."""
+"""Whole logs of images: equal results on any number of cores, reported faults, and little memory."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def record(topic: str, stamp_ns: int, data: bytes) -> ImageRecord:
 
 @pytest.fixture(scope="module")
 def images() -> list[ImageRecord]:
-    """Two topics in turns, not as many of each, a few views again and again."""
+    """Two topics in turns with different numbers of images; a few views repeat."""
     views = {
         topic: [
             png(render(camera, [(printed(TAG), pose((15.0, tilt, 0.0), (0.0, 0.0, 0.3)))], seed=int(tilt)))
@@ -89,7 +89,7 @@ def test_each_topic_comes_in_order(images: list[ImageRecord]) -> None:
         assert stamps == sorted(stamps)
 
 
-def test_detectors_are_made_once_a_thread(images: list[ImageRecord]) -> None:
+def test_each_thread_makes_its_detectors_once(images: list[ImageRecord]) -> None:
     made: list[tuple[str, int]] = []
 
     def maker(topic: str) -> Callable[[], Detector]:
@@ -103,7 +103,7 @@ def test_detectors_are_made_once_a_thread(images: list[ImageRecord]) -> None:
     assert len(made) == len(set(made)) <= 4
 
 
-def test_faults_are_said_and_the_others_go_on(images: list[ImageRecord]) -> None:
+def test_faults_are_reported_and_the_other_images_are_used(images: list[ImageRecord]) -> None:
     good = [image for image in images if image.topic == "/left"][:3]
     broken = record("/left", 5, b"no image")
     large = record("/left", 7, png(np.zeros((480, 640), np.uint8)))
@@ -131,7 +131,7 @@ def test_raw_images_need_no_copy(images: list[ImageRecord]) -> None:
     assert_same({("", 1): one}, {("", 1): other})
 
 
-def test_no_more_is_read_than_is_looked_at(images: list[ImageRecord]) -> None:
+def test_images_are_read_only_when_they_are_needed(images: list[ImageRecord]) -> None:
     empty = png(np.zeros((240, 320), np.uint8))
     read, furthest = 0, 0
 
@@ -148,7 +148,7 @@ def test_no_more_is_read_than_is_looked_at(images: list[ImageRecord]) -> None:
     assert furthest <= 6 * BATCH
 
 
-def test_processes_see_what_threads_see(images: list[ImageRecord]) -> None:
+def test_processes_detect_what_threads_detect(images: list[ImageRecord]) -> None:
     with_faults = [*images, record("/left", 1, b"no image"), record("/right", 2, png(np.zeros((5, 5), np.uint8)))]
     told: list[int] = []
     by_threads = by_image(detect_in_images(with_faults, MAKERS, workers=2))
@@ -169,7 +169,7 @@ def test_processes_end_with_the_caller(images: list[ImageRecord]) -> None:
     assert processes() == []
 
 
-def test_a_script_needs_no_main(tmp_path: Path, images: list[ImageRecord]) -> None:
+def test_a_script_needs_no_main_guard(tmp_path: Path, images: list[ImageRecord]) -> None:
     """Python's own processes would run the caller's script again."""
     (tmp_path / "image.png").write_bytes(images[1].data)
     script = tmp_path / "script.py"
@@ -208,7 +208,7 @@ def test_stopping_early_reads_no_further() -> None:
     assert read <= 4 * BATCH
 
 
-def test_an_error_while_reading_is_the_callers() -> None:
+def test_an_error_while_reading_reaches_the_caller() -> None:
     def log() -> Iterator[ImageRecord]:
         yield record("/left", 0, b"")
         raise OSError("the disk is gone")
@@ -225,7 +225,7 @@ def test_progress(images: list[ImageRecord]) -> None:
     assert len(told) >= 3
 
 
-def test_opencvs_threads_and_its_log_are_given_back(images: list[ImageRecord]) -> None:
+def test_opencv_gets_its_threads_and_log_level_back(images: list[ImageRecord]) -> None:
     before = cv2.getNumThreads(), cv2.utils.logging.getLogLevel()
     looked = detect_in_images(images[:2], MAKERS)
     next(looked)
@@ -233,11 +233,13 @@ def test_opencvs_threads_and_its_log_are_given_back(images: list[ImageRecord]) -
     assert (cv2.getNumThreads(), cv2.utils.logging.getLogLevel()) == before
 
 
-def test_no_images_nothing_seen() -> None:
+def test_no_images_give_no_detections() -> None:
     assert list(detect_in_images([], MAKERS)) == []
 
 
-def test_opencv_does_not_talk_of_broken_images(capfd: pytest.CaptureFixture[str], images: list[ImageRecord]) -> None:
+def test_opencv_prints_nothing_about_broken_images(
+    capfd: pytest.CaptureFixture[str], images: list[ImageRecord]
+) -> None:
     broken = [record("/left", k, images[1].data[: -40 - k]) for k in range(3)]
     for ending in (".jpg", ".bmp", ".tiff", ".jp2"):
         data = cv2.imencode(ending, np.zeros((240, 320), np.uint8))[1].tobytes()
@@ -259,13 +261,13 @@ def test_measured_corner_noise() -> None:
     assert measured_corner_px(squared, corners) == pytest.approx(0.3, rel=0.15)
 
 
-def test_measured_corner_noise_of_next_to_nothing() -> None:
+def test_measured_corner_noise_has_a_least_value() -> None:
     assert measured_corner_px(np.zeros(5), np.full(5, 4)) == 0.02
     assert measured_corner_px(np.zeros(0), np.zeros(0, dtype=int)) == 0.02
     assert measured_corner_px(np.ones(5), np.full(5, 3), least_px=0.1) == 0.1  # three corners leave nothing over
 
 
-def test_measured_corner_noise_of_single_tags_alone() -> None:
+def test_measured_corner_noise_of_single_tags() -> None:
     generator = np.random.default_rng(1)
     for seed in range(3):
         squared = 0.2**2 * np.random.default_rng(seed).chisquare(2, 400)

@@ -1,4 +1,4 @@
-"""Poses of flat targets: the truth without noise, covariances that cover with it, nan where there is none."""
+"""Poses of flat targets: true without noise, with covariances that cover the errors, nan without a pose."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ TARGETS: tuple[Target, ...] = (TAG, BOARD, AprilGrid("g", "tag36h11", 2, 2, 0.04
 
 
 def estimated(camera: Camera, target: Target, pixels: np.ndarray, corner_px: float = 0.1) -> PlanePoses:
-    """Of many sets (N, n, 2) of all of a target's corners."""
+    """Poses from N sets (N, n, 2) of all of a target's corners."""
     return plane_poses(camera, [target.corners()] * len(pixels), list(pixels), corner_px=corner_px)
 
 
 def nearest(T: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (N, 6) of candidates (N, 2, 4, 4), and which is the nearer one (N,)."""
+    """Errors (N, 6) of the nearer candidate of (N, 2, 4, 4), and its number (N,)."""
     errors = se3.logmap((np.linalg.inv(truth) @ np.nan_to_num(T, nan=1.0)).reshape(-1, 4, 4)).reshape(-1, 2, 6)
     which = np.argmin(np.where(np.isfinite(T[:, :, 0, 0]), np.linalg.norm(errors, axis=2), np.inf), axis=1)
     return np.take_along_axis(errors, which[:, None, None], axis=1)[:, 0], which
@@ -38,7 +38,7 @@ def nearest(T: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     st.tuples(st.floats(10.0, 65.0), st.floats(0.0, 360.0), st.floats(-180.0, 180.0)),
     st.tuples(st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), st.floats(0.3, 1.5)),
 )
-def test_without_noise_it_is_the_truth(
+def test_without_noise_the_pose_is_the_truth(
     camera: Camera, target: Target, turn: tuple[float, float, float], place: tuple[float, float, float]
 ) -> None:
     tilt, about, roll = np.radians(turn[0]), np.radians(turn[1]), turn[2]
@@ -58,7 +58,7 @@ def test_without_noise_it_is_the_truth(
 
 @pytest.mark.parametrize("far", [0.3, 0.3046875, 0.5])
 @pytest.mark.parametrize("tilt_deg", [0.0, 10.0, 30.0])
-def test_exactly_on_the_axis_too(tilt_deg: float, far: float) -> None:
+def test_targets_exactly_on_the_axis_have_their_true_pose(tilt_deg: float, far: float) -> None:
     for camera in CAMERAS:
         for target in TARGETS:
             T = pose((tilt_deg, 0.0, 0.0), (0.0, 0.0, far))
@@ -70,7 +70,7 @@ def test_exactly_on_the_axis_too(tilt_deg: float, far: float) -> None:
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.model)
 @pytest.mark.parametrize("target", [TAG, BOARD], ids=lambda target: target.name)
-def test_the_covariance_covers(camera: Camera, target: Target) -> None:
+def test_the_covariance_covers_the_errors(camera: Camera, target: Target) -> None:
     N, sigma = 300, 0.2
     T = pose((30.0, -25.0, 40.0), (0.03, -0.02, 0.35))
     pixels = projected(camera, target.corners(), T)
@@ -126,7 +126,7 @@ def test_both_candidates_of_a_far_tag_are_minima_and_mirror_images() -> None:
     np.testing.assert_allclose(gradient * sigma, 0.0, atol=1e-3)
 
 
-def test_ordered_by_what_is_left() -> None:
+def test_candidates_are_ordered_by_reprojection_error() -> None:
     generator = np.random.default_rng(0)
     T = pose((15.0, 10.0, 0.0), (0.0, 0.0, 1.5))
     noisy = projected(PINHOLE, TAG.corners(), T) + generator.normal(scale=0.3, size=(50, 4, 2))
@@ -143,7 +143,7 @@ def test_ordered_by_what_is_left() -> None:
     np.testing.assert_allclose(found.errors_px[k], noisy[k] - predicted, atol=1e-9)
 
 
-def test_many_at_once_are_as_each_alone() -> None:
+def test_many_targets_together_give_what_each_gives_alone() -> None:
     generator = np.random.default_rng(1)
     points, pixels = [], []
     for target in TARGETS * 3:
@@ -174,7 +174,7 @@ BAD = {
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.model)
 @pytest.mark.parametrize("bad", BAD)
-def test_corners_of_nothing_have_no_pose_and_do_not_disturb(bad: str, camera: Camera) -> None:
+def test_corners_of_no_plane_have_no_pose_and_do_not_change_the_others(bad: str, camera: Camera) -> None:
     good = projected(camera, TAG.corners(), pose((20.0, 10.0, 0.0), (0.0, 0.0, 0.4)))
     found = estimated(camera, TAG, np.array([good, BAD[bad], good]))
     assert np.isfinite(found.squared_px[[0, 2], 0]).all()
@@ -199,7 +199,7 @@ def test_points_on_a_line_of_the_target_have_no_pose() -> None:
     assert np.isnan(found.squared_px).all()
 
 
-def test_no_targets_no_poses() -> None:
+def test_no_targets_give_no_poses() -> None:
     found = plane_poses(PINHOLE, [], [], corner_px=0.1)
     assert found.T.shape == (0, 2, 4, 4)
     assert found.covariance.shape == (0, 2, 6, 6)

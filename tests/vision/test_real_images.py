@@ -1,4 +1,4 @@
-"""Images and poses that nobody here made: what is seen moves as the robot says it did."""
+"""Images and poses of other people's robots: the detected targets move as the robot reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every tag of every family in an image, each place once."""
+"""The survey finds every tag of every family in an image, and counts each place once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from gtsam_rwhec.vision.tag_survey import tags_in_image
 from gtsam_rwhec.vision.targets import AprilGrid, Tag
 
 
-def test_tags_of_every_family_are_found_each_place_once() -> None:
+def test_tags_of_every_family_are_found_once_at_each_place() -> None:
     scene = [
         (Tag("a", "tag36h11", 3, 0.05), pose((0.0, 0.0, 0.0), (-0.12, -0.08, 0.4))),
         (Tag("b", "tag25h9", 5, 0.05), pose((0.0, 0.0, 0.0), (0.0, -0.08, 0.4))),

@@ -1,4 +1,4 @@
-"""Where corners are: one frame for all targets, and OpenCV's boards up to the change of frame."""
+"""The places of targets' corners: one frame for all targets, and OpenCV's boards after a change of frame."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CHESS = Checkerboard("chess", 8, 5, 0.03)
 
 
 def from_opencvs(points: np.ndarray, width_m: float, height_m: float) -> np.ndarray:
-    """Of OpenCV's boards: origin at the top left outer corner, y down, z into the paper."""
+    """T from the frame of OpenCV's boards: origin at the top left outer corner, y down, z into the paper."""
     return points * [1.0, -1.0, -1.0] + [-0.5 * width_m, 0.5 * height_m, 0.0]
 
 
@@ -129,7 +129,7 @@ def test_the_widest_dictionaries_begin_with_the_others() -> None:
         (lambda: Checkerboard("t", 8, 5, 30.0), "square_m = 30.0"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_printed(make: object, words: str) -> None:
+def test_wrong_targets_are_refused(make: object, words: str) -> None:
     with pytest.raises(TargetError, match=rf"^target t: .*{words}"):
         make()  # type: ignore[operator]
 

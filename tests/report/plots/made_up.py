@@ -1,4 +1,4 @@
-"""Made-up calibrations to draw: a rig of some cameras among targets on walls, with noise as real ones have it."""
+"""Invented calibrations to draw: cameras on a hand, targets on walls, and realistic noise."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def pose_noised(T: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 
 def covariances(frames: RigFrames, seed: int = 1) -> dict[str, np.ndarray]:
-    """About 0.02 degrees and half a millimetre, worse for targets."""
+    """Covariances of about 0.02 degrees and half a millimetre, larger for targets."""
     generator = np.random.default_rng(seed)
     result = {}
     for name in (*frames.sensors, *frames.targets):
@@ -97,7 +97,7 @@ def measurements(frames: RigFrames, each: int = 120, seed: int = 2) -> dict[tupl
 
 
 def corners(frames: RigFrames, each: int = 1500, seed: int = 3) -> dict[str, PlottedCorners]:
-    """Clusters as targets pass through the image, with a slight error of the intrinsics in the first camera."""
+    """Clusters of corners; the first camera's intrinsics are slightly wrong."""
     generator = np.random.default_rng(seed)
     result = {}
     for k, sensor in enumerate(frames.sensors):

@@ -1,4 +1,4 @@
-"""What pictures are made of: names that cover nothing, round numbers, texts that fit."""
+"""The parts of pictures: names that cover nothing, round numbers, texts that fit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ AXES = Figure().subplots()
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 9))
-def test_names_do_not_cover_one_another_or_what_is_drawn(seed: int, count: int) -> None:
+def test_names_cover_neither_each_other_nor_the_drawing(seed: int, count: int) -> None:
     generator = np.random.default_rng(seed)
     figure = Figure(figsize=(6.0, 5.0), dpi=100)
     FigureCanvasAgg(figure)
@@ -75,7 +75,7 @@ def test_axes_have_numbers_within_them(low: float, decades: float) -> None:
 
 
 def test_an_ellipsoid_holds_95_of_100_positions() -> None:
-    """Its shadow along the third axis is that of all points within it."""
+    """The ellipsoid's shadow along the third axis is the shadow of all points within it."""
     generator = np.random.default_rng(4)
     root = generator.standard_normal((3, 3))
     points = generator.standard_normal((200_000, 3)) @ root.T

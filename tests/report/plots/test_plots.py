@@ -1,4 +1,4 @@
-"""Pictures are written, show what they are given, and are the same bytes for the same."""
+"""Pictures show their data, and equal data gives equal bytes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ DRAWN: dict[str, Callable[[Path], None]] = {
 
 
 def drawn(folder: Path, draw: Callable[..., None], *arguments: Any) -> np.ndarray:
-    """Draw; the picture's pixels, (rows, columns, 4) from 0 to 1."""
+    """Draw a picture, and return its pixels (rows, columns, 4), 0 to 1."""
     path = folder / "picture.png"
     draw(*arguments, path)
     pixels = np.asarray(imread(io.BytesIO(path.read_bytes())))
@@ -62,7 +62,7 @@ def has_colour(pixels: np.ndarray, colour: str) -> bool:
 
 
 @pytest.mark.parametrize("name", DRAWN)
-def test_pictures_are_written_and_always_the_same(name: str, tmp_path: Path) -> None:
+def test_equal_input_gives_equal_bytes(name: str, tmp_path: Path) -> None:
     before = dict(matplotlib.rcParams)
     paths = [tmp_path / "first.png", tmp_path / "second.png"]
     DRAWN[name](paths[0])
@@ -88,7 +88,7 @@ def test_ellipsoids_are_drawn(finite: dict[Any, np.ndarray], tmp_path: Path) -> 
 
 @pytest.mark.parametrize("place", [(3, 3), (0, 0)])
 def test_infinite_covariances_are_marked(place: tuple[int, int], finite: dict[Any, np.ndarray], tmp_path: Path) -> None:
-    """A position that is free is circled; of what is free there is a mark among the deviations."""
+    """A circle marks a position that is not determined; the deviations have a strip for infinite values."""
     free = {name: covariance.copy() for name, covariance in COVARIANCES.items()}
     free["tag_1"][place] = np.inf
     purple = "#CC79A7"
@@ -98,7 +98,7 @@ def test_infinite_covariances_are_marked(place: tuple[int, int], finite: dict[An
     assert ink(drawn(tmp_path, plot_deviations, FRAMES, free)) > ink(finite[plot_deviations]) + 0.01
 
 
-def test_all_infinite_and_none_at_all(tmp_path: Path) -> None:
+def test_covariances_all_infinite_zero_or_missing(tmp_path: Path) -> None:
     two = RigFrames("hand", "base", {"cam": np.eye(4)}, {"tag": np.eye(4)})
     for variance in (np.inf, 0.0):
         given = {name: np.diag(np.full(6, variance)) for name in ("cam", "tag")}
@@ -107,7 +107,7 @@ def test_all_infinite_and_none_at_all(tmp_path: Path) -> None:
     assert ink(drawn(tmp_path, plot_deviations, two, {})) > 0.005
 
 
-def test_nothing_to_draw_is_said(tmp_path: Path) -> None:
+def test_an_empty_picture_says_so(tmp_path: Path) -> None:
     for draw, arguments in (
         (plot_frames, (EMPTY, {})),
         (plot_deviations, (EMPTY, {})),
@@ -123,7 +123,7 @@ def test_one_frame_at_the_carriers_origin(tmp_path: Path) -> None:
 
 
 def test_a_far_origin_does_not_shrink_the_frames(tmp_path: Path) -> None:
-    """Targets a kilometre from the world's origin stay a metre apart in the picture, and it is said why."""
+    """Targets a kilometre from the world's origin stay a metre apart in the picture, and a note says why."""
     targets = {"a": np.eye(4), "b": np.eye(4)}
     for name, x in (("a", 1000.0), ("b", 1001.0)):
         targets[name][0, 3] = x
@@ -146,7 +146,7 @@ def test_reasons_have_symbols_of_their_own(tmp_path: Path) -> None:
 
 
 def test_many_and_strange_reasons(tmp_path: Path) -> None:
-    """Reasons come from logs, which are strangers' files."""
+    """Reasons come from logs, which other people write."""
     words = [
         "$\\frac{1}{$",
         "a\nb",
@@ -193,7 +193,7 @@ def test_long_names_leave_room(tmp_path: Path) -> None:
         assert ink(drawn(tmp_path, draw, frames, {name: 1e-6 * np.eye(6)})) > 0.01
 
 
-def test_wrong_input_is_said(tmp_path: Path) -> None:
+def test_wrong_input_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CountError, match="one length"):
         PlottedMeasurement(np.zeros(3), np.zeros(3), np.zeros(2), np.ones(3, dtype=bool), [""] * 3)
     with pytest.raises(CountError, match=r"\(N, 2\)"):
