@@ -16,20 +16,20 @@ from gtsam_rwhec.vision.camera import Camera
 _HEAD = """\
 # Cameras in the form of a Kalibr camchain. The frame {carrier}, which carries them, takes the place of the IMU:
 #   T_cam_imu          pose of {carrier} in the camera, metres
-#   T_cn_cnm1          pose of the camera before in this one
+#   T_cn_cnm1          pose of the previous camera in this camera
 #   timeshift_cam_imu  seconds: stamp of {carrier}'s poses = stamp of the image + shift
-#   cam_overlaps       cameras whose fields of view meet this one's, by geometry
+#   cam_overlaps       cameras whose fields of view overlap this camera's field of view
 """
-#: Kalibr's radial-tangential distortion: k1, k2, p1, p2.
+#: Number of coefficients of Kalibr's radial-tangential distortion: k1, k2, p1, p2.
 RADTAN = 4
 
 
 def camchain_yaml(frames: RigFrames) -> str:
     """The text of ``camchain.yaml``: cam0, cam1, ... in the order of the sensors.
 
-    What Kalibr cannot express is left out, and a comment says which sensor and why: sensors without intrinsics, and
-    radial-tangential distortion beyond k1, k2, p1, p2. Dropping such coefficients would bend the images' edges by
-    pixels without a word.
+    Two kinds of sensors are left out, and a comment names each one: sensors without intrinsics, and sensors with
+    radial-tangential distortion beyond k1, k2, p1, p2. Without these coefficients, points near the edges of the images
+    would be off by pixels.
     """
     left_out = {name: _reason(frames.cameras.get(name)) for name in frames.sensors}
     names = [name for name, reason in left_out.items() if not reason]
@@ -64,7 +64,7 @@ def camchain_yaml(frames: RigFrames) -> str:
 
 
 def _reason(camera: Camera | None) -> str:
-    """Why a sensor cannot be in a camchain; empty if it can."""
+    """Why a camchain cannot have a sensor; empty if it can."""
     if camera is None:
         return "whose intrinsics are not known."
     more = camera.D[RADTAN:] if camera.model == "radtan" else np.zeros(0)
@@ -77,7 +77,7 @@ def _reason(camera: Camera | None) -> str:
 
 
 def _four(camera: Camera) -> Array:
-    """k1, k2, p1, p2; zeros for a pinhole, which more readers of camchains know than distortion_model: none."""
+    """k1, k2, p1, p2. A pinhole has zeros: more readers of camchains know them than know distortion_model: none."""
     return np.pad(camera.D, (0, RADTAN))[:RADTAN]
 
 
@@ -90,5 +90,5 @@ def _row(values: Iterable[float]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """YAML's single quotes, in which nothing but themselves has a meaning."""
+    """Text in YAML's single quotes: inside them only the quote itself has a meaning."""
     return "'" + text.replace("'", "''") + "'"

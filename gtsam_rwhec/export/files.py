@@ -12,6 +12,7 @@ from gtsam_rwhec.export.urdf import urdf_xacro
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
+#: The text of each file, by its name.
 FILES: dict[str, Callable[[RigFrames], str]] = {
     "static_tf.launch.py": static_tf_launch,
     "tf.yaml": tf_yaml,
@@ -27,19 +28,19 @@ def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
     ----------
     frames : RigFrames
     folder
-        Must be there; files of these names in it are replaced.
+        It must exist; files of these names in it are replaced.
 
     Returns
     -------
     list of Path
-        What was written.
+        The written files.
 
     Raises
     ------
     FileFormatError
         A file cannot be written; the message says why.
     """
-    # All texts first: what cannot be written leaves no half of it.
+    # All texts come first: if one of them fails, no file is written.
     texts = {Path(folder) / name: _warned(text(frames), frames.warnings, name) for name, text in FILES.items()}
     for path, text in texts.items():
         write_atomically(path, text.encode())
@@ -47,11 +48,11 @@ def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
 
 
 def _warned(text: str, warnings: tuple[str, ...], name: str) -> str:
-    """Warnings as comments ahead of everything else."""
+    """The text with warnings as comments at its beginning."""
     if not warnings:
         return text
     if name.endswith(".xacro"):
-        declaration, rest = text.split("\n", 1)  # XML has it on its first line
+        declaration, rest = text.split("\n", 1)  # the first line of XML is its declaration
         comment = "\n".join(warnings).replace("--", "- -")
         return f"{declaration}\n<!--\n{comment}\n-->\n{rest}"
     return "".join(f"# {warning}\n" for warning in warnings) + text

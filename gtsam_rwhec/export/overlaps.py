@@ -1,4 +1,4 @@
-"""Which cameras can see the same things, from where they are and what they see."""
+"""Which cameras have overlapping fields of view, from their poses and intrinsics."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ from rwhec_factors.se3 import inverse
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 
-#: Depths (m) between which things are looked at, and the pixels and depths that are tried.
+#: Metres. Smallest and largest depth of the points that are tried.
 NEAR_M, FAR_M = 0.2, 20.0
+#: Grid of points that are tried in each field of view: pixels across, pixels down, depths.
 COLUMNS, ROWS, DEPTHS = 17, 13, 25
 
 
 def overlaps(cameras: list[Camera], T_rig_camera: list[Array]) -> list[list[int]]:
-    """For each camera, which others have a part of its field of view in theirs, between `NEAR_M` and `FAR_M`.
+    """For each camera, the other cameras whose field of view overlaps its own, between `NEAR_M` and `FAR_M`.
 
     Parameters
     ----------
     cameras : list of Camera
     T_rig_camera : list of (4, 4) arrays
-        Their poses in any common frame, metres.
+        Poses of the cameras in any common frame, metres.
 
     Returns
     -------
     list of lists of int
-        Indices, ascending; symmetric.
+        Indices of cameras, ascending; the relation is symmetric.
     """
     points = [_view(camera) for camera in cameras]
     T_camera_rig = inverse(np.array(T_rig_camera))
@@ -39,7 +40,7 @@ def overlaps(cameras: list[Camera], T_rig_camera: list[Array]) -> list[list[int]
 
 
 def _view(camera: Camera) -> Array:
-    """Points (N, 3) that a camera sees, in its frame; metres."""
+    """Points (N, 3) that a camera sees, in the camera's frame, metres."""
     u, v = np.meshgrid(np.linspace(0.0, camera.width - 1.0, COLUMNS), np.linspace(0.0, camera.height - 1.0, ROWS))
     x = camera.undistort(np.stack([u, v], axis=-1).reshape(-1, 2))
     rays = np.column_stack([x, np.ones(len(x))])[np.isfinite(x).all(axis=1)]

@@ -6,8 +6,8 @@ from gtsam_rwhec.export.written_poses import number, quaternion_xyzw
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
 _HEAD = """\
-# Calibrated frames, as a tf2_msgs/TFMessage has them: the pose of child_frame_id in header.frame_id, metres and a unit
-# quaternion.
+# Calibrated frames in the form of a tf2_msgs/TFMessage: the pose of child_frame_id in header.frame_id, as metres and a
+# unit quaternion.
 """
 
 

@@ -8,11 +8,11 @@ from gtsam_rwhec.rig.calibrated_frames import RigFrames
 _XACRO = """\
 <?xml version="1.0"?>
 <!--
-  Calibrated sensors: a link and a fixed joint each. In the robot's own description, which has the link {parent}:
+  Calibrated sensors, each a link and a fixed joint. The robot's description, which has the link {parent}, needs:
 
     <xacro:include filename="rig.urdf.xacro"/>
     <xacro:calibrated_sensors/>                         on {parent}
-    <xacro:calibrated_sensors parent="another_link"/>   on another link that is the same frame
+    <xacro:calibrated_sensors parent="another_link"/>   on another link of the same frame
 
   A camera's link is its optical frame: z forward, x right, y down.
 -->

@@ -1,4 +1,4 @@
-"""Numbers and rotations as files have them: digits that give the same double again, quaternions, fixed-axis angles."""
+"""The text of numbers, and rotations as quaternions and fixed-axis angles, for files."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from gtsam_rwhec.geometry.poses import Array
 
 
 def number(value: float) -> str:
-    """The fewest digits (at most 17) that are this double again when read, with a point in any case.
+    """The fewest digits (at most 17) that are read as the same double, always with a decimal point.
 
-    Without the point YAML 1.1 takes 1e-05 for text, and 1 for an integer.
+    Without the point, YAML 1.1 takes 1e-05 for text and 1 for an integer.
     """
     text = repr(float(value) + 0.0)  # + 0.0: no -0.0
     mantissa, e, exponent = text.partition("e")
@@ -27,8 +27,8 @@ def quaternion_xyzw(T: Array) -> Array:
 def fixed_axis_angles(T: Array) -> tuple[float, float, float]:
     """Roll, pitch, yaw in radians with R = Rz(yaw) Ry(pitch) Rx(roll): URDF's rpy.
 
-    Near pitch = +-90 degrees yaw and roll are free but for their difference or sum. Yaw is taken first, whatever it is,
-    and roll from what is left, Rz(yaw)' R = Ry(pitch) Rx(roll), so that the three always compose to R again.
+    Near pitch = +-90 degrees, R determines only the sum or the difference of yaw and roll. Yaw is computed first, then
+    pitch and roll from Rz(yaw)' R = Ry(pitch) Rx(roll): the three angles always compose to R.
     """
     R = T[:3, :3]
     yaw = np.arctan2(R[1, 0], R[0, 0])

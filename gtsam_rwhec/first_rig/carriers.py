@@ -1,4 +1,4 @@
-"""Which of a log's poses are the carriers': of all that moves, what carries the cameras, or what they look at."""
+"""The pairs of moving frames in a log that could be the carriers of the sensors and of the targets."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ class MovingPair:
     Attributes
     ----------
     source : PoseSource
+        Where the log has their poses.
     words : str
-        How many poses, and how far they move.
+        The topic, the number of poses, and how far they move.
     on_child, on_parent : int
-        How many of the cameras' frames are fixed to each, as tf has it; both 0 where it has none of them.
+        How many of the cameras' frames are fixed to the child and to the parent in tf.
     """
 
     source: PoseSource
@@ -31,10 +32,11 @@ class MovingPair:
 
 
 def moving_pairs(poses: Iterable[PoseTopic], camera_frames: Iterable[str]) -> tuple[list[MovingPair], list[str]]:
-    """Pairs of frames that could be the carriers, the likeliest first; and remarks on what cannot be used.
+    """Pairs of frames that could be the carriers, the likeliest first; and remarks on pairs that cannot be used.
 
-    Frames of tf that do not move against each other are one body. Of each body that moves and carries no further one,
-    the pair is the topmost frame that its chain moves against, and the frame by which the body hangs on that.
+    Frames of tf that do not move against each other are one body. Each moving body that carries no other moving body
+    gives a pair. The child is the body's own moving frame; the parent is the frame below the first moving link of its
+    chain, such as base for base -> link -> hand.
     """
     poses = list(poses)
     cameras = list(camera_frames)
@@ -44,7 +46,7 @@ def moving_pairs(poses: Iterable[PoseTopic], camera_frames: Iterable[str]) -> tu
         if not series.is_tf:
             by_topic.setdefault(series.topic, []).append(series)
     pairs += [_of_topic(series) for (series, *others) in by_topic.values() if series.is_moving and not others]
-    # A stable sort: what tf has stands before topics, the one with most poses first.
+    # The sort is stable: pairs of tf stay before topics, and pairs with more poses before others.
     pairs.sort(key=lambda pair: (pair.on_child, pair.on_parent), reverse=True)
     return pairs, remarks
 
@@ -62,7 +64,7 @@ def _of_tf(series: list[PoseTopic], cameras: list[str]) -> tuple[list[MovingPair
         return chain
 
     def body(frame: str) -> str:
-        """The frame by which a frame's body hangs on the rest."""
+        """The frame that stands for the body of a frame: its nearest moving frame, or its root."""
         chain = up(frame)
         return next((f for f in chain if f in moving), chain[-1])
 
@@ -98,6 +100,6 @@ def _words(series: PoseTopic, where: str) -> str:
 
 
 def frame_name(text: str) -> str:
-    """Text as a frame's name: what cannot be in one becomes _; empty if nothing is left."""
+    """Text made a frame's name: other characters become _; empty if no character is left."""
     words = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in text)[:60].strip("_")
     return words if is_name(words) else (f"f_{words}" if words else "")

@@ -1,4 +1,4 @@
-"""What a log holds that a rig file could name: cameras, the tags in some of their images, drivers, and what moves."""
+"""The content of a log for a rig file: cameras, tags in some of their images, drivers, and frames that move."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from gtsam_rwhec.rig.field_types import is_text
 from gtsam_rwhec.vision.images import decode_gray
 from gtsam_rwhec.vision.tag_survey import BY_TRUST, tags_in_image
 
-#: In so many images of each topic tags are looked for; they are taken evenly from all.
+#: Images of each topic that are searched for tags, taken evenly from all.
 IMAGES = 8
-#: In the first few of them tags of all families are looked for, which takes a second each.
+#: Images of each topic that are searched for tags of all families, which takes about a second for each image.
 IMAGES_FOR_ALL = 3
-#: Poses that are kept of each pair of frames, to see whether it moves.
+#: Poses of each pair of frames that are kept, at most, to see whether the pair moves.
 POSES = 1000
-#: A frame that moves and turns by less stands still.
+#: Metres. A frame that moves less, and turns less than `STILL_RAD`, stands still.
 STILL_M = 0.01
+#: Radians; see `STILL_M`.
 STILL_RAD = math.radians(1.0)
 
 
 @dataclass
 class Tags:
-    """Tags of one family: in how many images each id read with a single border, and with an AprilGrid's double one."""
+    """Tags of one family: in how many images each id had a single border, and a double one (AprilGrid)."""
 
     single: Counter[int] = field(default_factory=Counter)
     double: Counter[int] = field(default_factory=Counter)
@@ -38,7 +39,7 @@ class Tags:
 
 @dataclass
 class ImageTopic:
-    """A topic of images: its frame, and what was in those that were looked at."""
+    """A topic of images: its frame, and the tags in the images that were searched."""
 
     topic: str
     schema: str
@@ -53,7 +54,7 @@ class ImageTopic:
 
 @dataclass
 class DriverTopic:
-    """A topic of detections: frame, ids by family in how many messages each, sizes, whether there are poses."""
+    """A topic of detections: its frame, in how many messages each id was (by family), sizes, whether it has poses."""
 
     topic: str
     frame: str = ""
@@ -65,7 +66,7 @@ class DriverTopic:
 
 @dataclass
 class PoseTopic:
-    """Poses of one pair of frames in one topic: how many, and some of them."""
+    """Poses of one pair of frames in one topic: their number, and some of them."""
 
     topic: str
     parent: str
@@ -77,7 +78,7 @@ class PoseTopic:
     kept: list[Array] = field(default_factory=list)
 
     def add(self, T: Array) -> None:
-        """Keep every `stride`-th, evenly however many there are."""
+        """Count a pose, and keep every `stride`-th: the kept poses are spread evenly over all."""
         if self.count % self.stride == 0:
             self.kept.append(T.copy())
             if len(self.kept) > POSES:
@@ -103,7 +104,7 @@ class PoseTopic:
 
 @dataclass
 class LogContents:
-    """What a log holds, by topic; poses by topic, parent and child."""
+    """The content of a log by topic; poses by topic, parent and child."""
 
     topics: tuple[Topic, ...]
     images: dict[str, ImageTopic] = field(default_factory=dict)
@@ -113,19 +114,18 @@ class LogContents:
 
 
 def read_contents(log: Log) -> LogContents:
-    """Read a log once, and look for tags in some of its images."""
+    """Read a log once, and search some of its images for tags."""
     topics = log.topics()
     contents = LogContents(topics)
     readable = {topic.name for topic in topics if is_text(topic.name)}
-    # Several poses in a message are of several things (of targets, as a rule): no carrier's.
+    # A message with several poses has poses of several things, most often of targets: not of a carrier.
     readable -= {topic.name for topic in topics if topic.unreadable or schema_word(topic.schema) == "PosesInFrame"}
     transforms = {topic.name for topic in topics if topic.is_tf}
     for topic in topics:
         if topic.name in readable and topic.has_images:
             wanted = np.linspace(0, max(topic.count - 1, 0), IMAGES).round().astype(int)
-            contents.images[topic.name] = ImageTopic(
-                topic.name, topic.schema, topic.count, wanted=frozenset(wanted.tolist())
-            )
+            wanted_images = frozenset(wanted.tolist())
+            contents.images[topic.name] = ImageTopic(topic.name, topic.schema, topic.count, wanted=wanted_images)
     for record in log.records(sorted(readable)):
         if isinstance(record, PoseRecord):
             key = record.topic, record.parent, record.child
@@ -151,7 +151,7 @@ def _look_at(images: ImageTopic, record: ImageRecord) -> None:
     except ImageError as error:
         images.undecoded = str(error)
         return
-    # The first few tell which families there are: to look for all of them takes a second or so.
+    # The first few images show which families there are; the search for all of them takes a second for each image.
     families = BY_TRUST if images.looked_at < IMAGES_FOR_ALL else tuple(images.tags)
     images.looked_at += 1
     tags = tags_in_image(gray, families)

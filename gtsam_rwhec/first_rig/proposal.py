@@ -1,4 +1,4 @@
-"""A first rig file, proposed from what a log holds; what a person must fill in is marked TODO."""
+"""A first rig file, proposed from the content of a log; TODO marks the values that a person must state."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.first_rig.carriers import MovingPair, frame_name, moving_pairs
-from gtsam_rwhec.first_rig.log_contents import ImageTopic, LogContents, read_contents
+from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic, LogContents, read_contents
 from gtsam_rwhec.first_rig.targets import Guess, targets_seen
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig.field_types import is_name, is_text
@@ -18,22 +18,23 @@ from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseNoise, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
 
-#: Words of topics that say what is published and not by which camera.
+#: Words in names of topics that say what is published, and not by which camera.
 _COMMON = frozenset({
     "image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "image_rect_raw", "compressed",
     "raw", "color", "colour", "rgb", "detections", "tag_detections", "apriltag_detections", "detection", "tags",
     "apriltag", "apriltags", "aruco", "aruco_markers", "aruco_detections", "markers", "marker_publisher",
 })  # fmt: skip
-_TIME_OFFSET = "or seconds, 0.0 for one clock (to estimate it needs uneven turning)"
-_NOISE = "TODO how far its poses are off, a guess; without, standard deviations are too small"
-
-#: What good arms reach; motion capture and SLAM are worse.
+#: Comment on a sensor's time offset.
+_TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs a motion that turns unevenly)"
+#: Comment on the noise of the carriers' poses.
+_NOISE = "TODO errors of these poses, here a guess; without them, standard deviations are too small"
+#: Good robot arms have this noise; motion capture and SLAM have more.
 _GUESSED_NOISE = PoseNoise(rotation_deg=0.03, translation_mm=0.2)
 
 
 @dataclass(frozen=True)
 class _Camera:
-    """A sensor to be: its name, section, the frame that the log gives it, and remarks on its lines."""
+    """A proposed sensor: name, section, its frame in the log, and comments on its lines by key."""
 
     name: str
     section: Sensor
@@ -48,19 +49,19 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     ----------
     log : Log
     path
-        Where it will be, for messages.
+        The rig file that will be written, for messages.
 
     Returns
     -------
     text : str
-        Reads back with `parse_rig`; lengths in it are guesses and marked so.
+        A rig file that `parse_rig` reads; its lengths are guesses, and TODO marks them.
     notes : tuple of str
-        What was seen, what was chosen among several, what was left out.
+        What was seen, what was chosen, and what was left out.
 
     Raises
     ------
     RigError
-        The log has neither images nor detections, or no poses that move; with the topics that there are.
+        The log has neither images nor detections, or no poses that move; the message has the topics of the log.
     """
     contents = read_contents(log)
     notes: list[str] = []
@@ -72,8 +73,7 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     if not pairs:
         raise RigError(
             f"{_where(log)}: no poses of anything that moves, and without the carriers' motion nothing can be "
-            "calibrated (or record it together with what poses the robot or the motion capture has); "
-            f"{_topics(contents)}"
+            f"calibrated. Record the poses of the robot or of the motion capture too; {_topics(contents)}"
         )
     pair = pairs[0]
     notes.append(f"moving: {_pair_words(pair)}")
@@ -88,8 +88,8 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
         notes.append(f"targets seen: {', '.join(guess.name for guess in guesses)} (their sizes are guesses)")
     else:
         notes.append(
-            f"no tags in {looked_at} images that were looked at, nor of drivers; checkerboards are not looked for: "
-            "write the targets into the rig file"
+            f"no tags in {looked_at} images that were searched, and none from drivers. Checkerboards are not searched "
+            "for: write the targets into the rig file"
         )
         nothing = TagTarget(type="tag", family="tag36h11", id=0, size_m=0.1)
         guesses = [Guess("tag_0", nothing, "TODO an example: no tags were seen")]
@@ -118,8 +118,8 @@ def _text(log: Log, carriers: Carriers, carrier_remark: str, cameras: list[_Came
     rig = Rig(carriers=carriers, sensors=sensors, targets=targets)
     file = log.files[0].path.name
     head = (
-        f"# A first rig file, made by looking at {file if is_text(file) else repr(file)}.\n"
-        "# TODO marks what only a person knows, above all the sizes of the targets: those here are guesses.\n"
+        f"# A first rig file, made from the log {file if is_text(file) else repr(file)}.\n"
+        "# TODO marks what only a person knows, above all the sizes of the targets: the sizes here are guesses.\n"
     )
     return head + rig_text(rig, remarks)
 
@@ -132,46 +132,45 @@ def _carriers(pair: MovingPair) -> tuple[Carriers, str]:
     remark = (
         f"{child} carries the sensors, as tf has it"
         if pair.on_child
-        else "TODO if the targets are on what moves and the sensors are not, exchange sensors and targets"
+        else "TODO if the targets move and the sensors do not, exchange sensors and targets"
     )
     if pair.source.topic is not None:
-        remark += "; TODO check the frames' names: they are guesses where the topic has none"
+        remark += "; TODO check the frames' names: they are guesses if the topic has none"
     return Carriers(sensors=child, targets=parent, poses=pair.source, noise=_GUESSED_NOISE), remark
 
 
 def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:
-    """Sensors with images; and drivers' detections where no images are of the same camera."""
+    """Sensors with images, and drivers' detections if the log has no images of the same camera."""
     taken: set[str] = set()
-    cameras = []
+    cameras: list[_Camera] = []
+
+    def add(source: ImageTopic | DriverTopic, key: str, sources: int, missing: str) -> str:
+        """Add a sensor; the comment `missing` if it needs intrinsics and the log has none. Its name."""
+        intrinsics, remark = _intrinsics(source.topic, source.frame, contents.intrinsics, sources)
+        if intrinsics is None and missing:
+            intrinsics, remark = Intrinsics(file="camera.yaml"), missing
+        name = _free(_name(source.topic, source.frame), taken)
+        section = Sensor.model_validate({key: source.topic, "intrinsics": intrinsics})
+        cameras.append(_Camera(name, section, source.frame, {"intrinsics": remark} if remark else {}))
+        return name
+
+    missing = "TODO no topic has them; or {kalibr: camchain.yaml, camera: cam0}"
     for images in _without_copies(contents, notes):
-        remarks = {}
-        intrinsics, remark = _intrinsics(images.topic, images.frame, contents.intrinsics, len(contents.images))
-        if remark:
-            remarks["intrinsics"] = remark
-        if intrinsics is None:
-            intrinsics = Intrinsics(file="camera.yaml")
-            remarks["intrinsics"] = "TODO no topic has them; or {kalibr: camchain.yaml, camera: cam0}"
-        name = _free(_name(images.topic, images.frame), taken)
-        cameras.append(_Camera(name, Sensor(images=images.topic, intrinsics=intrinsics), images.frame, remarks))
+        name = add(images, "images", len(contents.images), missing)
         notes.append(f"camera {name}: {images.count} images in {images.topic}, {images.looked_at} looked at")
     with_images = {camera.frame for camera in cameras if camera.frame}
     for driver in contents.drivers.values():
         if driver.frame in with_images:
-            notes.append(f"not used: detections in {driver.topic}, whose camera's images are in the log")
+            notes.append(f"not used: detections in {driver.topic}; the log has images of the same camera")
             continue
-        intrinsics, remark = _intrinsics(driver.topic, driver.frame, contents.intrinsics, len(contents.drivers))
-        remarks = {"intrinsics": remark} if remark else {}
-        if intrinsics is None and not driver.has_poses:
-            intrinsics = Intrinsics(file="camera.yaml")
-            remarks["intrinsics"] = "TODO no topic has them, and the driver gives no poses"
-        name = _free(_name(driver.topic, driver.frame), taken)
-        cameras.append(_Camera(name, Sensor(detections=driver.topic, intrinsics=intrinsics), driver.frame, remarks))
+        missing = "" if driver.has_poses else "TODO no topic has them, and the driver gives no poses"
+        name = add(driver, "detections", len(contents.drivers), missing)
         notes.append(f"driver {name}: {driver.count} detections in {driver.topic}")
     return cameras
 
 
 def _without_copies(contents: LogContents, notes: list[str]) -> list[ImageTopic]:
-    """One topic for each camera: the one with most images, raw rather than compressed; none of depth."""
+    """One topic for each camera: the topic with most images, raw before compressed, and never of depth."""
     best: dict[tuple[str, str], ImageTopic] = {}
     ranked = sorted(contents.images.values(), key=lambda images: ("Compressed" in images.schema, images.topic))
     for images in sorted(ranked, key=lambda images: -images.looked_at):
@@ -188,7 +187,7 @@ def _without_copies(contents: LogContents, notes: list[str]) -> list[ImageTopic]
 
 
 def _intrinsics(topic: str, frame: str, known: dict[str, str], sensors: int) -> tuple[Intrinsics | None, str]:
-    """The topic of intrinsics that belongs to another topic, by frame and by the beginning of its name."""
+    """The topic of intrinsics for another topic: it has the same frame, or its name begins in the same way."""
     same_frame = [name for name, its_frame in known.items() if frame and its_frame == frame]
     candidates = same_frame or list(known)
     shared = {name: _shared(topic, name) for name in candidates}
@@ -201,19 +200,19 @@ def _intrinsics(topic: str, frame: str, known: dict[str, str], sensors: int) -> 
 
 
 def _shared(first: str, second: str) -> int:
-    """How many words two topics begin with together."""
+    """With how many common words two topics begin."""
     pairs = list(zip(first.strip("/").split("/"), second.strip("/").split("/"), strict=False))
     return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
 
 
 def _name(topic: str, frame: str) -> str:
-    """A camera's name: the words of its topic that say which it is, else its frame."""
+    """A camera's name: the words of its topic that are not common, or else its frame."""
     words = [word for word in topic.split("/") if word.lower() not in _COMMON]
     return frame_name("_".join(words)) or frame_name(frame) or "camera"
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """The name, or with a number behind it; taken from now on."""
+    """The name, with a number added if it is taken; it is taken from now on."""
     numbered = (f"{name}_{number}" for number in range(2, len(taken) + 3))
     free = next(candidate for candidate in (name, *numbered) if candidate not in taken)
     taken.add(free)

@@ -1,4 +1,4 @@
-"""Targets from the tags that were seen: single ones, and what looks like boards. Their sizes are guesses."""
+"""Guesses of the targets from the tags that were seen: single tags and boards. Their sizes are guesses too."""
 
 from __future__ import annotations
 
@@ -12,16 +12,25 @@ from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic
 from gtsam_rwhec.rig.target_sections import AprilGridTarget, CharucoTarget, TagTarget
 from gtsam_rwhec.vision.targets import FAMILIES, family_named
 
-#: Lengths that stand in a first rig file until someone measures.
-TAG_M, SQUARE_M, MARKER_M, SPACING = 0.1, 0.04, 0.03, 0.3
-#: From so many tags of one kind with ids in a row they are taken for a board's.
-BOARD, GRID = 6, 4
+#: Metres. Side of a tag, in a first rig file until a person measures it.
+TAG_M = 0.1
+#: Metres. Side of a square of a ChArUco board, until a person measures it.
+SQUARE_M = 0.04
+#: Metres. Side of a marker of a ChArUco board, until a person measures it.
+MARKER_M = 0.03
+#: Gap between tags / side of a tag of an AprilGrid, until a person measures it.
+SPACING = 0.3
+#: So many markers with ids in a row count as a ChArUco board.
+BOARD = 6
+#: So many tags with a double border count as an AprilGrid.
+GRID = 4
+#: The remark on a size that is a guess.
 TODO = "TODO measure"
 
 
 @dataclass(frozen=True)
 class Guess:
-    """A target, its name, and what to say beside it."""
+    """A guess of a target: its name, its section, and the comment beside it."""
 
     name: str
     section: TagTarget | CharucoTarget | AprilGridTarget
@@ -29,7 +38,7 @@ class Guess:
 
 
 def targets_seen(images: Iterable[ImageTopic], drivers: Iterable[DriverTopic]) -> tuple[list[Guess], list[str]]:
-    """Targets, and remarks on tags that were left out."""
+    """Guesses of the targets, and remarks on tags that were left out."""
     images = list(images)
     looked_at = sum(topic.looked_at for topic in images)
     guesses, remarks = [], []
@@ -38,7 +47,7 @@ def targets_seen(images: Iterable[ImageTopic], drivers: Iterable[DriverTopic]) -
         for topic in images:
             single.update(topic.tags[family].single if family in topic.tags else {})
             double.update(topic.tags[family].double if family in topic.tags else {})
-        # A tag that reads with both borders has the one with which it reads more often.
+        # A tag that was seen with both borders has the border with which it was seen more often.
         grid = sorted(i for i in double if double[i] > single[i])
         if len(grid) >= GRID:
             guesses.append(_aprilgrid(family, grid))
@@ -53,14 +62,14 @@ def targets_seen(images: Iterable[ImageTopic], drivers: Iterable[DriverTopic]) -
 
 
 def least_sightings(family: str, looked_at: int) -> int:
-    """In how many images a tag must have been: families of few bits are found where there are none."""
+    """In how many images a tag must be: in families of few bits, false detections are frequent."""
     if looked_at < 3 or family == "tag36h11":
         return 1
     return 3 if family in ("tag16h5", "aruco_4x4_1000", "aruco_original") else 2
 
 
 def _smallest(family: str, ids: Collection[int]) -> str:
-    """Of ArUco's dictionaries that begin one another, the smallest that has the ids: fewer wrong detections."""
+    """The smallest of ArUco's dictionaries of this kind that has the ids: it gives the fewest false detections."""
     stem = re.fullmatch(r"(aruco_\dx\d)_1000", family)
     if stem is None or not ids:
         return family
@@ -69,23 +78,20 @@ def _smallest(family: str, ids: Collection[int]) -> str:
 
 
 def _of_family(family: str, ids: dict[int, int], looked_at: int) -> Iterator[Guess]:
-    """A ChArUco board of ArUco's markers if there are many in a row; else single tags."""
+    """A ChArUco board if many ArUco markers have ids in a row; otherwise single tags."""
     order = sorted(ids)
     if family.startswith("aruco") and len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
         columns, rows = _squares(order[-1] - order[0] + 1)
-        section = CharucoTarget(
+        board = CharucoTarget(
             type="charuco", family=family, columns=columns, rows=rows, square_m=SQUARE_M, marker_m=MARKER_M,
             first_id=order[0],
         )  # fmt: skip
-        yield Guess(
-            f"board_{family.removeprefix('aruco_')}",
-            section,
-            f"TODO count columns and rows, measure: a guess from markers {_listed(order)}",
-        )
+        remark = f"TODO count columns and rows, measure: a guess from markers {_listed(order)}"
+        yield Guess(f"board_{family.removeprefix('aruco_')}", board, remark)
         return
     for i in order:
-        section_of_tag = TagTarget(type="tag", family=family, id=i, size_m=TAG_M)
-        yield Guess(f"{family}_{i}", section_of_tag, f"{TODO}; seen in {ids[i]} of {looked_at} images")
+        tag = TagTarget(type="tag", family=family, id=i, size_m=TAG_M)
+        yield Guess(f"{family}_{i}", tag, f"{TODO}; seen in {ids[i]} of {looked_at} images")
 
 
 def _aprilgrid(family: str, ids: list[int]) -> Guess:
@@ -100,7 +106,7 @@ def _aprilgrid(family: str, ids: list[int]) -> Guess:
 
 
 def _of_drivers(drivers: Iterable[DriverTopic], already: Iterable[Guess]) -> Iterator[Guess]:
-    """Tags that only a driver saw; with the driver's size where it says one."""
+    """Tags that only a driver saw, with the driver's size if it states one."""
     have = {(g.section.family, g.section.id) for g in already if isinstance(g.section, TagTarget)}
     for driver in drivers:
         for family, ids in driver.ids.items():
@@ -119,11 +125,10 @@ def _of_drivers(drivers: Iterable[DriverTopic], already: Iterable[Guess]) -> Ite
 
 
 def _squares(markers: int) -> tuple[int, int]:
-    """Columns and rows, as near to a square as can be, of a board with so many markers."""
-    sides = [
-        (columns, rows) for columns in range(2, 101) for rows in range(2, columns + 1) if columns * rows // 2 == markers
-    ]
-    return min(sides, key=lambda sides: sides[0] - sides[1], default=(7, 5))
+    """Columns and rows of a board with so many markers, as near to a square as possible."""
+    boards = [(columns, rows) for columns in range(2, 101) for rows in range(2, columns + 1)]
+    fitting = [(columns, rows) for columns, rows in boards if columns * rows // 2 == markers]
+    return min(fitting, key=lambda board: board[0] - board[1], default=(7, 5))
 
 
 def _listed(ids: list[int]) -> str:

@@ -1,4 +1,4 @@
-"""What is exported: where each sensor and each target is on its carrier, and what else the formats have of a sensor."""
+"""The calibrated frames that are exported and plotted: poses on the carriers, intrinsics, time offsets, topics."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ class CalibratedFrame(NamedTuple):
 class RigFrames:
     """Calibrated frames by name, in the order in which they are written.
 
-    Names go into Python, YAML and XML, so none is taken that means anything there: a letter first, then letters, digits
-    and _, parts joined by /.
+    Names are written into Python, YAML and XML. They have only characters without a meaning there: first a letter, then
+    letters, digits and _, in parts joined by /.
 
     Attributes
     ----------
     sensor_carrier, target_carrier : str
-        Frames that carry the sensors and the targets.
+        Names of the frames that carry the sensors and the targets.
     sensors : dict of str to (4, 4) array
         T_sensorcarrier_sensor, metres.
     targets : dict of str to (4, 4) array
         T_targetcarrier_target, metres.
     cameras : dict of str to Camera
-        Intrinsics by sensor; a sensor may lack them.
+        Intrinsics by sensor; may lack a sensor.
     time_offsets_s : dict of str to float
-        By sensor: its stamp t is the carriers' t + offset. Left out is 0.
+        Time offsets by sensor, seconds: the sensor's stamp t is the carriers' t + offset. A missing offset is 0.
     topics : dict of str to str
-        Topics of images by sensor; a sensor may lack one.
+        Topics of images by sensor; may lack a sensor.
     warnings : tuple of str
-        Why the frames, or some of them, are not to be used; written into every file.
+        Why frames should not be used; written into every file.
 
     Raises
     ------
     FrameError
-        A name that cannot be a frame's, that two frames have, or that is no sensor's; a topic that is no line of text.
+        A name cannot be a frame's, belongs to two frames, or is not a sensor's; or a topic is not one line of text.
     PoseError
-        A transform that is none.
+        A transform is not a valid pose.
     StampError
-        A time offset that is not finite.
+        A time offset is not finite.
     """
 
     sensor_carrier: str
@@ -69,42 +69,34 @@ class RigFrames:
         for index, name in enumerate(names):
             if not isinstance(name, str) or not NAME.fullmatch(name):
                 raise FrameError(
-                    f"{name!r} cannot be the name of an exported frame: a letter first, then letters, digits and _, "
-                    "parts joined by /; rename it in the rig file"
+                    f"{name!r} cannot be the name of an exported frame. A name has first a letter, then letters, "
+                    "digits and _, in parts joined by /; rename the frame in the rig file"
                 )
             if name in names[:index]:
                 raise FrameError(
-                    f"{name} is the name of two frames (carriers, sensors and targets each need their own); rename one"
+                    f"{name} is the name of two frames; rename one (each carrier, sensor and target needs its own name)"
                 )
-        for what, given in (
-            ("cameras", self.cameras),
-            ("time_offsets_s", self.time_offsets_s),
-            ("topics", self.topics),
-        ):
-            for name in given:
+        for what in ("cameras", "time_offsets_s", "topics"):
+            for name in getattr(self, what):
                 if name not in self.sensors:
-                    raise FrameError(f"{what} has {name!r}, which is no sensor; the sensors are {_list(self.sensors)}")
+                    sensors = ", ".join(self.sensors) or "none"
+                    raise FrameError(f"{what} has {name!r}, which is not a sensor; the sensors are {sensors}")
+            object.__setattr__(self, what, dict(getattr(self, what)))
         for name, offset in self.time_offsets_s.items():
             if not math.isfinite(offset):
                 raise StampError(f"the time offset of {name} is {offset!r}; give finite seconds, or leave it out")
         for name, topic in self.topics.items():
             if not topic or not topic.isprintable():
                 raise FrameError(f"the topic of {name} is {topic!r}; give one line of printable characters")
-        # Copies, so that what was checked stays as it is.
+        # Copies: the checked values cannot change any more.
         for what, carrier in (("sensors", self.sensor_carrier), ("targets", self.target_carrier)):
             given = getattr(self, what)
             checked = {name: one_transform(T, f"the pose of {name} in {carrier}") for name, T in given.items()}
             object.__setattr__(self, what, checked)
-        for what in ("cameras", "time_offsets_s", "topics"):
-            object.__setattr__(self, what, dict(getattr(self, what)))
 
     def frames(self) -> Iterator[CalibratedFrame]:
-        """Each sensor on its carrier, then each target on its own."""
+        """Each sensor on the sensors' carrier, then each target on the targets' carrier."""
         for name, T in self.sensors.items():
             yield CalibratedFrame(self.sensor_carrier, name, T)
         for name, T in self.targets.items():
             yield CalibratedFrame(self.target_carrier, name, T)
-
-
-def _list(names: Mapping[str, Array]) -> str:
-    return ", ".join(names) or "none"

@@ -1,4 +1,4 @@
-"""Faults between the values of a rig file: names given twice, targets that look alike."""
+"""Contradictions between values of a rig file: a name given twice, targets that look alike."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def contradictions(
     yield from _sensors(sensors)
     printed = []
     if not targets:
-        yield ("targets",), "none; give one or more"
+        yield ("targets",), "none; give at least one target"
     for name, section in targets.items():
         try:
             printed.append(section.target(name))
@@ -41,33 +41,31 @@ def contradictions(
 
 def _carriers(carriers: Carriers) -> Iterator[Fault]:
     if carriers.sensors == carriers.targets:
-        yield ("carriers", "targets"), f"{carriers.targets!r} carries the sensors too; name two different frames"
+        yield ("carriers", "targets"), f"{carriers.targets!r} also carries the sensors; name two different frames"
     elif set(carriers.poses.frames) != {carriers.sensors, carriers.targets}:
         key = "tf" if carriers.poses.tf is not None else "parent"
         parent, child = carriers.poses.frames
         yield (
             ("carriers", "poses", key),
-            f"poses of {child} in {parent} are not those of the carriers, {carriers.sensors} and {carriers.targets}; "
-            "name these two, either way round",
+            f"poses of {child} in {parent} are not poses of the carriers; name {carriers.sensors} and "
+            f"{carriers.targets}, in either order",
         )
 
 
 def _sensors(sensors: Mapping[str, Sensor]) -> Iterator[Fault]:
     if not sensors:
-        yield ("sensors",), "none; give one or more"
+        yield ("sensors",), "none; give at least one sensor"
     for key in ("images", "detections"):
         first: dict[str, str] = {}
         for name, sensor in sensors.items():
             topic = getattr(sensor, key)
             if topic is not None and first.setdefault(topic, name) != name:
-                yield (
-                    ("sensors", name, key),
-                    f"{topic} is the topic of sensor {first[topic]} too; each sensor needs its own",
-                )
+                words = f"{topic} is also the topic of sensor {first[topic]}; each sensor needs its own topic"
+                yield ("sensors", name, key), words
 
 
 def _names(carriers: Carriers, sensors: Mapping[str, Sensor], targets: Mapping[str, TargetSection]) -> Iterator[Fault]:
-    """Frames that have one name, whatever they are of."""
+    """Names that two frames have."""
     named: list[tuple[str, KeyPath, str]] = [(carriers.sensors, ("carriers", "sensors"), "the sensors' carrier")]
     if carriers.targets != carriers.sensors:
         named.append((carriers.targets, ("carriers", "targets"), "the targets' carrier"))
@@ -79,7 +77,7 @@ def _names(carriers: Carriers, sensors: Mapping[str, Sensor], targets: Mapping[s
     first: dict[str, str] = {}
     for name, path, what in named:
         if first.setdefault(name, what) != what:
-            yield path, f"{name!r} is the name of {first[name]} already; each frame needs its own"
+            yield path, f"{name!r} is already the name of {first[name]}; each frame needs its own name"
 
 
 def _detection(detection: Mapping[str, Any]) -> Iterator[Fault]:
@@ -100,8 +98,8 @@ def _lookalikes(targets: list[Target]) -> Iterator[Fault]:
             if {first.columns, first.rows} == {second.columns, second.rows}:
                 yield (
                     ("targets", second.name),
-                    f"a checkerboard of {second.columns} x {second.rows} inner corners like {first.name}: no image "
-                    "tells the two apart; take boards with tags",
+                    f"a checkerboard of {second.columns} x {second.rows} inner corners, like {first.name}: the boards "
+                    "look the same in images; use boards with tags",
                 )
             continue
         shared = sorted(set(first.ids) & set(second.ids))
@@ -109,6 +107,6 @@ def _lookalikes(targets: list[Target]) -> Iterator[Fault]:
             some = ", ".join(map(str, shared[:5])) + (", ..." if len(shared) > 5 else "")
             yield (
                 ("targets", second.name),
-                f"tags {some} of {second.family} belong to target {first.name} too: no image tells the two apart; "
-                "print targets with different ids",
+                f"tags {some} of {second.family} also belong to target {first.name}: the targets look the same in "
+                "images; print targets with different ids",
             )

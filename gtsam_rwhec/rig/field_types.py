@@ -1,4 +1,4 @@
-"""What single values of a rig file may be: names, lengths, positive numbers; wrong ones said in words."""
+"""Types of single values of a rig file: names, lengths, positive numbers, with messages for wrong values."""
 
 from __future__ import annotations
 
@@ -10,28 +10,31 @@ from pydantic import AfterValidator, BeforeValidator
 from gtsam_rwhec.files.yaml_lines import shown
 from gtsam_rwhec.vision.targets import LARGEST_M
 
+#: A frame's name: the characters that it may have.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*")
+#: Characters of a name, at most.
 LONGEST_NAME = 100
+#: Characters of a topic or a path, at most.
 LONGEST_TEXT = 1000
-#: Seconds; beyond, nanoseconds do not fit 64 bits.
+#: Seconds; larger offsets in nanoseconds do not fit into 64 bits.
 LARGEST_OFFSET_S = 4e9
 
 
 def is_name(text: str) -> bool:
-    """Whether a frame can be called so."""
+    """Whether this can be the name of a frame."""
     return len(text) <= LONGEST_NAME and NAME.fullmatch(text) is not None
 
 
 def is_text(text: str) -> bool:
-    """Whether a topic or a path can be."""
+    """Whether this can be a topic or a path."""
     return 0 < len(text) <= LONGEST_TEXT and text.isprintable()
 
 
 def _name(text: str) -> str:
     if not is_name(text):
         raise ValueError(
-            f"{shown(text)} cannot be a frame's name: a letter first, then letters, digits and _, parts joined by /, "
-            f"at most {LONGEST_NAME} characters"
+            f"{shown(text)} cannot be a frame's name: a name has first a letter, then letters, digits and _, in parts "
+            f"joined by /, and at most {LONGEST_NAME} characters"
         )
     return text
 
@@ -40,7 +43,7 @@ def _text(text: str) -> str:
     if not text:
         raise ValueError("'' is empty")
     if not is_text(text):
-        raise ValueError(f"{shown(text)} has unprintable characters, or more than {LONGEST_TEXT}")
+        raise ValueError(f"{shown(text)} has unprintable characters, or more than {LONGEST_TEXT} characters")
     return text
 
 
@@ -52,14 +55,14 @@ def _positive(number: float) -> float:
 
 def _length(number: float) -> float:
     if not number > 0.0:
-        raise ValueError(f"{number:g} is no length; give metres, above 0")
+        raise ValueError(f"{number:g} is not a length; give metres, above 0")
     if number >= LARGEST_M:
-        raise ValueError(f"{number:g} m is {LARGEST_M:g} m or more; millimetres? Then write {number / 1000.0:g}")
+        raise ValueError(f"{number:g} m is {LARGEST_M:g} m or more; if it is in millimetres, write {number / 1000.0:g}")
     return number
 
 
 def list_of(count: int, words: str) -> BeforeValidator:
-    """Of so many, which `words` describe."""
+    """A list of `count` values, which `words` describe."""
 
     def check(given: Any) -> Any:
         if not isinstance(given, (tuple, list)) or len(given) != count:

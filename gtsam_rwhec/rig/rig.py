@@ -1,4 +1,4 @@
-"""A rig file as a whole: its sections, checked against one another."""
+"""A whole rig file: its sections, with a check for contradictions between them."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from gtsam_rwhec.vision.targets import Target
 
 
 class RigFile(Section):
-    """What a rig file says."""
+    """The content of a rig file."""
 
-    carriers: Carriers = Field(description="what carries the sensors, what the targets, and where their poses are")
+    carriers: Carriers = Field(description="the frames that carry the sensors and the targets, and their poses")
     sensors: dict[Name, Sensor] = Field(description="by name, each with images or detections")
     targets: dict[Name, TargetSection] = Field(description="by name, each with type and sizes")
     sizes: Literal["known", "check", "estimate"] = "check"
@@ -34,12 +34,12 @@ class RigFile(Section):
 
     @cached_property
     def target_list(self) -> tuple[Target, ...]:
-        """The targets as the vision package has them, named, in the file's order."""
+        """The targets with their names, in the order of the file, for the vision package."""
         return tuple(section.target(name) for name, section in self.targets.items())
 
     @property
     def corner_px(self) -> float | None:
-        """Standard deviation of a corner along each axis, pixels; None where the rig file does not give it."""
+        """Standard deviation of a corner along each axis, pixels; None if the rig file does not state it."""
         return None if self.noise == "estimate" else self.noise.corner_px
 
     @property
@@ -53,7 +53,7 @@ class RigFile(Section):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> RigFile:
-        # pydantic puts the faults of a ValidationError that is raised here under their own places.
+        # pydantic keeps the places of the faults of a ValidationError that is raised here.
         faults = [
             InitErrorDetails(type=PydanticCustomError("value_error", "{words}", {"words": words}), loc=path, input=None)
             for path, words in contradictions(self.carriers, self.sensors, self.targets, self.detection)
@@ -64,6 +64,6 @@ class RigFile(Section):
 
 
 class Rig(RigFile):
-    """A rig file that has been read: what it says, and the folder that its relative paths are relative to."""
+    """A rig file that was read: its content, and the folder that its relative paths start from."""
 
     folder: Path = Path()

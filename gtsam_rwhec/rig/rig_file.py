@@ -1,4 +1,4 @@
-"""Rig files read, with every fault and its line."""
+"""Reading rig files; an error names every fault with its line."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_tex
 from gtsam_rwhec.rig import sections, target_sections
 from gtsam_rwhec.rig.rig import Rig, RigFile
 
-#: Faults that one message has, at most.
+#: Faults that a message names, at most.
 MOST_FAULTS = 20
 
+#: The section of each type of target.
 _TARGETS: dict[str, type[BaseModel]] = {
     "tag": target_sections.TagTarget,
     "charuco": target_sections.CharucoTarget,
     "aprilgrid": target_sections.AprilGridTarget,
     "checkerboard": target_sections.CheckerboardTarget,
 }
-#: Which section is where; * is any name.
+#: The section at each place; * stands for any name.
 _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     (): RigFile,
     ("carriers",): sections.Carriers,
@@ -34,6 +35,7 @@ _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     ("noise",): sections.DetectionNoise,
     ("cleaning",): sections.Cleaning,
 }
+#: What to do about a fault, by pydantic's name for its kind.
 _KINDS = {
     "float_type": "give a number",
     "int_type": "give a whole number",
@@ -42,7 +44,7 @@ _KINDS = {
     "bool_type": "give true or false",
     "finite_number": "give a finite number",
     "tuple_type": "give a list, [..., ...]",
-    "dict_type": "give a section: names, each with what belongs to it",
+    "dict_type": "give a section of names, each with its own keys",
 }
 
 
@@ -52,12 +54,12 @@ def read_rig(path: str | Path) -> Rig:
     Parameters
     ----------
     path
-        YAML in UTF-8; relative paths in it are relative to its folder.
+        YAML in UTF-8. Relative paths in it start from its folder.
 
     Raises
     ------
     RigError
-        It cannot be read, is not YAML, or says what cannot be: every fault with its line.
+        The file cannot be read, is not YAML, or has faults: the message names every fault with its line.
     """
     try:
         text = read_text(path)
@@ -75,7 +77,7 @@ def parse_rig(text: str, where: str, folder: Path = Path()) -> Rig:
     where : str
         The file, for messages.
     folder : Path
-        What relative paths are relative to.
+        The folder that relative paths start from.
 
     Raises
     ------
@@ -106,7 +108,7 @@ def _in_words(error: ValidationError, file: YamlFile) -> Iterator[tuple[KeyPath,
 
 
 def _path(loc: tuple[str | int, ...]) -> KeyPath:
-    """A fault's place without the names that pydantic gives to a union's choices and to keys."""
+    """The place of a fault, without pydantic's names for the choices of a union and for keys."""
     if loc[:1] == ("targets",) and len(loc) > 2:
         loc = (*loc[:2], *loc[3:])
     elif loc[:1] == ("noise",) and len(loc) > 1:
@@ -131,7 +133,7 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
     if kind == "union_tag_invalid":
         return f"{shown(given['type'])}; give one of {', '.join(_TARGETS)}"
     if kind == "union_tag_not_found":
-        return f"is missing: one of {', '.join(_TARGETS)}"
+        return f"is missing: give one of {', '.join(_TARGETS)}"
     if kind in ("model_type", "model_attributes_type"):
         model = _section(path, file.data)
         keys = f" with {', '.join(model.model_fields)}" if model else " with type and sizes"
@@ -142,7 +144,7 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
 
 
 def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
-    """The section that is at a place."""
+    """The section at a place."""
     if len(path) == 2 and path[0] == "targets":
         target = data["targets"][path[1]]
         kind = target.get("type") if isinstance(target, dict) else None

@@ -1,6 +1,6 @@
-"""The sections of a rig file, field by field, with units; those of targets are in `target_sections`.
+"""The sections of a rig file, field by field, with units; `target_sections` has the sections of targets.
 
-Nothing is converted, and a key that is not here is an error.
+No value is converted, and an unknown key is an error.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from gtsam_rwhec.vision.camera import Camera
 
 
 class Section(BaseModel):
-    """What all sections share: no key that is not listed, no conversion, nothing infinite."""
+    """Rules for all sections: no unknown keys, no conversion, only finite numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
     def _given(self, *names: str) -> list[str]:
-        """Which of these are there."""
+        """Those of these keys that the section has."""
         return [name for name in names if getattr(self, name) is not None]
 
 
 class PoseNoise(Section):
-    """Standard deviations about and along each axis."""
+    """Noise of poses: standard deviations about and along each axis."""
 
     rotation_deg: Positive = Field(description="standard deviation about each axis, degrees")
     translation_mm: Positive = Field(description="standard deviation along each axis, millimetres")
 
 
 class PoseSource(Section):
-    """Where the carriers' poses are: a pair of tf frames, or a topic whose poses are T_parent_child."""
+    """Where the carriers' poses are: in tf (two frames), or on a topic whose poses are T_parent_child."""
 
     tf: Annotated[tuple[Name, Name], list_of(2, "two frames, [parent, child]")] | None = None
     topic: Text | None = None
@@ -40,7 +40,7 @@ class PoseSource(Section):
 
     @property
     def frames(self) -> tuple[str, str]:
-        """Parent and child, wherever the poses are."""
+        """The parent and the child frame of the poses."""
         return self.tf if self.tf is not None else (self.parent or "", self.child or "")
 
     @model_validator(mode="after")
@@ -48,14 +48,14 @@ class PoseSource(Section):
         if len(self._given("tf", "topic")) != 1:
             raise ValueError("give one of tf: [parent, child] and topic: ... (with parent and child)")
         if self.tf is not None and self._given("parent", "child"):
-            raise ValueError("tf names both frames; leave parent and child out")
+            raise ValueError("tf names both frames already; leave parent and child out")
         if self.topic is not None and len(self._given("parent", "child")) < 2:
-            raise ValueError(f"say of which frames the poses of {self.topic} are: parent: ..., child: ...")
+            raise ValueError(f"name the frames of the poses of {self.topic}: parent: ..., child: ...")
         return self
 
 
 class Carriers(Section):
-    """What the sensors are mounted on, what the targets are, and where the log has the one's pose in the other."""
+    """The frame that carries the sensors, the frame that carries the targets, and where their poses are."""
 
     sensors: Name = Field(description="the frame that carries the sensors, such as hand")
     targets: Name = Field(description="the frame that carries the targets, such as base")
@@ -65,7 +65,7 @@ class Carriers(Section):
 
 
 class Intrinsics(Section):
-    """Where a camera's intrinsics are: a topic, a Kalibr camchain, another YAML file, or right here."""
+    """Where a camera's intrinsics are: a topic, a Kalibr camchain, another YAML file, or numbers in this section."""
 
     topic: Text | None = None
     kalibr: Text | None = None
@@ -103,7 +103,7 @@ class Intrinsics(Section):
 
 
 class Sensor(Section):
-    """A camera, or a detection driver behind one."""
+    """A camera with images, or with the detections of a driver."""
 
     images: Text | None = Field(default=None, description="topic of the camera's images")
     detections: Text | None = Field(default=None, description="topic of a driver's detections")
@@ -126,7 +126,7 @@ class Sensor(Section):
 
 
 class DetectionNoise(Section):
-    """Noise of the detections (B): standard deviations about and along each axis, or that of a corner in pixels."""
+    """Noise of the detections (B): standard deviations about and along each axis, or of a corner in pixels."""
 
     rotation_deg: Positive | None = None
     translation_mm: Positive | None = None
@@ -144,7 +144,7 @@ class DetectionNoise(Section):
 
 
 class Cleaning(Section):
-    """What is taken out before anything is solved; a limit that is left out (null) takes nothing out."""
+    """Which measurements cleaning removes before solving; a limit of null removes nothing."""
 
     min_rotation_deg: Positive = 0.5
     min_translation_mm: Positive = 3.0

@@ -1,4 +1,4 @@
-"""The sections of a rig file that say which targets there are, by type."""
+"""The sections of a rig file that describe targets, one class for each type of target."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Ta
 
 
 class _TargetSection(Section):
-    """A section whose keys, but for its type, are the fields of a target."""
+    """A section whose keys, except its type, are the fields of a target."""
 
     made: ClassVar[type[Target]]
 
     def target(self, name: str) -> Target:
-        """The target, named."""
+        """The target with this name."""
         return self.made(name=name, **self.model_dump(exclude={"type"}))
 
 
@@ -49,7 +49,7 @@ class AprilGridTarget(_TargetSection):
 
     made: ClassVar = AprilGrid
     type: Literal["aprilgrid"]
-    family: str = Field(description="tag36h11 as a rule")
+    family: str = Field(description="most often tag36h11")
     columns: int = Field(description="tags across")
     rows: int = Field(description="tags down")
     tag_m: Length = Field(description="side of a tag's black square, metres (Kalibr's tagSize)")

@@ -56,7 +56,7 @@ def test_a_name_is_that_of_one_frame(changes: dict[str, Any]) -> None:
 def test_only_sensors_have_cameras_offsets_and_topics(what: str) -> None:
     value = {"cameras": CAMERA, "time_offsets_s": 0.0, "topics": "/image"}[what]
     assert getattr(frames(**{what: {"cam": value}}), what) == {"cam": value}
-    with pytest.raises(FrameError, match=f"{what} has 'tag', which is no sensor; the sensors are cam"):
+    with pytest.raises(FrameError, match=f"{what} has 'tag', which is not a sensor; the sensors are cam"):
         frames(**{what: {"tag": value}})
 
 
