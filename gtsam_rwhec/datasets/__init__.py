@@ -1,4 +1,4 @@
-"""Measurements to try the library on: the shipped log, and public data to download."""
+"""Data to try the library on: the demo's log, which is shipped, and public data to download."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The demo's log, and what is true of it."""
+"""The demo's log, and the true calibration that it was made with."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import FileFormatError
 
+#: Names of the files in the demo's folder: the log, its rig file, and the truth.
 LOG, RIG, TRUTH = "robot_cell.mcap", "rig.yaml", "truth.json"
 
 
@@ -21,7 +22,7 @@ def demo_folder() -> Path:
     Raises
     ------
     FileFormatError
-        Neither is there.
+        When neither folder is there.
     """
     package = Path(str(files("gtsam_rwhec")))
     candidates = (package / "demo_data", package.parent / "data" / "cell")
@@ -35,24 +36,24 @@ def demo_folder() -> Path:
 
 @dataclass(frozen=True)
 class DemoTruth:
-    """What the log was made with.
+    """The facts that the log was made with.
 
     Attributes
     ----------
     X : dict of str to gtsam.Pose3
-        T_base_target of each target, metres.
+        T_base_target by target, metres.
     Y : dict of str to gtsam.Pose3
-        T_hand_camera of each camera, metres.
+        T_hand_camera by camera, metres.
     time_offsets_s : dict of str to float
-        Of each camera: its stamp t is the robot's t + offset.
+        By camera, seconds: the camera's stamp t is the robot's t + offset.
     scale : dict of str to float
-        Stated / true length of each target.
+        Stated length over true length, by target.
     twice_seen : str
-        The target whose tag is printed on a poster too.
+        The target whose tag a poster shows a second time.
     twice_seen_by : str
-        The camera that sees that poster.
+        The camera that sees the poster.
     twice_seen_in : int
-        In how many of its images.
+        Number of that camera's images with the poster.
     """
 
     X: dict[str, gtsam.Pose3]
@@ -65,13 +66,7 @@ class DemoTruth:
 
 
 def demo_truth() -> DemoTruth:
-    """What is true of the demo's log.
-
-    Raises
-    ------
-    FileFormatError
-        The demo's data is not there.
-    """
+    """The truth of the demo's log; a FileFormatError when the demo's data is not there."""
     raw = json.loads((demo_folder() / TRUTH).read_text(encoding="utf-8"))
     return DemoTruth(
         X={name: gtsam.Pose3(np.array(T)) for name, T in raw["T_base_target"].items()},

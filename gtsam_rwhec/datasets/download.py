@@ -1,8 +1,8 @@
-"""Download the RWHEC paper's real dataset, which has no licence and is therefore not shipped with this package.
+"""Download the RWHEC paper's real dataset. It has no licence, so this package does not ship it.
 
-The files come one by one from the authors' public repository and are checked against the sizes and SHA-256 sums in
-``utias_files.txt``, which is shipped. A file appears under its name only once it is complete and verified, so an
-interrupted download is resumed by calling again; a file that is there with other content is never overwritten.
+The files come one by one from the authors' public repository. Each is checked against its size and SHA-256 sum in
+``utias_files.txt``, which is shipped. A file gets its name only when it is complete and verified, so another call
+resumes an interrupted download. A file with other content is never overwritten.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from urllib3.util.retry import Retry
 from gtsam_rwhec.errors import FetchError, FileFormatError
 from gtsam_rwhec.files.atomic_write import write_atomically
 
+#: Folder ``data/real-world/combined`` of utiasSTARS/certifiable-rwhe-calibration on GitHub.
 UTIAS_URL = "https://raw.githubusercontent.com/utiasSTARS/certifiable-rwhe-calibration/main/data/real-world/combined/"
-"""Folder ``data/real-world/combined`` of utiasSTARS/certifiable-rwhe-calibration on GitHub."""
-
+#: Longest times to connect, and between two packets, s. The largest file has under 50 kB.
 TIMEOUT_S = (10.0, 60.0)
-"""Seconds to connect, and between two packets; the largest file has under 50 kB."""
+#: The end of a message about a download that stopped.
+KEPT = "Complete files stay."
 
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """One line of a registry: what a file is called, how long it is, and what is in it."""
+    """One line of a registry: a file's name, size and checksum."""
 
     name: str
     size_bytes: int
@@ -38,13 +39,11 @@ class RemoteFile:
 
 @dataclass(frozen=True)
 class Fetched:
-    """What one call of `fetch_utias` did."""
+    """The files of one call of `fetch_utias`: downloaded by it, or there before and verified by it."""
 
     folder: Path
     downloaded: tuple[str, ...]
-    """Names of the files that were downloaded now."""
     already_there: tuple[str, ...]
-    """Names of the files that were there before, verified now."""
 
 
 def utias_files() -> tuple[RemoteFile, ...]:
@@ -59,22 +58,22 @@ def fetch_utias(
     base_url: str = UTIAS_URL,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Fetched:
-    """Download the dataset into a folder, or complete what an earlier call began.
+    """Download the dataset into a folder, or complete an earlier download.
 
     Parameters
     ----------
-    destination
-        Folder to write to; made if it is not there.
-    base_url
-        Where the files are: a mirror, or a server inside an institute's network.
-    progress
+    destination : str or Path
+        Folder to write to; it is made if needed.
+    base_url : str
+        Where the files are, for example a mirror inside an institute's network.
+    progress : callable, optional
         Called before each file with (files done, files in all, name), and once more at the end.
 
     Raises
     ------
     FetchError
-        No network, a status other than 200, content with another checksum, or a file in the way whose content is
-        another. Everything verified until then stays, and the next call goes on from there.
+        For no network, a status other than 200, a wrong checksum, or another file of the same name in the folder. All
+        verified files stay, and the next call goes on from there.
     """
     folder = Path(destination)
     remote_files = utias_files()
@@ -92,20 +91,20 @@ def fetch_utias(
             try:
                 write_atomically(folder / file.name, content)
             except FileFormatError as error:
-                raise FetchError(f"{error} What is complete stays.") from error
+                raise FetchError(f"{error} {KEPT}") from error
     if progress is not None:
         progress(len(remote_files), len(remote_files), "")
     return Fetched(folder, tuple(file.name for file in missing), there)
 
 
 def _verified(folder: Path, remote_files: tuple[RemoteFile, ...]) -> tuple[str, ...]:
-    """Names of the files that are there already; nothing that is there with other content is ever written over."""
+    """Names of the files that are there already; a FetchError for a file with other content."""
     there = []
     for file in remote_files:
         path = folder / file.name
         if not path.exists():
             continue
-        sha256 = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "none, it is not a file"
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "none: it is not a file"
         if sha256 != file.sha256:
             raise FetchError(
                 f"{path} is there but is not the dataset's file (SHA-256 {sha256}, expected {file.sha256}). "
@@ -116,7 +115,7 @@ def _verified(folder: Path, remote_files: tuple[RemoteFile, ...]) -> tuple[str, 
 
 
 def _session() -> requests.Session:
-    """One connection for all files; what a moment later may work is tried again, twice, after 0.5 s and 1 s."""
+    """One connection for all files. Passing faults are tried again twice, after 0.5 s and 1 s."""
     session = requests.Session()
     retry = Retry(total=2, backoff_factor=0.5, status_forcelist=(429, 500, 502, 503, 504), raise_on_status=False)
     for scheme in ("https://", "http://"):
@@ -129,11 +128,10 @@ def _download(session: requests.Session, url: str, file: RemoteFile) -> bytes:
         response = session.get(url, timeout=TIMEOUT_S)
         status, reason, content = response.status_code, response.reason, response.content
     except requests.Timeout as error:
-        raise FetchError(f"{url}: no answer in time. Call again: what is complete stays.") from error
+        raise FetchError(f"{url}: no answer in time. Call again. {KEPT}") from error
     except requests.ConnectionError as error:
         raise FetchError(
-            f"{url}: no connection. Is there a network, and a proxy to set (HTTPS_PROXY)? What is complete stays: call "
-            "again later."
+            f"{url}: no connection. Is there a network, or a proxy to set (HTTPS_PROXY)? Call again later. {KEPT}"
         ) from error
     except requests.RequestException as error:
         raise FetchError(f"{url} cannot be downloaded: {error}.") from error
@@ -142,11 +140,11 @@ def _download(session: requests.Session, url: str, file: RemoteFile) -> bytes:
             f"{url}: not found (404). Has the repository moved its files? Give the new folder as base_url."
         )
     if status != requests.codes.ok:
-        raise FetchError(f"{url}: the server answered {status} {reason}. What is complete stays: call again later.")
+        raise FetchError(f"{url}: the server answered {status} {reason}. Call again later. {KEPT}")
     sha256 = hashlib.sha256(content).hexdigest()
     if (len(content), sha256) != (file.size_bytes, file.sha256):
         raise FetchError(
             f"{url}: {len(content)} bytes with SHA-256 {sha256}, expected {file.size_bytes} bytes with {file.sha256}. "
-            "Nothing was written. Something on the way changed it (a proxy's page?), or the authors changed the file."
+            "Nothing was written. Did a proxy send a page of its own, or did the authors change the file?"
         )
     return content

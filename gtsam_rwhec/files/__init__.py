@@ -1,4 +1,4 @@
-"""What several packages need around files: YAML with lines, atomic writes, natural order, text for a terminal."""
+"""Files, for several packages: YAML with lines, atomic writes, names in natural order, text for a terminal."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Writing a file so that whoever looks finds it whole or not at all. Nothing in this package writes in another way."""
+"""Files are written whole or not at all. Every file that this library writes goes through here."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def write_atomically(path: str | Path, content: bytes) -> None:
     Raises
     ------
     FileFormatError
-        The folder does not exist, is not writable, or the disk is full; what was at `path` before is untouched.
+        The folder does not exist, is not writable, or the disk is full. An earlier file at `path` stays as it was.
     """
     try:
         with atomic_stream(path) as stream:
@@ -28,21 +28,21 @@ def write_atomically(path: str | Path, content: bytes) -> None:
 
 @contextmanager
 def atomic_stream(path: str | Path) -> Iterator[BinaryIO]:
-    """A stream to a temporary file beside `path`, which gets its name in one step when the block ends without error.
+    """A stream to a temporary file beside `path`. It takes the name `path` when the block ends without an error.
 
-    A link is followed, and something that is not an ordinary file (``/dev/stdout``, a pipe) is written to directly.
+    A link is followed. A path that is not an ordinary file (``/dev/stdout``, a pipe) is written to directly.
 
     Raises
     ------
     OSError
-        As above. Not a `FileFormatError`: in the block, other files may be read that cannot be.
+        When the file cannot be written. Not a `FileFormatError`, since the block may read other files.
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():
         with open(path, "wb") as stream:
             yield stream
         return
-    # Not tempfile.mkstemp: its files are readable by their owner alone, and os.replace would keep that.
+    # Not tempfile.mkstemp: only the owner can read its files, and os.replace would keep that.
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with open(temporary, "wb") as stream:

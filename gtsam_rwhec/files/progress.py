@@ -1,4 +1,4 @@
-"""What a long calculation tells its caller: the name of each stage."""
+"""The progress of a long calculation: a callable that takes the name of each stage."""
 
 from __future__ import annotations
 
@@ -8,4 +8,4 @@ Progress = Callable[[str], None]
 
 
 def silent(stage: str) -> None:
-    """For a caller that does not ask."""
+    """Report nothing."""

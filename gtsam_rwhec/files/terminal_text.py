@@ -1,13 +1,13 @@
-"""Text for a terminal: logs are strangers' files, and names in them could be commands to it."""
+"""Text that is safe on a terminal: a log may come from a stranger, and a name in it could be a terminal command."""
 
 from __future__ import annotations
 
-#: Longer messages are cut in the middle.
+#: Longest message, characters. Longer messages are cut in the middle.
 LONGEST = 10_000
 
 
 def printable(text: str, longest: int = LONGEST) -> str:
-    r"""What cannot be printed as Python would escape it (``\x1b``), lines as they are; at most so many characters."""
+    r"""The text with unprintable characters escaped as in Python (``\x1b``), cut to ``longest``; lines stay."""
     if len(text) > longest:
         half = (longest - 20) // 2
         text = f"{text[:half]} [...] {text[len(text) - half :]}"

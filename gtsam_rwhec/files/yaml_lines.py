@@ -1,9 +1,10 @@
-"""YAML files whose every value knows its line, for messages that say where; read without trust.
+"""YAML files with the line of every value, for messages that say where. The files are not trusted.
 
-Only what people write by hand is read: one document of mappings, lists and scalars. Aliases (which can blow a small
-file up), tags (which can stand for any object), keys given twice and keys that are no text are refused. A scalar
+A file is one document of mappings, lists and scalars, as people write it by hand. Refused are aliases (a small file
+could grow without limit), tags (they can stand for any object), keys given twice, and keys that are not text. A scalar
 without quotes is a number, true, false or null as in YAML 1.2: ``1e-3`` is a number, ``no`` and ``12:30`` are text.
-PyYAML parses the file; its own constructor takes ``1e-3`` for text, ``no`` for false and the last of two equal keys.
+PyYAML parses the file. Its constructor is not used: it reads ``1e-3`` as text, ``no`` as false, and of two equal keys
+the last.
 """
 
 from __future__ import annotations
@@ -21,17 +22,18 @@ from gtsam_rwhec.errors import FileFormatError
 
 KeyPath: TypeAlias = tuple[str | int, ...]
 
+#: Size of the largest file that is read, bytes.
 MOST_BYTES = 1_000_000
-#: Mappings and lists inside one another.
+#: Most mappings and lists inside one another.
 DEEPEST = 20
-#: What `parse_yaml` is told to pass over in OpenCV's files.
+#: The tag in OpenCV's files, for `parse_yaml`.
 OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
 
 _WORDS = {
     "": None, "~": None, "null": None, "Null": None, "NULL": None,
     "true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False,
 }  # fmt: skip
-#: Longer ones become floats: Python does not convert thousands of digits.
+#: Longer integers become floats: Python does not convert thousands of digits.
 _INTEGER = re.compile(r"[-+]?[0-9]{1,18}")
 _NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _NOT_FINITE = re.compile(r"([-+]?)\.(inf|nan)", re.IGNORECASE)
@@ -40,16 +42,16 @@ _PLAIN_KEY = re.compile(r"[A-Za-z0-9_/.-]+")
 
 @dataclass(frozen=True)
 class YamlFile:
-    """What a file holds, and where.
+    """The contents of a YAML file, with their lines.
 
     Attributes
     ----------
     where : str
-        The file, for messages.
-    data
+        The file's name, for messages.
+    data : Any
         Mappings are dicts with keys of text, lists are tuples, scalars are str, int, float, bool or None.
     lines : mapping of key path to int
-        For each value the line of its key, or its own in a list; counted from 1.
+        For each value the line of its key, or of the value itself in a list, from 1 on.
     """
 
     where: str
@@ -57,7 +59,7 @@ class YamlFile:
     lines: Mapping[KeyPath, int]
 
     def line(self, path: KeyPath) -> int:
-        """The line of a value; of what should contain it, if it is not there."""
+        """The line of a value, or of the mapping or list that should contain it."""
         while path and path not in self.lines:
             path = path[:-1]
         return self.lines.get(path, 1)
@@ -72,13 +74,7 @@ class YamlFile:
 
 
 def read_yaml(path: str | Path, *, tags: Collection[str] = ()) -> YamlFile:
-    """Read a file; see `parse_yaml`.
-
-    Raises
-    ------
-    FileFormatError
-        It cannot be read, is larger than `MOST_BYTES` or is not UTF-8; or as `parse_yaml`.
-    """
+    """Read a file, with the errors of `read_text` and `parse_yaml`."""
     return parse_yaml(read_text(path), str(path), tags=tags)
 
 
@@ -88,7 +84,7 @@ def read_text(path: str | Path) -> str:
     Raises
     ------
     FileFormatError
-        It cannot be read, is larger than `MOST_BYTES` or is not UTF-8.
+        When the file cannot be read, is larger than `MOST_BYTES` or is not UTF-8.
     """
     try:
         with open(path, "rb") as stream:
@@ -111,22 +107,23 @@ def parse_yaml(text: str, where: str, *, tags: Collection[str] = ()) -> YamlFile
     Parameters
     ----------
     text : str
+        The document.
     where : str
-        The file, for messages.
+        The file's name, for messages.
     tags : collection of str
-        Tags that are passed over; any other is refused.
+        Tags that are ignored; any other tag is refused.
 
     Raises
     ------
     FileFormatError
-        It is not YAML, is empty, or has what is refused here (see the module); with the line.
+        When the text is not YAML, is empty, or has what this module refuses; with the line.
     """
     reader = _Reader(where, frozenset(tags), _events(text, where))
     return YamlFile(where, reader.document(), reader.lines)
 
 
 def dotted(path: KeyPath) -> str:
-    """``sensors.cam_left.D[2]``; keys that are not plain in quotes."""
+    """A key path as ``sensors.cam_left.D[2]``, with quotes around keys that are not plain."""
     text = ""
     for key in path:
         if isinstance(key, int):
@@ -137,13 +134,13 @@ def dotted(path: KeyPath) -> str:
 
 
 def suggestion(key: str, known: Collection[str]) -> str:
-    """What to say of an unknown key."""
+    """The message about an unknown key: the nearest known key, or all known keys."""
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.65)
-    return f"unknown key; did you mean {near[0]}?" if near else f"unknown key; there are {', '.join(known)}"
+    return f"unknown key; did you mean {near[0]}?" if near else f"unknown key; known keys are {', '.join(known)}"
 
 
 def shown(value: Any) -> str:
-    """A value for a message, shortened."""
+    """A value for a message, at most about 60 characters long."""
     if value is None:
         return "empty"
     if isinstance(value, bool):
@@ -172,13 +169,13 @@ def _events(text: str, where: str) -> Iterator[Any]:
         raise FileFormatError(
             f"{where}, line {line}: a character that no YAML file has ({error.character!r}); is it a text file?"
         ) from error
-    except (yaml.YAMLError, ValueError, OverflowError) as error:  # escapes and versions beyond all bounds
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # escapes and versions out of range
         raise FileFormatError(f"{where}: not YAML: {error}") from error
 
 
 @dataclass
 class _Reader:
-    """Takes the events of one document in their order; `lines` as in `YamlFile`."""
+    """Reads the events of one document in their order; `lines` are those of `YamlFile`."""
 
     where: str
     tags: frozenset[str]
@@ -193,16 +190,16 @@ class _Reader:
         next(self.events)  # the document ends
         after = next(self.events)
         if isinstance(after, yaml.DocumentStartEvent):
-            self._refuse(after, "a second document begins ('---'); one is read")
+            self._refuse(after, "a second document begins ('---'); keep one document")
         return data
 
     def _value(self, event: Any, path: KeyPath, depth: int) -> Any:
         """The value that begins with `event`, inside `depth` mappings and lists."""
-        self.lines.setdefault(path, _line(event))  # in a mapping the key's line stands already
+        self.lines.setdefault(path, _line(event))  # in a mapping the key's line is there already
         if isinstance(event, yaml.ScalarEvent):
             return _scalar(event.value) if event.style is None else event.value
         if depth == DEEPEST:
-            self._refuse(event, f"more than {DEEPEST} mappings and lists inside one another")
+            self._refuse(event, f"more than {DEEPEST} mappings and lists inside one another; nest less deeply")
         if isinstance(event, yaml.SequenceStartEvent):
             items: list[Any] = []
             while not isinstance(event := self._node(), yaml.SequenceEndEvent):
@@ -211,7 +208,7 @@ class _Reader:
         mapping: dict[str, Any] = {}
         while not isinstance(event := self._node(), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):
-                self._refuse(event, "a key that is itself a list or a mapping; is a {, [ or ? too many there?")
+                self._refuse(event, "a key that is itself a list or a mapping; is there a {, [ or ? too many?")
             under = (*path, event.value)
             if event.value in mapping:
                 self._refuse(event, f"{dotted(under)} is there twice, first in line {self.lines[under]}; keep one")
@@ -226,9 +223,7 @@ class _Reader:
             self._refuse(event, f"the alias *{event.anchor}: aliases are not read; write the value out")
         if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
             if event.anchor is not None:
-                self._refuse(
-                    event, f"the anchor &{event.anchor}: anchors are not read; write values out where they are"
-                )
+                self._refuse(event, f"the anchor &{event.anchor}: anchors are not read; write each value out")
             if event.tag is not None and event.tag not in self.tags:
                 tag = event.tag.replace("tag:yaml.org,2002:", "!!")
                 self._refuse(event, f"the tag {shown(tag)}: tags are not read; write a plain value")
@@ -243,7 +238,7 @@ def _line(event: Any) -> int:
 
 
 def _scalar(text: str) -> str | int | float | bool | None:
-    """What a scalar without quotes stands for, as YAML 1.2's core schema has it (without 0o and 0x)."""
+    """The value of a scalar without quotes, as in YAML 1.2's core schema (without 0o and 0x)."""
     if text in _WORDS:
         return _WORDS[text]
     if _INTEGER.fullmatch(text):
