@@ -6,7 +6,7 @@ pixels u = f x_distorted + c. Pixel centres are at whole numbers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -81,54 +81,43 @@ class Camera:
                 f"{where}: distortion model {model!r} is not supported; supported are "
                 f"{', '.join(repr(name) for name in MODELS if name)}"
             )
-        kind = MODELS[word]
-        camera = Camera(int(width), int(height), kind, np.array(K, dtype=float), np.array(D, dtype=float).ravel())
-        return camera._checked(where)
+        matrix, coefficients = np.array(K, dtype=float), np.trim_zeros(np.array(D, dtype=float).ravel(), "b")
+        camera = Camera(int(width), int(height), MODELS[word], matrix, coefficients)
+        fault = camera._fault()
+        if fault:
+            raise CameraError(f"{where}: {fault}")
+        kind = camera.model if camera.model == "equidistant" or len(coefficients) else "pinhole"
+        count = next(count for count in COEFFICIENTS[kind] if count >= len(coefficients))
+        return replace(camera, model=kind, D=np.pad(coefficients, (0, count - len(coefficients))))
 
-    def _checked(self, where: str) -> Camera:
+    def _fault(self) -> str:
+        """Why no supported camera has these intrinsics, with D without trailing zeros; empty if a camera can."""
         width, height, K, D = self.width, self.height, self.K, self.D
         if not (width > 0 and height > 0 and width * height <= MOST_PIXELS):
-            raise CameraError(
-                f"{where}: the image size is {width} x {height} pixels; both must be positive, and the product at most "
-                f"{MOST_PIXELS}"
-            )
+            limits = f"both must be positive, and the product at most {MOST_PIXELS}"
+            return f"the image size is {width} x {height} pixels; {limits}"
         if K.shape != (3, 3) or not np.isfinite(K).all():
-            raise CameraError(f"{where}: K is {K.tolist()}; give a finite 3 x 3 matrix")
+            return f"K is {K.tolist()}; give a finite 3 x 3 matrix"
         if not K.any():
-            raise CameraError(
-                f"{where}: K is all zeros: the camera was not calibrated (this is how ROS says it). Calibrate it"
-            )
+            return "K is all zeros: the camera was not calibrated (this is how ROS says it). Calibrate it"
         if K[0, 1] != 0.0 or K[1, 0] != 0.0 or K[2].tolist() != [0.0, 0.0, 1.0]:
-            raise CameraError(f"{where}: K is {K.tolist()}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-        largest = max(width, height)
+            return f"K is {K.tolist()}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+        image = f"image of {width} x {height} pixels"
         for name, f in (("fx", K[0, 0]), ("fy", K[1, 1])):
-            if not FOCAL_RANGE[0] * largest <= f <= FOCAL_RANGE[1] * largest:
-                raise CameraError(
-                    f"{where}: {name} = {f:g} pixels for an image of {width} x {height}; is the unit pixels, and the "
-                    "resolution right?"
-                )
+            if not FOCAL_RANGE[0] <= f / max(width, height) <= FOCAL_RANGE[1]:
+                return f"{name} = {f:g} pixels for an {image}; is the unit pixels, and the resolution right?"
         for name, c, size in (("cx", K[0, 2], width), ("cy", K[1, 2], height)):
             if not -size <= c <= 2 * size:
-                raise CameraError(f"{where}: {name} = {c:g} is far outside the image of {width} x {height} pixels")
+                return f"{name} = {c:g} is far outside the {image}"
         if not np.isfinite(D).all() or (np.abs(D) > 1e4).any():
-            raise CameraError(f"{where}: distortion coefficients {D.tolist()}; no lens has them")
-        kind, used = self.model, len(np.trim_zeros(D, "b"))
-        if kind == "radtan" and used > 12:
-            raise CameraError(
-                f"{where}: a tilted sensor (coefficients 13 and 14 are {D[12:].tolist()}) is not supported"
-            )
-        if kind != "equidistant" and used == 0:
-            kind = "pinhole"
-        elif kind == "pinhole":
-            raise CameraError(
-                f"{where}: coefficients {D.tolist()} without a distortion model; give 'plumb_bob' or 'equidistant'"
-            )
-        fits = [count for count in COEFFICIENTS[kind] if count >= used]
-        if not fits:
-            raise CameraError(f"{where}: {len(D)} coefficients are too many for the model {self.model}: {D.tolist()}")
-        padded = np.zeros(fits[0])
-        padded[:used] = D[:used]
-        return Camera(width, height, kind, K, padded)
+            return f"distortion coefficients {D.tolist()}; no lens has them"
+        if self.model == "radtan" and len(D) > 12:
+            return f"a tilted sensor (coefficients 13 and 14 are {D[12:].tolist()}) is not supported"
+        if self.model == "pinhole" and len(D):
+            return f"coefficients {D.tolist()} without a distortion model; give 'plumb_bob' or 'equidistant'"
+        if len(D) > COEFFICIENTS[self.model][-1]:
+            return f"{len(D)} coefficients are too many for the model {self.model}: {D.tolist()}"
+        return ""
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3) in the camera's frame, any unit.

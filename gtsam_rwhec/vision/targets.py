@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 
@@ -27,7 +27,17 @@ LARGEST_M = 10.0
 
 @dataclass(frozen=True)
 class Tag:
-    """A single tag; size_m is the side of its black square."""
+    """A single tag.
+
+    Attributes
+    ----------
+    name : str
+    family : str
+        A key of `FAMILIES`.
+    id : int
+    size_m : float
+        Side of the black square, metres.
+    """
 
     name: str
     family: str
@@ -57,6 +67,18 @@ class Charuco:
     """A ChArUco board of columns x rows squares, with markers in the white squares, numbered from first_id.
 
     Its corners are the inner corners of the chessboard in OpenCV's order: left to right, from the top.
+
+    Attributes
+    ----------
+    name : str
+    family : str
+        A key of `FAMILIES`.
+    columns, rows : int
+        Numbers of squares.
+    square_m, marker_m : float
+        Sides of a square and of a marker, metres.
+    first_id : int
+        The markers' ids are first_id, first_id + 1 and so on.
     """
 
     name: str
@@ -93,6 +115,19 @@ class AprilGrid:
     """Kalibr's AprilGrid: columns x rows tags with a double black border, spacing = gap / tag_m.
 
     Ids count from first_id at the bottom left, to the right, then up. Corners are the tags' corners in that order.
+
+    Attributes
+    ----------
+    name : str
+    family : str
+        A key of `FAMILIES`.
+    columns, rows : int
+        Numbers of tags.
+    tag_m : float
+        Side of a tag's black square, metres.
+    spacing : float
+        Gap between tags over tag_m.
+    first_id : int
     """
 
     name: str
@@ -135,12 +170,22 @@ class Checkerboard:
     """A checkerboard of columns x rows inner corners, numbered left to right, from the top.
 
     One of columns and rows must be even and the other odd: any other board looks the same after half a turn.
+
+    Attributes
+    ----------
+    name : str
+    columns, rows : int
+        Numbers of inner corners.
+    square_m : float
+        Side of a square, metres.
     """
 
     name: str
     columns: int
     rows: int
     square_m: float
+    family: ClassVar[str] = "checkerboard"
+    ids: ClassVar[tuple[int, ...]] = ()
 
     def __post_init__(self) -> None:
         _check_grid(self.name, self.columns, self.rows, 3)
@@ -151,16 +196,6 @@ class Checkerboard:
                 "after half a turn; take one with an odd and an even number, or a ChArUco board",
                 self.name,
             )
-
-    @property
-    def family(self) -> str:
-        """No tags."""
-        return "checkerboard"
-
-    @property
-    def ids(self) -> tuple[int, ...]:
-        """No tags."""
-        return ()
 
     @property
     def length_m(self) -> float:
