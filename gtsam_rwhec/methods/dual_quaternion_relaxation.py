@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import clarabel
 import numpy as np
 import scipy.sparse
+from scipy.linalg import block_diag
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import dual_parts, left, of_vectors, right
@@ -116,9 +117,5 @@ def multipliers_of(Q: Array, q: Array, t: Array) -> tuple[float, float]:
     dual = z.reshape(n, 2, 4)[:, 1]
     mu = np.einsum("ni,ni->n", g[:, 1], q)
     lam = np.einsum("ni,ni->n", g[:, 0] - mu[:, None] * dual, q)
-    Z = Q.copy().reshape(n, 2, 4, n, 2, 4)
-    for i in range(n):
-        Z[i, 0, :, i, 0, :] -= lam[i] * np.eye(4)
-        Z[i, 0, :, i, 1, :] -= mu[i] * np.eye(4)
-        Z[i, 1, :, i, 0, :] -= mu[i] * np.eye(4)
-    return float(lam.sum()), float(np.linalg.eigvalsh(Z.reshape(8 * n, 8 * n))[0])
+    blocks = [np.kron([[own, mixed], [mixed, 0.0]], np.eye(4)) for own, mixed in zip(lam, mu, strict=True)]
+    return float(lam.sum()), float(np.linalg.eigvalsh(Q - block_diag(*blocks))[0])

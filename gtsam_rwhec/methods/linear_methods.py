@@ -20,9 +20,9 @@ def linear_method(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
 def start_of(problem: Problem, options: MethodOptions) -> tuple[Poses, Poses, float, str]:
     """X, Y, scale, and the words for where they are from: the given start, else Wang's answer.
 
-    Wang's method has neither several Xs and Ys nor an unknown scale; its linear systems are extended to them. Raises
-    FrameError, PoseError or ScaleError for a given start that lacks a frame or has other values than poses and a scale,
-    and UnderdeterminedError when the linear systems do not determine a start.
+    Wang's linear systems are extended to several Xs and Ys and to an unknown scale, which his method does not have.
+    Raises FrameError, PoseError or ScaleError for a given start that lacks a frame or has other values than poses and a
+    scale, and UnderdeterminedError when the linear systems do not determine a start.
     """
     if options.start is not None:
         return *checked_start(problem.targets, problem.sensors, options.start), "the given start"

@@ -19,6 +19,7 @@ from functools import cache
 import clarabel
 import numpy as np
 import scipy.sparse
+from scipy.linalg import block_diag
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, to_rotations
@@ -55,9 +56,8 @@ class MomentSolution:
 
 @dataclass(frozen=True)
 class _MomentPlaces:
-    """The index of the moment in each entry of M(y y') and M(z z'), and the equations between moments."""
+    """The index of the moment in each entry of M(y y') and M(z z'), and the equations of the moments."""
 
-    count: int
     even: np.ndarray
     odd: np.ndarray
     equations: scipy.sparse.csc_matrix
@@ -77,7 +77,7 @@ def _moment_places(frames: int) -> _MomentPlaces:
     even = np.array([[index(p + q) for q in y] for p in y])
     z = [unit[a] + unit[4 + b] for a in _ENTRIES for b in _ENTRIES] if frames == 2 else []
     odd = np.array([[index(p + q) for q in z] for p in z], dtype=int).reshape(len(z), len(z))
-    rows = []
+    rows = [np.eye(len(place))[even[0, 0]]]
     for k in range(frames):
         for m in y:
             row = np.zeros(len(place))
@@ -85,27 +85,22 @@ def _moment_places(frames: int) -> _MomentPlaces:
                 row[index(m + 2 * unit[4 * k + a])] += 1.0
             row[index(m)] -= 1.0
             rows.append(row)
-    return _MomentPlaces(len(place), even, odd, scipy.sparse.csc_matrix(np.array(rows)))
+    return _MomentPlaces(even, odd, scipy.sparse.csc_matrix(np.array(rows)))
 
 
 def solve_moments(Q: Array) -> MomentSolution:
     """Solve the relaxation of x'Q'x, x = [vec R_1, (vec R_2,) 1], Q' (10, 10) or (19, 19)."""
     frames = (len(Q) - 1) // 9
     moments = _moment_places(frames)
-    to_x = np.zeros((len(Q), 1 + 10 * frames))
-    to_x[-1, 0] = 1.0
-    for k in range(frames):
-        to_x[9 * k : 9 * k + 9, 1 + 10 * k : 11 + 10 * k] = products_to_rotation()
+    to_x = np.roll(block_diag(*[products_to_rotation()] * frames, np.eye(1)), 1, axis=1)  # y has its 1 first
     C = to_x.T @ Q @ to_x
     scale = float(np.abs(C).max()) or 1.0
-    cost = np.zeros(moments.count)
+    equations, count = moments.equations, moments.equations.shape[1]
+    cost = np.zeros(count)
     np.add.at(cost, moments.even, C / scale)
     blocks = [block for block in (moments.even, moments.odd) if block.size]
-    first = np.zeros((1, moments.count))
-    first[0, moments.even[0, 0]] = 1.0
-    equations = scipy.sparse.vstack([scipy.sparse.csc_matrix(first), moments.equations], format="csc")
     cones = [clarabel.ZeroConeT(equations.shape[0]), *[clarabel.PSDTriangleConeT(len(block)) for block in blocks]]
-    A = scipy.sparse.vstack([equations, *[-_triangle(block, moments.count) for block in blocks]], format="csc")
+    A = scipy.sparse.vstack([equations, *[-_triangle(block, count) for block in blocks]], format="csc")
     b = np.zeros(A.shape[0])
     b[0] = 1.0
     mu, z, _ = solve_conic(cost, A, b, cones, TOLERANCE, STEPS)

@@ -170,7 +170,7 @@ class Observations:
             lost = np.flatnonzero(~np.isfinite(T[at, choice]).all(axis=(1, 2)))
             if lost.size:
                 raise CameraError(f"image {lost[0]} of {target} by {sensor} has no pose: are its corners on one line?")
-            # from right perturbations of the flat frame to those of the target's frame: by the adjoint
+            # right perturbations of the flat frame become right perturbations of the target's frame by the adjoint
             ad = se3.adjoint(np.broadcast_to(T_target_flat, (len(T), 4, 4)))
             covariance = ad @ found.covariance[at, choice] @ ad.mT
             problem.add(target, sensor, view.A, T[at, choice], covariances=0.5 * (covariance + covariance.mT))

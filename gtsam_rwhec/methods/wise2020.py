@@ -1,7 +1,7 @@
 """Wise, Giamou, Khoubyarian, Grebe and Kelly 2020: one sensor, certified by the Kronecker form's own relaxation.
 
-The paper solves A Y = Y B, one sensor's motions (hand-eye calibration); A X = Y B of one X and one Y is solved alike.
-The cost is quadratic in vec R_X and vec R_Y by Kronecker products, without translations and the monocular scale.
+The paper solves A Y = Y B, one sensor's motions (hand-eye calibration); the same method solves A X = Y B of one X and
+one Y. The cost is quadratic in vec R_X and vec R_Y by Kronecker products, without translations and the monocular scale.
 Each rotation has 21 quadratic constraints. The semidefinite relaxation's dual is a lower bound on every answer's cost.
 """
 

@@ -43,17 +43,18 @@ def test_products_of_a_quaternion_are_its_rotation() -> None:
 
 def test_moments_of_one_pair_of_quaternions_fulfil_everything() -> None:
     table = _moment_places(2)
-    assert table.count == 1 + 20 + 2 * 35 + 100  # even in each, of degrees 0, 2 and 4
+    equations, count = table.equations, table.equations.shape[1]
+    assert count == 1 + 20 + 2 * 35 + 100  # even in each, of degrees 0, 2 and 4
     generator = np.random.default_rng(1)
     q = generator.standard_normal((2, 4))
     q /= np.linalg.norm(q, axis=1)[:, None]
     y = np.concatenate([[1.0], *[[one[a] * one[b] for a, b in PRODUCTS] for one in q]])
     z = np.outer(*np.roll(q, 1, axis=1)).ravel()  # the scalar first, as in PRODUCTS
-    mu = np.full(table.count, np.nan)
+    mu = np.full(count, np.nan)
     mu[table.even] = np.outer(y, y)
     np.testing.assert_allclose(mu[table.even], np.outer(y, y), atol=1e-15)  # equal monomials have one place
     np.testing.assert_allclose(mu[table.odd], np.outer(z, z), atol=1e-15)
-    np.testing.assert_allclose(table.equations @ mu, 0.0, atol=1e-15)
+    np.testing.assert_allclose(equations @ mu, np.eye(equations.shape[0])[0], atol=1e-15)  # first: the moment of 1 is 1
 
 
 @pytest.mark.parametrize("noise", [Noise(0.01, 125.0), Noise(0.2, 2.0)])
