@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver import arrow
-from gtsam_rwhec.solver.forms import Forms
 from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.reduced_form import Forms
 
 NOISE = Noise(sigma_m=0.01, kappa=1e3)
 

@@ -18,8 +18,8 @@ from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
 from gtsam_rwhec.simulate.transforms import random_poses, rotations_of_vectors
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.descent import homogeneous
-from gtsam_rwhec.solver.forms import Forms
 from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.reduced_form import Forms
 from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations, vec
 
 NOISE = Noise(0.01, 500.0)

@@ -125,8 +125,8 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/solver": {
         "identifiability/test_information.py": "residuals",
         "solver/test_deflation.py": "lagrangian",
-        "solver/test_reduced_form.py": "forms full_form variables",
-        "solver/test_search.py": "found options stages",
+        "solver/test_reduced_form.py": "full_form variables",
+        "solver/test_search.py": "options stages",
     },
     "gtsam_rwhec/solving": {
         "solving/test_certified_solution.py": "arguments part_solution solution",

@@ -149,12 +149,12 @@ def _rotation_axes(part: Part, noise: Array, degrees_of_freedom: int) -> tuple[l
 
 def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak:
     """The directions with the least information in units of noise; all free directions are among them."""
-    leaf_unit = _unit(info.leaf_noise, info.used_leaf)
-    border_unit = _unit(info.border_noise, info.used_border)
+    used = info.used
+    unit = _unit(info.noise, used)
+    leaf_unit, border_unit = unit[: info.leaf[:, 0].size].reshape(-1, 7), unit[info.leaf[:, 0].size :]
     D = info.leaf * leaf_unit[:, :, None] * leaf_unit[:, None, :]
     C = info.coupling * leaf_unit[:, :, None] * border_unit
     E = info.border * border_unit[:, None] * border_unit
-    used = np.r_[info.used_leaf.ravel(), info.used_border]
     size = int(used.sum())
     if size == 0:
         return _Weak(np.zeros(0), np.zeros(0), np.zeros((len(used), 0)))
@@ -172,7 +172,6 @@ def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak
     squares = 1.0 / np.maximum((share**2 / (2.0 * counts[:, None])).sum(axis=0), 1e-300)
     thresholds = free_threshold(squares, degrees_of_freedom)
     order = np.argsort(values / thresholds)
-    unit = np.r_[leaf_unit.ravel(), border_unit]
     return _Weak(values[order], thresholds[order], vectors[:, order] * unit[:, None])
 
 

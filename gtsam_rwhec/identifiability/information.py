@@ -19,6 +19,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import ONE, R_A, T_A, T_B
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses
+from gtsam_rwhec.solver.rotations import HATS
 
 #: No data count as more exact than this, in radians and as a part of the measured lengths: where the noise is zero,
 #: the rounding of the eigenvalues (1e-16 / floor^2) must not pass for information.
@@ -119,9 +120,9 @@ def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -
     translation[:, V_X, V_X] = translation[:, V_Y, V_Y] = W[:, None, None] * eye
     translation[:, V_X, V_Y] = -turned
     # (c^)_{kj} = -eps_{kjm} c_m, so sum w (R_A' c^)_{ij} = -sum w R_A[k, i] eps_{kjm} c_m.
-    Rt_skew = -np.einsum("eikm,kjm->eij", Rt_c, _LEVI_CIVITA)
+    Rt_skew = np.einsum("eikm,kjm->eij", Rt_c, HATS)
     translation[:, V_X, OMEGA_Y] = R_Xt @ Rt_skew @ R_Y
-    skew = -np.einsum("em,kjm->ekj", c, _LEVI_CIVITA)  # sum w c^
+    skew = np.einsum("em,kjm->ekj", c, HATS)  # sum w c^
     translation[:, OMEGA_Y, V_Y] = -(R_Yt @ skew @ R_Y).transpose(0, 2, 1)
     square = np.einsum("eii->e", cc)
     translation[:, OMEGA_Y, OMEGA_Y] = R_Yt @ (square[:, None, None] * eye - cc) @ R_Y
@@ -166,24 +167,19 @@ def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -
     return PairInformation(rotation, translation, noise_rotation, noise_translation, used, q2)
 
 
-#: eps_ijk: +1 or -1 for even and odd permutations of the axes.
-_LEVI_CIVITA = np.cross(np.eye(3)[:, None], np.eye(3)[None])
-
-
 @dataclass(frozen=True)
 class Information:
     """Arrow matrix: leaf (L, 7, 7), coupling (L, 7, 7 P + 1), border (7 P + 1 square); and the diagonal of the noise.
 
-    The border has seven parameters of each center, then the logarithm of the shared scale.
+    The border has seven parameters of each center, then the logarithm of the shared scale. noise and used: of all
+    parameters, (7 L + 7 P + 1,).
     """
 
     leaf: Array
     coupling: Array
     border: Array
-    leaf_noise: Array
-    border_noise: Array
-    used_leaf: np.ndarray
-    used_border: np.ndarray
+    noise: Array
+    used: np.ndarray
 
 
 def information(part: Part, by_pair: Array, noise: Array, used: np.ndarray, priors: Array) -> Information:
@@ -211,15 +207,8 @@ def information(part: Part, by_pair: Array, noise: Array, used: np.ndarray, prio
     border[-1, -1] = by_pair[:, 14, 14].sum()
     np.einsum("lii->li", own)[:L] += priors[:L]
     np.einsum("ii->i", border)[:-1] += priors[L:].ravel()
-    return Information(
-        own[:L],
-        coupling,
-        border,
-        frame_noise[:L],
-        np.r_[frame_noise[L:n].ravel(), noise[:, 14].sum()],
-        frame_used[:L],
-        np.r_[frame_used[L:n].ravel(), used[:, 14].any()],
-    )
+    all_noise = np.r_[frame_noise[:n].ravel(), noise[:, 14].sum()]
+    return Information(own[:L], coupling, border, all_noise, np.r_[frame_used[:n].ravel(), used[:, 14].any()])
 
 
 def prior_information(part: Part) -> tuple[Array, Array]:

@@ -23,10 +23,9 @@ from gtsam_rwhec.problem.variance_factors import AS_STATED
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.optimisation import optimise
 from gtsam_rwhec.refinement.variables import State, Variables
-from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.search import Search
+from gtsam_rwhec.solver.search import Found, Search
 from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables, scales_of
 
 #: Number of free frames above which a gap stays open on the way. There the semidefinite relaxation would take most of

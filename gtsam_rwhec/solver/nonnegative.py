@@ -22,12 +22,11 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import Descent, descend
-from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.interior_point import Relaxation
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_with_scale
 from gtsam_rwhec.solver.rotations import vec
-from gtsam_rwhec.solver.search import Search
+from gtsam_rwhec.solver.search import Found, Search
 from gtsam_rwhec.solver.small_dual import stationary_multipliers
 from gtsam_rwhec.solver.variables import answer_of
 from gtsam_rwhec.solver.verified import gamma

@@ -49,6 +49,10 @@ CONSTRAINTS = ALL_CONSTRAINTS[:20]
 CONSTRAINTS_FLAT = CONSTRAINTS.reshape(20, 100)
 
 
+#: e_k^, the cross product with each axis (3, 3, 3): the opposite of the Levi-Civita symbol.
+HATS = -np.cross(np.eye(3)[:, None], np.eye(3)[None])
+
+
 def vec(R: Array) -> Array:
     """(n, 3, 3) to (n, 9), column after column."""
     return R.transpose(0, 2, 1).reshape(-1, 9)
@@ -62,12 +66,7 @@ def unvec(r: Array) -> Array:
 
 def tangent_basis(R: Array) -> Array:
     """(n, 9, 3): vec(R w^) = basis w, for right perturbations R exp(w^)."""
-    basis = np.zeros((len(R), 3, 3, 3))  # [rotation, column of R, row of R, k]
-    c0, c1, c2 = R[:, :, 0], R[:, :, 1], R[:, :, 2]
-    # Column b of R w^ is R (w x e_b).
-    basis[:, 0, :, 1], basis[:, 0, :, 2] = -c2, c1
-    basis[:, 1, :, 0], basis[:, 1, :, 2] = c2, -c0
-    basis[:, 2, :, 0], basis[:, 2, :, 1] = -c1, c0
+    basis: Array = np.einsum("nij,kjb->nbik", R, HATS)  # column b of R e_k^
     return basis.reshape(-1, 9, 3)
 
 
@@ -75,9 +74,7 @@ def retract(R: Array, w: Array) -> Array:
     """R exp(w^); one Newton-Schulz step brings it back to SO(3), so that rounding does not add up."""
     theta2 = (w * w).sum(axis=1)[:, None, None]
     theta = np.sqrt(theta2)
-    W = np.zeros_like(R)
-    W[:, 0, 1], W[:, 0, 2], W[:, 1, 2] = -w[:, 2], w[:, 1], -w[:, 0]
-    W[:, 1, 0], W[:, 2, 0], W[:, 2, 1] = w[:, 2], -w[:, 1], w[:, 0]
+    W = np.einsum("nk,kij->nij", w, HATS)
     first = np.sinc(theta / np.pi)
     second = 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
     S = R @ (np.eye(3) + first * W + second * (W @ W))

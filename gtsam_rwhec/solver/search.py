@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,13 +12,11 @@ from gtsam_rwhec.solver import small_dual
 from gtsam_rwhec.solver.bound import Bound, exact_value, lower_bound
 from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
-from gtsam_rwhec.solver.forms import Forms
-from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.interior_point import Relaxation
 from gtsam_rwhec.solver.mirror import mirrored
 from gtsam_rwhec.solver.options import Method, SolveOptions
 from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.reduced_form import ReducedForm
+from gtsam_rwhec.solver.reduced_form import Forms, ReducedForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_relaxation
 from gtsam_rwhec.solver.rotations import kkt_multipliers, project, random_rotations, unvec, vec
 from gtsam_rwhec.solver.stages import Stages
@@ -31,6 +29,40 @@ MIRROR_COST = 0.01
 TWIN_DISTANCE = 1e-3
 #: Before the first bound.
 NOTHING_YET = Bound()
+
+
+@dataclass(frozen=True)
+class Found:
+    """The best rotations of a part and the best bound on the cost of any answer.
+
+    Attributes
+    ----------
+    R : (n, 3, 3) array
+        In the order of ``part.free``, as the form has them.
+    cost : float
+        x'Q'x at R.
+    bound : Bound
+        Its ``lower_bound`` is at most ``cost``.
+    tolerance : float
+        The absolute gap up to which the answer counts as proven optimal.
+    path : SearchPath
+    cause : Cause
+    figures : dict of str to float
+        The numbers in the sentence of the cause, by name.
+    """
+
+    R: Array
+    cost: float
+    bound: Bound
+    tolerance: float
+    path: SearchPath
+    cause: Cause
+    figures: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the gap is within the tolerance: the answer is proven optimal."""
+        return self.cost - self.bound.lower_bound <= self.tolerance
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,9 @@ from gtsam_rwhec.identifiability.verdicts import Identifiability
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.solver.cause import Cause
 from gtsam_rwhec.solver.certificate import Certificate, Objective
-from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
-from gtsam_rwhec.solver.search import Search
+from gtsam_rwhec.solver.search import Found, Search
 from gtsam_rwhec.solver.variables import Answer, answer_of, as_variables, scales_of
 
 TWIN = FreeDirection(FreeKind.TWIN, FreeReason.SYMMETRY)

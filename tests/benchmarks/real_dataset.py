@@ -18,9 +18,9 @@ from interleaved import in_words
 from scs_relaxation import ScsResult, solve_by_scs
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.solver.forms import Forms
 from gtsam_rwhec.solver.options import Method
 from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solver.reduced_form import Forms
 
 COST = 8.2812454
 SCALE = 1.0254

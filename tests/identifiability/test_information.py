@@ -119,9 +119,8 @@ def our_information(part: Part, answer: Answer) -> np.ndarray:
         pairs.used,
         rotation_prior + translation_prior,
     )
-    used = np.r_[info.used_leaf.ravel(), info.used_border]
     full = arrow.dense(info.leaf, info.coupling, info.border)
-    return np.where(used[:, None] & used, full, 0.0)
+    return np.where(info.used[:, None] & info.used, full, 0.0)
 
 
 @pytest.mark.parametrize("case", CASES)

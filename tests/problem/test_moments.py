@@ -16,8 +16,8 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments, edge_forms
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.transforms import random_poses
-from gtsam_rwhec.solver.forms import Forms
 from gtsam_rwhec.solver.parts import Part, parts_of
+from gtsam_rwhec.solver.reduced_form import Forms
 from gtsam_rwhec.solver.variables import Answer, as_variables
 
 NOISE = Noise(0.02, 200.0)

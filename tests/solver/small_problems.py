@@ -10,11 +10,10 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, Simulation, general
 from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
-from gtsam_rwhec.solver.forms import Forms
 from gtsam_rwhec.solver.full_form import FullForm
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.reduced_form import ReducedForm
+from gtsam_rwhec.solver.reduced_form import Forms, ReducedForm
 from gtsam_rwhec.solver.rotations import kkt_multipliers, vec
 from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.start import spectral_start

@@ -27,8 +27,6 @@ from gtsam_rwhec.simulate import Noise
 from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.cause import Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import cost_of, descend
-from gtsam_rwhec.solver.forms import Forms
-from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.nonnegative import (
     run_with_nonnegative_scale,
     scale_row,
@@ -37,7 +35,9 @@ from gtsam_rwhec.solver.nonnegative import (
     without_scale,
 )
 from gtsam_rwhec.solver.options import SolveOptions
+from gtsam_rwhec.solver.reduced_form import Forms
 from gtsam_rwhec.solver.rotations import random_rotations
+from gtsam_rwhec.solver.search import Found
 from gtsam_rwhec.solver.variables import answer_of
 
 HELD = SolveOptions(nonnegative_scale=True)

@@ -12,8 +12,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.descent import homogeneous
-from gtsam_rwhec.solver.forms import Forms
-from gtsam_rwhec.solver.reduced_form import ReducedForm, generalised_inverse_factor
+from gtsam_rwhec.solver.reduced_form import Forms, ReducedForm, generalised_inverse_factor
 from gtsam_rwhec.solver.rotations import random_rotations
 from gtsam_rwhec.solver.variables import answer_of, as_variables
 

@@ -18,12 +18,11 @@ from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion, Noise
 from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start, Status
 from gtsam_rwhec.solver.certificate import Certificate
-from gtsam_rwhec.solver.found import Found
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.relaxation import solve_by_clarabel
 from gtsam_rwhec.solver.rotations import random_rotations, retract, tangent_basis, vec
-from gtsam_rwhec.solver.search import Search
+from gtsam_rwhec.solver.search import Found, Search
 
 SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")
 
