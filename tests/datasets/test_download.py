@@ -194,6 +194,6 @@ def test_a_destination_that_is_a_file(server: Server, tmp_path: Path) -> None:
         fetch_utias(tmp_path / "file", server.url)
 
 
-def test_an_address_that_is_none(tmp_path: Path) -> None:
+def test_an_invalid_address_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FetchError, match="cannot be downloaded"):
         fetch_utias(tmp_path, "not-an-address")

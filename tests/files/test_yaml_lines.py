@@ -1,4 +1,4 @@
-"""YAML with lines: what scalars become, where things are, and all that is refused."""
+"""YAML with lines: values of scalars, lines of values, and refusals."""
 
 from __future__ import annotations
 

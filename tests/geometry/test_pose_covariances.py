@@ -94,6 +94,6 @@ def test_standard_deviations_in_degrees_and_millimetres() -> None:
         (np.diag([np.inf, 1, 1, 1, 1, 1]), "infinite along a free direction"),
     ],
 )
-def test_what_is_no_covariance_is_refused(covariance: np.ndarray, words: str) -> None:
+def test_invalid_covariances_are_refused(covariance: np.ndarray, words: str) -> None:
     with pytest.raises(rw.errors.NoiseError, match=words):
         convert.left_of_right(T, covariance)

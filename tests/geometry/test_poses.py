@@ -1,4 +1,4 @@
-"""Poses in every form that users have them, brought to one."""
+"""Poses in every form that users give, brought to one shape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a method is asked, made without ``solve``; and its answer as a pose."""
+"""Requests made without ``solve``, and answers as gtsam.Pose3."""
 
 from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.handeye.motion_costs import cost_of

@@ -73,7 +73,7 @@ def test_all_name_the_height(method: str) -> None:
 def test_every_method_solves_or_refuses_a_cart_without_noise(method: str) -> None:
     s = cart(20, 2, 0.0, 0.0)
     if method in REFUSED:
-        with pytest.raises(UnderdeterminedError, match="method='dqopt'"):  # what does solve it is named
+        with pytest.raises(UnderdeterminedError, match="method='dqopt'"):  # the error names a method that solves it
             solve(s.C, s.H, method=method, rng=0)
         return
     r = solve(s.C, s.H, method=method, rng=0)
@@ -87,7 +87,7 @@ def test_every_method_solves_or_refuses_motion_that_does_not_turn(method: str) -
     rng = np.random.default_rng(3)
     s = pair(poses(np.zeros((10, 3)), rng.normal(size=(10, 3))), rng, 0.0, 0.0, UPRIGHT)
     if method in REFUSED:
-        with pytest.raises(UnderdeterminedError, match="method='dqopt'"):  # what does solve it is named
+        with pytest.raises(UnderdeterminedError, match="method='dqopt'"):  # the error names a method that solves it
             solve(s.C, s.H, method=method, rng=0)
         return
     r = solve(s.C, s.H, method=method, rng=0)

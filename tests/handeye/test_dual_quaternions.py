@@ -57,6 +57,6 @@ def test_a_turn_by_a_vector_is_a_product() -> None:
     assert times_vectors(q) == pytest.approx(right(q)[:, :3])
 
 
-def test_nothing_is_no_rotation() -> None:
+def test_a_zero_quaternion_is_refused() -> None:
     with pytest.raises((ValueError, ZeroDivisionError)):
         to_transform(np.zeros(4), np.ones(4))

@@ -141,6 +141,6 @@ def test_half_the_slopes_times_q_are_the_rotations_entries():
         np.testing.assert_allclose(rotation_slopes(q), numeric, atol=1e-8)
 
 
-def test_a_root_is_one():
+def test_the_square_of_a_root_is_its_form():
     A = np.random.default_rng(0).normal(size=(3, 5))
     np.testing.assert_allclose(root(A.T @ A).T @ root(A.T @ A), A.T @ A, atol=1e-13)

@@ -1,4 +1,4 @@
-"""What no method can use is refused by name, and lengths of any unit are solved alike."""
+"""Invalid arguments are refused by name, and every unit of length gives the same answer."""
 
 from __future__ import annotations
 

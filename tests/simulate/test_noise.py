@@ -162,7 +162,7 @@ def test_no_noise_is_a_copy() -> None:
     assert not np.shares_memory(noisy, poses)
 
 
-def test_no_measurements_are_no_trouble() -> None:
+def test_noise_on_no_measurements_is_empty() -> None:
     assert perturb(np.empty((0, 4, 4)), Noise(0.01, 12.0), 0).shape == (0, 4, 4)
 
 
