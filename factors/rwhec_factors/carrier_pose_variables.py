@@ -8,8 +8,7 @@ import gtsam
 import numpy as np
 
 from rwhec_factors.arguments import check_choice
-from rwhec_factors.measurement import Carriers, Residual, measurement_factor
-from rwhec_factors.se3 import Array
+from rwhec_factors.measurement import CarrierJacobians, Carriers, Residual, measurement_factor
 from rwhec_factors.values import pose_of
 
 Carrier = Literal["sensorcarrier_in_targetcarrier", "targetcarrier_in_sensorcarrier"]
@@ -58,10 +57,12 @@ def pose_robot_world_hand_eye_factor(
     inverted = pose == "sensorcarrier_in_targetcarrier"
     what = "P = T_targetcarrier_sensorcarrier" if inverted else "P = T_sensorcarrier_targetcarrier"
 
-    def carriers(values: gtsam.Values) -> tuple[gtsam.Pose3, dict[int, Array]]:
+    def carriers(values: gtsam.Values) -> tuple[gtsam.Pose3, CarrierJacobians]:
         P = pose_of(values, pose_key, what)
         # (P Expmap(d))^-1 = P^-1 Expmap(-Ad(P) d)
-        return (P.inverse(), {pose_key: -P.AdjointMap()}) if inverted else (P, {pose_key: np.eye(6)})
+        if inverted:
+            return P.inverse(), lambda: {pose_key: -P.AdjointMap()}
+        return P, lambda: {pose_key: np.eye(6)}
 
     keys = [pose_key, target_key, sensor_key]
     return measurement_factor(keys, target_key, sensor_key, carriers, B, noise, scale_key, residual)
@@ -104,9 +105,9 @@ def two_pose_robot_world_hand_eye_factor(
 def between(first_key: int, second_key: int, names: tuple[str, str]) -> Carriers:
     """A = P_i^-1 P_j of two pose variables; ``names`` describe them in errors."""
 
-    def carriers(values: gtsam.Values) -> tuple[gtsam.Pose3, dict[int, Array]]:
+    def carriers(values: gtsam.Values) -> tuple[gtsam.Pose3, CarrierJacobians]:
         A = pose_of(values, first_key, names[0]).between(pose_of(values, second_key, names[1]))
         # (P_i Expmap(d))^-1 P_j = A Expmap(-Ad(A^-1) d)
-        return A, {first_key: -A.inverse().AdjointMap(), second_key: np.eye(6)}
+        return A, lambda: {first_key: -A.inverse().AdjointMap(), second_key: np.eye(6)}
 
     return carriers

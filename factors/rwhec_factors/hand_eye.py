@@ -46,7 +46,7 @@ def hand_eye_factor(
     """
     check_pose(A, "A")
     return measurement_factor(
-        [sensor_key], sensor_key, sensor_key, lambda values: (A, {}), B, noise, scale_key, residual
+        [sensor_key], sensor_key, sensor_key, lambda values: (A, dict), B, noise, scale_key, residual
     )
 
 

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rwhec_factors.arguments import check_pose, check_time_offset, checked_twists
-from rwhec_factors.measurement import Residual, measurement_factor
-from rwhec_factors.se3 import Array
+from rwhec_factors.measurement import CarrierJacobians, Residual, measurement_factor
 from rwhec_factors.values import number_of
 
 
@@ -67,11 +66,11 @@ def robot_world_hand_eye_factor(
     check_time_offset(time_offset_key, twist)
     velocity = np.zeros(6) if twist is None else checked_twists(twist, (6,))
 
-    def carriers(values: gtsam.Values) -> tuple[gtsam.Pose3, dict[int, Array]]:
+    def carriers(values: gtsam.Values) -> tuple[gtsam.Pose3, CarrierJacobians]:
         if time_offset_key is None:
-            return A, {}
+            return A, dict
         offset = number_of(values, time_offset_key, "the time offset in seconds")
-        return A.compose(gtsam.Pose3.Expmap(offset * velocity)), {time_offset_key: velocity[:, None]}
+        return A.compose(gtsam.Pose3.Expmap(offset * velocity)), lambda: {time_offset_key: velocity[:, None]}
 
     keys = [target_key, sensor_key] + ([] if time_offset_key is None else [time_offset_key])
     return measurement_factor(keys, target_key, sensor_key, carriers, B, noise, scale_key, residual)

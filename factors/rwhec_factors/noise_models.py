@@ -33,7 +33,7 @@ def checked(noise: object, dimension: int, what: str) -> Noise:
     if isinstance(gaussian, gtsam.noiseModel.Constrained) or np.isinf(information).any():
         raise ValueError(
             f"the noise model of {what} has a standard deviation of zero; measurements are never exact: give a small "
-            "sigma, or add a gtsam.NonlinearEqualityPose3 to what is known"
+            "sigma, or add a gtsam.NonlinearEqualityPose3 for a known pose"
         )
     if not np.isfinite(information).all():
         raise ValueError(

@@ -178,9 +178,9 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit
     ratio = contradicted_by(cost, equations - sum(unknown.dimension for unknown in variables.unknowns))
     if ratio is not None:
         warnings.warn(
-            f"the residuals cost {cost:.4g}, {ratio:.3g} times what the given noise predicts ({cost / ratio:.4g}): "
-            f"standard deviations are too small by about {math.sqrt(ratio):.2g}; take noise='estimate', robust='gnc' "
-            "if some measurements are wrong, or carrier_noise if A is not exact",
+            f"the residuals cost {cost:.4g}, {ratio:.3g} times the cost that the given noise predicts "
+            f"({cost / ratio:.4g}): standard deviations are too small by about {math.sqrt(ratio):.2g}; "
+            "take noise='estimate', robust='gnc' if some measurements are wrong, or carrier_noise if A is not exact",
             WeightsWarning,
             stacklevel=3,
         )

@@ -1,4 +1,4 @@
-"""Hold-out errors: what they are of, which folds, and what shows up in them."""
+"""Cross-validation: hold-out errors, folds, and notes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def printed(result: rw.CrossValidation, width: int = 80, *, pairs: bool = False)
     return stream.getvalue()
 
 
-def test_errors_are_of_what_was_not_seen() -> None:
+def test_errors_are_of_held_out_measurements() -> None:
     """Against five calibrations and predictions written out by hand."""
     problem = general(2, 2, seed=0, number_of_measurements=23, noise=NOISE, scale="shared").problem
     result = rw.cross_validate(problem, folds=5)
@@ -85,8 +85,8 @@ def test_with_much_data_the_error_is_the_noise(scale: Any, by: Any) -> None:
     assert held.rotation_rms_deg == pytest.approx(np.degrees(np.sqrt(3.0 / 6000.0)), rel=0.15)
 
 
-def test_overfitting_shows() -> None:
-    """Four measurements: seen errors flatter, hold-out errors do not."""
+def test_overfitting_makes_hold_out_errors_larger() -> None:
+    """Four measurements: training errors are too small, hold-out errors are not."""
     problem = general(1, 1, seed=2, number_of_measurements=4, noise=NOISE).problem
     result = cross_validate(problem, folds=4)
     assert result.overall.held_out.translation_rms_mm > 1.3 * result.overall.training.translation_rms_mm
@@ -142,7 +142,7 @@ def test_drift_is_not_predicted_by_neighbours() -> None:
     assert drifting.held_out.translation_rms_mm > 1.05 * drifting.training.translation_rms_mm
 
 
-def test_what_nothing_else_measures_is_named() -> None:
+def test_frames_that_no_other_measurement_determines_are_named() -> None:
     problem = general(
         3, 2, seed=6, graph=[(0, 0), (1, 0), (0, 1), (2, 1)], number_of_measurements=15, noise=NOISE
     ).problem
@@ -201,7 +201,7 @@ def test_bad_input_is_refused() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_calibrating_the_rest_warns_of_is_a_note() -> None:
+def test_warnings_of_a_folds_calibration_are_notes() -> None:
     problem = general(1, 1, seed=9, motion="planar", number_of_measurements=20, noise=NOISE).problem
     result = cross_validate(problem, folds=2)
     assert any(note.startswith("without block 1 of 2: the measurements do not determine") for note in result.notes)

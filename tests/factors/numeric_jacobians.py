@@ -22,7 +22,7 @@ def moved(values: gtsam.Values, key: int, step: np.ndarray) -> gtsam.Values:
 
 
 def numeric_jacobian(factor: gtsam.CustomFactor, values: gtsam.Values, key: int, step: float = 1e-5) -> np.ndarray:
-    """Of the unwhitened error by one variable, Richardson's fourth-order differences."""
+    """The derivative of the unwhitened error by one variable, by Richardson's fourth-order differences."""
     columns = []
     for direction in np.eye(len(values.atVector(key)) if is_number(values, key) else 6):
 

@@ -59,7 +59,7 @@ MOTION = gtsam.Pose3.Expmap(np.array([0.4, -0.7, 0.2, 0.5, 1.0, -0.8]))
 def setting(
     name: str, seed: int, size: float, residual: str, scaled: bool, deviation: float = 1.0
 ) -> tuple[gtsam.CustomFactor, gtsam.Values, np.ndarray]:
-    """A factor, values and the right perturbation of B that is between them; deviation is that one's size."""
+    """A factor, values, and the right perturbation of B between them, of size ``deviation``."""
     generator = np.random.default_rng(seed)
     make, keys, predict = FACTORS[name]
     poses = [gtsam.Pose3.Expmap(size * generator.standard_normal(6)) for _ in keys]
@@ -85,7 +85,7 @@ def test_jacobians_are_the_numeric_ones(name: str, size: float, residual: str, s
 
 @pytest.mark.parametrize("scaled", [False, True], ids=["true size", "scaled"])
 @pytest.mark.parametrize("name", FACTORS)
-def test_residual_is_what_b_was_perturbed_by(name: str, scaled: bool) -> None:
+def test_residual_is_the_perturbation_of_b(name: str, scaled: bool) -> None:
     factor, values, xi = setting(name, 5, 1.0, "geodesic", scaled, deviation=0.3)
     np.testing.assert_allclose(factor.unwhitenedError(values), xi, atol=1e-12)
 
@@ -110,7 +110,7 @@ def test_chordal_residual_is_the_equation_of_the_certified_cost(name: str) -> No
 
 
 @pytest.mark.parametrize("residual", ["geodesic", "chordal"])
-def test_they_agree_with_known_carriers(residual: str) -> None:
+def test_factors_with_carrier_variables_agree_with_known_carriers(residual: str) -> None:
     generator = np.random.default_rng(7)
     P_s, P_t, X_, Y_, B = (gtsam.Pose3.Expmap(generator.standard_normal(6)) for _ in range(5))
     A = P_s.inverse().compose(P_t)
@@ -160,7 +160,7 @@ def test_a_wrong_type_is_named_and_what_it_should_be(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FACTORS)
-def test_noise_that_cannot_be_honoured_is_refused_in_words(name: str) -> None:
+def test_noise_that_these_factors_cannot_hold_is_refused(name: str) -> None:
     make = FACTORS[name][0]
     sigmas = np.array([0.1, 0.2, 0.1, 0.3, 0.3, 0.3])
     with pytest.raises(ValueError, match="dimension 3"):
@@ -180,7 +180,7 @@ def test_noise_that_cannot_be_honoured_is_refused_in_words(name: str) -> None:
     assert make(gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(sigmas)).dim() == 6
 
 
-def test_equal_keys_are_refused_in_words() -> None:
+def test_equal_keys_are_refused() -> None:
     B = gtsam.Pose3()
     for build in (
         lambda: pose_robot_world_hand_eye_factor(P(0), X(0), X(0), B, NOISE),

@@ -1,4 +1,4 @@
-"""The factors alone, as somebody drops them into a project that has gtsam and numpy and nothing else of ours."""
+"""The factors alone, in a project that has gtsam and numpy only."""
 
 from __future__ import annotations
 

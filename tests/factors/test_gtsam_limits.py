@@ -1,4 +1,4 @@
-"""What factors/README.md says GTSAM 4.3 cannot do with these factors, and what it says to do instead."""
+"""The limits of GTSAM 4.3 with these factors, and the remedies, as factors/README.md lists them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def problem(
     return graph, values
 
 
-def test_gnc_cannot_hold_them_and_a_robust_loss_does() -> None:
+def test_gtsams_gnc_refuses_the_factors_and_a_robust_loss_does_not() -> None:
     graph, values = problem(outlier=True)
     with pytest.raises(RuntimeError, match="clone"):
         gtsam.GncLMOptimizer(graph, values, gtsam.GncLMParams()).optimize()
@@ -54,7 +54,7 @@ def test_clone_and_rekey_throw_and_a_copied_graph_shares_its_factors() -> None:
     assert gtsam.NonlinearFactorGraph(graph).error(values) == graph.error(values)
 
 
-def test_they_cannot_be_pickled_and_a_frozen_linearisation_can() -> None:
+def test_factors_cannot_be_pickled_and_a_frozen_linearisation_can() -> None:
     graph, values = problem()
     with pytest.raises(TypeError, match="pickle"):
         pickle.dumps(graph.at(0))

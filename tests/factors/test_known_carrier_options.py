@@ -114,7 +114,7 @@ def test_batch_optimisers(kind: str, method: str) -> None:
 
 
 def in_steps(kind: str) -> list[tuple[gtsam.NonlinearFactorGraph, gtsam.Values]]:
-    """Half of the factors with the start, as fewer would not determine it; the others one by one; then nothing new."""
+    """Half of the factors with the start, which they determine; then the other factors one by one; then no factors."""
     factors, start = problem(kind)
     first = len(factors) // 2 if len(factors) > 2 else 1
     parts = [factors[:first]] + [[factor] for factor in factors[first:]] + [[]] * 15
@@ -128,7 +128,7 @@ def in_steps(kind: str) -> list[tuple[gtsam.NonlinearFactorGraph, gtsam.Values]]
 
 
 def relinearising() -> gtsam.ISAM2Params:
-    """Parameters under which the end is the optimum, not within a threshold of it."""
+    """Parameters under which the end is exactly the optimum."""
     parameters = gtsam.ISAM2Params()
     parameters.setRelinearizeThreshold(1e-9)
     parameters.relinearizeSkip = 1
@@ -186,7 +186,7 @@ def test_missing_variables_are_named() -> None:
         graph.error(values_of({X(0): x, Y(0): y}))
 
 
-def test_bad_arguments_are_refused_in_words() -> None:
+def test_bad_arguments_are_named_and_refused() -> None:
     A, B, _, _ = poses(6)
     with pytest.raises(TypeError, match=r"A is a ndarray; give a gtsam\.Pose3"):
         robot_world_hand_eye_factor(X(0), Y(0), A.matrix(), B, NOISE)

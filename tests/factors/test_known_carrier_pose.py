@@ -44,7 +44,7 @@ def test_jacobians_are_the_numeric_ones(seed: int, size: float) -> None:
     np.testing.assert_allclose(whitened, expected, atol=1e-7)
 
 
-def test_residual_is_what_b_was_perturbed_by() -> None:
+def test_residual_is_the_perturbation_of_b() -> None:
     A, _, T_target, T_sensor = poses(1, 1.0)
     xi = np.array([0.02, -0.01, 0.03, 0.1, -0.2, 0.05])
     exact = T_sensor.inverse().compose(A).compose(T_target)
@@ -71,7 +71,7 @@ def test_graph_recovers_the_extrinsics() -> None:
     assert result.atPose3(Y(0)).equals(T_sensor, 1e-6)
 
 
-def test_wrong_noise_and_equal_keys_are_refused_in_words() -> None:
+def test_wrong_noise_and_equal_keys_are_named() -> None:
     A, B, _, _ = poses(4, 1.0)
     with pytest.raises(ValueError, match="dimension 3"):
         robot_world_hand_eye_factor(X(0), Y(0), A, B, gtsam.noiseModel.Isotropic.Sigma(3, 1.0))

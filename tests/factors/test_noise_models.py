@@ -69,5 +69,5 @@ def test_anisotropic_noise_is_refused_by_the_chordal_residual(covariance: np.nda
         noise_models.chordal(noiseModel.Gaussian.Covariance(covariance), "B")
 
 
-def test_what_the_error_advises_exists() -> None:
+def test_the_factor_that_the_error_advises_exists() -> None:
     assert hasattr(gtsam, "NonlinearEqualityPose3")

@@ -37,7 +37,7 @@ def measured(T: gtsam.Pose3, generator: np.random.Generator, scale: float = 1.0)
 def steps(
     loss: gtsam.noiseModel.mEstimator.Base | None = None,
 ) -> list[tuple[gtsam.NonlinearFactorGraph, gtsam.Values]]:
-    """Robot poses P(i) and another robot's P(100 + i), with all that is measured at each."""
+    """Robot poses P(i) and another robot's P(100 + i), with the measurements at each pose."""
     generator = np.random.default_rng(0)
     noise = NOISE if loss is None else gtsam.noiseModel.Robust.Create(loss, NOISE)
     robots = [gtsam.Pose3.Expmap(generator.standard_normal(6)) for _ in range(COUNT)]
@@ -130,7 +130,7 @@ def incremental_smoother() -> gtsam.FixedLagSmoother:
 
 
 def smoothed(lagged: gtsam.FixedLagSmoother) -> gtsam.Values:
-    """After all steps; extrinsics are as young as the last one."""
+    """The estimate after all steps; the extrinsics keep the last step's time."""
     extrinsics = [X(0), X(1), Y(0), Y(1), S(0)]
     for i, (graph, new) in enumerate(steps()):
         lagged.update(graph, new, {key: float(i) for key in [*list(new.keys()), *extrinsics]})

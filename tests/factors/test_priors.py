@@ -91,14 +91,14 @@ def test_jacobians_far_from_the_prior(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PRIORS)
-def test_nothing_is_wrong_at_the_prior(name: str) -> None:
+def test_the_error_at_the_prior_is_zero(name: str) -> None:
     T_0 = pose(1)
     assert PRIORS[name][0](T_0).error(values_of({X(0): T_0})) < 1e-20
 
 
 @pytest.mark.parametrize("name", PRIORS)
 @pytest.mark.parametrize("angle", [0.5, 2.0, 3.1])
-def test_an_optimiser_reaches_what_is_known(name: str, angle: float) -> None:
+def test_an_optimiser_reaches_the_prior(name: str, angle: float) -> None:
     T_0 = pose(2)
     factor = PRIORS[name][0](T_0)
     graph = gtsam.NonlinearFactorGraph()
@@ -275,7 +275,7 @@ def test_a_known_height_determines_what_a_four_axis_robot_leaves_free() -> None:
 
 
 def test_a_known_rotation_determines_what_a_cartesian_robot_leaves_free() -> None:
-    """No turning: the motion shows the rotation; nothing shows the position, with or without a target."""
+    """Without turning the motion determines the rotation, but not the position, with or without a target."""
     generator = np.random.default_rng(14)
     T_target = pose(15)
     graph = gtsam.NonlinearFactorGraph()

@@ -1,4 +1,4 @@
-"""The prior on a carrier's pose at a clock that is off."""
+"""The prior on a carrier's pose with a time offset."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_jacobians(measured: np.ndarray, off: np.ndarray, offset_s: float) -> No
     check_jacobians(factor, values_of({POSE: T.retract(0.5 * off), OFFSET: offset_s}), NOISE.sigmas(), atol=1e-6)
 
 
-def test_no_error_where_the_carrier_was_then() -> None:
+def test_the_error_is_zero_at_the_shifted_pose() -> None:
     T = gtsam.Pose3.Expmap(np.array([0.3, 0.1, -0.2, 1.0, 2.0, 3.0]))
     then = T.compose(gtsam.Pose3.Expmap(0.05 * TWIST))
     factor = shifted_pose_prior_factor(POSE, OFFSET, T, TWIST, NOISE)

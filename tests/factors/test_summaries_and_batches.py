@@ -1,4 +1,4 @@
-"""One factor for all measurements of a pair, against as many single ones."""
+"""One factor for all measurements of a pair, against single factors of the same measurements."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_batch_of_one_frame_is_ax_xb() -> None:
     assert_same(graph_of(factor), graph_of(*others), point(9, 0.6))
 
 
-def test_bad_input_is_refused_in_words() -> None:
+def test_bad_input_of_summaries_and_batches_is_refused() -> None:
     A, B, twists = measurements(5)
     with pytest.raises(ValueError, match=r"A has shape \(5, 4, 4\) and B \(4, 4, 4\)"):
         EdgeSummary.of(A, B[:4], 1.0, 1.0)

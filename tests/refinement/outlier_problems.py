@@ -1,4 +1,4 @@
-"""Simulated problems with outliers, of which is known which they are."""
+"""Simulated problems with known outliers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def corrupted(
     pairs: tuple[Pair, ...] | None = None,
     weights: Literal["given", "unit", "three_times_too_small"] = "given",
 ) -> tuple[rw.Problem, dict[Pair, np.ndarray]]:
-    """The problem with a share of each pair's B replaced, and which measurements are still good.
+    """The problem with a share of each pair's B replaced, and masks of the good measurements.
 
     "random": poses within 2 m, any rotation. "structured": what a second target, at a random place, shows, with the
     same noise (for motions: a second sensor's).

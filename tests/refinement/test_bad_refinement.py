@@ -1,4 +1,4 @@
-"""What refine refuses: with the place, the value and what to do."""
+"""Errors of refine: each names the place, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -158,6 +158,6 @@ def test_groups_of_pairs_are_not_confused_by_dashes() -> None:
 
 
 @pytest.mark.parametrize("copy_of", [pickle.dumps, copy.deepcopy])
-def test_copies_are_refused_in_words(copy_of: Callable[[object], object]) -> None:
+def test_copies_are_refused(copy_of: Callable[[object], object]) -> None:
     with pytest.raises(TypeError, match="write_refined"):
         copy_of(rw.refine(PROBLEM, SOLUTION))

@@ -1,4 +1,4 @@
-"""Noise in A: propagated, or A's as variables shared between the measurements of one stamp."""
+"""Noise in A: propagated, or with each A a variable that the measurements of one stamp share."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_shared_carriers_become_variables_and_widen_the_covariance() -> None:
     assert relative[1] < relative[0]
 
 
-def test_shared_carriers_that_are_not_treated_so_are_told() -> None:
+def test_propagated_noise_of_shared_carriers_is_warned_of() -> None:
     problem = rig(1, 2, seed=4).problem
     solution = rw.solve(problem)
     options = rw.RefineOptions(carrier_noise=CARRIER, carrier_model="propagated")
@@ -50,7 +50,7 @@ def test_shared_carriers_that_are_not_treated_so_are_told() -> None:
         rw.refine(problem, solution, options)
 
 
-def test_stamps_tell_which_measurements_share_a_pose() -> None:
+def test_measurements_of_one_stamp_share_a_pose() -> None:
     simulation = rig(1, 2, seed=5, number_of_measurements=8, noise=None)
     options = rw.RefineOptions(carrier_noise=CARRIER)
 

@@ -1,4 +1,4 @@
-"""Covariances against the truth, in few runs: the benchmark tests/benchmarks/coverage.py has the thousands."""
+"""Covariances against the truth in a few runs; the benchmark tests/benchmarks/coverage.py makes thousands."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def squares(noise: str, scale: str, noisy_A: bool) -> dict[str, list[float]]:
     ("noise", "scale", "noisy_A"),
     [("given", "shared", False), ("estimate", "known", False), ("given", "known", True)],
 )
-def test_mean_squared_errors_are_what_covariances_say(noise: str, scale: str, noisy_A: bool) -> None:
+def test_mean_squared_errors_agree_with_the_covariances(noise: str, scale: str, noisy_A: bool) -> None:
     for name, values in squares(noise, scale, noisy_A).items():
         dimension = 1 if name == "scale" else 6
         spread = np.sqrt(2.0 / dimension / RUNS)  # of the mean of a chi-square over its dimension

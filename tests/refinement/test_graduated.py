@@ -80,7 +80,7 @@ def test_forty_percent_of_outliers_are_found(
         assert translation == pytest.approx(NOISE.sigma_m**2, rel=0.5)
 
 
-def test_without_outliers_it_is_solve() -> None:
+def test_without_outliers_the_answer_is_solves() -> None:
     problem = general(2, 2, seed=1, number_of_measurements=15, noise=NOISE).problem
     found = graduated(problem, confidence=1.0 - 1e-9)
     assert all(mask.all() for mask in found.inliers.values())
@@ -91,7 +91,7 @@ def test_without_outliers_it_is_solve() -> None:
     assert not found.left_out
 
 
-def test_noise_that_claims_three_times_too_much_is_estimated() -> None:
+def test_noise_given_three_times_too_small_is_estimated() -> None:
     simulation = general(3, 2, seed=5, number_of_measurements=30, noise=NOISE)
     problem, good = corrupted(simulation, 0.3, "random", 5, NOISE, weights="three_times_too_small")
     found = graduated(problem, noise_scale="estimate")
@@ -192,7 +192,7 @@ def test_missing_measurements_are_refused() -> None:
         graduated(general(1, 1, seed=0, noise=NOISE, keep_measurements=False).problem)
 
 
-def test_progress_is_told_and_the_problem_stays_as_it_was() -> None:
+def test_progress_is_reported_and_the_problem_does_not_change() -> None:
     problem, _ = corrupted(general(1, 1, seed=0, noise=NOISE), 0.2, "random", 0, NOISE)
     before = problem.moments("target0", "sensor0")
     told: list[str] = []

@@ -1,4 +1,4 @@
-"""Covariances with free directions, against the limit that they are."""
+"""Covariances with free directions, against the limit of weak priors along them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_without_free_directions_it_is_the_inverse() -> None:
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), axis=st.integers(0, 5), given_to_it=st.booleans())
 def test_one_axis_of_one_frame_is_infinite_and_the_rest_is_the_limit(seed: int, axis: int, given_to_it: bool) -> None:
-    """Whether it is told of the direction or finds the zero itself, and in whatever units."""
+    """With the direction given or found as a zero of the information, in any units."""
     free = np.zeros((13, 1))
     free[axis] = 1.0
     Lambda = information(seed, free)
@@ -74,7 +74,7 @@ def test_opposite_movements_have_minus_infinite_covariance() -> None:
     assert joint.covariance_of(np.eye(13))[5, 11] == -np.inf
 
 
-def test_noise_that_feigns_information_along_a_free_direction_is_not_believed() -> None:
+def test_information_from_noise_along_a_free_direction_is_ignored() -> None:
     free = np.zeros((13, 1))
     free[5] = 1.0
     Lambda = information(5, free) + 1e-3 * free @ free.T
@@ -82,7 +82,7 @@ def test_noise_that_feigns_information_along_a_free_direction_is_not_believed() 
     assert covariance[5, 5] == np.inf
 
 
-def test_nothing_measured_is_infinite_everywhere() -> None:
+def test_without_measurements_every_variance_is_infinite() -> None:
     joint = JointCovariance.of((A,), np.zeros((6, 6)), np.zeros((6, 0)), np.ones(6))
     np.testing.assert_array_equal(np.diag(joint.covariance_of(np.eye(6))), np.inf)
     np.testing.assert_allclose(joint.information_of((A,)), 0.0)

@@ -1,4 +1,4 @@
-"""refine: against the certified solution, against the truth, and against itself in other words."""
+"""refine: against the certified solution, against the truth, and against equivalent problems."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_both_residuals_agree_to_first_order() -> None:
 
 @pytest.mark.parametrize("residual", ["chordal", "geodesic"])
 def test_covariance_is_gtsams_marginal(residual: str) -> None:
-    """Where nothing is free, they are GTSAM's own."""
+    """Without free directions the covariances are GTSAM's."""
     r = refined(rig(scale="shared").problem, residual=residual)
     marginals = gtsam.Marginals(r.graph, r.values)
     for name in ("target1", "sensor0", "scale"):
@@ -134,7 +134,7 @@ def test_noise_by_sensor_and_by_pair() -> None:
 
 
 def test_full_covariances_are_honoured() -> None:
-    """Noise of B along its x only: an estimator that knows it does better, and says by how much."""
+    """Noise of B along its x only: full covariances lower the error, and the covariance shows by how much."""
     exact = general(1, 1, seed=9, number_of_measurements=60)
     sigma = np.r_[np.full(3, np.radians(0.1)), 0.05, 0.001, 0.001]
     squares: dict[str, list[float]] = {"whole": [], "mean": []}
@@ -262,7 +262,7 @@ def test_motions_and_mixed_problems() -> None:
         assert r.contains("sensor1", alone.Y["sensor1"], 0.9999)
 
 
-def test_a_world_far_away_changes_nothing() -> None:
+def test_a_world_origin_far_away_changes_nothing() -> None:
     problem = rig(seed=2).problem
     shift = np.eye(4)
     shift[:3, 3] = (4e5, -7e5, 2e5)
@@ -273,7 +273,7 @@ def test_a_world_far_away_changes_nothing() -> None:
         np.testing.assert_allclose(near.covariance(name), away.covariance(name), rtol=1e-3, atol=1e-12)
 
 
-def test_the_graph_goes_on() -> None:
+def test_the_graph_takes_further_factors() -> None:
     """A user adds a factor of her own to the graph and optimises again."""
     r = refined(rig(seed=1).problem)
     graph = r.graph
@@ -297,7 +297,7 @@ def test_a_known_size_other_than_one() -> None:
             assert r.contains(name, T, 0.9999), name
 
 
-def test_noise_given_too_small_is_told_and_estimated_is_not() -> None:
+def test_noise_given_too_small_is_warned_of_and_estimated_noise_is_not() -> None:
     problem = copied(rig(seed=4).problem, sigma=lambda pair, raw: 0.3 * raw.sigma)
     with pytest.warns(rw.errors.WeightsWarning, match="sigma and kappa predict"):
         solution = rw.solve(problem)
@@ -309,7 +309,7 @@ def test_noise_given_too_small_is_told_and_estimated_is_not() -> None:
         rw.refine(rig(seed=4).problem, rw.solve(rig(seed=4).problem))
 
 
-def test_a_limit_of_iterations_is_told() -> None:
+def test_a_limit_of_iterations_is_warned_of() -> None:
     simulation = rig(seed=4, noise=Noise(0.05, 50.0))
     solution = rw.solve(simulation.problem)
     with pytest.warns(rw.errors.NotConvergedWarning, match="after 1 iterations"):
@@ -317,7 +317,7 @@ def test_a_limit_of_iterations_is_told() -> None:
 
 
 def test_two_measurements() -> None:
-    """No degree of freedom, one turn only: nothing estimates the noise, and no pose is determined."""
+    """No degree of freedom, one turn only: the noise cannot be estimated, and no pose is determined."""
     problem = rig(1, 1, seed=5, number_of_measurements=2).problem
     r = refined(problem)
     assert len(r.free_directions) >= 1
@@ -338,7 +338,7 @@ def test_everything_fixed() -> None:
 
 @pytest.mark.parametrize("tilt_rad", [0.0, 0.02, 0.04])
 def test_a_free_direction_just_off_an_axis_is_not_forgotten(tilt_rad: float) -> None:
-    """Planar motion, frames tilted a little against the plane: what is free reaches every axis by its share."""
+    """Planar motion, frames tilted a little against the plane: the free direction changes every axis by its share."""
     held = []
     for seed in range(12):
         generator = np.random.default_rng(seed)
@@ -358,7 +358,7 @@ def test_a_free_direction_just_off_an_axis_is_not_forgotten(tilt_rad: float) -> 
 
 
 def test_estimated_noise_of_correlated_covariances() -> None:
-    """Degrees of freedom are no more than there are, and covariances nine times too large are told to be."""
+    """Degrees of freedom are not overestimated, and covariances nine times too large are found to be so."""
     factors = []
     for seed in range(6):
         generator = np.random.default_rng(seed)

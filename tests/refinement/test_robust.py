@@ -45,8 +45,8 @@ def test_without_outliers_a_loss_costs_little(loss: str) -> None:
 
 
 @pytest.mark.parametrize("loss", ["cauchy", "tukey"])
-def test_a_loss_holds_a_few_outliers_off(loss: str) -> None:
-    """From the certified solution, which a tenth of outliers has pulled away."""
+def test_a_loss_withstands_a_few_outliers(loss: str) -> None:
+    """The start is the certified solution, which a tenth of outliers has pulled away."""
     simulation, problem, _ = with_outliers(0.1, seed=2)
     assert worst_error(simulation, refined(problem, robust=loss)) < 0.3 * worst_error(simulation, refined(problem))
 
@@ -70,8 +70,8 @@ def test_gnc_with_the_chordal_residual() -> None:
     assert distance(r, refined(problem, robust="gnc")) < 0.01
 
 
-def test_the_estimated_noise_of_what_is_left_is_not_shrunk_by_the_cut() -> None:
-    """Leaving 10 % of good measurements out takes their variance away; it is given back."""
+def test_the_threshold_does_not_shrink_the_estimated_noise_of_inliers() -> None:
+    """Leaving 10 % of good measurements out lowers the estimated variance; the estimate corrects for this."""
     estimates = []
     for seed in range(4):
         problem = rig(seed=seed, number_of_measurements=100).problem
@@ -86,7 +86,7 @@ DEPTH = np.diag(np.r_[np.full(3, np.radians(0.3)), 0.002, 0.002, 0.02]) ** 2
 
 
 def depth_camera(seed: int, bad_share: float = 0.0) -> tuple[rw.Problem, np.ndarray]:
-    """A camera that sees depth ten times worse than the rest; full covariances, true ones."""
+    """A camera whose depth is ten times noisier than the other axes, with its true full covariances."""
     raw = rig(1, 1, seed=seed, noise=None, number_of_measurements=30).problem.measurements("target0", "sensor0")
     generator = np.random.default_rng(seed)
     bad = generator.random(30) < bad_share
@@ -98,7 +98,7 @@ def depth_camera(seed: int, bad_share: float = 0.0) -> tuple[rw.Problem, np.ndar
     return problem, bad
 
 
-def test_gnc_judges_by_full_covariances_and_keeps_good_measurements() -> None:
+def test_gnc_uses_full_covariances_and_keeps_good_measurements() -> None:
     kept = outliers = good = 0
     for seed in range(6):
         problem, bad = depth_camera(seed, bad_share=0.2)
@@ -110,7 +110,7 @@ def test_gnc_judges_by_full_covariances_and_keeps_good_measurements() -> None:
 
 @pytest.mark.parametrize("each", [False, True])
 def test_gnc_knows_the_noise_of_A(each: bool) -> None:
-    """A is five times worse than B: believed to be exact, it would make outliers of all."""
+    """A is five times noisier than B: if A counted as exact, all measurements would be outliers."""
     raw = rig(1, 1, seed=2, noise=None, number_of_measurements=40).problem.measurements("target0", "sensor0")
     generator = np.random.default_rng(0)
     A = perturb(raw.A, Noise(0.005, 0.5 / 0.005**2), generator)
@@ -126,7 +126,7 @@ def test_gnc_knows_the_noise_of_A(each: bool) -> None:
 
 
 @pytest.mark.parametrize("loss", ["huber", "tukey"])
-def test_losses_do_not_call_free_what_outliers_only_blur(loss: str) -> None:
+def test_under_a_loss_outliers_make_no_free_directions(loss: str) -> None:
     for seed in range(4):
         simulation = rig(1, 1, seed=seed, scale="shared", number_of_measurements=40)
         generator = np.random.default_rng(seed)
@@ -148,8 +148,8 @@ def test_more_than_half_outliers_are_warned_of_where_the_noise_is_estimated() ->
 
 
 @pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
-def test_moved_is_from_the_solution_that_was_given() -> None:
-    """Outliers had pulled it away; refinement's own start had not been."""
+def test_moved_is_relative_to_the_given_solution() -> None:
+    """Outliers had pulled the given solution away, but not the start of the refinement."""
     _, problem, _ = with_outliers(0.2)
     solution = rw.solve(problem)
     r = rw.refine(problem, solution, rw.RefineOptions(robust="gnc"))

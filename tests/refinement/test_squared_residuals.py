@@ -25,7 +25,7 @@ def truth(simulation: Simulation) -> CertifiedFit:
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
-def test_half_their_sum_is_the_certified_cost(scale: rw.ScaleMode) -> None:
+def test_half_the_sum_of_squares_is_the_certified_cost(scale: rw.ScaleMode) -> None:
     problem = general(
         2, 2, seed=1, number_of_measurements=9, noise=NOISE, scale=scale, odometry=7, odometry_noise=NOISE
     ).problem
@@ -35,7 +35,7 @@ def test_half_their_sum_is_the_certified_cost(scale: rw.ScaleMode) -> None:
 
 
 @pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
-def test_at_the_truth_they_are_chi_square(scale: rw.ScaleMode) -> None:
+def test_squares_at_the_truth_are_chi_square(scale: rw.ScaleMode) -> None:
     simulation = general(2, 2, seed=2, number_of_measurements=2000, noise=NOISE, scale=scale)
     measured = Measured.of(simulation.problem)
     squares = measured.squares(truth(simulation))

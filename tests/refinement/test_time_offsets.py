@@ -1,4 +1,4 @@
-"""Time offsets as variables, and the twists that they move A along."""
+"""Time offsets as variables, and the carriers' twists."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_offsets_are_found_with_their_standard_deviations() -> None:
     assert r.covariance("cam0", "time_offset:cam0").shape == (7, 7)
 
 
-def test_only_the_sensors_named() -> None:
+def test_offsets_of_the_named_sensors_only() -> None:
     r = refined(problem_with({"cam0": 0.02, "cam1": 0.0}), time_offsets=("cam0",))
     assert list(r.time_offsets_s) == ["cam0"]
     assert "time_offset:cam1" not in r.names
@@ -90,7 +90,7 @@ def test_robust_losses_and_carrier_noise_go_with_offsets() -> None:
         assert r.time_offsets_s["cam0"] == pytest.approx(0.03, abs=0.003)
 
 
-def test_an_offset_that_nothing_tells_has_infinite_variance() -> None:
+def test_an_undetermined_offset_has_infinite_variance() -> None:
     """A constant twist, a screw: moving along it is what X and Y do too."""
     stamps = np.arange(60) * 50_000_000
     twist = np.array([0.0, 0.0, 0.5, 0.1, 0.0, 0.05])
@@ -103,7 +103,7 @@ def test_an_offset_that_nothing_tells_has_infinite_variance() -> None:
 
 
 @pytest.mark.parametrize("noise_of_A", [0.0, 1e-6, 1e-4, 1e-3])
-def test_stop_and_go_does_not_tell_an_offset(noise_of_A: float) -> None:
+def test_stop_and_go_motion_does_not_determine_an_offset(noise_of_A: float) -> None:
     """The carrier stood at every stamp; noise in its poses looks like motion."""
     generator = np.random.default_rng(1)
     stops = np.repeat(trajectory(np.arange(10) * 1.7), 6, axis=0)
@@ -119,7 +119,7 @@ def test_stop_and_go_does_not_tell_an_offset(noise_of_A: float) -> None:
 
 
 def test_noise_in_the_carriers_poses_does_not_pull_an_offset_to_zero() -> None:
-    """At 30 Hz differences of neighbouring poses would be noise: five times the true motion."""
+    """At 30 Hz the noise in differences of neighbouring poses is five times the true motion."""
     noise, scores = 0.003, []
     for seed in range(6):
         generator = np.random.default_rng(seed)
@@ -136,7 +136,7 @@ def test_noise_in_the_carriers_poses_does_not_pull_an_offset_to_zero() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.02, 0.1])
 def test_large_offsets_leave_no_bias_in_the_poses(offset_s: float) -> None:
-    """The carrier accelerates: along the first twist alone a pose would be off by half a metre's second square."""
+    """The carrier accelerates: the first twist alone would leave an error of second order in the poses."""
     held = []
     for seed in range(8):
         stamps = np.arange(300) * 100_000_000
@@ -164,7 +164,7 @@ def test_outliers_and_an_offset_together() -> None:
     assert r.time_offsets_s["cam0"] == pytest.approx(0.03, abs=0.002)
 
 
-def test_a_tag_that_is_rarely_seen_knows_the_motion_from_the_others() -> None:
+def test_the_motion_at_a_rarely_seen_tag_comes_from_other_tags() -> None:
     often = problem_with({"cam0": 0.02}).measurements("tag", "cam0")
     rare = np.arange(3, 200, 45)
     problem = rw.Problem()
@@ -174,7 +174,7 @@ def test_a_tag_that_is_rarely_seen_knows_the_motion_from_the_others() -> None:
     assert refined(problem, time_offsets=True).time_offsets_s["cam0"] == pytest.approx(0.02, abs=0.002)
 
 
-def test_motions_have_two_stamps() -> None:
+def test_time_offsets_with_motions_are_refused() -> None:
     problem = problem_with({"cam0": 0.0}, count=20)
     raw = problem.measurements("tag", "cam0")
     problem.add_motion("cam0", raw.A, raw.A, SIGMA_M, KAPPA, stamps_ns=raw.stamps_ns)
@@ -242,7 +242,7 @@ def test_twists_along_a_path_are_its_velocity() -> None:
         LocalPaths.along(fast_path(), np.array([90_000_000_000]))
 
 
-def test_a_path_tells_the_offset_of_a_slow_camera() -> None:
+def test_a_logged_path_determines_the_offset_of_a_slow_camera() -> None:
     problem = slow_problem(fast_path(), 0.004)
     r = refined(problem, time_offsets=True, carrier_path=fast_path())
     deviation = np.sqrt(r.covariance("time_offset:cam0")[0, 0])

@@ -47,7 +47,7 @@ def test_a_frame_goes_where_most_of_its_measurements_agree(scale: Any, name: str
     assert np.abs(stays.poses[name] - fit.poses[name]).max() < 0.15
 
 
-def test_where_the_other_end_is_missing_too_nothing_is_proposed() -> None:
+def test_without_a_pose_of_the_other_frame_no_pose_is_proposed() -> None:
     simulation = general(1, 1, seed=2, number_of_measurements=5, noise=NOISE)
     fit, saved = by_vote(
         "target0", Measured.of(simulation.problem), CertifiedFit({}, {}, certified=True), ONE, THRESHOLD
@@ -92,7 +92,7 @@ def test_a_negative_scale_on_the_way_is_no_error() -> None:
     assert certified_fit(problem, None).alpha["target0"] < 0.0
 
 
-def test_too_few_measurements_are_said_to_be() -> None:
+def test_too_few_measurements_raise_an_error() -> None:
     problem = general(1, 1, seed=6, number_of_measurements=5, noise=NOISE).problem
     one = selected(problem, {("target0", "sensor0"): np.arange(5) == 2})
     with pytest.raises(UnderdeterminedError):

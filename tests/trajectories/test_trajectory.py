@@ -58,7 +58,7 @@ def test_the_offset_moves_the_sensors_stamps() -> None:
     np.testing.assert_allclose(A[0], screw(np.array([1.25 - 7e-9]))[0], atol=1e-9)
 
 
-def test_no_overlap_is_another_clock() -> None:
+def test_stamps_without_overlap_are_of_another_clock() -> None:
     with pytest.raises(rw.errors.StampError, match=r"no overlap in time: .* different clocks"):
         synchronise(ROAD, np.array([10**18, 10**18 + 1]))
 
