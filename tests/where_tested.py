@@ -41,7 +41,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/cli": {
         "cli/test_command.py": "app exit_status failures fetch options",
         "cli/test_roads.py": "calibrate",
-        "cli/test_wheel.py": "demo log_result",
+        "cli/test_wheel.py": "demo",
         "pipeline/test_commands.py": "clean convert detect export init solve",
     },
     "gtsam_rwhec/compat": {

@@ -1,7 +1,7 @@
-"""What people type: the command ``gtsam-rwhec``. It parses, calls and prints; everything else is in the library.
+"""The command ``gtsam-rwhec``. It parses, calls the library and prints.
 
 A subcommand is a module with the same name. The modules reach the library as any program does, by
-``import gtsam_rwhec as rw``: so a command brings in only what it uses, and ``--help`` brings in nothing.
+``import gtsam_rwhec as rw``: so a command imports only what it uses, and ``--help`` imports nothing.
 """
 
 from gtsam_rwhec.cli.app import main

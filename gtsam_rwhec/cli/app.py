@@ -26,7 +26,7 @@ from gtsam_rwhec.cli.solve import solve
 
 app = typer.Typer(
     name="gtsam-rwhec",
-    help="Calibrate sensors against their carriers and targets, with a proof that no answer is better.",
+    help="Find the poses of cameras and other sensors on a robot or rig, with a proof that no answer is better.",
     epilog=HELP,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -36,7 +36,7 @@ app.add_typer(fetch_app, name="fetch")
 
 
 def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
-    """Register a subcommand: its errors are printed as messages, and what it returns is the exit status."""
+    """Register a subcommand. Its errors are printed as messages, and it returns the exit status."""
 
     @wraps(subcommand)
     def run(*arguments: Any, **options: Any) -> None:
@@ -66,13 +66,13 @@ def common(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Options of the command itself; what it does is in the subcommands."""
+    """Options of the command itself; the subcommands do the work."""
 
 
 def main() -> None:
     """Entry point of the command ``gtsam-rwhec``."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal or pipe that lacks a sign gets a question mark
+        if isinstance(stream, io.TextIOWrapper):  # a question mark replaces a sign that the terminal lacks
             stream.reconfigure(errors="replace")
     try:
         app(prog_name="gtsam-rwhec")

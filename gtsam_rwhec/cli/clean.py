@@ -18,9 +18,10 @@ def clean(
     output: McapOption,
     rig: RigOption = None,
 ) -> ExitStatus:
-    """Second stage: synchronise with the carriers' poses, and take out what should not be used."""
+    """Second stage: find the carriers' poses at each detection, and remove measurements that are not good enough."""
     with StageDisplay() as stage:
         report = rw.pipeline.clean_log(detected, output, None if rig is None else rw.rig.read_rig(rig), progress=stage)
         used = sum(track.used for track in report.tracks)
-        typer.echo(f"{used} measurements to use, the others with their reasons, in {output}.")
+        typer.echo(f"Written to {output}: {used} measurements to use, and the removed measurements with the reasons.")
+        typer.echo(f"Next: gtsam-rwhec solve {output} -o FOLDER")
     return ExitStatus.DONE

@@ -1,4 +1,4 @@
-"""``gtsam-rwhec compare``: published methods side by side on one set of measurements."""
+"""``gtsam-rwhec compare``: compare published methods on one set of measurements."""
 
 from __future__ import annotations
 
@@ -27,20 +27,22 @@ def compare(
     method: Annotated[
         list[str] | None,
         typer.Option(
-            help="A method to compare; give it again for each.", show_default="all", autocompletion=_names_of_methods
+            help="Name of a method; repeat the option for several methods.",
+            show_default="all",
+            autocompletion=_names_of_methods,
         ),
     ] = None,
     targets: TargetsOption = "tag",
     sensors: SensorsOption = "cam",
-    seed: Annotated[int, typer.Option(help="Seed of the methods that draw random numbers.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed for methods that draw random numbers.")] = 0,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File for all results (JSON).")] = None,
 ) -> ExitStatus:
-    """Solve by every published method that applies; print cost, residuals, time and the gap to the certified bound."""
+    """Solve with every published method that applies; print the cost, gap, residuals and time of each."""
     check_folder_of(output)
     with StageDisplay() as stage, warnings.catch_warnings():
         stage(f"reading {folder}")
         problem = rw.read_csv(folder, scale, sigma, kappa, targets, sensors)
-        warnings.simplefilter("ignore", rw.errors.RwhecWarning)  # the methods' own words are in the report
+        warnings.simplefilter("ignore", rw.errors.RwhecWarning)  # the report has the methods' notes
         comparison = rw.methods.compare(
             problem,
             rw.methods.MethodOptions(seed=seed),

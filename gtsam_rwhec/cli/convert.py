@@ -1,4 +1,4 @@
-"""``gtsam-rwhec convert``: an MCAP log of what other programs recorded."""
+"""``gtsam-rwhec convert``: make an MCAP log of the files of other programs."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ def convert(
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="For a folder of images: text or CSV file of poses; each line has a name or stamp and seven numbers."
+            help="For a folder of images: file of poses. Each line has an image name or a stamp, and seven numbers."
         ),
     ] = None,
     columns: Annotated[Columns, typer.Option(help="With --poses: the order of the seven numbers.")] = (
         "tx ty tz qx qy qz qw"
     ),
-    parent: Annotated[str, typer.Option(help="With --poses: they are poses of --child in this frame.")] = "base",
-    child: Annotated[str, typer.Option(help="With --poses: the frame that moves.")] = "hand",
+    parent: Annotated[str, typer.Option(help="With --poses: the fixed frame, in which the poses are given.")] = "base",
+    child: Annotated[str, typer.Option(help="With --poses: the moving frame, whose poses are given.")] = "hand",
     camera: Annotated[str, typer.Option(help="With --poses: name of the camera.")] = "camera",
 ) -> ExitStatus:
-    """Make an MCAP log of a ROS bag, or of a folder of images with a file of poses."""
+    """Make an MCAP log of a ROS bag, or of a folder of images and a file of poses."""
     with StageDisplay() as stage:
         stage(f"converting {source}")
         if poses is not None:
@@ -53,8 +53,8 @@ def convert(
             refuse(context, NOT_FOR_A_BAG)
             if rw.logs.is_image_folder(source):
                 raise LogError(
-                    f"{source} is a folder of images, which say nothing of where they were taken: give --poses"
+                    f"{source} is a folder of images. Name the file with the robot's poses as well: --poses FILE"
                 )
             said = f"{rw.logs.convert_ros_bag(source, output)} messages"
-    typer.echo(f"{said} written to {output}.")
+    typer.echo(f"Written to {output}: {said}.\nNext: gtsam-rwhec init {output} -o rig.yaml")
     return ExitStatus.DONE

@@ -18,19 +18,18 @@ def detect(
     rig: Annotated[Path, typer.Option(help="Rig file (YAML).")],
     output: McapOption,
     images: ImagesOption = False,
-    draw: Annotated[
-        Path | None, typer.Option(help="Folder for pictures: each image with what was detected in it.")
-    ] = None,
+    draw: Annotated[Path | None, typer.Option(help="Folder for pictures: each image with its detections.")] = None,
     workers: WorkersOption = None,
 ) -> ExitStatus:
-    """First stage: from images to poses of targets."""
+    """First stage: find the targets in the images and compute their poses."""
     with StageDisplay() as stage:
         report = rw.pipeline.detect_log(
             log, rw.rig.read_rig(rig), output, images="copy" if images else "leave_out", workers=workers, progress=stage
         )
         used = sum(track.used for track in report.tracks)
-        removed = sum(sum(track.removed.values()) for track in report.tracks)
-        typer.echo(f"{used} detections to use, {removed} rejected, each with its reason, in {output}.")
+        rejected = sum(track.seen for track in report.tracks) - used
+        typer.echo(f"Written to {output}: {used} detections to use, and {rejected} rejected ones with the reasons.")
         if draw is not None:
-            typer.echo(f"{rw.pipeline.draw_log(log, output, draw, progress=stage)} images drawn in {draw}.")
+            typer.echo(f"Written to {draw}: {rw.pipeline.draw_log(log, output, draw, progress=stage)} pictures.")
+        typer.echo(f"Next: gtsam-rwhec clean {output} -o cleaned.mcap")
     return ExitStatus.DONE

@@ -1,4 +1,4 @@
-"""What the command's exit status means; scripts may rely on these numbers."""
+"""The exit statuses of the command; scripts may rely on these numbers."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ class ExitStatus(IntEnum):
     """Exit statuses of every subcommand."""
 
     DONE = CERTIFIED = 0
-    """Done; a calibration is certified and determined by the measurements."""
+    """The command succeeded; a calibration is certified, and the measurements determine it."""
     BAD_INPUT = 2
-    """An argument, a file or a measurement cannot be used; the message says which."""
+    """An option, a file or a measurement cannot be used; the message says which."""
     NOT_UNIQUE = 3
-    """No answer is better, but the measurements leave some frames free: do not use those."""
+    """The answer is certified, but the measurements do not determine every frame: do not use the poses."""
     NOT_CERTIFIED = 4
-    """An answer without a proof that there is no better one."""
+    """The answer is not certified: a better answer may exist."""
     DOWNLOAD_FAILED = 5
-    """No network, or not the expected files; what was downloaded stays."""
+    """No network, or not the expected files; complete files stay."""
     CONTRADICTED = 6
-    """Most measurements of a sensor or target were left out as outliers: do not use the answer."""
+    """Most measurements of a sensor or target are outliers: do not use the poses."""
     INTERRUPTED = 130
     """Ctrl-C."""
 
 
 HELP = (
-    "Exit status: 0 certified (or done); 2 bad input; 3 certified, but the measurements do not determine every frame; "
-    "4 not certified; 5 download failed; 6 most measurements of a frame contradict the answer; 130 interrupted."
+    "Exit status: 0 success, and certified; 2 bad input; 3 certified, but the measurements do not determine every "
+    "frame; 4 not certified; 5 download failed; 6 most measurements of a frame are outliers; 130 interrupted."
 )
 
 

@@ -16,7 +16,7 @@ def export(
     solved: Annotated[Path, typer.Argument(help="The clean.mcap that solve or calibrate wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")],
 ) -> ExitStatus:
-    """Last stage: launch file, tf, URDF, Kalibr camchain and plots from a solved log."""
+    """Last stage: write a launch file, tf, URDF, a Kalibr camchain and plots from a solved log."""
     with StageDisplay() as stage:
         for path in rw.pipeline.export_solved(solved, output, progress=stage):
             typer.echo(str(path))

@@ -1,4 +1,4 @@
-"""How errors and warnings reach a person: one message each, no traceback."""
+"""How errors and warnings are printed: one message each, without a traceback."""
 
 from __future__ import annotations
 
@@ -24,14 +24,15 @@ from gtsam_rwhec.files.terminal_text import printable
 
 @contextmanager
 def failures_in_words() -> Iterator[None]:
-    """Turn this package's errors into a message and an exit status, and its warnings into messages, each told once.
+    """Print this package's errors and warnings as messages, each message once.
 
     Raises
     ------
     typer.Exit
-        With the status of `ExitStatus`. Errors of any other kind are faults of the program and pass with a traceback.
+        After an error of this package, with an `ExitStatus`. Other errors are faults of the program and keep their
+        traceback.
     """
-    # Imported here: completion in a shell starts faster without.
+    # Imported here, because completion in a shell must start fast.
     from rich.console import Console
     from rich.text import Text
 
@@ -51,7 +52,7 @@ def failures_in_words() -> Iterator[None]:
         ) -> None:
             if issubclass(category, RwhecWarning):
                 words = printable(str(message))
-                if words not in told:  # a log is gone through several times
+                if words not in told:  # several passes over a log repeat a warning
                     told.add(words)
                     console.print(Text("Warning: ", style="bold yellow").append(words, style="not bold default"))
             else:
@@ -71,7 +72,7 @@ def failures_in_words() -> Iterator[None]:
 
 @contextmanager
 def said_in_the_report() -> Iterator[None]:
-    """Show no warning of what the report says in more detail: not certified, or not unique."""
+    """Hide the warnings that the report explains better: not certified, and not unique."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotUniqueWarning)
         warnings.simplefilter("ignore", NotCertifiedWarning)
@@ -79,12 +80,6 @@ def said_in_the_report() -> Iterator[None]:
 
 
 def check_folder_of(output: Path | None) -> None:
-    """Check, before a long calculation, that the folder of its result is there.
-
-    Raises
-    ------
-    FileFormatError
-        It is not.
-    """
+    """Check before a long calculation that the folder of its result exists; raise FileFormatError if not."""
     if output is not None and not output.absolute().parent.is_dir():
-        raise FileFormatError(f"{output} cannot be written: there is no folder {output.parent}.")
+        raise FileFormatError(f"{output} cannot be written: the folder {output.parent} does not exist.")

@@ -14,7 +14,7 @@ from gtsam_rwhec.cli.stage_display import StageDisplay
 
 
 def utias(
-    destination: Annotated[Path, typer.Argument(help="Folder to write to; made if it is not there.")] = Path("utias"),
+    destination: Annotated[Path, typer.Argument(help="Folder to write to; made if it does not exist.")] = Path("utias"),
     base_url: Annotated[
         str | None,
         typer.Option(help="Address of a mirror of the files.", show_default="the authors' repository on GitHub"),
@@ -22,7 +22,7 @@ def utias(
 ) -> ExitStatus:
     """Download the real dataset of the RWHEC paper: 16 tags, 8 cameras, 3230 measurements, 1.4 MB.
 
-    Call it again to go on with an interrupted download; files that are there are verified and kept.
+    Run the command again to continue an interrupted download. Existing files are verified and kept.
     """
     with StageDisplay() as stage:
         fetched = rw.datasets.fetch_utias(
@@ -31,8 +31,8 @@ def utias(
             lambda done, total, name: stage(f"downloading file {done + 1} of {total}: {name}"),
         )
     typer.echo(
-        f"{len(fetched.downloaded)} files downloaded to {fetched.folder}, {len(fetched.already_there)} were there; "
-        "all verified."
+        f"{len(fetched.downloaded)} files downloaded to {fetched.folder}, {len(fetched.already_there)} existed "
+        "already; all are verified."
     )
     typer.echo(f"Next: gtsam-rwhec calibrate {shlex.quote(str(fetched.folder))} --scale shared")
     return ExitStatus.DONE

@@ -20,15 +20,16 @@ def init(
     log: LogArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="Rig file to write.")] = Path("rig.yaml"),
 ) -> ExitStatus:
-    """Look at a log and write a first rig file. What a person must fill in is marked."""
+    """Look at a log and write a first rig file. TODO marks the lines that you must complete."""
     if output.exists():
-        raise FileFormatError(f"{output} is there already; it may have been filled in by hand. Give another name.")
+        raise FileFormatError(f"{output} exists already, perhaps with your changes. Give another name with -o.")
     with StageDisplay() as stage:
         stage(f"looking at {log}")
         with rw.logs.open_log(log) as opened:
             text, notes = rw.first_rig.propose_rig(opened, output)
     write_atomically(output, text.encode())
+    typer.echo(f"Written to {output}. Complete the lines marked TODO.")
+    typer.echo(f"Next: gtsam-rwhec calibrate {log} --rig {output} -o out\n")
     for note in notes:
         typer.echo(printable(note))
-    typer.echo(f"Written to {output}. Fill in what is marked, then: gtsam-rwhec calibrate {log} --rig {output} -o out")
     return ExitStatus.DONE

@@ -1,4 +1,4 @@
-"""Options and arguments that several subcommands share: the type of each, and its help."""
+"""Options and arguments that several subcommands share, and the report that two of them print."""
 
 from __future__ import annotations
 
@@ -7,30 +7,66 @@ from typing import Annotated, Literal
 
 import typer
 
-FOLDER_OF_CSV = "folder of <targets>_<id>_<sensors>_<id>_{A,B}.csv files"
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
+
+FOLDER_OF_CSV = "folder of CSV files such as tag_0_cam_0_A.csv and tag_0_cam_0_B.csv"
+#: Headings in the help.
+CSV_PANEL = "Options for a folder of CSV files"
+LOG_PANEL = "Options for a log"
+REFINEMENT_PANEL = "Options for the refinement of CSV files"
 Scale = Literal["known", "shared", "per_target"]
 
 ScaleOption = Annotated[
-    Scale, typer.Option(help="The sizes of the targets are known, wrong by one factor for all, or by one factor each.")
+    Scale,
+    typer.Option(
+        rich_help_panel=CSV_PANEL,
+        help="known: the sizes of the targets are right. shared: one unknown factor for all sizes. per_target: an "
+        "unknown factor for each size.",
+    ),
 ]
 SigmaOption = Annotated[
-    float | None, typer.Option(help="Standard deviation of a measured translation along each axis, m.")
+    float | None,
+    typer.Option(
+        rich_help_panel=CSV_PANEL, help="Standard deviation of a measured translation along each axis, metres."
+    ),
 ]
 KappaOption = Annotated[
     float | None,
     typer.Option(
-        help="Concentration of a measured rotation: 1/(2 s^2) for a standard deviation of s rad about each axis."
+        rich_help_panel=CSV_PANEL,
+        help="Concentration of a measured rotation: 1/(2 s^2) for a standard deviation of s radians about each axis.",
     ),
 ]
-TargetsOption = Annotated[str, typer.Option(help="The word for targets in the names of the files.")]
-SensorsOption = Annotated[str, typer.Option(help="The word for sensors in the names of the files.")]
+TargetsOption = Annotated[
+    str, typer.Option(rich_help_panel=CSV_PANEL, help="The word for a target in the names of the files.")
+]
+SensorsOption = Annotated[
+    str, typer.Option(rich_help_panel=CSV_PANEL, help="The word for a sensor in the names of the files.")
+]
 
-LogArgument = Annotated[Path, typer.Argument(help="MCAP file, or a folder of them (a ROS 2 bag).")]
+LogArgument = Annotated[Path, typer.Argument(help="MCAP file, or a folder of MCAP files (a ROS 2 bag).")]
 McapOption = Annotated[Path, typer.Option("--output", "-o", help="MCAP file to write.")]
 RigOption = Annotated[
-    Path | None, typer.Option(help="For a log: rig file (YAML). A log that detect or clean wrote has one inside.")
+    Path | None,
+    typer.Option(rich_help_panel=LOG_PANEL, help="Rig file (YAML). A log that detect or clean wrote holds its own."),
 ]
-ImagesOption = Annotated[bool, typer.Option("--images", help="For a log: copy its images too. They are large.")]
+ImagesOption = Annotated[
+    bool, typer.Option("--images", rich_help_panel=LOG_PANEL, help="Copy the images too. They are large.")
+]
 WorkersOption = Annotated[
-    int | None, typer.Option(min=1, help="For a log: processes that look at images.", show_default="one for each core")
+    int | None,
+    typer.Option(
+        min=1,
+        rich_help_panel=LOG_PANEL,
+        help="Number of processes that search the images.",
+        show_default="one for each core",
+    ),
 ]
+
+
+def show(calibrated: rw.pipeline.Calibrated) -> ExitStatus:
+    """Print the report of a calibrated log; its exit status."""
+    refined = calibrated.refined
+    rw.report.print_refined(refined, log=calibrated.log)
+    return exit_status(rw.judge(refined.solution, refined, calibrated.log))

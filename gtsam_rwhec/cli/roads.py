@@ -1,4 +1,4 @@
-"""A subcommand can go several ways. An option that the chosen way would pass over is refused."""
+"""Refusal of options that have no effect on the given input."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import typer
 
 
 def refuse(context: typer.Context, options: Mapping[str, Collection[str]]) -> None:
-    """Refuse each of these options that the user gave, be it with its default value.
+    """Refuse those of these options that the user wrote, even with the default value.
 
     Parameters
     ----------
-    context
-        Of the subcommand, with what was given.
-    options
-        For each reason why options do not count on the chosen way (and what to do): the names of their parameters.
+    context : typer.Context
+        The context of the subcommand.
+    options : dict of str to names
+        Names of parameters that have no effect, by the reason and what to do.
 
     Raises
     ------
     typer.BadParameter
-        Names the options, says why they do not count, and what to do.
+        The user wrote some of these options; the message has the options and the reasons.
     """
     lines = []
     for why, names in options.items():

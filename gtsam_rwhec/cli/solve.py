@@ -10,8 +10,7 @@ import typer
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import said_in_the_report
-from gtsam_rwhec.cli.log_result import show
-from gtsam_rwhec.cli.options import RigOption
+from gtsam_rwhec.cli.options import RigOption, show
 from gtsam_rwhec.cli.stage_display import StageDisplay
 
 
@@ -20,11 +19,12 @@ def solve(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for result.json and clean.mcap.")],
     rig: RigOption = None,
 ) -> ExitStatus:
-    """Third stage: the certified solution, refined, with covariances."""
+    """Third stage: find the certified poses, refine them, and print covariances."""
     with StageDisplay() as stage, said_in_the_report():
         calibrated = rw.pipeline.solve_into(
             cleaned, None if rig is None else rw.rig.read_rig(rig), output, progress=stage
         )
     status = show(calibrated)
     typer.echo(f"Written: {output / rw.pipeline.RESULT_FILE}, {output / rw.pipeline.CLEAN_LOG}.", err=True)
+    typer.echo(f"Next: gtsam-rwhec export {output / rw.pipeline.CLEAN_LOG} -o FOLDER", err=True)
     return status

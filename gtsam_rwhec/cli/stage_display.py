@@ -1,4 +1,4 @@
-"""What the user sees of a calculation that takes more than a second: its stage and the time, on standard error."""
+"""The progress of a long calculation: its stage and the time, on standard error."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Self
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+#: Seconds before anything is shown, and between lines in a log.
 INTERVAL_S = 1.0
-"""Nothing is shown before this, and lines in a log come no faster."""
 
 
 class StageDisplay:
-    """A context in which stages can be announced: a spinner on a terminal, a line a stage in a log.
+    """A context that shows stages: with a spinner on a terminal, or with a line for each stage in a log.
 
     Examples
     --------
@@ -51,7 +51,7 @@ class StageDisplay:
             self._progress.stop()
 
     def __call__(self, stage: str) -> None:
-        """Announce what begins now."""
+        """Show the stage that begins now."""
         self._stage = stage
         self._progress.update(self._task, description=stage)
 
@@ -62,4 +62,4 @@ class StageDisplay:
                 self._progress.start()  # does nothing when it runs already
             elif self._stage != shown:
                 shown = self._stage
-                self._console.print(f"[{time.monotonic() - self._begun_s:.0f} s] {shown}", markup=False)
+                self._console.print(f"[{time.monotonic() - self._begun_s:.0f} s] {shown}", markup=False, soft_wrap=True)

@@ -163,10 +163,10 @@ def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
         (["calibrate", DEMO, "--scale", "unknown"], "unknown"),
         (["calibrate", DEMO, "--method", "local"], "--initial"),
         (["calibrate", DEMO, "--initial", "x.json"], "--method local"),
-        (["calibrate", DEMO, "-o", "/nowhere/result.json"], "there is no folder /nowhere"),
+        (["calibrate", DEMO, "-o", "/nowhere/result.json"], "the folder /nowhere does not exist"),
         (["calibrate", DEMO, "--robust", "gnc"], "--robust"),
         (["calibrate", DEMO, "--refine", "estimate", "--carrier-noise-mm", "2"], "go together"),
-        (["calibrate", DEMO, "--refine", "given"], "noise='estimate'"),
+        (["calibrate", DEMO, "--refine", "given"], "--refine estimate"),
         (["calibrate"], "source"),
         (["fetch", "other"], "other"),
         (["guess"], "guess"),
@@ -279,9 +279,9 @@ def test_a_log_gets_a_line_for_what_takes_long(slow_address: str, tmp_path: Path
 def test_fetch_then_calibrate(serve: str, tmp_path: Path) -> None:
     first = run("fetch", "utias", "--base-url", serve, cwd=tmp_path)
     assert first.returncode == 0, first.stderr
-    assert "146 files downloaded to utias, 0 were there; all verified." in first.stdout
+    assert "146 files downloaded to utias, 0 existed already; all are verified." in first.stdout
     again = run("fetch", "utias", "utias", "--base-url", serve, cwd=tmp_path)
-    assert "0 files downloaded to utias, 146 were there" in again.stdout
+    assert "0 files downloaded to utias, 146 existed already" in again.stdout
     next_command = again.stdout.splitlines()[-1].removeprefix("Next: gtsam-rwhec ").split()
     assert run(*next_command, cwd=tmp_path).returncode == 0
 

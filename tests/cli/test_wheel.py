@@ -75,7 +75,8 @@ def test_the_demo_runs_from_it_and_meets_the_truth(unpacked_wheel: Path, tmp_pat
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
     log = unpacked_wheel / "gtsam_rwhec" / "demo_data" / "robot_cell.mcap"
-    assert done.stdout.startswith(f"The same as: gtsam-rwhec calibrate {log} --rig {log.parent / 'rig.yaml'} -o ")
+    assert f"This is the same as: gtsam-rwhec calibrate {log} --rig {log.parent / 'rig.yaml'} -o " in done.stderr
+    assert done.stdout.startswith("Use these poses: ")
     for words in (
         "Certified globally optimal",
         "Outliers: ",
