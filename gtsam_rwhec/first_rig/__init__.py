@@ -1,4 +1,4 @@
-"""A first rig file, made by looking at a log."""
+"""A first rig file, proposed from the content of a log."""
 
 import lazy_loader
 

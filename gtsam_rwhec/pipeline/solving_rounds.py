@@ -52,11 +52,6 @@ class SolvingRounds:
     estimated: tuple[str, ...]
     progress: Progress
 
-    @property
-    def targets(self) -> frozenset[str]:
-        """Names of all targets."""
-        return frozenset(self.rig.targets)
-
     def settled(self, given: SynchronisedPairs, free_sizes: Collection[str]) -> SynchronisedPairs:
         """Mark outliers and estimate time offsets until neither changes.
 
@@ -131,8 +126,8 @@ class SolvingRounds:
             with warnings.catch_warnings():
                 if is_check:  # users get only the warnings of the answer
                     warnings.simplefilter("ignore", RwhecWarning)
-                marked = self.settled(given, self.targets)
-                refined = self.refined(marked, self.targets, "time offsets")
+                marked = self.settled(given, self.rig.targets)
+                refined = self.refined(marked, self.rig.targets, "time offsets")
         except ScaleError:
             if not is_check:
                 raise
@@ -145,7 +140,7 @@ class SolvingRounds:
         """Estimates of sizes that count as known; empty if the measurements do not determine them."""
         self.progress("looking at the targets' sizes")
         try:
-            return self._sizes_in(self.refined(given, self.targets, "time offsets"))
+            return self._sizes_in(self.refined(given, self.rig.targets, "time offsets"))
         except RwhecError:
             return ()  # the answer, with sizes as stated, does not need this one
 

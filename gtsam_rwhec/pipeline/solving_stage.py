@@ -95,9 +95,9 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     sizes: tuple[SizeFields, ...] = ()
     if rig.sizes != "known":
         sizes, given = rounds.sizes(given)
-    free = frozenset[str]()
+    free: set[str] = set()
     if any(size.is_free for size in sizes):
-        free = rounds.targets - {size.target for size in sizes if not size.is_free}
+        free = set(rig.targets) - {size.target for size in sizes if not size.is_free}
     settled = rounds.settled(given, free)
     if rig.sizes == "known":
         sizes = rounds.sizes_as_seen(settled)
