@@ -125,7 +125,7 @@ def checkerboard_corners(gray: Gray, board: Checkerboard) -> Array:
             return np.zeros((0, 2))
         grid = np.reshape(corners, (board.rows, board.columns, 2)).astype(float)
         right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-        if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: nobody sees a board from behind
+        if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: a board is not seen from behind
             grid = grid[::-1]
         contrast = _contrast(gray, grid)
         if contrast < 0.0:

@@ -1,4 +1,4 @@
-"""Drawings of detections in their images, which show what was used and what was not used."""
+"""Drawings of detections in their images: used and rejected detections have different colours."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def _look(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> li
 
 
 def _decoded(image: ImageRecord, camera: Camera) -> Gray | str:
-    """The pixels of an image, or the reason why there are none."""
+    """The pixels of an image, or the fault that it has."""
     try:
         gray = decode_gray(image)
     except ImageError as error:

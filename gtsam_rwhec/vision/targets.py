@@ -220,7 +220,7 @@ def is_same_print(first: str, second: str) -> bool:
 
 
 def family_named(word: str) -> str | None:
-    """The family of `FAMILIES` that a driver means by a word; None if there is none."""
+    """The family of `FAMILIES` that a driver means by a word, or None."""
     bare = _bare(word)
     return next((family for family in (f"tag{bare}", f"aruco_{bare}") if family in FAMILIES), None)
 

@@ -192,12 +192,12 @@ def test_no_intrinsics(tmp_path: Path) -> None:
     ("changed", "words"),
     [
         ({"K": [0.0] * 9}, "K is all zeros: the camera was not calibrated"),
-        ({"K": [0.004, 0, 320, 0, 0.004, 240, 0, 0, 1]}, "fx = 0.004 pixels for an image of 640 x 480; is it in "),
+        ({"K": [0.004, 0, 320, 0, 0.004, 240, 0, 0, 1]}, "fx = 0.004 pixels for an image of 640 x 480 pixels"),
         ({"K": [-400.0, 0, 320, 0, 400, 240, 0, 0, 1]}, "fx = -400 pixels"),
         ({"K": [400.0, 0, 9e9, 0, 400, 240, 0, 0, 1]}, "cx = 9e+09 is far outside the image of 640 x 480"),
-        ({"K": [float("nan"), 0, 320, 0, 400, 240, 0, 0, 1]}, "a finite 3 x 3 matrix is needed"),
+        ({"K": [float("nan"), 0, 320, 0, 400, 240, 0, 0, 1]}, "give a finite 3 x 3 matrix"),
         ({"width": 0}, "the image size is 0 x 480 pixels"),
-        ({"D": [1e300] * 5}, "are those of no lens"),
+        ({"D": [1e300] * 5}, "no lens has them"),
         ({"distortion_model": "acme"}, "distortion model 'acme' is not supported; supported are"),
     ],
 )

@@ -199,7 +199,7 @@ def test_wrong_input_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CountError, match=r"\(N, 2\)"):
         PlottedCorners(np.zeros((3, 2)), np.zeros((2, 2)))
     for draw in (plot_frames, plot_deviations):
-        with pytest.raises(NoiseError, match="cannot be negative"):
+        with pytest.raises(NoiseError, match="not negative"):
             draw(FRAMES, {"tag_0": -np.eye(6)}, tmp_path / "picture.png")
     with pytest.raises(FileFormatError, match="cannot be written: No such file"):
         plot_frames(FRAMES, {}, tmp_path / "nowhere" / "picture.png")
