@@ -67,8 +67,16 @@ def of_rotations(R: Array) -> Array:
 
 def to_rotations(q: Array) -> Array:
     """Rotations (..., 3, 3) of quaternions (..., 4) of any length but zero."""
-    products = (q[..., :, None] * q[..., None, :]).reshape(*q.shape[:-1], 16)
-    R: Array = products @ ROTATION.reshape(16, 9) / (q * q).sum(axis=-1, keepdims=True)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    R: Array = np.stack(
+        [
+            *(1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)),
+            *(s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)),
+            *(s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)),
+        ],
+        axis=-1,
+    )
     return R.reshape(*q.shape[:-1], 3, 3)
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from rwhec_factors import se3
 
+from gtsam_rwhec.geometry.quaternions import to_rotations
 from gtsam_rwhec.logs.records import Array
 
 #: A quaternion's norm may be this far from 1; the quaternion is then normalised.
@@ -32,12 +33,7 @@ def transforms(positions: Array, quaternions_xyzw: Array) -> tuple[Array, dict[i
     if bad:
         positions = np.where(good[:, None], positions, 0.0)
         quaternions_xyzw = np.where(good[:, None], quaternions_xyzw, [0.0, 0.0, 0.0, 1.0])
-    T = np.zeros((len(norms), 4, 4))
-    if len(norms):
-        T[:, :3, :3] = Rotation.from_quat(quaternions_xyzw).as_matrix()
-    T[:, :3, 3] = positions
-    T[:, 3, 3] = 1.0
-    return T, faults
+    return se3.pose(to_rotations(quaternions_xyzw), positions), faults
 
 
 def _fault(position: Array, quaternion: Array, norm: float) -> str:

@@ -20,6 +20,8 @@ from gtsam_rwhec.trajectories.trajectory import Trajectory
 WINDOW_S = 0.5
 #: Number of poses about a stamp that are taken from a path that was logged fast.
 NEAREST = 32
+#: Poses that are compared with their neighbours at once: memory stays bounded.
+POSES_AT_ONCE = 100_000
 #: Time, s, between two poses above which the motion in between is unknown.
 LONGEST_GAP_S = 1.0
 #: Largest difference of an entry (rad and m) between two poses of one stamp and one carrier.
@@ -87,16 +89,14 @@ class LocalPaths:
             )
         if len(stamps) < 2:
             raise CountError(f"{where}: a time offset needs at least two stamps; there is {len(stamps)}")
-        seconds = (stamps - stamps[0]) * 1e-9
-        near = [_neighbours(seconds, i) for i in range(len(stamps))]
-        for i, rows in enumerate(near):
-            if len(rows) < 2:
-                raise CountError(
-                    f"{where}: the measurement at {stamps[i]} ns has no other measurement within {LONGEST_GAP_S:g} s, "
-                    "so the carrier's velocity there is unknown. Leave it out, or estimate no time offset for its "
-                    "sensor"
-                )
-        return _fitted(poses, [(seconds[rows] - seconds[i], poses[rows]) for i, rows in enumerate(near)], place)
+        low, high = _neighbours((stamps - stamps[0]) * 1e-9)
+        if (high - low < 2).any():
+            raise CountError(
+                f"{where}: the measurement at {stamps[np.argmin(high - low)]} ns has no other measurement within "
+                f"{LONGEST_GAP_S:g} s, so the carrier's velocity there is unknown. Leave it out, or estimate no time "
+                "offset for its sensor"
+            )
+        return _fitted(poses, stamps, Trajectory(stamps, poses, where), low, high, place)
 
     @staticmethod
     def along(path: Trajectory, stamps_ns: np.ndarray) -> LocalPaths:
@@ -115,48 +115,54 @@ class LocalPaths:
         """
         stamps, place = np.unique(stamps_ns, return_inverse=True)
         poses, _ = path.at(stamps)
-        near = []
-        for stamp, first in zip(stamps, np.searchsorted(path.stamps_ns, stamps) - NEAREST // 2, strict=True):
-            first = min(max(first, 0), max(len(path.T) - NEAREST, 0))
-            tau = (path.stamps_ns[first : first + NEAREST] - stamp) * 1e-9
-            inside = np.abs(tau) <= WINDOW_S
-            if inside.sum() < 4:
-                raise CountError(
-                    f"{path.where}: only {inside.sum()} poses are within {WINDOW_S:g} s of the measurement at {stamp} "
-                    "ns; a time offset needs at least four, for the carrier's velocity. Log the poses faster"
-                )
-            near.append((tau[inside], path.T[first : first + NEAREST][inside]))
-        return _fitted(poses, near, place)
+        first = np.searchsorted(path.stamps_ns, stamps) - NEAREST // 2
+        first = np.clip(first, 0, max(len(path.T) - NEAREST, 0))
+        window_ns = round(WINDOW_S * 1e9)
+        low = np.maximum(first, np.searchsorted(path.stamps_ns, stamps - window_ns))
+        high = np.minimum(first + NEAREST, np.searchsorted(path.stamps_ns, stamps + window_ns, side="right"))
+        if (high - low < 4).any():
+            i = int(np.argmin(high - low))
+            raise CountError(
+                f"{path.where}: only {max(high[i] - low[i], 0)} poses are within {WINDOW_S:g} s of the measurement at "
+                f"{stamps[i]} ns; a time offset needs at least four, for the carrier's velocity. Log the poses faster"
+            )
+        return _fitted(poses, stamps, path, low, high, place)
 
 
-def _fitted(poses: Array, near: list[tuple[Array, Array]], place: np.ndarray) -> LocalPaths:
-    """The cubics about ``poses``, each fitted to the poses nearby (seconds away, pose); ``place`` repeats them."""
+def _fitted(
+    poses: Array, stamps_ns: np.ndarray, path: Trajectory, low: np.ndarray, high: np.ndarray, place: np.ndarray
+) -> LocalPaths:
+    """The cubics about ``poses`` at ``stamps_ns``, each fitted to ``path[low:high]``; ``place`` repeats them."""
     coefficients, leverage = np.zeros((len(poses), 3, 6)), np.zeros(len(poses))
     squares, degrees_of_freedom = np.zeros(6), 0
-    for i, (tau, others) in enumerate(near):
-        xi = se3.logmap(se3.inverse(poses[i : i + 1]) @ others)
+    block = max(1, POSES_AT_ONCE // int((high - low).max()))
+    for i in range(0, len(poses), block):
+        own = slice(i, i + block)
+        rows = low[own, None] + np.arange(int((high[own] - low[own]).max()))
+        near = rows < high[own, None]
+        rows = np.minimum(rows, len(path.T) - 1)
+        tau = (path.stamps_ns[rows] - stamps_ns[own, None]) * 1e-9
+        xi = se3.logmap((se3.inverse(poses[own])[:, None] @ path.T[rows]).reshape(-1, 4, 4)).reshape(*tau.shape, 6)
         # With enough poses a constant takes up the noise of the pose itself. Third powers of milliseconds would
-        # vanish, so the columns are in units of the window.
-        start, degree = 0 if len(tau) > 2 else 1, min(3, len(tau) - 1)
-        Z = (tau[:, None] / WINDOW_S) ** np.arange(start, degree + 1)
+        # vanish, so the columns are in units of the window. Columns and rows of zeros change nothing.
+        count = near.sum(axis=1)[:, None]
+        used = (np.arange(4) >= np.where(count > 2, 0, 1)) & (np.arange(4) < count)
+        Z = np.where(near[..., None] & used[:, None], (tau[..., None] / WINDOW_S) ** np.arange(4), 0.0)
         inverse = np.linalg.pinv(Z)
         solution = inverse @ xi
-        coefficients[i, :degree] = solution[1 - start :] / WINDOW_S ** np.arange(1, degree + 1)[:, None]
-        leverage[i] = (inverse[1 - start] ** 2).sum() / WINDOW_S**2
-        squares += ((xi - Z @ solution) ** 2).sum(axis=0)
-        degrees_of_freedom += len(tau) - Z.shape[1]
+        coefficients[own] = solution[:, 1:] / WINDOW_S ** np.arange(1, 4)[:, None]
+        leverage[own] = (inverse[:, 1] ** 2).sum(axis=1) / WINDOW_S**2
+        squares += (np.where(near[..., None], xi - Z @ solution, 0.0) ** 2).sum(axis=(0, 1))
+        degrees_of_freedom += int((count - used.sum(axis=1, keepdims=True)).sum())
     return LocalPaths(coefficients[place], leverage[place], squares / max(degrees_of_freedom, 1))
 
 
-def _neighbours(seconds: Array, i: int) -> np.ndarray:
-    """Indices of the poses about the i-th, with itself: half a second each way, at least two, not across a long gap."""
-    low = high = i
-    while low > 0 and seconds[low] - seconds[low - 1] <= LONGEST_GAP_S:
-        if seconds[i] - seconds[low - 1] > WINDOW_S and i - low >= 2:
-            break
-        low -= 1
-    while high < len(seconds) - 1 and seconds[high + 1] - seconds[high] <= LONGEST_GAP_S:
-        if seconds[high + 1] - seconds[i] > WINDOW_S and high - i >= 2:
-            break
-        high += 1
-    return np.arange(low, high + 1)
+def _neighbours(seconds: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Each pose's neighbours as ``low:high``: half a second each way, at least two, not across a long gap."""
+    index = np.arange(len(seconds))
+    long_gap = np.diff(seconds) > LONGEST_GAP_S
+    first = np.maximum.accumulate(np.where(np.r_[True, long_gap], index, 0))
+    last = np.minimum.accumulate(np.where(np.r_[long_gap, True], index, len(seconds))[::-1])[::-1]
+    low = np.searchsorted(seconds, seconds - WINDOW_S)
+    high = np.searchsorted(seconds, seconds + WINDOW_S, side="right") - 1
+    return np.maximum(first, np.minimum(low, index - 2)), np.minimum(last, np.maximum(high, index + 2)) + 1
