@@ -109,7 +109,6 @@ TABLE: dict[str, dict[str, str]] = {
         "report/test_solution_report.py": "pose_table printing sentences",
     },
     "gtsam_rwhec/report/plots": {
-        "report/plots/test_drawing.py": "labels",
         "report/plots/test_plots.py": "coverage deviations frames plotted residuals",
     },
     "gtsam_rwhec/results": {"results/test_result_file.py": "json_tree schema"},
