@@ -1,4 +1,4 @@
-"""The origin of the carriers' world moved away: the same relative poses and cost (DESIGN: centre the translations).
+"""The origin of the carriers' world moved away: the same relative poses and cost (design fact 9).
 
     python tests/benchmarks/world_origin.py
 

@@ -79,7 +79,7 @@ def test_with_much_data_the_error_is_the_noise(scale: Any, by: Any) -> None:
     problem = general(2, 2, seed=1, number_of_measurements=60, noise=NOISE, scale=scale, true_scale=true_scale).problem
     held = cross_validate(problem, by=by).overall.held_out
     true_sigma_mm = 5.0 if scale == "known" else 2.5  # B's noise is on twice the length
-    # Turned round, the certified form of a scale per target lets rotation noise act on the lever arm (DESIGN fact 7).
+    # In the inverse form, which a scale for each target needs, rotation noise acts on the lever arm (design fact 7).
     slack = 3.0 if scale == "per_target" else 1.15
     assert np.sqrt(3.0) * true_sigma_mm * 0.9 < held.translation_rms_mm < np.sqrt(3.0) * true_sigma_mm * slack
     assert held.rotation_rms_deg == pytest.approx(np.degrees(np.sqrt(3.0 / 6000.0)), rel=0.15)

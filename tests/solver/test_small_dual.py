@@ -61,7 +61,7 @@ def test_z_x_stays_zero_and_the_measure_is_reached(seed: int, scale: ScaleMode) 
 
 
 def test_it_certifies_where_the_multipliers_of_orthogonality_do_not() -> None:
-    """Of poorly excited problems nearly all need it (DESIGN fact 4a), and it suffices for most."""
+    """Of poorly excited problems nearly all need it (design fact 4a), and it suffices for most."""
     needed = helped = 0
     for seed in range(12):
         problem = simulated(1, 1, seed, motion=POORLY_EXCITED, noise=GROSS_NOISE).problem
