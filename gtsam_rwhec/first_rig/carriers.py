@@ -13,22 +13,12 @@ from gtsam_rwhec.rig.sections import PoseSource
 
 @dataclass(frozen=True)
 class MovingPair:
-    """Two frames that move against each other.
+    """Two frames that move against each other."""
 
-    Attributes
-    ----------
-    source : PoseSource
-        Where the log has their poses.
-    words : str
-        The topic, the number of poses, and how far they move.
-    on_child, on_parent : int
-        How many of the cameras' frames are fixed to the child and to the parent in tf.
-    """
-
-    source: PoseSource
-    words: str
-    on_child: int = 0
-    on_parent: int = 0
+    source: PoseSource  #: where the log has their poses
+    words: str  #: the topic, the number of poses, and how far they move
+    on_child: int = 0  #: how many of the cameras' frames are fixed to the child in tf
+    on_parent: int = 0  #: how many are fixed to the parent
 
 
 def moving_pairs(poses: Iterable[PoseTopic], camera_frames: Iterable[str]) -> tuple[list[MovingPair], list[str]]:

@@ -13,26 +13,13 @@ from gtsam_rwhec.rig import Rig
 
 @dataclass(frozen=True, eq=False)
 class SensorDetections:
-    """The detections of one sensor.
+    """The detections of one sensor."""
 
-    Attributes
-    ----------
-    records : list of DetectionRecord
-        Detections of the targets. A detection that is not used has a reason.
-    count : int
-        Number of images, or of messages of the driver, in the log.
-    strangers : Counter
-        Tags that belong to no target, by family and id: how often each was seen.
-    faults : tuple of str
-        One sentence for each image that could not be used.
-    corner_px : dict of str to float
-        Measured standard deviation of a corner along each axis, pixels, by target/sensor.
-    """
-
-    records: list[DetectionRecord]
-    count: int
-    strangers: Counter[tuple[str, str]]
-    faults: tuple[str, ...] = ()
+    records: list[DetectionRecord]  #: detections of the targets; one that is not used has a reason
+    count: int  #: number of images, or of messages of the driver, in the log
+    strangers: Counter[tuple[str, str]]  #: how often each tag that belongs to no target was seen, by family and id
+    faults: tuple[str, ...] = ()  #: one sentence for each image that could not be used
+    #: Measured standard deviation of a corner along each axis, pixels, by target/sensor.
     corner_px: Mapping[str, float] = field(default_factory=dict)
 
 

@@ -24,28 +24,14 @@ from gtsam_rwhec.vision.targets import Tag, Target, is_same_print
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """All measurements of one target by one sensor.
-
-    Attributes
-    ----------
-    target, sensor : str
-        Names of the target and the sensor.
-    stamps_ns : (N,) integers
-        The sensor's stamps, increasing.
-    B : (N, 4, 4) array
-        T_sensor_target, metres; the identity for a measurement without a pose, which has a reason.
-    covariance : (N, 6, 6) array or None
-        Covariances of B; None if a measurement has no covariance.
-    reasons : tuple of N str
-        Why a measurement is not used (`Rejection`, `RemovalReason`); empty if it is used.
-    """
+    """All measurements of one target by one sensor."""
 
     target: str
     sensor: str
-    stamps_ns: np.ndarray
-    B: Array
-    covariance: Array | None
-    reasons: tuple[str, ...]
+    stamps_ns: np.ndarray  #: (N,) integers: the sensor's stamps, increasing
+    B: Array  #: (N, 4, 4): T_sensor_target, metres; the identity for a measurement without a pose, which has a reason
+    covariance: Array | None  #: (N, 6, 6), of B; None if a measurement has no covariance
+    reasons: tuple[str, ...]  #: N reasons why a measurement is not used (`Rejection`, `RemovalReason`); empty if it is
 
     @property
     def used(self) -> np.ndarray:

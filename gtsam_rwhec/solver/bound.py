@@ -43,30 +43,15 @@ MORE_ROOM = 16.0
 
 @dataclass(frozen=True)
 class Bound:
-    """A rigorous lower bound, and what was proven about Z for it; ``Bound()`` claims nothing.
+    """A rigorous lower bound, and what was proven about Z for it; ``Bound()`` claims nothing."""
 
-    Attributes
-    ----------
-    lower_bound : float
-        Never above the optimum of the stored reduced form.
-    value : float
-        x' Z x, without any allowance: the bound in exact arithmetic if Z_rr is positive definite.
-    definite : bool
-        Whether Z_rr (without one entry, for an unknown scale) is proven positive definite: the optimum is unique.
-    semidefinite : bool
-        Whether Z_rr is proven positive semidefinite up to rounding.
-    eigenvalue : float
-        A proven lower bound on the smallest eigenvalue of Z_rr.
-    direction : (9 n,) array or None
-        An eigenvector of a negative eigenvalue of Z_rr, for a better start.
-    """
-
-    lower_bound: float = -np.inf
-    value: float = -np.inf
+    lower_bound: float = -np.inf  #: never above the optimum of the stored reduced form
+    value: float = -np.inf  #: x' Z x, without any allowance: the bound in exact arithmetic if Z_rr is positive definite
+    #: Whether Z_rr (without one entry, for an unknown scale) is proven positive definite: the optimum is unique.
     definite: bool = False
-    semidefinite: bool = False
-    eigenvalue: float = -np.inf
-    direction: Array | None = None
+    semidefinite: bool = False  #: whether Z_rr is proven positive semidefinite up to rounding
+    eigenvalue: float = -np.inf  #: a proven lower bound on the smallest eigenvalue of Z_rr
+    direction: Array | None = None  #: (9 n,): an eigenvector of a negative eigenvalue of Z_rr, for a better start
 
 
 def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:

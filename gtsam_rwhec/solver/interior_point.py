@@ -28,29 +28,15 @@ from gtsam_rwhec.solver.rotations import CONSTRAINTS
 
 @dataclass(frozen=True)
 class Relaxation:
-    """A solution of the relaxation, up to the solver's accuracy.
+    """A solution of the relaxation, up to the solver's accuracy."""
 
-    Attributes
-    ----------
-    X : (9 n + 1, 9 n + 1) array
-        The primal variable; it has rank one where the relaxation is tight.
-    multipliers : (n, 20) array
-    scale_multiplier : float
-        The multiplier of alpha >= 0; zero without this constraint.
-    primal, dual : float
-        <Q', X> and gamma.
-    iterations : int
-    solver : Start
-        Which method solved it.
-    """
-
-    X: Array
-    multipliers: Array
-    scale_multiplier: float
-    primal: float
-    dual: float
+    X: Array  #: (9 n + 1, 9 n + 1): the primal variable; it has rank one where the relaxation is tight
+    multipliers: Array  #: (n, 20)
+    scale_multiplier: float  #: the multiplier of alpha >= 0; zero without this constraint
+    primal: float  #: <Q', X>
+    dual: float  #: gamma
     iterations: int
-    solver: Start
+    solver: Start  #: which method solved it
 
 
 def solve_by_blocks(Q: Array, tolerance: float, max_iterations: int, progress: Progress | None = None) -> Relaxation:

@@ -25,46 +25,21 @@ FAR = 100.0
 
 @dataclass(frozen=True)
 class Part:
-    """One connected part of a problem, about its own gauge.
+    """One connected part of a problem, about its own gauge."""
 
-    Attributes
-    ----------
-    leaves, centers : tuple of str
-        Free frames; leaves are the larger side, and each leaf meets centers only.
-    targets, sensors : tuple of str
-        All frames of the part, fixed ones too.
-    pairs : tuple of Pair
-        The pairs that join the frames.
-    moments : MomentStack
-        Of the pairs in their order, about ``gauge``.
-    fixed : dict of str to (4, 4) array
-        Known poses, about ``gauge``.
-    priors : dict of str to list of Prior
-        About ``gauge``.
-    fixed_scales : dict of str to float
-        Known scales of targets, and of sensors with motions of their own.
-    gauge : Gauge
-        The reference points of moments and poses.
-    kind : "direct" or "inverse"
-        Which equation's residuals the form has.
-    scale : "known", "shared" or "per_target"
-    is_relative : bool
-        Whether all weights are 1, so that costs have no statistical meaning.
-    """
-
-    leaves: tuple[str, ...]
-    centers: tuple[str, ...]
-    targets: tuple[str, ...]
-    sensors: tuple[str, ...]
-    pairs: tuple[Pair, ...]
-    moments: MomentStack
-    fixed: dict[str, Array]
-    priors: dict[str, list[Prior]]
-    fixed_scales: dict[str, float]
-    gauge: Gauge
-    kind: Kind
+    leaves: tuple[str, ...]  #: free frames of the larger side; each leaf meets centers only
+    centers: tuple[str, ...]  #: the other free frames
+    targets: tuple[str, ...]  #: all of the part, fixed ones too
+    sensors: tuple[str, ...]  #: all of the part, fixed ones too
+    pairs: tuple[Pair, ...]  #: the pairs that join the frames
+    moments: MomentStack  #: of the pairs in their order, about ``gauge``
+    fixed: dict[str, Array]  #: known poses (4, 4), about ``gauge``
+    priors: dict[str, list[Prior]]  #: about ``gauge``
+    fixed_scales: dict[str, float]  #: known scales of targets, and of sensors with motions of their own
+    gauge: Gauge  #: the reference points of moments and poses
+    kind: Kind  #: which equation's residuals the form has
     scale: ScaleMode
-    is_relative: bool
+    is_relative: bool  #: whether all weights are 1, so that costs have no statistical meaning
 
     @property
     def free(self) -> tuple[str, ...]:

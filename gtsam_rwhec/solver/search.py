@@ -33,31 +33,15 @@ NOTHING_YET = Bound()
 
 @dataclass(frozen=True)
 class Found:
-    """The best rotations of a part and the best bound on the cost of any answer.
+    """The best rotations of a part and the best bound on the cost of any answer."""
 
-    Attributes
-    ----------
-    R : (n, 3, 3) array
-        In the order of ``part.free``, as the form has them.
-    cost : float
-        x'Q'x at R.
-    bound : Bound
-        Its ``lower_bound`` is at most ``cost``.
-    tolerance : float
-        The absolute gap up to which the answer counts as proven optimal.
-    path : SearchPath
-    cause : Cause
-    figures : dict of str to float
-        The numbers in the sentence of the cause, by name.
-    """
-
-    R: Array
-    cost: float
-    bound: Bound
-    tolerance: float
+    R: Array  #: (n, 3, 3), in the order of ``part.free``, as the form has them
+    cost: float  #: x'Q'x at R
+    bound: Bound  #: its ``lower_bound`` is at most ``cost``
+    tolerance: float  #: the absolute gap up to which the answer counts as proven optimal
     path: SearchPath
     cause: Cause
-    figures: dict[str, float] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)  #: numbers in the cause's sentence, by name
 
     @property
     def is_closed(self) -> bool:
