@@ -26,11 +26,8 @@ from gtsam_rwhec.files.terminal_text import printable
 def failures_in_words() -> Iterator[None]:
     """Print this package's errors and warnings as messages, each message once.
 
-    Raises
-    ------
-    typer.Exit
-        After an error of this package, with an `ExitStatus`. Other errors are faults of the program and keep their
-        traceback.
+    Raises `typer.Exit` with an `ExitStatus` after an error of this package. Other errors are faults of the program and
+    keep their traceback.
     """
     # Imported here, because completion in a shell must start fast.
     from rich.console import Console

@@ -10,17 +10,8 @@ import typer
 def refuse(context: typer.Context, options: Mapping[str, Collection[str]]) -> None:
     """Refuse those of these options that the user wrote, even with the default value.
 
-    Parameters
-    ----------
-    context : typer.Context
-        The context of the subcommand.
-    options : dict of str to names
-        Names of parameters that have no effect, by the reason and what to do.
-
-    Raises
-    ------
-    typer.BadParameter
-        The user wrote some of these options; the message has the options and the reasons.
+    `options` has names of parameters without effect, by the reason and what to do. Raises `typer.BadParameter` if the
+    user wrote some of them; its message has the options and the reasons.
     """
     lines = []
     for why, names in options.items():

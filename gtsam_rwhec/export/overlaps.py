@@ -17,16 +17,8 @@ COLUMNS, ROWS, DEPTHS = 17, 13, 25
 def overlaps(cameras: list[Camera], T_rig_camera: list[Array]) -> list[list[int]]:
     """For each camera, the other cameras whose field of view overlaps its own, between `NEAR_M` and `FAR_M`.
 
-    Parameters
-    ----------
-    cameras : list of Camera
-    T_rig_camera : list of (4, 4) arrays
-        Poses of the cameras in any common frame, metres.
-
-    Returns
-    -------
-    list of lists of int
-        Indices of cameras, ascending; the relation is symmetric.
+    `T_rig_camera` has the cameras' poses (4, 4) in any common frame, metres. Cameras stand as
+    their indices, ascending; the relation is symmetric.
     """
     points = [_view(camera) for camera in cameras]
     T_camera_rig = inverse(np.array(T_rig_camera))

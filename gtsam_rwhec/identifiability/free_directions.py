@@ -135,14 +135,8 @@ class FreeDirection:
 def reason_for(axes: int, turned_rad: float, residual_rad: float) -> FreeReason:
     """Why a direction of a pair is free.
 
-    Parameters
-    ----------
-    axes : int
-        Number of axes about which the pair's motion turned, beyond the noise: 0, 1, or 2 for two and more.
-    turned_rad : float
-        Root mean square of its turning, noise included.
-    residual_rad : float
-        Root mean square of its rotation residuals.
+    ``axes``: about how many axes the pair's motion turned, beyond the noise: 0, 1, or 2 for two and more. The others
+    are root mean squares, of its turning, noise included, and of its rotation residuals.
     """
     if axes < 2 and turned_rad > TURNED_RAD and residual_rad > 0.5 * turned_rad:
         return FreeReason.CONTRADICTION
@@ -155,17 +149,9 @@ def free_directions_of(
     """Records of the free directions that a basis spans: as many as it has columns, each as sparse as possible.
 
     Directions that turn frames come first, then changes of scales, then translations.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Frames.
-    basis : (7 n + 1, k) array
-        Free directions: [omega (rad), v (m), log own scale] for each frame, then the shared scale's logarithm.
-    length_m : float
-        How many metres count as one radian.
-    reasons : dict of str to FreeReason
-        Reason of each frame, from ``reason_for``.
+    ``basis`` (7 n + 1, k): free directions of the frames ``names``, [omega (rad), v (m), log own scale] for each frame,
+    then the shared scale's logarithm. ``length_m``: how many metres count as one radian. ``reasons``: the reason of
+    each frame, from ``reason_for``.
     """
     if basis.shape[1] == 0:
         return ()

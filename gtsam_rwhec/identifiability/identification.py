@@ -67,13 +67,8 @@ class _Weak:
 def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiability:
     """Test every direction of a part at an answer, and every direction of each pair alone.
 
-    Parameters
-    ----------
-    part : Part
-    poses : PairPoses
-        The answer.
-    J_t, J_R : (E,) arrays
-        Costs of the pairs at the answer, in the physical model; the noise is estimated from them.
+    J_t and J_R (E,) are the costs of the pairs at the answer ``poses``, in the physical model; the noise is estimated
+    from them.
     """
     noise = variance_factors(part, J_t, J_R)
     pairs = pair_information(part, poses, noise)

@@ -16,14 +16,8 @@ def free_threshold(squares: Array | float, degrees_of_freedom: int) -> Array:
 
     This is the F quantile of both numbers; with no degrees of freedom, where only the weights tell the noise, the
     chi-square quantile over ``squares``.
-
-    Parameters
-    ----------
-    squares : float or array
-        How many squares of noise the information sums.
-    degrees_of_freedom : int
-        Equations minus unknowns. The noise of rotations and the noise of translations are each estimated from half of
-        them.
+    ``squares``: how many squares of noise the information sums. ``degrees_of_freedom``: equations minus unknowns; the
+    noise of rotations and the noise of translations are each estimated from half of them.
     """
     if degrees_of_freedom <= 0:
         return np.asarray(chdtri(squares, SIGNIFICANCE) / squares)

@@ -37,14 +37,9 @@ class CarrierMotion:
 def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     """Read the carriers' motion from the tf frames or the topic that the rig file names.
 
-    Raises
-    ------
-    LogError
-        The topic is missing or has no poses of these frames, or the log has no transforms.
-    TransformError
-        No chain of transforms joins the frames, or the frames never move against each other.
-    StampError
-        All stamps are the same, or a clock was set back during the recording.
+    Raises `LogError` if the topic is missing or has no poses of these frames, or if the log has no transforms;
+    `TransformError` if no chain of transforms joins the frames, or if they never move against each other; `StampError`
+    if all stamps are the same, or if a clock was set back during the recording.
     """
     source, noise = rig.carriers.poses, rig.carriers.noise
     parent, child = source.frames
@@ -111,10 +106,8 @@ def _from_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
 def check_order(stamps_ns: np.ndarray, where: str) -> None:
     """Check the stamps (N,) of the messages of a topic, in the order in which they were logged.
 
-    Raises
-    ------
-    StampError
-        Stamps are all the same (most often zero), before 1970, after 2116, or go back by more than `BACKWARDS_S`.
+    Raises `StampError` if stamps are all the same (most often zero), before 1970, after 2116, or go back by more than
+    `BACKWARDS_S`.
     """
     if not len(stamps_ns):
         return

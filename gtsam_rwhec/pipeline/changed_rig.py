@@ -38,10 +38,7 @@ def changes(made_with: Rig, rig: Rig) -> Changes:
 def rig_for_cleaning(log: Log, rig: Rig | None) -> Rig:
     """The rig file for cleaning a log of detections: `rig`, or by default the log's own.
 
-    Raises
-    ------
-    LogError
-        `rig` has targets or cameras that differ from the detected ones.
+    Raises `LogError` if `rig` has targets or cameras that differ from the detected ones.
     """
     made_with = read_embedded_rig(log)
     if rig is None:
@@ -58,10 +55,8 @@ def rig_for_cleaning(log: Log, rig: Rig | None) -> Rig:
 def rig_for_solving(log: Log, rig: Rig | None) -> Rig:
     """The rig file for solving a cleaned log: `rig`, or by default the log's own.
 
-    Raises
-    ------
-    LogError
-        `rig` has targets or cameras that differ from the detected ones, or other carriers or settings for cleaning.
+    Raises `LogError` if `rig` has targets or cameras that differ from the detected ones, or other carriers or settings
+    for cleaning.
     """
     chosen = rig_for_cleaning(log, rig)
     keys = changes(read_embedded_rig(log), chosen).cleaning

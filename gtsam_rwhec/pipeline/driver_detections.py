@@ -33,14 +33,8 @@ def read_driver_detections(log: Log, rig: Rig, sensor: str, camera: Camera | Non
     sizes. A plane has two poses: the one nearer to the driver's pose is taken, or, without a driver's pose, the one of
     smaller reprojection error. Without intrinsics, the driver's poses and sizes are taken.
 
-    Raises
-    ------
-    LogError
-        The topic is missing or has no detections, or the driver made poses with a size other than the rig file's.
-    StampError
-        As `check_order`.
-    CameraError
-        There are no poses, and no intrinsics from which to make them.
+    Raises `LogError` if the topic is missing or has no detections, or if the driver made poses with a size other than
+    the rig file's; `StampError` as `check_order`; `CameraError` if there are neither poses nor intrinsics.
     """
     source = rig.sensors[sensor]
     assert source.detections is not None

@@ -37,12 +37,7 @@ def detect_in_log(
 ) -> dict[str, SensorDetections]:
     """The detections of every sensor that has images.
 
-    Raises
-    ------
-    LogError
-        A topic has no images, or no image of a sensor can be used.
-    StampError
-        As `check_order`.
+    Raises `LogError` if a topic has no images, or if no image of a sensor can be used; `StampError` as `check_order`.
     """
     sensor_of = {source.images: name for name, source in rig.sensors.items() if source.images is not None}
     images: dict[str, list[DetectedImage]] = {topic: [] for topic in sensor_of}

@@ -85,21 +85,9 @@ def problem_of(
 ) -> Problem:
     """The problem that the used pairs state, with stamps on the carriers' clock.
 
-    Parameters
-    ----------
-    pairs : dict of (target, sensor) to MeasuredPairs
-    rig : Rig
-        States the noise.
-    offsets_s : dict of sensor to float
-        The time offsets at which A was taken, seconds.
-    free_sizes : collection of str
-        Targets whose size is estimated.
-
-    Raises
-    ------
-    NoiseError
-        The rig file says ``noise: {corner_px: ...}`` and a measurement has no covariance, or a covariance is not
-        positive definite.
+    `rig` states the noise, `offsets_s` the time offset of each sensor at which A was taken, seconds; sizes of the
+    targets `free_sizes` are estimated. Raises `NoiseError` if the rig file says ``noise: {corner_px: ...}`` and a
+    measurement has no covariance, or a covariance is not positive definite.
     """
     problem = Problem("per_target" if free_sizes else "known")
     noise = rig.noise

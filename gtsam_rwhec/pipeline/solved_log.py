@@ -28,20 +28,8 @@ def write_solved(
 ) -> None:
     """Write the cleaned log with its solution: frames as static transforms, certificate as metadata, result attached.
 
-    Parameters
-    ----------
-    clean_path
-        The log that ``clean_log`` wrote; may be `out_path`.
-    calibrated : Calibrated
-    out_path
-        The MCAP file to write.
-    images : "copy" or "leave_out"
-        Whether the written log has the images of the cleaned log.
-
-    Raises
-    ------
-    LogError
-        A file cannot be read or written.
+    `clean_path` is the log that ``clean_log`` wrote, and may be `out_path`, the MCAP file to write; `images` says
+    whether it has the images of the cleaned log. Raises `LogError` if a file cannot be read or written.
     """
     rig, refined, pairs = calibrated.rig, calibrated.refined, calibrated.pairs.values()
     with open_log(clean_path) as log, LogWriter(out_path) as out:

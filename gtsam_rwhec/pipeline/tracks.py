@@ -90,10 +90,7 @@ def _track(target: str, sensor: str, records: list[DetectionRecord]) -> Track:
 def target_of(record: DetectionRecord, targets: Iterable[Target]) -> Target | None:
     """The target of a detection, found by its name (which this library writes) or by family and id.
 
-    Raises
-    ------
-    FrameError
-        The driver does not say the family, and two targets have the id.
+    Raises `FrameError` if the driver does not say the family, and two targets have the id.
     """
     targets = list(targets)
     mine = [t for t in targets if t.name == record.id] or [

@@ -21,10 +21,8 @@ _RESIDUAL = ("translation_rms_m", "rotation_rms_rad")
 def as_version_4(raw: dict[str, Any]) -> dict[str, Any]:
     """Move a file's fields to their places in version 4.
 
-    Raises
-    ------
-    ValueError, KeyError, TypeError, AttributeError
-        A field is missing, or is of another type than its version says.
+    Raises `ValueError`, `KeyError`, `TypeError` or `AttributeError` if a field is missing, or is of another type than
+    its version says.
     """
     heading = ("format", "format_version", "written_by", "conventions", "refined", "log")
     certified = {name: value for name, value in raw.items() if name not in heading}

@@ -36,10 +36,7 @@ INFINITIES = {
 def to_json(value: Any, place: str, field: str = "") -> Any:
     """Turn a record into JSON values: null for infinity, rows for `ROWS`, and its sentence if it has one.
 
-    Raises
-    ------
-    ValueError
-        A number is infinite or NaN in a field where it must be finite.
+    Raises `ValueError` if a number is infinite or NaN in a field where it must be finite.
     """
     if is_dataclass(value) and not isinstance(value, type):
         tree = {f.name: to_json(getattr(value, f.name), f"{place}.{f.name}", f.name) for f in fields(value)}
@@ -68,10 +65,7 @@ def to_json(value: Any, place: str, field: str = "") -> Any:
 def from_json(value: Any, place: str, field: str) -> Any:
     """Reverse `to_json`; a pair that is a key becomes its JSON text.
 
-    Raises
-    ------
-    ValueError
-        A number is infinite or NaN, or a row lacks its target or sensor.
+    Raises `ValueError` if a number is infinite or NaN, or if a row lacks its target or sensor.
     """
     if isinstance(value, dict):
         told = {key: item for key, item in value.items() if key != SENTENCE or not isinstance(item, str)}

@@ -30,16 +30,9 @@ def deflated_eigenvalue(
 ) -> float:
     """A proven lower bound on the smallest eigenvalue of Z_rr; minus infinity when nothing is proven.
 
-    Parameters
-    ----------
-    form : ReducedForm
-    multipliers : (n, 20) array
-    arrow_part : (9 n, 9 n) array
-        Z_rr before G'G is subtracted.
-    rounded : (9 n,) array
-        A diagonal that dominates the rounding in ``arrow_part``.
-    slack : (n, 9) array
-        The verified test's allowance: it cannot tell smaller eigenvalues from zero.
+    ``multipliers`` (n, 20); ``arrow_part`` (9 n, 9 n): Z_rr before G'G is subtracted; ``rounded`` (9 n,): a diagonal
+    that dominates its rounding; ``slack`` (n, 9): the verified test's allowance, which cannot tell smaller eigenvalues
+    from zero.
     """
     N = len(arrow_part)
     G = form.G[:, :-1]

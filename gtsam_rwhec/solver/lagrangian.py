@@ -20,10 +20,7 @@ WIDE_UNIT = float(np.finfo(Wide).eps) / 2.0
 def lagrangian(form: ReducedForm, multipliers: Array, x: Array) -> tuple[Any, Array, float, Array]:
     """x'Zx and Z x for x (9 n + 1,), Z = Q' - Lambda, in extended precision, each with a bound on its rounding.
 
-    Returns
-    -------
-    value, Zx : extended precision
-    value_error, Zx_error : float and (9 n + 1,) array
+    Returns x'Zx, Z x (9 n + 1,), the bound for x'Zx, and the bounds (9 n + 1,) for Z x.
     """
     n, split = form.rotations, 9 * form.leaves
     wide_x = x.astype(Wide)

@@ -61,12 +61,8 @@ def with_scale_multiplier(form: ReducedForm, nu: float) -> ReducedForm:
 def run_with_nonnegative_scale(search: Search) -> Found:
     """Solve with alpha >= 0 as a constraint; the answer is the unconstrained optimum where that has a positive scale.
 
-    Raises
-    ------
-    ScaleError
-        When scale zero costs less than every positive scale that was found.
-    OptionError
-        For more than ``MAX_FRAMES`` frames.
+    Raises `ScaleError` when scale zero costs less than every positive scale that was found, and `OptionError` for more
+    than ``MAX_FRAMES`` frames.
     """
     found = search.run("auto", None)
     if search.part.kind != "direct":

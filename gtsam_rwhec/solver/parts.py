@@ -77,15 +77,8 @@ def parts_of(problem: Problem) -> list[Part]:
     """Split a problem into connected parts, and check the problem as a whole.
 
     A scale that all targets share joins all frames to one part.
-
-    Raises
-    ------
-    CountError
-        No measurements.
-    FrameError
-        A fixed frame, prior or scale of a frame that no measurement mentions.
-    UnderdeterminedError
-        Fewer equations than unknowns in a part.
+    Raises `CountError` without measurements; `FrameError` for a fixed frame, prior or scale of a frame that no
+    measurement mentions; `UnderdeterminedError` for fewer equations than unknowns in a part.
     """
     problem.require_pairs()
     frames = problem.targets + problem.sensors

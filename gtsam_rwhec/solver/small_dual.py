@@ -49,21 +49,9 @@ def stationary_multipliers(form: ReducedForm, R: Array, multipliers: Array) -> A
 def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int = 60) -> tuple[Array, float]:
     """Maximise t with Z >= t P across x over the multipliers' freedom.
 
-    Parameters
-    ----------
-    form : ReducedForm
-    R : (n, 3, 3) array
-        A critical point.
-    multipliers : (n, 20) array
-        With Z x = 0.
-
-    Returns
-    -------
-    multipliers : (n, 20) array
-        Still with Z x = 0.
-    t : float
-        Z - t P is positive definite across x; a positive t proves x optimal. Minus infinity, with the multipliers as
-        given, where rounding has left Q' with a negative eigenvalue.
+    R (n, 3, 3) is a critical point. Z x = 0 at the given multipliers (n, 20) and at the returned ones. A positive t
+    proves x optimal: Z - t P is positive definite across x. Where rounding has left Q' with a negative eigenvalue, t
+    is minus infinity and the multipliers are the given ones.
     """
     n = len(R)
     null = null_multipliers(R)

@@ -53,11 +53,8 @@ def is_positive_definite(matrix: Array, margin: Array | float = 0.0) -> bool:
 def arrow_is_positive_definite(D: Array, C: Array, E: Array, leaf_margin: Array, border_margin: Array) -> bool:
     """Whether arrow(D, C, E) - diag(margin) is proven positive definite.
 
-    Parameters
-    ----------
-    D, C, E : (L, m, m), (L, m, b), (b, b) arrays
-    leaf_margin, border_margin : (L, m), (b,) arrays
-        Subtracted from the diagonal; negative for a weaker test.
+    D (L, m, m), C (L, m, b), E (b, b). The margins (L, m) and (b,) are subtracted from the diagonal; they are negative
+    for a weaker test.
     """
     size = D.shape[0] * D.shape[1] + len(E)
     leaf_diagonal = np.einsum("lii->li", D)

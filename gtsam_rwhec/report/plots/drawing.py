@@ -55,11 +55,7 @@ def picture(
     """Yield a figure, and write it as a PNG when the block ends without an error; equal figures give equal bytes.
 
     The layout "compressed" is for panels with a fixed ratio of their sides.
-
-    Raises
-    ------
-    FileFormatError
-        The file cannot be written.
+    Raises `FileFormatError` if the file cannot be written.
     """
     from matplotlib import style
     from matplotlib.backends.backend_agg import FigureCanvasAgg
