@@ -126,8 +126,8 @@ def closed_form(A: Array, B: Array, options: ConsensusOptions) -> tuple[Array, A
     """X, Y (H, 4, 4) and scale (H,) of H samples of n measurements, A and B (H, n, 4, 4).
 
     First the rotations (Shah 2013): sum R_A (x) R_B maps vec R_X to n vec R_Y. The first singular vectors of the sum,
-    projected to SO(3), are R_Y and R_X. Then translations and scale by least squares, with minimum norm where a
-    sample leaves a direction free.
+    projected to SO(3), are R_Y and R_X. Then least squares gives translations and scale: the solution of minimum norm
+    if a sample leaves a direction free.
     """
     H, n = A.shape[:2]
     R_A, R_B = A[..., :3, :3], B[..., :3, :3]

@@ -33,7 +33,7 @@ HELP = (
 
 
 def exit_status(judgement: rw.Judgement) -> ExitStatus:
-    """The exit status that the gravest ground of a judgement leads to."""
+    """The exit status for the most serious ground of a judgement."""
     ground = rw.Ground
     status = {
         ground.NO_BOUND: ExitStatus.NOT_CERTIFIED,

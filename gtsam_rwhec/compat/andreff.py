@@ -9,7 +9,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.methods.normal_equations import solve_scaled
 from gtsam_rwhec.solver.rotations import project
 
-#: An eigenvalue below this of the scaled normal equations is rounding.
+#: An eigenvalue below this of the scaled normal equations is rounding error.
 SINGULAR = 1e-15
 #: What to tell a user whose poses leave entries of the rotation free.
 LENGTH_UNKNOWN = (

@@ -13,7 +13,7 @@ from gtsam_rwhec.geometry.poses import LARGEST_M, ROTATION_TOLERANCE, Array, det
 
 #: Fewest poses that hold two motions about different axes; OpenCV asks for as many.
 FEWEST_POSES = 3
-#: Share of the largest possible turning of the axes below which turning is rounding.
+#: Share of the largest possible turning of the axes below which turning is rounding error.
 PARALLEL = 1e-13
 #: Second row times third row, entries (1, 2), (2, 0), (0, 1), then (2, 1), (0, 2), (1, 0): their cross product.
 _NEXT, _AFTER = [4, 5, 3, 5, 3, 4], [8, 6, 7, 7, 8, 6]

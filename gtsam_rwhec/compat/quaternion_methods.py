@@ -16,7 +16,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, to_rotations
 from gtsam_rwhec.solver.rotations import project
 
-#: Least 2 sin(angle / 2) of a motion that Tsai's method uses, by both sensors; observed of OpenCV 4 to 1e-14.
+#: Least 2 sin(angle / 2) of a motion that Tsai's method uses, by both sensors; found by tests of OpenCV 4, to 1e-14.
 TSAI_LEAST = 0.3
 #: Most 2 sin(angle / 2) of such a motion.
 TSAI_MOST = 1.7

@@ -53,7 +53,7 @@ class Stations:
 
 
 def stations_of(R_G: Array, t_G: Array, R_C: Array, t_C: Array) -> Stations:
-    """Stations about the mean origins: motions do not depend on origins, but rounding does."""
+    """Stations with translations relative to their mean: the origin changes no motion, only rounding errors."""
     u = np.einsum("nba,nb->na", R_C, t_C)
     origin = u.mean(axis=0)
     return Stations(R_G, t_G - t_G.mean(axis=0), R_C, u - origin, origin)

@@ -77,7 +77,7 @@ def _reason(camera: Camera | None) -> str:
 
 
 def _four(camera: Camera) -> Array:
-    """k1, k2, p1, p2. A pinhole has zeros: more readers of camchains know them than know distortion_model: none."""
+    """k1, k2, p1, p2. A pinhole has zeros: more programs read these than read distortion_model: none."""
     return np.pad(camera.D, (0, RADTAN))[:RADTAN]
 
 

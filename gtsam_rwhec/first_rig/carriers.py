@@ -13,7 +13,7 @@ from gtsam_rwhec.rig.sections import PoseSource
 
 @dataclass(frozen=True)
 class MovingPair:
-    """Two frames that move against each other."""
+    """Two frames that move relative to each other."""
 
     source: PoseSource  #: where the log has their poses
     words: str  #: the topic, the number of poses, and how far they move
@@ -22,11 +22,11 @@ class MovingPair:
 
 
 def moving_pairs(poses: Iterable[PoseTopic], camera_frames: Iterable[str]) -> tuple[list[MovingPair], list[str]]:
-    """Pairs of frames that could be the carriers, the likeliest first; and remarks on pairs that cannot be used.
+    """Pairs of frames that could be the carriers, the most likely first; and remarks on pairs that cannot be used.
 
-    Frames of tf that do not move against each other are one body. Each moving body that carries no other moving body
-    gives a pair. The child is the body's own moving frame; the parent is the frame below the first moving link of its
-    chain, such as base for base -> link -> hand.
+    Frames of tf that do not move relative to each other are one body. Each moving body that carries no other moving
+    body gives a pair. The child is the body's own moving frame; the parent is the frame below the first moving link of
+    its chain, such as base for base -> link -> hand.
     """
     poses = list(poses)
     cameras = list(camera_frames)
@@ -90,6 +90,6 @@ def _words(series: PoseTopic, where: str) -> str:
 
 
 def frame_name(text: str) -> str:
-    """Text made a frame's name: other characters become _; empty if no character is left."""
+    """A valid frame name made from a text: characters that are not allowed become _; empty if none is left."""
     words = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in text)[:60].strip("_")
     return words if is_name(words) else (f"f_{words}" if words else "")

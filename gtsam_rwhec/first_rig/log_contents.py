@@ -78,7 +78,7 @@ class PoseTopic:
     kept: list[Array] = field(default_factory=list)
 
     def add(self, T: Array) -> None:
-        """Count a pose, and keep every `stride`-th: the kept poses are spread evenly over all."""
+        """Count a pose, and keep every `stride`-th: the kept poses are spread evenly over the log."""
         if self.count % self.stride == 0:
             self.kept.append(T.copy())
             if len(self.kept) > POSES:
@@ -95,7 +95,7 @@ class PoseTopic:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the child moves against the parent."""
+        """Whether the child moves relative to the parent."""
         if self.is_static or len(self.kept) < 2:
             return False
         moved, turned = self.motion()

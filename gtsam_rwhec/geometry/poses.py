@@ -27,7 +27,7 @@ PosesLike = ArrayLike | Sequence[gtsam.Pose3]
 ROTATION_TOLERANCE = 1e-3
 #: Larger translations (m) are refused: their squares would drown all others.
 LARGEST_M = 1e15
-#: Differences of R'R from I below this are rounding, and the rotation stays as it is.
+#: Differences of R'R from I below this are rounding error, and the rotation stays as it is.
 ROTATION_ROUNDING = 1e-13
 
 
@@ -89,7 +89,7 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
 def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str) -> Array:
     if order not in ("wxyz", "xyzw"):
         raise PoseError(
-            f"{where}: rows of 7 need the quaternion's order named, order='wxyz' or order='xyzw', got {order!r}"
+            f"{where}: rows of 7 need the order of the quaternion; give order='wxyz' or order='xyzw', not {order!r}"
         )
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if bad.size:
@@ -109,7 +109,7 @@ def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str
 
 
 def checked_rows(block: Array, first: int, where: str, out: Array | None = None) -> tuple[Array, int]:
-    """Check a block of transforms and lay it out for the moments.
+    """Check a block of transforms and write it as the rows from which moments are computed.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from gtsam_rwhec.handeye.saddle import minimum
 ITERATIONS = 50
 #: Alpha has converged when it changes by less than this part. Residuals tell alpha to a few per cent at best.
 STILL = 1e-6
-#: Residuals below this part of the motions' own size are rounding and tell nothing.
+#: Residuals below this part of the motions' own size are rounding error and tell nothing.
 ROUNDING = 1e-24
 #: Alpha stays within this factor of its starting value.
 RANGE = 1e6
@@ -28,7 +28,7 @@ def estimate_alpha(motions: Motions, weights: Array | None = None, prior: DualQu
 
     Each step lowers N log(sum |A q|^2) + N log(sum |B q + A q'|^2): the likelihood of normal residuals whose two
     sigmas are unknown. For given poses alpha is that ratio, and for given alpha the poses are DQOpt's. Where the
-    residuals are rounding, alpha stays as it is; at the start it is the ratio of the motions' own sizes.
+    residuals are rounding error, alpha stays as it is; at the start it is the ratio of the motions' own sizes.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.methods.estimate import Outcome
 
-#: Squares of singular values below this part of the largest are rounding.
+#: Squares of singular values below this part of the largest are rounding error.
 NULL = 1e-13
 #: Rows of ``Motions.rows`` that hold vector parts.
 _VECTORS = [0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]

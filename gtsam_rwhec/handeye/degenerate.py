@@ -7,8 +7,8 @@ alone would create there:
 - With noise delta q_C, delta q_H, A_i has E |A_i p|^2 = E |delta q_C|^2 + E |delta q_H|^2 for *every* unit p, since L
   and R of a unit quaternion are rotations. At the answer the signal's part of A q is zero. So |A q|^2 is that noise,
   and A'A has it in every direction. t enters as A q' (eq. 7), so its information is that of A'A.
-- The same holds for the whole residual: lambda is what noise makes of q'Z q for the best q, and so for every q. The
-  information about the rotation is in the eigenvalues of Z(mu*).
+- The same holds for the whole residual: at the best q, q'Z q = lambda comes from noise alone, and noise adds as
+  much for every other q. The information about the rotation is in the eigenvalues of Z(mu*).
 
 N motions give 3 N squares of noise to a direction, and the fit takes 6 of the 6 N equations.
 """
@@ -25,7 +25,7 @@ from gtsam_rwhec.handeye.saddle import best_translation
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind, FreeReason
 from gtsam_rwhec.identifiability.threshold import free_threshold
 
-#: Information below this part of the largest is rounding.
+#: Information below this part of the largest is rounding error.
 ROUNDING = 1e-12
 #: Step (rad) of the finite difference that tells how the translation follows a turn.
 STEP_RAD = 1e-5
@@ -44,7 +44,7 @@ def free_directions(request: Request, q: Array, values: Array, vectors: Array) -
     """
     cost, V = request.cost, times_vectors(q)
     of_t, directions = np.linalg.eigh(V.T @ cost.M @ V)  # q' = (t / 2, 0) (x) q
-    of_prior = 0.0 if request.prior is None else request.prior.b  # the prior's part of M is no sign of noise
+    of_prior = 0.0 if request.prior is None else request.prior.b  # the prior adds to M without noise
     noise = max(float(q @ cost.M @ q) - of_prior, 0.0)
     threshold = _threshold(cost.count)
     moves = directions[:, of_t <= threshold * noise + ROUNDING * of_t[2]]
@@ -68,9 +68,9 @@ def free_of_rotations_alone(request: Request) -> tuple[FreeDirection, ...]:
 
 
 def _threshold(count: int) -> float:
-    """Information up to which a direction is free, over the noise along the answer itself.
+    """Information up to which a direction is free, divided by the noise along the answer.
 
-    The fit takes away one part in ``count`` of a motion's three squares of noise along the answer.
+    The fit makes the noise along the answer smaller by the factor (count - 1) / count. The threshold corrects this.
     """
     return float(free_threshold(3.0 * count, 6 * count - 6)) * count / (count - 1.0)
 

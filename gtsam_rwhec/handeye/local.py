@@ -1,7 +1,7 @@
 """Nonlinear least squares: DQNLOpt and DQNLOptRnd on the cost (8), ChVecOpt and QuatVecOpt on the costs (30).
 
-Each cost is a quadratic form y'F y of a few numbers y that a pose is written as. F does not grow with the number of
-motions. With F = L'L, the residual L y has 8 to 22 rows, and the same cost, gradient and Gauss-Newton Hessian as the
+Each cost is a quadratic form y'F y, where the few numbers y are computed from the pose. F does not grow with the number
+of motions. With F = L'L, the residual L y has 8 to 22 rows, and the same cost, gradient and Gauss-Newton Hessian as the
 residuals of all motions together. The unknowns are a quaternion p of any length (q = p / |p|) and a translation in
 units of 1/alpha, so every start can reach every rotation.
 """
@@ -145,7 +145,7 @@ def _descend(factor: Array, lift: Lift, start: Array, unit: float) -> Array:
 
 
 def root(form: Array) -> Array:
-    """L with L'L a positive semidefinite form. Eigenvalues that are rounding are set to zero.
+    """L with L'L a positive semidefinite form. Eigenvalues that are rounding error are set to zero.
 
     The form is first brought to unit diagonal: rotations and lengths of any unit keep their own digits.
     """
@@ -158,7 +158,7 @@ def root(form: Array) -> Array:
 
 
 def rotation_slopes(q: Array) -> Array:
-    """Derivatives (9, 4) of vec R (rows) by a unit quaternion xyzw. Half of them times q is vec R."""
+    """Derivatives (9, 4) of vec R (rows) by a unit quaternion xyzw. vec R is half the derivatives times q."""
     slopes: Array = 2.0 * _QUADRATIC @ q
     return slopes
 

@@ -31,7 +31,7 @@ from gtsam_rwhec.methods.estimate import Outcome
 
 #: The searches end at this many times eq. 22's gap. The gap is an upper bound, up to rounding.
 BEYOND = 1.25
-#: A remainder below this part of its dividend is rounding: two roots have met.
+#: A remainder below this part of its dividend is rounding error: two roots have met.
 ROUNDING = 1e-15
 #: The resultant's search starts at this part of eq. 22's gap: at 0 one root is mu = 0 and spoils the roots' mean.
 NOT_ZERO = 1e-3
@@ -63,7 +63,7 @@ class Curve:
 
 
 def curve(relaxed: RelaxedCost) -> Curve | None:
-    """The curve's coefficients (eq. 15); None where the gap of eq. 22 is rounding, and mu = 0 is the answer."""
+    """The curve's coefficients (eq. 15); None where the gap of eq. 22 is rounding error, and mu = 0 is the answer."""
     gap = relaxation_gap(relaxed)
     if not gap > 1e-15 * max(abs(float(relaxed.values[0])), 1e-15 * abs(float(relaxed.values[3]))):
         return None

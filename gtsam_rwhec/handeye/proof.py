@@ -28,7 +28,7 @@ def proven(K: Array) -> bool:
 
 
 def proven_bound(form: Callable[[float], Array], value: float, step: float) -> float:
-    """The first proven bound among value - step, value - 4 step, value - 16 step, ...; 0 where none above 0 is proven.
+    """The first proven bound among value - step, value - 4 step, value - 16 step, ...; 0 if no positive one is proven.
 
     Parameters
     ----------

@@ -97,7 +97,7 @@ METHODS: dict[str, Method[[Request]]] = {
 _COST_WITH_PRIOR = {"imaginary": "eq. 26", "distance": "eq. 25"}
 #: A gap is closed when it is below this part of the cost,
 CLOSED = 1e-9
-#: or below this part of the squares that cancel in the cost, which is rounding,
+#: or below this part of the squares that cancel in the cost, which is rounding error,
 ROUNDING = 1e-12
 #: or below this part of all squares: the cost is then zero.
 NOTHING = 1e-28

@@ -16,7 +16,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.dual_quaternions import times_vectors
 
-#: Eigenvalues of M below this part of its largest are rounding: M is singular.
+#: Eigenvalues of M below this part of its largest are rounding error: M is singular.
 SINGULAR = 1e-14
 #: The search ends when a step gains less than this part of lambda_0, far below its rounding.
 GAIN = 1e-17

@@ -19,7 +19,7 @@ def check_one_kind(weights: ArrayLike | None, covariances: ArrayLike | None) -> 
 
 
 def check_alpha(alpha: float | str) -> float:
-    """Alpha as a float; an OptionError when it is not positive and finite, or its square overflows sums."""
+    """Alpha as a float; an OptionError when it is not a positive number from 1 / LARGEST to LARGEST."""
     try:
         number = float(alpha)
     except (TypeError, ValueError):

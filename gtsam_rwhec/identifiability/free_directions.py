@@ -67,7 +67,7 @@ class FreeReason(StrEnum):
 
 @dataclass(frozen=True)
 class FreeDirection:
-    """One direction in which the answer can move while the measurements fit as well, up to their noise.
+    """A direction in which the answer can move without a change of the residuals larger than the noise.
 
     The direction has length 1, where a rotation of 1 rad, a translation of ``length_m``, a scale times e, and a time
     offset of 1 s each count as 1. Its sign is arbitrary. ``str()`` is a sentence.

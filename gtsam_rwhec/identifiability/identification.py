@@ -2,11 +2,12 @@
 
 Noise excites every direction a little, so the rank decides nothing on real data. A direction counts as *free* when the
 motions give no more information about it than noise alone would create if the true motions left the direction open
-(``information.pair_information``). In units of that noise a free direction has a ratio of mean 1: a sum of about
-m = 2 N squares of noise over a noise variance estimated with nu degrees of freedom, an F variate. The threshold is the
-99.9 % quantile F(m, nu): a free direction counts as determined once in a thousand times. The noise of rotations and the
-noise of translations are estimated separately, each from about half of the degrees of freedom: three measurements with
-six degrees of freedom need a ratio of 130, a hundred measurements need 1.5.
+(``information.pair_information``). The test is the ratio of the information to that of noise alone. For a free
+direction it has mean 1: it is an F variate, a sum of about m = 2 N squares of noise over a noise variance with nu
+degrees of freedom. The threshold is the 99.9 % quantile F(m, nu): a free direction counts as determined once in a
+thousand times. The noise of rotations and the noise of translations are estimated separately, each from about half of
+the degrees of freedom: three measurements with six degrees of freedom need a ratio of 130, a hundred measurements need
+1.5.
 
 Rotation residuals depend on rotations only, so rotations are tested first. If all rotations are determined, the second
 test is about translations and scales at those rotations; if not, one test of everything uses all residuals together.

@@ -52,7 +52,7 @@ def variance_factors(part: Part, J_t: Array, J_R: Array) -> PartVarianceFactors:
     """
     counts, N = part.moments.count, part.number_of_measurements
     degrees_of_freedom = 6 * N - part.number_of_unknowns
-    if degrees_of_freedom <= 0:  # only the weights tell the noise
+    if degrees_of_freedom <= 0:  # the noise cannot be estimated: use the weights
         return PartVarianceFactors(np.ones(len(counts)), np.ones(len(counts)), degrees_of_freedom)
     correction = 6.0 * N / degrees_of_freedom
     lengths = np.einsum("eii->e", part.moments.translation[:, T_B, T_B])

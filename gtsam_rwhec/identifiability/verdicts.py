@@ -35,7 +35,7 @@ class PairIdentifiability:
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What a problem's measurements determine. ``str()`` is a sentence about the pairs and the whole.
+    """What a problem's measurements determine. ``str()`` is a sentence about the pairs and the whole problem.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Identifiability:
     free_directions : tuple of FreeDirection
         They span all that is free.
     weakest, threshold : float
-        As in ``PairIdentifiability``, for the whole.
+        As in ``PairIdentifiability``, for the whole problem.
     pairs : dict of (target, sensor) to PairIdentifiability
         Each pair alone: the grid of the paper's Figure 8.
     parts : tuple of tuple of str

@@ -156,7 +156,7 @@ class Log:
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records of all files by name; the last record of a name counts.
 
-        The files' index leads to them: a file without an index, or a truncated file, has none.
+        They are found through a file's index: a file without an index, or a truncated file, gives none.
         """
         return {entry.name: dict(entry.metadata) for entry in self._indexed(lambda reader: reader.iter_metadata())}
 

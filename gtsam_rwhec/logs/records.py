@@ -82,7 +82,7 @@ class IntrinsicsRecord:
     Attributes
     ----------
     model : str
-        The log's own word: ``plumb_bob``, ``equidistant``, ``kannala_brandt``, ...
+        The model's name in the log: ``plumb_bob``, ``equidistant``, ``kannala_brandt``, ...
     K, P : (3, 3) and (3, 4) arrays
         Camera matrix and projection matrix of the rectified image, in pixels.
     R : (3, 3) array

@@ -153,9 +153,9 @@ def linear_outcome(stack: Stack, R: Array, notes: Iterable[str] = ()) -> Outcome
 
 
 def linear_translations(stack: Stack, R: Array, *, unknown_scale: bool = False) -> tuple[Array, float]:
-    """t (n, 3) in metres and alpha of least |R_A t_X - t_Y + alpha t_A - R_Y t_B| (eq. 8b), for rotations R (n, 3, 3).
+    """t (n, 3) in metres and alpha that minimise |R_A t_X - t_Y + alpha t_A - R_Y t_B| (eq. 8b), given R (n, 3, 3).
 
-    Raises UnderdeterminedError when the rotations measured do not determine t (or, with unknown scale, the translations
+    Raises UnderdeterminedError when the measured rotations do not determine t (or, with unknown scale, the translations
     do not determine alpha), and ScaleError when alpha is not positive.
     """
     n = len(R)

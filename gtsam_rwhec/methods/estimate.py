@@ -85,7 +85,7 @@ class Estimate(Generic[X]):
     method : str
         The method's name.
     X : dict of str to gtsam.Pose3, or gtsam.Pose3
-        T_targetcarrier_target of each target, metres; of A X = X B the one pose, T_c_h with C_i X = X H_i.
+        T_targetcarrier_target of each target, metres. For A X = X B it is one pose: T_c_h with C_i X = X H_i.
     Y : dict of str to gtsam.Pose3
         T_sensorcarrier_sensor of each sensor, metres; empty for A X = X B.
     scale : float or dict of str to float

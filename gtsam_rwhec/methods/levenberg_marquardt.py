@@ -16,7 +16,7 @@ Chart = Callable[[Array], tuple[Array, Array]]
 
 #: Damping of the first step, relative to the Hessian's diagonal; a failed step multiplies it by 10, a good one by 0.1.
 FIRST_DAMPING = 1e-6
-#: With more damping than this the steps are rounding.
+#: With more damping than this the steps are rounding error.
 MOST_DAMPING = 1e9
 #: Largest entry of a step (rad, m) that is taken although rounding hides whether the cost falls.
 FLAT_STEP = 1e-7

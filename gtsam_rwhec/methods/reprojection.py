@@ -305,8 +305,9 @@ def _in_plane(points: Array, name: str) -> tuple[Array, Array]:
     _, singular, Vt = np.linalg.svd(points - middle)
     if singular[2] > FLAT * singular[0]:
         raise TargetError(
-            f"the corners of {name} lie in no plane (off by {singular[2] / np.sqrt(len(points)):.3g} m), and only flat "
-            "targets have poses from single images; give a start by MethodOptions.start"
+            f"the corners of {name} do not lie in one plane (the root mean square distance is "
+            f"{singular[2] / np.sqrt(len(points)):.3g} m), and only flat targets have poses from "
+            "single images; give a start by MethodOptions.start"
         )
     if singular[1] <= FLAT * singular[0]:
         raise TargetError(f"the corners of {name} lie on one line, which determines no pose; give corners in a plane")

@@ -24,7 +24,7 @@ from gtsam_rwhec.problem.problem import Problem
 SETTLED = 1e-6
 #: Most rounds.
 ROUNDS = 50
-#: Standard deviations (rad and m) below this are rounding: exact data have no variance to weigh by.
+#: Standard deviations (rad and m) below this are rounding error: exact data have no variance to weigh by.
 SMALLEST = 1e-9
 
 

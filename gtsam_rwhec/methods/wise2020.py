@@ -45,7 +45,7 @@ class CertifiedRotations:
 
     @property
     def gap(self) -> float:
-        """Cost minus bound, relative to the cost; it says nothing of exact data, whose cost is rounding."""
+        """Cost minus bound, relative to the cost; it says nothing of exact data, whose cost is rounding error."""
         return (self.cost - self.lower_bound) / max(self.cost, 1e-300)
 
 

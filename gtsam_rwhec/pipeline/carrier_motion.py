@@ -38,8 +38,8 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     """Read the carriers' motion from the tf frames or the topic that the rig file names.
 
     Raises `LogError` if the topic is missing or has no poses of these frames, or if the log has no transforms;
-    `TransformError` if no chain of transforms joins the frames, or if they never move against each other; `StampError`
-    if all stamps are the same, or if a clock was set back during the recording.
+    `TransformError` if no chain of transforms joins the frames, or if they never move relative to each other;
+    `StampError` if all stamps are the same, or if a clock was set back during the recording.
     """
     source, noise = rig.carriers.poses, rig.carriers.noise
     parent, child = source.frames

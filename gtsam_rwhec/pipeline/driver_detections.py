@@ -30,8 +30,8 @@ def read_driver_detections(log: Log, rig: Rig, sensor: str, camera: Camera | Non
     """Read the detections of a sensor from the topic of its driver.
 
     With intrinsics, poses are computed from the corners and the rig file's sizes; the driver may have used other
-    sizes. A plane has two poses: the one nearer to the driver's pose is taken, or, without a driver's pose, the one of
-    smaller reprojection error. Without intrinsics, the driver's poses and sizes are taken.
+    sizes. The corners of a plane fit two poses. The one nearer to the driver's pose is taken, or, without a driver's
+    pose, the one with the smaller reprojection error. Without intrinsics, the driver's poses and sizes are taken.
 
     Raises `LogError` if the topic is missing or has no detections, or if the driver made poses with a size other than
     the rig file's; `StampError` as `check_order`; `CameraError` if there are neither poses nor intrinsics.

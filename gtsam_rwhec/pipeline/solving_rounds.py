@@ -27,11 +27,11 @@ from gtsam_rwhec.solving.certified_solution import solve
 Pairs = dict[Pair, MeasuredPairs]
 #: What a solution is for: to find outliers, to estimate time offsets, or to be the answer.
 Purpose = Literal["outliers", "time offsets", "answer"]
-#: Rounds of outliers and time offsets, at most, and of A at new time offsets.
+#: Most rounds that estimate outliers and time offsets, and that compute A again at the new time offsets.
 ROUNDS = 6
 #: Seconds. If no time offset changes by more than this, the rounds end.
 SETTLED_S = 2e-5
-#: Seconds. If no time offset changes by more than this, the same measurements are outliers.
+#: Seconds. If no time offset changes by more than this, outliers are not searched for again.
 SAME_OUTLIERS_S = 1e-4
 
 
@@ -137,12 +137,12 @@ class SolvingRounds:
         return sizes, self.at(given.pairs, marked.offsets_s)
 
     def sizes_as_seen(self, given: SynchronisedPairs) -> tuple[SizeFields, ...]:
-        """Estimates of sizes that count as known; empty if the measurements do not determine them."""
+        """Measured scales of sizes that the solver takes as known; empty if the measurements do not determine them."""
         self.progress("looking at the targets' sizes")
         try:
             return self._sizes_in(self.refined(given, self.rig.targets, "time offsets"))
         except RwhecError:
-            return ()  # the answer, with sizes as stated, does not need this one
+            return ()  # the answer uses the stated sizes and does not need these estimates
 
     def _sizes_in(self, refined: Refined) -> tuple[SizeFields, ...]:
         assert not isinstance(refined.scale, float)

@@ -1,4 +1,4 @@
-"""What the user states: measurements by pair, scale, priors and known frames; and the moments that hold all of it."""
+"""What the user states (measurements by pair, scale, priors, known frames) and the moments of the measurements."""
 
 import lazy_loader
 

@@ -33,7 +33,7 @@ class ChordalModel:
 
     @property
     def given_noise(self) -> dict[Pair, tuple[float, float]]:
-        """Standard deviations as given, one pair's measurements together: rad and (measured) metres an axis."""
+        """Given standard deviations, averaged over each pair's measurements: rad and (measured) metres per axis."""
         return {
             pair: (
                 float(np.sqrt(0.5 * part.moments.count[e] / part.moments.kappa[e])),

@@ -81,12 +81,12 @@ class GeodesicModel:
 
     @property
     def reweighs(self) -> bool:
-        """Whether the weights depend on the estimate: A's noise is propagated into the residual there."""
+        """Whether the weights depend on the estimate: they do if A's noise is propagated into the residual."""
         return self.options.carrier_noise is not None and self.carriers is None
 
     @property
     def given_noise(self) -> dict[Pair, tuple[float, float]]:
-        """Standard deviations as given, root mean square over measurements and axes: rad and metres."""
+        """Given standard deviations, root mean square over each pair's measurements and axes: rad and metres."""
         result = {}
         for item in self.data:
             variances = np.einsum("nii->i", item.covariance) / item.count

@@ -26,7 +26,7 @@ from gtsam_rwhec.refinement.unknowns import Unknown, rows_of, slots_of
 SHARE = 0.05
 #: Distance of an estimate from the truth along a free direction, in units (the typical length).
 DISPLACED = 1.0
-#: Share of the largest eigenvalue of an equilibrated information below which an eigenvalue is rounding.
+#: Share of the largest eigenvalue of an equilibrated information below which an eigenvalue is rounding error.
 ROUNDING = 1e-13
 
 
@@ -90,7 +90,7 @@ class JointCovariance:
         """The movement (m, k) of the rows of G along each free direction that moves one parameter by a unit."""
         if self.free.shape[1] == 0:
             return np.zeros((len(G), 0))
-        # Many frames that move together share one direction's length.
+        # The largest entry sets the length: a direction may move many frames.
         largest = np.linalg.norm(self.free, axis=1).max()
         moved: Array = (G * self.unit) @ self.free / largest
         return moved

@@ -111,7 +111,7 @@ class TruncatedLeastSquares:
         return self.vote(fit, keep)
 
     def vote(self, fit: CertifiedFit, keep: np.ndarray) -> tuple[CertifiedFit, np.ndarray]:
-        """The fit after single frames moved to where more of their measurements agree, if this lowers the cost."""
+        """Move single frames to where more of their measurements agree, if this lowers the cost; return the new fit."""
         least = self.truncated(self.distances(fit))
         for name in self.problem.targets + self.problem.sensors:
             good, total = inlier_count(name, self.measured.by_pair(keep))

@@ -88,7 +88,9 @@ def _sizes(log: LogFields) -> list[str]:
                 "in the rig file."
             )
         elif size.sigma is not None and abs(size.scale - 1.0) > SIZE_SIGMAS * size.sigma:
-            advice.append(f"{fact} The poses use the motion's size. Measure the target and correct the rig file.")
+            advice.append(
+                f"{fact} The poses use the size that the motion gives. Measure the target and correct the rig file."
+            )
     unchecked = [size.target for size in log.sizes if size.sigma is None]
     if unchecked:
         advice.append(

@@ -1,8 +1,8 @@
-"""Records as trees of JSON values and back, bit for bit; and what is wrong with a file, in words.
+"""Records as trees of JSON values and back, bit for bit; and sentences about what is wrong with a file.
 
 Pydantic reads and checks the records. These functions do what pydantic (2.14, tried) does not. Its JSON has null for
 NaN and for both infinities, and none of these becomes a float again. A key that is a pair becomes the text "a,b", which
-does not become a pair again. It does not know gtsam.Pose3, arrays and slices.
+does not become a pair again. Pydantic cannot write gtsam.Pose3, arrays and slices.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from gtsam_rwhec.problem.pairs import Pair
 
 #: Standard deviations by which a stated size must differ from the measured size before it is doubted.
 SIZE_SIGMAS = 5.0
-#: Share by which a stated size must differ as well: printers, calipers and intrinsics are seldom better.
+#: A size is doubted only if it also differs by this share: printers, calipers and intrinsics are seldom more exact.
 SIZE_SHARE = 0.004
 #: Seconds whose nanoseconds fit 64 bits; rig files have the same limit.
 Seconds: TypeAlias = Annotated[float, Field(ge=-4e9, le=4e9)]

@@ -32,7 +32,7 @@ class Verdict(StrEnum):
 
 
 class Ground(StrEnum):
-    """What speaks against using the poses, the gravest first."""
+    """Reasons not to use the poses, the most serious first."""
 
     #: No lower bound of the cost was found.
     NO_BOUND = "no_bound"
@@ -60,7 +60,7 @@ class Judgement:
     verdict : Verdict
         What to do with the poses.
     grounds : tuple of Ground
-        What speaks against using the poses, the gravest first; empty for ``Verdict.USE``.
+        Reasons not to use the poses, the most serious first; empty for ``Verdict.USE``.
     reason : str
         The grounds in words.
     """

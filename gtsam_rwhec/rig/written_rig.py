@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.rig.rig import RigFile
 
-#: Text that every reader of YAML takes for text.
+#: Strings that every YAML reader reads as strings without quotes.
 _PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off|y|n)$)[/]?[A-Za-z][A-Za-z0-9_/.]*", re.IGNORECASE)
 #: Column in which comments begin, where the text before them is shorter.
 _COLUMN = 30

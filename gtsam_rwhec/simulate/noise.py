@@ -100,8 +100,8 @@ def langevin_rotations(count: int, kappa: float, seed: Seed) -> Array:
     """
     generator = np.random.default_rng(seed)
     bingham = np.array([0.0, 4.0 * kappa, 4.0 * kappa, 4.0 * kappa])
-    # The envelope with the most acceptances has 1/b + 3/(b + 8 kappa) = 1. Of the two ways to write its positive root,
-    # each is taken where it does not cancel.
+    # The envelope with the most acceptances has 1/b + 3/(b + 8 kappa) = 1. Its positive root can be written in two
+    # ways. The one without cancellation is used.
     linear = 8.0 * kappa - 4.0
     root = math.hypot(linear, math.sqrt(32.0 * kappa))
     b = 16.0 * kappa / (linear + root) if linear > 0.0 else (root - linear) / 2.0

@@ -21,15 +21,15 @@ class PosesAndScale(Protocol):
 
     @property
     def X(self) -> Mapping[str, gtsam.Pose3]:
-        """T_targetcarrier_target by target."""
+        """T_targetcarrier_target of each target."""
 
     @property
     def Y(self) -> Mapping[str, gtsam.Pose3]:
-        """T_sensorcarrier_sensor by sensor."""
+        """T_sensorcarrier_sensor of each sensor."""
 
     @property
     def scale(self) -> float | Mapping[str, float]:
-        """One alpha, or one by target; t_B = alpha * (true length)."""
+        """One alpha for all targets, or one for each target; t_B = alpha * (true length)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,13 +91,13 @@ def run_with_nonnegative_scale(search: Search) -> Found:
     positive = [end for end in ends if answer_of(search.part, form, end.R).scale > 0.0]
     with search.stages.of("dual certificate"):
         bound = max(_bounds(form, relaxation, at_zero[0].R), key=lambda each: each.lower_bound)
-    lower = max(bound.lower_bound, found.bound.lower_bound)  # a constraint lowers no optimum
+    lower = max(bound.lower_bound, found.bound.lower_bound)  # a bound without the constraint holds with it
     if not positive or positive[0].cost > at_zero[0].cost:
         proven = at_zero[0].cost - lower <= search.tolerance(at_zero[0].cost)
         raise ScaleError(
             f"with alpha >= 0 as a constraint the {'optimum' if proven else 'best point found'} is at scale zero (cost "
             f"{at_zero[0].cost:.6g}, no answer below {lower:.6g}; the unconstrained optimum, {found.cost:.6g}, has a "
-            "negative scale): the noise drowns the scale"
+            "negative scale): the noise is too large to find the scale"
         )
     best = positive[0]
     constrained = Found(

@@ -17,8 +17,8 @@ from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.full_form import FullForm, full_forms
 from gtsam_rwhec.solver.parts import Part
 
-#: With a unit diagonal, a smaller eigenvalue of the eliminated block is rounding: the pseudo-inverse of eq. 48 leaves
-#: its direction out.
+#: With a unit diagonal, a smaller eigenvalue of the eliminated block is rounding error: the pseudo-inverse of eq. 48
+#: leaves its direction out.
 RANK_TOLERANCE = 1e-12
 #: A variable with a smaller diagonal, relative to the largest, is absent: this is the square of the rounding of a zero,
 #: and far below any ratio of weights.

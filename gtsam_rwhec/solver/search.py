@@ -144,8 +144,8 @@ class Search:
     def has_twin(self, found: Found) -> bool:
         """Whether descents from random starts find another answer of the same cost.
 
-        The information is about the neighbourhood of the answer. A twin far away shows in a Z that is not definite:
-        only then is this asked.
+        The information matrix shows only the neighbourhood of the answer. If there is a twin far away, Z is not
+        positive definite: only then is this function called.
         """
         if self.is_large:
             return False

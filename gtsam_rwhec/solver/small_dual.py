@@ -2,11 +2,12 @@
 
 At a critical point x the multipliers of R'R = I are unique, but the multipliers of all 20 independent constraints are
 not: for each rotation, 14 combinations N of the constraints have N x = 0. Adding them changes Z = Q' - Lambda, keeps
-Z x = 0, and may make Z positive semidefinite: maximise t subject to Z(y) >= t P across x. The method is log-barrier
-Newton on (y, t). It stops as soon as t is safely positive, since any such y proves the same.
+Z x = 0, and may make Z positive semidefinite: maximise t subject to z'Z(y) z >= t z'P z for all z with z'P x = 0. The
+method is log-barrier Newton on (y, t). It stops as soon as t is safely positive, since any such y proves the same.
 
 P sets the measure: Q' with a little added to its diagonal. Weights of translations and rotations differ by powers of
-ten, and the directions that matter are those in which Q' is smallest; the identity as measure would hide them.
+ten, and the directions that matter are those in which Q' is smallest. With the identity in place of P, t would not
+show them.
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ def stationary_multipliers(form: ReducedForm, R: Array, multipliers: Array) -> A
 
 
 def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int = 60) -> tuple[Array, float]:
-    """Maximise t with Z >= t P across x over the multipliers' freedom.
+    """Maximise t with z'Z z >= t z'P z for all z with z'P x = 0, over the multipliers that keep Z x = 0.
 
     R (n, 3, 3) is a critical point. Z x = 0 at the given multipliers (n, 20) and at the returned ones. A positive t
-    proves x optimal: Z - t P is positive definite across x. Where rounding has left Q' with a negative eigenvalue, t
-    is minus infinity and the multipliers are the given ones.
+    proves x optimal: z'(Z - t P) z > 0 for all such z but 0. Where rounding errors have given Q' a negative
+    eigenvalue, t is minus infinity and the multipliers are the given ones.
     """
     n = len(R)
     null = null_multipliers(R)
@@ -67,13 +68,13 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
     P[np.diag_indices_from(P)] += 1e-9 * np.abs(np.diagonal(P)) + 1e-12
     try:
         np.linalg.cholesky(P)
-    except np.linalg.LinAlgError:  # an ill-conditioned reduction has rounded Q' below zero: P is no measure
+    except np.linalg.LinAlgError:  # rounding errors of the reduction made P indefinite
         return multipliers, -np.inf
-    # A term along P x excludes x from the test and leaves all z across x, z'P x = 0, unchanged.
+    # A term along P x excludes x from the test and changes nothing for all z with z'P x = 0.
     along_x = P @ x / np.sqrt(float(x @ P @ x))
     try:
         t = float(scipy.linalg.eigh(Z0, P, eigvals_only=True, subset_by_index=[0, 0], check_finite=False)[0])
-    except np.linalg.LinAlgError:  # P is no measure: Q' is zero, or its entries differ by all of double precision
+    except np.linalg.LinAlgError:  # P is singular: Q' is zero, or its entries differ by all of double precision
         return multipliers, -np.inf
     t -= 0.1 * max(abs(t), 1e-3)
     Z0 += 10.0 * max(abs(t), 1.0) * np.outer(along_x, along_x)

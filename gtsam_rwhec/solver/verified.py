@@ -20,9 +20,9 @@ from gtsam_rwhec.solver import arrow
 
 #: Unit roundoff of double precision.
 UNIT = 2.0**-53
-#: Covers the rounding of the few operations in the bounds themselves.
+#: Factor that makes a bound larger than the rounding errors of the few operations that compute it.
 _SAFETY = 1.0 + 1e-10
-#: Covers underflow.
+#: Number added to a bound, larger than what underflow can lose.
 _TINY = 1e-290
 
 

@@ -55,7 +55,7 @@ class PartSolution:
                 cause=Cause.DIGITS_LOST,
                 figures={"reduced_cost": found.cost},
             )
-            bound = replace(bound, lower_bound=0.0)  # J is a sum of squares: zero is the one bound that stays true
+            bound = replace(bound, lower_bound=0.0)  # zero still holds: J is a sum of squares
         elif found.is_closed and not known.is_unique:
             number = float(len(known.free_directions))
             found = replace(found, cause=Cause.FREE_DIRECTIONS, figures={"free_directions": number})
@@ -89,6 +89,6 @@ def _check_scale(part: Part, answer: Answer, proven: bool) -> None:
             raise ScaleError(
                 f"{what} is {value:.6g} at the {'optimum' if proven else 'best point found'}, which no real target "
                 "has. Either the poses contradict the frame convention (is B = T_sensor_target? is A inverted?), or "
-                "the motion was planar, where a mirror image fits too (turn about a second axis), or "
-                "the noise drowns the scale (SolveOptions(nonnegative_scale=True) constrains a shared one)"
+                "the motion was planar, where a mirror image fits too (turn about a second axis), or the "
+                "noise is too large to find the scale (SolveOptions(nonnegative_scale=True) constrains a shared one)"
             )

@@ -143,8 +143,8 @@ def _fitted(
         rows = np.minimum(rows, len(path.T) - 1)
         tau = (path.stamps_ns[rows] - stamps_ns[own, None]) * 1e-9
         xi = se3.logmap((se3.inverse(poses[own])[:, None] @ path.T[rows]).reshape(-1, 4, 4)).reshape(*tau.shape, 6)
-        # With enough poses a constant takes up the noise of the pose itself. Third powers of milliseconds would
-        # vanish, so the columns are in units of the window. Columns and rows of zeros change nothing.
+        # With enough poses the fit has a constant term, because the pose at the stamp is noisy too. Times are in units
+        # of the window: third powers of milliseconds would be too small. Columns and rows of zeros change nothing.
         count = near.sum(axis=1)[:, None]
         used = (np.arange(4) >= np.where(count > 2, 0, 1)) & (np.arange(4) < count)
         Z = np.where(near[..., None] & used[:, None], (tau[..., None] / WINDOW_S) ** np.arange(4), 0.0)

@@ -102,7 +102,7 @@ def choose_by_agreement(
 
 
 def _starts(track: _Track) -> list[np.ndarray]:
-    """First choices (n,): the best over all combinations in a few images, and what agrees with them elsewhere."""
+    """First choices (n,): the best combination of candidates in a few images; in the others, what agrees with it."""
     few = _apart(track.R_A)
     found: list[tuple[float, np.ndarray]] = []
     for picked in itertools.product((0, 1), repeat=len(few)):

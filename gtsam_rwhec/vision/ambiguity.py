@@ -42,7 +42,7 @@ class Choice:
     which : (n,) array of int
         The chosen candidate, 0 or 1.
     margin : (n,) array
-        By how much log-likelihood the best track with the other candidate in this image is worse.
+        Log-likelihood of the chosen track, minus that of the best track with the other candidate in this image.
     """
 
     which: np.ndarray

@@ -116,7 +116,8 @@ def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndar
 def checkerboard_corners(gray: Gray, board: Checkerboard) -> Array:
     """Inner corners (columns rows, 2), left to right from the top; (0, 2) where the board is not whole in the image.
 
-    The top is where the first corner's outer square is black: a half turn changes its colour.
+    The top is where the first corner's outer square is black. If the board is turned by half a turn, that square is
+    white.
     """
     # OpenCV sometimes takes an outer edge for inner corners: the contrast shows it, and other options can avoid it.
     for flags in (cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY, 0):

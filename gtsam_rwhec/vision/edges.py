@@ -139,7 +139,8 @@ def _by_areas(stack: Gray, image_of: np.ndarray, corners: Array, camera: Camera,
     profile = sampled(stack, image_of, points)
     dark, light = profile[..., 0], profile[..., -2:].mean(axis=-1)
     contrast = light - dark  # (N, 4, P)
-    # Black is equal along a side, and a single sample is noisy: take the median. White varies with the light.
+    # Black is equal along a side, and a single sample is noisy: take the median. The white side stays as it is: its
+    # gray value varies with the light along the side.
     black = np.median(dark, axis=2, keepdims=True)[..., None]
     with np.errstate(invalid="ignore", divide="ignore"):
         rise = (profile - black) / (light[..., None] - black)

@@ -91,7 +91,7 @@ def test_what_is_no_pose_is_refused_with_its_place() -> None:
     bad[3, 0, 3] = np.nan
     with pytest.raises(PoseError, match=r"H: measurement 3 has an entry that is NaN"):
         motions_of(s.C, bad)
-    with pytest.raises(PoseError, match="C: rows of 7 need the quaternion's order"):
+    with pytest.raises(PoseError, match="C: rows of 7 need the order of the quaternion"):
         motions_of(np.ones((3, 7)), np.ones((3, 7)))
 
 

@@ -131,7 +131,7 @@ class TestSolving:
             assert held.certificate.is_certified
             assert held.certificate.path == SearchPath(Start.SPECTRAL, Multipliers.KKT)
 
-    def test_outcomes_where_the_noise_drowns_the_scale(self) -> None:
+    def test_outcomes_where_the_noise_is_too_large_to_find_the_scale(self) -> None:
         """Against random starts on each side: no positive scale, and no scale zero, costs less than what is found."""
         outcomes: dict[bool, int] = {True: 0, False: 0}
         proven = 0
@@ -160,7 +160,7 @@ class TestSolving:
         assert proven >= 3
 
     def test_solve_raises_where_no_positive_scale_is_best(self) -> None:
-        with pytest.raises(ScaleError, match=r"optimum is at scale zero.*the noise drowns the scale"):
+        with pytest.raises(ScaleError, match=r"optimum is at scale zero.*the noise is too large to find the scale"):
             rw.solve(noisy(4), options=HELD)
 
 

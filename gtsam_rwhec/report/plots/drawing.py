@@ -78,7 +78,7 @@ def say(axes: Axes, words: str) -> None:
 
 
 def shortened(text: str, most: int = LONGEST_NAME) -> str:
-    """The text as one line of at most `most` characters that the font has; a long text loses its middle."""
+    """The text as one line of at most `most` characters that the font has; a long text is cut in the middle."""
     line = "".join(c if c.isprintable() else " " for c in text.encode("latin-1", "replace").decode("latin-1"))
     line = " ".join(line.split())
     if len(line) <= most:

@@ -141,7 +141,7 @@ class _Scene:
                 outline = at + ELLIPSE_SHARE * self.extent * _circle()
                 axes.add_patch(Polygon(outline, fill=False, edgecolor=PURPLE, lw=1.6, ls="--", zorder=2))
         axes.set_aspect("equal", adjustable="datalim")
-        # Margins of the axes would not do: matplotlib takes them away to make the aspect equal.
+        # The data limits are padded, because matplotlib removes margins of axes to make the aspect equal.
         axes.update_datalim(axes.dataLim.padded(MARGIN_SHARE * self.extent))
         axes.margins(0.0)
         for axis in (axes.xaxis, axes.yaxis):
