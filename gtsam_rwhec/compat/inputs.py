@@ -97,8 +97,7 @@ def _rotations(values: Any, where: str) -> Array:
     if array.shape[1:] in _VECTORS:
         _check_finite(array, where)
         vectors = array.reshape(-1, 3)
-        rotations: Array = se3.expmap(np.concatenate([vectors, np.zeros_like(vectors)], axis=1))[:, :3, :3]
-        return rotations
+        return se3.expmap(np.concatenate([vectors, np.zeros_like(vectors)], axis=1))[:, :3, :3]
     raise PoseError(
         f"{where}: shape {array.shape} is not a list of rotations; give matrices (3, 3) or rotation vectors (3,), "
         "(3, 1), (1, 3), one for every pose"

@@ -44,5 +44,4 @@ def translation_of(stations: Stations, R: Array, sums: Array | None = None) -> A
     sum_e = ones @ p - np.einsum("nab,nb->a", R_RC, sum_u) - np.einsum("nba,nb->a", R_G, sum_t)
     turned = np.einsum("nar,nab,nb->r", sum_R, R_G, p, optimize=True)
     turned -= np.einsum("narb,nab->r", sum_Ru, R_G @ R_RC) + sum_Rt.sum(axis=0)
-    t: Array = np.linalg.solve(normal, turned - sum_e)
-    return t
+    return np.linalg.solve(normal, turned - sum_e)

@@ -84,13 +84,11 @@ def horaud(stations: Stations) -> tuple[Array, Array]:
 
 
 def _moment(a: Array, weight: Array, b: Array) -> Array:
-    moment: Array = (a * weight).reshape(3, -1) @ b.reshape(3, -1).T
-    return moment
+    return (a * weight).reshape(3, -1) @ b.reshape(3, -1).T
 
 
 def _log_factor(q: Array) -> Array:
     """The factor from a quaternion's vector part to the rotation vector, for nonnegative scalar parts."""
     length = np.sqrt((q[:3] ** 2).sum(axis=0))
     safe = np.maximum(length, 1e-150)
-    factor: Array = np.where(length > 1e-8, 2.0 * np.arctan2(length, q[3]) / safe, 2.0)
-    return factor
+    return np.where(length > 1e-8, 2.0 * np.arctan2(length, q[3]) / safe, 2.0)

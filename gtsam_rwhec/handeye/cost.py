@@ -74,28 +74,24 @@ class DualQuaternionCost:
     def Z2(self) -> Array:
         """M^-1 (eq. 13). M must not be singular."""
         half, _ = self._halves
-        result: Array = half @ half.T
-        return result
+        return half @ half.T
 
     @cached_property
     def Z1(self) -> Array:
         """W M^-1 + M^-1 W' (eq. 13)."""
         half, W_half = self._halves
         product = W_half @ half.T
-        result: Array = product + product.T
-        return result
+        return product + product.T
 
     @cached_property
     def Z0(self) -> Array:
         """S - W M^-1 W' (eq. 13)."""
         _, W_half = self._halves
-        result: Array = self.S - W_half @ W_half.T
-        return result
+        return self.S - W_half @ W_half.T
 
     def Z(self, mu: float) -> Array:
         """Z(mu) = Z0 + mu Z1 - mu^2 Z2 (eq. 12)."""
-        matrix: Array = self.Z0 + mu * (self.Z1 - mu * self.Z2)
-        return matrix
+        return self.Z0 + mu * (self.Z1 - mu * self.Z2)
 
     def value(self, q: Array, q_dual: Array) -> float:
         """The cost of a dual quaternion, parts (4,) each. Digits are lost where the cost is small beside tr S."""
@@ -111,8 +107,7 @@ def blocks(count: int, matrices: int = 1) -> Iterator[slice]:
 def gram(rows: Array, weights: Array | None = None) -> Array:
     """The sum of weight * row row' (n, n) over motions, the columns of ``rows`` (n, N)."""
     if weights is None:
-        product: Array = rows @ rows.T
-        return product
+        return rows @ rows.T
     total = np.zeros((len(rows), len(rows)))
     for block in blocks(rows.shape[1]):
         total += (rows[:, block] * weights[block]) @ rows[:, block].T
@@ -123,8 +118,7 @@ def by_parts(moments: Array, products: Array) -> Array:
     """Sums of P'P (2, 2, 4, 4) for P of primal and dual parts, from moments (2 n, 2 n) and vec(P_k' P_l) (n n, 16)."""
     n = len(moments) // 2
     pairs = moments.reshape(2, n, 2, n).transpose(0, 2, 1, 3).reshape(4, n * n)
-    sums: Array = (pairs @ products).reshape(2, 2, 4, 4)
-    return sums
+    return (pairs @ products).reshape(2, 2, 4, 4)
 
 
 def motion_moments(rows: Array, weights: Array | None = None) -> MotionMoments:
@@ -139,5 +133,4 @@ def residuals(rows: Array, q: Array, q_dual: Array) -> Array:
     linear = np.zeros((8, 14))
     linear[:4, :7] = linear[4:, 7:] = P
     linear[4:, :7] = P_dual
-    result: Array = linear @ rows
-    return result
+    return linear @ rows

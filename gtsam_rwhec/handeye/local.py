@@ -129,14 +129,12 @@ def _descend(factor: Array, lift: Lift, start: Array, unit: float) -> Array:
 
     def residual(x: Array) -> Array:
         q, t, _ = pose(x)
-        e: Array = factor @ lift(q, t)[0]
-        return e
+        return factor @ lift(q, t)[0]
 
     def jacobian(x: Array) -> Array:
         q, t, slope = pose(x)
         _, by_q, by_t = lift(q, t)
-        J: Array = factor @ np.hstack([by_q @ slope, unit * by_t])
-        return J
+        return factor @ np.hstack([by_q @ slope, unit * by_t])
 
     (q,), _ = from_transforms(start[None])
     x0 = np.concatenate([q, start[:3, 3] / unit])

@@ -74,8 +74,7 @@ def Z_pseudo(cost: DualQuaternionCost) -> Array:
     values, vectors = cost.spectrum
     used = values > SINGULAR * max(float(values[3]), 0.0)
     half = cost.W @ (vectors[:, used] / np.sqrt(values[used]))
-    result: Array = cost.S - half @ half.T
-    return result
+    return cost.S - half @ half.T
 
 
 def search(Z0: Array, Z1: Array, Z2: Array) -> tuple[float, Array, Array, Array]:
@@ -130,8 +129,7 @@ def bracket(Z1: Array, Z2: Array) -> tuple[float, float]:
 
 def best_dual(cost: DualQuaternionCost, q: Array) -> Array:
     """The best q' for a given q, orthogonal to it: eq. 20, without M^-1."""
-    dual: Array = times_vectors(q) @ (0.5 * best_translation(cost, q))
-    return dual
+    return times_vectors(q) @ (0.5 * best_translation(cost, q))
 
 
 def best_translation(cost: DualQuaternionCost, q: Array) -> Array:

@@ -84,8 +84,7 @@ class Stack:
     @property
     def centred_t_A(self) -> Array:
         """(N, 3) translations of A about the gauge: t_X and t_Y are then without its origins (design fact 9)."""
-        centred: Array = self.A[:, :3, 3] + self.A[:, :3, :3] @ self.gauge.target_carrier - self.gauge.sensor_carrier
-        return centred
+        return self.A[:, :3, 3] + self.A[:, :3, :3] @ self.gauge.target_carrier - self.gauge.sensor_carrier
 
     def outcome(
         self, R: Array, t: Array, scale: float = 1.0, *, starts_from: str | None = None, notes: Iterable[str] = ()
@@ -99,8 +98,7 @@ class Stack:
 
     def sums(self, rows: Array) -> Array:
         """(E, ...) sums of (N, ...) rows over each pair's measurements."""
-        summed: Array = np.add.reduceat(rows, self.first[:-1], axis=0)
-        return summed
+        return np.add.reduceat(rows, self.first[:-1], axis=0)
 
     def by_pair(self, rows: Array) -> list[Array]:
         """(N, ...) rows as one array for each pair."""

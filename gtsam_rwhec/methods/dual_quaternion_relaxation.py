@@ -64,8 +64,7 @@ def _smallest_eigenvector(Q: Array) -> Array:
     pp, pd, dd = (blocks[:, a, :, :, b, :].reshape(half, half) for a, b in ((0, 0), (0, 1), (1, 1)))
     to_dual = -np.linalg.lstsq(dd, pd.T, rcond=1e-12)[0]
     p = np.linalg.eigh(pp + pd @ to_dual)[1][:, 0]
-    z: Array = np.stack([p.reshape(-1, 4), (to_dual @ p).reshape(-1, 4)], axis=1).ravel()
-    return z
+    return np.stack([p.reshape(-1, 4), (to_dual @ p).reshape(-1, 4)], axis=1).ravel()
 
 
 def rounded(z: Array, frames: int) -> tuple[Array, Array]:
@@ -79,8 +78,7 @@ def rounded(z: Array, frames: int) -> tuple[Array, Array]:
 
 def vector_of(q: Array, t: Array) -> Array:
     """z (8 n,) of unit quaternions and translations."""
-    z: Array = np.stack([q, dual_parts(q, t)], axis=1).ravel()
-    return z
+    return np.stack([q, dual_parts(q, t)], axis=1).ravel()
 
 
 def polished(Q: Array, q: Array, t: Array) -> tuple[Array, Array, float]:

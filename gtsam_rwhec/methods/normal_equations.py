@@ -21,5 +21,4 @@ def solve_scaled(normal: Array, right: Array, undetermined: str, smallest: float
     scaled = normal * scaling[:, None] * scaling
     if np.linalg.eigvalsh(scaled)[0] <= smallest:
         raise UnderdeterminedError(undetermined)
-    solution: Array = scaling * np.linalg.solve(scaled, scaling * right)
-    return solution
+    return scaling * np.linalg.solve(scaled, scaling * right)

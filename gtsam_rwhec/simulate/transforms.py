@@ -14,8 +14,7 @@ from gtsam_rwhec.geometry.quaternions import to_rotations
 
 def rotations_of_vectors(vectors_rad: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of axis times angle (..., 3), radians."""
-    rotations: Array = Rotation.from_rotvec(np.asarray(vectors_rad, dtype=np.float64)).as_matrix()
-    return rotations
+    return Rotation.from_rotvec(np.asarray(vectors_rad, dtype=np.float64)).as_matrix()
 
 
 def random_directions(count: int, generator: Generator) -> Array:
