@@ -18,14 +18,8 @@ RobotWorld = tuple[Array, Array, Array, Array]
 class PoseMeans(NamedTuple):
     """Means over the poses of products of (R_A, t_A, 1) and (R_B, t_A, t_B, 1).
 
-    Attributes
-    ----------
-    R_A_R_B : (3, 3, 3, 3) array
-        [a, b, c, d] is the mean of R_A[a, b] R_B[c, d].
-    R_A_t_A, R_A_t_B : (3, 3, 3) arrays
-        [a, b, c] is the mean of R_A[a, b] t[c].
-    t_A_t_B, t_B_t_B, R_A : (3, 3) arrays
-    t_A, t_B : (3,) arrays
+    Entry [a, b, c, d] of R_A_R_B is the mean of R_A[a, b] R_B[c, d], entry [a, b, c] of R_A_t_A that of
+    R_A[a, b] t_A[c].
     """
 
     R_A_R_B: Array

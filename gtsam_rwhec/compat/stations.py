@@ -19,24 +19,16 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import conjugate, left, of_rotations
 
-#: Pairs in one block: a dozen arrays of this size stay within the processor's cache.
+#: Pairs in one block, at most about: a dozen arrays of this size stay within the processor's cache.
 BLOCK_PAIRS = 1 << 15
 
 
 @dataclass(frozen=True)
 class Stations:
-    """Poses of N stations.
+    """Poses of N stations: R_G (N, 3, 3) and t_G (N, 3) of the gripper in the base, about the mean of t_G.
 
-    Attributes
-    ----------
-    R_G, t_G : (N, 3, 3) and (N, 3) arrays
-        The gripper in the base, about the mean of t_G.
-    R_C : (N, 3, 3) array
-        The target in the camera.
-    u : (N, 3) array
-        R_C' t_C (minus the camera's position in the target's frame), about its mean.
-    origin : (3,) array
-        The mean of R_C' t_C.
+    R_C (N, 3, 3) is the target in the camera, and u (N, 3) is R_C' t_C (minus the camera's position in the target's
+    frame), about its mean ``origin`` (3,).
     """
 
     R_G: Array
@@ -70,16 +62,9 @@ def all_earlier(features: Array) -> Array:
 class PairBlock:
     """Rotations of a block of pairs, as quaternions with nonnegative scalar parts.
 
-    Attributes
-    ----------
-    first, last : int
-        The later stations are first, ..., last - 1.
-    a, b : (4, J, I) arrays
-        Quaternions (xyzw) of A and of B between the later stations (J) and all stations before ``last`` (I).
-    signs : two (J, I) arrays
-        The factors +-1 that make the scalar parts of A and of B nonnegative.
-    weight : (J, I) array
-        1 for pairs of a station and an earlier station, else 0.
+    The later stations are first, ..., last - 1. a and b (4, J, I) are the quaternions (xyzw) of A and of B between the
+    later stations (J) and all stations before ``last`` (I), ``signs`` (J, I) the factors +-1 that make their scalar
+    parts nonnegative. ``weight`` (J, I) is 1 for pairs of a station and an earlier station, else 0.
     """
 
     first: int
@@ -95,19 +80,14 @@ def pair_blocks(stations: Stations) -> Iterator[PairBlock]:
     q_G, q_C = of_rotations(stations.R_G), of_rotations(stations.R_C)
     left_G, left_C = left(conjugate(q_G)), left(q_C)
     right_G, right_C = q_G.T, conjugate(q_C).T
-    for first, last in blocks_of(len(q_G)):
+    step = max(1, BLOCK_PAIRS // len(q_G))
+    for first in range(0, len(q_G), step):
+        last = min(first + step, len(q_G))
         a = products(left_G[first:last], right_G[:, :last])
         b = products(left_C[first:last], right_C[:, :last])
         signs = (np.copysign(1.0, a[3]), np.copysign(1.0, b[3]))
         weight = (np.arange(last) < np.arange(first, last)[:, None]).astype(float)
         yield PairBlock(first, last, a * signs[0], b * signs[1], signs, weight)
-
-
-def blocks_of(count: int) -> Iterator[tuple[int, int]]:
-    """Ranges of later stations with at most about BLOCK_PAIRS pairs each."""
-    step = max(1, BLOCK_PAIRS // count)
-    for first in range(0, count, step):
-        yield first, min(first + step, count)
 
 
 def products(matrices: Array, columns: Array) -> Array:

@@ -29,13 +29,7 @@ def estimate_alpha(motions: Motions, weights: Array | None = None, prior: DualQu
     Each step lowers N log(sum |A q|^2) + N log(sum |B q + A q'|^2): the likelihood of normal residuals whose two
     sigmas are unknown. For given poses alpha is that ratio, and for given alpha the poses are DQOpt's. Where the
     residuals are rounding error, alpha stays as it is; at the start it is the ratio of the motions' own sizes.
-
-    Parameters
-    ----------
-    motions : Motions
-    weights : (N,) array, optional
-    prior : DualQuaternionPrior, optional
-        Its a and b keep their meaning while alpha changes.
+    A prior's a and b keep their meaning while alpha changes.
     """
     moments = motion_moments(motions.rows, weights)
     turned, moved = float(np.trace(moments.AA)), float(np.trace(moments.BB))

@@ -31,10 +31,7 @@ ROUNDING = 1e-13
 def dq2steps(request: Request) -> Outcome[Array]:
     """DQ2Steps (Section 3.2.2, Algorithm 2): the rotation that fits the rotations best, then the translation.
 
-    Raises
-    ------
-    UnderdeterminedError
-        When the rotations alone do not determine the rotation: parallel axes, or no rotation.
+    Raises UnderdeterminedError when the rotations alone do not determine the rotation: parallel axes, or no rotation.
     """
     values, vectors = request.cost.spectrum
     if not values[1] > SINGULAR * values[3]:
@@ -65,12 +62,8 @@ def dq2ndord(request: Request) -> Outcome[Array]:
 def dq_nth_order(request: Request, order: int) -> Outcome[Array]:
     """The expansion in mu to any order (Appendix A): q(mu) of eq. 32 at the root of d lambda / d mu nearest mu = 0.
 
-    Parameters
-    ----------
-    request : Request
-    order : int
-        Order of lambda and q, >= 1; 2 is ``dq2ndord``. The series converges for |mu| up to where Z's two smallest
-        eigenvalues meet in the complex plane. Higher orders help only within that range.
+    ``order`` is that of lambda and q, >= 1; 2 is ``dq2ndord``. The series converges for |mu| up to where Z's two
+    smallest eigenvalues meet in the complex plane. Higher orders help only within that range.
     """
     if order < 1:
         raise OptionError(f"order={order}: the expansion in mu starts at order 1")
@@ -94,11 +87,8 @@ def dqitr(request: Request) -> Outcome[Array]:
     """DQItr: mu <- q(mu)'Z1 q(mu) / (2 q(mu)'Z2 q(mu)) (eq. 24) until mu converges.
 
     With M singular (no noise) the paper finds the iteration unstable. There mu = 0 is exact, and nothing is iterated.
-
-    Warns
-    -----
-    NotConvergedWarning
-        When mu still changes after 200 iterations: the fixed point need not attract. ``dqopt`` always converges.
+    Warns by NotConvergedWarning when mu still changes after 200 iterations: the fixed point need not attract. ``dqopt``
+    always converges.
     """
     cost = request.cost
     if is_singular(cost):
@@ -123,14 +113,9 @@ def dqitr(request: Request) -> Outcome[Array]:
 
 @dataclass(frozen=True)
 class RelaxedCost:
-    """Eq. 21 without the constraint, and Z1 and Z2 in its eigenvectors.
+    """Eq. 21 without the constraint: lambda_a (4,) and q_a (4, 4) of Z0, and Z1 and Z2 in these eigenvectors.
 
-    Attributes
-    ----------
-    values, vectors : (4,), (4, 4) arrays
-        lambda_a and q_a of Z0.
-    Z1, Z2 : (4, 4) arrays
-        Entry [a, b] is q_a'Z q_b, the paper's Z^ab.
+    Entry [a, b] is q_a'Z q_b, the paper's Z^ab.
     """
 
     values: Array

@@ -24,11 +24,7 @@ def certified(request: Request) -> Outcome[Array]:
     The library's cost J is this cost, with 1 / sigma^2 = 2 alpha^2 w and kappa = 2 w for a motion of weight w. An
     unknown scale has t_C = scale * (true length). The equation is then inverted, H X^-1 = X^-1 C, so that the measured
     side has the scale: the cost is that of X^-1.
-
-    Raises
-    ------
-    ScaleError
-        When the scale at the optimum is not positive.
+    Raises ScaleError when the scale at the optimum is not positive.
     """
     w = np.ones(len(request.motions)) if request.weights is None else request.weights
     used = w > 0.0

@@ -12,12 +12,8 @@ from gtsam_rwhec.handeye.motions import Motions
 def chordal_moments(motions: Motions, weights: Array | None = None) -> tuple[Array, Array]:
     """The two forms of eq. 30, summed over the motions in one pass.
 
-    Returns
-    -------
-    rotation : (9, 9) array
-        |R_C R - R R_H|^2 = vec(R)' rotation vec(R). Here vec takes rows: R_C (x) I - I (x) R_H'.
-    translation : (13, 13) array
-        |(R_C - 1) T - R T_H + T_C|^2 as a form of (vec R, T, 1).
+    Rotation (9, 9): |R_C R - R R_H|^2 as a form of vec R. Here vec takes rows: R_C (x) I - I (x) R_H'. Translation
+    (13, 13): |(R_C - 1) T - R T_H + T_C|^2 as a form of (vec R, T, 1).
     """
     rotation, translation = np.zeros((9, 9)), np.zeros((13, 13))
     for block in blocks(len(motions)):

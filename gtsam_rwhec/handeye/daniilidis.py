@@ -35,10 +35,8 @@ _PRODUCTS = np.einsum("kji,ljm->klim", E[:6, :3], E[:6, :3]).reshape(36, 16)
 def daniilidis(request: Request) -> Outcome[Array]:
     """Dan, with translations multiplied by alpha as in Section 4.3.
 
-    Raises
-    ------
-    UnderdeterminedError
-        When all axes are parallel, or no motion rotates: the null space then has more than two dimensions.
+    Raises UnderdeterminedError when all axes are parallel, or no motion rotates: the null space then has more than two
+    dimensions.
     """
     moments = gram(request.motions.rows, request.weights)[np.ix_(_VECTORS, _VECTORS)]
     moments[6:] *= request.alpha
@@ -66,12 +64,7 @@ def unit_combination(u: Array, v: Array) -> tuple[Array, Array]:
 
     Two combinations have q . q' = 0. The combination with the longer q is taken: without noise the other q vanishes.
     (The paper solves for the ratio s of the coefficients and must avoid a vector whose coefficient is 0. An angle
-    avoids no vector.)
-
-    Raises
-    ------
-    UnderdeterminedError
-        When no combination has a rotation.
+    avoids no vector.) Raises UnderdeterminedError when no combination has a rotation.
     """
     (a, b), (c, d) = (u.T @ v).tolist()
     # (x, y) = (cos phi, sin phi):  a x^2 + (b + c) x y + d y^2 = (a + d + (a - d) cos 2 phi + (b + c) sin 2 phi) / 2

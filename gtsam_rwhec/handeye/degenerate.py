@@ -34,13 +34,7 @@ STEP_RAD = 1e-5
 def free_directions(request: Request, q: Array, values: Array, vectors: Array) -> tuple[FreeDirection, ...]:
     """Free directions of the answer q (4,), as right perturbations of T_c_h; what a prior fixes is not free.
 
-    Parameters
-    ----------
-    request : Request
-    q : (4,) array
-        Rotation of the answer.
-    values, vectors : (4,), (4, 4) arrays
-        Eigenvalues of Z(mu*), ascending, and its eigenvectors.
+    ``values`` (4,) are the eigenvalues of Z(mu*), ascending, ``vectors`` (4, 4) its eigenvectors.
     """
     cost, V = request.cost, times_vectors(q)
     of_t, directions = np.linalg.eigh(V.T @ cost.M @ V)  # q' = (t / 2, 0) (x) q

@@ -17,10 +17,7 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 def from_rows(rows: Array) -> tuple[Array, Array]:
     """Dual quaternions of poses (12, N): vec R, column after column, then t in metres (``poses.checked_rows``).
 
-    Returns
-    -------
-    q, q_dual : (4, N) arrays
-        xyzw. The scalar part of q is not negative; q_dual has the unit m / 2.
+    q and q_dual are (4, N), xyzw. The scalar part of q is not negative; q_dual has the unit m / 2.
     """
     q = of_rows(rows[:9])
     q *= np.copysign(1.0, q[3])
@@ -41,12 +38,7 @@ def from_transforms(T: Array) -> tuple[Array, Array]:
 def to_transform(q: Array, q_dual: Array) -> Array:
     """The pose (4, 4) of one dual quaternion, parts (4,) xyzw, of any length but zero.
 
-    The part of q_dual along q is left out: no pose has it.
-
-    Raises
-    ------
-    ValueError
-        When q is zero or not finite.
+    The part of q_dual along q is left out: no pose has it. Raises ValueError when q is zero or not finite.
     """
     square = float(q @ q)
     if not 0.0 < square < np.inf:

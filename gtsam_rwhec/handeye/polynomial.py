@@ -43,12 +43,8 @@ BISECTIONS = 60
 class Curve:
     """p(lambda, mu) in x = mu / ``mu_scale`` and y = (lambda - lambda_0) / ``lambda_scale``.
 
-    Attributes
-    ----------
-    coefficients : (5, 9) array
-        Entry [m, n] belongs to y^m x^n; 25 are not zero: n <= 8 - 2 m.
-    mu_scale, lambda_scale : float
-        mu of eq. 14 for the relaxation's q, and the gap of eq. 22.
+    Entry [m, n] of the coefficients (5, 9) belongs to y^m x^n; 25 are not zero: n <= 8 - 2 m. The scales are mu of
+    eq. 14 for the relaxation's q, and the gap of eq. 22.
     """
 
     coefficients: Array

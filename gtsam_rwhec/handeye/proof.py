@@ -30,15 +30,8 @@ def proven(K: Array) -> bool:
 def proven_bound(form: Callable[[float], Array], value: float, step: float) -> float:
     """The first proven bound among value - step, value - 4 step, value - 16 step, ...; 0 if no positive one is proven.
 
-    Parameters
-    ----------
-    form : callable
-        Gives, for a candidate bound, a new matrix (n, n), n <= 9. The bound holds when the matrix is positive
-        semidefinite.
-    value : float
-        The optimum, up to rounding: of a sum of squares, so that 0 is always a bound.
-    step : float
-        First distance from the optimum.
+    ``form`` gives, for a candidate bound, a new matrix (n, n), n <= 9. The bound holds when the matrix is positive
+    semidefinite. ``value`` is the optimum, up to rounding: of a sum of squares, so that 0 is always a bound.
     """
     lower = value - step
     while lower > 0.0:

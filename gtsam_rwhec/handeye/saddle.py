@@ -26,16 +26,10 @@ STEPS = 200
 
 @dataclass(frozen=True)
 class Minimum:
-    """The saddle of the Lagrangian's two multipliers, and the pose there.
+    """The saddle of the Lagrangian's two multipliers, and the pose q, q_dual (4,) there, xyzw: |q| = 1, q . q_dual = 0.
 
-    Attributes
-    ----------
-    q, q_dual : (4,) arrays
-        The pose, xyzw: |q| = 1, q . q_dual = 0.
-    mu : float
-        The multiplier of q . q' = 0.
-    values, vectors : (4,), (4, 4) arrays
-        Eigenvalues of Z(mu), ascending, and its eigenvectors. values[0] is the cost, up to rounding.
+    mu is the multiplier of q . q' = 0. ``values`` (4,) are the eigenvalues of Z(mu), ascending, ``vectors`` (4, 4) its
+    eigenvectors. values[0] is the cost, up to rounding.
     """
 
     q: Array

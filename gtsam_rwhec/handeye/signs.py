@@ -35,16 +35,10 @@ def flipped(rows: Array, sums: Array) -> Array:
 
 
 def resolve_signs(rows: Array, sums: Array, uncertain: NDArray[np.bool_]) -> None:
-    """Choose the signs of the uncertain motions, in place.
+    """Choose the signs of the motions ``uncertain`` (N,), whose scalar parts do not tell the sign, in place.
 
-    Parameters
-    ----------
-    rows : (14, N) array
-        ``Motions.rows``, whose scalar parts are not negative.
-    sums : (2, N) array
-        Sums of the scalar parts of q_C and q_H, and of their duals.
-    uncertain : (N,) bool array
-        Motions whose scalar parts do not tell the sign.
+    ``rows`` (14, N) are ``Motions.rows``, whose scalar parts are not negative; ``sums`` (2, N) are the sums of the
+    scalar parts of q_C and q_H, and of their duals.
     """
     same = rows[:, uncertain]
     other = flipped(same, sums[:, uncertain])

@@ -46,10 +46,8 @@ def _numbers(given: ArrayLike, what: str) -> Array:
 def check_weights(weights: ArrayLike | None, count: int) -> Array | None:
     """Weights as an array (N,), or None.
 
-    Raises
-    ------
-    CountError, NoiseError
-        Not one for each motion; negative or not finite; or fewer than two that are not zero.
+    Raises CountError when there is not one for each motion, and NoiseError for weights that are negative or not finite,
+    or fewer than two that are not zero.
     """
     if weights is None:
         return None
@@ -69,10 +67,7 @@ def check_weights(weights: ArrayLike | None, count: int) -> Array | None:
 def check_covariances(covariances: ArrayLike | None, count: int) -> Array | None:
     """Covariances (N, 8, 8), or (8, 8) for all motions, of (A q, B q + A q'); returns (N or 1, 8, 8), or None.
 
-    Raises
-    ------
-    CountError, NoiseError
-        A wrong shape; not symmetric, or not positive definite.
+    Raises CountError for a wrong shape, NoiseError for covariances that are not symmetric, or not positive definite.
     """
     if covariances is None:
         return None

@@ -25,22 +25,11 @@ from gtsam_rwhec.solver.rotations import project
 
 @dataclass(frozen=True)
 class Stack:
-    """Measurements of all pairs, one pair after the other.
+    """Measurements A, B (N, 4, 4) of all pairs, metres, one pair after the other.
 
-    Attributes
-    ----------
-    targets, sensors, names : tuple of str
-        Names of the frames; ``names`` are targets, then sensors. Arrays of n frames have this order.
-    A, B : (N, 4, 4) arrays
-        Metres.
-    target, sensor : (N,) integer arrays
-        Each measurement's indices into ``names``.
-    pairs : (E, 2) integer array
-        The same indices for each pair.
-    first : (E + 1,) integer array
-        The measurements of pair e are first[e], ..., first[e + 1] - 1.
-    gauge : Gauge
-        Origins near the data, metres; ``origins`` (n, 3) has each frame's.
+    Arrays of n frames have the order of ``names``: targets, then sensors. ``target`` and ``sensor`` (N,) are each
+    measurement's indices into ``names``, ``pairs`` (E, 2) each pair's. The measurements of pair e are first[e], ...,
+    first[e + 1] - 1. The ``gauge`` has origins near the data, metres; ``origins`` (n, 3) has each frame's.
     """
 
     targets: tuple[str, ...]

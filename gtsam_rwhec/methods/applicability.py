@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from gtsam_rwhec.errors import (
-    CountError,
-    FrameError,
-    OptionError,
-    PriorError,
-    RwhecError,
-    ScaleError,
-)
+from gtsam_rwhec.errors import CountError, FrameError, OptionError, PriorError, RwhecError, ScaleError
 from gtsam_rwhec.methods.method import Method, Takes
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
@@ -38,9 +31,8 @@ def refusal(method: Method[Any], problem: Problem) -> RwhecError | None:
 def check_problem(method: Method[Any], problem: Problem) -> None:
     """Refuse a problem that the method cannot solve.
 
-    Raises
-    ------
-    CountError, FrameError, MeasurementsNotKeptError, OptionError, PriorError, ScaleError
+    Raises CountError, FrameError, MeasurementsNotKeptError, OptionError, PriorError or ScaleError, or what the method's
+    own check raises.
     """
     takes = method.takes
     if not isinstance(problem, Problem):

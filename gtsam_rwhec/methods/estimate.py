@@ -19,22 +19,11 @@ X = TypeVar("X")
 
 @dataclass(frozen=True)
 class Outcome(Generic[X]):
-    """What a method's function returns.
+    """What a method's function returns; X and Y are poses by name, or X the one pose (4, 4) of A X = X B, metres.
 
-    Attributes
-    ----------
-    X, Y : poses by name, or the one pose (4, 4) of A X = X B
-        Metres.
-    cost : float or None
-        The method's own cost; None when it is the cost by which the call compares all methods.
-    cost_name : str
-        The name of ``cost``.
-    lower_bound : float or None
-        A proven lower bound on ``cost``.
-    is_optimal : bool or None
-        Whether the bound proves the answer, where the method has its own rule.
-    scale, free_directions, starts_from, notes
-        As in ``Estimate``; free directions where the method finds them itself.
+    ``cost`` is the method's own cost (None when it is the cost by which the call compares all methods),
+    ``lower_bound`` a proven bound on it. ``is_optimal`` says whether the bound proves the answer, where the method has
+    its own rule. ``free_directions`` are given where the method finds them itself. The rest is as in ``Estimate``.
     """
 
     X: X

@@ -19,15 +19,10 @@ from gtsam_rwhec.solving.arguments import check_against_knowledge
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an answer costs and how well it fits.
+    """What an answer costs, how well it fits, and what it leaves free.
 
-    Attributes
-    ----------
-    cost : float
-        J (eq. 18) with priors, in the inverse form where the certified solver uses the inverse form.
-    residuals : dict of (target, sensor) to Residual
-    free_directions : tuple of FreeDirection
-        What the measurements leave undetermined, by this answer's residuals: larger residuals leave more free.
+    The cost is J (eq. 18) with priors, in the inverse form where the certified solver uses the inverse form. Larger
+    residuals leave more directions free.
     """
 
     cost: float
@@ -38,13 +33,7 @@ class Evaluation:
 def evaluate(
     problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
 ) -> Evaluation:
-    """Evaluate an answer: X = T_targetcarrier_target and Y = T_sensorcarrier_sensor by name, metres, and the scale.
-
-    Raises
-    ------
-    FrameError, PoseError, PriorError, ScaleError
-        When the answer lacks a frame, or contradicts what the problem fixes.
-    """
+    """Evaluate an answer; arguments and errors are those of ``cost_of_answer``."""
     parts = parts_of(problem)
     check_against_knowledge(problem, X, Y, scale)
     cost = 0.0

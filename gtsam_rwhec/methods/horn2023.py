@@ -54,21 +54,13 @@ UNCERTAIN_DEG = 150.0
 
 @dataclass(frozen=True)
 class DualQuaternionAnswer:
-    """The answer for one choice of signs.
+    """The answer for one choice of signs: R (n, 3, 3) and t (n, 3) of all targets, then of all sensors; metres.
 
-    Attributes
-    ----------
-    R, t : (n, 3, 3) and (n, 3) arrays
-        Frames of all targets, then of all sensors; metres.
-    cost, lower_bound : float
-        z'Qz with these signs, and what no z goes below, by the relaxation's multipliers. Other signs have other costs.
-    signs : (N,) array
-        Sign of each measurement's <p_a, p_b> relative to the quaternions of ``of_rotations``. Two choices of signs can
-        be compared by it.
-    contradicted : int
-        Number of measurements whose sign the answer contradicts. The common sign of a pair is free.
-    smallest_margin : float
-        The least |<p_a p_x, p_y p_b>|, the cosine of half the residual's angle: near zero the sign cannot be told.
+    ``cost`` is z'Qz with these signs (other signs have other costs), ``lower_bound`` what no z goes below, by the
+    relaxation's multipliers. ``signs`` (N,) are those of <p_a, p_b> relative to the quaternions of ``of_rotations``:
+    two choices of signs can be compared by them. ``contradicted`` counts the measurements whose sign the answer
+    contradicts; the common sign of a pair is free. ``smallest_margin`` is the least |<p_a p_x, p_y p_b>|, the cosine of
+    half the residual's angle: near zero the sign cannot be told.
     """
 
     R: Array
@@ -111,12 +103,8 @@ def solve_dual_quaternions(
 ) -> DualQuaternionAnswer:
     """The global optimum of Horn's cost for a choice of signs; "random" signs are drawn with the seed.
 
-    Raises
-    ------
-    OptionError
-        When ``signs`` or ``residual`` is not one of the choices.
-    UnderdeterminedError
-        When the rotations are not determined ("aligned" finds them first).
+    Raises OptionError when ``signs`` or ``residual`` is not one of the choices, and UnderdeterminedError when the
+    rotations are not determined ("aligned" finds them first).
     """
     q_A, q_B = signed_quaternions(stack, signs, seed)
     rows_X, rows_Y = residual_rows(stack, q_A, q_B, residual)

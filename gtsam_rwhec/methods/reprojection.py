@@ -78,17 +78,7 @@ class Observations:
         views: Mapping[tuple[str, str], tuple[PosesLike, ArrayLike]],
         corner_px: float = 0.1,
     ) -> Observations:
-        """Make checked observations.
-
-        Parameters
-        ----------
-        cameras : dict of str to Camera
-        corners : dict of str to (n, 3)
-            Metres.
-        views : dict of (target, sensor) to (A, pixels)
-            A = T_sensorcarrier_targetcarrier of each image, pixels (N, n, 2).
-        corner_px : float
-            Standard deviation of a corner along each axis, pixels.
+        """Make checked observations; views are given as A = T_sensorcarrier_targetcarrier and pixels of each image.
 
         Raises
         ------
@@ -136,18 +126,9 @@ class Observations:
     def poses(self, predicted: Mapping[tuple[str, str], Array] | None = None) -> Problem:
         """A problem of poses: each image's pose by its corners alone, with covariances.
 
-        Parameters
-        ----------
-        predicted : dict of (target, sensor) to (N, 4, 4), optional
-            T_camera_target by a calibration, metres. Each image takes the nearer of a flat target's two poses. Left
-            out, each image takes the pose with less reprojection error.
-
-        Raises
-        ------
-        TargetError
-            When a target is not flat.
-        CameraError
-            When an image's corners have no pose.
+        ``predicted`` has each image's T_camera_target (N, 4, 4) by a calibration, metres: the image takes the nearer of
+        a flat target's two poses. Left out, each image takes the pose with less reprojection error. Raises TargetError
+        when a target is not flat, and CameraError when an image's corners have no pose.
         """
         from gtsam_rwhec.vision.pose import plane_poses
 
@@ -220,10 +201,8 @@ def calibrate(observations: Observations, options: MethodOptions | None = None) 
     options = options or MethodOptions()
     targets, sensors = observations.targets, observations.sensors
     X, Y, starts_from = _start(observations, options)
-    T = np.array(
-        [one_transform(X[name], f"start of {name}") for name in targets]
-        + [one_transform(Y[name], f"start of {name}") for name in sensors]
-    )
+    starts = [(name, X[name]) for name in targets] + [(name, Y[name]) for name in sensors]
+    T = np.array([one_transform(pose, f"start of {name}") for name, pose in starts])
     if not np.isfinite(linearised(observations, T).cost):
         raise CameraError(
             f"the start ({starts_from}) puts a corner that was seen behind its camera; give a better start by "
@@ -312,8 +291,6 @@ def _in_plane(points: Array, name: str) -> tuple[Array, Array]:
     if singular[1] <= FLAT * singular[0]:
         raise TargetError(f"the corners of {name} lie on one line, which determines no pose; give corners in a plane")
     R = Vt.T * np.array([1.0, 1.0, np.linalg.det(Vt)])
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, middle
     flat = (points - middle) @ R
     flat[:, 2] = 0.0
-    return flat, T
+    return flat, se3.pose(R, middle)

@@ -23,33 +23,12 @@ def true_scales(
     known_sizes: tuple[str, ...],
     seed: Seed,
 ) -> float | dict[str, float]:
-    """Check the scales that a caller gives, and draw the scales that it leaves out.
+    """Check the scales that a caller gives, and draw the scales that it leaves out: alpha, or alpha by name.
 
-    Parameters
-    ----------
-    names : list of str
-        Targets, and sensors with odometry: each has its own scale with ``"per_target"``.
-    mode : "known", "shared" or "per_target"
-        The problem's scale mode.
-    given : float, mapping of str to float, or None
-        One scale, or a mapping for ``"per_target"``. ``None``: 1 (known), 0.5 (shared), or log-uniform in [1/2, 2]
-        with 1 for known sizes.
-    known_sizes : tuple of str
-        Names whose scale the problem is told.
-    seed : int or numpy.random.Generator
-        Seed, or a generator to draw from.
-
-    Returns
-    -------
-    float or dict of str to float
-        alpha, or alpha by name with ``"per_target"``.
-
-    Raises
-    ------
-    OptionError
-        For an unknown mode or name, a missing name, or a kind of scale that does not go with the mode.
-    ScaleError
-        If a scale is not positive and finite.
+    With ``"per_target"`` each target, and each sensor with odometry, has its own scale in ``names``. Scales that are
+    not given are 1 (known), 0.5 (shared), or log-uniform in [1/2, 2] with 1 for ``known_sizes``, whose scale the
+    problem is told. Raises OptionError for an unknown mode or name, a missing name, or a kind of scale that does not go
+    with the mode, and ScaleError if a scale is not positive and finite.
     """
     if mode not in get_args(ScaleMode):
         raise OptionError(f"true_scale: scale is {mode!r}; choose one of {', '.join(get_args(ScaleMode))}")
