@@ -8,7 +8,7 @@ import lazy_loader
 
 __version__ = "0.1.0"
 
-# The table of contents is __init__.pyi: type checkers and editors read it there, and here each of its names is imported
-# when a program first asks for it. A package with its own table has these two lines and an __init__.pyi, whose lines
+# The public names stand in __init__.pyi, where type checkers and editors read them. Each name is imported when a
+# program first uses it. A package with public names has these two lines and an __init__.pyi, whose lines
 # are "from .module import Name as Name"; only modules of the package itself may stand there.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -145,7 +145,8 @@ def direction_prior_factor(
 ) -> gtsam.CustomFactor:
     """A prior on a tilt (2,), rad: R axis_frame points along axis_carrier, and a turn about that axis stays free.
 
-    The residual is, with N (3, 2) a basis across axis_frame and theta the angle between the two axes::
+    The residual is, with N (3, 2) a basis of the plane orthogonal to axis_frame, and theta the angle between the two
+    axes::
 
         e = theta / sin(theta) N' R' axis_carrier       |e| = theta
 

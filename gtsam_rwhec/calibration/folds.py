@@ -14,7 +14,7 @@ Split = Literal["time", "pair", "sensor"]
 
 
 class Fold(NamedTuple):
-    """Measurements that are held out together, (N,) booleans of each pair with any, and the fold's name in messages."""
+    """Measurements held out together: (N,) booleans for each pair that has some; and a name for messages."""
 
     name: str
     held_out: dict[Pair, np.ndarray]

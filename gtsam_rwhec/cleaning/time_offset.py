@@ -75,7 +75,7 @@ def coarse_time_offset(
     search_s : float
         The search covers offsets from -search_s to search_s.
     max_gap_s : float
-        Between poses of the carrier further apart nothing is interpolated.
+        Poses of the carrier are not interpolated over gaps longer than this.
     where : str
         The sensor, for messages.
 

@@ -93,11 +93,11 @@ def checked(covariance: ArrayLike) -> Array:
 
 
 def _turned(by: Array, covariance: ArrayLike) -> Array:
-    """by Sigma by'; a NoiseError for infinite variances, which only the axes of their own frame can hold."""
+    """by Sigma by'; a NoiseError for infinite variances, which can be written only in the axes of their own frame."""
     array = checked(covariance)
     if not np.isfinite(array).all():
         raise NoiseError(
-            "the covariance is infinite along a free direction, which another frame's axes cannot hold; "
+            "the covariance is infinite along a free direction and cannot be written in another frame's axes; "
             "turn the marginal information instead (Refined.information)"
         )
     turned: Array = by @ array @ by.T

@@ -119,7 +119,7 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
     where : str
         For errors: which argument of which pair.
     out : (12, b) array, optional
-        Takes the rows, which saves a copy.
+        The rows are written into this array, which saves a copy.
 
     Returns
     -------

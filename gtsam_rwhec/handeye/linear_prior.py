@@ -78,7 +78,7 @@ def on_sphere(Z: Array, pull: Array) -> tuple[Array, float]:
     if gaps[0] > 1e-12 * (abs(values[0]) + length):
         q = p / gaps
         return vectors @ (q / math.sqrt(float(q @ q))), lam
-    # The pull has no part along the smallest eigenvector: either sign of that vector completes q.
+    # The pull has no component along the smallest eigenvector: q takes that component with either sign.
     q = np.concatenate([[0.0], p[1:] / np.maximum(gaps[1:], 1e-300)])
     q[0] = math.copysign(math.sqrt(max(1.0 - float(q @ q), 0.0)), p[0])
     return vectors @ (q / math.sqrt(float(q @ q))), float(values[0])

@@ -64,10 +64,10 @@ METHODS: dict[str, Method[[Request]]] = {
         _of_dq_paper(
             "dq2steps", dq2steps, "Section 3.2.2, Algorithm 2", "axes that are not parallel", _QUADRATIC, joint=False
         ),
-        _of_dq_paper("dqconvrlx", dqconvrlx, "Section 3.2.3", "little noise: q . q' = 0 nearly holds unasked"),
-        _of_dq_paper("dq2ndord", dq2ndord, "Section 3.2.4, Algorithm 4", "mu small, as with little noise"),
-        _of_dq_paper("dq2ndord_lambda", dq2ndord_lambda, "Appendix A", "lambda near the relaxation's"),
-        _of_dq_paper("dqitr", dqitr, "Section 3.2.5, Algorithm 5", "a fixed point that attracts; some noise"),
+        _of_dq_paper("dqconvrlx", dqconvrlx, "Section 3.2.3", "little noise: then q . q' is nearly 0"),
+        _of_dq_paper("dq2ndord", dq2ndord, "Section 3.2.4, Algorithm 4", "little noise: mu is small"),
+        _of_dq_paper("dq2ndord_lambda", dq2ndord_lambda, "Appendix A", "lambda near that of the relaxation"),
+        _of_dq_paper("dqitr", dqitr, "Section 3.2.5, Algorithm 5", "some noise; an iteration that converges"),
         _of_dq_paper("dqoptpoly_resultant", dqoptpoly_resultant, "Appendix B", "some noise: M is not singular"),
         _of_dq_paper("dqoptpoly_sturm", dqoptpoly_sturm, "Appendix B", "some noise: M is not singular"),
         Method(

@@ -58,7 +58,7 @@ def variance_factors(part: Part, J_t: Array, J_R: Array) -> PartVarianceFactors:
     lengths = np.einsum("eii->e", part.moments.translation[:, T_B, T_B])
     factors = []
     for J, floor in (
-        (J_t, (lengths + 1e-4 * part.moments.weight) * FLOOR**2 / counts),  # at least a centimetre's part
+        (J_t, (lengths + 1e-4 * part.moments.weight) * FLOOR**2 / counts),  # t_B counts as 1 cm at least
         (J_R, 2.0 * part.moments.kappa * FLOOR**2 / counts),
     ):
         of_part = correction * float(J.sum()) / (1.5 * N)

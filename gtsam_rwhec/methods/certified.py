@@ -19,12 +19,12 @@ SOURCE = (
 
 
 def certified(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """Solve by ``gtsam_rwhec.solve``; the notes have the certificate where it does not prove the answer."""
+    """Solve by ``gtsam_rwhec.solve``; the notes give the certificate if it does not prove the answer."""
     return outcome_of(quiet_solution(problem, options))
 
 
 def quiet_solution(problem: Problem, options: MethodOptions) -> Solution:
-    """Solve by ``gtsam_rwhec.solve`` without its warnings: the solution has their facts."""
+    """Solve by ``gtsam_rwhec.solve`` without its warnings: the solution states the same facts."""
     with warnings.catch_warnings():
         for category in (NotUniqueWarning, NotCertifiedWarning, WeightsWarning):
             warnings.simplefilter("ignore", category)

@@ -243,7 +243,8 @@ def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array
     Q[:, rY, rY] = np.einsum("ejl,ik->ejilk", G[:, T_B, T_B], I3).reshape(edges, 9, 9)
     _mirror(Q)
     P = np.zeros((edges, 25, 25))
-    # M_R = [I (x) R_A, -R_B' (x) I] (eq. 25); M_R' M_R has kappa I on the diagonal, -R_B' (x) R_A' beside it.
+    # M_R = [I (x) R_A, -R_B' (x) I] (eq. 25); M_R' M_R has diagonal blocks kappa I, and -R_B' (x) R_A' off the
+    # diagonal.
     P[:, rX, rX] = kappa[:, None, None] * I9
     P[:, rY, rY] = kappa[:, None, None] * I9
     cross = rotation.reshape(edges, 3, 3, 3, 3)  # [i, k, p, q] = sum kappa R_A[k, i] R_B[q, p]

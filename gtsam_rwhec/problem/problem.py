@@ -206,8 +206,8 @@ class Problem(Knowledge):
         accumulator, projected = self._accumulator.added(batch)
         if projected:
             warnings.warn(
-                f"{where}: {projected} rotations were off R'R = I by rounding in the input (less than "
-                f"{ROTATION_TOLERANCE:g}) and were projected to the nearest rotation",
+                f"{where}: {projected} rotations were not exact: R'R differs from I, by less than "
+                f"{ROTATION_TOLERANCE:g}; they were projected to the nearest rotation",
                 RotationsProjectedWarning,
                 stacklevel=3,
             )

@@ -61,7 +61,7 @@ def scale_sentence(solution: Solution) -> str:
 
 
 def weights_sentence(solution: Solution) -> str:
-    """What the weights are, and what they make of the cost."""
+    """How the measurements are weighted, and what the cost means with these weights."""
     if solution.is_relative:
         return (
             "Weights: sigma or kappa was not given and 1 was used, so costs and covariances are relative. Give both "

@@ -93,7 +93,7 @@ class CleaningReport(_Record):
 
     tracks: tuple[TrackCount, ...] = Field(description="measurements of each target by each sensor")
     time_offsets_s: dict[str, Seconds] = Field(
-        description="by sensor, at which the carriers' poses were taken: as given, or found from turning rates"
+        description="of each sensor, used to synchronise: as given, or found from turning rates"
     )
     coarse_sigma_s: dict[str, float] = Field(
         description="standard deviations of the time offsets that were found from turning rates"

@@ -25,8 +25,8 @@ class CalibratedFrame(NamedTuple):
 class RigFrames:
     """Calibrated frames by name, in the order in which they are written.
 
-    Names are written into Python, YAML and XML. They have only characters without a meaning there: first a letter, then
-    letters, digits and _, in parts joined by /.
+    Names are written into Python, YAML and XML. They have only characters that mean nothing special there: first a
+    letter, then letters, digits and _, in parts joined by /.
 
     Attributes
     ----------

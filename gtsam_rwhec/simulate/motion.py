@@ -25,8 +25,8 @@ class Motion:
     ----------
     kind : "general", "planar", "single_axis" or "none"
         ``"general"``: rotations about all axes, translations in a cube. ``"planar"``: rotations about one axis,
-        translations across it. ``"single_axis"``: rotations about one axis, translations in a cube. ``"none"``: no
-        rotation, translations in a cube.
+        translations perpendicular to it. ``"single_axis"``: rotations about one axis, translations in a cube.
+        ``"none"``: no rotation, translations in a cube.
     axis : tuple of three floats
         Rotation axis of planar and single-axis motion, in the frame that does not move, of any length. The default z
         suits a wheeled robot's floor.

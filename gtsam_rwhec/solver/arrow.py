@@ -74,7 +74,7 @@ def cholesky(D: Array, C: Array, E: Array) -> ArrowFactor | None:
 
 
 def forward_substitution(lower: Array, right: Array) -> Array:
-    """Solve lower y = right for stacks (L, m, m) and (L, m, c), row after row across the stack."""
+    """Solve lower y = right for stacks (L, m, m) and (L, m, c): each row of all L systems at once."""
     y = np.empty_like(right)
     for i in range(lower.shape[1]):
         row = right[:, i, :]

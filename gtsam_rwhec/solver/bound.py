@@ -92,7 +92,7 @@ def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
         room = np.r_[leaf_unit.ravel(), border_unit]
         by_room = float((reach**2 / room).sum()) * (1.0 + 1e-10)
         by_size = of_g if pin is None else np.inf  # better with a large g and little room: z'Z_rr z >= 0
-        # Each try needs a factorisation: try for more room only where g is large enough to matter.
+        # Each try needs a factorisation: it is worth it only if the bound loses enough to g.
         more = MORE_ROOM
         while min(by_room, by_size) > 1e-9 * abs(float(value)) + 1e-17 * size * form.magnitude:
             if not proven(more * leaf_unit, more * border_unit, pin):

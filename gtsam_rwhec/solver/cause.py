@@ -24,11 +24,11 @@ class Start(StrEnum):
 class Multipliers(StrEnum):
     """Which multipliers gave the best lower bound."""
 
-    #: Of R'R = I, at the answer (design fact 3).
+    #: Multipliers of R'R = I, at the answer (design fact 3).
     KKT = "dual"
-    #: Of all 20 independent constraints of each rotation (design fact 4).
+    #: Multipliers of all 20 independent constraints of each rotation (design fact 4).
     ALL_CONSTRAINTS = "small dual"
-    #: As the solver of the semidefinite relaxation returned them.
+    #: Multipliers that the solver of the semidefinite relaxation returned.
     RELAXATION = "relaxation's multipliers"
 
 

@@ -19,9 +19,10 @@ from gtsam_rwhec.solver.lagrangian import WIDE_UNIT, Wide, lagrangian
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.verified import cholesky_allowance, gamma, is_positive_definite
 
-#: Eigenvectors are taken out up to this many times the verified test's allowance for rounding.
+#: Eigenvectors are removed if their eigenvalue is below this many times the verified test's allowance for rounding
+#: errors.
 REACH = 100.0
-#: Covers the rounding of the few operations in the bounds themselves.
+#: Factor that makes a bound larger than the rounding errors of the few operations that compute it.
 _SAFETY = 1.0 + 1e-9
 
 

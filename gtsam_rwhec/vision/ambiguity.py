@@ -2,11 +2,11 @@
 
 A far or nearly frontal plane looks almost the same in two poses, mirror images of each other about the line of sight.
 The reprojection errors of one image hardly tell them apart. A track tells more: between two images the target turns
-against the camera by the same angle as the carriers turn against each other, for any extrinsics (A_i^-1 A_j and
-B_i B_j^-1 are conjugate), and a wrong choice changes that angle. Dynamic programming finds the most likely choice of
-the whole track, a chain with two states for each image; the cost of the best chain through the other state says how
-sure each choice is. Where the carriers' poses are known in enough images, one extrinsic rotation for all images tells
-more than the angles between neighbours do (`agreement`).
+relative to the camera by the same angle as the target carrier relative to the sensor carrier, for any extrinsics
+(A_i^-1 A_j and B_i B_j^-1 are conjugate). A wrong choice changes that angle. Dynamic programming finds the most likely
+choice of the whole track, a chain with two states for each image; the cost of the best chain through the other state
+says how sure each choice is. Where the carriers' poses are known in enough images, one extrinsic rotation for all
+images tells more than the angles between neighbours do (`agreement`).
 """
 
 from __future__ import annotations

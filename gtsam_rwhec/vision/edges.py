@@ -108,7 +108,7 @@ def refine_corners(
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Corners (N, 4, 2), the blur across each side (N, 4), pixels, and how much lighter the paper is (N,)."""
+    """Corners (N, 4, 2), the blur across each side (N, 4), pixels, and paper minus tag in gray values (N,)."""
 
     corners_px: Array
     blur_px: Array
