@@ -69,7 +69,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/identifiability": {"identifiability/test_identification.py": "threshold verdicts"},
     "gtsam_rwhec/logs": {
-        "logs/test_mcap_reader.py": "checked_poses mcap_blocks message_kinds protobuf_messages records ros2_schemas",
+        "logs/test_mcap_reader.py": "checked_poses decoders mcap_blocks message_kinds records ros2_schemas",
         "logs/test_mcap_writer.py": "foxglove_schemas written_schemas",
     },
     "gtsam_rwhec/methods": {
@@ -91,7 +91,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/problem": {
         "problem/test_moments.py": "accumulation",
-        "problem/test_problem.py": "knowledge measurements priors",
+        "problem/test_problem.py": "knowledge measurements",
         "problem/test_selection.py": "variance_factors",
     },
     "gtsam_rwhec/refinement": {

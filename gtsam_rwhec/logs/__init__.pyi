@@ -4,9 +4,9 @@ from .image_folder import is_image_folder as is_image_folder
 from .image_folder import write_image_folder as write_image_folder
 from .mcap_reader import Log as Log
 from .mcap_reader import PoseSeries as PoseSeries
-from .mcap_reader import Topic as Topic
 from .mcap_reader import open_log as open_log
 from .mcap_writer import LogWriter as LogWriter
+from .message_kinds import Topic as Topic
 
 # What its messages are read as.
 from .records import DetectionRecord as DetectionRecord

@@ -106,13 +106,7 @@ def find(tree: Any, path: str) -> Any:
 
 
 class MessageType:
-    """A ROS 2 message type, made from the definition that the log carries.
-
-    Raises
-    ------
-    MessageError
-        The definition cannot be read or lacks a part.
-    """
+    """A ROS 2 message type, made from the log's definition; a MessageError where it cannot be read or lacks a part."""
 
     def __init__(self, name: str, text: str) -> None:
         self._root = _short(name)
@@ -174,10 +168,7 @@ class MessageType:
     def walk(self, message: bytes | memoryview) -> Shape:
         """Find where everything is in one message.
 
-        Raises
-        ------
-        MessageError
-            The message ends too early, is not CDR, or has a string that is not UTF-8.
+        A MessageError says that the message ends too early, is not CDR, or has a string that is not UTF-8.
         """
         return _Walk(self._fields, message).walk(self._root)
 

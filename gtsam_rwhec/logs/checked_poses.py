@@ -16,14 +16,9 @@ LARGEST_M = 1e12
 
 
 def transforms(positions: Array, quaternions_xyzw: Array) -> tuple[Array, dict[int, str]]:
-    """Make (N, 4, 4) transforms of (N, 3) positions in metres and (N, 4) quaternions.
+    """Make (N, 4, 4) transforms of (N, 3) positions in metres and (N, 4) quaternions, and say what is wrong, by index.
 
-    Returns
-    -------
-    T : (N, 4, 4) array
-        The identity where there is a fault.
-    faults : dict of int to str
-        What is wrong, by index: an entry that is not finite, a norm that is not 1, a position too far away.
+    A fault is an entry that is not finite, a norm that is not 1, or a position too far away; T is the identity there.
     """
     norms = np.sqrt(np.einsum("ij,ij->i", quaternions_xyzw, quaternions_xyzw))
     # Every comparison with NaN is false, so NaN is a fault.
@@ -48,12 +43,8 @@ def gtsam_covariances(T: Array, covariances: Array) -> list[Array | None]:
     """Turn (N, 6, 6) covariances of ROS poses T (N, 4, 4) into GTSAM's.
 
     ROS has (x, y, z, rotations about the fixed axes x, y, z) in the parent frame: t + d, Exp(phi) R. A right
-    perturbation [omega, v] moves (R, t) to (R Exp(omega), t + R v), so omega = R' phi and v = R' d.
-
-    Returns
-    -------
-    list of (6, 6) arrays or None
-        None for a covariance that is all zeros or has a negative variance (ROS says "unknown" so) or is not finite.
+    perturbation [omega, v] moves (R, t) to (R Exp(omega), t + R v), so omega = R' phi and v = R' d. A covariance that
+    is all zeros or has a negative variance (ROS says "unknown" so) or is not finite becomes None.
     """
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
     known: NDArray[np.bool_] = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))

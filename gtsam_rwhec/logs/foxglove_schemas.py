@@ -96,16 +96,9 @@ PROTOBUF = Access(getattr, "seconds", "nanos", bytes)
 def decoder(
     schema: str, parse: Callable[[bytes | memoryview], Any], access: Access
 ) -> Callable[[str, Sequence[bytes | memoryview], list[int]], list[Read]]:
-    """Make the function that reads messages of a schema: (topic, messages, logged_ns) -> records of each.
+    """Make the function that reads messages of a schema in `SCHEMAS`: (topic, messages, logged_ns) -> records of each.
 
-    Parameters
-    ----------
-    schema
-        A key of `SCHEMAS`.
-    parse
-        Makes a JSON object or a protobuf message of bytes, or raises `MessageError`.
-    access
-        `JSON` or `PROTOBUF`.
+    `parse` makes a JSON object or a protobuf message of bytes, or raises `MessageError`.
     """
     rows_of = _POSES.get(schema)
 
@@ -143,13 +136,7 @@ def _with_poses(out: list[Any], rows: list[Row], topic: str, logged_ns: list[int
 
 
 def parse_json(message: bytes | memoryview) -> Any:
-    """JSON object of a message.
-
-    Raises
-    ------
-    MessageError
-        For anything else.
-    """
+    """JSON object of a message; a MessageError for anything else."""
     try:
         value = json.loads(bytes(message))
     except (ValueError, RecursionError) as error:

@@ -17,6 +17,7 @@ import io
 import struct
 import zlib
 from array import array
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -84,13 +85,7 @@ class Seen:
 
 @dataclass
 class McapFile:
-    """An MCAP file's schemas, channels and blocks.
-
-    Raises
-    ------
-    LogError
-        The file cannot be opened or is not MCAP.
-    """
+    """An MCAP file's schemas, channels and blocks; a LogError where the file cannot be opened or is not MCAP."""
 
     path: Path
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -106,17 +101,16 @@ class McapFile:
             self._stream = open(self.path, "rb")  # noqa: SIM115  (read from for as long as the object lives)
         except OSError as error:
             raise LogError(f"{self.path} cannot be read: {error.strerror}.") from error
-        if self._read(0, len(MAGIC)) != MAGIC:
+        first = self._read(0, len(MAGIC))
+        if first != MAGIC:
             self.close()
-            begins = f"begins with {self._begins!r}" if self._begins else "is empty"
+            begins = f"begins with {first!r}" if first else "is empty"
             raise LogError(
                 f"{self.path} is not an MCAP file (version 0): it {begins}. ROS 1 bags and db3 bags must be converted "
                 "first: gtsam-rwhec convert."
             )
-        try:
+        with suppress(*_FAULTS):
             self.is_indexed = self._read_summary()
-        except _FAULTS:
-            self.is_indexed = False
         if not self.is_indexed:
             self.schemas, self.channels, self.blocks, self.seen = {}, {}, [], {}
             self._read_through()
@@ -126,25 +120,16 @@ class McapFile:
         self._stream.close()
 
     def open(self, block: Block) -> Messages:
-        """Read, check and decompress a block.
-
-        Raises
-        ------
-        LogError
-            The block has a wrong compression, size or checksum.
-        """
+        """Read, check and decompress a block; a LogError where its compression, size or checksum is wrong."""
         raw = self._read(block.offset, block.length)
         return self._split(self._opened(raw, block) if block.is_chunk else raw, block.offset)
 
     def _read(self, offset: int, length: int) -> bytes:
         try:
             self._stream.seek(offset)
-            data = self._stream.read(length)
+            return self._stream.read(length)
         except OSError as error:
             raise LogError(f"{self.path}, byte {offset}: {error.strerror}") from error
-        if offset == 0:
-            self._begins = data
-        return data
 
     def _read_summary(self) -> bool:
         """Take schemas, channels, chunks and counts from the index; return whether the index fits the file."""
@@ -164,18 +149,16 @@ class McapFile:
             statistics is None
             or statistics.chunk_count != len(chunks)
             or not set(statistics.channel_message_counts) <= set(self.channels)
+            or (statistics.message_count and not chunks)
         ):
             return False
-        if statistics.message_count and not chunks:
-            return False
+        self.seen = {channel: Seen(count) for channel, count in statistics.channel_message_counts.items()}
         for chunk in chunks:
             inside = len(MAGIC) <= chunk.chunk_start_offset <= start - chunk.chunk_length
             if not inside or chunk.message_start_time > chunk.message_end_time:
                 return False
             self.blocks.append(Block(chunk.chunk_start_offset, chunk.chunk_length, True, chunk.message_start_time))
-        self.seen = {channel: Seen(count) for channel, count in statistics.channel_message_counts.items()}
-        # A channel's span is the span of its chunks: the indexes of single messages are not read.
-        for chunk in chunks:
+            # A channel's span is the span of its chunks: the indexes of single messages are not read.
             for channel in chunk.message_index_offsets:
                 _widen(self.seen.setdefault(channel, Seen()), chunk.message_start_time, chunk.message_end_time)
         return True
@@ -213,10 +196,7 @@ class McapFile:
                 self._count(Block(at, whole, True, 0))
             at += whole
         self._count_loose(loose_at, at)
-        before = sum(seen.count for seen in self.seen.values())
-        if is_cut:
-            self._count(Block(at, self.size - at, True, 0, is_cut=True))
-        saved = sum(seen.count for seen in self.seen.values()) - before
+        saved = self._count(Block(at, self.size - at, True, 0, is_cut=True)) if is_cut else 0
         self.losses.append(
             f"{self.path} ends too early, or is damaged, at byte {at} of {self.size}: the last {self.size - at} bytes "
             f"and all that should follow are lost, but for {saved} messages of the chunk that breaks off"
@@ -226,13 +206,13 @@ class McapFile:
         if start:
             self._count(Block(start, end - start, False, 0))
 
-    def _count(self, block: Block) -> None:
-        """Open a block once, for its schemas, channels, counts and span."""
+    def _count(self, block: Block) -> int:
+        """Open a block once, for its schemas, channels, counts and span; return how many messages it has."""
         try:
             messages = self.open(block)
         except LogError as error:
             self.losses.append(str(error))
-            return
+            return 0
         channels, log_time = messages.heads["channel"], messages.heads["log_time"]
         for channel in np.unique(channels).tolist():
             times = log_time[channels == channel]
@@ -241,11 +221,12 @@ class McapFile:
             _widen(seen, int(times.min()), int(times.max()))
         if len(log_time):
             self.blocks.append(replace(block, start_ns=int(log_time.min())))
+        return len(log_time)
 
     def _opened(self, raw: bytes, block: Block) -> bytes:
         """The records in a chunk; of a chunk that is cut, as many as there are."""
         where = f"{self.path}, chunk at byte {block.offset}"
-        stream = _stream(raw)
+        stream = ReadDataStream(io.BytesIO(raw))
         try:
             opcode, length = _RECORD.unpack(stream.read(_RECORD.size))
             chunk = Chunk.read(stream)
@@ -284,12 +265,12 @@ class McapFile:
                 starts.append(start + head_bytes)
                 ends.append(at)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                kind = Schema if opcode == Opcode.SCHEMA else Channel
                 try:
-                    self._note((Schema if opcode == Opcode.SCHEMA else Channel).read(_stream(data[start:at])))
+                    self._note(kind.read(ReadDataStream(io.BytesIO(data[start:at]))))
                 except _FAULTS as error:
-                    raise LogError(
-                        f"{self.path}, byte {offset}: a schema or channel cannot be read: {error}"
-                    ) from error
+                    what = f"a schema or channel cannot be read: {error}"
+                    raise LogError(f"{self.path}, byte {offset}: {what}") from error
         if not starts:
             return Messages(data, np.zeros(0, _HEAD), starts, ends)
         windows = sliding_window_view(np.frombuffer(data, np.uint8), head_bytes)
@@ -306,10 +287,6 @@ def _decompressed(chunk: Chunk) -> bytes:
     if chunk.compression == "lz4":
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
     return {"": chunk.data, "none": chunk.data}[chunk.compression]
-
-
-def _stream(data: bytes) -> ReadDataStream:
-    return ReadDataStream(io.BytesIO(data))
 
 
 def _widen(seen: Seen, first_ns: int, last_ns: int) -> None:

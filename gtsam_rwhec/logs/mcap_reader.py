@@ -15,18 +15,16 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, TypeVar
 
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import McapReader, make_reader
-from mcap.records import Channel, Schema
 
 from gtsam_rwhec.errors import LogError, LogWarning, MessageError
-from gtsam_rwhec.logs import foxglove_schemas, protobuf_messages, ros2_schemas
+from gtsam_rwhec.logs.decoders import Decoder, decoder_for
 from gtsam_rwhec.logs.mcap_blocks import Block, McapFile
-from gtsam_rwhec.logs.message_kinds import IMAGE_SCHEMAS, TF_TOPICS, TRANSFORM_SCHEMAS, schema_word
+from gtsam_rwhec.logs.message_kinds import Topic
 from gtsam_rwhec.logs.records import Array, PoseRecord, Record
 
 OnBad = Literal["warn", "raise"]
@@ -38,38 +36,6 @@ MOST_OPEN_BYTES = 1 << 30
 MOST_NAMED = 50
 
 _Entry = TypeVar("_Entry")
-_Decoder = Callable[[str, Sequence[bytes | memoryview], list[int]], list[foxglove_schemas.Read]]
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a log.
-
-    Attributes
-    ----------
-    first_ns, last_ns : int or None
-        First and last log time; where the file has an index, of the chunks that have the topic.
-    unreadable : str
-        Why the messages cannot become records; empty where they can.
-    """
-
-    name: str
-    schema: str
-    encoding: str
-    count: int
-    first_ns: int | None
-    last_ns: int | None
-    unreadable: str
-
-    @property
-    def is_tf(self) -> bool:
-        """Whether the topic has transforms of the log's tree of frames."""
-        return self.name.rpartition("/")[2] in TF_TOPICS or self.schema in TRANSFORM_SCHEMAS
-
-    @property
-    def has_images(self) -> bool:
-        """Whether its messages are images that can be decoded."""
-        return schema_word(self.schema) in IMAGE_SCHEMAS
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +82,7 @@ class Log:
 
     def __init__(self, files: list[McapFile]) -> None:
         self.files = files
-        self._decoders: dict[tuple[int, int], _Decoder | str] = {}
+        self._decoders: dict[tuple[int, int], Decoder | str] = {}
         self.losses = [loss for file in files for loss in file.losses]
         if self.losses:
             warnings.warn("; ".join(self.losses), LogWarning, stacklevel=3)
@@ -124,9 +90,7 @@ class Log:
     def __enter__(self) -> Log:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         for file in self.files:
             file.close()
 
@@ -271,7 +235,7 @@ class Log:
                 raise LogError(f"{self.files[0].path}, topic {topic.name}: {topic.unreadable}.")
         return wanted
 
-    def _decoder(self, number: int, channel_id: int) -> _Decoder | str:
+    def _decoder(self, number: int, channel_id: int) -> Decoder | str:
         """The function for a channel's messages, or why there is none."""
         key = number, channel_id
         if key not in self._decoders:
@@ -280,7 +244,7 @@ class Log:
             try:
                 if channel is None:
                     raise MessageError(f"channel {channel_id} is not described in the file")
-                self._decoders[key] = _decoder_for(channel, file.schemas.get(channel.schema_id))
+                self._decoders[key] = decoder_for(channel, file.schemas.get(channel.schema_id))
             except MessageError as error:
                 self._decoders[key] = str(error)
         return self._decoders[key]
@@ -339,19 +303,3 @@ class _Bad:
         if self._first:
             parts = [f"{where}: {self._counts[where]} left out, the first: {e}" for where, e in self._first.items()]
             warnings.warn("; ".join(parts), LogWarning, stacklevel=3)
-
-
-def _decoder_for(channel: Channel, schema: Schema | None) -> _Decoder:
-    if schema is None:
-        raise MessageError("it has no schema")
-    name, encoding = schema.name, channel.message_encoding
-    if encoding == "cdr" and schema.encoding == "ros2msg" and name.replace("/msg/", "/") in ros2_schemas.SCHEMAS:
-        try:
-            return ros2_schemas.decoder(name, schema.data.decode())
-        except UnicodeDecodeError as error:
-            raise MessageError(f"the definition of {name} is not UTF-8") from error
-    if encoding == "json" and name in foxglove_schemas.SCHEMAS:
-        return foxglove_schemas.decoder(name, foxglove_schemas.parse_json, foxglove_schemas.JSON)
-    if encoding == "protobuf" and name in foxglove_schemas.SCHEMAS:
-        return foxglove_schemas.decoder(name, protobuf_messages.parser(schema), foxglove_schemas.PROTOBUF)
-    raise MessageError(f"schema {name!r} ({schema.encoding}) in {encoding!r} is not read by this library")

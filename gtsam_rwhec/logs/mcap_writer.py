@@ -26,13 +26,7 @@ from scipy.spatial.transform import Rotation
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.atomic_write import atomic_stream
 from gtsam_rwhec.logs.mcap_reader import Log
-from gtsam_rwhec.logs.message_kinds import (
-    IMAGE_SCHEMAS,
-    MEASURED_PAIR,
-    TAG_DETECTIONS,
-    VIDEO_SCHEMAS,
-    schema_word,
-)
+from gtsam_rwhec.logs.message_kinds import IMAGE_SCHEMAS, MEASURED_PAIR, TAG_DETECTIONS, VIDEO_SCHEMAS, schema_word
 from gtsam_rwhec.logs.records import Array, DetectionRecord, IntrinsicsRecord, PairRecord
 from gtsam_rwhec.logs.written_schemas import json_schema
 

@@ -1,6 +1,8 @@
-"""Names of topics and schemas by their content: transforms, images, intrinsics, detections, pairs."""
+"""A log's topics, and names of topics and schemas by content: transforms, images, intrinsics, detections, pairs."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 #: The last words of ROS's topics of transforms.
 TF_TOPICS = ("tf", "tf_static")
@@ -17,3 +19,34 @@ MEASURED_PAIR = "gtsam_rwhec.MeasuredPair"
 def schema_word(schema: str) -> str:
     """The last word of a schema's name: ``Image`` of ``sensor_msgs/msg/Image`` and of ``foxglove.Image``."""
     return schema.replace("/", ".").rpartition(".")[2]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a log.
+
+    Attributes
+    ----------
+    first_ns, last_ns : int or None
+        First and last log time; where the file has an index, of the chunks that have the topic.
+    unreadable : str
+        Why the messages cannot become records; empty where they can.
+    """
+
+    name: str
+    schema: str
+    encoding: str
+    count: int
+    first_ns: int | None
+    last_ns: int | None
+    unreadable: str
+
+    @property
+    def is_tf(self) -> bool:
+        """Whether the topic has transforms of the log's tree of frames."""
+        return self.name.rpartition("/")[2] in TF_TOPICS or self.schema in TRANSFORM_SCHEMAS
+
+    @property
+    def has_images(self) -> bool:
+        """Whether its messages are images that can be decoded."""
+        return schema_word(self.schema) in IMAGE_SCHEMAS

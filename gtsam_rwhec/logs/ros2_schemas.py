@@ -18,14 +18,7 @@ import numpy as np
 from gtsam_rwhec.errors import MessageError
 from gtsam_rwhec.logs.cdr import Batch, MessageType, Numbers, find
 from gtsam_rwhec.logs.checked_poses import gtsam_covariances, image_fault, transforms
-from gtsam_rwhec.logs.records import (
-    Array,
-    DetectionRecord,
-    ImageRecord,
-    IntrinsicsRecord,
-    PoseRecord,
-    Record,
-)
+from gtsam_rwhec.logs.records import Array, DetectionRecord, ImageRecord, IntrinsicsRecord, PoseRecord, Record
 
 #: The records of a message, or its fault in words.
 Read = Sequence[Record] | str
@@ -56,10 +49,7 @@ class Tag:
 def decoder(schema: str, definition: str) -> Callable[[str, Sequence[bytes | memoryview], list[int]], list[Read]]:
     """Make the function that reads messages of a schema: (topic, messages, logged_ns) -> records of each.
 
-    Raises
-    ------
-    MessageError
-        The definition in the log cannot be read.
+    A MessageError says that the definition in the log cannot be read.
     """
     decode = SCHEMAS[schema.replace("/msg/", "/")]
     message_type = MessageType(schema, definition)
@@ -132,12 +122,7 @@ def _poses(where: Pose, batch: Batch, topic: str, logged_ns: list[int]) -> list[
         T, covariances, wrong = _pose(batch, tree, where)
         parent, child = _frame(batch, tree), _frame(batch, tree, where.child) if where.child else ""
         each = zip(logged_ns, _stamps(batch, tree), T, covariances, strict=True)
-        parts.append(
-            [
-                PoseRecord(logged, stamp, topic, parent, child, T_i, covariance)
-                for logged, stamp, T_i, covariance in each
-            ]
-        )
+        parts.append([PoseRecord(logged, stamp, topic, parent, child, T_i, S) for logged, stamp, T_i, S in each])
         faults = wrong | faults
     return _by_message(parts, faults, len(logged_ns))
 
@@ -161,12 +146,11 @@ def _detections(tags: Sequence[Tag], batch: Batch, topic: str, logged_ns: list[i
                 T, covariances, wrong = _pose(batch, tree, tag.pose)
                 poses = zip(T, covariances, strict=True)
                 faults = wrong | faults
+            each = zip(logged_ns, stamps, ids, corners, poses, strict=False)
             parts.append(
                 [
                     DetectionRecord(logged, stamp, topic, frame, family, id_, corners_px, *pose)
-                    for logged, stamp, id_, corners_px, pose in zip(
-                        logged_ns, stamps, ids, corners, poses, strict=False
-                    )
+                    for logged, stamp, id_, corners_px, pose in each
                 ]
             )
     return _by_message(parts, faults, len(logged_ns))

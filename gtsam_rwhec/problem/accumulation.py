@@ -47,10 +47,7 @@ class Accumulator:
     def added(self, batch: Batch) -> tuple[Accumulator, int]:
         """The accumulator with a batch added, and how many of the batch's rotations were projected to SO(3).
 
-        Raises
-        ------
-        PoseError
-            The batch has a pose that is not valid.
+        A PoseError names a pose that is not valid.
         """
         if self._opening is None:
             gauge = self.gauge

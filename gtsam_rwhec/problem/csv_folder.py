@@ -102,23 +102,10 @@ def read_csv(
 
 
 def read_pose_rows(path: str | Path) -> NDArray[np.float64]:
-    """Read one file of poses.
+    """Read the rows (N, 7), N >= 1, of one file of poses: text in UTF-8, lines of ``qw,qx,qy,qz,tx,ty,tz``.
 
-    Parameters
-    ----------
-    path
-        Text in UTF-8; lines of ``qw,qx,qy,qz,tx,ty,tz``.
-
-    Returns
-    -------
-    rows : (N, 7) array
-        N >= 1, all finite; quaternions of norm 1 up to `QUATERNION_TOLERANCE`, which `Problem.add` normalises.
-
-    Raises
-    ------
-    FileFormatError
-        The file cannot be read or is empty, or a line is not seven finite numbers or has a quaternion whose norm is not
-        1. The message has the file and the line.
+    All are finite, with quaternions of norm 1 up to `QUATERNION_TOLERANCE`, which `Problem.add` normalises. For a file
+    that cannot be read or is empty, and for any other line, a FileFormatError has the file and the line.
     """
     path = Path(path)
     try:

@@ -111,10 +111,8 @@ class GivenMeasurements:
     def checked(self, where: str) -> Measurements:
         """The arguments as arrays; a single sigma or kappa for all measurements stays one number.
 
-        Raises
-        ------
-        PoseError, CountError, NoiseError
-            Poses, stamps or noise are not valid, do not have one entry for each measurement, or noise is given twice.
+        A PoseError, CountError or NoiseError says which poses, stamps or noise are not valid, do not have one entry for
+        each measurement, or are given twice.
         """
         A = as_transforms(self.A, self.order, f"A of {where}")
         B = as_transforms(self.B, self.order, f"B of {where}")

@@ -72,20 +72,10 @@ class Gauge:
 
 @dataclass(frozen=True)
 class Moments:
-    """Sums over the measurements of one pair; ``a + b`` is the moments of both.
+    """Sums over the `count` measurements of one pair; ``a + b`` is the moments of both.
 
-    Attributes
-    ----------
-    count : int
-        Number of measurements.
-    kappa : float
-        Sum of the rotation weights.
-    translation : (25, 25) array
-        sum f f' / sigma^2.
-    rotation : (9, 9) array
-        sum kappa vec(R_A) vec(R_B)'.
-    projected : int
-        Measurements whose rotations were projected to SO(3).
+    `kappa` is the sum of the rotation weights, `translation` (25, 25) is sum f f' / sigma^2, `rotation` (9, 9) is
+    sum kappa vec(R_A) vec(R_B)'; the rotations of `projected` measurements were projected to SO(3).
     """
 
     count: int
@@ -210,18 +200,8 @@ class MomentStack:
 def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array, Array]:
     """Quadratic forms of E pairs over x = [t_X, t_Y, alpha, vec R_X, vec R_Y] (design fact 1; eqs. 24-33).
 
-    Parameters
-    ----------
-    translation : (E, 25, 25) array
-        Second moments of the features, about the gauge; permuted by ``SWAPPED`` for the inverse equation.
-    rotation : (E, 9, 9) array
-        sum kappa vec(R_A) vec(R_B)' (transposed for the inverse equation).
-    kappa : (E,) array
-
-    Returns
-    -------
-    translation_form, rotation_form : (E, 25, 25) arrays
-        x' form x is the pair's J_t and J_R (eq. 18), with the factor 1/2.
+    The moments are as in `MomentStack`; for the inverse equation ``translation`` is permuted by ``SWAPPED`` and
+    ``rotation`` transposed. x' form x is the pair's J_t and J_R (eq. 18), with the factor 1/2; each form (E, 25, 25).
     """
     G = translation
     edges = len(G)

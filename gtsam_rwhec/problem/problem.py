@@ -9,22 +9,11 @@ from typing import Literal
 
 from numpy.typing import ArrayLike
 
-from gtsam_rwhec.errors import (
-    CountError,
-    FrameError,
-    MeasurementsNotKeptError,
-    OptionError,
-    RotationsProjectedWarning,
-)
+from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError, RotationsProjectedWarning
 from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder
 from gtsam_rwhec.problem.accumulation import Accumulator, Batch
 from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode
-from gtsam_rwhec.problem.measurements import (
-    GivenMeasurements,
-    KeptMeasurements,
-    Measurements,
-    warn_of_millimetres,
-)
+from gtsam_rwhec.problem.measurements import GivenMeasurements, KeptMeasurements, Measurements, warn_of_millimetres
 from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.pairs import Pair
 

@@ -20,24 +20,9 @@ from gtsam_rwhec.problem.variance_factors import AS_STATED, VarianceFactors
 def selected(problem: Problem, keep: ByPair[ArrayLike]) -> Problem:
     """The problem with some of its measurements only.
 
-    Parameters
-    ----------
-    problem : Problem
-        With its raw measurements; it is not changed.
-    keep : dict of (target, sensor) to (N,) booleans
-        True for measurements that stay, in the order of ``problem.measurements``. Pairs without an entry stay whole.
-
-    Returns
-    -------
-    Problem
-        Frames in the same order, without the pairs and frames that have no measurement left.
-
-    Raises
-    ------
-    MeasurementsNotKeptError
-        The problem was made with ``keep_measurements=False``.
-    FrameError, CountError
-        The problem does not have a pair, a mask is not one boolean for each measurement, or nothing is left.
+    The masks ``keep`` (N,) are true for measurements that stay, in the order of ``problem.measurements``. Pairs without
+    an entry stay whole. A CountError says which mask is not one boolean for each measurement; other errors are as in
+    `reweighted`.
     """
     masks = {Pair(*pair): np.asarray(mask) for pair, mask in keep.items()}
     for pair, mask in masks.items():

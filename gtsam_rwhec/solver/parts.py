@@ -9,10 +9,9 @@ import numpy as np
 
 from gtsam_rwhec.errors import FrameError, PoseError, PriorError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.knowledge import Prior, ScaleMode
 from gtsam_rwhec.problem.moments import Gauge, Moments, MomentStack
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.problem.priors import Prior
 from gtsam_rwhec.problem.problem import Problem
 
 #: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" is the inverse equation, B X^-1 = Y^-1 A, which a

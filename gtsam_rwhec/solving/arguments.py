@@ -8,7 +8,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform
-from gtsam_rwhec.problem.priors import difference
+from gtsam_rwhec.problem.knowledge import difference
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.options import SolveOptions
 
