@@ -3,7 +3,6 @@
 from .image_folder import is_image_folder as is_image_folder
 from .image_folder import write_image_folder as write_image_folder
 from .mcap_reader import Log as Log
-from .mcap_reader import PoseSeries as PoseSeries
 from .mcap_reader import open_log as open_log
 from .mcap_writer import LogWriter as LogWriter
 from .message_kinds import Topic as Topic
@@ -14,6 +13,7 @@ from .records import ImageRecord as ImageRecord
 from .records import IntrinsicsRecord as IntrinsicsRecord
 from .records import PairRecord as PairRecord
 from .records import PoseRecord as PoseRecord
+from .records import PoseSeries as PoseSeries
 from .records import Record as Record
 from .ros_bags import convert_ros_bag as convert_ros_bag
 from .transforms import TfBuffer as TfBuffer

@@ -13,7 +13,6 @@ import heapq
 import struct
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -25,7 +24,7 @@ from gtsam_rwhec.errors import LogError, LogWarning, MessageError
 from gtsam_rwhec.logs.decoders import Decoder, decoder_for
 from gtsam_rwhec.logs.mcap_blocks import Block, McapFile
 from gtsam_rwhec.logs.message_kinds import Topic
-from gtsam_rwhec.logs.records import Array, PoseRecord, Record
+from gtsam_rwhec.logs.records import Array, PoseRecord, PoseSeries, Record
 
 OnBad = Literal["warn", "raise"]
 #: Number of messages that are decoded together.
@@ -36,16 +35,6 @@ MOST_OPEN_BYTES = 1 << 30
 MOST_NAMED = 50
 
 _Entry = TypeVar("_Entry")
-
-
-@dataclass(frozen=True, eq=False)
-class PoseSeries:
-    """All poses of one pair of frames, by stamp: stamps_ns (N,), T_parent_child (N, 4, 4)."""
-
-    stamps_ns: np.ndarray
-    T: Array
-    parent: str
-    child: str
 
 
 def open_log(path: str | Path | Iterable[str | Path]) -> Log:

@@ -44,6 +44,16 @@ class PoseRecord:
         return self.topic.rpartition("/")[2] == "tf_static"
 
 
+@dataclass(frozen=True, eq=False)
+class PoseSeries:
+    """All poses of one pair of frames, by stamp: stamps_ns (N,), T_parent_child (N, 4, 4)."""
+
+    stamps_ns: np.ndarray
+    T: Array
+    parent: str
+    child: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageRecord:
     """An image, not decoded.

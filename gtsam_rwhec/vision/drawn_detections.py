@@ -26,19 +26,9 @@ AXIS = 0.08
 
 
 def draw(gray: Gray, detections: Iterable[DetectionRecord], camera: Camera) -> NDArray[np.uint8]:
-    """Draw outlines of tags, corners of boards, axes of used detections, and names with reasons.
+    """Draw outlines of tags, corners of boards, axes of used detections, and names with reasons, on an image.
 
-    Parameters
-    ----------
-    gray : (height, width) uint8
-    detections : iterable of DetectionRecord
-        The detections in this image.
-    camera : Camera
-
-    Returns
-    -------
-    (height, width, 3) uint8
-        Colours (blue, green, red), as OpenCV writes them.
+    The picture (height, width, 3) has the colours (blue, green, red), as OpenCV writes them.
     """
     picture = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     for record in detections:

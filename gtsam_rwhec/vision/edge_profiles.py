@@ -25,18 +25,10 @@ NOISE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Edges that were fitted to profiles (...).
+    """Edges that were fitted to profiles (...); all arrays (...).
 
-    Attributes
-    ----------
-    shift : (...) array
-        How far outwards the edge is, in the profiles' unit of length.
-    wider : (...) array
-        By how much the blur is wider than assumed, in the same unit.
-    step : (...) array
-        By how much the paper is lighter than the border.
-    rms : (...) array
-        Root mean square of the residuals, in units of the step.
+    The edge is `shift` further outwards and the blur `wider` than assumed, in the profiles' unit of length; the paper
+    is lighter than the border by `step`; `rms` is the root mean square of the residuals, in units of the step.
     """
 
     shift: Array
@@ -48,18 +40,9 @@ class Fitted:
 def fit_profiles(values: Array, places: Array, module: Array, blur: Array, step: Array) -> Fitted:
     """Fit edges to profiles by one Gauss-Newton step from an edge at 0.
 
-    Parameters
-    ----------
-    values : (..., S) array
-        Gray values.
-    places : (..., S) array
-        Places of the values, from inside (negative) outwards.
-    module : (...) array
-        Distance from the edge inwards to the code.
-    blur : (...) array
-        Standard deviation of the blur.
-    step : (...) array
-        About how much lighter the paper is than the border: a scale for the priors.
+    Profiles are gray values (..., S) at places (..., S), from inside (negative) outwards. `module` (...) is the
+    distance from the edge inwards to the code, `blur` (...) the blur's standard deviation, and `step` (...) about how
+    much lighter the paper is than the border: a scale for the priors.
     """
     sigma = blur[..., None]
     z = places / sigma

@@ -194,14 +194,8 @@ def _quiet_on_one_thread() -> None:
 def measured_corner_px(squared_px: np.ndarray, corners: np.ndarray, least_px: float = 0.02) -> float:
     """Standard deviation of a corner along each axis, from reprojection errors.
 
-    Parameters
-    ----------
-    squared_px : (n,)
-        Sums of squared errors of n poses of one target in one camera, px^2.
-    corners : (n,)
-        Number of corners of each pose; 2 corners - 6 degrees of freedom.
-    least_px : float
-        The least result: few data can give too small a result.
+    `squared_px` (n,) are sums of squared errors of n poses of one target in one camera, px^2; a pose of `corners` (n,)
+    corners has 2 corners - 6 degrees of freedom. The result is at least `least_px`, since few data can give too little.
     """
     freedom = 2 * corners - 6
     mask = np.isfinite(squared_px) & (freedom > 0)
