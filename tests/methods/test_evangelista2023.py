@@ -179,7 +179,7 @@ def test_what_cannot_be_observed_is_refused_in_words() -> None:
         Observations.of(CAMERAS, {"tag": SQUARE[:3]}, {("tag", "left"): (A, pixels)})
     observations, X, Y = seen(0.0, 6, images=5)
     bent = {**observations.corners, "board": GRID + [[0.0, 0.0, 0.01 * (k % 2)] for k in range(30)]}
-    with pytest.raises(TargetError, match="no plane"):
+    with pytest.raises(TargetError, match="do not lie in one plane"):
         calibrate(dataclasses.replace(observations, corners=bent))
     turned = {name: T @ np.diag([1.0, -1.0, -1.0, 1.0]) for name, T in Y.items()}
     with pytest.raises(CameraError, match="behind"):
