@@ -182,17 +182,36 @@ class JointFields(JointCovariance):
 
 @dataclass(frozen=True)
 class FrameFields:
-    """How well a refined frame is known. This is for people; only the joint covariance is read back."""
+    """How well a refined frame is known. This is for people; only the joint covariance is read back.
 
-    standard_deviations_deg: Triple  #: about the frame's x, y, z axes, degrees; null: infinite, as a direction is free
-    standard_deviations_mm: Triple  #: of translations along the same axes, millimetres; null as above
-    #: 6 x 6, of [omega (rad), v (m)]; zero for a fixed frame; null: infinite, of either sign.
+    Attributes
+    ----------
+    standard_deviations_deg : 3 float
+        Of rotations about the frame's own x, y and z axes, degrees; null: infinite, because a direction is free.
+    standard_deviations_mm : 3 float
+        Of translations along the same axes, millimetres; null as above.
+    covariance : 6 x 6
+        Of [omega (rad), v (m)]; zero for a fixed frame; null: infinite, of either sign.
+    """
+
+    standard_deviations_deg: Triple
+    standard_deviations_mm: Triple
     covariance: list[list[float | None]]
 
 
 @dataclass(frozen=True)
 class RefinedFields(RefinedPoses):
-    """The refined calibration in a file; its poses and scale stand at the top of the file."""
+    """The refined calibration in a file; its poses and scale stand at the top of the file.
+
+    Attributes
+    ----------
+    residual : str
+        "geodesic" or "chordal".
+    robust : str
+        The robust loss; "gnc" if outliers were left out; or "none".
+    frames : dict of str to FrameFields
+        How well each target and sensor is known.
+    """
 
     X: Annotated[dict[str, gtsam.Pose3], Poses, Field(alias="targets")]
     Y: Annotated[dict[str, gtsam.Pose3], Poses, Field(alias="sensors")]
@@ -200,9 +219,9 @@ class RefinedFields(RefinedPoses):
     noise: dict[PairKey, PairNoise]
     inlier_counts: dict[PairKey, tuple[int, int]]
     joint: Annotated[JointCovariance, _told_as(JointFields)]
-    residual: str  #: "geodesic" or "chordal"
-    robust: str  #: the robust loss; "gnc" if outliers were left out; or "none"
-    frames: dict[str, FrameFields]  #: how well each target and sensor is known
+    residual: str
+    robust: str
+    frames: dict[str, FrameFields]
 
 
 class ResultFile(BaseModel):
