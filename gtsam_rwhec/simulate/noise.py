@@ -28,8 +28,7 @@ from numpy.random import Generator
 
 from gtsam_rwhec.errors import NoiseError, OptionError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.quaternions import to_rotations
-from gtsam_rwhec.simulate.transforms import random_directions, rotations_of_vectors
+from gtsam_rwhec.simulate.transforms import random_directions, rotations_of_quaternions, rotations_of_vectors
 
 NoiseModel = Literal["stated", "released"]
 #: The RWHEC paper's section whose rule gives the lengths of released translations.
@@ -118,7 +117,7 @@ def langevin_rotations(count: int, kappa: float, seed: Seed) -> Array:
         accepted = proposals[np.log1p(-generator.random(len(proposals))) < log_ratio][: count - filled]
         quaternions_wxyz[filled : filled + len(accepted)] = accepted
         filled += len(accepted)
-    return to_rotations(quaternions_wxyz[:, [1, 2, 3, 0]])
+    return rotations_of_quaternions(quaternions_wxyz)
 
 
 def released_rotations(count: int, kappa: float, seed: Seed) -> Array:
