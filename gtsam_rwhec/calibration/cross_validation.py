@@ -103,7 +103,7 @@ def cross_validate(
     -------
     CrossValidation
         ``report.print_cross_validation`` prints it. The errors of outliers are included: they raise the root mean
-        squares and the percentiles, and hardly the medians.
+        squares and the percentiles, but change the medians little.
 
     Raises
     ------

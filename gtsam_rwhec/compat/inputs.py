@@ -72,8 +72,8 @@ def check_axes(R: tuple[Array, Array], where: tuple[str, str]) -> None:
 def least_and_most_turning(total: Array, count: int) -> tuple[float, float]:
     """The determinant of N^2 I - S'S over the sum of its 2 x 2 minors, and its trace.
 
-    The quotient is the least eigenvalue where this is small: motions about one axis turn two directions alike, so two
-    eigenvalues are never small beside a large eigenvalue. Plain numbers, since NumPy's call alone would take longer.
+    A small quotient is the least eigenvalue: motions about one axis turn two directions alike, so two eigenvalues are
+    never small if the third is large. The sums use plain numbers: a call of NumPy takes longer than the sums.
     """
     (a, b, c), (d, e, f), (g, h, i) = (total.T @ total).tolist()
     square = float(count) ** 2

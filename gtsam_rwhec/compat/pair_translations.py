@@ -25,7 +25,7 @@ def translation_features(stations: Stations) -> Array:
 
 
 def translation_of(stations: Stations, R: Array, sums: Array | None = None) -> Array:
-    """The t (3,) of the least sum of |(R_A - I) t - (R t_B - t_A)|^2 over pairs (Tsai & Lenz 1989, eq. 15).
+    """The t (3,) that minimises the sum of |(R_A - I) t - (R t_B - t_A)|^2 over pairs (Tsai & Lenz 1989, eq. 15).
 
     With p_j = R t_C,j + R_G,j' t_G,j and Z_j = R_G,j R R_C,j the right-hand side of a pair is
     e = p_j - R R_C,j u_i - R_G,j' t_G,i, and R_A' e = R_G,i' (R_G,j p_j - Z_j u_i - t_G,i): all bilinear in i and j.

@@ -1,4 +1,4 @@
-"""Text that is safe on a terminal: a log may come from a stranger, and a name in it could be a terminal command."""
+"""Text that is safe on a terminal: a log may come from anyone, and a name in it could be a terminal command."""
 
 from __future__ import annotations
 

@@ -54,9 +54,9 @@ class FreeReason(StrEnum):
     ONE_AXIS = "one_axis", "the motion turned about one axis only"
     #: The motion turned enough, and still the information is no more than noise alone would create.
     NOISE = "noise", "the measurements say no more about it than their noise would"
-    COMPENSATED = "compensated", "with these motions, translations of the frames make up for it"
+    COMPENSATED = "compensated", "with these motions, translations of the frames have the same effect"
     STANDSTILL = "standstill", "the carriers moved no faster than the noise of their poses makes it seem"
-    SYMMETRY = "symmetry", "half turns, or a symmetric motion, fit both"
+    SYMMETRY = "symmetry", "the motion is symmetric or has half turns only, and two answers fit it"
 
     def __new__(cls, value: str, words: str) -> FreeReason:
         """A member of the table."""

@@ -201,7 +201,8 @@ def _weakest_by_lanczos(D: Array, C: Array, E: Array, used: np.ndarray, enough: 
         if values.max() > enough:
             return values, vectors[used]
         count *= 4
-    everything = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])  # with so many free, Lanczos is no gain
+    # Lanczos is not faster with so many free directions.
+    everything = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])
     return everything.eigenvalues, everything.eigenvectors
 
 

@@ -21,8 +21,8 @@ from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses
 from gtsam_rwhec.solver.rotations import HATS
 
-#: No data count as more exact than this, in radians and as a part of the measured lengths: where the noise is zero,
-#: the rounding of the eigenvalues (1e-16 / floor^2) must not pass for information.
+#: Smallest noise assumed, in radians and as a part of the measured lengths. If the noise were zero, rounding errors of
+#: the eigenvalues (1e-16 / floor^2) would look like information.
 FLOOR = 1e-7
 #: The 15 parameters of a pair: seven of the target, seven of the sensor, the logarithm of the shared scale. The seven
 #: of a frame: rotation, translation, logarithm of its own scale.
@@ -89,9 +89,9 @@ def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -
     eps x omega or eps x v, with expected square 2 q^2 |.|^2. Both ends move together along a free direction, so each
     takes half. The residuals do not separate A's noise from B's, but they bound A's noise: the rotation residuals hold
     all of it, so q^2 <= f_R / (2 kappa); the translation residuals hold it at the end of a lever arm a, so
-    2 q^2 |a|^2 <= 3 f_t sigma^2. If A is wrongly turned about the origin of its target carrier, as given, the arm is
-    t_X; about the origin of its sensor carrier, the arm is c: the shorter arm is safe. A's translation noise is at most
-    f_t sigma^2 an axis: 2 f_t |omega_Y|^2, and 3 f_t for a scale.
+    2 q^2 |a|^2 <= 3 f_t sigma^2. If A's rotation error is about the origin of its target carrier, the arm is t_X. If it
+    is about the origin of its sensor carrier, the arm is c. The shorter arm gives the safe bound. A's translation noise
+    is at most f_t sigma^2 an axis: 2 f_t |omega_Y|^2, and 3 f_t for a scale.
     """
     E = len(part.pairs)
     R_X, t_X, R_Y, t_Y, alpha = poses.R_X, poses.t_X, poses.R_Y, poses.t_Y, poses.alpha

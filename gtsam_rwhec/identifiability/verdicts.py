@@ -60,7 +60,7 @@ class Identifiability:
 
     @staticmethod
     def merged(results: list[Identifiability], components: tuple[tuple[str, ...], ...]) -> Identifiability:
-        """One result for parts that were solved apart."""
+        """One result for parts that were solved separately."""
         weakest = min(results, key=lambda r: r.weakest / max(r.threshold, 1e-300))
         return Identifiability(
             is_unique=all(r.is_unique for r in results),

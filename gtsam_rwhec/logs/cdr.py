@@ -1,15 +1,15 @@
 """ROS 2 messages: their definitions (``ros2msg`` text) and their bytes (CDR), many messages of one shape at once.
 
-A message can be read only from front to back, since strings and sequences move what follows. But the messages of a
-topic nearly always have the same strings and lengths. So this module walks the first message only. Every other message
-of its length, with the same bytes in its strings and counts, has each number at the same place. Their numbers are read
-as columns of one array, without a step of Python for each message.
+A message can be read only from front to back, since the lengths of strings and sequences decide where the rest is. But
+the messages of a topic nearly always have the same strings and lengths. So this module walks the first message only.
+Another message of the same length, with the same bytes in its strings and counts, has its numbers at the same places.
+The numbers of all these messages are read as columns of one array, without a step of Python for each message.
 
 Why no library: measured on 2026-11-21 (tests/benchmarks/own_code_against_libraries.py), microseconds a message, ours
 with the records made, mcap-ros2-support 0.6.0 and rosbags 0.11.9 decoding only: PoseStamped 1.3, 18, 13; TFMessage 2.5,
-24, 19; Odometry 4.9, 100, 44; AprilTagDetectionArray 10, 65, 49. To read a log may take three times what going through
-it undecoded takes, which is 7 to 9 us a message: with either library Odometry takes six times and more.
-mcap-ros2-support also takes an image that is cut short for a whole one, and knows no XCDR2.
+24, 19; Odometry 4.9, 100, 44; AprilTagDetectionArray 10, 65, 49. Without decoding, reading a log takes 7 to 9 us a
+message. Decoding may take three times as long; with either library Odometry takes six times as long or more.
+mcap-ros2-support also accepts an image that is cut short, and does not read XCDR2.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from gtsam_rwhec.errors import MessageError
 from gtsam_rwhec.logs import foxglove_schemas, ros2_schemas
 
 Decoder = Callable[[str, Sequence[bytes | memoryview], list[int]], list[foxglove_schemas.Read]]
-#: What a pool raises for wrong descriptors in a stranger's file.
+#: Errors that a descriptor pool raises for wrong descriptors in a file.
 _FAULTS = (McapError, DecodeError, TypeError, ValueError, KeyError, RecursionError)
 
 

@@ -35,7 +35,7 @@ Read = Sequence[Record] | str
 Row = tuple[int, str, str, tuple[float, ...]]
 #: Numbers of a message's list, at most: the corners of a board of 100 x 100 squares.
 MOST_NUMBERS = 20_000
-#: What a stranger's message can raise on its way to numbers.
+#: Errors that a damaged message can raise when it is converted to numbers.
 _FAULTS = (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, IndexError)
 
 

@@ -31,7 +31,7 @@ OnBad = Literal["warn", "raise"]
 SLICE = 4096
 #: Bytes of opened blocks that overlap in time and are held together, at most.
 MOST_OPEN_BYTES = 1 << 30
-#: Topics that an error lists, at most: a stranger's log may have thousands.
+#: Topics that an error lists, at most: logs may have thousands.
 MOST_NAMED = 50
 
 _Entry = TypeVar("_Entry")
@@ -101,7 +101,7 @@ class Log:
         return tuple(found[key] for key in sorted(found))
 
     def topics_in_words(self) -> str:
-        """The topics and their schemas, for messages: `MOST_NAMED` at most, as a stranger's log may have thousands."""
+        """The topics and their schemas, for messages: `MOST_NAMED` at most, as logs may have thousands."""
         known = self.topics()
         there = ", ".join(f"{topic.name} ({topic.schema})" for topic in known[:MOST_NAMED]) or "none"
         return there + (f" and {len(known) - MOST_NAMED} others" if len(known) > MOST_NAMED else "")

@@ -148,7 +148,7 @@ class TfBuffer:
         return np.array(T), gap_s
 
     def _links_of(self, parent: str, child: str) -> list[tuple[_Link, bool]]:
-        """The links of the chain, each with whether the chain goes down the link, from its parent to its child."""
+        """The links of the chain; for each link, whether the chain goes from the link's parent to its child."""
         steps = list(itertools.pairwise(self.chain(parent, child)))
         down = [b in self._links and self._links[b].parent == a for a, b in steps]
         return [(self._links[b if is_down else a], is_down) for (a, b), is_down in zip(steps, down, strict=True)]

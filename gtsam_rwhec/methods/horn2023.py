@@ -37,14 +37,14 @@ from gtsam_rwhec.problem.problem import Problem
 #: How the quaternions of A and B get their signs.
 #:
 #: "aligned": the signs that the answer satisfies. A rotation estimate without signs chooses first, then the answer.
-#: "continuous": A's and B's quaternions apart, each near to the quaternion before it. Right for smooth paths.
+#: "continuous": each quaternion is near to the one before it, for A and for B separately. Right for smooth paths.
 #: "scalar": no scalar part is negative, as in many conversions from matrices.
 #: "random": drawn with the seed.
 Signs = Literal["aligned", "continuous", "scalar", "random"]
 #: The residual that is squared. A product with a dual quaternion changes the norm, so "a x - y b" and "x - a* y b" are
 #: different costs. The RWHEC paper's rows "Horn" have the second.
 Residual = Literal["a x - y b", "x - a* y b"]
-#: Relative gap up to which the relaxation's bound proves the answer: what its solver's tolerance leaves.
+#: Relative gap up to which the relaxation's bound proves the answer: the gap that remains at its solver's tolerance.
 CLOSED = 1e-6
 #: Most rounds of choosing signs by the answer.
 ROUNDS = 10

@@ -91,8 +91,8 @@ def _isotropic(P: Array) -> Array:
     return u
 
 
-# The RWHEC paper's Section 2 says that Li's methods solve rotations and translations apart. But both systems hold both,
-# and measured translations affect the rotations found: the methods are joint.
+# The RWHEC paper's Section 2 says that Li's methods solve rotations and translations separately. But both systems hold
+# both, and measured translations affect the rotations found: the methods are joint.
 KRONECKER = Method(
     name="li2010_kronecker",
     properties=Properties("matrices"),

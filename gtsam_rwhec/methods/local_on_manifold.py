@@ -1,6 +1,6 @@
 """LOM, the RWHEC paper's local on-manifold method (Appendix C): the baseline that needs a good start.
 
-Its residual is not the refinement's: it has rotation and translation apart (eq. 76),
+Its residual is not the refinement's: it has rotation and translation as separate terms (eq. 76),
 
     e_R = log(R_X' R_A' R_Y R_B),    e_t = R_A t_X + alpha t_A - R_Y t_B - t_Y,
 

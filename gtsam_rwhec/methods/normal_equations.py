@@ -12,7 +12,7 @@ FREE = 1e-10
 
 
 def solve_scaled(normal: Array, right: Array, undetermined: str, smallest: float = FREE) -> Array:
-    """Solve the normal equations; all unknowns are scaled to one length, so that units cost no digits.
+    """Solve the normal equations; all unknowns are scaled alike, so that the choice of units loses no digits.
 
     Raises UnderdeterminedError with the text ``undetermined`` when an eigenvalue of the scaled matrix is at most
     ``smallest``.

@@ -43,9 +43,9 @@ def products_to_rotation() -> Array:
 
 @dataclass(frozen=True)
 class MomentSolution:
-    """Starts (list of (n, 3, 3) rotations), a lower bound on the cost, and whether the moments are a single point's.
+    """Starts (list of (n, 3, 3) rotations), a lower bound on the cost, and whether a single point has these moments.
 
-    ``eigenvalue_ratio`` is the second eigenvalue of M(y y') over the first: zero where one answer alone is optimal and
+    ``eigenvalue_ratio`` is the second eigenvalue of M(y y') over the first: zero if only one answer is optimal and
     the relaxation is tight.
     """
 

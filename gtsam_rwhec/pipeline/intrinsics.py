@@ -11,7 +11,7 @@ from gtsam_rwhec.vision.intrinsics_files import read_calibration_yaml, read_kali
 
 
 def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
-    """Read the intrinsics of every sensor that has them; the rig file makes sure that sensors with images do.
+    """Read the intrinsics of every sensor that has them. A sensor with images always has them.
 
     Raises `CameraError` if the intrinsics change within the log, or if no camera can have them; `LogError` or
     `FileFormatError` if a topic or file is missing or cannot be read.

@@ -22,7 +22,7 @@ def no_detections(log: Log, rig: Rig, report: DetectionReport) -> str:
     ]
     said += map(str, report.tracks)
     if report.strangers:
-        said.append(f"tags that are no target were seen: {_named(report.strangers)}")
+        said.append(f"tags that belong to no target were seen: {_named(report.strangers)}")
     else:
         said.append("no other tags of the targets' families were seen either")
         if any(source.images is not None for source in rig.sensors.values()):

@@ -252,7 +252,7 @@ class Problem(Knowledge):
     # -- joining ------------------------------------------------------------------------------------------------
 
     def __add__(self, other: Problem) -> Problem:
-        """One problem with the measurements and knowledge of both: logs can be processed apart and joined."""
+        """One problem with the measurements and knowledge of both: logs can be processed separately and joined."""
         if not isinstance(other, Problem):
             return NotImplemented
         if self.scale != other.scale:

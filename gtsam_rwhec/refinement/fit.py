@@ -89,7 +89,8 @@ def fit(
             for group, component in few
         )
         warnings.warn(
-            f"the estimated noise did not settle in {MAX_ROUNDS} rounds; the fewest degrees of freedom are of {where}. "
+            f"the estimated noise did not settle in {MAX_ROUNDS} rounds; these have the fewest degrees of "
+            f"freedom: {where}. "
             + (
                 "The noise given for A may already explain the residuals: give less, or give B's noise (noise='given')"
                 if options.carrier_noise is not None

@@ -64,7 +64,7 @@ class Graduated:
     left_out : tuple of str
         Frames of which no measurement agrees; the solution lacks them.
     suspect : dict of str to (int, int)
-        Frames of which less than half of the measurements agree: the number that agrees, and of all.
+        Frames of which less than half of the measurements agree: the number that agrees, and the number of all.
     suspect_pairs : dict of (target, sensor) to (int, int)
         The same for pairs of which neither frame is suspect as a whole.
     history : tuple of Iteration

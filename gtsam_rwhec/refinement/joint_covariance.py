@@ -98,9 +98,10 @@ class JointCovariance:
     def covariance_of(self, G: Array) -> Array:
         """The covariance (m, m) of the linear functions G (m, d) of the unknowns.
 
-        The variance of every row that a free direction changes is infinite. So is the covariance of two rows that one
-        direction changes, with the sign of their correlation. A row that a direction changes by less than ``SHARE``
-        keeps a finite variance, which includes a displacement by ``DISPLACED`` units along the direction.
+        The variance of every row that a free direction changes is infinite. If a direction changes two
+        rows, their covariance is infinite too, with the sign of their correlation. A row that a direction changes by
+        less than ``SHARE`` keeps a finite variance, which includes a displacement by ``DISPLACED`` units along the
+        direction.
         """
         moved = self.reach(G)
         length = np.linalg.norm(G * self.unit, axis=1)

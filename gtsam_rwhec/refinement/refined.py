@@ -157,7 +157,7 @@ class RefinedPoses:
         """A frame's standard deviations (3,) in degrees about and (3,) in millimetres along its own x, y, z."""
         if name not in self.X and name not in self.Y:
             raise FrameError(
-                f"{name!r} is no frame, and has no axes; there are {', '.join(self.X | self.Y)} (of a scale or an "
+                f"{name!r} is not a frame and has no axes; there are {', '.join(self.X | self.Y)} (of a scale or an "
                 "offset take the root of covariance(name))"
             )
         return standard_deviations(self.covariance(name))

@@ -187,7 +187,7 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit
 
 
 def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> None:
-    """Warn if a time offset is beyond the window of its motion, or its bias exceeds half its standard deviation."""
+    """Warn if a time offset is larger than ``WINDOW_S``, or if its bias exceeds half its standard deviation."""
     for sensor, part in space.shrinkage.items():
         offset_s, what = abs(state.offsets_s[sensor]), f"the time offset of {sensor}"
         unknown = Unknown(UnknownKind.TIME_OFFSET, sensor)

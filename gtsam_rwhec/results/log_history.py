@@ -81,7 +81,9 @@ class DetectionReport(_Record):
     images: dict[str, int] = Field(description="number of images, or of a detection driver's messages, by sensor")
     undecoded: dict[str, tuple[str, ...]] = Field(description="images that could not be used, and why, by sensor")
     tracks: tuple[TrackCount, ...] = Field(description="detections of each target in each sensor")
-    strangers: dict[str, int] = Field(description="how often a tag was seen that is no target, by family and id")
+    strangers: dict[str, int] = Field(
+        description="how often each tag that belongs to no target was seen, by family and id"
+    )
     unseen: tuple[str, ...] = Field(default=(), description="targets that no sensor saw")
     corner_px: dict[str, float] = Field(
         description="measured standard deviation of a corner along each axis, pixels, by target/sensor"

@@ -153,7 +153,7 @@ def perturb(poses: Array, noise: Noise | None, seed: Seed, section: Section | No
     seed : int or numpy.random.Generator
         Seed, or a generator to draw from.
     section : "8.1" or "8.2", optional
-        Whose rule for translations ``released`` noise follows. ``stated`` noise does not use it.
+        The section of the paper whose rule ``released`` noise uses for translations. ``stated`` noise does not use it.
 
     Returns
     -------

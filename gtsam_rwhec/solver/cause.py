@@ -154,7 +154,7 @@ class Cause(StrEnum):
         "digits_lost",
         Status.GAP,
         "eliminating the translations lost digits: the answer costs {cost:.8g}, and {reduced_cost:.8g} in the reduced "
-        "form that the bound is about; the motion hardly turns for the accuracy that sigma claims",
+        "form that the bound is about; the motion turns too little for the accuracy that sigma claims",
     )
     NO_BOUND = "no_bound", Status.FAILED, "no finite lower bound was found"
     #: Rounding alone can bring this about.

@@ -89,7 +89,7 @@ class Certificate:
     def reason(self) -> str:
         """The cause in a sentence."""
         parts = int(self.figures.get("parts", 1))
-        apart = f"{parts} unconnected parts, solved apart; " if parts > 1 else ""
+        apart = f"{parts} unconnected parts, solved separately; " if parts > 1 else ""
         return self.words or apart + self.cause.sentence({"cost": self.cost} | self.figures)
 
     @property
@@ -132,7 +132,7 @@ class Certificate:
 
     @staticmethod
     def merged(certificates: list[Certificate]) -> Certificate:
-        """One certificate for parts that were solved apart: the sums of costs and bounds, and the worst cause."""
+        """One certificate for parts that were solved separately: the sums of costs and bounds, and the worst cause."""
         if len(certificates) == 1:
             return certificates[0]
         statuses, causes = list(Status), list(Cause)

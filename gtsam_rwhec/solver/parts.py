@@ -1,4 +1,4 @@
-"""The parts of a problem that are solved apart: their frames, which side is eliminated first, and their gauge."""
+"""The parts of a problem that are solved separately: their frames, which side is eliminated first, and their gauge."""
 
 from __future__ import annotations
 

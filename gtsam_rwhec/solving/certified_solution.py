@@ -191,7 +191,8 @@ def _merge(problem: Problem, results: list[PartSolution]) -> Solution:
 
 def _warn_of_weights(problem: Problem, results: list[PartSolution]) -> None:
     """Warn where the residuals contradict the weights."""
-    # The cost of the inverse equation has other weights than the physical model, whose minimum is then elsewhere.
+    # The inverse equation weights residuals otherwise than the physical model, so its cost says nothing about the
+    # noise.
     if problem.is_relative or any(result.part.kind == "inverse" for result in results):
         return
     cost = sum(result.residual_cost for result in results)

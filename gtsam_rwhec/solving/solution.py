@@ -43,7 +43,7 @@ class Solution:
     identifiability : Identifiability
     residuals : dict of (target, sensor) to Residual
     parts : tuple of SolvedPart
-        The unconnected parts, which were solved apart; one part when all frames are connected.
+        The unconnected parts, which were solved separately; one part when all frames are connected.
     """
 
     X: dict[str, gtsam.Pose3]

@@ -79,8 +79,8 @@ def _to_the_markers(board: Charuco, plane: Array, pixels: Array) -> float:
 def aprilgrid_corners(gray: Gray, board: AprilGrid, ids: np.ndarray, tags_px: Array) -> tuple[np.ndarray, Array]:
     """Indices (n,) and places (n, 2) of a grid's corners, from its tags' ids (m,) and corners (m, 4, 2).
 
-    Generators print tags turned by different multiples of a right angle. The turn is taken with which all corners
-    together fit a plane best.
+    Generators print tags turned by different multiples of a right angle. This function takes the
+    multiple with which all corners together fit a plane best.
     """
     unique, counts = np.unique(ids, return_counts=True)
     once = np.isin(ids, unique[counts == 1])

@@ -75,7 +75,7 @@ def quadrangles(gray: Gray) -> Array:
 
 
 def identified(gray: Gray, quads: Array, family: str, border_bits: int = 1) -> np.ndarray:
-    """Ids (N,) of quadrangles (N, 4, 2), pixels, clockwise; -1 where a quadrangle is no tag of the family."""
+    """Ids (N,) of quadrangles (N, 4, 2), pixels, clockwise; -1 if a quadrangle is not a tag of the family."""
     signs, correctable = codes(family)
     n = round(np.sqrt(signs.shape[2]))
     white = _white_cells(gray, quads, n + 2 * border_bits)

@@ -220,13 +220,13 @@ def is_same_print(first: str, second: str) -> bool:
 
 
 def family_named(word: str) -> str | None:
-    """The family of `FAMILIES` that a driver means by a word, or None."""
+    """The family of `FAMILIES` that a driver calls by this name, or None."""
     bare = _bare(word)
     return next((family for family in (f"tag{bare}", f"aruco_{bare}") if family in FAMILIES), None)
 
 
 def _bare(word: str) -> str:
-    """The core of a driver's word: 36h11 for tag36h11, tagStandard36h11 and DICT_APRILTAG_36h11."""
+    """A driver's name of a family without prefixes: 36h11 for tag36h11, tagStandard36h11 and DICT_APRILTAG_36h11."""
     return re.sub(r"^(dict_)?(apriltag_|aruco_)?(tag)?(standard)?", "", word.strip().lower())
 
 

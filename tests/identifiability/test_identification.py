@@ -206,7 +206,7 @@ def test_unconnected_parts_are_solved_apart_and_named() -> None:
     assert [set(part.names) for part in solution.parts] == [{"tag0", "cam0"}, {"tag1", "cam1", "tag2"}]
     assert [part.certificate.status for part in solution.parts] == ["certified", "certified_not_unique"]
     assert solution.certificate.status == "certified_not_unique"
-    assert "2 unconnected parts, solved apart" in solution.certificate.reason
+    assert "2 unconnected parts, solved separately" in solution.certificate.reason
     assert solution.cost == pytest.approx(sum(part.certificate.cost for part in solution.parts))
     (direction,) = known.free_directions
     assert set(direction.frames) == {"tag1", "tag2", "cam1"}

@@ -312,7 +312,7 @@ def test_links_that_are_missing(tmp_path: Path) -> None:
 
 def test_tags_of_another_family(tmp_path: Path) -> None:
     other = {tag: f"{{type: tag, family: tag25h9, id: {i}, size_m: {made.SIZE_M}}}" for i, tag in enumerate(made.TAGS)}
-    words = "looked at 19 images or messages of cam_0", "tags that are no target were seen: tag36h11 0 (38 times)"
+    words = "looked at 19 images or messages of cam_0", "tags that belong to no target were seen: tag36h11 0 (38 times)"
     refused(tmp_path, RECORDED, LogError, *words, "Are the families, ids and topics in the rig file right?", **other)
     messages = MOVING + images(picture(cv2.aruco.DICT_APRILTAG_25h9, 3))
     words = "looked at 6 images or messages of cam_0", "tags of other families", "tag25h9 3 (12 times)"
@@ -321,7 +321,9 @@ def test_tags_of_another_family(tmp_path: Path) -> None:
 
 def test_tags_of_other_ids(tmp_path: Path) -> None:
     messages = MOVING + images(picture(cv2.aruco.DICT_APRILTAG_36h11, 7))
-    refused(tmp_path, messages, LogError, "tags that are no target were seen: tag36h11 7 (12 times)", **WITH_IMAGES)
+    refused(
+        tmp_path, messages, LogError, "tags that belong to no target were seen: tag36h11 7 (12 times)", **WITH_IMAGES
+    )
 
 
 def test_nothing_is_seen(tmp_path: Path) -> None:

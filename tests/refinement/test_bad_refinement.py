@@ -114,7 +114,7 @@ def test_refused(call: Callable[[], Any], error: type[Exception], words: str) ->
     [
         (lambda r: r.covariance("cam"), "there is no 'cam'; there are target0"),
         (lambda r: r.covariance("scale"), "'scale' is not an unknown: it is known, 1"),
-        (lambda r: r.standard_deviations("scale"), "'scale' is no frame, and has no axes"),
+        (lambda r: r.standard_deviations("scale"), "'scale' is not a frame and has no axes"),
         (lambda r: r.information("cam"), "'cam' is not among the unknowns"),
         (lambda r: r.contains("cam", np.eye(4)), "there is no frame 'cam'"),
     ],

@@ -110,4 +110,4 @@ class TestMerged:
             assert both.tolerance == pytest.approx(2e-4)
             assert both.seconds == {"descent": 1.5, "small dual": 2.0}
             assert (both.cause, both.path) == (other.cause, other.path)
-            assert both.reason == f"2 unconnected parts, solved apart; {other.reason}"
+            assert both.reason == f"2 unconnected parts, solved separately; {other.reason}"

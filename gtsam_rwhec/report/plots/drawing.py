@@ -39,7 +39,7 @@ STYLE = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "savefig.dpi": "figure",
-    # Reasons and names come from logs: a "$" in them is no formula.
+    # Reasons and names come from logs: a "$" in them does not begin a formula.
     "text.parse_math": False,
 }
 #: Longest reason that a legend has room for, characters.
