@@ -20,9 +20,9 @@ SQUARE_M = 0.04
 MARKER_M = 0.03
 #: Gap between tags / side of a tag of an AprilGrid, until a person measures it.
 SPACING = 0.3
-#: So many markers with ids in a row count as a ChArUco board.
+#: At least this number of markers with consecutive ids is taken for a ChArUco board.
 BOARD = 6
-#: So many tags with a double border count as an AprilGrid.
+#: At least this number of tags with a double border is taken for an AprilGrid.
 GRID = 4
 #: The remark on a size that is a guess.
 TODO = "TODO measure"
@@ -78,7 +78,7 @@ def _smallest(family: str, ids: Collection[int]) -> str:
 
 
 def _of_family(family: str, ids: dict[int, int], looked_at: int) -> Iterator[Guess]:
-    """A ChArUco board if many ArUco markers have ids in a row; otherwise single tags."""
+    """A ChArUco board if many ArUco markers have consecutive ids; otherwise single tags."""
     order = sorted(ids)
     if family.startswith("aruco") and len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
         columns, rows = _squares(order[-1] - order[0] + 1)

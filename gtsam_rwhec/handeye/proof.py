@@ -8,16 +8,16 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 
-#: Rounding that a Cholesky factorisation of a 9 x 9 matrix of unit diagonal can hide in double precision (Higham 2002,
-#: Theorem 10.7: 9 gamma_10 = 1e-14), together with the rounding of the matrix's own entries.
+#: Rounding error that a Cholesky factorisation of a 9 x 9 matrix of unit diagonal can hide in double precision (Higham
+#: 2002, Theorem 10.7: 9 gamma_10 = 1e-14), together with the rounding errors of the matrix's own entries.
 HIDDEN = 1.2e-14
 
 
 def proven(K: Array) -> bool:
     """Whether K (n, n), n <= 9, is proven to be positive semidefinite. K's diagonal is changed.
 
-    A factorisation that succeeds proves this of a matrix whose entries differ from K's by up to ``HIDDEN`` times the
-    root of the product of their two diagonal entries. So ``HIDDEN`` is first taken off the diagonal.
+    If the Cholesky factorisation succeeds, a matrix near K is positive semidefinite. Its entries (i, j) differ from K's
+    by up to ``HIDDEN`` sqrt(K_ii K_jj). So the diagonal is first multiplied by 1 - ``HIDDEN``.
     """
     np.fill_diagonal(K, K.diagonal() * (1.0 - HIDDEN))
     try:

@@ -125,7 +125,7 @@ def solve(
     method : str
         A name of ``METHODS``.
     alpha : float or "estimate"
-        Weight of a translation residual beside a rotation residual (eq. 8), 1/m: about sigma_rotation /
+        Weight of a translation residual relative to a rotation residual (eq. 8), 1/m: about sigma_rotation /
         sigma_translation. "estimate" finds it from the residuals.
     weights : (N,) array, optional
         Factor of each motion's terms.

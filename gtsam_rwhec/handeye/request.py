@@ -26,7 +26,7 @@ class Request:
     cost : DualQuaternionCost
         Eq. 8 with alpha, with weights or covariances, and with the prior (eqs. 26-29) if there is one.
     alpha : float
-        Weight of translations beside rotations, 1/m.
+        Weight of translations relative to rotations, 1/m.
     weights : (N,) array or None
         Factor of each motion's terms.
     covariances : (N, 8, 8) or (1, 8, 8) array or None

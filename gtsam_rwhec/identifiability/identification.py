@@ -214,7 +214,7 @@ def _pairs(
     reasons: list[FreeReason],
     length: float,
 ) -> dict[Pair, PairIdentifiability]:
-    """Test every pair alone as the whole is tested, all pairs in one stack of 15 x 15 problems."""
+    """Test every pair alone, in the way the whole problem is tested; all pairs are one stack of 15 x 15 problems."""
     counts = part.moments.count
     threshold = free_threshold(2.0 * counts, degrees_of_freedom)
     rotations = pairs.used & _IS_ROTATION

@@ -44,7 +44,7 @@ def gtsam_covariances(T: Array, covariances: Array) -> list[Array | None]:
 
     ROS has (x, y, z, rotations about the fixed axes x, y, z) in the parent frame: t + d, Exp(phi) R. A right
     perturbation [omega, v] moves (R, t) to (R Exp(omega), t + R v), so omega = R' phi and v = R' d. A covariance that
-    is all zeros or has a negative variance (ROS says "unknown" so) or is not finite becomes None.
+    is all zeros or has a negative variance (so ROS marks an unknown covariance) or is not finite becomes None.
     """
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
     known: NDArray[np.bool_] = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))

@@ -246,7 +246,9 @@ class McapFile:
         if block.is_cut:
             return data
         if len(data) != size:
-            raise LogError(f"{where}: opens to other than the {size} bytes that it states; its messages are lost")
+            raise LogError(
+                f"{where}: has {len(data)} bytes after decompression, and states {size}; its messages are lost"
+            )
         if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
             raise LogError(f"{where}: wrong checksum; its messages are lost")
         return data

@@ -72,7 +72,7 @@ class Stack:
 
     @property
     def centred_t_A(self) -> Array:
-        """(N, 3) translations of A about the gauge: t_X and t_Y are then without its origins (design fact 9)."""
+        """(N, 3) translations of A about the gauge; t_X and t_Y are then relative to its points (design fact 9)."""
         return self.A[:, :3, 3] + self.A[:, :3, :3] @ self.gauge.target_carrier - self.gauge.sensor_carrier
 
     def outcome(

@@ -189,7 +189,7 @@ def _multiplication(q: Array, t: Array, side: Callable[[Array], Array]) -> Array
 
 
 def _bound(Q: Array, q: Array, t: Array, cost: float, found: Relaxed) -> float:
-    """The bound by the multipliers at the answer; where these prove nothing, the solver's, true to its tolerance."""
+    """The bound of the multipliers at the answer; if they prove nothing, the solver's, exact to its tolerance."""
     value, smallest = multipliers_of(Q, q, t)
     if smallest >= -1e-13 * len(Q) * float(np.abs(Q).max()):
         return min(value, cost)

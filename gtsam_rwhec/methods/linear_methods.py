@@ -18,7 +18,7 @@ def linear_method(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
 
 
 def start_of(problem: Problem, options: MethodOptions) -> tuple[Poses, Poses, float, str]:
-    """X, Y, scale, and the words for where they are from: the given start, else Wang's answer.
+    """X, Y, scale, and a text that names their source: the given start, else Wang's answer.
 
     Wang's linear systems are extended to several Xs and Ys and to an unknown scale, which his method does not have.
     Raises FrameError, PoseError or ScaleError for a given start that lacks a frame or has other values than poses and a

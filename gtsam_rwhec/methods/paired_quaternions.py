@@ -1,8 +1,8 @@
 """Signs of quaternions that fit together in each measurement.
 
 In q_A q_X = q_Y q_B the signs of q_X and q_Y belong to the answer. The signs of each q_A and q_B must be chosen, and an
-equation with the wrong sign is wrong. The linear rotation system has no signs: its answer chooses here, so that it
-satisfies each equation.
+equation with the wrong sign is wrong. The linear rotation system has no signs. So its answer decides: each sign is
+the one with which this answer satisfies the equation.
 """
 
 from __future__ import annotations

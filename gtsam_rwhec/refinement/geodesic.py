@@ -116,7 +116,7 @@ class GeodesicModel:
 
     @property
     def first_loss(self) -> Robust | None:
-        """The loss without local minima that is minimised before the options' loss."""
+        """The loss that is minimised first, because it has no local minima; the loss of the options follows."""
         return "huber" if self.is_m_estimate and self.options.robust != "huber" else None
 
     def values(self, state: State) -> gtsam.Values:

@@ -29,7 +29,7 @@ def bipartite_edges(
         ``"complete"``: every sensor sees every target. ``"star"``: the fewest edges that connect all frames, all at
         sensor 0 or at target 0 (two joined stars, or one star where there is one target or one sensor). ``"random"``: a
         random spanning tree, and every other edge with probability ``edge_probability``. Given edges keep their order;
-        they may leave parts unconnected and frames alone.
+        they may leave unconnected parts, and frames without an edge.
     targets, sensors : int
         Number of targets and of sensors.
     seed : int or numpy.random.Generator

@@ -73,7 +73,7 @@ def general(
         gives the weights. ``None``: exact B, unit weights.
     noise_in_A : Noise or None
         ``stated`` noise on the right of A, one draw for each pose of the rig: pairs with one stamp share the motion
-        capture's error. It has no part in the weights.
+        capture's error. The weights do not include it.
     scale : "known", "shared" or "per_target"
         The problem's scale mode.
     true_scale : float, or mapping of str to float, optional

@@ -26,7 +26,7 @@ FAR = 100.0
 class Part:
     """One connected part of a problem, about its own gauge."""
 
-    leaves: tuple[str, ...]  #: free frames of the larger side; each leaf meets centers only
+    leaves: tuple[str, ...]  #: free frames of the larger side; leaves have pairs with centers only
     centers: tuple[str, ...]  #: the other free frames
     targets: tuple[str, ...]  #: all of the part, fixed ones too
     sensors: tuple[str, ...]  #: all of the part, fixed ones too

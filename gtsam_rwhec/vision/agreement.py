@@ -71,7 +71,7 @@ def choose_by_agreement(
     T (n, 2, 4, 4) are the candidates T_camera_target, `carrier` (n, 4, 4) is T_sensorcarrier_targetcarrier, and `which`
     (n,) is a first choice. `covariance` (n, 2, 3, 3) is of each candidate's rotation (rad^2, right perturbation), with
     the errors of clocks and carriers. `image` (n, 2) is the cost of each candidate in its own image (negative
-    log-likelihood), infinite where a candidate is missing; `most` is the largest cost of an image's disagreement.
+    log-likelihood), infinite where a candidate is missing; `most` limits the cost of an image that disagrees.
     """
     B = np.nan_to_num(T)
     information = np.linalg.inv(covariance)

@@ -40,7 +40,7 @@ OTHER = "other reasons"
 UNKNOWN_AT = 0.04
 #: Legend of the measurements whose residual is not known.
 UNKNOWN = "(on the lower edge: residual not known)"
-#: In place of an empty reason.
+#: Reason that is written if a measurement has none.
 NO_REASON = "not used"
 
 
