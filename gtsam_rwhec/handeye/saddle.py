@@ -18,7 +18,7 @@ from gtsam_rwhec.handeye.dual_quaternions import times_vectors
 
 #: Eigenvalues of M below this part of its largest are rounding error: M is singular.
 SINGULAR = 1e-14
-#: The search ends when a step gains less than this part of lambda_0, far below its rounding.
+#: The search ends when a step gains less than this part of lambda_0. This is far below the rounding error of lambda_0.
 GAIN = 1e-17
 #: Most steps of the search.
 STEPS = 200

@@ -173,7 +173,7 @@ def free_directions_of(
 def _sparse(columns: Array, rows_first: list[np.ndarray]) -> Array:
     """Another basis (d, k) of the columns' span, by elimination: each column has a row that is zero in the others.
 
-    ``rows_first``: masks (d,) of the rows among which to look for such a row, one mask after the other. The same span
+    ``rows_first`` are masks (d,) of rows. Such rows are searched in the first mask, then in the next. The same span
     gives the same basis, whichever ``columns`` span it.
     """
     done: dict[int, Array] = {}

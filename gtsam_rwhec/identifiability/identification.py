@@ -157,7 +157,7 @@ def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak
     if size <= DENSE_PARAMETERS:
         values, reduced = np.linalg.eigh(arrow.dense(D, C, E)[used][:, used])
     else:
-        # Every direction sums at least two squares, and fewer squares have a higher threshold.
+        # Each direction has at least two squares, and the threshold is the highest for the fewest squares.
         values, reduced = _weakest_by_lanczos(D, C, E, used, float(free_threshold(2.0, degrees_of_freedom)))
     vectors = np.zeros((len(used), len(values)))
     vectors[used] = reduced
@@ -247,7 +247,7 @@ def _weakest_of_each(info: Array, noise: Array, used: np.ndarray) -> tuple[Array
     unit = _unit(noise, used)
     matrix = info * unit[:, :, None] * unit[:, None, :]
     diagonal = np.einsum("eii->ei", matrix)  # a view
-    # No larger than needed, or the small eigenvalues lose their digits.
+    # Unused parameters get large entries, but no larger than needed: small eigenvalues would lose digits.
     diagonal[...] = np.where(used, diagonal, 1e3 + 2.0 * diagonal.max(axis=1, keepdims=True))
     values, vectors = np.linalg.eigh(matrix)
     foreign = (vectors**2 * ~used[:, :, None]).sum(axis=1) > 0.5

@@ -102,7 +102,7 @@ def rotation_products(stack: Stack) -> Array:
 
 
 def linear_rotations(stack: Stack) -> Array:
-    """R (n, 3, 3) of least |R_A R_X - R_Y R_B|, as matrices of unit norm, then projected.
+    """R (n, 3, 3): the matrices of unit norm that minimise |R_A R_X - R_Y R_B|, projected to rotations.
 
     The answer is the smallest eigenvector of the normal equations, component by component. With one X and one Y it
     consists of the two singular vectors of the largest singular value of K (Shah 2013), since the diagonal blocks are

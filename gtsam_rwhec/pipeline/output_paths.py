@@ -11,7 +11,7 @@ from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG
 
 
 def check_writable(path: str | Path) -> None:
-    """Raise `LogError` if a file cannot be written: its folder is missing or closed, or a folder has its name."""
+    """Raise `LogError` if a file cannot be written: its folder is missing or not writable, or a folder has its name."""
     path = Path(path)
     folder = path.absolute().parent
     if not folder.is_dir():

@@ -67,7 +67,7 @@ def general(
         The rig's motion, T_world_rig; a kind stands for ``Motion(kind)``.
     number_of_measurements : int, or mapping of (target, sensor) to int
         For every pair, or by pair of names. The rig has one trajectory, as long as the largest number. A pair with
-        fewer measurements has a random part of its poses.
+        fewer measurements uses poses that are drawn from it.
     noise : Noise, mapping of (target, sensor) to Noise, or None
         ``stated`` noise on B, added after the scale: sigma_m is the true standard deviation at every scale. It also
         gives the weights. ``None``: exact B, unit weights.

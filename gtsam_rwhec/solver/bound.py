@@ -6,14 +6,14 @@ constraint is zero at y. Write y = x + [z, 0] for any x whose last entry is 1::
     y' Z y = x' Z x + 2 g' z + z' Z_rr z,      g = (Z x) without its last entry
 
 If Z_rr >= diag(m) with m > 0, the right side is at least x' Z x - sum g^2 / m. This is the dual certificate of design
-fact 3 with the null vector taken out beforehand, so that the test of definiteness has room. If only Z_rr >= -diag(m)
+fact 3 without its null vector, so that rounding errors do not decide the test of definiteness. If only Z_rr >= -diag(m)
 can be shown (free directions, or no certificate), |z_i| <= sqrt(3) + |r_i| for each rotation bounds the loss.
 
 With an unknown scale nothing couples to h: (R, alpha) and (-R, -alpha) cost the same, and r itself is a null vector of
 Z_rr. Then an entry j of r takes the role of h: y_r = a r + z with z_j = 0 and a = y_j / r_j, |a| <= 1 / |r_j|.
 
-Z_rr is singular where an answer is free or has a twin. ``deflation`` takes the null directions out first and loses
-next to nothing; the verified test of all of Z_rr would lose the whole allowance.
+Z_rr is singular where an answer is free or has a twin. ``deflation`` removes the null directions first and loses
+almost nothing; the verified test of all of Z_rr would lose the whole allowance.
 
 x'Zx and g are evaluated in extended precision, with a bound on their rounding; ``verified`` tests the definiteness.
 The bound is a true bound on the optimum of the stored D, C, E, G of ``ReducedForm``.

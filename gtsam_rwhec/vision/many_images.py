@@ -195,7 +195,8 @@ def measured_corner_px(squared_px: np.ndarray, corners: np.ndarray, least_px: fl
     """Standard deviation of a corner along each axis, from reprojection errors.
 
     `squared_px` (n,) are sums of squared errors of n poses of one target in one camera, px^2; a pose of `corners` (n,)
-    corners has 2 corners - 6 degrees of freedom. The result is at least `least_px`, since few data can give too little.
+    corners has 2 corners - 6 degrees of freedom. The result is at least `least_px`, since few data can give a value
+    that is too small.
     """
     freedom = 2 * corners - 6
     mask = np.isfinite(squared_px) & (freedom > 0)

@@ -111,7 +111,7 @@ def _draw(axes: Axes, deviations: dict[str, Array], names: list[str], limits: tu
 
 
 def _limits(values: Array) -> tuple[float, float, float]:
-    """Lower and upper end of the axis, and the factor that its last part, for infinite values, spans."""
+    """Lower and upper end of the axis, and upper over lower end of its last part, where infinite values are drawn."""
     finite = values[np.isfinite(values) & (values > 0.0)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.1, 1.0)
     middle = np.sqrt(low * high)
