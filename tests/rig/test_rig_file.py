@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, get_args
@@ -10,6 +11,7 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from places import CELL, REPOSITORY
 from rig_texts import FULL, MINIMAL
 
 from gtsam_rwhec.errors import RigError
@@ -239,3 +241,12 @@ def test_mutated_files(data: st.DataObject) -> None:
     except RigError:
         return
     assert parse_rig(rig_text(rig), "again") == rig
+
+
+def test_the_targets_of_the_page_on_logs_are_read() -> None:
+    page = (REPOSITORY / "docs" / "from_a_log.md").read_text(encoding="utf-8")
+    targets = re.search(r"```yaml\n(targets:.*?)```", page, re.DOTALL)
+    assert targets is not None
+    rig = yaml.safe_load((CELL / "rig.yaml").read_text(encoding="utf-8")) | yaml.safe_load(targets[1])
+    kinds = {type(target).__name__ for target in parse_rig(yaml.safe_dump(rig), "the page").target_list}
+    assert kinds == {"Tag", "Charuco", "AprilGrid", "Checkerboard"}
