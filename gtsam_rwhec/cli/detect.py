@@ -23,8 +23,11 @@ def detect(
 ) -> ExitStatus:
     """First stage: find the targets in the images and compute their poses."""
     with StageDisplay() as stage:
+        sources = rw.rig.read_rig(rig)
+        if draw is not None:
+            rw.pipeline.check_drawable(sources, draw)
         report = rw.pipeline.detect_log(
-            log, rw.rig.read_rig(rig), output, images="copy" if images else "leave_out", workers=workers, progress=stage
+            log, sources, output, images="copy" if images else "leave_out", workers=workers, progress=stage
         )
         used = sum(track.used for track in report.tracks)
         rejected = sum(track.seen for track in report.tracks) - used

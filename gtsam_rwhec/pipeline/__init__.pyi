@@ -10,6 +10,7 @@ from .detections_in_images import draw_log as draw_log
 
 # What comes out, and what a log that a stage wrote holds.
 from .earlier_output import check_replaceable as check_replaceable
+from .image_options import check_drawable as check_drawable
 from .log_contract import CLEAN_LOG as CLEAN_LOG
 from .log_contract import RESULT_FILE as RESULT_FILE
 from .log_metadata import LogMetadata as LogMetadata

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gtsam_rwhec.errors import LogError, OptionError
+from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export import export_all
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.logs import Log, open_log
@@ -12,6 +12,7 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.changed_rig import changes
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.image_options import check_image_options
 from gtsam_rwhec.pipeline.log_contract import (
     CLEAN_LOG,
     CLEANING_METADATA,
@@ -63,7 +64,7 @@ def calibrate_log(
     Raises
     ------
     OptionError
-        A log that a stage wrote is given with `workers`, or has no images and is given with ``images="copy"``.
+        `workers` is given, and no images will be searched; or ``images="copy"``, and the log has none.
     RwhecError
         As each stage does.
     """
@@ -77,7 +78,8 @@ def calibrate_log(
             check_is_not_read(log, detected)
             check_is_not_read(log, clean)
         else:
-            _check_stage_log(log, images, workers)
+            _check_is_alone(log)
+        check_image_options(log, rig if is_raw else None, images=images, workers=workers)
         is_cleaned = CLEANING_METADATA in log.metadata() and (
             rig is None or not changes(read_embedded_rig(log), rig).cleaning
         )
@@ -96,23 +98,12 @@ def calibrate_log(
     return calibrated
 
 
-def _check_stage_log(log: Log, images: Images, workers: int | None) -> None:
-    """Refuse a log of a stage that is one of several files, and options that count only in detection."""
+def _check_is_alone(log: Log) -> None:
+    """Refuse a log of a stage that is one of several files."""
     if len(log.files) > 1:
         raise LogError(
             f"{', '.join(str(file.path) for file in log.files[:10])}: a stage wrote at least one of these files; give "
             "that file alone, or only raw logs"
-        )
-    path = log.files[0].path
-    if workers is not None:
-        raise OptionError(
-            f"workers={workers} (--workers) counts only in detection, and the detections are already in {path}: leave "
-            "the option out, or give the raw log"
-        )
-    if images == "copy" and not any(topic.has_images for topic in log.topics()):
-        raise OptionError(
-            f'images="copy" (--images): {path} has no images to copy, because detection left them out. Leave the '
-            "option out, or give the raw log"
         )
 
 

@@ -14,6 +14,7 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.driver_detections import read_driver_detections
 from gtsam_rwhec.pipeline.image_detections import detect_in_log
+from gtsam_rwhec.pipeline.image_options import check_image_options
 from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
 from gtsam_rwhec.pipeline.log_contract import annotations_topic, detections_topic, poses_topic, raw_topics
 from gtsam_rwhec.pipeline.log_metadata import LogMetadata
@@ -54,6 +55,8 @@ def detect_log(
 
     Raises
     ------
+    OptionError
+        `workers` is given, and no sensor has images; or ``images="copy"``, and the log has none.
     LogError, StampError, TransformError, CameraError, FrameError
         The log lacks a topic of the rig file or the carriers' poses, or no target was detected.
     """
@@ -61,6 +64,7 @@ def detect_log(
     check_writable(out_path)
     with open_log(log_path) as log:
         check_is_not_read(log, out_path)
+        check_image_options(log, rig, images=images, workers=workers)
         cameras = read_intrinsics(log, rig)
         tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
         motion = read_carrier_motion(log, rig)

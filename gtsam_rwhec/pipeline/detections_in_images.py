@@ -11,6 +11,7 @@ from gtsam_rwhec.errors import ImageError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, open_log
+from gtsam_rwhec.pipeline.image_options import check_drawable
 from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
 from gtsam_rwhec.pipeline.log_metadata import read_cameras, read_embedded_rig
 from gtsam_rwhec.pipeline.output_paths import made_folder
@@ -35,16 +36,19 @@ def draw_log(
 
     Raises
     ------
+    OptionError
+        No sensor has images.
     LogError
         A log cannot be read.
     FileFormatError
         A picture cannot be written.
     """
     tell = progress or silent
-    folder = made_folder(folder)
     count = 0
     with open_log(detected_path) as detected, open_log(log_path) as log:
         rig, cameras = read_embedded_rig(detected), read_cameras(detected)
+        check_drawable(rig, folder)
+        folder = made_folder(folder)
         for sensor, source in rig.sensors.items():
             if source.images is None:
                 continue

@@ -59,7 +59,7 @@ ESTIMATED = "detections: /cam_1/tags\n    time_offset: estimate"
 def calibrate(folder: Path, messages: Iterable[Message], **pieces: str) -> Any:
     """All stages, on messages as given; `pieces` of the rig file replaced."""
     log = made.write(folder / "raw.mcap", messages)
-    return calibrate_log(log, made.rig(**pieces), folder / "out", workers=1)
+    return calibrate_log(log, made.rig(**pieces), folder / "out")
 
 
 def refused(folder: Path, messages: Iterable[Message], kind: type[RwhecError], *words: str, **pieces: str) -> str:
