@@ -8,11 +8,11 @@ from rwhec_factors import se3
 from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.geometry.poses import Array
 
-#: Metres. The paper's limit: a larger step between two consecutive frames is a tracking error.
+#: Metres. By the paper, a step between two consecutive frames that is larger than this is a tracking error.
 MAX_STEP_M = 0.10
-#: Radians. The paper's limit for the same step: 11.5 degrees.
+#: Radians. The paper limits the turn in the same step to 11.5 degrees.
 MAX_STEP_RAD = float(np.radians(11.5))
-#: Seconds. The paper's limit: two sensors' poses with stamps further apart are not of one instant.
+#: Seconds. By the paper, two sensors' poses with stamps further apart than this are not of one instant.
 MAX_APART_S = 0.1
 
 

@@ -17,7 +17,7 @@ from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.rotations import project
 
-#: A hypothesis is fitted at most so often to the measurements that agree with it; two or three fits are the rule.
+#: A hypothesis is fitted at most this often to the measurements that agree with it. Most need two or three fits.
 MOST_FITS = 10
 
 
@@ -170,7 +170,7 @@ def _least_squares(rows: Array, right: Array) -> Array:
 
 
 def _rotation(M: Array) -> Array:
-    """The rotations nearest to matrices (H, 3, 3) of unknown sign: det M > 0 tells the sign."""
+    """The rotations nearest to matrices (H, 3, 3) of unknown sign; the sign is chosen so that det M > 0."""
     return project(M * np.where(np.linalg.det(M) < 0.0, -1.0, 1.0)[:, None, None])
 
 
@@ -197,7 +197,7 @@ class _Best:
 
 
 def _best(A: Array, B: Array, hypotheses: tuple[Array, Array, Array], options: ConsensusOptions) -> _Best:
-    """The hypothesis that most measurements agree with; among equals, the one with the smallest distances."""
+    """The hypothesis that most measurements agree with. Among equals it has the smallest distances."""
     X, Y, scale = hypotheses
     metres, radians = distances(A, B, X, Y, scale)
     agree = (metres <= options.max_translation_m) & (radians <= options.max_rotation_rad)

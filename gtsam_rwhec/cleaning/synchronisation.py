@@ -9,7 +9,7 @@ from gtsam_rwhec.errors import StampError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-#: Seconds. Between poses further apart nothing is interpolated: an arm at 1 m/s moves 20 cm in this time.
+#: Seconds. Poses further apart than this are not interpolated: an arm at 1 m/s moves 20 cm in this time.
 MAX_GAP_S = 0.2
 
 
@@ -33,7 +33,7 @@ def synchronise(
     time_offset_s : float
         The sensor's stamp t is the carrier's t + offset (Kalibr's convention).
     max_gap_s : float
-        Between poses further apart in time nothing is interpolated.
+        Poses further apart in time than this are not interpolated.
     where : str
         The sensor, for messages.
     needs_overlap : bool

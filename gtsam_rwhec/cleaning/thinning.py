@@ -31,7 +31,7 @@ def thin(
     bad = np.zeros(len(A), dtype=bool)
     moved = np.zeros(len(A))
     last = 0
-    # |R - R'|_F = sqrt(8) sin(angle / 2): no logarithm needed to compare with a limit
+    # |R - R'|_F = sqrt(8) sin(angle / 2), so the comparison with a limit needs no logarithm.
     limit = np.sqrt(8.0) * np.sin(0.5 * min(min_rotation_rad, np.pi))
     R, t = A[:, :3, :3], A[:, :3, 3]
     for i in range(1, len(A)):

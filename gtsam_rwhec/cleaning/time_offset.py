@@ -18,19 +18,19 @@ from gtsam_rwhec.errors import StampError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-#: Seconds between the two detections of an interval: long enough for the angle to exceed a detection's noise, short
-#: enough for the motion not to repeat itself.
+#: The two detections of an interval are this many seconds apart. The time is long enough for the angle to exceed a
+#: detection's noise, and short enough for the motion not to repeat itself.
 INTERVAL_S = 0.4
-#: Intervals that are used, at most, taken evenly from all.
+#: At most this many intervals are used; they are taken evenly from all.
 MOST = 3000
-#: Seconds between two offsets of the grid search.
+#: Two neighbouring offsets of the grid search are this many seconds apart.
 GRID_S = 0.01
-#: Seconds; step of the central differences of the angle with respect to the offset.
+#: Central differences of the angle with respect to the offset use this step (seconds).
 STEP_S = 0.005
 #: This quantile of the differences tells how well an offset fits. An interval has two detections: with 30 % wrong
 #: detections, half of all intervals are wrong.
 QUANTILE = 0.3
-#: The same quantile of |x| for a normal x of unit variance.
+#: This is the same quantile of |x|, where x is normal with unit variance.
 NORMAL_QUANTILE = 0.3853
 #: A difference of angles beyond this many standard deviations comes from a wrong detection.
 GROSS = 3.0
@@ -156,7 +156,7 @@ def _check_grid(grid: Array, costs: Array, best: int, count: int, where: str, se
 
 
 def _refined(differences: Callable[[float], Array], offset: float) -> tuple[float, float, float, int]:
-    """Gauss-Newton from the best offset of the grid: offset, standard deviation, rms of the angles, intervals used."""
+    """Refine the grid's best offset by Gauss-Newton: offset, standard deviation, rms of the angles, intervals used."""
     sigma = rms = np.inf
     used = 0
     for _ in range(20):

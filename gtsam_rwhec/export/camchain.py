@@ -20,7 +20,7 @@ _HEAD = """\
 #   timeshift_cam_imu  seconds: stamp of {carrier}'s poses = stamp of the image + shift
 #   cam_overlaps       cameras whose fields of view overlap this camera's field of view
 """
-#: Number of coefficients of Kalibr's radial-tangential distortion: k1, k2, p1, p2.
+#: Kalibr's radial-tangential distortion has four coefficients: k1, k2, p1, p2.
 RADTAN = 4
 
 
@@ -64,7 +64,7 @@ def camchain_yaml(frames: RigFrames) -> str:
 
 
 def _reason(camera: Camera | None) -> str:
-    """Why a camchain cannot have a sensor; empty if it can."""
+    """Say why a camchain cannot have a sensor; the text is empty if it can."""
     if camera is None:
         return "whose intrinsics are not known."
     more = camera.D[RADTAN:] if camera.model == "radtan" else np.zeros(0)

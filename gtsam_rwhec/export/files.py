@@ -12,7 +12,7 @@ from gtsam_rwhec.export.urdf import urdf_xacro
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
-#: The text of each file, by its name.
+#: These functions give the text of each file, by its name.
 FILES: dict[str, Callable[[RigFrames], str]] = {
     "static_tf.launch.py": static_tf_launch,
     "tf.yaml": tf_yaml,

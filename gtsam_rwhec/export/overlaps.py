@@ -8,9 +8,9 @@ from rwhec_factors.se3 import inverse
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 
-#: Metres. Smallest and largest depth of the points that are tried.
+#: Metres. The points that are tried have depths between these two.
 NEAR_M, FAR_M = 0.2, 20.0
-#: Grid of points that are tried in each field of view: pixels across, pixels down, depths.
+#: The points that are tried in each field of view form a grid of pixels across, pixels down, and depths.
 COLUMNS, ROWS, DEPTHS = 17, 13, 25
 
 

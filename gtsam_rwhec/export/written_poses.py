@@ -19,7 +19,7 @@ def number(value: float) -> str:
 
 
 def quaternion_xyzw(T: Array) -> Array:
-    """(4,) unit quaternion x, y, z, w of a transform's rotation, w not below 0."""
+    """The unit quaternion (4,) of a transform's rotation, as x, y, z, w, where w is not below 0."""
     quaternion: Array = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
     return quaternion
 

@@ -17,23 +17,23 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
 
-#: Least number of images: with fewer images, R_X and R_Y agree with too many choices.
+#: A track needs this number of images: with fewer images, R_X and R_Y agree with too many choices.
 LEAST_IMAGES = 12
-#: Rounds of choices, at most.
+#: There are at most this many rounds of choices.
 ROUNDS = 10
-#: Rounds of R_X and R_Y in turns, in each round of choices.
+#: Each round of choices solves for R_X and R_Y in turns this many times.
 TURNS = 4
-#: Steps of Gauss-Newton on R_X and R_Y, in each round of choices.
+#: Each round of choices makes this many steps of Gauss-Newton on R_X and R_Y.
 STEPS = 4
-#: Images for which all choices are tried; their carriers' rotations are far apart.
+#: All choices are tried for this number of images, whose carriers' rotations are far apart.
 FEW = 4
-#: The number of best choices that become starts.
+#: This number of the best choices become starts.
 BEST = 3
 #: Two images are compared for a first R_Y if their numbers differ by one of these.
 LAGS = (1, 2, 4, 8, 16, 32)
-#: Standard deviation of a translation, as a share of the distance: the tag's size, clocks, corner noise.
+#: A translation's standard deviation is this share of the distance. The tag's size, clocks and corner noise add to it.
 SIGMA_SHARE = 0.03
-#: Angles of two turns that differ by less (rad) can be one turn, seen by the carriers and by the camera.
+#: Two turns can be one turn, seen by the carriers and by the camera, if their angles differ by less than this (rad).
 ALIKE_RAD = float(np.radians(6.0))
 
 
@@ -105,7 +105,7 @@ def _starts(track: _Track) -> list[np.ndarray]:
 
 
 def _apart(R: Array) -> np.ndarray:
-    """Numbers of `FEW` of the rotations (n, 3, 3) that are far apart."""
+    """Choose `FEW` of the rotations (n, 3, 3) that are far apart, and return their indices."""
     chosen = [0]
     nearest = np.full(len(R), np.inf)
     for _ in range(FEW):
@@ -144,13 +144,13 @@ def _settled(track: _Track, which: np.ndarray) -> _Answer:
 
 
 def _off(R_A: Array, R_B: Array, R_X: Array, R_Y: Array) -> Array:
-    """Rotation vectors (n, c, 3) from the predicted R_Y' R_A R_X to R_B (n, c, 3, 3), in the target's frame."""
+    """The rotation vectors (n, c, 3) from the predicted R_Y' R_A R_X to R_B (n, c, 3, 3), in the target's frame."""
     predicted = R_Y.T @ R_A @ R_X
     return se3.so3_logmap((predicted[:, None].swapaxes(-1, -2) @ R_B).reshape(-1, 3, 3)).reshape(*R_B.shape[:2], 3)
 
 
 def _rotations(R_A: Array, R_B: Array, weight: Array, R_X: Array, R_Y: Array) -> tuple[Array, Array]:
-    """R_X and R_Y of R_A R_X = R_Y R_B, weighted least squares from a first R_Y."""
+    """Solve R_A R_X = R_Y R_B for R_X and R_Y, by weighted least squares from a first R_Y."""
     w = weight[:, None, None]
     for _ in range(TURNS):
         R_X = _rotation((w * (R_A.swapaxes(1, 2) @ R_Y @ R_B)).sum(axis=0))

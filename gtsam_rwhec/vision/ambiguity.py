@@ -19,17 +19,17 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.agreement import LEAST_IMAGES, choose_by_agreement
 
-#: Standard deviation of an angle between two images (rad), without corner noise: time offsets, errors of the arm.
+#: Time offsets and arm errors give the angle between two images this standard deviation (rad). Corner noise adds to it.
 SIGMA_TURN_RAD = float(np.radians(3.0))
-#: Standard deviation of a target's angular velocity against the camera (rad/s) where the carriers' poses are not known.
+#: A target's angular velocity against the camera has this standard deviation (rad/s) where carriers' poses are unknown.
 SIGMA_RATE_RAD_S = float(np.radians(60.0))
-#: Two images further apart in time than this are not compared.
+#: Two images are not compared if they are further apart in time than this (seconds).
 LONGEST_LINK_S = 3.0
-#: Largest cost (log-likelihood) of the comparison of two images, so that one comparison cannot outweigh the others.
+#: The comparison of two images costs at most this (log-likelihood), so that it cannot outweigh the others.
 MOST_OF_A_LINK = 8.0
-#: Largest cost (log-likelihood) of one image, so that one image cannot outweigh the others.
+#: One image costs at most this (log-likelihood), so that it cannot outweigh the others.
 MOST_OF_AN_IMAGE = 30.0
-#: Candidates whose rotations differ by less (rad) are one pose.
+#: Two candidates are one pose if their rotations differ by less than this (rad).
 SAME_RAD = float(np.radians(0.2))
 
 
@@ -42,7 +42,7 @@ class Choice:
     which : (n,) array of int
         The chosen candidate, 0 or 1.
     margin : (n,) array
-        Log-likelihood of the chosen track, minus that of the best track with the other candidate in this image.
+        By how much the chosen track's log-likelihood exceeds that of the best track with this image's other candidate.
     """
 
     which: np.ndarray
@@ -106,7 +106,7 @@ def choose_over_time(
 
 
 def _links(stamps_ns: np.ndarray, T: Array, covariance: Array, carrier: Array | None) -> Array:
-    """Costs (n - 1, 2, 2) of each state after each: how far the angle between them is from the carriers' angle."""
+    """Costs (n - 1, 2, 2) of each state after each: they say how far their angle is from the carriers' angle."""
     seconds = np.diff(stamps_ns) * 1e-9
     R = np.nan_to_num(T[..., :3, :3])
     between = R[:-1, :, None] @ np.swapaxes(R[1:, None], -1, -2)  # B_i B_j^-1

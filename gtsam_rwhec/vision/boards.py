@@ -11,26 +11,26 @@ from gtsam_rwhec.vision.dictionaries import dictionary
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard
 
-#: End of cornerSubPix: 30 rounds, or a step of 1e-3 pixels.
+#: cornerSubPix ends after 30 rounds, or with a step of at most 1e-3 pixels.
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 #: A corner that refinement moves by more than this share of its window is another corner, and is not used.
 MOST_MOVED = 0.8
-#: Half window that finds an AprilGrid's corner, as a share of a tag's side: OpenCV's contours are wrong by pixels where
-#: black squares touch.
+#: The half window that finds an AprilGrid's corner is this share of a tag's side. It is large because OpenCV's contours
+#: are wrong by pixels where black squares touch.
 FIND = 0.2
-#: Largest half window that finds a corner, as a share of the gap between tags.
+#: The half window that finds a corner is at most this share of the gap between tags.
 FIND_GAP = 0.7
-#: Half window that measures a found corner, as a share of a tag's side.
+#: The half window that measures a found corner is this share of a tag's side.
 MEASURE = 0.13
-#: Largest half window that measures a corner, as a share of the gap between tags.
+#: The half window that measures a corner is at most this share of the gap between tags.
 MEASURE_GAP = 0.55
 #: A corner further than this (pixels) from the place that the other corners predict is not used.
 ASTRAY_PX = 1.5
-#: Half window at a checkerboard's corner, as a share of a square's side.
+#: The half window at a checkerboard's corner is this share of a square's side.
 OF_SQUARE = 0.4
-#: How far blur and the gradient's window carry a marker's edge outwards, pixels.
+#: Blur and the gradient's window carry a marker's edge outwards by this many pixels.
 GRADIENT_PX = 0.5
-#: Least contrast of a checkerboard's outermost squares, as a share of the contrast of its inner squares.
+#: A checkerboard's outermost squares need at least this share of the contrast of its inner squares.
 LEAST_CONTRAST = 0.3
 
 
@@ -64,7 +64,7 @@ def charuco_corners(
 
 
 def _to_the_markers(board: Charuco, plane: Array, pixels: Array) -> float:
-    """Least distance from a corner (n, 2) to the nearest marker, pixels along x or y."""
+    """The smallest distance between any corner (n, 2) and its nearest marker, in pixels along x or y."""
     if len(plane) < 4:
         return 0.0
     H, _ = cv2.findHomography(plane, pixels)
@@ -103,7 +103,7 @@ def aprilgrid_corners(gray: Gray, board: AprilGrid, ids: np.ndarray, tags_px: Ar
 
 
 def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndarray:
-    """Which (n,) of a board's corners (n, 3), seen at (n, 2), agree with most corners; all if there are under six."""
+    """Say which (n,) of a board's corners (n, 3), seen at (n, 2), agree with most corners. Under six corners all do."""
     everyone = np.ones(len(corners_m), dtype=bool)
     x = camera.undistort(corners_px)
     if len(corners_m) < 6 or not np.isfinite(x).all():
@@ -140,7 +140,7 @@ def checkerboard_corners(gray: Gray, board: Checkerboard) -> Array:
 def _contrast(gray: Gray, grid: Array) -> float:
     """How much lighter the white squares are if the first corner's outer square is black; negative if it is white.
 
-    0 where the outermost squares in the image do not alternate: an outer edge was taken for inner corners.
+    It is 0 if the outermost squares in the image do not alternate, since an outer edge was taken for inner corners.
     """
     beyond = np.pad(grid, ((1, 1), (1, 1), (0, 0)), mode="reflect", reflect_type="odd")
     middles = 0.25 * (beyond[1:, 1:] + beyond[1:, :-1] + beyond[:-1, 1:] + beyond[:-1, :-1])
@@ -166,7 +166,7 @@ def refined_corners(gray: Gray, corners: Array, half: int) -> Array:
 
 
 def _plane_error(plane: Array, pixels: Array) -> float:
-    """Mean squared error of the least-squares homography of all points, pixels^2."""
+    """The mean squared error (pixels^2) of the homography that least squares fits to all points."""
     H, _ = cv2.findHomography(plane, pixels)
     if H is None:
         return float("inf")

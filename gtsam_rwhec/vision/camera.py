@@ -16,18 +16,18 @@ from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.distortion import Model, distorted, folding_radius, undistorted
 
-#: Models by the words of ROS, Foxglove, Kalibr and OpenCV.
+#: ROS, Foxglove, Kalibr and OpenCV name the models by these words.
 MODELS: dict[str, Model] = {
     "": "pinhole", "none": "pinhole", "pinhole": "pinhole",
     "plumb_bob": "radtan", "radtan": "radtan", "rational_polynomial": "radtan", "thin_prism": "radtan",
     "equidistant": "equidistant", "equi": "equidistant", "fisheye": "equidistant", "kannala_brandt": "equidistant",
 }  # fmt: skip
-#: Numbers of distortion coefficients that OpenCV takes for each model.
+#: OpenCV takes these numbers of distortion coefficients for each model.
 COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5, 8, 12, 14), "equidistant": (4,)}
-#: Least and largest focal length over the image's larger side: for a pinhole 0.05 is a field of view of over 160
-#: degrees, 50 of one degree.
+#: The focal length over the image's larger side must be within this range. For a pinhole, 0.05 is a field of view of
+#: over 160 degrees, and 50 is one of one degree.
 FOCAL_RANGE = (0.05, 50.0)
-#: Pixels of the largest image: 2^28 bytes in gray.
+#: An image has at most this many pixels, which are 2^28 bytes in gray.
 MOST_PIXELS = 1 << 28
 
 
@@ -122,7 +122,7 @@ class Camera:
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3) in the camera's frame, any unit.
 
-        nan behind the camera and beyond `ring`: the polynomials bring such points back into the image, a lens does not.
+        They are nan behind the camera and beyond `ring`, where polynomials, unlike a lens, lead back into the image.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             x = points[..., :2] / points[..., 2:]

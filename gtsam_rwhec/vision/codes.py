@@ -23,23 +23,23 @@ from gtsam_rwhec.vision.dictionaries import dictionary
 from gtsam_rwhec.vision.edge_geometry import from_unit_square
 from gtsam_rwhec.vision.images import Gray
 
-#: Window of the adaptive threshold, pixels.
+#: The window of the adaptive threshold has this side (pixels).
 WINDOW = 23
 #: A dark pixel is darker than the mean of its window by this gray value.
 DARKER = 7
-#: Largest distance of a contour from its quadrangle, as a share of the contour's length.
+#: A contour may be this far from its quadrangle, as a share of the contour's length.
 OFF = 0.03
-#: Shortest side of a quadrangle, pixels: 1.5 for each of a tag's 8 modules.
+#: A quadrangle's sides must be this long (pixels): 1.5 pixels for each of a tag's 8 modules.
 LEAST_PX = 12.0
-#: Places of samples along each side of a cell, as shares of the side.
+#: A cell is sampled at these places along each of its sides, as shares of the side.
 LOOKS = np.array([0.3, 0.5, 0.7])
-#: Least difference between the brightest and the darkest cells of a tag, gray values.
+#: The brightest and the darkest cells of a tag must differ by at least this gray value.
 LEAST_CONTRAST = 15.0
-#: Largest share of wrong bits in a border (OpenCV's value).
+#: At most this share of a border's bits may be wrong (OpenCV's value).
 BORDER_ERRORS = 0.35
-#: Share of the bits that a family's distances allow to correct and that are corrected (OpenCV's value).
+#: Of the bits that a family's distances allow to correct, this share is corrected (OpenCV's value).
 CORRECTED = 0.6
-#: Quadrangles whose middles are nearer than this share of the smaller quadrangle's size are one tag.
+#: Two quadrangles are one tag if their middles are nearer than this share of the smaller quadrangle's size.
 SAME_TAG = 0.25
 
 
@@ -75,7 +75,7 @@ def quadrangles(gray: Gray) -> Array:
 
 
 def identified(gray: Gray, quads: Array, family: str, border_bits: int = 1) -> np.ndarray:
-    """Ids (N,) of quadrangles (N, 4, 2), pixels, clockwise; -1 if a quadrangle is not a tag of the family."""
+    """Ids (N,) of clockwise quadrangles (N, 4, 2) in pixels; an id is -1 if the quadrangle is no tag of the family."""
     signs, correctable = codes(family)
     n = round(np.sqrt(signs.shape[2]))
     white = _white_cells(gray, quads, n + 2 * border_bits)
@@ -94,7 +94,7 @@ def identified(gray: Gray, quads: Array, family: str, border_bits: int = 1) -> n
 
 
 def _white_cells(gray: Gray, quads: Array, modules: int) -> np.ndarray:
-    """Which cells are white: (N, modules, modules) booleans, all true where there is no contrast."""
+    """Say which cells are white, as (N, modules, modules) booleans; all are true where there is no contrast."""
     if not len(quads):
         return np.ones((0, modules, modules), dtype=bool)
     along = ((np.arange(modules)[:, None] + LOOKS) / modules).ravel()

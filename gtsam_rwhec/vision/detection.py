@@ -70,7 +70,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class ImageDetections:
-    """The targets detected in one image, and the number of tags of no target, by family and id."""
+    """The targets detected in one image, and the number of tags that belong to no target, by family and id."""
 
     detections: tuple[Detection, ...]
     strangers: dict[tuple[str, int], int]
@@ -103,7 +103,7 @@ class Detector:
         self._owners = {(*_kind(t), i) for t in targets for i in t.ids}
         kinds = sorted({_kind(target) for target in targets if target.ids})
         self._ids = {kind: sorted(i for *of, i in self._owners if tuple(of) == kind) for kind in kinds}
-        #: One detector for each border: OpenCV looks for several families at once.
+        #: Each border has one detector, since OpenCV looks for several families at once.
         self._detectors = {
             border: detector_of({family: ids for (family, b), ids in self._ids.items() if b == border}, border)
             for border in sorted({border for _, border in kinds})
@@ -141,7 +141,7 @@ class Detector:
         ]
 
     def _tags_in(self, images: Sequence[Gray]) -> dict[_Kind, list[_Tags]]:
-        """Targets' tags of each kind in each image, with corners right to about a pixel."""
+        """Find the targets' tags of each kind in each image, with corners right to about a pixel."""
         tags: dict[_Kind, list[_Tags]] = {kind: [] for kind in self._ids}
         for gray in images:
             for border, detector in self._detectors.items():
@@ -158,7 +158,7 @@ class Detector:
     def _strangers(
         self, images: Sequence[Gray], tags: dict[_Kind, list[_Tags]]
     ) -> Iterator[dict[tuple[str, int], int]]:
-        """The tags in each image that have a target's family and belong to no target: how many, by family and id."""
+        """Count the tags in each image that have a target's family but belong to no target, by family and id."""
         for k, gray in enumerate(images):
             quads = quadrangles(gray) if tags else np.zeros((0, 4, 2))
             quads = unlike(quads, np.concatenate([quads[:0], *(found[k][1] for found in tags.values())]))
@@ -233,7 +233,7 @@ class Detector:
 
 
 def grazing_rad(T_camera_target: Array) -> float:
-    """Angle between the line of sight to a target's origin and the target's normal; 0 is from the front."""
+    """The angle between the line of sight to a target's origin and the target's normal; it is 0 from the front."""
     t = T_camera_target[:3, 3]
     cosine = -float(T_camera_target[:3, 2] @ t) / float(np.linalg.norm(t))
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -11,9 +11,9 @@ from gtsam_rwhec.geometry.poses import Array
 
 Model = Literal["pinhole", "radtan", "equidistant"]
 
-#: Steps of Newton's method, at most.
+#: Newton's method takes at most this many steps.
 STEPS = 30
-#: A smaller step, in normalised coordinates, ends the iteration.
+#: The iteration ends with a step smaller than this, in normalised coordinates.
 NEAR = 1e-10
 
 
@@ -27,7 +27,7 @@ def distorted(model: Model, D: Array, x: Array) -> tuple[Array, Array]:
 
 
 def undistorted(model: Model, D: Array, wanted: Array, ring: float) -> Array:
-    """Coordinates x (..., 2) whose distorted coordinates are `wanted`, by Newton; nan where none is within `ring`."""
+    """Solve for x (..., 2) whose distorted coordinates are `wanted`, by Newton; x is nan if none is within `ring`."""
     if model == "pinhole":
         return wanted
     if model == "equidistant":
@@ -52,7 +52,7 @@ def undistorted(model: Model, D: Array, wanted: Array, ring: float) -> Array:
 
 
 def _undistorted_fisheye(D: Array, wanted: Array, ring: float) -> Array:
-    """As `undistorted`, by Newton on the angle: tan grows too fast near 90 degrees."""
+    """Do as `undistorted`, but by Newton on the angle, since tan grows too fast near 90 degrees."""
     k1, k2, k3, k4 = D
     curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4])
     slope = curve.deriv()
@@ -85,7 +85,7 @@ def folding_radius(model: Model, D: Array) -> float:
 
 
 def _first_root(polynomial: Polynomial) -> float:
-    """Smallest positive root of a polynomial that is 1 at 0; infinite if no root is real and positive."""
+    """The smallest positive root of a polynomial that is 1 at 0. It is infinite if no root is real and positive."""
     # numpy finds the reciprocals of the roots here: the last coefficients can be almost 0, the first coefficient is 1.
     roots = np.roots(polynomial.coef)
     inverse = float(roots[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)].real.max(initial=0.0))

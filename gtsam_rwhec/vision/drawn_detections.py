@@ -13,15 +13,15 @@ from gtsam_rwhec.logs.records import DetectionRecord
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.images import Gray
 
-#: Colour of a used detection, (blue, green, red): blue of Okabe and Ito's palette, for colour-blind people.
+#: A used detection has this colour (blue, green, red), a blue of Okabe and Ito's palette for colour-blind people.
 USED = (178, 114, 0)
-#: Colour of a detection that is not used: vermilion of the same palette.
+#: A detection that is not used has this colour, the vermilion of the same palette.
 NOT_USED = (0, 94, 213)
-#: Colours of the axes x, y, z.
+#: The axes x, y, z have these colours.
 AXES = (NOT_USED, (115, 158, 0), USED)
-#: Bits of a place below the pixel: 1/16 of a pixel.
+#: OpenCV draws at places with this number of bits below the pixel, so to 1/16 of a pixel.
 SHIFT = 4
-#: Length of an axis over the target's distance.
+#: An axis is this long, as a share of the target's distance.
 AXIS = 0.08
 
 
@@ -61,5 +61,5 @@ def _draw_axes(picture: NDArray[np.uint8], T: Array, camera: Camera) -> None:
 
 
 def _fixed(pixels: Array) -> NDArray[np.int32]:
-    """OpenCV's fixed-point places; clipped, since places far outside do not fit."""
+    """OpenCV's fixed-point places. They are clipped, since places far outside do not fit."""
     return np.rint(np.clip(pixels, -1e4, 1e5) * (1 << SHIFT)).astype(np.int32)

@@ -7,7 +7,7 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.images import Gray
 
-#: Points further from their line than this many times the median distance belong to something in front of the tag.
+#: A point is of something in front of the tag if its distance from the line is above this times 1.4826 of the median.
 GROSS = 3.5
 
 
@@ -28,7 +28,7 @@ def area(corners: Array) -> Array:
 def sampled(stack: Gray, image_of: np.ndarray, points: Array) -> Array:
     """Bilinear gray values at points (N, ..., 2), each point in its own image; the border's values go on outside.
 
-    Not by cv2.remap, which rounds places to 1/32 of a pixel.
+    cv2.remap is not used, because it rounds places to 1/32 of a pixel.
     """
     _, height, width = stack.shape
     x = np.clip(np.nan_to_num(points[..., 0]), 0.0, width - 1.001)
@@ -53,7 +53,7 @@ def lines_through(x: Array, good: np.ndarray, least: int) -> Array:
             mean = (weight[..., None] * x).sum(axis=-2) / total[..., None]
         off = np.nan_to_num(x - mean[..., None, :])
         C = np.einsum("nkp,nkpi,nkpj->nkij", weight, off, off)
-        # The direction of least spread of a 2 x 2 matrix, in closed form.
+        # A closed form gives the direction in which a 2 x 2 matrix has the smallest spread.
         angle = 0.5 * np.arctan2(2.0 * C[..., 0, 1], C[..., 0, 0] - C[..., 1, 1]) + 0.5 * np.pi
         normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         distance = np.abs(np.einsum("nkpi,nki->nkp", off, normal))

@@ -14,12 +14,12 @@ from scipy.special import ndtr
 
 from gtsam_rwhec.geometry.poses import Array
 
-#: Prior standard deviation of the gray values beyond the border and beyond the paper, in units of the edge's step.
+#: Gray values beyond the border and beyond the paper have this prior standard deviation, in units of the edge's step.
 BEYOND = 2.0
-#: Prior standard deviation of the edge's shift and of the blur's change in one round, in units of the blur.
+#: The edge's shift and the blur's change in one round have this prior standard deviation, in units of the blur.
 SHIFT = 1.0
-#: Noise of a sample, in units of the step. With so little noise the priors only separate columns that the samples do
-#: not separate.
+#: A sample has this noise, in units of the step. With so little noise the priors only separate columns that the samples
+#: do not separate.
 NOISE = 0.01
 
 

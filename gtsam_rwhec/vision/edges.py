@@ -20,41 +20,41 @@ from gtsam_rwhec.vision.edge_geometry import area, crossings, from_unit_square, 
 from gtsam_rwhec.vision.edge_profiles import fit_profiles
 from gtsam_rwhec.vision.images import Gray
 
-#: Profiles along a side.
+#: A side has this number of profiles.
 PROFILES = 18
-#: The part of a side that has profiles: near the corners two edges mix.
+#: Profiles lie in this part of a side, because two edges mix near the corners.
 PART = (0.12, 0.88)
-#: Good profiles that a line needs.
+#: A line needs at least this number of good profiles.
 LEAST = 6
-#: Samples across an edge.
+#: A profile has this number of samples across an edge.
 SAMPLES = 13
-#: Reach of a first profile inwards, modules: a white cell of the code, a module away, must not blur into the profile.
+#: A first profile reaches this far inwards (modules): a white cell, one module away, must not blur into it.
 INWARDS = 0.55
-#: Reach of a first profile outwards, modules: the paper may end.
+#: A first profile reaches this far outwards (modules), because the paper may end there.
 OUTWARDS = 0.7
-#: Reach of a first profile at most, pixels.
+#: A first profile never reaches further than this (pixels).
 REACH_PX = 5.0
-#: Reach of the model's profiles inwards, modules: the model contains the code.
+#: The model's profiles reach this far inwards (modules), because the model contains the code.
 MODEL_INWARDS = 1.1
-#: Reach of the model's profiles outwards, modules: the model contains the paper's end.
+#: The model's profiles reach this far outwards (modules), because the model contains the paper's end.
 MODEL_OUTWARDS = 0.9
-#: Reach of the model's profiles at most: standard deviations of the blur.
+#: The model's profiles reach at most this many standard deviations of the blur, and `MORE_PX` further.
 BLURS = 3.5
-#: Reach of the model's profiles at most: pixels beyond `BLURS`.
+#: The model's profiles reach at most this many pixels beyond `BLURS`.
 MORE_PX = 1.5
-#: Rounds by areas.
+#: The edges are refined by areas in this number of rounds.
 ROUNDS = 2
-#: Rounds by the model.
+#: The edges are then refined by the model in this number of rounds.
 MODEL_ROUNDS = 3
-#: Least blur, pixels: a pixel's own.
+#: The blur is at least this (pixels): a pixel itself blurs so much.
 LEAST_BLUR_PX = 0.35
-#: Largest blur, modules: beyond it no code can be read.
+#: The blur is at most this (modules): beyond it no code can be read.
 MOST_BLUR = 1.0
-#: Largest root mean square of a good profile's residuals, in units of the step.
+#: A profile is good only if the root mean square of its residuals is at most this, in units of the step.
 MOST_LEFT = 0.15
-#: Least step of a good profile, as a share of the tag's step.
+#: A profile is good only if its step is at least this share of the tag's step.
 LEAST_STEP = 0.5
-#: Least step of a tag, gray values.
+#: A tag needs a step of at least this, in gray values.
 LEAST_GRAY = 8.0
 
 
@@ -67,7 +67,7 @@ class RefinedCorners:
     corners_px : (N, 4, 2) array
         Pixels; nan where the edges were not found.
     blur_px : (N,) array
-        Standard deviation of the blur across the edges, on the side with the largest blur; contains a pixel's own blur.
+        Standard deviation of the blur across the edges, on the side with the largest blur. It contains a pixel's blur.
     """
 
     corners_px: Array
@@ -126,7 +126,7 @@ def _by_areas(stack: Gray, image_of: np.ndarray, corners: Array, camera: Camera,
     outward = np.sign(np.einsum("nki,nki->nk", normal, 0.5 * (start + end) - middle))
     normal *= outward[..., None]
     share = np.linspace(*PART, PROFILES)
-    # A slanted tag is narrower than its sides are long: take its area over its longest side.
+    # A slanted tag is narrower than its sides are long, so its width is its area over its longest side.
     with np.errstate(invalid="ignore", divide="ignore"):
         module = area(corners) / length[..., 0].max(axis=1) / modules  # (N,)
     inwards, outwards = np.minimum(INWARDS * module, REACH_PX), np.minimum(OUTWARDS * module, REACH_PX)
@@ -175,7 +175,7 @@ def _corners(camera: Camera, edge: Array, good: np.ndarray) -> Array:
 def _by_model(stack: Gray, image_of: np.ndarray, edges: _Edges, camera: Camera, modules: int) -> _Edges:
     """Refine edges that are right to a pixel, by one round of the model."""
     x = camera.undistort(edges.corners_px)
-    # For each side: the square whose first side it is.
+    # Each side gets the square whose first side it is.
     H = from_unit_square(np.stack([np.roll(x, -k, axis=1) for k in range(4)], axis=1))
     share = np.linspace(*PART, PROFILES)
     foot, inner = (camera.pixels(mapped(H, share, y)) for y in (0.0, 1.0 / modules))  # (N, 4, P, 2)

@@ -10,11 +10,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-#: First bytes of files.
+#: Files begin with these bytes.
 PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG, _BMP, _RIFF = b"\xff\xd8", b"BM", b"RIFF"
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
-#: TIFF's tags for width and height, and its types for whole numbers: 16 and 32 bits.
+#: TIFF has these tags for width and height, and two types for whole numbers, of 16 and 32 bits.
 _WIDTH, _HEIGHT = 256, 257
 _WHOLE = {3: "H", 4: "I"}
 
@@ -66,7 +66,7 @@ def _webp(data: bytes) -> Size:
 
 
 def _tiff(data: bytes) -> Size | None:
-    """The size in the first directory; the larger value if a tag is given twice."""
+    """The size in the first directory. If a tag is given twice, the larger value counts."""
     order = _TIFF[data[:4]]
     (at,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, at)

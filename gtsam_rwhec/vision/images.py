@@ -13,7 +13,7 @@ from gtsam_rwhec.vision.image_sizes import PNG, stated_size
 
 Gray = NDArray[np.uint8]
 
-#: Raw encodings: channels, bytes in a channel, and OpenCV's conversion to gray (None for gray images).
+#: Each raw encoding has its channels, the bytes in a channel, and OpenCV's conversion to gray (None for gray images).
 _RAW: dict[str, tuple[int, int, int | None]] = {
     "mono8": (1, 1, None), "8uc1": (1, 1, None), "mono16": (1, 2, None), "16uc1": (1, 2, None),
     "rgb8": (3, 1, cv2.COLOR_RGB2GRAY), "8uc3": (3, 1, cv2.COLOR_BGR2GRAY), "bgr8": (3, 1, cv2.COLOR_BGR2GRAY),

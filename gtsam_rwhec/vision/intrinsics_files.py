@@ -18,15 +18,15 @@ from gtsam_rwhec.files.yaml_lines import OPENCV_MATRIX, KeyPath, YamlFile, parse
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import MODELS, Camera
 
-#: Kalibr's distortion models of its camera model pinhole.
+#: Kalibr combines its camera model pinhole with these distortion models.
 KALIBR_DISTORTIONS = ("none", "radtan", "equidistant")
 _KALIBR_CAMERA = re.compile(r"cam\d+")
-#: Keys of intrinsics, in lower case and without underscores, as ROS, OpenCV's samples and people write them.
+#: ROS, OpenCV's samples and people write these keys of intrinsics; here they have lower case and no underscores.
 _WIDTH, _HEIGHT = ("imagewidth", "width"), ("imageheight", "height")
 _MATRIX = ("cameramatrix", "k")
 _COEFFICIENTS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "d")
 _MODEL = ("distortionmodel", "cameramodel")
-#: Names of the needed fields, for messages.
+#: Messages give the needed fields these names.
 _FIELDS = {
     _WIDTH: "image_width", _HEIGHT: "image_height", _MATRIX: "camera_matrix", _COEFFICIENTS: "distortion_coefficients",
 }  # fmt: skip

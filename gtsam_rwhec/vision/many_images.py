@@ -23,11 +23,11 @@ from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.detection import Detector, ImageDetections
 from gtsam_rwhec.vision.images import Gray, decode_gray
 
-#: Images in a batch: enough that their common refinement is cheap, few enough for the memory.
+#: A batch has this number of images: enough to make their common refinement cheap, and few enough for the memory.
 BATCH = 32
-#: Images for the threads, before processes start for the other images.
+#: The threads take this number of images before processes take over the others.
 FEW = 320
-#: Environment of the processes: linear algebra uses one thread in each, since each core has its process.
+#: With this environment, linear algebra uses one thread in each process, since each core has its process.
 _ONE_THREAD = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
@@ -128,7 +128,7 @@ class _Processes:
             self._pool.shutdown(wait=True, kill_workers=kind is not None or not self.are_ready())
 
 
-#: Detectors by topic, in each thread. A thread, and a process, works for one call of `detect_in_images` only.
+#: Each thread keeps its detectors here, by topic. A thread or process works for one call of `detect_in_images` only.
 _of_thread = threading.local()
 
 

@@ -18,22 +18,22 @@ class DetectionOptions:
     Attributes
     ----------
     min_side_px : float
-        Least length of a tag's sides, or of a board's bounding box, pixels: errors of corners are a large share of a
-        shorter side.
+        A tag's sides, or a board's bounding box, must be at least this long (pixels): errors of corners are a large
+        share of a shorter side.
     min_corners : int
-        Least number of a board's corners.
+        At least this number of a board's corners must be seen.
     max_blur_px : float
-        Largest standard deviation of the blur across a tag's edges, pixels. Motion and wrong focus blur.
+        The blur across a tag's edges may have at most this standard deviation (pixels). Motion and wrong focus blur.
     max_grazing_deg : float
-        Largest angle between the line of sight and the target's normal, degrees; 90 is from the side.
+        The line of sight may be at most this far from the target's normal, degrees; 90 is from the side.
     max_reprojection_px : float
-        Largest root mean square of the reprojection errors of a detection's corners, pixels.
+        The reprojection errors of a detection's corners may have at most this root mean square, pixels.
     ambiguity_margin : float
-        Least difference of log-likelihoods between the chosen pose of a plane and its other candidate, over the whole
-        track.
+        The log-likelihood of a plane's chosen pose must exceed that of its other candidate by at least this, over the
+        whole track.
     corner_px : float
-        Standard deviation of a corner along each axis, pixels: it gives the poses' covariances. With ``noise:
-        estimate`` only the proportions of the covariances count.
+        A corner has this standard deviation along each axis (pixels). The poses' covariances follow from it. With
+        ``noise: estimate`` only the proportions of the covariances count.
     """
 
     min_side_px: float = 12.0

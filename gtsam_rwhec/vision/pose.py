@@ -17,15 +17,15 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 
-#: Steps of Gauss-Newton, at most.
+#: Gauss-Newton takes at most this many steps.
 STEPS = 15
-#: The iteration ends when costs change by less than this share.
+#: The iteration ends when the costs change by less than this share.
 SETTLED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class PlanePoses:
-    """Poses of N flat targets, two candidates for each target, the better candidate first.
+    """Poses of N flat targets. Each target has two candidates, and the better candidate is first.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ def plane_poses(
 
 
 def _ippe(points: Array, x: Array) -> Array:
-    """IPPE's two poses (2, 4, 4) from normalised coordinates; nan for a pose that is not found."""
+    """IPPE's two poses (2, 4, 4) from normalised coordinates. A pose that is not found is nan."""
     T = np.full((2, 4, 4), np.nan)
     if len(x) < 4 or not np.isfinite(x).all():
         return T
@@ -106,7 +106,7 @@ def _ippe(points: Array, x: Array) -> Array:
 def _refined(
     camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, corner_px: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Damped Gauss-Newton: T, sums of squares, covariances, errors (N, 2, n, 2)."""
+    """Refine T by damped Gauss-Newton; return T, sums of squares, covariances, and errors (N, 2, n, 2)."""
     T = T.copy()
     errors, J = _linearised(camera, T, p, u, known)
     cost = np.einsum("ncki,ncki->nc", errors, errors)
@@ -160,7 +160,7 @@ def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray)
 
 
 def _solved(H: Array, g: Array) -> Array:
-    """H^-1 g, g (..., 6, n); nan where H is not finite or singular."""
+    """H^-1 g, with g (..., 6, n). It is nan where H is singular or not finite."""
     bad = np.asarray(~np.isfinite(H).all(axis=(-1, -2)))
     # Units differ (rad, m): scale to a unit diagonal before the test and the solution.
     unit = np.sqrt(np.where(bad[..., None], 1.0, np.maximum(np.einsum("...aa->...a", H), 1e-300)))

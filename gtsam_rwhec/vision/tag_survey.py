@@ -12,14 +12,14 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.dictionaries import tag_detector
 from gtsam_rwhec.vision.images import Gray
 
-#: Families by trust: the first family's codes are the least likely by chance (many bits, few tags, far apart).
+#: Families are in the order of trust: the first one's codes (many bits, few tags, far apart) arise by chance least.
 BY_TRUST = (
     "tag36h11", "aruco_mip_36h12", "aruco_7x7_1000", "aruco_6x6_1000", "tag36h10", "tag25h9", "aruco_5x5_1000",
     "aruco_original", "tag16h5", "aruco_4x4_1000",
 )  # fmt: skip
 #: The family of Kalibr's AprilGrids, which have a double border.
 DOUBLE = "tag36h11"
-#: Side of a flattened tag, pixels.
+#: A flattened tag has this side, in pixels.
 SIDE = 50
 
 

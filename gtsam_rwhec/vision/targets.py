@@ -15,13 +15,13 @@ import numpy as np
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.geometry.poses import Array
 
-#: Number of tags in each family.
+#: Each family has this number of tags.
 FAMILIES: dict[str, int] = {
     "tag16h5": 30, "tag25h9": 35, "tag36h10": 2320, "tag36h11": 587,
     **{f"aruco_{n}x{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
     "aruco_original": 1024, "aruco_mip_36h12": 250,
 }  # fmt: skip
-#: Lengths of targets are below this (m): longer lengths are probably millimetres.
+#: Lengths of targets must be below this (m), since longer lengths are probably millimetres.
 LARGEST_M = 10.0
 
 
@@ -231,7 +231,7 @@ def _bare(word: str) -> str:
 
 
 def _square(side_m: float) -> Array:
-    """Corners of a square about the origin: top left, top right, bottom right, bottom left."""
+    """Corners of a square about the origin, in the order top left, top right, bottom right, bottom left."""
     return 0.5 * side_m * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
 
 
