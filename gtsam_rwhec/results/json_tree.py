@@ -93,7 +93,7 @@ def in_words(error: Exception) -> str:
         return f"{error}."
     faults = []
     for fault in error.errors(include_url=False):
-        keys = fault["loc"][1:] if fault["loc"][:1] == ("refined",) and fault["loc"][1] in POSED else fault["loc"]
+        keys = fault["loc"][1:] if fault["loc"][:2] in [("refined", name) for name in POSED] else fault["loc"]
         place = "$" + "".join(_step(key) for key in keys)
         given = repr(fault["input"])
         value = f" (found {given})" if len(given) <= 60 and fault["type"] != "missing" else ""

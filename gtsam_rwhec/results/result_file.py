@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
+from gtsam_rwhec.results.agreement import check_certificates, check_joint, check_top, check_verdict
 from gtsam_rwhec.results.earlier_versions import FIRST_VERSION, as_version_4
 from gtsam_rwhec.results.json_tree import POSED, from_json, in_words, to_json
 from gtsam_rwhec.results.log_history import LogFields
@@ -165,9 +166,16 @@ def parse_result(content: bytes, path: str | Path) -> Result:
     try:
         raw = json.loads(content)
         file = _checked(raw if number == FORMAT_VERSION else as_version_4(raw))
+        result = _result_of(file)
+        if number == FORMAT_VERSION:  # earlier versions had no verdict
+            check_verdict(file.verdict, judge(result.solution, result.refined, result.log).verdict)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         of_version = "" if number == FORMAT_VERSION else f" of version {number} (places are those of {FORMAT_VERSION})"
         raise FileFormatError(f"{path} is not a valid result{of_version}: {in_words(error)}") from error
+    return result
+
+
+def _result_of(file: ResultFile) -> Result:
     refined = None if file.refined is None else _of_class(RefinedPoses, file.refined)
     return Result(_of_class(Solution, file.certified), refined, file.log)
 
@@ -231,4 +239,10 @@ def _checked(tree: dict[str, Any]) -> ResultFile:
     rest = {name: value for name, value in tree.items() if name not in posed}
     if isinstance(tree.get("refined"), dict):
         rest["refined"] = {**tree["refined"], **posed}
-    return ResultFile.model_validate_json(json.dumps(from_json(rest, "$", "")))
+    file = ResultFile.model_validate_json(json.dumps(from_json(rest, "$", "")))
+    check_certificates(file.certified)
+    if file.refined is None:
+        check_top(tree)
+    else:
+        check_joint(file.refined, file.certified)
+    return file

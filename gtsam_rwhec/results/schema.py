@@ -21,7 +21,7 @@ from gtsam_rwhec.identifiability.verdicts import Identifiability, PairIdentifiab
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.refined import PairNoise, RefinedPoses
-from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.refinement.unknowns import Unknown
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.verdict import Ground, Verdict
 from gtsam_rwhec.solver.residuals import Residual
@@ -255,25 +255,11 @@ class ResultFile(BaseModel):
             unknown = {name for pair in pairs for name in pair} - names
             if unknown:
                 raise ValueError(f"pairs name frames that have no pose: {', '.join(sorted(unknown))}")
-            if isinstance(answer, RefinedFields):
-                _check_joint(answer, names)
+            targets = {pair.target for pair in pairs}
+            if isinstance(answer.scale, dict) and not targets <= answer.scale.keys() <= names:
+                raise ValueError(
+                    f"scale has {', '.join(answer.scale)}, but the targets are {', '.join(sorted(targets))}"
+                )
         if self.certified.residuals.keys() != self.certified.identifiability.pairs.keys():
             raise ValueError("residuals and identifiability.pairs have different pairs")
         return self
-
-
-def _check_joint(refined: RefinedFields, names: set[str]) -> None:
-    if refined.frames.keys() != names or refined.moved.keys() != names:
-        raise ValueError(f"frames and moved must have the targets and sensors {', '.join(sorted(names))}")
-    owners = (
-        *((UnknownKind.FRAME, name) for name in names),
-        *((UnknownKind.TIME_OFFSET, name) for name in refined.time_offsets_s),
-        *((UnknownKind.SCALE, name) for name in (refined.scale if isinstance(refined.scale, dict) else [""])),
-    )
-    unknown = refined.joint.slots.keys() - {Unknown(*owner) for owner in owners}
-    if unknown:
-        raise ValueError(f"unknowns that have no value: {', '.join(sorted(map(str, unknown)))}")
-    size = max((rows.stop for rows in refined.joint.slots.values()), default=0)
-    shapes = refined.joint.unit.shape, refined.joint.finite.shape, refined.joint.free.shape[:1]
-    if shapes != ((size,), (size, size), (size,)):
-        raise ValueError(f"slots have {size} rows, but unit, finite and free are {shapes}")

@@ -22,6 +22,7 @@ from gtsam_rwhec.errors import FileFormatError, ResultVersionError
 from gtsam_rwhec.results.result_file import read_solution, write_solution
 from gtsam_rwhec.results.schema import FORMAT_VERSION, ResultFile
 from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solver.cause import Cause
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
 
@@ -108,6 +109,7 @@ def test_infinities_are_null_and_come_back(demo_solution: rw.Solution, tmp_path:
     certificate = dataclasses.replace(
         demo_solution.certificate,
         status=rw.Status.FAILED,
+        cause=Cause.NO_BOUND,
         lower_bound=-math.inf,
         float_bound=-math.inf,
         min_eigenvalue=-math.inf,
@@ -252,12 +254,50 @@ def test_another_version_says_what_to_do(written: Path, version: int, remedy: st
             r"\$\.certified\.residuals\[\"tag_1\", \"cam_0\"\]\.number_of_measurements: .*1\.5",
         ),
         (lambda raw: raw["certified"]["residuals"].pop(), r"residuals and identifiability\.pairs"),
+        *[
+            (lambda raw, name=name: raw.pop(name), rf"\$\.{name}: Field required")
+            for name in ("sensors", "targets", "scale", "scale_mode")
+        ],
+        (
+            lambda raw: raw.update(sensors="junk"),
+            r"\$\.sensors: differs from \$\.certified\.sensors \(found \"junk\"\)",
+        ),
+        (lambda raw: raw.update(scale=-3), r"\$\.scale: differs from \$\.certified\.scale \(found -3\)"),
+        (lambda raw: raw.update(scale=True), r"\$\.scale: differs from \$\.certified\.scale \(found true\)"),
+        (lambda raw: raw.update(scale_mode="shared"), r"\$\.scale_mode: differs.*\"shared\""),
+        (
+            lambda raw: raw["targets"][0]["translation_m"].__setitem__(0, 99.0),
+            r"\$\.targets: differs from \$\.certified\.targets, but the file has no refined poses",
+        ),
+        (lambda raw: raw.update(refined=3), r"\$\.refined: .*\(found 3\)"),
+        (lambda raw: raw.update(refined=[]), r"\$\.refined: .*\(found \[\]\)"),
+        (lambda raw: raw.update(refined="xx"), r"\$\.refined: .*\(found 'xx'\)"),
+        (
+            lambda raw: raw["certified"]["certificate"].update(cause="no_bound"),
+            r"\$\.certified\.certificate\.status: must be 'failed' with the cause 'no_bound' \(found 'certified'\)",
+        ),
+        (
+            lambda raw: raw["certified"]["parts"][0]["certificate"].update(status="gap"),
+            r"\$\.certified\.parts\[0\]\.certificate\.status: must be 'certified' .*\(found 'gap'\)",
+        ),
+        (
+            lambda raw: raw.update(verdict="do_not_use"),
+            r"\$\.verdict: the file says 'do_not_use', but its content leads to 'use'",
+        ),
     ],
 )
 def test_a_damaged_field_is_named(written: Path, change: Callable[[dict[str, Any]], object], said: str) -> None:
     with pytest.raises(FileFormatError, match=said) as caught:
         read_solution(spoil(written, change))
     assert str(written) in str(caught.value)
+
+
+def test_a_status_read_from_an_earlier_version_needs_no_cause(tmp_path: Path) -> None:
+    solution = rw.read_solution(Path(__file__).parents[1] / "golden" / "result_version_3.json")
+    assert solution.certificate.cause is Cause.NOT_RECORDED
+    assert solution.certificate.status is rw.Status.CERTIFIED
+    write_solution(solution, tmp_path / "result.json")
+    assert_same(solution, read_solution(tmp_path / "result.json"))
 
 
 def test_many_faults_are_counted(written: Path) -> None:

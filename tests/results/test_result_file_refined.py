@@ -145,17 +145,57 @@ def test_a_solution_that_was_not_refined_is_refused(tmp_path: Path) -> None:
         (lambda raw: raw["refined"].update(speed=1), "$.refined.speed"),
         (lambda raw: raw["refined"]["noise"][1].update(degrees_of_freedom=[1.0]), "degrees_of_freedom"),
         (lambda raw: raw["refined"]["noise"][1].update(sensor="moon"), "have no pose: moon"),
+        (lambda raw: raw.pop("refined"), "differs from $.certified."),
+        (lambda raw: raw["refined"]["joint"]["slots"].pop("sensor0"), "slots: unknowns that have no rows: sensor0"),
+        (
+            lambda raw: raw["refined"]["joint"]["slots"].update(sensor0=[0, 6]),
+            "rows may neither overlap nor be left out (found [0, 6])",
+        ),
+        (
+            lambda raw: raw["refined"]["joint"]["slots"].update(sensor1=[18, 21]),
+            "$.refined.joint.slots.sensor1: must be [18, 24], because rows may neither overlap nor be left out (found "
+            "[18, 21])",
+        ),
+        (lambda raw: raw["refined"]["joint"]["slots"].update(scale=[24, 25]), "have no value: scale"),
+        (
+            lambda raw: raw["refined"]["joint"]["finite"][0].__setitem__(3, 1e9),
+            "$.refined.joint.finite[0][3]: a covariance is symmetric, but [3][0] is",
+        ),
     ],
 )
 def test_damage_is_refused_with_its_place(damage: Callable[[Any], object], said: str, tmp_path: Path) -> None:
-    path = tmp_path / "refined.json"
-    rw.write_refined(KINDS["known scale"](), path)
+    assert_refused("known scale", damage, said, tmp_path / "refined.json")
+
+
+def assert_refused(kind: str, damage: Callable[[Any], object], said: str, path: Path) -> None:
+    rw.write_refined(KINDS[kind](), path)
     raw = json.loads(path.read_text(encoding="utf-8"))
     damage(raw)
     path.write_text(json.dumps(raw), encoding="utf-8")
     with pytest.raises(FileFormatError) as caught:
         rw.read_refined(path)
     assert said in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda raw: raw["scale"].pop("target1"), "but the targets are target0, target1, target2"),
+        (lambda raw: raw["scale"].update(moon=1.0), "scale has target0, target1, target2, moon"),
+        (lambda raw: raw["certified"]["scale"].pop("target1"), "but the targets are target0, target1, target2"),
+        (lambda raw: raw["refined"]["joint"]["slots"].pop("scale:target1"), "that have no rows: scale:target1"),
+    ],
+)
+def test_every_target_has_its_scale(damage: Callable[[Any], object], said: str, tmp_path: Path) -> None:
+    assert_refused("scales of targets", damage, said, tmp_path / "refined.json")
+
+
+def test_a_missing_offset_is_refused(tmp_path: Path) -> None:
+    def damage(raw: Any) -> None:
+        raw["refined"]["joint"]["slots"].pop("time_offset:sensor1")
+
+    assert_refused("time offsets", damage, "that have no rows: time_offset:sensor1", tmp_path / "refined.json")
 
 
 def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
