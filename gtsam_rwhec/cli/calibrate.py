@@ -116,7 +116,10 @@ def calibrate(
     if rig is not None or is_log(source):
         refuse(context, NOT_FOR_A_LOG)
         if output is None:
-            raise typer.BadParameter("the calibration of a log writes several files: name a folder with -o FOLDER")
+            needed = "give -o FOLDER"
+            if rig is None:
+                needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
+            raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
         return calibrate_log(source, rig, output, images=images, workers=workers)
     refuse(context, NOT_WITHOUT_REFINEMENT if refine is None else NOT_FOR_A_FOLDER)
     if (method == "local") != (initial is not None):
@@ -170,5 +173,5 @@ def calibrate_log(source: Path, rig: Path | None, output: Path, *, images: bool,
             progress=stage,
         )
     status = show(calibrated)
-    typer.echo(f"Written to {output}: {', '.join(sorted(path.name for path in output.iterdir()))}.", err=True)
+    typer.echo(f"Written to {output}: {', '.join(rw.pipeline.OUTPUTS)}.", err=True)
     return status

@@ -18,7 +18,7 @@ def demo(
 ) -> ExitStatus:
     """Calibrate two cameras on a robot's hand. The log of their images comes with this package.
 
-    The demo replaces its own earlier output. It refuses a folder with other files.
+    The demo replaces its own earlier output. It refuses to replace files that it did not write.
     """
     folder = rw.datasets.demo_folder()
     log, rig = folder / rw.datasets.LOG, folder / rw.datasets.RIG

@@ -25,7 +25,7 @@ _COMMON = frozenset({
     "apriltag", "apriltags", "aruco", "aruco_markers", "aruco_detections", "markers", "marker_publisher",
 })  # fmt: skip
 #: Comment on a sensor's time offset.
-_TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs a motion that turns unevenly)"
+_TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs rotation that speeds up and slows down)"
 #: Comment on the noise of the carriers' poses.
 _NOISE = "TODO errors of these poses, here a guess; without them, standard deviations are too small"
 #: Good robot arms have this noise; motion capture and SLAM have more.
@@ -85,7 +85,9 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     notes += remarks
     looked_at = sum(images.looked_at for images in used)
     if guesses:
-        notes.append(f"targets seen: {', '.join(guess.name for guess in guesses)} (their sizes are guesses)")
+        notes.append(
+            f"targets seen: {', '.join(guess.name for guess in guesses)} (sizes in rig.yaml are guesses: measure them)"
+        )
     else:
         notes.append(
             f"no tags in {looked_at} images that were searched, and none from drivers. Checkerboards are not searched "
@@ -132,7 +134,7 @@ def _carriers(pair: MovingPair) -> tuple[Carriers, str]:
     remark = (
         f"{child} carries the sensors, as tf has it"
         if pair.on_child
-        else "TODO if the targets move and the sensors do not, exchange sensors and targets"
+        else "TODO fixed camera and target on the hand: exchange the two names"
     )
     if pair.source.topic is not None:
         remark += "; TODO check the frames' names: they are guesses if the topic has none"

@@ -79,8 +79,11 @@ class Identifiability:
         if len(self.pairs) == 1:
             return "The pair's measurements determine both of its frames."
         if alone:
-            return (
-                f"{alone} of {len(self.pairs)} pairs determine their frames on their own; along the graph that "
-                "determines every frame (Theorem 3)."
-            )
+            number = len(self.pairs)
+            if alone == number:
+                which = f"Each of the {number} pairs determines its own frames"
+            else:
+                own = "determines its own frames" if alone == 1 else "determine their own frames"
+                which = f"{alone} of {number} pairs {own}, and the other pairs connect the rest to them"
+            return f"{which}, so every frame is determined (RWHEC paper, Theorem 3)."
         return "No pair determines its frames on its own; together the pairs determine every frame."

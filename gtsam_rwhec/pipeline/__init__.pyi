@@ -1,4 +1,5 @@
 # All stages in a row.
+from .all_stages import OUTPUTS as OUTPUTS
 from .all_stages import calibrate_log as calibrate_log
 
 # Stage by stage.

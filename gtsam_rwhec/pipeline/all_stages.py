@@ -6,6 +6,7 @@ from pathlib import Path
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export import export_all
+from gtsam_rwhec.export.files import FILES
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
@@ -29,6 +30,9 @@ from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
 from gtsam_rwhec.results.result_file import write_refined
 from gtsam_rwhec.rig import Rig
+
+#: Names of all that `calibrate_log` leaves in its folder.
+OUTPUTS = (CLEAN_LOG, RESULT_FILE, *FILES, PLOTS_FOLDER)
 
 
 def calibrate_log(

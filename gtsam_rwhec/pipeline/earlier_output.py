@@ -1,4 +1,4 @@
-"""Whether the files in a folder are an earlier output of the same log: only then they are replaced without asking."""
+"""Whether the files that a run would replace are its own earlier output: it refuses to replace any other file."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from gtsam_rwhec.results.result_file import read_result
 
 
 def check_replaceable(folder: Path, log_name: str) -> None:
-    """Refuse a folder in which `calibrate_log` would replace files of another log, or of unknown origin.
+    """Refuse to replace files of another log, or of unknown origin.
 
-    Files that `calibrate_log` does not write do not matter.
+    Only the names of the files that `calibrate_log` writes count. Other files may be in the folder.
 
     Parameters
     ----------

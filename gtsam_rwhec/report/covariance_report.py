@@ -26,7 +26,7 @@ DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
 LEGEND = (
     "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation, along "
     "and about the axes of the frame itself; free: infinite, because the measurements leave a direction free. moved: "
-    "change from the certified answer."
+    "how far the refinement moved the pose"
 )
 
 
@@ -44,14 +44,17 @@ def print_refined(refined: Refined, console: Console | None = None, *, log: LogF
     """
     console = report_console() if console is None else console
     solution = refined.solution
-    print_verdict(console, judge(solution, refined, log))
+    print_verdict(console, judge(solution, refined, log), solution)
     print_advice(console, refined.free_directions or solution.identifiability.free_directions, log)
     print_heading(console, "Poses")
-    tables = (
-        _frame_table("Sensors in the frame of their carrier", "sensor", refined.Y, refined),
-        _frame_table("Targets in the frame of their carrier", "target", refined.X, refined),
+    sensor_frame, target_frame = (
+        ("of their carrier", "of their carrier") if log is None else (log.sensor_carrier, log.target_carrier)
     )
-    print_tables(console, tables, LEGEND)
+    tables = (
+        _frame_table(f"Sensors in the frame {sensor_frame}", "sensor", refined.Y, refined),
+        _frame_table(f"Targets in the frame {target_frame}", "target", refined.X, refined),
+    )
+    print_tables(console, tables, legend(refined))
     for sentence in scale_and_offset_sentences(refined):
         print_sentence(console, sentence)
     print_heading(console, "Details")
@@ -66,7 +69,21 @@ def print_refined(refined: Refined, console: Console | None = None, *, log: LogF
     for sentence in refined_sentences(refined):
         print_sentence(console, sentence)
     console.print()
-    print_solution_details(console, solution)
+    print_solution_details(console, solution, "as given" if log is None else _weights_of_log(refined))
+
+
+def legend(refined: Refined) -> str:
+    """What the columns mean, and what the refinement's model has that the certified one lacks."""
+    has_offsets = any(unknown.kind is UnknownKind.TIME_OFFSET for unknown in refined.unknowns)
+    added = ["clock offsets"] * has_offsets + ["the noise of A"] * (refined.options.carrier_noise is not None)
+    return f"{LEGEND}; it adds {' and '.join(added)}." if added else f"{LEGEND}."
+
+
+def _weights_of_log(refined: Refined) -> str:
+    """Where the weights of the certified solution of a log come from; see `gtsam_rwhec.pipeline.problem_of`."""
+    if refined.noise_source == "estimated":
+        return "from the covariances of the detections in the log"
+    return "from the noise that the rig file states"
 
 
 def scale_and_offset_sentences(refined: Refined) -> list[str]:
@@ -96,8 +113,9 @@ def refined_sentences(refined: Refined) -> list[str]:
     loss = "" if refined.options.robust in ("none", "gnc") else f", {refined.options.robust} loss"
     steps = f"{refined.iterations} iteration{'' if refined.iterations == 1 else 's'}"
     sentences.append(
-        f"Cost of the refinement: {refined.cost:.6g} after {steps}, {refined.initial_cost:.6g} at the certified answer "
-        f"({refined.options.residual} residual{loss}). Its weights differ from the weights of the certified cost."
+        f"Cost of the refinement: {refined.initial_cost:.6g} before, {refined.cost:.6g} after {steps} "
+        f"({refined.options.residual} residual{loss}). Do not compare it with the certified cost, which has other "
+        "weights."
     )
     if refined.inlier_counts:
         sentences.append(_outlier_sentence(refined.inlier_counts))
@@ -155,7 +173,11 @@ def noise_table(refined: Refined) -> FrameTable:
         if all(rows[label(pair)] == cells for pair, cells in noises.items())
     )
     headings = ("±°", "±mm") if refined.noise_source == "given" else ("±°", "±mm", "d.o.f. (°)", "d.o.f. (mm)")
-    title = "Noise of B for each axis" + ("" if refined.noise_source == "given" else ", and degrees of freedom")
+    title = "Noise of B for each axis"
+    if refined.noise_source == "estimated":
+        title += ", and degrees of freedom"
+        if refined.options.noise_groups == "all":  # one estimate for all rows
+            title += " of all pairs together"
     return FrameTable(title, kind, headings, {name: rows[name] for name in sorted(rows, key=natural_key)})
 
 

@@ -1,4 +1,4 @@
-"""The report of the demo: what its log hides, how far the calibration is from the truth, and what to do next."""
+"""The report of the demo: the errors in its log, how far the calibration is from the truth, and what to do next."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LEGEND = (
 def print_demo(
     refined: RefinedPoses, log: LogFields, truth: DemoTruth, folder: Path, console: Console | None = None
 ) -> None:
-    """Print what the log hides and what was found, the distance from the truth, and what to do next.
+    """Print the errors that we put into the log and what was found, the distance from the truth, and what to do next.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def print_demo(
         Where to print; standard output by default.
     """
     console = report_console() if console is None else console
-    print_heading(console, "What this log hides, and what was found")
+    print_heading(console, "Errors that we put into this log, and what was found")
     print_list(console, hidden_sentences(refined, log, truth))
     print_heading(console, "How far the answer is from the truth")
     print_tables(console, [truth_table(refined, truth)], LEGEND)
@@ -56,7 +56,7 @@ def print_demo(
 
 
 def hidden_sentences(refined: RefinedPoses, log: LogFields, truth: DemoTruth) -> list[str]:
-    """Each difficulty that the log hides, and what the calibration found."""
+    """Each error that we put into the log, and what the calibration found."""
     sentences = []
     for size in log.sizes:
         true = truth.scale[size.target]

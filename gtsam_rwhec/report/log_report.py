@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 
 from rich.console import Console
@@ -14,6 +15,9 @@ LEGEND = (
     "seen: detections in the images. usable: detections that were not rejected. cleaned: measurements after the "
     "cleaning. used: measurements in the answer."
 )
+
+#: Unit of the compared value at the end of a reason: counts have no unit.
+_UNIT = re.compile(r" \((?:s|rad|m|rad/s|m/s|m moved|share that agrees)\)$")
 
 
 def print_log(log: LogFields, console: Console | None = None) -> None:
@@ -64,6 +68,7 @@ def _by_reason(tracks: Iterable[TrackCount], told_before: set[str]) -> list[str]
             if why not in told_before:
                 reasons.setdefault(why, {})[str(track.pair)] = count
     return [
-        f"{why}: {sum(counts.values())} ({', '.join(f'{count} of {pair}' for pair, count in counts.items())})"
+        f"{_UNIT.sub('', why)}: {sum(counts.values())} "
+        f"({', '.join(f'{count} of {pair}' for pair, count in counts.items())})"
         for why, counts in sorted(reasons.items())
     ]

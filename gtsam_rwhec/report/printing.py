@@ -10,6 +10,7 @@ from rich.text import Text
 from gtsam_rwhec.files.terminal_text import printable
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.results.verdict import Judgement, Verdict
+from gtsam_rwhec.solving.solution import Solution
 
 #: Columns for tables in a file. Sentences in a file are not wrapped.
 PLAIN_WIDTH = 160
@@ -23,9 +24,12 @@ def report_console() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH, no_color=True)
 
 
-def print_verdict(console: Console, judgement: Judgement) -> None:
-    """Print whether to use the poses: every report begins with this sentence."""
+def print_verdict(console: Console, judgement: Judgement, solution: Solution) -> None:
+    """Print whether to use the poses: every report begins with this sentence. Below: whether the noise was stated."""
     print_sentence(console, str(judgement), STYLES[judgement.verdict])
+    if solution.is_relative:
+        advice = "Look at the residuals, in mm and degrees, before you trust the poses: no noise was stated."
+        print_sentence(console, advice, STYLES[Verdict.CARE])
 
 
 def print_heading(console: Console, words: str) -> None:

@@ -10,23 +10,11 @@ from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solving.solution import Solution
 
 
-def summary_sentence(solution: Solution) -> str:
-    """The size of the problem: "16 targets, 8 sensors, 73 pairs, 3230 measurements"."""
-    measurements = sum(residual.number_of_measurements for residual in solution.residuals.values())
-    counts = (
-        (len(solution.X), "target"),
-        (len(solution.Y), "sensor"),
-        (len(solution.residuals), "pair"),
-        (measurements, "measurement"),
-    )
-    return ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for number, word in counts)
-
-
 def certificate_sentence(certificate: Certificate) -> str:
     """What the certificate proves about the cost."""
     proof = (
         f"this answer costs {certificate.cost:.10g}, and no answer can cost less than {certificate.lower_bound:.10g} "
-        f"(relative gap {certificate.relative_gap:.1e}; by {certificate.path})"
+        f"(relative gap {certificate.relative_gap:.1e}; {certificate.path.words})"
     )
     if certificate.status is Status.CERTIFIED:
         return f"Certified globally optimal: {proof}."
@@ -60,19 +48,19 @@ def scale_sentence(solution: Solution) -> str:
     )
 
 
-def weights_sentence(solution: Solution) -> str:
-    """How the measurements are weighted, and what the cost means with these weights."""
+def weights_sentence(solution: Solution, source: str = "as given") -> str:
+    """Where the weights of the measurements come from (`source`), and what the cost means with these weights."""
     if solution.is_relative:
         return (
             "Weights: sigma or kappa was not given and 1 was used, so costs and covariances are relative. Give both "
             "for absolute numbers."
         )
     if solution.certificate.objective.form == "inverse":
-        return "Weights: as given. The cost is not a chi-square: it is of the inverse equation B X^-1 = Y^-1 A."
-    return "Weights: as given. If they are true, the cost is half a chi-square."
+        return f"Weights: {source}. The cost is not a chi-square: it is of the inverse equation B X^-1 = Y^-1 A."
+    return f"Weights: {source}. If they are true, the cost is half a chi-square."
 
 
 def time_sentence(certificate: Certificate) -> str:
     """How long each step took."""
     stages = ", ".join(f"{stage} {seconds:.3f}" for stage, seconds in certificate.seconds.items())
-    return f"Time: {sum(certificate.seconds.values()):.3f} s ({stages})."
+    return f"Time of the certified solution alone: {sum(certificate.seconds.values()):.3f} s ({stages})."

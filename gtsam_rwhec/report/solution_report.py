@@ -19,7 +19,6 @@ from gtsam_rwhec.report.sentences import (
     certificate_sentence,
     part_sentences,
     scale_sentence,
-    summary_sentence,
     time_sentence,
     weights_sentence,
 )
@@ -38,18 +37,20 @@ def print_solution(solution: Solution, console: Console | None = None) -> None:
         Where to print; standard output by default.
     """
     console = report_console() if console is None else console
-    print_verdict(console, judge(solution))
+    print_verdict(console, judge(solution), solution)
     print_advice(console, solution.identifiability.free_directions)
     print_heading(console, "Poses")
     print_tables(console, (sensor_table(solution), target_table(solution)), POSE_LEGEND)
     print_sentence(console, scale_sentence(solution))
     print_heading(console, "Details")
     print_solution_details(console, solution)
+    if solution.certificate.objective.form == "inverse":
+        print_sentence(console, "Refine the answer for the exact model of each target's scale.")
 
 
-def print_solution_details(console: Console, solution: Solution) -> None:
+def print_solution_details(console: Console, solution: Solution, weights_from: str = "as given") -> None:
     """Print the facts behind a certified solution: the grid of Figure 8, the certificate, and its objective."""
-    print_sentence(console, f"Calibration of {summary_sentence(solution)}.")
+    print_sentence(console, f"Calibration of {solution.counts}.")
     console.print()
     console.print(PairGrid(solution.identifiability))
     console.print()
@@ -57,7 +58,7 @@ def print_solution_details(console: Console, solution: Solution) -> None:
     print_sentence(console, certificate_sentence(solution.certificate), style)
     for sentence in (
         *part_sentences(solution),
-        weights_sentence(solution),
+        weights_sentence(solution, weights_from),
         f"Objective: {solution.certificate.objective}",
         time_sentence(solution.certificate),
     ):

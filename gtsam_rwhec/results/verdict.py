@@ -105,5 +105,9 @@ def judge(solution: Solution, refined: RefinedPoses | None = None, log: LogField
     if found:
         worst = max((ground.verdict for ground in found), key=list(Verdict).index)
         return Judgement(worst, tuple(found), "; ".join(found.values()))
-    answer = "the answer" if refined is None else "the certified answer, where the refinement began,"
-    return Judgement(Verdict.USE, (), f"{answer} is proven optimal, and the measurements determine every pose")
+    proven = (
+        "the answer is proven optimal, and"
+        if refined is None
+        else "the first answer is proven optimal, the refinement started from it, and"
+    )
+    return Judgement(Verdict.USE, (), f"{proven} the measurements determine every pose")

@@ -48,6 +48,12 @@ class SearchPath:
     multipliers: Multipliers
     is_mirrored: bool = False
 
+    @property
+    def words(self) -> str:
+        """How the answer was found, and how its bound was proven."""
+        mirrored = " and mirrored" if self.is_mirrored else ""
+        return f"found from {_STARTS[self.start]}{mirrored}, bound proven by {_MULTIPLIERS[self.multipliers]}"
+
     @staticmethod
     def parse(text: str) -> SearchPath:
         """The path that a result file has as text; a ``ValueError`` for any other text."""
@@ -58,6 +64,21 @@ class SearchPath:
 
     def __str__(self) -> str:
         return ", ".join([self.start, self.multipliers] + ["mirrored"] * self.is_mirrored)
+
+
+_STARTS = {
+    Start.GIVEN: "the given start",
+    Start.SPECTRAL: "a spectral start",
+    Start.BETTER: "a better start",
+    Start.CLARABEL: "the relaxation (Clarabel)",
+    Start.INTERIOR_POINT: "the relaxation (interior point)",
+    Start.NONNEGATIVE_SCALE: "the relaxation with alpha >= 0",
+}
+_MULTIPLIERS = {
+    Multipliers.KKT: "dual multipliers",
+    Multipliers.ALL_CONSTRAINTS: "dual multipliers of all constraints",
+    Multipliers.RELAXATION: "the relaxation's multipliers",
+}
 
 
 class Status(StrEnum):

@@ -31,10 +31,9 @@ class Objective:
 
 
 _OBJECTIVES: dict[Kind, str] = {
-    "direct": "Problem 3: half the squared residuals of A X = Y B, R_A t_X + alpha t_A - t_Y - R_Y t_B over sigma and "
-    "R_A R_X - R_Y R_B times the square root of kappa",
-    "inverse": "half the squared residuals of the inverse equation B X^-1 = Y^-1 A, with each t_B divided by its scale "
-    "(refine for the exact per-target model)",
+    "direct": "Problem 3 of the RWHEC paper: half the squared residuals of A X = Y B, R_A t_X + alpha t_A - t_Y - "
+    "R_Y t_B over sigma and R_A R_X - R_Y R_B times the square root of kappa",
+    "inverse": "half the squared residuals of the inverse equation B X^-1 = Y^-1 A, with each t_B divided by its scale",
 }
 
 

@@ -23,7 +23,7 @@ class SolvedPart:
 
 @dataclass(frozen=True)
 class Solution:
-    """A calibration.
+    """A calibration; ``str()`` is a few lines: what is proven, the counts, and the scale.
 
     Attributes
     ----------
@@ -56,3 +56,22 @@ class Solution:
     identifiability: Identifiability
     residuals: dict[Pair, Residual]
     parts: tuple[SolvedPart, ...]
+
+    @property
+    def counts(self) -> str:
+        """The size of the problem: "16 targets, 8 sensors, 73 pairs, 3230 measurements"."""
+        measurements = sum(residual.number_of_measurements for residual in self.residuals.values())
+        counts = (
+            (len(self.X), "target"),
+            (len(self.Y), "sensor"),
+            (len(self.residuals), "pair"),
+            (measurements, "measurement"),
+        )
+        return ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for number, word in counts)
+
+    def __str__(self) -> str:
+        if isinstance(self.scale, dict):
+            scale = ", ".join(f"{name} {value:.6g}" for name, value in self.scale.items())
+        else:
+            scale = f"{self.scale:.6g}"
+        return f"{self.certificate}\n{self.counts}\nscale ({self.scale_mode}): {scale}"

@@ -20,7 +20,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from places import DEMO
+from places import CELL, DEMO
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general
@@ -167,6 +167,8 @@ def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
         (["calibrate", DEMO, "--robust", "gnc"], "--robust"),
         (["calibrate", DEMO, "--refine", "estimate", "--carrier-noise-mm", "2"], "go together"),
         (["calibrate", DEMO, "--refine", "given"], "--refine estimate"),
+        (["calibrate", CELL / "robot_cell.mcap"], "--rig"),
+        (["calibrate", CELL / "robot_cell.mcap", "--rig", CELL / "rig.yaml"], "several files"),
         (["calibrate"], "source"),
         (["fetch", "other"], "other"),
         (["guess"], "guess"),

@@ -151,7 +151,7 @@ def test_where_the_cameras_are_is_not_known(scene: Scene) -> None:
     scene.moving("base", "hand").moving("base", "door", reach=0.2).images("/image_raw", "", TAGS)
     rig, text, notes = scene.first()
     assert (rig.carriers.sensors, rig.carriers.targets) == ("hand", "base")
-    assert "TODO if the targets move and the sensors do not, exchange sensors and targets" in text
+    assert "TODO fixed camera and target on the hand: exchange the two names" in text
     assert any(note.startswith("moves too, not used: door in base") for note in notes)
     assert list(rig.sensors) == ["camera"]
     intrinsics = rig.sensors["camera"].intrinsics

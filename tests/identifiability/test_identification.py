@@ -142,8 +142,14 @@ def test_what_one_pair_determines_spreads(noise: Any) -> None:
     known = identify(of_motions(motions, noise))
     assert known.is_unique
     assert {pair for pair, value in known.pairs.items() if value.is_unique} == {("tag0", "cam0")}
-    assert "1 of 5 pairs determine their frames on their own" in str(known)
-    assert "Theorem 3" in str(known)
+    assert str(known) == (
+        "1 of 5 pairs determines its own frames, and the other pairs connect the rest to them, so every frame is "
+        "determined (RWHEC paper, Theorem 3)."
+    )
+    two = identify(of_motions({(0, 0): excited, (0, 1): excited}, noise))
+    assert str(two) == (
+        "Each of the 2 pairs determines its own frames, so every frame is determined (RWHEC paper, Theorem 3)."
+    )
 
 
 def test_single_measurements_alone_spread_nothing() -> None:

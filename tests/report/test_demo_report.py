@@ -1,4 +1,4 @@
-"""The demo says what its log hides, and how far its answer is from the truth."""
+"""The demo says which errors we put into its log, and how far its answer is from the truth."""
 
 from __future__ import annotations
 
@@ -65,7 +65,12 @@ def test_every_frame_has_its_distance_from_the_truth(found: tuple[rw.RefinedPose
 def test_it_ends_with_what_to_do_next(found: tuple[rw.RefinedPoses, LogFields]) -> None:
     out = io.StringIO()
     print_demo(*found, demo_truth(), Path("here"), Console(file=out, width=160))
-    headings = ("What this log hides", "How far the answer is from the truth", "What to do next", "gtsam-rwhec init")
+    headings = (
+        "Errors that we put into",
+        "How far the answer is from the truth",
+        "What to do next",
+        "gtsam-rwhec init",
+    )
     places = [out.getvalue().index(words) for words in headings]
     assert places == sorted(places)
     assert "here/plots/frames.png" in out.getvalue()

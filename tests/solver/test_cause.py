@@ -45,6 +45,12 @@ def test_the_three_reasons_of_design_fact_4_are_three_causes() -> None:
 def test_a_path_is_read_back_from_its_words(start: Start, multipliers: Multipliers, mirrored: bool) -> None:
     path = SearchPath(start, multipliers, is_mirrored=mirrored)
     assert SearchPath.parse(str(path)) == path
+    assert path.words.startswith("found from ")
+
+
+def test_a_path_says_how_the_answer_was_found_and_its_bound_proven() -> None:
+    path = SearchPath(Start.SPECTRAL, Multipliers.KKT)
+    assert path.words == "found from a spectral start, bound proven by dual multipliers"
 
 
 @pytest.mark.parametrize(

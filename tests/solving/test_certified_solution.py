@@ -366,3 +366,13 @@ def test_a_known_size_carries_over_to_targets_of_unknown_size() -> None:
     errors = simulation.errors(solution)
     assert isinstance(errors.relative_scale, dict)
     assert max(errors.relative_scale.values()) < 0.005
+
+
+def test_a_solution_prints_as_a_few_lines() -> None:
+    solution = rw.solve(simulated("known").problem)
+    status, counts, scale = str(solution).splitlines()
+    assert status == str(solution.certificate)
+    assert counts.startswith(f"{len(solution.X)} targets, {len(solution.Y)} sensors, ")
+    assert scale == "scale (known): 1"
+    *_, scale = str(rw.solve(simulated("per_target").problem)).splitlines()
+    assert all(name in scale for name in solution.X)
