@@ -1,8 +1,8 @@
 """AX = XB, hand-eye calibration: the pose between two rigidly joined frames, from the motion of each.
 
-``solve(C, H, method="dqopt")`` gives X = T_c_h of C_i X = X H_i. ``METHODS`` says of each method what it assumes and
-which paper it is from. The DQ paper is Dekel, Harenstam-Nielsen, Caccamo: Optimal least-squares solution to the
-hand-eye calibration problem (CVPR 2020).
+``solve(C, H, method="dqopt")`` gives X = T_c_h of C_i X = X H_i. ``METHODS`` says what each method assumes and which
+paper it is from. The DQ paper is Dekel, Harenstam-Nielsen, Caccamo: Optimal least-squares solution to the hand-eye
+calibration problem (CVPR 2020).
 """
 
 import lazy_loader

@@ -13,9 +13,9 @@ from gtsam_rwhec.handeye.motions import Motions
 from gtsam_rwhec.handeye.prior import DualQuaternionPrior
 from gtsam_rwhec.handeye.saddle import minimum
 
-#: Most solutions with a new alpha each.
+#: Alpha changes at most this many times, with one solution for each alpha.
 ITERATIONS = 50
-#: Alpha has converged when it changes by less than this part. Residuals tell alpha to a few per cent at best.
+#: Alpha has converged when it changes by less than this part. Residuals give alpha to a few per cent at best.
 STILL = 1e-6
 #: Residuals below this part of the motions' own size are rounding error and tell nothing.
 ROUNDING = 1e-24
@@ -27,9 +27,9 @@ def estimate_alpha(motions: Motions, weights: Array | None = None, prior: DualQu
     """Alpha (1/m) that gives both kinds of residual the same size: rms |A q| / rms |B q + A q'| at the optimum.
 
     Each step lowers N log(sum |A q|^2) + N log(sum |B q + A q'|^2): the likelihood of normal residuals whose two
-    sigmas are unknown. For given poses alpha is that ratio, and for given alpha the poses are DQOpt's. Where the
-    residuals are rounding error, alpha stays as it is; at the start it is the ratio of the motions' own sizes.
-    A prior's a and b keep their meaning while alpha changes.
+    sigmas are unknown. For given poses alpha is that ratio, and for given alpha the poses are DQOpt's. Alpha starts as
+    the ratio of the motions' own sizes. Where the residuals are rounding error, it stays as it is. A prior's a and b
+    keep their meaning while alpha changes.
     """
     moments = motion_moments(motions.rows, weights)
     turned, moved = float(np.trace(moments.AA)), float(np.trace(moments.BB))

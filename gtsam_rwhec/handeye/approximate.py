@@ -22,16 +22,16 @@ from gtsam_rwhec.methods.estimate import Outcome
 
 #: DQItr has converged when mu changes by less than this part of Appendix C's range of mu.
 STILL = 1e-13
-#: Most iterations of DQItr.
+#: DQItr stops after this many iterations.
 ITERATIONS = 200
-#: Rounding of lambda_0, as a part of tr S.
+#: Lambda_0 has a rounding error of this part of tr S.
 ROUNDING = 1e-13
 
 
 def dq2steps(request: Request) -> Outcome[Array]:
     """DQ2Steps (Section 3.2.2, Algorithm 2): the rotation that fits the rotations best, then the translation.
 
-    Raises UnderdeterminedError when the rotations alone do not determine the rotation: parallel axes, or no rotation.
+    Raises UnderdeterminedError when the axes are parallel or nothing rotates: the rotations alone then do not suffice.
     """
     values, vectors = request.cost.spectrum
     if not values[1] > SINGULAR * values[3]:
@@ -62,8 +62,8 @@ def dq2ndord(request: Request) -> Outcome[Array]:
 def dq_nth_order(request: Request, order: int) -> Outcome[Array]:
     """The expansion in mu to any order (Appendix A): q(mu) of eq. 32 at the root of d lambda / d mu nearest mu = 0.
 
-    ``order`` is that of lambda and q, >= 1; 2 is ``dq2ndord``. The series converges for |mu| up to where Z's two
-    smallest eigenvalues meet in the complex plane. Higher orders help only within that range.
+    Lambda and q have the order ``order``, >= 1; order 2 is ``dq2ndord``. The series converges for |mu| up to where Z's
+    two smallest eigenvalues meet in the complex plane. Higher orders help only within that range.
     """
     if order < 1:
         raise OptionError(f"order={order}: the expansion in mu starts at order 1")
@@ -87,8 +87,8 @@ def dqitr(request: Request) -> Outcome[Array]:
     """DQItr: mu <- q(mu)'Z1 q(mu) / (2 q(mu)'Z2 q(mu)) (eq. 24) until mu converges.
 
     With M singular (no noise) the paper finds the iteration unstable. There mu = 0 is exact, and nothing is iterated.
-    Warns by NotConvergedWarning when mu still changes after 200 iterations: the fixed point need not attract. ``dqopt``
-    always converges.
+    Warns by NotConvergedWarning when mu still changes after 200 iterations: the iteration may move away from the fixed
+    point. ``dqopt`` always converges.
     """
     cost = request.cost
     if is_singular(cost):
@@ -115,7 +115,7 @@ def dqitr(request: Request) -> Outcome[Array]:
 class RelaxedCost:
     """Eq. 21 without the constraint: lambda_a (4,) and q_a (4, 4) of Z0, and Z1 and Z2 in these eigenvectors.
 
-    Entry [a, b] is q_a'Z q_b, the paper's Z^ab.
+    Entry [a, b] of Z1 or Z2 is q_a'Z q_b, the paper's Z^ab.
     """
 
     values: Array

@@ -1,7 +1,7 @@
 """AX = XB by the library's certified solver: the chordal cost, with a known or an unknown scale.
 
-Here one sensor stands behind the call that all AX = XB methods share. ``Problem.add_motion`` and ``solve`` take any
-number of sensors, with priors and with targets in the same problem.
+This module serves the call that all AX = XB methods share, with one sensor. ``Problem.add_motion`` and ``solve`` take
+any number of sensors, with priors and with targets in the same problem.
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from gtsam_rwhec.solving.certified_solution import solve
 def certified(request: Request) -> Outcome[Array]:
     """Certified minimum of sum |R_C R - R R_H|^2 + alpha^2 |(R_C - 1) T - R T_H + T_C|^2 (eq. 30, first).
 
-    The library's cost J is this cost, with 1 / sigma^2 = 2 alpha^2 w and kappa = 2 w for a motion of weight w. An
+    The library's cost J is this cost when a motion of weight w has 1 / sigma^2 = 2 alpha^2 w and kappa = 2 w. An
     unknown scale has t_C = scale * (true length). The equation is then inverted, H X^-1 = X^-1 C, so that the measured
-    side has the scale: the cost is that of X^-1.
-    Raises ScaleError when the scale at the optimum is not positive.
+    side has the scale: the cost is that of X^-1. Raises ScaleError when the scale at the optimum is not positive.
     """
     w = np.ones(len(request.motions)) if request.weights is None else request.weights
     used = w > 0.0

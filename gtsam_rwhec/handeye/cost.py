@@ -15,7 +15,7 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import LEFT, RIGHT
 
-#: Number of motions that are worked on at once. It bounds the memory beyond the input.
+#: This many motions are worked on at once, which bounds the memory beyond the input.
 BLOCK = 32768
 
 #: Entry [k] is E_k (4, 4) of A = sum_k a_k E_k, with a = [v_C + v_H, v_C - v_H, w_C - w_H].

@@ -1,7 +1,7 @@
 """Dan: Daniilidis, Hand-Eye Calibration Using Dual Quaternions (IJRR 1999), the linear method of the DQ paper's [9].
 
-A conjugation keeps the scalar parts, so eq. 7 is taken without them: six rows a motion, linear in eight unknowns
-(q, q'),
+A conjugation keeps the scalar parts, so eq. 7 is taken without them. Each motion gives six rows, linear in the eight
+unknowns (q, q'),
 
     [ P   0 ]           P = [Skew(v_C + v_H), v_C - v_H]   (3 x 4, unknowns with the scalar last),
     [ P'  P ]           P' the same of the dual parts.
@@ -26,7 +26,7 @@ from gtsam_rwhec.methods.estimate import Outcome
 
 #: Squares of singular values below this part of the largest are rounding error.
 NULL = 1e-13
-#: Rows of ``Motions.rows`` that hold vector parts.
+#: These rows of ``Motions.rows`` hold vector parts.
 _VECTORS = [0, 1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12]
 #: Row 6 k + l is vec(P_k' P_l): P is linear in the six numbers (v_C + v_H, v_C - v_H).
 _PRODUCTS = np.einsum("kji,ljm->klim", E[:6, :3], E[:6, :3]).reshape(36, 16)

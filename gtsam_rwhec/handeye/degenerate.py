@@ -1,8 +1,8 @@
 """Free directions of AX = XB: what the motions do not determine.
 
-Noise in the measurements looks like motion, so real data never leave a direction exactly undetermined. As for every
-problem (``gtsam_rwhec.identifiability``), a direction is free when its information is not significantly more than noise
-alone would create there:
+Noise in the measurements looks like motion, so real data never leave a direction exactly undetermined. As in
+``gtsam_rwhec.identifiability``, a direction is free when it has not significantly more information than noise alone
+would create there. That noise is known from the answer:
 
 - With noise delta q_C, delta q_H, A_i has E |A_i p|^2 = E |delta q_C|^2 + E |delta q_H|^2 for *every* unit p, since L
   and R of a unit quaternion are rotations. At the answer the signal's part of A q is zero. So |A q|^2 is that noise,
@@ -10,7 +10,7 @@ alone would create there:
 - The same holds for the whole residual: at the best q, q'Z q = lambda comes from noise alone, and noise adds as
   much for every other q. The information about the rotation is in the eigenvalues of Z(mu*).
 
-N motions give 3 N squares of noise to a direction, and the fit takes 6 of the 6 N equations.
+In each direction N motions sum 3 N squares of noise. The fit uses up 6 of the 6 N equations.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gtsam_rwhec.identifiability.threshold import free_threshold
 
 #: Information below this part of the largest is rounding error.
 ROUNDING = 1e-12
-#: Step (rad) of the finite difference that tells how the translation follows a turn.
+#: A finite difference with this step (rad) tells how the translation follows a turn.
 STEP_RAD = 1e-5
 
 
@@ -62,7 +62,7 @@ def free_of_rotations_alone(request: Request) -> tuple[FreeDirection, ...]:
 
 
 def _threshold(count: int) -> float:
-    """Information up to which a direction is free, divided by the noise along the answer.
+    """A direction is free up to this information, divided by the noise along the answer.
 
     The fit makes the noise along the answer smaller by the factor (count - 1) / count. The threshold corrects this.
     """

@@ -2,7 +2,7 @@
 
 With |q| = |dq| = 1 the term is 2 a - 2 a q_0 . q. For a given mu, q minimises q'Z(mu) q - 2 a q_0 . q on the sphere:
 (Z(mu) - lambda) q = a q_0, and lambda is the smallest real eigenvalue of [[Z, -1], [-a^2 q_0 q_0', Z]] (Gander,
-Golub and von Matt 1989, eq. 9). That minimum is concave in mu and a lower bound of the cost, as lambda_0(mu) is.
+Golub and von Matt 1989, eq. 9). Like lambda_0(mu), that minimum is concave in mu and never above the cost.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import Z_pseudo, best_dual, bracket, is_singular
 from gtsam_rwhec.methods.estimate import Outcome
 
-#: Newton steps that polish the multiplier of |q| = 1.
+#: This many Newton steps refine the multiplier of |q| = 1.
 POLISHING = 4
 
 

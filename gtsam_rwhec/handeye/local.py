@@ -1,8 +1,8 @@
 """Nonlinear least squares: DQNLOpt and DQNLOptRnd on the cost (8), ChVecOpt and QuatVecOpt on the costs (30).
 
 Each cost is a quadratic form y'F y, where the few numbers y are computed from the pose. F does not grow with the number
-of motions. With F = L'L, the residual L y has 8 to 22 rows, and the same cost, gradient and Gauss-Newton Hessian as the
-residuals of all motions together. The unknowns are a quaternion p of any length (q = p / |p|) and a translation in
+of motions. With F = L'L, the residual L y has 8 to 22 rows. Its cost, gradient and Gauss-Newton Hessian are those of
+the residuals of all motions together. The unknowns are a quaternion p of any length (q = p / |p|) and a translation in
 units of 1/alpha, so every start can reach every rotation.
 """
 
@@ -25,9 +25,9 @@ from gtsam_rwhec.handeye.request import Request
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
 from gtsam_rwhec.methods.estimate import Outcome
 
-#: least_squares stops where a step changes cost or unknowns by less than this part: by rounding.
+#: least_squares stops where a step changes cost or unknowns by less than this part, which is rounding error.
 STOP = 1e-15
-#: Rounding of one entry of a form of unit diagonal.
+#: An entry of a form of unit diagonal has this rounding error.
 ROUNDING = float(np.finfo(np.float64).eps)
 #: vec R (rows) of a unit quaternion is quadratic in it: entry k is q' _QUADRATIC[k] q.
 _QUADRATIC = ROTATION.transpose(2, 3, 0, 1).reshape(9, 4, 4)
@@ -36,13 +36,13 @@ Lift = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 def dqnlopt(request: Request) -> Outcome[Array]:
-    """DQNLOpt: descent on the cost (8) from DQOpt's answer, where the descent should stay (Section 4.4)."""
+    """DQNLOpt descends on the cost (8) from DQOpt's answer, and should stay there (Section 4.4)."""
     found = minimum(request.cost)
     return _outcome(request, found, _descend_dual_quaternion(request, to_transform(found.q, found.q_dual)))
 
 
 def dqnlopt_random(request: Request) -> Outcome[Array]:
-    """DQNLOptRnd: descent on the cost (8) from a random pose. Some runs end in local minima (Table 1).
+    """DQNLOptRnd descends on the cost (8) from a random pose. Some runs end in local minima (Table 1).
 
     The start's rotation is uniform. Its translation is normal, with the root mean square of the motions' translations.
     """
@@ -125,7 +125,7 @@ def _descend(factor: Array, lift: Lift, start: Array, unit: float) -> Array:
     def pose(x: Array) -> tuple[Array, Array, Array]:
         length = float(np.linalg.norm(x[:4]))
         q = x[:4] / length
-        return q, unit * x[4:], (np.eye(4) - np.outer(q, q)) / length  # the last: dq / dp
+        return q, unit * x[4:], (np.eye(4) - np.outer(q, q)) / length  # the last is dq / dp
 
     def residual(x: Array) -> Array:
         q, t, _ = pose(x)

@@ -16,7 +16,7 @@ from gtsam_rwhec.methods.estimate import Outcome
 
 
 def dqopt(request: Request) -> Outcome[Array]:
-    """DQOpt: the pose of least cost (8), with lambda* as the proof."""
+    """DQOpt finds the pose with the smallest cost (8); lambda* proves it."""
     if request.prior is not None and request.prior.form == "distance":
         return solve_with_linear_prior(request, request.prior)
     found = minimum(request.cost)

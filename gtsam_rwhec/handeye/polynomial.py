@@ -1,14 +1,14 @@
 """DQOptPoly (DQ paper, Section 3.1.2 and Appendix B): the optimum from the algebraic curve p(lambda, mu) = 0.
 
 p(lambda, mu) = det(Z(mu) - lambda) (eq. 15) has 25 coefficients. As a polynomial in mu it has eight real roots for
-lambda from the relaxation's lambda_0 up to lambda*. At lambda* the two roots around mu = 0 meet; beyond there are six.
-Two searches in one variable find lambda*: by the sign of the resultant of p and dp/dmu, and by the number of real roots
-(Sturm's theorem).
+lambda from the relaxation's lambda_0 up to lambda*. At lambda* the two roots around mu = 0 meet; above it there are
+six. Two searches in one variable find lambda*. One looks at the sign of the resultant of p and dp/dmu, the other counts
+the real roots (Sturm's theorem).
 
 The paper starts at lambda = 0. Here lambda is counted from lambda_0, Z is written in the relaxation's eigenvectors, and
 mu and lambda are scaled by the sizes that eqs. 14 and 22 expect. The curve is the same, and double precision keeps more
-digits. Of 16 digits of lambda* - lambda_0 the resultant keeps 14, and Sturm's sequence 7 (rotation noise of 1e-4 rad)
-to 13 (0.1 rad): tests/handeye/test_polynomial.py. DQOpt needs none of this.
+digits. The resultant keeps 14 of 16 digits of lambda* - lambda_0. Sturm's sequence keeps 7 (rotation noise of 1e-4 rad)
+to 13 (0.1 rad): see tests/handeye/test_polynomial.py. DQOpt needs none of this.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ BEYOND = 1.25
 ROUNDING = 1e-15
 #: The resultant's search starts at this part of eq. 22's gap: at 0 one root is mu = 0 and spoils the roots' mean.
 NOT_ZERO = 1e-3
-#: Halvings of Sturm's interval, below the rounding of a double.
+#: Sturm's interval is halved this many times, to below the rounding of a double.
 BISECTIONS = 60
 
 
@@ -125,7 +125,7 @@ def real_roots(p: Array) -> int:
 
 
 def by_resultant(of: Curve) -> float:
-    """The least y at which the resultant changes its sign."""
+    """The smallest y at which the resultant changes its sign."""
 
     def f(y: float) -> float:
         return resultant(of.in_x(y))

@@ -31,7 +31,7 @@ def proven_bound(form: Callable[[float], Array], value: float, step: float) -> f
     """The first proven bound among value - step, value - 4 step, value - 16 step, ...; 0 if no positive one is proven.
 
     ``form`` gives, for a candidate bound, a new matrix (n, n), n <= 9. The bound holds when the matrix is positive
-    semidefinite. ``value`` is the optimum, up to rounding: of a sum of squares, so that 0 is always a bound.
+    semidefinite. ``value`` is the optimum, up to rounding, of a sum of squares, so 0 is always a bound.
     """
     lower = value - step
     while lower > 0.0:

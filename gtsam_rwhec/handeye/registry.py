@@ -93,7 +93,7 @@ METHODS: dict[str, Method[[Request]]] = {
     )
 }
 
-#: The name of the cost with a prior, by the prior's form.
+#: The cost with a prior has this name, by the prior's form.
 _COST_WITH_PRIOR = {"imaginary": "eq. 26", "distance": "eq. 25"}
 #: A gap is closed when it is below this part of the cost,
 CLOSED = 1e-9
@@ -121,11 +121,11 @@ def solve(
     Parameters
     ----------
     C, H : (N, 4, 4) arrays, sequences of N gtsam.Pose3, or (N, 7) arrays
-        Relative poses T_before_after of the two rigidly joined frames, metres; C_i and H_i of the same move.
+        Relative poses T_before_after of the two rigidly joined frames, metres; C_i and H_i belong to the same move.
     method : str
         A name of ``METHODS``.
     alpha : float or "estimate"
-        Weight of a translation residual relative to a rotation residual (eq. 8), 1/m: about sigma_rotation /
+        Weight of a translation residual relative to a rotation residual (eq. 8), 1/m. It is about sigma_rotation /
         sigma_translation. "estimate" finds it from the residuals.
     weights : (N,) array, optional
         Factor of each motion's terms.

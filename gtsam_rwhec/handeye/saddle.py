@@ -1,8 +1,8 @@
 """The minimum of the DQ paper's cost as the saddle of its two multipliers (Sections 3.1.2 and 3.2.1).
 
-lambda_0(mu), the smallest eigenvalue of Z(mu) (eq. 12), is concave. As the Lagrangian's minimum it is, for *every* mu,
-a lower bound of the cost over all poses. At its maximum q . q' = 0, and a pose attains the bound. Newton's method
-starts at mu = 0, with the derivatives of lambda_0 from one eigendecomposition; its first step is eq. 34.
+lambda_0(mu), the smallest eigenvalue of Z(mu) (eq. 12), is concave. It is the Lagrangian's minimum, so for *every* mu
+no pose costs less. At its maximum q . q' = 0, and a pose has this cost. Newton's method starts at mu = 0, and its first
+step is eq. 34. One eigendecomposition gives the derivatives of lambda_0.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gtsam_rwhec.handeye.dual_quaternions import times_vectors
 SINGULAR = 1e-14
 #: The search ends when a step gains less than this part of lambda_0. This is far below the rounding error of lambda_0.
 GAIN = 1e-17
-#: Most steps of the search.
+#: The search takes at most this many steps.
 STEPS = 200
 
 

@@ -21,7 +21,7 @@ from gtsam_rwhec.handeye.saddle import minimum
 UNCERTAIN = 0.2
 #: The other motions determine the rotation when M's second eigenvalue is this many times its first.
 DETERMINED = 9.0
-#: How often signs and rotation are found from each other.
+#: Signs and rotation are found from each other this many times.
 ROUNDS = 3
 
 
@@ -63,7 +63,7 @@ def _squares(rows: Array, q: Array) -> Array:
 
 
 def _cost(rows: Array) -> float:
-    """The least cost of motions (14, n), with translations weighed as much as rotations."""
+    """The smallest cost of motions (14, n), with translations weighed as much as rotations."""
     moments = motion_moments(rows)
     lengths = np.trace(moments.BB)
     alpha = float(np.sqrt(np.trace(moments.AA) / lengths)) if lengths > 0.0 else 1.0

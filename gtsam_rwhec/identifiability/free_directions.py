@@ -76,8 +76,8 @@ class FreeDirection:
     ----------
     kind : FreeKind
     frames : dict of str to (omega_x, omega_y, omega_z, v_x, v_y, v_z)
-        How each frame that takes part moves: the right perturbation T Expmap(xi), in GTSAM's order, in rad and m, in
-        the frame's own axes.
+        How each frame that takes part moves. It is the right perturbation T Expmap(xi) in GTSAM's order, in rad and m,
+        in the frame's own axes.
     scale : float
         Change of the logarithm of the shared scale.
     own_scales : dict of str to float
@@ -135,8 +135,8 @@ class FreeDirection:
 def reason_for(axes: int, turned_rad: float, residual_rad: float) -> FreeReason:
     """Why a direction of a pair is free.
 
-    ``axes``: about how many axes the pair's motion turned, beyond the noise: 0, 1, or 2 for two and more. The others
-    are root mean squares, of its turning, noise included, and of its rotation residuals.
+    ``axes`` says about how many axes the pair's motion turned beyond the noise: 0, 1, or 2 for two and more. The others
+    are root mean squares: one of its turning, noise included, and one of its rotation residuals.
     """
     if axes < 2 and turned_rad > TURNED_RAD and residual_rad > 0.5 * turned_rad:
         return FreeReason.CONTRADICTION
@@ -146,7 +146,7 @@ def reason_for(axes: int, turned_rad: float, residual_rad: float) -> FreeReason:
 def free_directions_of(
     names: tuple[str, ...], basis: Array, length_m: float, reasons: Mapping[str, FreeReason]
 ) -> tuple[FreeDirection, ...]:
-    """Records of the free directions that a basis spans: as many as it has columns, each as sparse as possible.
+    """Records of the free directions that a basis spans, one for each column and each as sparse as possible.
 
     Directions that turn frames come first, then changes of scales, then translations.
     ``basis`` (7 n + 1, k): free directions of the frames ``names``, [omega (rad), v (m), log own scale] for each frame,

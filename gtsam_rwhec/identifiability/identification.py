@@ -2,19 +2,19 @@
 
 Noise excites every direction a little, so the rank decides nothing on real data. A direction counts as *free* when the
 motions give no more information about it than noise alone would create if the true motions left the direction open
-(``information.pair_information``). The test is the ratio of the information to that of noise alone. For a free
-direction it has mean 1: it is an F variate, a sum of about m = 2 N squares of noise over a noise variance with nu
-degrees of freedom. The threshold is the 99.9 % quantile F(m, nu): a free direction counts as determined once in a
+(``information.pair_information``). The test divides the information by that of noise alone. For a free direction this
+ratio has mean 1. It follows an F distribution: about m = 2 N squares of noise are divided by a noise variance with nu
+degrees of freedom. The threshold is the 99.9 % quantile F(m, nu), so a free direction counts as determined once in a
 thousand times. The noise of rotations and the noise of translations are estimated separately, each from about half of
-the degrees of freedom: three measurements with six degrees of freedom need a ratio of 130, a hundred measurements need
+the degrees of freedom. Three measurements with six degrees of freedom need a ratio of 130, a hundred measurements need
 1.5.
 
-Rotation residuals depend on rotations only, so rotations are tested first. If all rotations are determined, the second
-test is about translations and scales at those rotations; if not, one test of everything uses all residuals together.
+Rotation residuals depend on rotations only, so rotations are tested first. If all are determined, the second test is
+about translations and scales at those rotations. If not, one test of everything uses all residuals together.
 
-Corollaries 2 and 4 are the same test on one pair: rotations about two distinct axes leave nothing free. Theorems 1 and
-3 (one determined pair determines all that is connected) and endnote 9 (pairs that determine only together) need no rule
-of their own: information adds along the graph, and the whole is tested as the pairs are.
+Corollaries 2 and 4 are the same test on one pair: rotations about two distinct axes leave nothing free. Information
+adds along the graph, and the whole is tested as the pairs are. So Theorems 1 and 3 (one determined pair determines all
+that is connected) and endnote 9 (pairs that determine only together) need no rule of their own.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def _rotation_axes(part: Part, noise: Array, degrees_of_freedom: int) -> tuple[l
 
 
 def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak:
-    """The directions with the least information in units of noise; all free directions are among them."""
+    """The directions with the smallest information in units of noise; all free directions are among them."""
     used = info.used
     unit = _unit(info.noise, used)
     leaf_unit, border_unit = unit[: info.leaf[:, 0].size].reshape(-1, 7), unit[info.leaf[:, 0].size :]
@@ -161,7 +161,7 @@ def _weakest(info: Information, counts: Array, degrees_of_freedom: int) -> _Weak
         values, reduced = _weakest_by_lanczos(D, C, E, used, float(free_threshold(2.0, degrees_of_freedom)))
     vectors = np.zeros((len(used), len(values)))
     vectors[used] = reduced
-    # Satterthwaite: the squares that a direction sums follow from its shares of the frames' measurements.
+    # By Satterthwaite, the squares that a direction sums follow from its shares of the frames' measurements.
     share = np.empty((len(counts), len(values)))
     share[:-1] = (vectors[:-1] ** 2).reshape(len(counts) - 1, 7, len(values)).sum(axis=1)
     share[-1] = vectors[-1] ** 2

@@ -1,9 +1,9 @@
 """The Fisher information that a part's motions give about poses and scales, and the share that A's noise creates.
 
-Parameters are what users perturb: for each free frame [omega, v], a right perturbation T Expmap(xi) in GTSAM's order
-(rad, m), and the logarithm of each unknown scale. The information is the *expected* one: B enters by its prediction
-Y^-1 A X at the answer, not by its noisy measurement, so that only the noise of A can pass for information. The moments
-of A suffice. With c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carrier's frame):
+Users perturb the parameters. Each free frame has [omega, v], a right perturbation T Expmap(xi) in GTSAM's order (rad,
+m); each unknown scale has its logarithm. The information is the *expected* one: it takes B's prediction Y^-1 A X at the
+answer, not B's noisy measurement. So only the noise of A can pass for information, and the moments of A suffice. With
+c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carrier's frame):
 
 - rotation residual, weight 2 kappa:        omega_X - (R_Y' R_A R_X)' omega_Y
 - translation residual, weight alpha^2/s^2: R_A R_X v_X - R_Y v_Y + c^ R_Y omega_Y + c dlog alpha
@@ -21,11 +21,11 @@ from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses
 from gtsam_rwhec.solver.rotations import HATS
 
-#: Smallest noise assumed, in radians and as a part of the measured lengths. If the noise were zero, rounding errors of
-#: the eigenvalues (1e-16 / floor^2) would look like information.
+#: The noise counts as at least this, in radians and as a part of the measured lengths. If it were zero, rounding errors
+#: of the eigenvalues (1e-16 / floor^2) would look like information.
 FLOOR = 1e-7
-#: The 15 parameters of a pair: seven of the target, seven of the sensor, the logarithm of the shared scale. The seven
-#: of a frame: rotation, translation, logarithm of its own scale.
+#: A pair has 15 parameters: seven of the target, seven of the sensor, the logarithm of the shared scale. A frame has
+#: seven: rotation, translation, logarithm of its own scale.
 OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
 
 _UPPER = np.triu_indices(15, 1)
@@ -46,9 +46,9 @@ class PartVarianceFactors:
 def variance_factors(part: Part, J_t: Array, J_R: Array) -> PartVarianceFactors:
     """Variance factors from the costs J_t, J_R (E,) of the pairs at the optimum, in the physical model.
 
-    A pair has the variance factor of the part, or its own where that is larger. J_t is sum |r|^2 / (2 sigma^2),
-    expected 3 N / 2; J_R is sum kappa |dR|_F^2 / 2 = sum kappa theta^2, expected 3 N / 2 too, as each axis has variance
-    1 / (2 kappa). The part's factors are corrected for the unknowns that were fitted.
+    A pair has the variance factor of the part, or its own where that is larger. J_t is sum |r|^2 / (2 sigma^2), and J_R
+    is sum kappa |dR|_F^2 / 2 = sum kappa theta^2. Both have expectation 3 N / 2, as rotations have variance 1 / (2
+    kappa) an axis. The part's factors are corrected for the unknowns that were fitted.
     """
     counts, N = part.moments.count, part.number_of_measurements
     degrees_of_freedom = 6 * N - part.number_of_unknowns
@@ -87,11 +87,11 @@ def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -
 
     In a direction that the true motions leave free, A's rotation error eps (variance q^2 an axis) turns a zero into
     eps x omega or eps x v, with expected square 2 q^2 |.|^2. Both ends move together along a free direction, so each
-    takes half. The residuals do not separate A's noise from B's, but they bound A's noise: the rotation residuals hold
-    all of it, so q^2 <= f_R / (2 kappa); the translation residuals hold it at the end of a lever arm a, so
-    2 q^2 |a|^2 <= 3 f_t sigma^2. If A's rotation error is about the origin of its target carrier, the arm is t_X. If it
-    is about the origin of its sensor carrier, the arm is c. The shorter arm gives the safe bound. A's translation noise
-    is at most f_t sigma^2 an axis: 2 f_t |omega_Y|^2, and 3 f_t for a scale.
+    takes half. The residuals do not separate A's noise from B's, but they bound A's noise. The rotation residuals hold
+    all of it, so q^2 <= f_R / (2 kappa). The translation residuals hold it on a lever arm a, so 2 q^2 |a|^2 <= 3 f_t
+    sigma^2. If A's rotation error is about the origin of its target carrier, the arm is t_X. If it is about the origin
+    of its sensor carrier, the arm is c. The shorter arm gives the safe bound. A's translation noise is at most f_t
+    sigma^2 an axis: 2 f_t |omega_Y|^2, and 3 f_t for a scale.
     """
     E = len(part.pairs)
     R_X, t_X, R_Y, t_Y, alpha = poses.R_X, poses.t_X, poses.R_Y, poses.t_Y, poses.alpha
@@ -171,8 +171,8 @@ def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -
 class Information:
     """Arrow matrix: leaf (L, 7, 7), coupling (L, 7, 7 P + 1), border (7 P + 1 square); and the diagonal of the noise.
 
-    The border has seven parameters of each center, then the logarithm of the shared scale. noise and used: of all
-    parameters, (7 L + 7 P + 1,).
+    The border has seven parameters of each center, then the logarithm of the shared scale. ``noise`` and ``used`` have
+    one entry for each parameter, (7 L + 7 P + 1,).
     """
 
     leaf: Array
@@ -188,7 +188,7 @@ def information(part: Part, by_pair: Array, noise: Array, used: np.ndarray, prio
     n = L + P
     place = {name: i for i, name in enumerate(part.free)}
     ends = np.array([[place.get(name, n) for name in pair] for pair in part.pairs])  # n: a fixed frame
-    # Of each frame alone; one row more takes what the fixed frames would get.
+    # Each frame has a row; one row more takes what the fixed frames would get.
     own, with_scale = np.zeros((n + 1, 7, 7)), np.zeros((n + 1, 7))
     frame_noise, frame_used = np.zeros((n + 1, 7)), np.zeros((n + 1, 7), dtype=bool)
     sides = slice(0, 7), slice(7, 14)

@@ -14,10 +14,9 @@ SIGNIFICANCE = 1e-3
 def free_threshold(squares: Array | float, degrees_of_freedom: int) -> Array:
     """Information up to which a direction is free, in units of the information that noise alone would create in it.
 
-    This is the F quantile of both numbers; with no degrees of freedom, where the noise is known from the weights only,
-    the chi-square quantile over ``squares``. ``squares``: how many squares of noise the information sums.
-    ``degrees_of_freedom``: equations minus unknowns; the noise of rotations and the noise of translations are each
-    estimated from half of them.
+    This is the F quantile of both numbers. With no degrees of freedom only the weights tell the noise, and it is the
+    chi-square quantile over ``squares``. The information sums ``squares`` squares of noise. ``degrees_of_freedom`` is
+    equations minus unknowns. The noise of rotations and that of translations are each estimated from half of them.
     """
     if degrees_of_freedom <= 0:
         return np.asarray(chdtri(squares, SIGNIFICANCE) / squares)

@@ -1,4 +1,4 @@
-"""What the measurements of one pair determine, and of the whole problem."""
+"""What the measurements of one pair determine, and what those of the whole problem determine."""
 
 from __future__ import annotations
 
