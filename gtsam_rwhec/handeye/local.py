@@ -36,7 +36,7 @@ Lift = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 def dqnlopt(request: Request) -> Outcome[Array]:
-    """DQNLOpt descends on the cost (8) from DQOpt's answer, and should stay there (Section 4.4)."""
+    """DQNLOpt descends on the cost (8) from DQOpt's answer, where it should stay (Section 4.4)."""
     found = minimum(request.cost)
     return _outcome(request, found, _descend_dual_quaternion(request, to_transform(found.q, found.q_dual)))
 

@@ -67,7 +67,7 @@ def cholesky(D: Array, C: Array, E: Array) -> ArrowFactor | None:
         border = np.linalg.cholesky(E - wide.T @ wide)
     except np.linalg.LinAlgError:
         return None
-    # LAPACK may let NaN and infinity pass as pivots; they end up on the diagonal.
+    # LAPACK may let NaN and infinity pass as pivots; the diagonal then has them.
     if not (np.isfinite(np.einsum("lii->li", leaves)).all() and np.isfinite(np.diagonal(border)).all()):
         return None
     return ArrowFactor(leaves, coupling, border)

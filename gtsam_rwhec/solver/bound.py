@@ -1,19 +1,19 @@
-"""A lower bound on the optimum of a reduced form, rigorous in floating point, from any multipliers.
+"""A lower bound on the optimum of a reduced form, from any multipliers. It is rigorous in floating point.
 
-For every feasible y = [vec R_1, ..., vec R_n, 1] and any multipliers, y'Q'y = y'Z y with Z = Q' - Lambda, because each
+Let y = [vec R_1, ..., vec R_n, 1] be feasible and Z = Q' - Lambda for any multipliers. Then y'Q'y = y'Z y, because each
 constraint is zero at y. Write y = x + [z, 0] for any x whose last entry is 1::
 
     y' Z y = x' Z x + 2 g' z + z' Z_rr z,      g = (Z x) without its last entry
 
 If Z_rr >= diag(m) with m > 0, the right side is at least x' Z x - sum g^2 / m. This is the dual certificate of design
-fact 3 without its null vector, so that rounding errors do not decide the test of definiteness. If only Z_rr >= -diag(m)
-can be shown (free directions, or no certificate), |z_i| <= sqrt(3) + |r_i| for each rotation bounds the loss.
+fact 3 without its null vector, so rounding errors do not decide the test of definiteness. Free directions, or no
+certificate, leave only Z_rr >= -diag(m). Then |z_i| <= sqrt(3) + |r_i| for each rotation bounds the loss.
 
 With an unknown scale nothing couples to h: (R, alpha) and (-R, -alpha) cost the same, and r itself is a null vector of
 Z_rr. Then an entry j of r takes the role of h: y_r = a r + z with z_j = 0 and a = y_j / r_j, |a| <= 1 / |r_j|.
 
-Z_rr is singular where an answer is free or has a twin. ``deflation`` removes the null directions first and loses
-almost nothing; the verified test of all of Z_rr would lose the whole allowance.
+Z_rr is singular where an answer is free or has a twin. ``deflation`` removes the null directions first and loses almost
+nothing. The verified test of all of Z_rr would lose the whole allowance.
 
 x'Zx and g are evaluated in extended precision, with a bound on their rounding; ``verified`` tests the definiteness.
 The bound is a true bound on the optimum of the stored D, C, E, G of ``ReducedForm``.
@@ -35,9 +35,9 @@ from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
 from gtsam_rwhec.solver.verified import UNIT, arrow_is_positive_definite, cholesky_allowance, gamma
 
-#: Above this size Lanczos finds the eigenvalue of a failed certificate, not a dense decomposition.
+#: Above this size Lanczos finds the eigenvalue of a failed certificate; below it, a dense decomposition does.
 DENSE_EIGEN_SIZE = 700
-#: Factor between one margin of definiteness and the next that is tried; a power of two, so that it does not round.
+#: Each margin of definiteness is this factor times the one tried before; a power of two does not round.
 MORE_ROOM = 16.0
 
 
@@ -55,7 +55,7 @@ class Bound:
 
 
 def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
-    """The bound from multipliers (n, 20) and a point r (9 n,): true for any, tight for optimal ones."""
+    """The bound from multipliers (n, 20) and a point r (9 n,). It is true for any, and tight for optimal ones."""
     if not (np.isfinite(multipliers).all() and np.isfinite(r).all()):  # a solver failed
         return Bound()
     L, n = form.leaves, form.rotations

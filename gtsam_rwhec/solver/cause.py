@@ -90,7 +90,7 @@ class Status(StrEnum):
     CERTIFIED_NOT_UNIQUE = "certified_not_unique"
     #: The bound is true but below the cost: the answer may or may not be optimal.
     GAP = "gap"
-    #: No bound, or no critical point, was found.
+    #: The search found no bound, or no critical point.
     FAILED = "failed"
 
 
@@ -149,7 +149,7 @@ class Cause(StrEnum):
         "the mirror image, which has a negative scale, costs {mirror_cost:.8g}, less than this answer's {cost:.8g}: "
         "with planar motion only the noise decides the sign of the scale",
     )
-    #: Either fact 4 (a) or (b); method="local" does not find out which.
+    #: Fact 4 (a) or (b) applies; method="local" does not find out which.
     LOCAL_MINIMUM_POSSIBLE = (
         "local_minimum_possible",
         Status.GAP,

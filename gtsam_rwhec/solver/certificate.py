@@ -16,9 +16,9 @@ class Objective:
     Attributes
     ----------
     form : "direct" or "inverse"
-        "direct" is the cost of A X = Y B (eq. 18). "inverse" is the cost of B X^-1 = Y^-1 A, which a scale for each
-        target, and priors on translations with an unknown scale, need (design facts 7 and 11). The inverse cost is not
-        half a chi-square; ``refine`` finds the optimum of the exact model from its answer.
+        "direct" is the cost of A X = Y B (eq. 18). "inverse" is the cost of B X^-1 = Y^-1 A. A scale for each target
+        needs it, and so do priors on translations with an unknown scale (design facts 7 and 11). The inverse cost is
+        not half a chi-square; ``refine`` finds the optimum of the exact model from its answer.
     has_priors : bool
         Whether the cost has terms for priors.
     """
@@ -59,7 +59,7 @@ class Certificate:
     float_bound : float
         The lower bound without the allowance for rounding.
     min_eigenvalue : float
-        A lower bound on the smallest eigenvalue of the certificate matrix Z (0 in exact arithmetic when certified).
+        A lower bound on the certificate matrix Z's smallest eigenvalue. In exact arithmetic it is 0 when certified.
     tolerance : float
         The absolute gap up to which the answer counts as optimal.
     is_relative : bool
@@ -108,7 +108,7 @@ class Certificate:
 
     @property
     def relative_gap(self) -> float:
-        """The gap over the cost; with a cost of zero, as exact data give, over a million times the tolerance."""
+        """The gap over the cost. Where exact data make the cost zero, the gap is divided by a million tolerances."""
         return self._relative_gap(self.lower_bound)
 
     @property

@@ -1,12 +1,12 @@
 """A lower bound on the smallest eigenvalue of a nearly singular Z_rr, far tighter than a verified test of all of Z_rr.
 
 Let V (N, k) be approximate eigenvectors of the smallest eigenvalues and M = Z + c V V' >= m > 0, verified with room.
-Any z is V a + w with V'w = 0, so w'Zw = w'Mw >= m |w|^2, and with R = Z V - V diag(lambda), w'Z V a = w'R a::
+Any z is V a + w with V'w = 0, so w'Zw = w'Mw >= m |w|^2. With R = Z V - V diag(lambda), w'Z V a is w'R a. Hence::
 
     z'Zz >= a'(V'ZV)a - 2 |a| |R| |w| + m |w|^2 >= -(nu + |R|^2 / m) |a|^2,      |a|^2 <= |z|^2 / (1 - |V'V - I|)
 
-with -nu a lower bound on the eigenvalues of V'ZV (Gershgorin: V'ZV is nearly diagonal). V'ZV and R are evaluated in
-extended precision. The term |R|^2 is there because V is only approximate.
+Here -nu is a lower bound on the eigenvalues of V'ZV (by Gershgorin, as V'ZV is nearly diagonal). V'ZV and R are
+evaluated in extended precision. The term |R|^2 is there because V is only approximate.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gtsam_rwhec.solver.verified import cholesky_allowance, gamma, is_positive_d
 #: Eigenvectors are removed if their eigenvalue is below this many times the verified test's allowance for rounding
 #: errors.
 REACH = 100.0
-#: Factor that makes a bound larger than the rounding errors of the few operations that compute it.
+#: A bound times this factor covers the rounding errors of the few operations that compute it.
 _SAFETY = 1.0 + 1e-9
 
 

@@ -1,7 +1,7 @@
 """Riemannian second-order descent on SO(3)^n for f(R) = x' Q' x, with Q' in arrow form.
 
-Newton's method on the manifold, damped (Levenberg) where the Hessian is not positive definite or the step does not
-descend. A step needs one arrow factorisation with 3 x 3 leaves.
+This is Newton's method on the manifold. It is damped (Levenberg) where the Hessian is not positive definite or the step
+does not descend. A step needs one arrow factorisation with 3 x 3 leaves.
 """
 
 from __future__ import annotations

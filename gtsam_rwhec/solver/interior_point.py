@@ -5,10 +5,10 @@
     primal   min <Q', X>   s.t. <A_ik, X> = 0 (20 a rotation),  X_hh = 1,  X >= 0        (eqs. 50-52)
     dual     max gamma     s.t. Z = Q' - sum lambda_ik A_ik - gamma e_h e_h' >= 0
 
-The HKM direction with Mehrotra's predictor and corrector (Helmberg, Rendl, Vanderbei, Wolkowicz 1996; Todd 2001),
-from strictly feasible points of both sides, known in closed form (design fact 6). The Schur complement needs only
-10 x 10 blocks of X and Z^-1 (``local_blocks.gram``), where a general solver would treat every pair of constraints as
-dense: 481 constraints on a 217 x 217 matrix, the real dataset, take a fraction of a second.
+It takes the HKM direction with Mehrotra's predictor and corrector (Helmberg, Rendl, Vanderbei, Wolkowicz 1996; Todd
+2001). It starts from strictly feasible points of both sides, known in closed form (design fact 6). The Schur complement
+needs only 10 x 10 blocks of X and Z^-1 (``local_blocks.gram``), where a general solver would treat every pair of
+constraints as dense. The real dataset, 481 constraints on a 217 x 217 matrix, takes a fraction of a second.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The mirror image of an answer, which costs the same when the motion is planar and the scale unknown.
 
-Let every A turn about one axis, u_s in the sensor carrier, u_t in the target carrier, A u_t = u_s, and translate at
+Let every A turn about one axis (u_s in the sensor carrier, u_t in the target carrier, A u_t = u_s) and translate at
 right angles to it. Then each residual is a component along the axis plus an independent component at right angles to
 it. A half turn of all frames about the axis changes the sign of this second component, and so does a negative scale: (H
 R, -alpha) and (R, alpha) cost the same. Both have det R = 1, but only one of them has a positive scale.

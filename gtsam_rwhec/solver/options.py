@@ -24,9 +24,9 @@ class SolveOptions:
     max_descent_iterations : int
         Riemannian Newton steps from one start; three to ten are usual.
     random_starts : int
-        Number of random starts when the first answer is not proven, before the relaxation.
+        Number of random starts that are tried before the relaxation, when the first answer is not proven.
     seed : int
-        Seed of the random starts: the same problem gives the same answer.
+        Seed of the random starts. The same problem gives the same answer.
     max_dense_frames : int
         With more free frames, the search skips the small dual and the semidefinite relaxation, which are dense.
     relaxation_tolerance : float

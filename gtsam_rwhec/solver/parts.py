@@ -17,8 +17,8 @@ from gtsam_rwhec.problem.problem import Problem
 #: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" is the inverse equation, B X^-1 = Y^-1 A, which a
 #: scale for each target needs (design fact 7).
 Kind = Literal["direct", "inverse"]
-#: A gauge that moves by more than this many times the spread of the translations loses four or more of the 16 digits:
-#: the square of this.
+#: A gauge that moves by more than this many times the spread of the translations loses the digits of that number's
+#: square, four or more of 16.
 FAR = 100.0
 
 

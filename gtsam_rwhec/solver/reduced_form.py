@@ -17,11 +17,11 @@ from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.full_form import FullForm, full_forms
 from gtsam_rwhec.solver.parts import Part
 
-#: With a unit diagonal, a smaller eigenvalue of the eliminated block is rounding error: the pseudo-inverse of eq. 48
+#: With a unit diagonal, a smaller eigenvalue of the eliminated block is rounding error. The pseudo-inverse of eq. 48
 #: leaves its direction out.
 RANK_TOLERANCE = 1e-12
-#: A variable with a smaller diagonal, relative to the largest, is absent: this is the square of the rounding of a zero,
-#: and far below any ratio of weights.
+#: A variable with a smaller diagonal, relative to the largest, is absent. This is the square of the rounding of a zero,
+#: and it is far below any ratio of weights.
 ABSENT = 1e-26
 
 
@@ -76,7 +76,7 @@ class ReducedForm:
 
     @cached_property
     def magnitude(self) -> float:
-        """A scale for costs: the sum of the diagonal, about the cost of a grossly wrong answer."""
+        """A scale for costs: the sum of the diagonal is about the cost of a grossly wrong answer."""
         return float(np.einsum("lii->", self.D) + np.trace(self.E))
 
     def apply(self, x: Array) -> Array:

@@ -23,11 +23,11 @@ from gtsam_rwhec.solver.stages import Stages
 from gtsam_rwhec.solver.start import spectral_start, unconstrained_start
 from gtsam_rwhec.solver.variables import answer_of
 
-#: A mirror image may cost this part more, and the measurements may still mean it. Beyond, it is another answer.
+#: A mirror image may cost this part more, and the measurements may still mean it. Above, it is another answer.
 MIRROR_COST = 0.01
 #: Two answers are different when an entry of their rotations differs by this much.
 TWIN_DISTANCE = 1e-3
-#: Before the first bound.
+#: A search has this bound before it has tried any multipliers.
 NOTHING_YET = Bound()
 
 

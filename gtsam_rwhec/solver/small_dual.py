@@ -1,9 +1,9 @@
 """The small dual (design fact 4a): better multipliers of all constraints at the same point.
 
 At a critical point x the multipliers of R'R = I are unique, but the multipliers of all 20 independent constraints are
-not: for each rotation, 14 combinations N of the constraints have N x = 0. Adding them changes Z = Q' - Lambda, keeps
-Z x = 0, and may make Z positive semidefinite: maximise t subject to z'Z(y) z >= t z'P z for all z with z'P x = 0. The
-method is log-barrier Newton on (y, t). It stops as soon as t is safely positive, since any such y proves the same.
+not: for each rotation, 14 combinations N of the constraints have N x = 0. Adding them changes Z = Q' - Lambda, leaves Z
+x = 0, and may make Z positive semidefinite. The small dual maximises t subject to z'Z(y) z >= t z'P z for all z with
+z'P x = 0, by log-barrier Newton on (y, t). It stops as soon as t is safely positive, since any such y proves the same.
 
 P sets the measure: Q' with a little added to its diagonal. Weights of translations and rotations differ by powers of
 ten, and the directions that matter are those in which Q' is smallest. With the identity in place of P, t would not
@@ -50,9 +50,9 @@ def stationary_multipliers(form: ReducedForm, R: Array, multipliers: Array) -> A
 def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int = 60) -> tuple[Array, float]:
     """Maximise t with z'Z z >= t z'P z for all z with z'P x = 0, over the multipliers that keep Z x = 0.
 
-    R (n, 3, 3) is a critical point. Z x = 0 at the given multipliers (n, 20) and at the returned ones. A positive t
-    proves x optimal: z'(Z - t P) z > 0 for all such z but 0. Where rounding errors have given Q' a negative
-    eigenvalue, t is minus infinity and the multipliers are the given ones.
+    R (n, 3, 3) is a critical point. Z x is zero at the given multipliers (n, 20) and at the returned ones. A positive t
+    proves x optimal: z'(Z - t P) z > 0 for all such z but 0. Where rounding errors have given Q' a negative eigenvalue,
+    t is minus infinity and the multipliers are the given ones.
     """
     n = len(R)
     null = null_multipliers(R)

@@ -56,7 +56,7 @@ def spectral_start(part: Part, rotation_form: FullForm) -> list[Array]:
 
 
 def _smallest_eigenvector(S: Array) -> Array:
-    """The smallest eigenvector of a symmetric matrix; for a small matrix, all eigenvectors cost less than a subset."""
+    """The smallest eigenvector of a symmetric matrix. For a small one, all eigenvectors take less time."""
     if len(S) <= 64:
         return np.linalg.eigh(S)[1][:, 0]
     vectors: Array = scipy.linalg.eigh(S, subset_by_index=[0, 0], check_finite=False)[1]
@@ -76,7 +76,7 @@ def _center_blocks(part: Part) -> list[np.ndarray]:
 
 
 def unconstrained_start(form: ReducedForm) -> list[Array]:
-    """Minimisers of x'Q'x over all matrices: with h = 1 where Q' has linear terms, else the smallest eigenvector.
+    """Minimisers of x'Q'x over all matrices. Where Q' has linear terms, h = 1; else it is the smallest eigenvector.
 
     Q' has the translation residuals too, so these starts can be better where rotations alone are poorly excited. The
     eigenvector comes from inverse iteration on the arrow factor.

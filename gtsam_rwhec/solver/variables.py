@@ -19,8 +19,8 @@ from gtsam_rwhec.solver.rotations import vec
 class Answer:
     """Poses X and Y of the free frames about a part's gauge (never inverted), in metres.
 
-    R (n, 3, 3) and t (n, 3) in the order of ``part.free``; own_scale (n,), nan for a frame without an own scale; scale,
-    the shared scale. A scale that the measurements leave free is 1.
+    R (n, 3, 3) and t (n, 3) have the order of ``part.free``. own_scale (n,) is nan for a frame without an own scale,
+    and ``scale`` is the shared scale. A scale that the measurements leave free is 1.
     """
 
     R: Array

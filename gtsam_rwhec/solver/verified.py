@@ -6,9 +6,9 @@ definite. The backward error has an a-priori bound (Higham 2002, theorem 10.3, a
 
     |dA_ij| <= g / (1 - g) sqrt(a_ii a_jj),   g = gamma_{N+1} = (N + 1) u / (1 - (N + 1) u)
 
-so the diagonal matrix N g / (1 - g) a_ii dominates dA. Subtract this matrix (and a bound on the rounding of forming
-the matrix) from the diagonal first: if the factorisation then succeeds, the matrix as stated is positive definite. The
-test is sufficient: a failure proves nothing.
+so the diagonal matrix N g / (1 - g) a_ii dominates dA. This matrix, and a bound on the rounding of forming the matrix,
+are subtracted from the diagonal first. If the factorisation then succeeds, the matrix as stated is positive definite. A
+failure proves nothing.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from gtsam_rwhec.solver import arrow
 
 #: Unit roundoff of double precision.
 UNIT = 2.0**-53
-#: Factor that makes a bound larger than the rounding errors of the few operations that compute it.
+#: A bound times this factor covers the rounding errors of the few operations that compute it.
 _SAFETY = 1.0 + 1e-10
-#: Number added to a bound, larger than what underflow can lose.
+#: This number is added to a bound; underflow can lose less.
 _TINY = 1e-290
 
 
