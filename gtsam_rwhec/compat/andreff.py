@@ -11,7 +11,7 @@ from gtsam_rwhec.solver.rotations import project
 
 #: An eigenvalue below this of the scaled normal equations is rounding error.
 SINGULAR = 1e-15
-#: What to tell a user whose poses leave entries of the rotation free.
+#: A user reads this when the poses leave entries of the rotation free.
 LENGTH_UNKNOWN = (
     "{} linear system finds the rotation's length from the translations, and these do not determine it: the gripper "
     "only turned, or hardly moved; move the gripper, or use another method"
@@ -21,9 +21,9 @@ LENGTH_UNKNOWN = (
 def andreff(stations: Stations) -> tuple[Array, Array]:
     """Least squares of (I - R_A (x) R_B) vec(R) = 0 and (I (x) t_B') vec(R) + (I - R_A) t = t_A (their eq. 11).
 
-    vec takes rows. R is the nearest rotation; t stays as in the linear system: observed of OpenCV 4. The 12 x 12 normal
-    equations are sums over pairs of products of the two stations' features: with D_j = R_G,j' (x) R_C,j the product
-    R_A (x) R_B is D_j D_i'. Raises UnderdeterminedError when the translations do not determine the rotation's length.
+    vec takes rows. R is the nearest rotation. As in OpenCV 4, t stays the linear system's. The 12 x 12 normal equations
+    are sums over pairs of products of the two stations' features: with D_j = R_G,j' (x) R_C,j the product R_A (x) R_B
+    is D_j D_i'. Raises UnderdeterminedError when the translations do not determine the rotation's length.
     """
     R_G, t_G, R_C, u, count = stations.R_G, stations.t_G, stations.R_C, stations.u, len(stations.u)
     t_C = stations.t_C

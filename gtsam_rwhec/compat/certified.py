@@ -11,7 +11,7 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
-#: Residuals (radians, or lengths over the spread of the translations) below this are rounding error: exact poses.
+#: Residuals (radians, or lengths over the spread of the translations) below this are rounding error of exact poses.
 LEAST_RESIDUAL = 1e-6
 
 

@@ -13,7 +13,7 @@ from gtsam_rwhec.handeye.dual_quaternions import to_transform
 from gtsam_rwhec.handeye.saddle import Minimum, minimum
 from gtsam_rwhec.handeye.signs import UNCERTAIN
 
-#: Solutions after the first solution, each with alpha from the residuals of the solution before.
+#: This many solutions follow the first one, each with alpha from the residuals of the solution before.
 ROUNDS = 3
 
 

@@ -11,9 +11,9 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import LARGEST_M, ROTATION_TOLERANCE, Array, determinant, orthonormality
 
-#: Fewest poses that hold two motions about different axes; OpenCV asks for as many.
+#: Two motions about different axes need at least this many poses; OpenCV asks for as many.
 FEWEST_POSES = 3
-#: Share of the largest possible turning of the axes below which turning is rounding error.
+#: Turning of the axes below this share of the largest possible turning is rounding error.
 PARALLEL = 1e-13
 #: Second row times third row, entries (1, 2), (2, 0), (0, 1), then (2, 1), (0, 2), (1, 0): their cross product.
 _NEXT, _AFTER = [4, 5, 3, 5, 3, 4], [8, 6, 7, 7, 8, 6]
@@ -72,8 +72,8 @@ def check_axes(R: tuple[Array, Array], where: tuple[str, str]) -> None:
 def least_and_most_turning(total: Array, count: int) -> tuple[float, float]:
     """The determinant of N^2 I - S'S over the sum of its 2 x 2 minors, and its trace.
 
-    A small quotient is the least eigenvalue: motions about one axis turn two directions alike, so two eigenvalues are
-    never small if the third is large. The sums use plain numbers: a call of NumPy takes longer than the sums.
+    A small quotient is the smallest eigenvalue. Motions about one axis turn two directions alike, so two eigenvalues
+    are never small if the third is large. The sums use plain numbers: a call of NumPy takes longer than the sums.
     """
     (a, b, c), (d, e, f), (g, h, i) = (total.T @ total).tolist()
     square = float(count) ** 2

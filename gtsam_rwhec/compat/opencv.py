@@ -4,9 +4,9 @@ Change one line: ``from gtsam_rwhec.compat import opencv as cv2``. OpenCV's meth
 motions between all pairs of poses) in a fraction of its time. Two methods are this library's: DQOpt over the same
 pairs, and the certified solution, which needs no pairs.
 
-OpenCV returns a meaningless pose for input that determines no answer; these calls raise an error: for fewer than three
-poses, motions about parallel axes or without rotation, fewer than two motions in Tsai's range of angles. They also
-raise an error for an unknown method. They take lists of lists too.
+OpenCV returns a meaningless pose for input that determines no answer; these calls raise an error. Such input has fewer
+than three poses, motions about parallel axes or without rotation, or fewer than two motions in Tsai's range of angles.
+They also raise an error for an unknown method. They take lists of lists too.
 """
 
 from __future__ import annotations

@@ -16,9 +16,9 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import ROTATION, to_rotations
 from gtsam_rwhec.solver.rotations import project
 
-#: Least 2 sin(angle / 2) of a motion that Tsai's method uses, by both sensors; found by tests of OpenCV 4, to 1e-14.
+#: Tsai's method uses motions of at least this 2 sin(angle / 2), by both sensors (from tests of OpenCV 4, to 1e-14).
 TSAI_LEAST = 0.3
-#: Most 2 sin(angle / 2) of such a motion.
+#: Such a motion has at most this 2 sin(angle / 2).
 TSAI_MOST = 1.7
 
 

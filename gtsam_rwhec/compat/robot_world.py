@@ -71,7 +71,7 @@ def li(R_A: Array, t_A: Array, R_B: Array, t_B: Array) -> RobotWorld:
     """R_X, t_X, R_Z, t_Z of A X = Z B by Li, Wang & Wu 2010 (Kronecker form): one linear least squares for all.
 
     (R_A (x) I) vec(R_X) - (I (x) R_B') vec(R_Z) = 0 and (I (x) t_B') vec(R_Z) - R_A t_X + t_Z = t_A, vec by rows.
-    The nearest rotations follow; the translations stay as in the linear system: observed of OpenCV 4. Raises
+    The nearest rotations follow. The translations stay as in the linear system, as observed of OpenCV 4. Raises
     UnderdeterminedError when the translations do not determine the rotations' length.
     """
     m = pose_means(R_A, t_A, R_B, t_B)

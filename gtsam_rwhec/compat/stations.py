@@ -19,7 +19,7 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import conjugate, left, of_rotations
 
-#: Pairs in one block, at most about: a dozen arrays of this size stay within the processor's cache.
+#: A block has at most about this many pairs: a dozen arrays of this size stay within the processor's cache.
 BLOCK_PAIRS = 1 << 15
 
 

@@ -1,8 +1,8 @@
 """Covariances (6, 6) of poses, moved between frames and conventions.
 
-Everywhere in this library a covariance of T_a_b is the covariance of xi in T_a_b Expmap(xi): GTSAM's right
-perturbation, in b's axes and about b's origin, rotation first, [omega (rad), v (m)]. All conversions are of first order
-(Barfoot, State Estimation for Robotics, Section 7.3). Ad is GTSAM's adjoint: T Expmap(xi) T^-1 = Expmap(Ad_T xi).
+Everywhere in this library a covariance of T_a_b is the covariance of xi in T_a_b Expmap(xi). This is GTSAM's right
+perturbation [omega (rad), v (m)], in b's axes and about b's origin. All conversions are of first order (Barfoot, State
+Estimation for Robotics, Section 7.3). Ad is GTSAM's adjoint: T Expmap(xi) T^-1 = Expmap(Ad_T xi).
 """
 
 from __future__ import annotations

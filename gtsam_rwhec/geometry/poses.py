@@ -17,7 +17,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import PoseError
 from gtsam_rwhec.geometry.quaternions import to_rotations
 
-#: Arrays of real numbers, in double precision unless a docstring says otherwise.
+#: Arrays hold real numbers, in double precision unless a docstring says otherwise.
 Array = NDArray[np.floating[Any]]
 QuaternionOrder = Literal["wxyz", "xyzw"]
 PoseLike = ArrayLike | gtsam.Pose3

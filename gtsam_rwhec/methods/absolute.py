@@ -2,7 +2,7 @@
 
 The rotations come first (eq. 8a): R_A R_X = R_Y R_B is linear in the matrices' entries. The translations follow
 (eq. 8b) for known rotations: R_A t_X - t_Y + alpha t_A = R_Y t_B. Neither has weights, as in the authors' papers. Sums
-over measurements are matrix products; loops go over pairs.
+over measurements are matrix products, and loops go over pairs.
 """
 
 from __future__ import annotations

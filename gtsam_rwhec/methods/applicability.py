@@ -9,9 +9,9 @@ from gtsam_rwhec.methods.method import Method, Takes
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
 
-#: Measurements that A X = Y B of one X and one Y takes: two motions about axes that are not parallel.
+#: A X = Y B of one X and one Y takes this many measurements: they give two motions about axes that are not parallel.
 FEWEST = 3
-#: What a method must take for each kind of scale.
+#: A method must take this for each kind of scale.
 _FOR_SCALE: dict[ScaleMode, frozenset[Takes]] = {
     "known": frozenset(),
     "shared": frozenset({Takes.SHARED_SCALE}),

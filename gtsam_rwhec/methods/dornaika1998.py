@@ -15,7 +15,7 @@ from gtsam_rwhec.methods.method import Method, MethodOptions, Properties
 from gtsam_rwhec.methods.paired_quaternions import paired_quaternions
 from gtsam_rwhec.problem.problem import Problem
 
-#: Weight of |R R' - I|^2; the residuals have weight 1.
+#: |R R' - I|^2 has this weight; the residuals have weight 1.
 PENALTY = 1e6
 
 
@@ -33,10 +33,10 @@ def closed_form(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
 
 
 def nonlinear(problem: Problem, options: MethodOptions) -> Outcome[Poses]:
-    """Least |R_A R_X - R_Y R_B|^2 + |R_A t_X + t_A - R_Y t_B - t_Y|^2 + 1e6 (|R_X R_X' - I|^2 + |R_Y R_Y' - I|^2).
+    """Minimise |R_A R_X - R_Y R_B|^2 + |R_A t_X + t_A - R_Y t_B - t_Y|^2 + 1e6 (|R_X R_X' - I|^2 + |R_Y R_Y' - I|^2).
 
-    Levenberg-Marquardt over the 24 entries. The first two sums are one quadratic form in the entries, so an iteration's
-    time does not grow with the number of measurements. The matrices found are projected to rotations.
+    Levenberg-Marquardt varies the 24 entries. The first two sums are one quadratic form in the entries, so an
+    iteration's time does not grow with the number of measurements. The matrices found are projected to rotations.
     """
     stack = Stack.of(problem)
     X, Y, _, starts_from = start_of(problem, options)

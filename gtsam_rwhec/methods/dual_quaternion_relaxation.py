@@ -1,4 +1,4 @@
-"""The least z'Qz over unit dual quaternions: Shor's relaxation, rounding, descent on a chart, multipliers.
+"""The smallest z'Qz over unit dual quaternions, by Shor's relaxation, rounding, descent on a chart and multipliers.
 
 z = [p_1, p_1', p_2, p_2', ...], |p_i| = 1, <p_i, p_i'> = 0. The relaxation's dual is max sum lambda_i subject to
 Z = Q - blkdiag([[lambda_i I, mu_i I], [mu_i I, 0]]) >= 0.
@@ -18,12 +18,12 @@ from gtsam_rwhec.geometry.quaternions import dual_parts, left, of_vectors, right
 from gtsam_rwhec.methods.levenberg_marquardt import descend_on_chart
 from gtsam_rwhec.solver.conic_solver import solve_conic, stacked, unstacked
 
-#: Number of frames up to which the relaxation is solved; a cone of 8 n takes a dense block of order 4 n (8 n + 1)
+#: The relaxation is solved for at most this many frames. A cone of 8 n takes a dense block of order 4 n (8 n + 1)
 #: squared.
 MOST_FRAMES = 10
-#: Relative gap and infeasibility at which the interior-point solver stops.
+#: The interior-point solver stops at this relative gap and infeasibility.
 TOLERANCE = 1e-10
-#: Steps after which the interior-point solver, and steps after which the descent stops in any case.
+#: The interior-point solver and the descent stop after these numbers of steps in any case.
 STEPS, DESCENT_STEPS = 200, 1000
 
 

@@ -1,9 +1,9 @@
 """Heller, Henrion and Pajdla 2014: the cost of A X = Y B (or A Y = Y B) as a polynomial, its global minimum by an SDP.
 
-The cost sum |A_i X - Y B_i|_F^2 is quadratic in the matrices' entries. Over quaternions it is of degree four: the first
-relaxation in Lasserre's hierarchy is of order two (``quaternion_moments``). Over rotation matrices, with all quadratic
-equations between their entries, it is of degree two, and the relaxation of order one. The products of a quaternion's
-entries fulfil 20 equations q_a q_b q_c q_d = q_a q_c q_b q_d; the matrix's entries fulfil 20 independent equations. The
+The cost sum |A_i X - Y B_i|_F^2 is quadratic in the matrices' entries. Over quaternions it has degree four, so
+Lasserre's first relaxation has order two (``quaternion_moments``). Over rotation matrices, with all quadratic equations
+between their entries, it has degree two, and the relaxation has order one. The products of a quaternion's entries
+fulfil 20 equations q_a q_b q_c q_d = q_a q_c q_b q_d; the matrix's entries fulfil 20 independent equations. The
 relaxations differ by the second block of moments alone, with which quaternions are tight where matrices are not.
 """
 
@@ -29,9 +29,9 @@ RELAXATIONS: dict[Parameterisation, str] = {
     "quaternion": "order 2 over quaternions",
     "matrix": "order 1 over rotation matrices",
 }
-#: Gap, relative to the cost, up to which a relaxation counts as tight: what the solver's multipliers leave.
+#: A relaxation counts as tight up to this gap, relative to the cost: the solver's multipliers leave as much.
 TIGHT = 1e-5
-#: The same, relative to the cost of a grossly wrong answer, for exact data.
+#: For exact data the gap counts relative to the cost of a grossly wrong answer; this is its limit.
 ROUNDING = 1e-8
 
 

@@ -44,11 +44,11 @@ Signs = Literal["aligned", "continuous", "scalar", "random"]
 #: The residual that is squared. A product with a dual quaternion changes the norm, so "a x - y b" and "x - a* y b" are
 #: different costs. The RWHEC paper's rows "Horn" have the second.
 Residual = Literal["a x - y b", "x - a* y b"]
-#: Relative gap up to which the relaxation's bound proves the answer: the gap that remains at its solver's tolerance.
+#: The relaxation's bound proves the answer up to this relative gap, which remains at its solver's tolerance.
 CLOSED = 1e-6
-#: Most rounds of choosing signs by the answer.
+#: Signs are chosen by the answer in at most this many rounds.
 ROUNDS = 10
-#: Angle of a residual, degrees, from which a measurement's sign cannot be told.
+#: A measurement's sign cannot be told when its residual has at least this angle, degrees.
 UNCERTAIN_DEG = 150.0
 
 

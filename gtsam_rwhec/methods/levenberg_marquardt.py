@@ -14,13 +14,13 @@ Point = TypeVar("Point")
 #: The point x (m,) of parameters p (k,), and its derivatives (m, k).
 Chart = Callable[[Array], tuple[Array, Array]]
 
-#: Damping of the first step, relative to the Hessian's diagonal; a failed step multiplies it by 10, a good one by 0.1.
+#: Damping starts at this, relative to the Hessian's diagonal. A failed step multiplies it by 10, a good one by 0.1.
 FIRST_DAMPING = 1e-6
 #: With more damping than this the steps are rounding error.
 MOST_DAMPING = 1e9
-#: Largest entry of a step (rad, m) that is taken although rounding hides whether the cost falls.
+#: A step with no larger entry (rad, m) is taken although rounding hides whether the cost falls.
 FLAT_STEP = 1e-7
-#: Largest entry (rad, m) of the last step.
+#: The descent ends after a step with no larger entry (rad, m).
 LAST_STEP = 1e-9
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 
-#: Smallest over largest eigenvalue up to which normal equations count as singular: exact data with a free direction.
+#: Up to this smallest eigenvalue over the largest, normal equations are singular: exact data leave a direction free.
 FREE = 1e-10
 
 

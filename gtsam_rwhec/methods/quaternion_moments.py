@@ -30,9 +30,9 @@ from gtsam_rwhec.solver.rotations import project, unvec
 _ENTRIES = (3, 0, 1, 2)
 #: (a, b) of the ten products q_a q_b.
 PRODUCTS = [(_ENTRIES[i], _ENTRIES[j]) for i in range(4) for j in range(i, 4)]
-#: Relative gap and infeasibility at which the interior-point solver stops.
+#: The interior-point solver stops at this relative gap and infeasibility.
 TOLERANCE = 1e-11
-#: Most steps of the interior-point solver, and of the descent after it.
+#: The interior-point solver takes at most this many steps, and so does the descent after it.
 STEPS = 200
 
 
@@ -121,7 +121,7 @@ def _triangle(block: np.ndarray, count: int) -> scipy.sparse.csc_matrix:
 def _lower_bound(cost: Array, A: scipy.sparse.csc_matrix, z: Array, equations: int, blocks: list[np.ndarray]) -> float:
     """A lower bound that holds (up to rounding) for any multipliers z: -z_0, less what the solver's tolerance leaves.
 
-    For the moments mu of any unit quaternions, cost' mu = -z_0 + sum <Z, M> + r' mu with r = cost + A' z. No moment
+    For the moments mu of any unit quaternions, cost' mu is -z_0 + sum <Z, M> + r' mu with r = cost + A' z. No moment
     exceeds 1. The trace of M(y y') is at most 1 + n, the trace of M(z z') is 1. The smallest change of z that makes r
     vanish comes first.
     """

@@ -32,9 +32,9 @@ from gtsam_rwhec.methods.method import MethodOptions, checked_start
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.vision.camera import Camera
 
-#: Rounds of choosing between a flat target's two poses by the calibration of the round before.
+#: In this many rounds, the calibration of the round before chooses between a flat target's two poses.
 ROUNDS = 3
-#: Distance of the corners from a plane, as a share of the target's size, up to which the target is flat.
+#: A target is flat when its corners are no farther from a plane than this share of its size.
 FLAT = 1e-6
 
 

@@ -22,7 +22,7 @@ from gtsam_rwhec.problem.problem import Problem
 
 #: The weights rest when their ratio changes by less than this share.
 SETTLED = 1e-6
-#: Most rounds.
+#: There are at most this many rounds.
 ROUNDS = 50
 #: Standard deviations (rad and m) below this are rounding error: exact data have no variance to weigh by.
 SMALLEST = 1e-9

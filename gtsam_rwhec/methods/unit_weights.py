@@ -1,7 +1,7 @@
 """A X = Y B with all weights 1 as the certified solver's quadratic form, for methods whose cost has no noise model.
 
 A radian weighs as much as a metre (times the square root of two, by the Frobenius norm). Translations and a shared
-scale are eliminated exactly: x'Q'x over x = [vec R_1, ..., vec R_n, 1] is the least cost for given rotations (RWHEC
+scale are eliminated exactly: x'Q'x over x = [vec R_1, ..., vec R_n, 1] is the smallest cost for given rotations (RWHEC
 paper, eq. 48), its 1/2 included.
 """
 

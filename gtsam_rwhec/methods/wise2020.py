@@ -23,17 +23,17 @@ from gtsam_rwhec.solver.local_blocks import scatter
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_by_clarabel
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers, vec
 
-#: Relative gap and infeasibility at which the interior-point solver stops.
+#: The interior-point solver stops at this relative gap and infeasibility.
 TOLERANCE = 1e-10
-#: Most steps of the interior-point solver, and of the descent.
+#: The interior-point solver takes at most this many steps, and so does the descent.
 STEPS = 200
-#: Second over first eigenvalue of the solution below which it has rank one, and the relaxation is tight.
+#: Below this second eigenvalue over the first, the solution has rank one, and the relaxation is tight.
 RANK_ONE = 1e-5
 
 
 @dataclass(frozen=True)
 class CertifiedRotations:
-    """Rotations (n, 3, 3) of least cost, a lower bound on every answer's cost, and how tight the relaxation is.
+    """Rotations (n, 3, 3) of the lowest cost, a lower bound on every answer's cost, and how tight the relaxation is.
 
     ``eigenvalue_ratio`` is the relaxation's second eigenvalue over its first.
     """

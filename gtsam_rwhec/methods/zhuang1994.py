@@ -15,7 +15,7 @@ from gtsam_rwhec.problem.problem import Problem
 
 #: Measurements whose A has a smaller scalar part (half turns) are left out: the equations divide by it.
 SMALLEST_SCALAR = 1e-3
-#: Scalar part of Y (11 degrees off a half turn) below which a note warns the user.
+#: A note warns the user when Y's scalar part is below this (11 degrees off a half turn).
 NEAR_HALF_TURN = 0.1
 
 

@@ -10,8 +10,8 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
 from gtsam_rwhec.problem.pairs import Pair
 
-#: Up to this number of measurements the gauge moves and all moments are summed again: one measurement does not tell the
-#: centre of a trajectory. Later measurements are summed about the gauge as it then is.
+#: Up to this number of measurements the gauge moves and all moments are summed again, as one measurement does not tell
+#: the centre of a trajectory. Later measurements are summed about the gauge as it then is.
 OPENING = 64
 
 

@@ -8,8 +8,8 @@ Each measurement has one column of 25 features::
 
     f = [vec R_A (9), t_A (3), vec R_B (9), t_B (3), 1]          (vec stacks columns)
 
-``translation = sum f f' / sigma^2`` holds everything that eqs. 35-41 of the RWHEC paper need, for Problem 3 and for
-the inverse equation (one scale per target); ``rotation = sum kappa vec(R_A) vec(R_B)'`` all that L(G^rho) needs.
+``translation = sum f f' / sigma^2`` holds everything that eqs. 35-41 of the RWHEC paper need, for Problem 3 and for the
+inverse equation (one scale per target). ``rotation = sum kappa vec(R_A) vec(R_B)'`` holds all that L(G^rho) needs.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import LARGEST_M, Array, checked_rows
 
 R_A, T_A, R_B, T_B, ONE = slice(0, 9), slice(9, 12), slice(12, 21), slice(21, 24), 24
-#: The order of the features for the inverse equation, B X^-1 = Y^-1 A, in which A and B change places.
+#: This is the order of the features for the inverse equation, B X^-1 = Y^-1 A, in which A and B change places.
 SWAPPED = np.r_[12:24, 0:12, 24]
-#: Measurements that are summed at once: a block of this size stays in the processor's cache.
+#: This many measurements are summed at once; a block of this size stays in the processor's cache.
 BLOCK = 2048
 I3 = np.eye(3)
 I9 = np.eye(9)

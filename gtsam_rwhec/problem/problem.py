@@ -22,13 +22,13 @@ class Problem(Knowledge):
     """A calibration problem: A_i X_j = Y_k B_i for targets j, sensors k and measurements i.
 
     A = T_sensorcarrier_targetcarrier (known: kinematics, motion capture, SLAM), B = T_sensor_target (measured),
-    X = T_targetcarrier_target and Y = T_sensorcarrier_sensor (unknown). Translations in metres.
+    X = T_targetcarrier_target and Y = T_sensorcarrier_sensor (unknown). Translations are in metres.
 
     Parameters
     ----------
     scale : "known", "shared" or "per_target"
-        Whether lengths in B are true, or true times one unknown factor, or true times one unknown factor for each
-        target (t_B = scale * true length). With "per_target", ``fix_scale`` names targets of known size.
+        Lengths in B are true, or true times one unknown factor, or true times one unknown factor per target (t_B =
+        scale * true length). With "per_target", ``fix_scale`` names targets of known size.
     keep_measurements : bool
         Whether raw measurements are kept beside the moments. Refinement with covariances, time offsets or outliers
         needs them; the certified solution does not. Without them memory does not grow with their number.

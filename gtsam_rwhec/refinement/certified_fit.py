@@ -28,10 +28,10 @@ from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.search import Found, Search
 from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables, scales_of
 
-#: Number of free frames above which a gap stays open on the way. There the semidefinite relaxation would take most of
-#: the time, and the final, full solution has its own certificate.
+#: With more free frames than this a gap stays open on the way. The semidefinite relaxation would take most of the time,
+#: and the final, full solution has its own certificate.
 FRAMES_RELAXED = 12
-#: Levenberg-Marquardt steps from the certified optimum to the physical one; fewer than ten are usual.
+#: So many Levenberg-Marquardt steps may lead from the certified optimum to the physical one; below ten is usual.
 MAX_STEPS = 30
 
 

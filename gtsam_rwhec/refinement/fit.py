@@ -23,11 +23,11 @@ from gtsam_rwhec.refinement.weighting import FactorsByPair, Group, group_label, 
 
 Model = GeodesicModel | ChordalModel
 
-#: Largest number of rounds, each of which estimates the noise and propagates A's noise again; two to five are usual.
+#: At most this many rounds estimate the noise and propagate A's noise again; two to five are usual.
 MAX_ROUNDS = 30
-#: Largest relative change of a variance factor in a round that counts as settled.
+#: A variance factor is settled when a round changes it by no more than this part.
 SETTLED = 1e-4
-#: Largest change of a time offset, s, in a round that counts as settled.
+#: A time offset is settled when a round changes it by no more than this, s.
 OFFSET_SETTLED_S = 1e-6
 
 

@@ -17,7 +17,7 @@ from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses, costs_of_pairs
 from gtsam_rwhec.solver.variables import given_answer
 
-#: Mean square of a carrier's velocity over the part that noise explains; up to this number the carrier stands still.
+#: A carrier stands still when its velocity's mean square is at most this many times the part that noise explains.
 MOVED = 4.0
 
 #: The one scale of all targets.

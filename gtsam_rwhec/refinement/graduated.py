@@ -37,11 +37,11 @@ from gtsam_rwhec.refinement.truncated_least_squares import (
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
-#: Share of agreeing measurements below which a warning names a frame or pair.
+#: A warning names a frame or pair when the share of its measurements that agree is below this.
 SUSPECT = 0.5
-#: Standard deviation about an axis, rad, above which no sensor is: an estimate above it comes from outliers.
+#: No sensor has a larger standard deviation about an axis, rad. A larger estimate comes from outliers.
 GROSS_RAD = 0.35
-#: Largest number of frames and pairs that a warning names.
+#: A warning names at most this many frames and pairs.
 NAMED = 5
 
 

@@ -21,12 +21,12 @@ from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.refinement.unknowns import Unknown, rows_of, slots_of
 
-#: Share along the free directions below which a linear function is determined. (A free direction's sentence leaves out
-#: frames below the same share.)
+#: A linear function is determined when its share along the free directions is below this. (A free direction's sentence
+#: leaves out frames below the same share.)
 SHARE = 0.05
-#: Distance of an estimate from the truth along a free direction, in units (the typical length).
+#: An estimate counts as this far from the truth along a free direction, in units (the typical length).
 DISPLACED = 1.0
-#: Share of the largest eigenvalue of an equilibrated information below which an eigenvalue is rounding error.
+#: An eigenvalue of an equilibrated information is rounding error below this share of the largest one.
 ROUNDING = 1e-13
 
 

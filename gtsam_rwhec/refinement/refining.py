@@ -41,7 +41,7 @@ from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.solving.weights import contradicted_by
 from gtsam_rwhec.trajectories.local_paths import WINDOW_S
 
-#: Largest number of times that the inliers are chosen again under the full noise; two or three are usual.
+#: The inliers are chosen again under the full noise at most this many times; two or three are usual.
 MAX_CHOICES = 10
 
 

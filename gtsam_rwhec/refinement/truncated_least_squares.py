@@ -26,19 +26,19 @@ from gtsam_rwhec.refinement.voting import by_vote
 
 NoiseScale = Literal["given", "estimate"]
 
-#: Factor by which mu grows in an iteration (the paper's value).
+#: Mu grows by this factor in an iteration (the paper's value).
 GRADUATION = 1.4
-#: The last mu. Here only residuals within about 10 % of c^2 have weights between 0 and 1.
+#: This is the last mu. Here only residuals within about 10 % of c^2 have weights between 0 and 1.
 LAST_MU = 10.0
-#: Share of agreeing measurements below which a frame's measurements vote on its pose.
+#: A frame's measurements vote on its pose when less than this share of them agree.
 VOTED = 0.9
-#: Smallest standard deviation of residuals, m and rad, so that exact data can be divided by it.
+#: Residuals count with at least this standard deviation, m and rad, so that exact data can be divided by it.
 QUIETEST = 1e-8
-#: Relative decrease of the truncated cost above which a vote is accepted.
+#: A vote is accepted when it decreases the truncated cost by more than this part.
 PAYS = 1e-6
-#: Degrees of freedom of a measurement: three of rotation, three of translation.
+#: A measurement has these degrees of freedom: three of rotation, three of translation.
 DOF = 6
-#: Largest number of re-weighted solutions from each start.
+#: Each start gets at most this many re-weighted solutions.
 MAX_ITERATIONS = 100
 
 

@@ -34,7 +34,7 @@ from gtsam_rwhec.refinement.weighting import (
 )
 from gtsam_rwhec.solver.parts import Part
 
-#: The smallest variance factor, of the noise as given (or of 1 m and 1 rad, where none was given).
+#: A variance factor is at least this part of the noise as given (or of 1 m and 1 rad, where none was given).
 SMALLEST = 1e-20
 
 

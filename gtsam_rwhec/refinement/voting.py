@@ -11,7 +11,7 @@ from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement.certified_fit import CertifiedFit
 from gtsam_rwhec.refinement.squared_residuals import Measured
 
-#: Largest number of proposals for a frame, sampled evenly in the order of the residuals.
+#: A frame has at most this many proposals, sampled evenly in the order of the residuals.
 PROPOSALS = 50
 
 

@@ -15,7 +15,7 @@ from gtsam_rwhec.solver.options import SolveOptions
 Poses = Mapping[str, PoseLike]
 Scale = float | Mapping[str, float]
 
-#: An answer's fixed frames (entries, rad and m) and scales may differ from the problem's by this much: files round.
+#: An answer's fixed frames (entries, rad and m) and scales may differ from the problem's by this much, as files round.
 ROUNDING = 1e-9
 
 

@@ -50,7 +50,7 @@ def solve(
     Returns
     -------
     Solution
-        With a warning when the measurements leave a direction free (``NotUniqueWarning``), when the answer is not
+        A warning says when the measurements leave a direction free (``NotUniqueWarning``), when the answer is not
         proven optimal (``NotCertifiedWarning``), or when the residuals contradict the weights (``WeightsWarning``).
 
     Raises
@@ -113,7 +113,7 @@ def certify(
     Returns
     -------
     Certificate
-        Of the answer as given. ``Cause.BETTER_ANSWER`` means that the search found a better answer.
+        It is about the answer as given. ``Cause.BETTER_ANSWER`` means that the search found a better answer.
 
     Raises
     ------

@@ -32,8 +32,8 @@ class Solution:
     Y : dict of str to gtsam.Pose3
         T_sensorcarrier_sensor of each sensor, metres.
     scale : float or dict of str to float
-        t_B = scale * true length: 1 when known, one number when shared, else one number for each target (and for
-        each sensor with motions of its own).
+        t_B = scale * true length. It is 1 when known and one number when shared. Else it is one number for each target
+        (and for each sensor with motions of its own).
     scale_mode : "known", "shared" or "per_target"
     cost : float
         J; half a chi-square when the weights are true.

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from scipy.special import chdtrc
 
-#: Residuals may cost this many times the prediction of the weights; the noise is then 1.4 times larger, the root.
+#: Residuals may cost this many times what the weights predict. The noise is then larger by the root, 1.4 times.
 UNLIKELY = 2.0
-#: With few degrees of freedom, chance often makes such a cost; its probability must be smaller than this.
+#: With few degrees of freedom, chance often makes such a cost. Its probability must be smaller than this.
 CHANCE = 1e-3
 
 
 def contradicted_by(cost: float, degrees_of_freedom: int) -> float | None:
-    """The cost over its expectation with true weights, where the cost is surely too large; else None.
+    """The cost over its expectation with true weights. It is None where the cost is not surely too large.
 
     With true weights, twice the cost is a chi-square with ``degrees_of_freedom``, equations minus unknowns.
     """

@@ -16,15 +16,15 @@ from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-#: Time, s, from a stamp within which poses determine the motion there.
+#: Poses within this time, s, of a stamp determine the motion there.
 WINDOW_S = 0.5
-#: Number of poses about a stamp that are taken from a path that was logged fast.
+#: This many poses about a stamp are taken from a path that was logged fast.
 NEAREST = 32
-#: Poses that are compared with their neighbours at once: memory stays bounded.
+#: This many poses are compared with their neighbours at once, so that memory stays bounded.
 POSES_AT_ONCE = 100_000
-#: Time, s, between two poses above which the motion in between is unknown.
+#: The motion between two poses is unknown when more than this time, s, lies between them.
 LONGEST_GAP_S = 1.0
-#: Largest difference of an entry (rad and m) between two poses of one stamp and one carrier.
+#: Entries (rad and m) of two poses of one stamp and one carrier may differ by this much.
 SAME_POSE = 1e-6
 
 
