@@ -21,9 +21,9 @@ from rwhec_factors.arguments import check_keys, checked_pairs
 from rwhec_factors.se3 import HATS, Array
 from rwhec_factors.values import number_of, pose_of
 
-#: Number of measurements that are summed at once, which bounds the memory.
+#: This number of measurements is summed at once, which bounds the memory.
 BLOCK = 4096
-#: Eigenvalues of the scaled Q below this share of the largest are rounding error: they make no row.
+#: Eigenvalues of the scaled Q below this share of the largest are rounding error and make no row.
 ROUNDING = 1e-15
 
 T_X, T_Y, SCALE, R_X, R_Y = slice(0, 3), slice(3, 6), 6, slice(7, 16), slice(16, 25)

@@ -24,9 +24,9 @@ from rwhec_factors.values import number_of, pose_of
 
 Residual = Literal["geodesic", "chordal"]
 
-#: By key, the Jacobian (6, m) of A's right perturbation.
+#: This function gives the Jacobian (6, m) of A's right perturbation, by key.
 CarrierJacobians = Callable[[], dict[int, Array]]
-#: From the values: A = T_sensorcarrier_targetcarrier, and its Jacobians, which are computed on demand.
+#: This function of the values gives A = T_sensorcarrier_targetcarrier and its Jacobians, which are computed on demand.
 Carriers = Callable[[gtsam.Values], tuple[gtsam.Pose3, CarrierJacobians]]
 
 
@@ -47,7 +47,7 @@ def measurement_factor(
     keys : list of int
         The factor's keys in their order, the scale's left out: it is the last one.
     target_key, sensor_key : int
-        Keys of X and Y. For A Y = Y B both are the key of Y.
+        Keys of X and Y. In A Y = Y B both are the key of Y.
     carriers : callable
         Gives A and its Jacobians.
     B : gtsam.Pose3

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-#: Angle, rad, below which series replace quotients whose numerators cancel.
+#: Below this angle, rad, series replace quotients whose numerators cancel.
 SMALL = 1e-2
-#: Angle, rad, above which the axis comes from the rotation's symmetric part: the antisymmetric part is zero at pi.
+#: Above this angle, rad, the axis comes from the rotation's symmetric part: the antisymmetric part is zero at pi.
 LARGE = 3.0
 
 

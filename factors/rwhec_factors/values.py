@@ -6,7 +6,7 @@ import gtsam
 
 
 def pose_of(values: gtsam.Values, key: int, what: str) -> gtsam.Pose3:
-    """The Pose3 of a key; KeyError if the key is missing, TypeError if it holds another type."""
+    """The Pose3 of a key. Raises KeyError if the key is missing, and TypeError if it holds another type."""
     try:
         return values.atPose3(key)
     except RuntimeError as error:
@@ -14,7 +14,7 @@ def pose_of(values: gtsam.Values, key: int, what: str) -> gtsam.Pose3:
 
 
 def number_of(values: gtsam.Values, key: int, what: str) -> float:
-    """The number in the 1-vector of a key; KeyError if the key is missing, TypeError if it holds another type."""
+    """The number in a key's 1-vector. Raises KeyError if the key is missing, and TypeError if it has another type."""
     try:
         vector = values.atVector(key)
     except RuntimeError as error:

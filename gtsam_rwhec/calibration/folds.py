@@ -14,7 +14,7 @@ Split = Literal["time", "pair", "sensor"]
 
 
 class Fold(NamedTuple):
-    """Measurements held out together: (N,) booleans for each pair that has some; and a name for messages."""
+    """Measurements held out together, as (N,) booleans for each pair that has some, and a name for messages."""
 
     name: str
     held_out: dict[Pair, np.ndarray]

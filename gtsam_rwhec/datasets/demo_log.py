@@ -12,7 +12,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import FileFormatError
 
-#: Names of the files in the demo's folder: the log, its rig file, and the truth.
+#: The demo's folder has these files: the log, its rig file, and the truth.
 LOG, RIG, TRUTH = "robot_cell.mcap", "rig.yaml", "truth.json"
 
 
@@ -66,7 +66,7 @@ class DemoTruth:
 
 
 def demo_truth() -> DemoTruth:
-    """The truth of the demo's log; a FileFormatError when the demo's data is not there."""
+    """The truth of the demo's log. Raises a FileFormatError if the demo's data is not there."""
     raw = json.loads((demo_folder() / TRUTH).read_text(encoding="utf-8"))
     return DemoTruth(
         X={name: gtsam.Pose3(np.array(T)) for name, T in raw["T_base_target"].items()},

@@ -22,9 +22,9 @@ from gtsam_rwhec.files.atomic_write import write_atomically
 
 #: Folder ``data/real-world/combined`` of utiasSTARS/certifiable-rwhe-calibration on GitHub.
 UTIAS_URL = "https://raw.githubusercontent.com/utiasSTARS/certifiable-rwhe-calibration/main/data/real-world/combined/"
-#: Longest times to connect, and between two packets, s. The largest file has under 50 kB.
+#: Connecting, and the time between two packets, may take at most this long, s. The largest file has under 50 kB.
 TIMEOUT_S = (10.0, 60.0)
-#: The end of a message about a download that stopped.
+#: A message about a download that stopped ends with these words.
 KEPT = "Complete files stay."
 
 
@@ -98,7 +98,7 @@ def fetch_utias(
 
 
 def _verified(folder: Path, remote_files: tuple[RemoteFile, ...]) -> tuple[str, ...]:
-    """Names of the files that are there already; a FetchError for a file with other content."""
+    """Names of the files that are there already. A file with other content raises a FetchError."""
     there = []
     for file in remote_files:
         path = folder / file.name

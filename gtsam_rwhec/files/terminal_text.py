@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-#: Longest message, characters. Longer messages are cut in the middle.
+#: A message has at most this many characters. Longer messages are cut in the middle.
 LONGEST = 10_000
 
 

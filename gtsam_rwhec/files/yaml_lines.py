@@ -22,11 +22,11 @@ from gtsam_rwhec.errors import FileFormatError
 
 KeyPath: TypeAlias = tuple[str | int, ...]
 
-#: Size of the largest file that is read, bytes.
+#: A file of more bytes than this is not read.
 MOST_BYTES = 1_000_000
-#: Most mappings and lists inside one another.
+#: At most this many mappings and lists may be inside one another.
 DEEPEST = 20
-#: The tag in OpenCV's files, for `parse_yaml`.
+#: OpenCV's files have this tag; `parse_yaml` can ignore it.
 OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
 
 _WORDS = {
@@ -116,7 +116,7 @@ def parse_yaml(text: str, where: str, *, tags: Collection[str] = ()) -> YamlFile
     Raises
     ------
     FileFormatError
-        When the text is not YAML, is empty, or has what this module refuses; with the line.
+        When the text is not YAML, is empty, or has what this module refuses. The message has the line.
     """
     reader = _Reader(where, frozenset(tags), _events(text, where))
     return YamlFile(where, reader.document(), reader.lines)

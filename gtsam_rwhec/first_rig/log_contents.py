@@ -17,13 +17,13 @@ from gtsam_rwhec.rig.field_types import is_text
 from gtsam_rwhec.vision.images import decode_gray
 from gtsam_rwhec.vision.tag_survey import BY_TRUST, tags_in_image
 
-#: Images of each topic that are searched for tags, taken evenly from all.
+#: This number of images of each topic, taken evenly from all, is searched for tags.
 IMAGES = 8
-#: Images of each topic that are searched for tags of all families, which takes about a second for each image.
+#: This number of images of each topic is searched for tags of all families, which takes about a second for each image.
 IMAGES_FOR_ALL = 3
-#: Poses of each pair of frames that are kept, at most, to see whether the pair moves.
+#: At most this many poses of each pair of frames are kept, to see whether the pair moves.
 POSES = 1000
-#: Metres. A frame that moves less, and turns less than `STILL_RAD`, stands still.
+#: Metres. A frame stands still if it moves less than this and turns less than `STILL_RAD`.
 STILL_M = 0.01
 #: Radians; see `STILL_M`.
 STILL_RAD = math.radians(1.0)
@@ -31,7 +31,7 @@ STILL_RAD = math.radians(1.0)
 
 @dataclass
 class Tags:
-    """Tags of one family: in how many images each id had a single border, and a double one (AprilGrid)."""
+    """Tags of one family. They count in how many images each id had a single border, and a double one (AprilGrid)."""
 
     single: Counter[int] = field(default_factory=Counter)
     double: Counter[int] = field(default_factory=Counter)
@@ -118,7 +118,7 @@ def read_contents(log: Log) -> LogContents:
     topics = log.topics()
     contents = LogContents(topics)
     readable = {topic.name for topic in topics if is_text(topic.name)}
-    # A message with several poses has poses of several things, most often of targets: not of a carrier.
+    # A message with several poses has poses of several things, most often of targets, and not of a carrier.
     readable -= {topic.name for topic in topics if topic.unreadable or schema_word(topic.schema) == "PosesInFrame"}
     transforms = {topic.name for topic in topics if topic.is_tf}
     for topic in topics:

@@ -18,7 +18,7 @@ from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseNoise, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
 
-#: Words in names of topics that say what is published, and not by which camera.
+#: These words in names of topics say what is published, and not by which camera.
 _COMMON = frozenset({
     "image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "image_rect_raw", "compressed",
     "raw", "color", "colour", "rgb", "detections", "tag_detections", "apriltag_detections", "detection", "tags",
@@ -147,7 +147,7 @@ def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:
     cameras: list[_Camera] = []
 
     def add(source: ImageTopic | DriverTopic, key: str, sources: int, missing: str) -> str:
-        """Add a sensor; the comment `missing` if it needs intrinsics and the log has none. Its name."""
+        """Add a sensor, with the comment `missing` if the log lacks the intrinsics that it needs; return its name."""
         intrinsics, remark = _intrinsics(source.topic, source.frame, contents.intrinsics, sources)
         if intrinsics is None and missing:
             intrinsics, remark = Intrinsics(file="camera.yaml"), missing
@@ -189,7 +189,7 @@ def _without_copies(contents: LogContents, notes: list[str]) -> list[ImageTopic]
 
 
 def _intrinsics(topic: str, frame: str, known: dict[str, str], sensors: int) -> tuple[Intrinsics | None, str]:
-    """The topic of intrinsics for another topic: it has the same frame, or its name begins in the same way."""
+    """The topic of intrinsics for another topic. It has the same frame, or its name begins in the same way."""
     same_frame = [name for name, its_frame in known.items() if frame and its_frame == frame]
     candidates = same_frame or list(known)
     shared = {name: _shared(topic, name) for name in candidates}
@@ -202,19 +202,19 @@ def _intrinsics(topic: str, frame: str, known: dict[str, str], sensors: int) -> 
 
 
 def _shared(first: str, second: str) -> int:
-    """With how many common words two topics begin."""
+    """Count the common words with which two topics begin."""
     pairs = list(zip(first.strip("/").split("/"), second.strip("/").split("/"), strict=False))
     return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
 
 
 def _name(topic: str, frame: str) -> str:
-    """A camera's name: the words of its topic that are not common, or else its frame."""
+    """Name a camera by the words of its topic that are not common, or else by its frame."""
     words = [word for word in topic.split("/") if word.lower() not in _COMMON]
     return frame_name("_".join(words)) or frame_name(frame) or "camera"
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """The name, with a number added if it is taken; it is taken from now on."""
+    """Return the name, with a number added if it is taken. It is taken from now on."""
     numbered = (f"{name}_{number}" for number in range(2, len(taken) + 3))
     free = next(candidate for candidate in (name, *numbered) if candidate not in taken)
     taken.add(free)

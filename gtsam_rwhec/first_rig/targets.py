@@ -12,19 +12,19 @@ from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic
 from gtsam_rwhec.rig.target_sections import AprilGridTarget, CharucoTarget, TagTarget
 from gtsam_rwhec.vision.targets import FAMILIES, family_named
 
-#: Metres. Side of a tag, in a first rig file until a person measures it.
+#: Metres. A tag's side has this value in a first rig file, until a person measures it.
 TAG_M = 0.1
-#: Metres. Side of a square of a ChArUco board, until a person measures it.
+#: Metres. The side of a ChArUco board's square has this value, until a person measures it.
 SQUARE_M = 0.04
-#: Metres. Side of a marker of a ChArUco board, until a person measures it.
+#: Metres. The side of a ChArUco board's marker has this value, until a person measures it.
 MARKER_M = 0.03
-#: Gap between tags / side of a tag of an AprilGrid, until a person measures it.
+#: An AprilGrid's gap between tags, divided by a tag's side, has this value, until a person measures it.
 SPACING = 0.3
 #: At least this number of markers with consecutive ids is taken for a ChArUco board.
 BOARD = 6
 #: At least this number of tags with a double border is taken for an AprilGrid.
 GRID = 4
-#: The remark on a size that is a guess.
+#: A size that is a guess gets this remark.
 TODO = "TODO measure"
 
 
@@ -62,7 +62,7 @@ def targets_seen(images: Iterable[ImageTopic], drivers: Iterable[DriverTopic]) -
 
 
 def least_sightings(family: str, looked_at: int) -> int:
-    """In how many images a tag must be: in families of few bits, false detections are frequent."""
+    """In how many images a tag must be. Families of few bits need more, since their false detections are frequent."""
     if looked_at < 3 or family == "tag36h11":
         return 1
     return 3 if family in ("tag16h5", "aruco_4x4_1000", "aruco_original") else 2

@@ -34,13 +34,13 @@ _BUILTIN = {
     "builtin_interfaces/Duration": (("int32", "sec"), ("uint32", "nanosec")),
 }
 _FIELD = re.compile(r"([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(<=)?(\d{0,9})\])?\s+([A-Za-z]\w*)(\s*=.*|\s.*)?$")
-#: Messages inside one message, at most; each of ROS's own messages has far fewer.
+#: A message contains at most this many messages; each of ROS's own messages contains far fewer.
 MOST_PARTS = 100_000
-#: Levels of messages inside messages, at most; each of ROS's own messages has far fewer.
+#: Messages inside messages have at most this many levels; each of ROS's own messages has far fewer.
 DEEPEST = 16
-#: Messages of more bytes are not stacked: copying them costs more than walking them.
+#: Messages of more bytes than this are not stacked, because copying them costs more than walking them.
 STACKED_BYTES = 1 << 16
-#: Shapes of one length that are told apart in one call; the rest of the messages are walked one by one.
+#: One call tells at most this many shapes of one length apart. It walks the rest of the messages one by one.
 MOST_SHAPES = 64
 
 
@@ -97,7 +97,7 @@ class Batch:
 
 
 def find(tree: Any, path: str) -> Any:
-    """The value at `path` (``header.stamp.sec``) below `tree`; a MessageError names a field that is not there."""
+    """The value at `path` (``header.stamp.sec``) below `tree`. A MessageError names a field that is not there."""
     for name in path.split("."):
         if not isinstance(tree, dict) or name not in tree:
             raise MessageError(f"the schema in the log has no field {path}")
@@ -106,7 +106,7 @@ def find(tree: Any, path: str) -> Any:
 
 
 class MessageType:
-    """A ROS 2 message type, made from the log's definition; a MessageError where it cannot be read or lacks a part."""
+    """A ROS 2 message type, made from the log's definition. An unreadable or incomplete one raises a MessageError."""
 
     def __init__(self, name: str, text: str) -> None:
         self._root = _short(name)

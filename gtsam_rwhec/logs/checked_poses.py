@@ -9,7 +9,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.quaternions import to_rotations
 from gtsam_rwhec.logs.records import Array
 
-#: A quaternion's norm may be this far from 1; the quaternion is then normalised.
+#: A quaternion's norm may be this far from 1. The quaternion is then normalised.
 QUATERNION_TOLERANCE = 1e-2
 #: A position further away than this, in metres, is refused.
 LARGEST_M = 1e12
@@ -61,7 +61,7 @@ def gtsam_covariances(T: Array, covariances: Array) -> list[Array | None]:
 
 
 def image_fault(width: int, height: int, step: int, data: bytes) -> str:
-    """What is wrong with a raw image's size; empty where the data has all rows."""
+    """Say what is wrong with a raw image's size; the text is empty if the data has all rows."""
     if width * height and step * height <= len(data):
         return ""
     return f"image of {width} x {height} pixels, {step} bytes a row, has {len(data)} bytes"

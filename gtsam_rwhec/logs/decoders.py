@@ -14,12 +14,12 @@ from gtsam_rwhec.errors import MessageError
 from gtsam_rwhec.logs import foxglove_schemas, ros2_schemas
 
 Decoder = Callable[[str, Sequence[bytes | memoryview], list[int]], list[foxglove_schemas.Read]]
-#: Errors that a descriptor pool raises for wrong descriptors in a file.
+#: A descriptor pool raises these errors for wrong descriptors in a file.
 _FAULTS = (McapError, DecodeError, TypeError, ValueError, KeyError, RecursionError)
 
 
 def _protobuf_parser(schema: Schema) -> Callable[[bytes | memoryview], Any]:
-    """Make the function from bytes to messages of `schema`; a MessageError where the descriptors lack it or are wrong.
+    """Make the function from bytes to messages of `schema`. Raise a MessageError if descriptors lack it or are wrong.
 
     The function raises a MessageError for bytes that are not a message.
     """
@@ -40,7 +40,7 @@ def _protobuf_parser(schema: Schema) -> Callable[[bytes | memoryview], Any]:
 
 
 def decoder_for(channel: Channel, schema: Schema | None) -> Decoder:
-    """The function from messages of a channel to their records; a MessageError where there is none."""
+    """The function from messages of a channel to their records. If there is none, a MessageError is raised."""
     if schema is None:
         raise MessageError("it has no schema")
     name, encoding = schema.name, channel.message_encoding

@@ -29,13 +29,13 @@ from gtsam_rwhec.logs.records import (
     Record,
 )
 
-#: The records of a message, or its fault in words.
+#: A read message gives its records, or its fault in words.
 Read = Sequence[Record] | str
-#: One pose of a message: stamp, parent, child, then x, y, z and x, y, z, w.
+#: A row holds one pose of a message: stamp, parent, child, then x, y, z and x, y, z, w.
 Row = tuple[int, str, str, tuple[float, ...]]
-#: Numbers of a message's list, at most: the corners of a board of 100 x 100 squares.
+#: A message's list has at most this many numbers, enough for the corners of a board of 100 x 100 squares.
 MOST_NUMBERS = 20_000
-#: Errors that a damaged message can raise when it is converted to numbers.
+#: A damaged message can raise these errors when it is converted to numbers.
 _FAULTS = (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, IndexError)
 
 
@@ -136,7 +136,7 @@ def _with_poses(out: list[Any], rows: list[Row], topic: str, logged_ns: list[int
 
 
 def parse_json(message: bytes | memoryview) -> Any:
-    """JSON object of a message; a MessageError for anything else."""
+    """The JSON object of a message. Anything else raises a MessageError."""
     try:
         value = json.loads(bytes(message))
     except (ValueError, RecursionError) as error:

@@ -25,9 +25,9 @@ from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.records import Array
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
-#: Foxglove's names of the formats of images, by the files' ending.
+#: Foxglove gives the formats of images these names; the keys are the files' endings.
 FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
-#: Digits of a stamp in nanoseconds, at least.
+#: A stamp in nanoseconds has at least this many digits.
 NANOSECOND_DIGITS = 16
 
 

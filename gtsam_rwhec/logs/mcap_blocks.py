@@ -34,22 +34,22 @@ from numpy.lib.stride_tricks import sliding_window_view
 from gtsam_rwhec.errors import LogError
 
 MAGIC = b"\x89MCAP0\r\n"
-#: Bytes of the largest chunk that is opened, as the chunk states them and as it yields them.
+#: A chunk is opened only if it has at most this many bytes, both those that it states and those that it yields.
 LARGEST_CHUNK = 1 << 29
-#: Bytes of a block of messages outside chunks, about.
+#: A block of messages outside chunks has about this many bytes.
 LOOSE_BLOCK = 1 << 22
-#: The head of every record: opcode and length.
+#: Every record begins with its opcode and its length.
 _RECORD = struct.Struct("<BQ")
-#: The head of a message record.
+#: A message record begins with these fields.
 _HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")])
 _FOOTER_BYTES = _RECORD.size + 20
-#: What the readers of records raise for bytes that are not a record.
+#: The readers of records raise these errors for bytes that are not a record.
 _FAULTS = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError)
 
 
 @dataclass(frozen=True)
 class Block:
-    """Where messages are: the record of a chunk, or records outside chunks; and their first log time.
+    """The place of messages (the record of a chunk, or records outside chunks), and their first log time.
 
     `is_cut` says that the file ends inside the chunk.
     """
@@ -85,7 +85,7 @@ class Seen:
 
 @dataclass
 class McapFile:
-    """An MCAP file's schemas, channels and blocks; a LogError where the file cannot be opened or is not MCAP."""
+    """An MCAP file's schemas, channels and blocks. A file that cannot be opened or is not MCAP raises a LogError."""
 
     path: Path
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -120,7 +120,7 @@ class McapFile:
         self._stream.close()
 
     def open(self, block: Block) -> Messages:
-        """Read, check and decompress a block; a LogError where its compression, size or checksum is wrong."""
+        """Read, check and decompress a block. A wrong compression, size or checksum raises a LogError."""
         raw = self._read(block.offset, block.length)
         return self._split(self._opened(raw, block) if block.is_chunk else raw, block.offset)
 
@@ -164,7 +164,7 @@ class McapFile:
         return True
 
     def _records(self, start: int) -> list[McapRecord]:
-        """The records from a place in the file to its end, read from memory: a wrong length allocates nothing."""
+        """The records from a place in the file to its end. They come from memory: a wrong length allocates nothing."""
         stream = io.BytesIO(self._read(start, self.size - start))
         return list(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
 
@@ -224,7 +224,7 @@ class McapFile:
         return len(log_time)
 
     def _opened(self, raw: bytes, block: Block) -> bytes:
-        """The records in a chunk; of a chunk that is cut, as many as there are."""
+        """The records in a chunk. A chunk that is cut gives as many records as there are."""
         where = f"{self.path}, chunk at byte {block.offset}"
         stream = ReadDataStream(io.BytesIO(raw))
         try:
@@ -280,7 +280,7 @@ class McapFile:
 
 
 def _decompressed(chunk: Chunk) -> bytes:
-    """The chunk's data; at most one byte more than the chunk states."""
+    """The chunk's data, which has at most one byte more than the chunk states."""
     most = chunk.uncompressed_size + 1
     if chunk.compression == "zstd":
         decompressor = zstandard.ZstdDecompressor(max_window_size=1 << 27)

@@ -27,11 +27,11 @@ from gtsam_rwhec.logs.message_kinds import Topic
 from gtsam_rwhec.logs.records import Array, PoseRecord, PoseSeries, Record
 
 OnBad = Literal["warn", "raise"]
-#: Number of messages that are decoded together.
+#: This number of messages is decoded together.
 SLICE = 4096
-#: Bytes of opened blocks that overlap in time and are held together, at most.
+#: Opened blocks that overlap in time and are held together have at most this many bytes.
 MOST_OPEN_BYTES = 1 << 30
-#: Topics that an error lists, at most: logs may have thousands.
+#: An error lists at most this many topics, since logs may have thousands.
 MOST_NAMED = 50
 
 _Entry = TypeVar("_Entry")
@@ -67,7 +67,7 @@ def open_log(path: str | Path | Iterable[str | Path]) -> Log:
 
 
 class Log:
-    """One or more MCAP files read as one; made by `open_log`. A context manager, which closes the files."""
+    """One or more MCAP files that `open_log` reads as one log. It is a context manager, which closes the files."""
 
     def __init__(self, files: list[McapFile]) -> None:
         self.files = files
@@ -84,7 +84,7 @@ class Log:
             file.close()
 
     def topics(self) -> tuple[Topic, ...]:
-        """Every topic, by name; a topic with several schemas or encodings has one entry for each."""
+        """Every topic, by name. A topic with several schemas or encodings has one entry for each."""
         found: dict[tuple[str, str, str], Topic] = {}
         for number, file in enumerate(self.files):
             for channel in file.channels.values():
@@ -101,7 +101,7 @@ class Log:
         return tuple(found[key] for key in sorted(found))
 
     def topics_in_words(self) -> str:
-        """The topics and their schemas, for messages: `MOST_NAMED` at most, as logs may have thousands."""
+        """The topics and their schemas, for messages. At most `MOST_NAMED` are named, as logs may have thousands."""
         known = self.topics()
         there = ", ".join(f"{topic.name} ({topic.schema})" for topic in known[:MOST_NAMED]) or "none"
         return there + (f" and {len(known) - MOST_NAMED} others" if len(known) > MOST_NAMED else "")
@@ -114,7 +114,7 @@ class Log:
         return {entry.name: dict(entry.metadata) for entry in self._indexed(lambda reader: reader.iter_metadata())}
 
     def attachment(self, name: str) -> bytes | None:
-        """The content that is attached under a name, found as `metadata` is; None where there is none."""
+        """The content that is attached under a name, or None if there is none. It is found as `metadata` is."""
         found = [entry.data for entry in self._indexed(lambda reader: reader.iter_attachments()) if entry.name == name]
         return found[-1] if found else None
 
@@ -154,7 +154,7 @@ class Log:
             key=lambda entry: entry[:2],
             reverse=True,
         )
-        # The heap holds, for each open block, its next record's time; the number breaks ties.
+        # The heap holds the time of each open block's next record; the number breaks ties.
         heap: list[tuple[int, int, Record, Iterator[Record], int]] = []
         order = open_bytes = 0
         while waiting or heap:
@@ -225,7 +225,7 @@ class Log:
         return wanted
 
     def _decoder(self, number: int, channel_id: int) -> Decoder | str:
-        """The function for a channel's messages, or why there is none."""
+        """The function for a channel's messages, or the reason why there is none."""
         key = number, channel_id
         if key not in self._decoders:
             file = self.files[number]
@@ -239,7 +239,7 @@ class Log:
         return self._decoders[key]
 
     def _records_of(self, number: int, block: Block, wanted: set[str] | None, bad: _Bad) -> Iterator[Record]:
-        """Records of one block, in the order of log time; decoded a slice at a time."""
+        """Records of one block, in the order of log time. They are decoded a slice at a time."""
         file = self.files[number]
         try:
             messages = file.open(block)

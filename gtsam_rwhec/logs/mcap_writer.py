@@ -31,14 +31,14 @@ from gtsam_rwhec.logs.records import Array, DetectionRecord, IntrinsicsRecord, P
 from gtsam_rwhec.logs.written_schemas import json_schema
 
 Images = Literal["copy", "leave_out"]
-#: foxglove.PointsAnnotation's number for a closed line
+#: foxglove.PointsAnnotation has this number for a closed line.
 _LINE_LOOP = 2
 _GREEN = {"r": 0.0, "g": 1.0, "b": 0.0, "a": 1.0}
 _BLACK = {"r": 0.0, "g": 0.0, "b": 0.0, "a": 0.6}
 
 
 class LogWriter:
-    """Writes one MCAP file; a context manager.
+    """A context manager that writes one MCAP file.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ class LogWriter:
             self._writer.add_message(channel, stamp_ns, data, stamp_ns)
 
     def _copied_channel(self, file: Any, channel_id: int, wanted: set[str] | None, images: Images) -> int | None:
-        """The channel of this log for a channel of `file`; None if its messages are not copied."""
+        """The channel of this log for a channel of `file`. It is None if its messages are not copied."""
         channel = file.channels.get(channel_id)
         if channel is None or (wanted is not None and channel.topic not in wanted):
             return None

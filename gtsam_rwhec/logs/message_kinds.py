@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-#: The last words of ROS's topics of transforms.
+#: ROS's topics of transforms end with these words.
 TF_TOPICS = ("tf", "tf_static")
 TRANSFORM_SCHEMAS = ("foxglove.FrameTransforms", "foxglove.FrameTransform")
 INTRINSICS_SCHEMAS = ("sensor_msgs/msg/CameraInfo", "sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
-#: The last words of the schemas of images that can be decoded, in ROS and in Foxglove.
+#: In ROS and in Foxglove, the schemas of images that can be decoded end with these words.
 IMAGE_SCHEMAS = ("Image", "CompressedImage", "RawImage")
 VIDEO_SCHEMAS = ("CompressedVideo",)
-#: This library's own schemas.
+#: These schemas are this library's own.
 TAG_DETECTIONS = "gtsam_rwhec.TagDetections"
 MEASURED_PAIR = "gtsam_rwhec.MeasuredPair"
 
 
 def schema_word(schema: str) -> str:
-    """The last word of a schema's name: ``Image`` of ``sensor_msgs/msg/Image`` and of ``foxglove.Image``."""
+    """The last word of a schema's name, such as ``Image`` of ``sensor_msgs/msg/Image`` and ``foxglove.Image``."""
     return schema.replace("/", ".").rpartition(".")[2]
 
 
@@ -28,9 +28,9 @@ class Topic:
     Attributes
     ----------
     first_ns, last_ns : int or None
-        First and last log time; where the file has an index, of the chunks that have the topic.
+        First and last log time. If the file has an index, they are the times of the chunks that have the topic.
     unreadable : str
-        Why the messages cannot become records; empty where they can.
+        Why the messages cannot become records; the text is empty if they can.
     """
 
     name: str

@@ -27,7 +27,7 @@ class PoseRecord:
     child : str
         Empty where the message names one frame only (``PoseStamped``, ``PoseInFrame``).
     covariance : (6, 6) array or None
-        As GTSAM has it: rotation first, right perturbation ``T * Expmap(xi)``. None: the message has no covariance.
+        GTSAM's order: rotation first, right perturbation ``T * Expmap(xi)``. It is None if the message has none.
     """
 
     logged_ns: int
@@ -63,7 +63,7 @@ class ImageRecord:
     encoding : str
         Pixel format (``mono8``, ``rgb8``, ...) of a raw image; format (``jpeg``, ``png``) of a compressed image.
     width, height : int or None
-        Pixels of a raw image; None for a compressed image.
+        Pixels of a raw image. They are None for a compressed image.
     step : int or None
         Bytes from one row of a raw image to the next; None for a compressed image.
     """
@@ -125,7 +125,7 @@ class DetectionRecord:
     id : str
         The tag's number, or the board's name.
     corners_px : (4, 2) array or None
-        Pixels, in the driver's order; (n, 2) of a board, with the corners that were seen.
+        Pixels, in the driver's order. A board has (n, 2), with the corners that were seen.
     T_camera_tag, covariance : (4, 4) and (6, 6) arrays or None
         The pose in metres and its covariance as in `PoseRecord`.
     size_m, reprojection_px : float or None

@@ -20,14 +20,14 @@ from gtsam_rwhec.logs.cdr import Batch, MessageType, Numbers, find
 from gtsam_rwhec.logs.checked_poses import gtsam_covariances, image_fault, transforms
 from gtsam_rwhec.logs.records import Array, DetectionRecord, ImageRecord, IntrinsicsRecord, PoseRecord, Record
 
-#: The records of a message, or its fault in words.
+#: A read message gives its records, or its fault in words.
 Read = Sequence[Record] | str
 Decode = Callable[[Batch, str, list[int]], list[Read]]
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Paths of a pose's fields; `parts` is the list whose entries have one pose each. Empty: there is no such field."""
+    """Paths of a pose's fields; an empty path means no field. `parts` is the list whose entries have one pose each."""
 
     pose: str
     covariance: str = ""
@@ -83,7 +83,7 @@ def _frame(batch: Batch, tree: Any, path: str = "header.frame_id") -> str:
 
 
 def _parts(batch: Batch, name: str) -> list[Any]:
-    """The messages in the list `name` of a message; without a name, the message itself."""
+    """The messages in the list `name` of a message. Without a name, the result is the message itself."""
     value = find(batch.shape.tree, name) if name else [batch.shape.tree]
     if not isinstance(value, list):
         raise MessageError(f"field {name} is not a list of messages")
@@ -108,7 +108,7 @@ def _columns(batch: Batch, tree: Any, names: str) -> Array:
 
 
 def _by_message(parts: Sequence[Sequence[Record]], faults: dict[int, str], count: int) -> list[Read]:
-    """The records of each message from those of each part; a fault in one part is the whole message's."""
+    """The records of each message, joined from its parts. If one part has a fault, the whole message has it."""
     of_messages: list[Read] = list(zip(*parts, strict=True)) if parts else [()] * count
     for i, fault in faults.items():
         of_messages[i] = fault
@@ -165,7 +165,7 @@ def _corners(batch: Batch, tree: Any) -> Array:
 
 
 def _aruco_markers(batch: Batch, topic: str, logged_ns: list[int]) -> list[Read]:
-    """Ids and poses stand in two lists: they are made one list of markers, as other drivers have it."""
+    """Make one list of markers, as other drivers have it, from the two lists of ids and poses."""
     tree = batch.shape.tree
     ids, poses = find(tree, "marker_ids"), _parts(batch, "poses")
     if not isinstance(ids, Numbers) or ids.count != len(poses):

@@ -13,7 +13,7 @@ from mcap.writer import Writer as McapWriter
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.atomic_write import atomic_stream
 
-#: Bytes of messages kept before they are compressed and written.
+#: Messages are compressed and written when they have this many bytes.
 CHUNK_BYTES = 1 << 20
 
 

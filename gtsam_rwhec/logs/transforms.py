@@ -19,7 +19,7 @@ Stamps: TypeAlias = NDArray[np.int64]
 
 @dataclass
 class _Link:
-    """T_parent_child over time; a static link has one transform and no stamps."""
+    """T_parent_child over time. A static link has one transform and no stamps."""
 
     parent: str
     child: str
@@ -30,7 +30,7 @@ class _Link:
     sorted: tuple[Stamps, Array] | None = None
 
     def by_stamp(self) -> tuple[Stamps, Array]:
-        """Strictly increasing stamps and their transforms; the last transform of a stamp counts."""
+        """Strictly increasing stamps and their transforms. Of several transforms with one stamp, the last counts."""
         if self.sorted is None:
             stamps = np.array(self.stamps_ns, dtype=np.int64)
             order = np.argsort(stamps, kind="stable")
@@ -49,7 +49,7 @@ class TfBuffer:
                 self.add(record)
 
     def add(self, record: PoseRecord) -> None:
-        """Take a transform; a transform on the topic ``tf_static`` is static.
+        """Take a transform. It is static if its topic is ``tf_static``.
 
         Raises
         ------
@@ -128,7 +128,7 @@ class TfBuffer:
         Returns
         -------
         T : (M, 4, 4)
-            Each moving link interpolated on SE(3) between its neighbours in time, T_i Expmap(tau Log(T_i^-1 T_i+1)).
+            Each moving link is interpolated on SE(3) between its neighbours in time, T_i Expmap(tau Log(T_i^-1 T_i+1)).
         gap_s : (M,)
             The longest time between two such neighbours. It is 0 where each link is static or has a transform at
             the stamp, and infinite where a link has no transform before or after (T then has the nearest).
@@ -148,7 +148,7 @@ class TfBuffer:
         return np.array(T), gap_s
 
     def _links_of(self, parent: str, child: str) -> list[tuple[_Link, bool]]:
-        """The links of the chain; for each link, whether the chain goes from the link's parent to its child."""
+        """The links of the chain. Each comes with whether the chain goes from the link's parent to its child."""
         steps = list(itertools.pairwise(self.chain(parent, child)))
         down = [b in self._links and self._links[b].parent == a for a, b in steps]
         return [(self._links[b if is_down else a], is_down) for (a, b), is_down in zip(steps, down, strict=True)]

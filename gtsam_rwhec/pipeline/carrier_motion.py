@@ -17,7 +17,7 @@ from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: Seconds. If stamps go back by more than this in the order of the log, a clock was set during the recording.
 BACKWARDS_S = 1.0
-#: Nanoseconds. Stamps must be below this (the year 2116): then differences and time offsets fit into 64 bits.
+#: Nanoseconds. Stamps must be below this (the year 2116), so that differences and time offsets fit into 64 bits.
 LATEST_NS = 1 << 62
 
 
@@ -29,7 +29,7 @@ class CarrierMotion:
     noise: CarrierNoise | None
 
     def A_where_known(self, stamps_ns: np.ndarray, max_gap_s: float) -> Array:
-        """A (N, 4, 4) at stamps (N,); nan outside the trajectory and in gaps above `max_gap_s`."""
+        """A (N, 4, 4) at stamps (N,). It is nan outside the trajectory and in gaps above `max_gap_s`."""
         A, gap_s = self.trajectory.at(stamps_ns)
         return np.where((gap_s > max_gap_s)[:, None, None], np.nan, A)
 

@@ -10,11 +10,11 @@ from gtsam_rwhec.logs import Log
 from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig
 from gtsam_rwhec.rig import Rig
 
-#: Keys of a sensor's section that detection depends on.
+#: Detection depends on these keys of a sensor's section.
 DETECTED_BY = ("images", "detections", "intrinsics")
-#: Keys of the section of the carriers that cleaning depends on.
+#: Cleaning depends on these keys of the section of the carriers.
 CLEANED_BY = ("sensors", "targets", "poses", "max_gap_s")
-#: Differences that a message names, at most.
+#: A message names at most this many differences.
 MOST_NAMED = 10
 
 

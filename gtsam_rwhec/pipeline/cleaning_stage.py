@@ -32,7 +32,7 @@ from gtsam_rwhec.results.log_history import CleaningReport
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-#: Nanoseconds; half the time over which the carriers' speed at a stamp is measured.
+#: Nanoseconds. The carriers' speed at a stamp is measured from this time before it to this time after it.
 SPEED_STEP_NS = 20_000_000
 
 
@@ -139,7 +139,7 @@ def clean_track(track: Track, path: Trajectory, rig: Rig, offset_s: float) -> Me
 
 
 def speeds(path: Trajectory, stamps_ns: np.ndarray) -> tuple[Array, Array]:
-    """Turning (rad/s) and moving (m/s) of the carriers at stamps (N,), by central differences of their path."""
+    """How fast the carriers turn (rad/s) and move (m/s) at stamps (N,), by central differences of their path."""
     before, _ = path.at(stamps_ns - SPEED_STEP_NS)
     after, _ = path.at(stamps_ns + SPEED_STEP_NS)
     step = se3.inverse(before) @ after
@@ -151,7 +151,7 @@ def speeds(path: Trajectory, stamps_ns: np.ndarray) -> tuple[Array, Array]:
 
 
 def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track]) -> tuple[float, float | None]:
-    """The time offset of a sensor as stated, or estimated from turning rates; the standard deviation of an estimate."""
+    """A sensor's time offset, as stated or estimated from turning rates, and an estimate's standard deviation."""
     given = rig.sensors[sensor].time_offset
     if given != "estimate":
         return float(given), None
@@ -166,7 +166,7 @@ def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track]) -
 
 
 def _check_overlap(tracks: list[Track], path: Trajectory, sensor: str, offset_s: float) -> None:
-    """Refuse a sensor all of whose stamps are outside the carriers' path; a single target may be outside."""
+    """Refuse a sensor if all its stamps are outside the carriers' path. A single target may be outside."""
     if tracks:
         stamps = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
         synchronise(path, stamps, time_offset_s=offset_s, where=sensor)

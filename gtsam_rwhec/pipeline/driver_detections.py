@@ -1,4 +1,4 @@
-"""The detections of a driver: poses come from its corners and the rig file's sizes, or from the driver."""
+"""The detections of a driver. Poses come from its corners and the rig file's sizes, or from the driver."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from gtsam_rwhec.vision.pose import plane_poses
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import Target
 
-#: Pixels; assumed standard deviation of a driver's corners, which drivers do not state. If the noise is estimated, only
-#: the proportions between covariances count.
+#: A driver's corners are assumed to have this standard deviation (pixels), which drivers do not state. If the noise is
+#: estimated, only the proportions between covariances count.
 CORNER_PX = 0.1
 #: Two sizes are the same if they differ by less than this share: some messages have them in single precision.
 SAME_SIZE = 1e-4
@@ -88,7 +88,7 @@ def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor
 
 
 def _in_our_order(corners_px: np.ndarray) -> np.ndarray:
-    """Corners clockwise in the image, from the driver's first corner: the AprilTag library goes counterclockwise."""
+    """Put corners clockwise in the image, from the driver's first: the AprilTag library goes counterclockwise."""
     first, second = corners_px[2] - corners_px[0], corners_px[3] - corners_px[1]
     clockwise = first[0] * second[1] - first[1] * second[0] > 0.0  # with y down
     return corners_px if clockwise else corners_px[::-1]

@@ -22,7 +22,7 @@ from gtsam_rwhec.vision.many_images import DetectedImage, detect_in_images, meas
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.targets import Target
 
-#: The stamps of a camera are checked after so many images: nobody waits long for a log that cannot be used.
+#: A camera's stamps are checked after these numbers of images, so that nobody waits long for a log of no use.
 CHECKED_AFTER = (10, 100, 1000, 10_000)
 
 
@@ -58,7 +58,7 @@ def _detected(
     workers: int | None,
     progress: Progress,
 ) -> Iterator[DetectedImage]:
-    """The detections of every image, in any order; stamps are checked while images are read."""
+    """The detections of every image, in any order. Stamps are checked while images are read."""
     if not sensor_of:
         return
     stamps: dict[str, list[int]] = defaultdict(list)
@@ -114,7 +114,7 @@ def _of_sensor(log: Log, rig: Rig, sensor: str, images: list[DetectedImage], mot
 def _of_track(
     track: list[tuple[int, Detection]], target: Target, sensor: str, rig: Rig, motion: CarrierMotion
 ) -> tuple[list[DetectionRecord], float | None]:
-    """Each stamped detection of a target with the pose that the whole track supports; the noise of the corners."""
+    """Each stamped detection of a target, with the pose that the whole track supports, and the corners' noise."""
     options = rig.detection_options
     chosen = [0] * len(track)
     rejections = [detection.rejection for _, detection in track]

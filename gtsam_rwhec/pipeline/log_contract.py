@@ -16,31 +16,31 @@ from gtsam_rwhec.logs import Log, Record
 
 Kind = TypeVar("Kind", bound=Record)
 
-#: Topic of the calibrated frames, as static transforms: viewers show them at any time.
+#: This topic has the calibrated frames as static transforms, which viewers show at any time.
 SOLUTION_TOPIC = "/calibration/tf_static"
-#: Topics that detection writes.
+#: Detection writes topics with these names.
 _OF_DETECTION = re.compile(r"/calibration/.+/(detections|annotations|poses)")
-#: Topics that cleaning and solving write.
+#: Cleaning and solving write topics with these names.
 _OF_CLEANING_AND_SOLVING = re.compile(r"/calibration/(.+/pairs|tf_static)")
 
-#: Metadata: the text of the rig file.
+#: This metadata holds the text of the rig file.
 RIG_METADATA = "gtsam_rwhec.rig"
-#: Metadata: the intrinsics of each sensor.
+#: This metadata holds the intrinsics of each sensor.
 CAMERAS_METADATA = "gtsam_rwhec.cameras"
-#: Metadata: the report of detection.
+#: This metadata holds the report of detection.
 DETECTION_METADATA = "gtsam_rwhec.detection"
-#: Metadata: the report of cleaning.
+#: This metadata holds the report of cleaning.
 CLEANING_METADATA = "gtsam_rwhec.cleaning"
-#: Metadata: the certificate, for people who look at the log.
+#: This metadata holds the certificate, for people who look at the log.
 CERTIFICATE_METADATA = "gtsam_rwhec.certificate"
 
-#: File of the output folder that detection writes; it is removed at the end.
+#: Detection writes this file in the output folder. It is removed at the end.
 DETECTED_LOG = "detected.mcap"
-#: File of the output folder that cleaning writes; solving adds its solution.
+#: Cleaning writes this file in the output folder. Solving adds its solution to it.
 CLEAN_LOG = "clean.mcap"
-#: File of the output folder with the result, and name of its copy attached to the solved log.
+#: The result's file in the output folder has this name, and so has its copy attached to the solved log.
 RESULT_FILE = "result.json"
-#: Folder of the pictures, in the output folder.
+#: The pictures are in this folder of the output folder.
 PLOTS_FOLDER = "plots"
 
 
@@ -65,7 +65,7 @@ def pairs_topic(sensor: str) -> str:
 
 
 def is_from_stage(log: Log) -> bool:
-    """Whether a stage wrote the log: only then it has the report of a stage."""
+    """Whether a stage wrote the log. Only then does it have the report of a stage."""
     return bool({DETECTION_METADATA, CLEANING_METADATA} & set(log.metadata()))
 
 
@@ -82,7 +82,7 @@ def topics_up_to_detection(log: Log) -> list[str]:
 
 
 def records_of(log: Log, topics: Iterable[str], kind: type[Kind]) -> Iterator[Kind]:
-    """The records of one kind on some topics, in the order of the log; a topic that the log lacks has none."""
+    """The records of one kind on some topics, in the order of the log. A topic that the log lacks has none."""
     there = {topic.name for topic in log.topics()}.intersection(topics)
     if there:
         yield from (record for record in log.records(there) if isinstance(record, kind))

@@ -9,7 +9,7 @@ from gtsam_rwhec.logs import Log
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 
-#: Tags that belong to no target and that a message names, at most.
+#: A message names at most this many tags that belong to no target.
 MOST_NAMED = 20
 
 
@@ -35,7 +35,7 @@ def no_detections(log: Log, rig: Rig, report: DetectionReport) -> str:
 
 
 def tags_of_any_family(log: Log, rig: Rig) -> dict[str, int]:
-    """Tags of all families in some of the images: in how many images each was. Tags in a single image may be chance."""
+    """Count in how many of some images each tag of any family was. A tag that only a single image has may be chance."""
     seen: Counter[str] = Counter()
     topics = {source.images for source in rig.sensors.values()}
     surveyed = [images for topic, images in read_contents(log).images.items() if topic in topics]

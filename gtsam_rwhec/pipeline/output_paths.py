@@ -29,7 +29,7 @@ def check_is_not_read(log: Log, path: str | Path) -> None:
 
 
 def made_folder(path: str | Path) -> Path:
-    """The folder, which is made if it does not exist; `LogError` if files cannot be written into it."""
+    """Return the folder, made if it does not exist. Raise `LogError` if files cannot be written into it."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -25,12 +25,12 @@ from gtsam_rwhec.report.plots import (
     plot_residuals,
 )
 
-#: File names of the pictures.
+#: The pictures' files have these names.
 FRAMES, RESIDUALS, COVERAGE, DEVIATIONS = "frames.png", "residuals.png", "coverage.png", "deviations.png"
 
 
 def plot_all(solved: Solved, solved_path: str | Path, folder: Path) -> list[Path]:
-    """Draw every picture into an existing folder; their paths. The log at `solved_path` has the corners."""
+    """Draw every picture into an existing folder; return their paths. The log at `solved_path` has the corners."""
     frames = frames_of(solved)
     names = {name: solved.rig.frame_of(name) for name in solved.refined.Y} | {name: name for name in solved.refined.X}
     covariances = {frame: solved.refined.covariance(name) for name, frame in names.items()}
@@ -87,7 +87,7 @@ def scale_of(solved: Solved, target: str) -> float:
 
 
 def plotted_corners(solved: Solved, log: Log) -> dict[str, PlottedCorners]:
-    """By camera: the corners of used detections, and their reprojection errors under the calibration."""
+    """The corners of used detections, and their reprojection errors under the calibration, by camera."""
     path = read_carrier_motion(log, solved.rig).trajectory
     targets = {target.name: target for target in solved.rig.target_list}
     offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}

@@ -19,7 +19,7 @@ from gtsam_rwhec.pipeline.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
 from gtsam_rwhec.results.result_file import parse_result, refined_json
 
-#: Added to the name of a calibrated frame if the raw log has transforms of a frame with this name.
+#: A calibrated frame's name gets this ending if the raw log has transforms of a frame with the same name.
 CALIBRATED = "_calibrated"
 
 

@@ -25,9 +25,9 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.certified_solution import solve
 
 Pairs = dict[Pair, MeasuredPairs]
-#: What a solution is for: to find outliers, to estimate time offsets, or to be the answer.
+#: A solution serves to find outliers, to estimate time offsets, or as the answer.
 Purpose = Literal["outliers", "time offsets", "answer"]
-#: Most rounds that estimate outliers and time offsets, and that compute A again at the new time offsets.
+#: At most this many rounds estimate outliers and time offsets, and compute A again at the new time offsets.
 ROUNDS = 6
 #: Seconds. If no time offset changes by more than this, the rounds end.
 SETTLED_S = 2e-5
@@ -81,7 +81,7 @@ class SolvingRounds:
         return marked
 
     def at(self, pairs: Pairs, offsets_s: Mapping[str, float]) -> SynchronisedPairs:
-        """The pairs with A at new time offsets; pairs of sensors with a stated offset stay as they are."""
+        """The pairs with A at new time offsets. Pairs of sensors with a stated offset stay as they are."""
         path = self.motion.trajectory
         moved = {
             pair: measured.at(path, offsets_s[measured.sensor]) if measured.sensor in self.estimated else measured
@@ -137,7 +137,7 @@ class SolvingRounds:
         return sizes, self.at(given.pairs, marked.offsets_s)
 
     def sizes_as_seen(self, given: SynchronisedPairs) -> tuple[SizeFields, ...]:
-        """Measured scales of sizes that the solver takes as known; empty if the measurements do not determine them."""
+        """Measured scales of sizes that the solver takes as known, if the measurements determine them; else empty."""
         self.progress("looking at the targets' sizes")
         try:
             return self._sizes_in(self.refined(given, self.rig.targets, "time offsets"))
@@ -160,7 +160,7 @@ class SolvingRounds:
 
 
 def sigma_of(refined: Refined, unknown: Unknown) -> float | None:
-    """The standard deviation of a scalar; None if it is infinite."""
+    """The standard deviation of a scalar, or None if it is infinite."""
     variance = float(refined.covariance(unknown)[0, 0])
     return math.sqrt(variance) if math.isfinite(variance) else None
 

@@ -135,7 +135,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
 
 
 def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:
-    """A free size as the answer has it; the answer takes the sizes that are not free as known."""
+    """A free size as the answer has it. The answer takes the sizes that are not free as known."""
     assert not isinstance(refined.scale, float)
     scale = refined.scale[size.target]
     return size.model_copy(update={"scale": scale, "sigma": sigma_of(refined, Unknown(UnknownKind.SCALE, size.target))})

@@ -11,9 +11,9 @@ from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.report.printing import print_heading, print_list
 from gtsam_rwhec.results.log_history import LogFields
 
-#: Standard deviations by which an estimated size must differ from the stated size before it is named.
+#: An estimated size is named if it differs from the stated size by more than this many standard deviations.
 SIZE_SIGMAS = 3.0
-#: Largest difference of the targets' scales that a common cause explains.
+#: A common cause explains the targets' scales if they differ by less than this.
 COMMON_SCALE = 0.005
 #: Unknown tags are named up to this number.
 MOST_NAMED = 10

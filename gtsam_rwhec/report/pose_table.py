@@ -22,7 +22,7 @@ POSE_LEGEND = "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(p
 
 POSE_HEADINGS = ("x m", "y m", "z m", "roll°", "pitch°", "yaw°")
 RESIDUAL_HEADINGS = ("rms mm", "rms°", "n")
-#: Columns of a narrower table.
+#: A narrower table has this many columns.
 SPLIT = len(POSE_HEADINGS)
 
 

@@ -12,9 +12,9 @@ from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.results.verdict import Judgement, Verdict
 from gtsam_rwhec.solving.solution import Solution
 
-#: Columns for tables in a file. Sentences in a file are not wrapped.
+#: Tables in a file have this many columns. Sentences in a file are not wrapped.
 PLAIN_WIDTH = 160
-#: The colour of each verdict.
+#: Each verdict has its colour.
 STYLES = {Verdict.USE: "bold green", Verdict.CARE: "bold yellow", Verdict.DO_NOT_USE: "bold red"}
 
 

@@ -23,7 +23,7 @@ def contradictions(
     targets: Mapping[str, TargetSection],
     detection: Mapping[str, Any],
 ) -> Iterator[Fault]:
-    """Every fault of a rig file's sections: the path of the value, and what is wrong with it."""
+    """Yield every fault of a rig file's sections, as the path of the value and what is wrong with it."""
     yield from _carriers(carriers)
     yield from _sensors(sensors)
     printed = []

@@ -10,13 +10,13 @@ from pydantic import AfterValidator, BeforeValidator
 from gtsam_rwhec.files.yaml_lines import shown
 from gtsam_rwhec.vision.targets import LARGEST_M
 
-#: A frame's name: the characters that it may have.
+#: A frame's name must match this pattern.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*")
-#: Characters of a name, at most.
+#: A name has at most this many characters.
 LONGEST_NAME = 100
-#: Characters of a topic or a path, at most.
+#: A topic or a path has at most this many characters.
 LONGEST_TEXT = 1000
-#: Seconds; larger offsets in nanoseconds do not fit into 64 bits.
+#: Seconds. Offsets are at most this, because larger offsets in nanoseconds do not fit into 64 bits.
 LARGEST_OFFSET_S = 4e9
 
 

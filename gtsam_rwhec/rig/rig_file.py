@@ -14,17 +14,17 @@ from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_tex
 from gtsam_rwhec.rig import sections, target_sections
 from gtsam_rwhec.rig.rig import Rig, RigFile
 
-#: Faults that a message names, at most.
+#: A message names at most this many faults.
 MOST_FAULTS = 20
 
-#: The section of each type of target.
+#: Each type of target has this section.
 _TARGETS: dict[str, type[BaseModel]] = {
     "tag": target_sections.TagTarget,
     "charuco": target_sections.CharucoTarget,
     "aprilgrid": target_sections.AprilGridTarget,
     "checkerboard": target_sections.CheckerboardTarget,
 }
-#: The section at each place; * stands for any name.
+#: Each place has this section; * stands for any name.
 _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     (): RigFile,
     ("carriers",): sections.Carriers,
@@ -35,7 +35,7 @@ _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     ("noise",): sections.DetectionNoise,
     ("cleaning",): sections.Cleaning,
 }
-#: What to do about a fault, by pydantic's name for its kind.
+#: These words say what to do about a fault, by pydantic's name for its kind.
 _KINDS = {
     "float_type": "give a number",
     "int_type": "give a whole number",

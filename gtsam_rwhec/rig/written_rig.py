@@ -13,15 +13,15 @@ from pydantic import BaseModel
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.rig.rig import RigFile
 
-#: Strings that every YAML reader reads as strings without quotes.
+#: Every YAML reader reads these strings as strings without quotes.
 _PLAIN = re.compile(r"(?!(?:true|false|null|yes|no|on|off|y|n)$)[/]?[A-Za-z][A-Za-z0-9_/.]*", re.IGNORECASE)
-#: Column in which comments begin, where the text before them is shorter.
+#: Comments begin in this column if the text before them is shorter.
 _COLUMN = 30
-#: Characters of a line, at most: longer comments stand on lines of their own.
+#: A line has at most this many characters; longer comments stand on lines of their own.
 _WIDTH = 120
-#: Sections that are written key by key, each on its line; all others are written in one line.
+#: These sections are written key by key, each on its line. All others are written in one line.
 _BLOCKS = ("carriers", "sensors", "targets", "detection", "cleaning")
-#: The comment on each line.
+#: Each line gets this comment.
 _REMARKS: dict[KeyPath, str] = {
     ("carriers",): "the frames that carry the sensors and the targets",
     ("carriers", "max_gap_s"): "s; between poses further apart in time nothing is interpolated",
@@ -34,7 +34,7 @@ _REMARKS: dict[KeyPath, str] = {
 
 
 def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
-    """The YAML text of a rig file, with comments; `parse_rig` reads it back equal.
+    """The YAML text of a rig file, with comments. `parse_rig` reads it back equal.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
 
 
 def _lines(items: Iterable[tuple[str, Any]], path: KeyPath = ()) -> Iterator[tuple[KeyPath, str]]:
-    """Each line with its path; values that are not given are left out, except in ``cleaning``."""
+    """Each line with its path. Values that are not given are left out, except in ``cleaning``."""
     indent = "  " * len(path)
     for key, value in items:
         here = (*path, key)

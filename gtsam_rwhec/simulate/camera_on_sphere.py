@@ -25,15 +25,15 @@ from gtsam_rwhec.simulate.simulation import Simulation
 CAMERA = "camera"
 MARKER = "marker"
 
-#: Range of both angles' knots, rad, as in the paper.
+#: Both angles' knots are in this range, rad, as in the paper.
 KNOT_RANGE_RAD = (math.pi / 4.0, 3.0 * math.pi / 4.0)
-#: Time between two poses, s, as in the paper.
+#: Two poses are this far apart in time, s, as in the paper.
 SAMPLE_PERIOD_S = 0.5
-#: Time between two knots, s, as in the paper.
+#: Two knots are this far apart in time, s, as in the paper.
 KNOT_PERIOD_S = 1.0
-#: Distance of the camera from the marker, m, as in the paper.
+#: The camera is at this distance from the marker, m, as in the paper.
 OUTER_RADIUS_M = 1.0
-#: The same for the second half of a monocular path, m, as in the paper.
+#: It is at this distance in the second half of a monocular path, m, as in the paper.
 INNER_RADIUS_M = 0.3
 
 #: The true calibration, as in the paper.

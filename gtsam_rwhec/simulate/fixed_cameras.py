@@ -26,11 +26,11 @@ from gtsam_rwhec.simulate.transforms import rotations_of_vectors
 CAMERAS = ("camera0", "camera1", "camera2", "camera3")
 MARKER = "marker"
 
-#: Coordinates of the marker's grid along each axis of frame i, metres.
+#: The marker's grid has these coordinates along each axis of frame i, metres.
 GRID_M = (-0.6, 0.0, 0.6)
-#: Positions of the cameras in frame i, metres.
+#: The cameras have these positions in frame i, metres.
 CAMERA_POSITIONS_IN_I_M = ((-1.0, 0.0, 0.5), (0.0, 0.0, 1.0), (-1.0, 1.0, 1.0), (-1.0, -1.0, 1.0))
-#: Points in frame i, metres: the marker's z axis points to one of them. They lie on one line.
+#: The marker's z axis points to one of these points in frame i, metres. They lie on one line.
 LOOK_AT_IN_I_M = ((-10.0, -10.0, 0.0), (-7.0, -10.0 / 3.0, 2.0 / 3.0), (-4.0, 10.0 / 3.0, 4.0 / 3.0), (-1.0, 10.0, 2.0))
 
 #: Frame i in the base frame.

@@ -31,7 +31,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate.transforms import random_directions, rotations_of_quaternions, rotations_of_vectors
 
 NoiseModel = Literal["stated", "released"]
-#: The RWHEC paper's section whose rule gives the lengths of released translations.
+#: The rule of this section of the RWHEC paper gives the lengths of released translations.
 Section = Literal["8.1", "8.2"]
 Seed = int | Generator
 

@@ -21,11 +21,11 @@ from gtsam_rwhec.simulate.transforms import random_poses
 
 Value = TypeVar("Value")
 
-#: Largest coordinate of a target in the world, m: a room.
+#: A target's coordinates in the world are at most this, m, as in a room.
 TARGETS_WITHIN_M = 2.0
-#: Largest coordinate of a sensor on the rig, m: a person can carry it.
+#: A sensor's coordinates on the rig are at most this, m, so that a person can carry the rig.
 SENSORS_WITHIN_M = 0.5
-#: Time between two poses of the rig, ns: ten poses a second.
+#: Two poses of the rig are this far apart in time, ns, which gives ten poses a second.
 PERIOD_NS = 100_000_000
 
 

@@ -12,7 +12,7 @@ from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate.noise import Seed
 
-#: alpha of a shared scale, unless it is given; also the scale of the paper's monocular simulations.
+#: A shared scale has this alpha, unless it is given. The paper's monocular simulations have it too.
 SHARED_SCALE = 0.5
 
 

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from matplotlib.collections import PathCollection
     from matplotlib.colors import Colormap
 
-#: Cells along the longer side of an image, for its coverage.
+#: An image's longer side has this many cells for its coverage.
 COVERAGE_CELLS = 16
-#: Cells along the longer side of an image, for mean errors.
+#: An image's longer side has this many cells for mean errors.
 MEAN_CELLS = 10
 #: A mean error is drawn only for a cell with at least this many corners.
 LEAST_CORNERS = 5
-#: Length of the longest arrow, as a share of a cell.
+#: The longest arrow has this length, as a share of a cell.
 ARROW_SHARE = 0.9
 
 

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
 
-#: Markers of the axes x, y, z.
+#: The axes x, y, z have these markers.
 MARKERS = ("o", "s", "^")
-#: Heights of the markers in a frame's row, in rows.
+#: The markers in a frame's row have these heights, in rows.
 HEIGHTS = (-0.22, 0.0, 0.22)
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 #: The palette of Okabe and Ito: people with any form of colour blindness can tell its colours apart.
 BLUE, VERMILLION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 SKY, PURPLE, BLACK, GREY, PALE = "#56B4E9", "#CC79A7", "#000000", "#777777", "#DDDDDD"
-#: Colours of the axes x, y, z of frames.
+#: The axes x, y, z of frames have these colours.
 AXIS_COLOURS = (VERMILLION, GREEN, BLUE)
 AXIS_NAMES = ("x", "y", "z")
 
@@ -42,9 +42,9 @@ STYLE = {
     # Reasons and names come from logs: a "$" in them does not begin a formula.
     "text.parse_math": False,
 }
-#: Longest reason that a legend has room for, characters.
+#: A legend has room for a reason of this many characters.
 LONGEST_REASON = 60
-#: Longest name that a title or an axis has room for, characters.
+#: A title or an axis has room for a name of this many characters.
 LONGEST_NAME = 28
 
 

@@ -29,21 +29,21 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Quantile 0.95 of chi-square with 3 degrees of freedom.
+#: This is the 0.95 quantile of chi-square with 3 degrees of freedom.
 CHI2_95 = 7.814727903251179
-#: Length of a frame's axes, as a share of the scene.
+#: A frame's axes have this length, as a share of the scene.
 AXIS_SHARE = 0.1
-#: Semi-axis of the largest ellipsoid, as a share of the scene.
+#: The largest ellipsoid's semi-axis has this length, as a share of the scene.
 ELLIPSE_SHARE = 0.07
-#: Room around the scene, as a share of it.
+#: The room around the scene is this share of it.
 MARGIN_SHARE = 0.1
 #: The carrier's origin is left out when its distance is more than this many times the spread of the frames.
 FAR_ORIGIN = 5.0
 #: Frames with a smaller spread (m) are drawn as if they were in one place.
 SMALLEST_M = 1e-6
-#: Size of the names, points.
+#: The names have this size, in points.
 NAME_SIZE = 8.5
-#: Places that textalloc tries for each name.
+#: textalloc tries this many places for each name.
 PLACES = 500
 
 

@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.lines import Line2D
 
-#: Markers and colours of the most frequent reasons; the other reasons share `REST`.
+#: The most frequent reasons have these markers and colours; the other reasons share `REST`.
 SYMBOLS = (("x", VERMILLION), ("^", ORANGE), ("s", GREEN), ("D", PURPLE), ("v", SKY), ("+", BLACK))
 REST = ("1", GREY)
-#: Legend of `REST`.
+#: The legend has this text for `REST`.
 OTHER = "other reasons"
-#: Height of the measurements whose residual is not known, as a share of the axes.
+#: Measurements whose residual is not known are drawn at this height, as a share of the axes.
 UNKNOWN_AT = 0.04
-#: Legend of the measurements whose residual is not known.
+#: The legend has this text for measurements whose residual is not known.
 UNKNOWN = "(on the lower edge: residual not known)"
-#: Reason that is written if a measurement has none.
+#: This reason is written if a measurement has none.
 NO_REASON = "not used"
 
 
@@ -121,7 +121,7 @@ def _draw(
 
 
 def _limits(values: Array, inlier: np.ndarray) -> tuple[float, float]:
-    """Ends of the axis: up to the largest residual, and down to a hundredth of the median of the used residuals."""
+    """The axis ends at the largest residual, and begins at a hundredth of the median of the used residuals."""
     positive = values[np.isfinite(values) & (values > 0.0)]
     if not len(positive):
         return 0.1, 10.0
