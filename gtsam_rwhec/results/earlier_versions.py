@@ -6,10 +6,14 @@ Version 1 had no ``refined``, version 2 had no ``log``, and no version had a ver
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
 
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind
+from gtsam_rwhec.results.json_tree import in_words
 from gtsam_rwhec.results.log_history import OutlierCount, contradictions
 from gtsam_rwhec.solver.cause import Cause, SearchPath
 
@@ -18,12 +22,127 @@ FIRST_VERSION = 1
 _RESIDUAL = ("translation_rms_m", "rotation_rms_rad")
 
 
+class _Fields(BaseModel):
+    """The fields that the conversion reads, under their old names. The rest is checked as fields of version 4."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+class _Certificate(_Fields):
+    reason: str
+    objective: str
+    path: str
+
+
+class _Part(_Fields):
+    certificate: _Certificate
+
+
+class _Scale(_Fields):
+    mode: Any
+    value: Any
+    by_frame: Any
+
+
+class _Determined(_Fields):
+    free_directions: list[str]
+
+
+class _Pair(_Determined):
+    target: str
+    sensor: str
+    number_of_measurements: Any
+    translation_rms_m: Any
+    rotation_rms_rad: Any
+
+
+class _Frame(_Fields):
+    name: str
+    moved_mm: Any
+    moved_deg: Any
+
+
+class _Noise(_Fields):
+    target: str
+    sensor: str
+    redundancy: Any
+    noise_rad: Any
+    noise_m: Any
+    inliers: Any
+
+
+class _Unknown(_Fields):
+    name: str
+    rows: int
+
+
+def _lower_triangle(rows: list[list[float]]) -> list[list[float]]:
+    for i, row in enumerate(rows):
+        if len(row) != i + 1:
+            raise ValueError(f"row {i} must have {i + 1} numbers, a lower triangle (found {len(row)})")
+    return rows
+
+
+class _Joint(_Fields):
+    unknowns: list[_Unknown]
+    finite: Annotated[list[list[float]], AfterValidator(_lower_triangle)]
+    free: list[list[float]]
+    units: Any
+
+    @model_validator(mode="after")
+    def _directions_fit(self) -> _Joint:
+        for k, direction in enumerate(self.free):
+            if len(direction) != len(self.finite):
+                raise ValueError(f"free[{k}] must have {len(self.finite)} numbers (found {len(direction)})")
+        return self
+
+
+class _Refined(_Determined):
+    targets: Any
+    sensors: Any
+    scale: _Scale
+    frames: list[_Frame]
+    pairs: list[_Noise]
+    joint: _Joint
+
+
+class _Outliers(_Fields):
+    target: str
+    sensor: str
+    used: int
+    removed: dict[str, int]
+
+
+class _Log(_Fields):
+    outliers: list[_Outliers]
+    contradicted: list[str] = []
+
+
+class _Earlier(_Fields):
+    """A file of versions 1 to 3."""
+
+    written_by: Any
+    conventions: Any
+    targets: Any
+    sensors: Any
+    scale: _Scale
+    certificate: _Certificate
+    identifiability: _Determined
+    pairs: list[_Pair]
+    parts: list[_Part]
+    refined: _Refined | None = None
+    log: _Log | None = None
+
+
 def as_version_4(raw: dict[str, Any]) -> dict[str, Any]:
     """Move a file's fields to their places in version 4.
 
-    Raises `ValueError`, `KeyError`, `TypeError` or `AttributeError` if a field is missing, or is of another type than
-    its version says.
+    Raises `ValueError` if a field that it reads is missing, or is of another type than its version says.
     """
+    try:
+        _Earlier.model_validate_json(json.dumps(raw))
+    except ValidationError as error:
+        raise ValueError(in_words(error, moved=()).removesuffix(".")) from error
     heading = ("format", "format_version", "written_by", "conventions", "refined", "log")
     certified = {name: value for name, value in raw.items() if name not in heading}
     rows = certified.pop("pairs")
@@ -72,7 +191,14 @@ def _log(log: dict[str, Any]) -> dict[str, Any]:
         OutlierCount(**_only(row, "target", "sensor", "used"), left_out=sum(row["removed"].values()))
         for row in log["outliers"]
     ]
-    records = {"outliers": outliers, "contradicted": contradictions(outliers)}
+    contradicted = contradictions(outliers)
+    named = log.get("contradicted")  # the first files of version 3 name none
+    if named is not None and set(named) != {counts.frame for counts in contradicted}:
+        frames = ", ".join(counts.frame for counts in contradicted) or "none"
+        raise ValueError(
+            f"$.log.contradicted: must be {frames}, by $.log.outliers (found {', '.join(named) or 'none'})"
+        )
+    records = {"outliers": outliers, "contradicted": contradicted}
     return {**log, **{name: [record.model_dump() for record in made] for name, made in records.items()}}
 
 

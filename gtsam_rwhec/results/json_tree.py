@@ -85,15 +85,16 @@ def from_json(value: Any, place: str, field: str) -> Any:
     return INFINITIES[field] if value is None and field in INFINITIES else value
 
 
-def in_words(error: Exception) -> str:
-    """What is wrong with a file: of pydantic's error, each fault with its JSON path, the first three in full."""
-    if isinstance(error, KeyError):
-        return f"it lacks {error}."
+def in_words(error: Exception, moved: tuple[str, ...] = POSED) -> str:
+    """What is wrong with a file: of pydantic's error, each fault with its JSON path, the first three in full.
+
+    ``moved`` are the fields that were moved from the top of the file into ``refined`` before the check.
+    """
     if not isinstance(error, ValidationError):
         return f"{error}."
     faults = []
     for fault in error.errors(include_url=False):
-        keys = fault["loc"][1:] if fault["loc"][:2] in [("refined", name) for name in POSED] else fault["loc"]
+        keys = fault["loc"][1:] if fault["loc"][:2] in [("refined", name) for name in moved] else fault["loc"]
         place = "$" + "".join(_step(key) for key in keys)
         given = repr(fault["input"])
         value = f" (found {given})" if len(given) <= 60 and fault["type"] != "missing" else ""

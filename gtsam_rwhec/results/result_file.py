@@ -169,8 +169,10 @@ def parse_result(content: bytes, path: str | Path) -> Result:
         result = _result_of(file)
         if number == FORMAT_VERSION:  # earlier versions had no verdict
             check_verdict(file.verdict, judge(result.solution, result.refined, result.log).verdict)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        of_version = "" if number == FORMAT_VERSION else f" of version {number} (places are those of {FORMAT_VERSION})"
+    except ValueError as error:
+        of_version = (
+            "" if number == FORMAT_VERSION else f" of version {number} (converted places are those of {FORMAT_VERSION})"
+        )
         raise FileFormatError(f"{path} is not a valid result{of_version}: {in_words(error)}") from error
     return result
 

@@ -104,6 +104,31 @@ def test_version_3_counted_outliers_by_reason_and_only_named_contradicted_frames
     assert (log.contradicted[0].frame, log.contradicted[0].left_out) == (first["sensor"], 2 * first["used"])
 
 
+@pytest.mark.parametrize("contradicted", [["cam_front"], ["nobody"], []])
+def test_contradicted_frames_must_be_those_of_the_counts(contradicted: list[str], tmp_path: Path) -> None:
+    _, raw = stored(3)
+    side = raw["log"]["outliers"][1]
+    side["removed"] = {"outlier (robust estimation)": 2 * side["used"]}
+    raw["log"]["contradicted"] = contradicted
+    (tmp_path / "result.json").write_text(json.dumps(raw), encoding="utf-8")
+    said = (
+        rf"\$\.log\.contradicted: must be cam_side, by \$\.log\.outliers \(found {', '.join(contradicted) or 'none'}\)"
+    )
+    with pytest.raises(rw.errors.FileFormatError, match=said):
+        rw.read_solution(tmp_path / "result.json")
+
+
+def test_the_first_files_of_version_3_did_not_name_contradicted_frames(tmp_path: Path) -> None:
+    _, raw = stored(3)
+    side = raw["log"]["outliers"][1]
+    side["removed"] = {"outlier (robust estimation)": 2 * side["used"]}
+    del raw["log"]["contradicted"]
+    (tmp_path / "result.json").write_text(json.dumps(raw), encoding="utf-8")
+    log = read_result(tmp_path / "result.json").log
+    assert log is not None
+    assert [counts.frame for counts in log.contradicted] == ["cam_side"]
+
+
 def test_version_1_was_not_refined() -> None:
     with pytest.raises(rw.errors.FileFormatError, match="was not refined"):
         rw.read_refined(stored(1)[0])
@@ -112,10 +137,29 @@ def test_version_1_was_not_refined() -> None:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (lambda raw: raw.pop("pairs"), "it lacks 'pairs'"),
+        (lambda raw: raw.pop("pairs"), r"\$\.pairs: Field required"),
         (lambda raw: raw["certificate"].pop("cost"), r"\$\.certified\.certificate\.cost: Field required"),
         (lambda raw: raw["sensors"][0].update(child=7), r"\$\.certified\.sensors\[0\]\.child"),
         (lambda raw: raw.update(extra=1), "extra"),
+        (lambda raw: raw.update(refined=3), r"\$\.refined: .*\(found 3\)"),
+        (lambda raw: raw.update(refined=[]), r"\$\.refined: .*\(found \[\]\)"),
+        (lambda raw: raw.update(refined="xx"), r"\$\.refined: .*\(found 'xx'\)"),
+        (lambda raw: raw.update(parts=3), r"\$\.parts: .*\(found 3\)"),
+        (lambda raw: raw.update(certificate="xx"), r"\$\.certificate: .*\(found 'xx'\)"),
+        (lambda raw: raw["pairs"].__setitem__(0, 3), r"\$\.pairs\[0\]: .*\(found 3\)"),
+        (lambda raw: raw["refined"].update(scale=3), r"\$\.refined\.scale: .*\(found 3\)"),
+        (lambda raw: raw["refined"]["frames"][0].pop("name"), r"\$\.refined\.frames\[0\]\.name: Field required"),
+        (lambda raw: raw["refined"]["joint"]["unknowns"][0].update(rows="6"), r"joint\.unknowns\[0\]\.rows: .*'6'"),
+        (lambda raw: raw["refined"]["joint"].update(finite=3), r"\$\.refined\.joint\.finite: .*\(found 3\)"),
+        (
+            lambda raw: raw["refined"]["joint"]["finite"].pop(0),
+            r"\$\.refined\.joint\.finite: row 0 must have 1 .*found 2",
+        ),
+        (lambda raw: raw["refined"]["joint"]["finite"].pop(), r"\$\.refined\.joint: slots have 19 rows"),
+        (
+            lambda raw: raw["refined"]["joint"]["free"].append([0.0]),
+            r"joint: free\[0\] must have 19 numbers \(found 1\)",
+        ),
     ],
 )
 def test_damage_is_refused_with_the_version(damage: Any, said: str, tmp_path: Path) -> None:
