@@ -20,6 +20,7 @@ from gtsam_rwhec.refinement.refined import PairNoise
 from gtsam_rwhec.report import print_refined
 from gtsam_rwhec.report.covariance_report import (
     deviation_cells,
+    legend,
     noise_table,
     refined_sentences,
     scale_and_offset_sentences,
@@ -198,8 +199,10 @@ def test_noise_by_sensor_and_by_pair_in_a_table(rig: rw.Refined) -> None:
 def test_it_says_whether_the_carriers_are_taken_for_exact(rig: rw.Refined) -> None:
     (sentence,) = [s for s in refined_sentences(rig) if s.startswith("Noise of A")]
     assert sentence.startswith("Noise of A: none, the carriers' poses count as exact")
+    assert legend(rig).endswith("moved: how far the refinement moved the pose.")
     noise = rw.CarrierNoise(rotation_rad=math.radians(0.3), translation_m=0.002)
     options = dataclasses.replace(rig.options, carrier_noise=noise)
+    assert legend(dataclasses.replace(rig, options=options)).endswith("; it adds the noise of A.")
     sentences = refined_sentences(dataclasses.replace(rig, options=options))
     assert "Noise of A: 0.3° and 2 mm for each axis of the target carrier, as given." in sentences
 
