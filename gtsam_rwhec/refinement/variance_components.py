@@ -182,7 +182,7 @@ def _check(group: Group, component: str, degrees_of_freedom: float, weighed: flo
             f"the {component} noise of {where} cannot be estimated: the noise given for A already explains the "
             "residuals. Give less noise of A, or give sigma and kappa of B (noise='given')"
         )
-    joined = "" if group == ("all",) else "join groups (noise_groups='all'), "
+    joined = "" if group is None else "join groups (noise_groups='all'), "
     raise NoiseError(
         f"the {component} noise of {where} cannot be estimated with {degrees_of_freedom:.2g} degrees of freedom. "
         f"Measure more, {joined}give less noise of A if you gave any, or give sigma and kappa (noise='given')"

@@ -16,8 +16,8 @@ from gtsam_rwhec.refinement.pair_data import PairData
 #: The two components of a measurement's noise.
 Component = Literal["rotation", "translation"]
 COMPONENTS: tuple[Component, Component] = ("rotation", "translation")
-#: Pairs that share a variance factor: ("all",), (sensor,) or (target, sensor).
-Group = tuple[str, ...]
+#: Pairs that share a variance factor: one pair, all pairs of the sensor with this name, or all pairs (None).
+Group = Pair | str | None
 #: The variance factors of each pair.
 FactorsByPair = dict[Pair, VarianceFactors]
 
@@ -31,15 +31,13 @@ def largest_change(before: FactorsByPair, after: FactorsByPair) -> float:
 def group_of(pair: Pair, groups: NoiseGroups) -> Group:
     """The group that a pair is in."""
     if groups == "all":
-        return ("all",)
-    return (pair.sensor,) if groups == "sensor" else pair
+        return None
+    return pair.sensor if groups == "sensor" else pair
 
 
 def group_label(group: Group) -> str:
     """The group's name in messages."""
-    if group == ("all",):
-        return "the measurements"
-    return str(Pair(*group)) if len(group) == 2 else group[0]
+    return "the measurements" if group is None else str(group)
 
 
 def measurement_covariance(data: PairData, factors: VarianceFactors) -> Array:

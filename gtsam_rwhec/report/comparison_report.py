@@ -41,8 +41,7 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
         print_sentence(console, f"No lower bound of the cost: {comparison.error}", "bold red")
     else:
         style = "bold green" if comparison.certificate.is_certified else "bold red"
-        sentence = certificate_sentence(comparison.certificate).replace("this answer", "the certified answer", 1)
-        print_sentence(console, sentence, style)
+        print_sentence(console, certificate_sentence(comparison.certificate, "the certified answer"), style)
     if comparison.solution is not None:
         print_advice(console, comparison.solution.identifiability.free_directions)
     console.print()

@@ -12,6 +12,7 @@ from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.geometry.pose_covariances import standard_deviations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.refinement.options import About
 from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.refinement.unknowns import UnknownKind
 from gtsam_rwhec.report.advice import print_advice
@@ -23,6 +24,8 @@ from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.verdict import judge
 
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
+#: The carrier that has the noise of A.
+CARRIERS: dict[About, str] = {"targetcarrier": "target carrier", "sensorcarrier": "sensor carrier"}
 LEGEND = (
     "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation, along "
     "and about the axes of the frame itself; free: infinite, because the measurements leave a direction free. moved: "
@@ -144,7 +147,7 @@ def _carrier_noise_sentence(refined: Refined) -> str:
         return "Noise of A: the covariances given for each measurement."
     return (
         f"Noise of A: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm for each axis "
-        f"of the {noise.about.removesuffix('carrier')} carrier, as given."
+        f"of the {CARRIERS[noise.about]}, as given."
     )
 
 

@@ -10,10 +10,10 @@ from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solving.solution import Solution
 
 
-def certificate_sentence(certificate: Certificate) -> str:
-    """What the certificate proves about the cost."""
+def certificate_sentence(certificate: Certificate, answer: str = "this answer") -> str:
+    """What the certificate proves about the cost of the answer, which the sentence calls ``answer``."""
     proof = (
-        f"this answer costs {certificate.cost:.10g}, and no answer can cost less than {certificate.lower_bound:.10g} "
+        f"{answer} costs {certificate.cost:.10g}, and no answer can cost less than {certificate.lower_bound:.10g} "
         f"(relative gap {certificate.relative_gap:.1e}; {certificate.path.words})"
     )
     if certificate.status is Status.CERTIFIED:
@@ -22,7 +22,7 @@ def certificate_sentence(certificate: Certificate) -> str:
         return f"Certified, but not unique: {proof}; other answers fit equally well, up to noise."
     if certificate.status is Status.GAP:
         return f"Not certified: {proof}; {certificate.reason}."
-    return f"Not certified: this answer costs {certificate.cost:.10g}; {certificate.reason}."
+    return f"Not certified: {answer} costs {certificate.cost:.10g}; {certificate.reason}."
 
 
 def part_sentences(solution: Solution) -> Iterator[str]:
