@@ -114,6 +114,7 @@ def certify(
     -------
     Certificate
         It is about the answer as given. ``Cause.BETTER_ANSWER`` means that the search found a better answer.
+        ``Cause.NO_BOUND`` means that it found no finite lower bound, whether it found a better answer or not.
 
     Raises
     ------
@@ -138,7 +139,9 @@ def certify(
         cause, figures = best.cause, best.figures
         if gap < -tolerance:
             cause, figures = Cause.BELOW_BOUND, {"reduced_bound": found.bound.lower_bound}
-        elif cost - found.cost > tolerance or (gap > tolerance and best.is_optimal):
+        elif best.cause is not Cause.NO_BOUND and (
+            cost - found.cost > tolerance or (gap > tolerance and best.is_optimal)
+        ):
             cause, figures = Cause.BETTER_ANSWER, {"better_cost": found.cost}
         # The bound holds to the last digit of the stored form; the cost of the given answer has rounding of its own.
         lower, floating = min(best.lower_bound, cost), min(best.float_bound, cost)

@@ -16,7 +16,8 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotCertifiedWarning, RwhecWarning, WeightsWarning
 from gtsam_rwhec.simulate import Motion, Noise, Simulation, general
 from gtsam_rwhec.simulate.transforms import random_poses
-from gtsam_rwhec.solver import Cause, Start
+from gtsam_rwhec.solver import Cause, Start, search
+from gtsam_rwhec.solver.bound import Bound
 from gtsam_rwhec.solver.parts import parts_of
 
 NOISE = Noise(0.02, 300.0)
@@ -207,6 +208,17 @@ def test_an_answer_beside_the_optimum_is_not(mode: str, size: float) -> None:
     assert certificate.cause is Cause.BETTER_ANSWER
     assert certificate.gap == pytest.approx(certificate.cost - certificate.lower_bound)
     assert certificate.relative_gap == pytest.approx(certificate.gap / certificate.cost)
+
+
+def test_without_a_bound_a_worse_answer_is_not_called_a_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gap needs a bound. No measurements are known that have none, so the search is given the record of none."""
+    problem = simulated("known").problem
+    best = rw.solve(problem)
+    monkeypatch.setattr(search, "lower_bound", lambda *_: Bound())
+    for size in (0.0, 0.1):
+        certificate = rw.certify(problem, X=perturbed(best.X, size, 3), Y=best.Y)
+        assert (certificate.status, certificate.cause) == (rw.Status.FAILED, Cause.NO_BOUND)
+        assert certificate.lower_bound == -np.inf
 
 
 @pytest.mark.parametrize("mode", ["shared", "per_target"])
