@@ -10,8 +10,8 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 
-#: A sentence leaves out a frame whose share is below this part of the largest share. A direction of length 1 that
-#: turns the frames by less than this (in rad) is a translation.
+#: A turn, a shift or a change takes no part in a direction if it is at most this part of the direction's largest. A
+#: direction of length 1 that turns the frames by less than this (in rad) is a translation.
 SHARE = 0.05
 #: A sentence names at most this many frames and counts the rest.
 NAMED = 4
@@ -70,18 +70,20 @@ class FreeDirection:
     """A direction in which the answer can move without a change of the residuals larger than the noise.
 
     The direction has length 1, where a rotation of 1 rad, a translation of ``length_m``, a scale times e, and a time
-    offset of 1 s each count as 1. Its sign is arbitrary. ``str()`` is a sentence.
+    offset of 1 s each count as 1. Its sign is arbitrary. ``str()`` is a sentence. The hash is of
+    the fields that are not dicts.
 
     Attributes
     ----------
     kind : FreeKind
     frames : dict of str to (omega_x, omega_y, omega_z, v_x, v_y, v_z)
         How each frame that takes part moves. It is the right perturbation T Expmap(xi) in GTSAM's order, in rad and m,
-        in the frame's own axes.
+        in the frame's own axes. A frame takes no part if its turn and its shift are at most ``SHARE`` of the largest
+        turn, shift or change.
     scale : float
         Change of the logarithm of the shared scale.
     own_scales : dict of str to float
-        Change of the logarithm of each target's own scale.
+        Change of the logarithm of each own scale that takes part.
     time_offsets_s : dict of str to float
         Change of each sensor's time offset, in s.
     length_m : float
@@ -94,10 +96,10 @@ class FreeDirection:
 
     kind: FreeKind
     reason: FreeReason | None
-    frames: dict[str, Twist] = field(default_factory=dict)
+    frames: dict[str, Twist] = field(default_factory=dict, hash=False)
     scale: float = 0.0
-    own_scales: dict[str, float] = field(default_factory=dict)
-    time_offsets_s: dict[str, float] = field(default_factory=dict)
+    own_scales: dict[str, float] = field(default_factory=dict, hash=False)
+    time_offsets_s: dict[str, float] = field(default_factory=dict, hash=False)
     length_m: float = 1.0
     words: str = ""
 
@@ -143,21 +145,19 @@ def reason_for(axes: int, turned_rad: float, residual_rad: float) -> FreeReason:
     return (FreeReason.NO_ROTATION, FreeReason.ONE_AXIS, FreeReason.NOISE)[axes]
 
 
-def free_directions_of(
-    names: tuple[str, ...], basis: Array, length_m: float, reasons: Mapping[str, FreeReason]
-) -> tuple[FreeDirection, ...]:
-    """Records of the free directions that a basis spans, one for each column and each as sparse as possible.
+def sparse_basis(basis: Array, length_m: float) -> Array:
+    """Another basis (7 n + 1, k) of the same free directions. Each column is as sparse as possible and has length 1.
 
-    Directions that turn frames come first, then changes of scales, then translations.
-    ``basis`` (7 n + 1, k): free directions of the frames ``names``, [omega (rad), v (m), log own scale] for each frame,
-    then the shared scale's logarithm. ``length_m``: how many metres count as one radian. ``reasons``: the reason of
-    each frame, from ``reason_for``.
+    Columns that turn frames come first, then changes of scales, then translations.
+    ``basis`` (7 n + 1, k): free directions of n frames, [omega (rad), v (m), log own scale] for each frame, then the
+    shared scale's logarithm. ``length_m``: how many metres count as one radian.
     """
     if basis.shape[1] == 0:
-        return ()
-    unit = np.r_[np.tile(np.r_[np.ones(3), np.full(3, length_m), 1.0], len(names)), 1.0]
+        return basis
+    frames = len(basis) // 7
+    unit = _units(frames, length_m)
     weighed, _ = np.linalg.qr(basis / unit[:, None])
-    row = np.tile(np.arange(7), len(names))
+    row = np.tile(np.arange(7), frames)
     is_turn, is_scale = np.r_[row < 3, False], np.r_[row == 6, True]
     # The right singular vectors of the rotations' rows separate directions that turn frames from the rest.
     _, s, Vt = np.linalg.svd(weighed[is_turn], full_matrices=True)
@@ -165,9 +165,29 @@ def free_directions_of(
     turns[: len(s)] = s > SHARE
     turned = _sparse(weighed @ Vt[turns].T, [is_turn])
     still = _sparse(weighed @ Vt[~turns].T, [is_scale, ~is_turn])
-    return tuple(
-        _record(names, column, length_m, reasons, is_turn, is_scale) for column in np.hstack([turned, still]).T
-    )
+    columns = np.hstack([turned, still])
+    columns /= np.linalg.norm(columns, axis=0)
+    columns[np.abs(columns) < 1e-12] = 0.0  # rounding
+    columns *= np.sign(np.take_along_axis(columns, np.abs(columns).argmax(axis=0)[None], axis=0))
+    sparse: Array = columns * unit[:, None]
+    return sparse
+
+
+def free_directions_of(
+    names: tuple[str, ...], basis: Array, length_m: float, reasons: Mapping[str, FreeReason]
+) -> tuple[FreeDirection, ...]:
+    """A record of each column of a ``sparse_basis`` of the frames ``names``, with what takes part in it.
+
+    ``reasons``: the reason of each frame, from ``reason_for``.
+    """
+    weighed = basis / _units(len(names), length_m)[:, None]
+    return tuple(_record(names, column, length_m, reasons) for column in weighed.T)
+
+
+def _units(frames: int, length_m: float) -> Array:
+    """The unit of each row of a basis: 1 rad, ``length_m`` metres, a scale times e."""
+    unit: Array = np.r_[np.tile(np.r_[np.ones(3), np.full(3, length_m), 1.0], frames), 1.0]
+    return unit
 
 
 def _sparse(columns: Array, rows_first: list[np.ndarray]) -> Array:
@@ -189,35 +209,30 @@ def _sparse(columns: Array, rows_first: list[np.ndarray]) -> Array:
     return np.column_stack([*done.values(), columns]) if done else columns
 
 
-def _record(
-    names: tuple[str, ...],
-    column: Array,
-    length_m: float,
-    reasons: Mapping[str, FreeReason],
-    is_turn: np.ndarray,
-    is_scale: np.ndarray,
-) -> FreeDirection:
-    column = column / np.linalg.norm(column)
-    column = np.where(np.abs(column) < 1e-12, 0.0, column)  # rounding
-    column *= np.sign(column[np.abs(column).argmax()])
-    of_frame = column[:-1].reshape(-1, 7)
-    least = SHARE * np.abs(column).max()
-    if np.abs(column[is_turn]).max() > least:
-        kind = FreeKind.ROTATION
-    else:
-        kind = FreeKind.SCALE if np.abs(column[is_scale]).max() > least else FreeKind.TRANSLATION
-    taking_part = [reasons[name] for name, part in zip(names, of_frame, strict=True) if np.abs(part).max() > least]
+def _record(names: tuple[str, ...], column: Array, length_m: float, reasons: Mapping[str, FreeReason]) -> FreeDirection:
+    of_frame, shared = column[:-1].reshape(-1, 7), column[-1]
+    # What takes part: turns, shifts and own scales of the frames (n, 3), and the shared scale.
+    sizes = np.sqrt(np.add.reduceat(of_frame**2, (0, 3, 6), axis=1))
+    least = SHARE * max(sizes.max(initial=0.0), abs(shared))
+    takes_part = sizes > least
+    of_frame = np.where(np.repeat(takes_part, (3, 3, 1), axis=1), of_frame, 0.0)
+    shared = shared if abs(shared) > least else 0.0
+    length = np.hypot(np.linalg.norm(of_frame), shared)
+    of_frame, shared = of_frame / length, shared / length
+    turns, shifts, own = takes_part.T
+    without_turn = FreeKind.SCALE if own.any() or shared else FreeKind.TRANSLATION
+    kind = FreeKind.ROTATION if turns.any() else without_turn
+    taking_part = [reasons[name] for name, parts in zip(names, takes_part, strict=True) if parts.any()]
     reason = min(taking_part, key=list(FreeReason).index, default=FreeReason.NOISE)
-    if kind is FreeKind.SCALE and reason is FreeReason.NOISE:
+    if kind is FreeKind.SCALE and reason is FreeReason.NOISE and shifts.any():
         reason = FreeReason.COMPENSATED
     metric = np.repeat([1.0, length_m], 3)
-    frames = {name: part[:6] * metric for name, part in zip(names, of_frame, strict=True) if part[:6].any()}
     return FreeDirection(
         kind=kind,
         reason=reason,
-        frames={name: _twist(xi) for name, xi in frames.items()},
-        scale=float(column[-1]) + 0.0,
-        own_scales={name: float(part[6]) for name, part in zip(names, of_frame, strict=True) if part[6]},
+        frames={names[i]: _twist(of_frame[i, :6] * metric) for i in np.flatnonzero(turns | shifts)},
+        scale=float(shared) + 0.0,
+        own_scales={names[i]: float(of_frame[i, 6]) for i in np.flatnonzero(own)},
         length_m=length_m,
     )
 

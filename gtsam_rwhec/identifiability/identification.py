@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.free_directions import FreeReason, free_directions_of, reason_for
+from gtsam_rwhec.identifiability.free_directions import FreeReason, free_directions_of, reason_for, sparse_basis
 from gtsam_rwhec.identifiability.information import (
     Information,
     PairInformation,
@@ -71,6 +71,15 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
     J_t and J_R (E,) are the costs of the pairs at the answer ``poses``, in the physical model; the noise is estimated
     from them.
     """
+    return identify_with_basis(part, poses, J_t, J_R)[0]
+
+
+def identify_with_basis(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> tuple[Identifiability, Array]:
+    """``identify``, and the free directions with their small shares, which the records leave out.
+
+    The basis (7 n + 1, k) has a column for each record: [omega (rad), v (m), log own scale] for each of ``part.free``,
+    then the shared scale's logarithm. It spans exactly what is free.
+    """
     noise = variance_factors(part, J_t, J_R)
     pairs = pair_information(part, poses, noise)
     length = typical_length(part)
@@ -83,8 +92,9 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
         name: reasons[max((a, e) for e, (a, pair) in enumerate(zip(axes, part.pairs, strict=True)) if name in pair)[1]]
         for name in part.free
     }
-    free = free_directions_of(part.free, weak.directions[:, weak.free], length, of_frame)
-    return Identifiability(
+    basis = sparse_basis(weak.directions[:, weak.free], length)
+    free = free_directions_of(part.free, basis, length, of_frame)
+    known = Identifiability(
         is_unique=not free,
         free_directions=free,
         weakest=float(weak.values[0]) if len(weak.values) else np.inf,
@@ -92,6 +102,7 @@ def identify(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> Identifiab
         pairs=_pairs(part, pairs, noise.degrees_of_freedom, axes, reasons, length),
         parts=(part.names,),
     )
+    return known, basis
 
 
 def _weakest_of_part(part: Part, pairs: PairInformation, degrees_of_freedom: int) -> _Weak:
@@ -232,9 +243,8 @@ def _pairs(
         if not free.any() and axes[e] < 2 and len(ends) == 2:
             free[rest[e].argmin()] = True  # Corollary 4: a pair that turns about one axis leaves a direction free
         rows = [first + k for first in ends.values() for k in range(7)] + [14]
-        directions_free = free_directions_of(
-            tuple(ends), directions[e][rows][:, free], length, dict.fromkeys(ends, reasons[e])
-        )
+        basis = sparse_basis(directions[e][rows][:, free], length)
+        directions_free = free_directions_of(tuple(ends), basis, length, dict.fromkeys(ends, reasons[e]))
         weakest = float(min(rest[e].min(), turning[e].min() if settled[e] else np.inf))
         result[pair] = PairIdentifiability(
             not free.any(), directions_free, axes[e], int(counts[e]), weakest, float(threshold[e])

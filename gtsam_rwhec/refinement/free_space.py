@@ -8,7 +8,7 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind, FreeReason
-from gtsam_rwhec.identifiability.identification import identify, typical_length
+from gtsam_rwhec.identifiability.identification import identify_with_basis, typical_length
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind, slots_of
 from gtsam_rwhec.refinement.variables import State, Variables
@@ -31,7 +31,7 @@ class FreeSpace:
     Attributes
     ----------
     basis : (d, k) array
-        The directions over ``Variables.unknowns``.
+        The directions over ``Variables.unknowns``, with the small shares that the records leave out.
     directions : tuple of FreeDirection
         The same directions as records.
     unit : (d,) array
@@ -61,6 +61,7 @@ def free_space_of(
     size = sum(unknown.dimension for unknown in slots)
     unit = np.ones(size)
     directions: list[FreeDirection] = []
+    columns = [np.zeros((size, 0))]
     for part in parts:
         answer = given_answer(part, state.X, state.Y, _scales_of(part, state))
         poses = PairPoses.of(part, answer)
@@ -68,25 +69,29 @@ def free_space_of(
         if fitted is not None:  # the costs that these factors predict, 3 / 2 for each measurement
             factors = np.array([fitted[pair] for pair in part.pairs])
             J_R, J_t = 1.5 * part.moments.count * factors[:, 0], 1.5 * part.moments.count * factors[:, 1]
-        directions += identify(part, poses, J_t, J_R).free_directions
+        known, free = identify_with_basis(part, poses, J_t, J_R)
+        directions += known.free_directions
+        basis = np.zeros((size, free.shape[1]))
+        changes = {SHARED: free[-1]}  # of the logarithm of each scale
         length = typical_length(part)
-        for name in part.free:
-            unit[slots[Unknown(UnknownKind.FRAME, name)]] = np.r_[np.ones(3), np.full(3, length)]
+        for name, of_frame in zip(part.free, free[:-1].reshape(len(part.free), 7, free.shape[1]), strict=True):
+            frame = slots[Unknown(UnknownKind.FRAME, name)]
+            unit[frame] = np.r_[np.ones(3), np.full(3, length)]
+            basis[frame] = of_frame[:6]
+            changes[Unknown(UnknownKind.SCALE, name)] = of_frame[6]
+        for scale in changes.keys() & slots.keys():  # d alpha = alpha d log alpha
+            basis[slots[scale]] = state.scales[scale] * changes[scale]
+        columns.append(basis)
     offsets, shrinkage = free_offsets(data, variables)
     directions += offsets
+    for offset in offsets:
+        (sensor,) = offset.time_offsets_s
+        column = np.zeros((size, 1))
+        column[slots[Unknown(UnknownKind.TIME_OFFSET, sensor)]] = 1.0
+        columns.append(column)
     for scale, value in state.scales.items():
         unit[slots[scale]] = value
-    basis = np.zeros((size, len(directions)))
-    for direction, column in zip(directions, basis.T, strict=True):
-        for name, xi in direction.frames.items():
-            column[slots[Unknown(UnknownKind.FRAME, name)]] = xi
-        for owner, change in ({SHARED.owner: direction.scale} | direction.own_scales).items():
-            scale = Unknown(UnknownKind.SCALE, owner)
-            if scale in slots:  # d alpha = alpha d log alpha
-                column[slots[scale]] = state.scales[scale] * change
-        for sensor, change_s in direction.time_offsets_s.items():
-            column[slots[Unknown(UnknownKind.TIME_OFFSET, sensor)]] = change_s
-    return FreeSpace(basis, tuple(directions), unit, shrinkage)
+    return FreeSpace(np.hstack(columns), tuple(directions), unit, shrinkage)
 
 
 def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[FreeDirection], dict[str, float]]:

@@ -16,6 +16,7 @@ from gtsam_rwhec.identifiability.free_directions import (
     FreeReason,
     free_directions_of,
     reason_for,
+    sparse_basis,
 )
 from gtsam_rwhec.simulate import Motion, Noise, carrier_poses, perturb
 from gtsam_rwhec.simulate.transforms import rotations_of_vectors
@@ -36,7 +37,7 @@ def direction(frame: int, frames: int, **entries: Any) -> np.ndarray:
 
 def directions(*columns: np.ndarray, names: tuple[str, ...] = ("cam0",), length_m: float = 1.0) -> list[FreeDirection]:
     reasons = dict.fromkeys(names, FreeReason.ONE_AXIS)
-    return list(free_directions_of(names, np.array(columns).T, length_m, reasons))
+    return list(free_directions_of(names, sparse_basis(np.array(columns).T, length_m), length_m, reasons))
 
 
 @pytest.mark.parametrize(
@@ -100,6 +101,31 @@ def test_turning_and_shifting_come_apart() -> None:
 def test_frames_that_do_not_move_take_no_part() -> None:
     (found,) = directions(direction(1, 2, v=[0, 0, 1]), names=("tag0", "cam0"))
     assert list(found.frames) == ["cam0"]
+
+
+def test_small_shares_are_left_out_of_the_record_but_not_of_the_basis() -> None:
+    """The target turns, shifts and scales by less than a twentieth of the camera's shift."""
+    dust = direction(0, 2, omega=[0, 0, 0.02], v=[0, 0.02, 0], own=0.02, shared=0.02)
+    column = (dust + direction(1, 2, omega=[0.02, 0, 0], v=[0, 0, 1]))[:, None]
+    basis = sparse_basis(column, 1.0)
+    np.testing.assert_allclose(basis, column / np.linalg.norm(column))
+    (found,) = free_directions_of(("tag0", "cam0"), basis, 1.0, dict.fromkeys(("tag0", "cam0"), FreeReason.ONE_AXIS))
+    assert found == FreeDirection(FreeKind.TRANSLATION, FreeReason.ONE_AXIS, {"cam0": (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)})
+
+
+def test_only_a_scale_that_moves_frames_is_compensated_by_them() -> None:
+    alone, shifted = (
+        free_directions_of(("tag0",), column[:, None], 1.0, {"tag0": FreeReason.NOISE})[0]
+        for column in (direction(0, 1, v=[1e-7, 0, 0], own=1.0), direction(0, 1, v=[0, 0, 1], own=1.0))
+    )
+    assert (alone.kind, alone.reason, alone.frames) == (FreeKind.SCALE, FreeReason.NOISE, {})
+    assert (shifted.kind, shifted.reason, [*shifted.frames]) == (FreeKind.SCALE, FreeReason.COMPENSATED, ["tag0"])
+
+
+def test_equal_records_have_equal_hashes() -> None:
+    one, same = directions(direction(0, 1, v=[0, 0, 1])) + directions(direction(0, 1, v=[0, 0, 2]))
+    (other,) = directions(direction(0, 1, v=[1, 0, 0]))
+    assert len({one, same, other}) == 2
 
 
 def test_frames_that_move_together_are_one_direction() -> None:
