@@ -22,10 +22,10 @@ def demo(
     """
     folder = rw.datasets.demo_folder()
     log, rig = folder / rw.datasets.LOG, folder / rw.datasets.RIG
-    rw.pipeline.check_replaceable(output, log.name)
     command = shlex.join(["gtsam-rwhec", "calibrate", str(log), "--rig", str(rig), "-o", str(output)])
-    typer.echo(f"This is the same as: {command}", err=True)
-    status = calibrate_log(log, rig, output, images=False, workers=None)
+    with rw.pipeline.replacing_output(output, log.name):
+        typer.echo(f"This is the same as: {command}", err=True)
+        status = calibrate_log(log, rig, output, images=False, workers=None)
     result = rw.results.read_result(output / rw.pipeline.RESULT_FILE)
     if result.refined is not None and result.log is not None:
         rw.report.print_demo(result.refined, result.log, rw.datasets.demo_truth(), output)

@@ -10,7 +10,7 @@ from .detection_stage import detect_log as detect_log
 from .detections_in_images import draw_log as draw_log
 
 # What comes out, and what a log that a stage wrote holds.
-from .earlier_output import check_replaceable as check_replaceable
+from .earlier_output import replacing_output as replacing_output
 from .image_options import check_drawable as check_drawable
 from .log_contract import CLEAN_LOG as CLEAN_LOG
 from .log_contract import RESULT_FILE as RESULT_FILE
