@@ -26,23 +26,15 @@ SHARED = Unknown(UnknownKind.SCALE)
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Free directions.
+    """Free directions."""
 
-    Attributes
-    ----------
-    basis : (d, k) array
-        The directions over ``Variables.unknowns``, with the small shares that the records leave out.
-    directions : tuple of FreeDirection
-        The same directions as records.
-    unit : (d,) array
-        The unit of each parameter: 1 rad, the typical length (m), a scale's value, 1 s.
-    shrinkage : dict of str to float
-        By sensor: the share by which noise in the carrier's velocity pulls the time offset towards zero.
-    """
-
+    #: (d, k): the directions over ``Variables.unknowns``, with the small shares that the records leave out.
     basis: Array
+    #: The same directions as records.
     directions: tuple[FreeDirection, ...]
+    #: (d,): the unit of each parameter: 1 rad, the typical length (m), a scale's value, 1 s.
     unit: Array
+    #: By sensor: the share by which noise in the carrier's velocity pulls the time offset towards zero.
     shrinkage: dict[str, float]
 
 

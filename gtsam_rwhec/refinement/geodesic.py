@@ -32,23 +32,14 @@ from gtsam_rwhec.refinement.weighting import (
 
 @dataclass(frozen=True)
 class GeodesicModel:
-    """The geodesic residuals of the raw measurements.
-
-    Attributes
-    ----------
-    data : list of PairData
-    variables : Variables
-    options : RefineOptions
-    carriers : CarrierVariables or None
-        The carrier poses, where they are variables.
-    inlier_share : float
-        Share of its variance that a squared residual keeps when residuals beyond the inlier threshold are left out.
-    """
+    """The geodesic residuals of the raw measurements."""
 
     data: list[PairData]
     variables: Variables
     options: RefineOptions
+    #: The carrier poses, where they are variables.
     carriers: graphs.CarrierVariables | None
+    #: Share of its variance that a squared residual keeps when residuals beyond the inlier threshold are left out.
     inlier_share: float
 
     @staticmethod

@@ -47,38 +47,25 @@ NAMED = 5
 
 @dataclass(frozen=True)
 class Graduated:
-    """A calibration from the measurements that agree with it.
+    """A calibration from the measurements that agree with it."""
 
-    Attributes
-    ----------
-    solution : Solution
-        The certified solution of the inliers, under the variance factors.
-    inliers : dict of (target, sensor) to (N,) booleans
-        In the order of ``problem.measurements``.
-    variance_factors : VarianceFactors
-        Factors of the noise as given; 1 unless estimated.
-    threshold : float
-        c^2, the largest squared residual of an inlier.
-    truncated_cost : float
-        1/2 sum min(d^2, c^2).
-    left_out : tuple of str
-        Frames of which no measurement agrees; the solution lacks them.
-    suspect : dict of str to (int, int)
-        Frames of which less than half of the measurements agree: the number that agrees, and the number of all.
-    suspect_pairs : dict of (target, sensor) to (int, int)
-        The same for pairs of which neither frame is suspect as a whole.
-    history : tuple of Iteration
-        The re-weighted solutions, of all starts together.
-    """
-
+    #: The certified solution of the inliers, under the variance factors.
     solution: Solution
+    #: In the order of ``problem.measurements``.
     inliers: dict[Pair, np.ndarray]
+    #: Factors of the noise as given; 1 unless estimated.
     variance_factors: VarianceFactors
+    #: c^2, the largest squared residual of an inlier.
     threshold: float
+    #: 1/2 sum min(d^2, c^2).
     truncated_cost: float
+    #: Frames of which no measurement agrees; the solution lacks them.
     left_out: tuple[str, ...]
+    #: Frames of which less than half of the measurements agree: the number that agrees, and the number of all.
     suspect: dict[str, tuple[int, int]]
+    #: The same for pairs of which neither frame is suspect as a whole.
     suspect_pairs: dict[Pair, tuple[int, int]]
+    #: The re-weighted solutions, of all starts together.
     history: tuple[Iteration, ...]
 
 

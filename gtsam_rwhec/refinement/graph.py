@@ -45,22 +45,15 @@ class CarrierVariables:
     """Carrier poses that are variables: one for each distinct (stamp, A) of the problem.
 
     Sensors with an unknown time offset share no carrier pose with other sensors.
-
-    Attributes
-    ----------
-    index : dict of Pair to (N,) integers
-        The carrier pose of each measurement.
-    first : list of (Pair, int)
-        The first measurement at each of the M carrier poses.
-    A : (M, 4, 4) array
-        The poses as given, T_sensorcarrier_targetcarrier.
-    covariance : (M, 6, 6) array
-        Their noise.
     """
 
+    #: (N,): the carrier pose of each measurement.
     index: dict[Pair, np.ndarray]
+    #: The first measurement at each of the M carrier poses.
     first: list[tuple[Pair, int]]
+    #: (M, 4, 4): the poses as given, T_sensorcarrier_targetcarrier.
     A: Array
+    #: (M, 6, 6): their noise.
     covariance: Array
 
     @property

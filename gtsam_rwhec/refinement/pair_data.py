@@ -20,27 +20,19 @@ from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class PairData:
-    """One pair's measurements; translations of B are in true metres where the scale is known.
-
-    Attributes
-    ----------
-    pair : Pair
-    residuals : BatchResiduals
-        The geodesic residuals.
-    covariance : (N, 6, 6) array
-        Covariances of B's right perturbation, as given: sigma and kappa (1 / sqrt(2 kappa) rad an axis), or full ones.
-    carrier : (N, 6, 6) array or None
-        Covariances of A's right perturbation.
-    stamps_ns : (N,) array or None
-    paths : LocalPaths or None
-        The carriers' motion about each stamp, where the sensor's clock has an offset.
-    """
+    """One pair's measurements; translations of B are in true metres where the scale is known."""
 
     pair: Pair
+    #: The geodesic residuals.
     residuals: BatchResiduals
+    #: (N, 6, 6): covariances of B's right perturbation, as given: sigma and kappa (1 / sqrt(2 kappa) rad an axis), or
+    #: full ones.
     covariance: Array
+    #: (N, 6, 6): covariances of A's right perturbation.
     carrier: Array | None
+    #: (N,)
     stamps_ns: np.ndarray | None
+    #: The carriers' motion about each stamp, where the sensor's clock has an offset.
     paths: LocalPaths | None = None
 
     @property

@@ -17,48 +17,33 @@ from gtsam_rwhec.refinement.certified_fit import CertifiedFit
 
 @dataclass(frozen=True)
 class Squares:
-    """Whitened squared residuals of N measurements: about chi-square with 3 degrees of freedom each, at the truth.
+    """Whitened squared residuals of N measurements: about chi-square with 3 degrees of freedom each, at the truth."""
 
-    Attributes
-    ----------
-    rotation : (N,) array
-        kappa |R_A R_X - R_Y R_B|_F^2, which is 2 kappa theta^2 for a small angle; or the Mahalanobis distance under the
-        rotation block of a full covariance. Infinite where a frame has no pose.
-    translation : (N,) array
-        |alpha (R_A t_X + t_A - t_Y) - R_Y t_B|^2 / sigma^2; or the same under the translation block.
-    error : (N, 6) array or None
-        Log(B^-1 Y^-1 A X) in measured lengths, where full covariances were given.
-    """
-
+    #: (N,): kappa |R_A R_X - R_Y R_B|_F^2, which is 2 kappa theta^2 for a small angle; or the Mahalanobis distance
+    #: under the rotation block of a full covariance. Infinite where a frame has no pose.
     rotation: Array
+    #: (N,): |alpha (R_A t_X + t_A - t_Y) - R_Y t_B|^2 / sigma^2; or the same under the translation block.
     translation: Array
+    #: (N, 6): log(B^-1 Y^-1 A X) in measured lengths, where full covariances were given.
     error: Array | None
 
 
 @dataclass(frozen=True)
 class Measured:
-    """All raw measurements of a problem, pair by pair.
-
-    Attributes
-    ----------
-    pairs : tuple of Pair
-    rows : tuple of slice
-        The measurements of each pair.
-    A, B : (N, 4, 4) arrays
-    sigma, kappa : (N,) arrays
-    whitening : (N, 6, 6) array or None
-        Inverse Cholesky factors of B's covariances, where full ones were given.
-    whitening_of_translation : (N, 3, 3) array or None
-        Inverse Cholesky factors of the translation blocks alone.
-    """
+    """All raw measurements of a problem, pair by pair."""
 
     pairs: tuple[Pair, ...]
+    #: The measurements of each pair.
     rows: tuple[slice, ...]
+    #: (N, 4, 4)
     A: Array
     B: Array
+    #: (N,)
     sigma: Array
     kappa: Array
+    #: (N, 6, 6): inverse Cholesky factors of B's covariances, where full ones were given.
     whitening: Array | None
+    #: (N, 3, 3): inverse Cholesky factors of the translation blocks alone.
     whitening_of_translation: Array | None
 
     @staticmethod

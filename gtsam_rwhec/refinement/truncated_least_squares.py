@@ -44,26 +44,17 @@ MAX_ITERATIONS = 100
 
 @dataclass(frozen=True)
 class Iteration:
-    """One re-weighted solution.
+    """One re-weighted solution."""
 
-    Attributes
-    ----------
-    stage : str
-        "graduating", "trimming" or "settling".
-    mu : float
-        The graduation's parameter; nan where weights are 0 or 1.
-    truncated_cost : float
-        1/2 sum min(d^2, c^2) of all measurements.
-    inliers : int
-        Number of measurements with d^2 <= c^2.
-    certified : bool
-        Whether the optimum of the re-weighted problem is certified.
-    """
-
+    #: "graduating", "trimming" or "settling".
     stage: str
+    #: The graduation's parameter; nan where weights are 0 or 1.
     mu: float
+    #: 1/2 sum min(d^2, c^2) of all measurements.
     truncated_cost: float
+    #: Number of measurements with d^2 <= c^2.
     inliers: int
+    #: Whether the optimum of the re-weighted problem is certified.
     certified: bool
 
 

@@ -26,27 +26,18 @@ class State:
 
 @dataclass(frozen=True)
 class Variables:
-    """The variables' keys in the graph.
+    """The variables' keys in the graph."""
 
-    Attributes
-    ----------
-    targets, sensors : dict of str to int
-        Pose3 variables: X = T_targetcarrier_target, Y = T_sensorcarrier_sensor.
-    scales : dict of Unknown to int
-        1-vectors: one shared scale, or the unknown scales with scale="per_target".
-    offsets : dict of str to int
-        1-vectors in seconds, by sensor.
-    fixed : frozenset of str
-        Frames that are known exactly; they are in the graph, but not among the unknowns.
-    scale_of_pair : dict of Pair to Unknown
-        The scale of a pair's translations; pairs of known scale are absent.
-    """
-
+    #: Pose3 variables: X = T_targetcarrier_target, Y = T_sensorcarrier_sensor.
     targets: dict[str, int]
     sensors: dict[str, int]
+    #: 1-vectors: one shared scale, or the unknown scales with scale="per_target".
     scales: dict[Unknown, int]
+    #: 1-vectors in seconds, by sensor.
     offsets: dict[str, int]
+    #: Frames that are known exactly; they are in the graph, but not among the unknowns.
     fixed: frozenset[str]
+    #: The scale of a pair's translations; pairs of known scale are absent.
     scale_of_pair: dict[Pair, Unknown]
 
     @staticmethod
