@@ -81,6 +81,7 @@ TABLE: dict[str, dict[str, str]] = {
         "methods/test_registry.py": "applicability certified estimate evaluation method",
     },
     "gtsam_rwhec/pipeline": {
+        "pipeline/test_all_stages.py": "image_options",
         "pipeline/test_bad_logs.py": "intrinsics no_detections output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",
         "pipeline/test_same_log.py": "changed_rig log_metadata",
@@ -104,14 +105,14 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/report": {
         "calibration/test_cross_validation.py": "cross_validation_table",
-        "cli/test_wheel.py": "advice log_report",
+        "cli/test_wheel.py": "advice",
         "methods/test_comparison.py": "comparison_report",
         "report/test_solution_report.py": "pose_table printing sentences",
     },
     "gtsam_rwhec/report/plots": {
         "report/plots/test_plots.py": "coverage deviations frames plotted residuals",
     },
-    "gtsam_rwhec/results": {"results/test_result_file.py": "json_tree schema"},
+    "gtsam_rwhec/results": {"results/test_result_file.py": "agreement json_tree schema"},
     "gtsam_rwhec/rig": {
         "rig/test_rig_faults.py": "contradictions",
         "rig/test_rig_file.py": "field_types rig sections target_sections written_rig",
