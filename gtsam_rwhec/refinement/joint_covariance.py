@@ -32,15 +32,23 @@ ROUNDING = 1e-13
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """The covariance of all unknowns together: dense, d x d."""
+    """The covariance of all unknowns together: dense, d x d.
 
-    #: The rows of each unknown.
+    Attributes
+    ----------
+    slots : dict of Unknown to slice
+        The rows of each unknown.
+    finite : (d, d) array
+        Q (Q' Lambda Q)^-1 Q'.
+    free : (d, k) array
+        Directions of infinite variance, orthonormal in units of ``unit``.
+    unit : (d,) array
+        The unit of each parameter: 1 rad, the typical length (m), a scale's value, 1 s.
+    """
+
     slots: dict[Unknown, slice]
-    #: (d, d): Q (Q' Lambda Q)^-1 Q'.
     finite: Array
-    #: (d, k): directions of infinite variance, orthonormal in units of ``unit``.
     free: Array
-    #: (d,): the unit of each parameter: 1 rad, the typical length (m), a scale's value, 1 s.
     unit: Array
 
     @staticmethod

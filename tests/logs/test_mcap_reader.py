@@ -333,7 +333,7 @@ def test_decompression_is_bounded(tmp_path: Path, compression: str) -> None:
     with open_log(path) as log:
         (block,) = log.files[0].blocks
     at = block.offset + 9 + 16  # the chunk's stated size follows its record's head and two stamps
-    for claim, words in ((1000, "other than the 1000 bytes"), (mcap_blocks.LARGEST_CHUNK + 1, "beyond the limit")):
+    for claim, words in ((1000, "1001 bytes after decompression"), (mcap_blocks.LARGEST_CHUNK + 1, "beyond the limit")):
         path.write_bytes(content[:at] + struct.pack("<Q", claim) + content[at + 8 :])
         with pytest.warns(LogWarning, match=words):
             assert read(path) == []
