@@ -10,6 +10,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CountError, PoseError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import LARGEST_M, ROTATION_TOLERANCE, Array, determinant, orthonormality
+from gtsam_rwhec.geometry.real_numbers import real_array
 
 #: Two motions about different axes need at least this many poses; OpenCV asks for as many.
 FEWEST_POSES = 3
@@ -122,16 +123,23 @@ def _as_array(values: Any, where: str, what: str) -> Array | None:
     if array is not None:
         return array
     try:
-        if np.iscomplexobj(values):
-            raise TypeError("complex numbers")
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        if isinstance(values, (list, tuple)) and len({np.shape(value) for value in values}) > 1:
+        array = real_array(values)
+    except ValueError as error:
+        if isinstance(values, (list, tuple)) and len(set(map(_shape, values))) > 1:
             return None
         raise PoseError(f"{where}: cannot be read as numbers ({error}); give arrays of numbers") from error
     if array.size == 0:
         raise CountError(f"{where}: no {what}; at least {FEWEST_POSES} are needed")
     return array
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    """The shape of an array; None for lists of different lengths."""
+    try:
+        shape: tuple[int, ...] = np.shape(value)
+        return shape
+    except ValueError:
+        return None
 
 
 def _joined(values: list[Any] | tuple[Any, ...]) -> Array | None:

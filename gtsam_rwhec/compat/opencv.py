@@ -25,6 +25,7 @@ from gtsam_rwhec.compat.quaternion_methods import horaud, park, tsai
 from gtsam_rwhec.compat.robot_world import li, shah
 from gtsam_rwhec.compat.stations import Stations, stations_of
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 
 CALIB_HAND_EYE_TSAI = 0
@@ -170,4 +171,4 @@ def _into(given: Array | None, answer: Array) -> Array:
 def _unknown(method: object, prefix: str) -> str:
     names = {name: value for name, value in globals().items() if name.startswith(f"{prefix}_")}
     listed = ", ".join(f"{name} = {value}" for name, value in names.items())
-    return f"method={method!r} is not one of {listed}"
+    return f"method={brief(method)} is not one of {listed}"

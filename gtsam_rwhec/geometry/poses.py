@@ -7,7 +7,7 @@ translation. Checks run on blocks, so that memory beyond the input does not grow
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import gtsam
 import numpy as np
@@ -15,7 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import PoseError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.quaternions import to_rotations
+from gtsam_rwhec.geometry.real_numbers import real_array
 
 #: Arrays hold real numbers, in double precision unless a docstring says otherwise.
 Array = NDArray[np.floating[Any]]
@@ -63,11 +65,9 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
                     "give one kind of pose in a list"
                 )
         return np.array([pose.matrix() for pose in poses])
-    if isinstance(poses, np.ma.MaskedArray) or getattr(poses, "dtype", None) in (np.complex64, np.complex128):
-        raise PoseError(f"{where}: a masked or complex array; leave masked measurements out, and give real numbers")
     try:
-        array = np.asarray(poses, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        array = real_array(poses)
+    except ValueError as error:
         raise PoseError(
             f"{where}: cannot be read as numbers ({error}); give (N,4,4), (N,7) or a list of gtsam.Pose3"
         ) from error
@@ -76,7 +76,8 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
     if array.ndim == 3 and array.shape[1:] == (4, 4):
         if order is not None:
             raise PoseError(
-                f"{where}: order={order!r} names a quaternion's order, but the poses are 4x4 matrices; leave order out"
+                f"{where}: order={brief(order)} names a quaternion's order, but the poses are 4x4 matrices; "
+                "leave order out"
             )
         return array
     if array.ndim == 2 and array.shape[1] == 7:
@@ -89,7 +90,8 @@ def as_transforms(poses: PosesLike, order: QuaternionOrder | None, where: str) -
 def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str) -> Array:
     if order not in ("wxyz", "xyzw"):
         raise PoseError(
-            f"{where}: rows of 7 need the order of the quaternion; give order='wxyz' or order='xyzw', not {order!r}"
+            f"{where}: rows of 7 need the order of the quaternion; give order='wxyz' or order='xyzw', "
+            f"not {brief(order)}"
         )
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if bad.size:
@@ -108,7 +110,15 @@ def _from_quaternion_rows(rows: Array, order: QuaternionOrder | None, where: str
     return se3.pose(to_rotations(rows[:, [1, 2, 3, 0] if order == "wxyz" else [0, 1, 2, 3]]), rows[:, 4:])
 
 
-def checked_rows(block: Array, first: int, where: str, out: Array | None = None) -> tuple[Array, int]:
+class CheckedRows(NamedTuple):
+    """The rows (12, b) of a block, how many rotations were projected, and how far R'R may be from I after that."""
+
+    rows: Array
+    projected: int
+    deviation: float
+
+
+def checked_rows(block: Array, first: int, where: str, out: Array | None = None) -> CheckedRows:
     """Check a block of transforms and write it as the rows from which moments are computed.
 
     Parameters
@@ -127,6 +137,8 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
         vec(R), column after column, then t: each entry is a contiguous row.
     projected : int
         Number of rotations that were off by more than rounding and were projected to SO(3).
+    deviation : float
+        Largest entry of |R'R - I| of all rotations of the block, projected ones after the projection.
 
     Raises
     ------
@@ -136,7 +148,8 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
     rows = np.empty((12, len(block))) if out is None else out
     for column in range(4):
         rows[3 * column : 3 * column + 3] = block[:, :3, column].T
-    if not np.abs(rows[9:]).max() <= LARGEST_M or not np.isfinite(rows.sum()):
+    far = max(rows[9:].max(), -rows[9:].min())
+    if not far <= LARGEST_M or not np.isfinite(rows[:9].sum()):
         bad = np.flatnonzero(~(np.abs(rows) <= LARGEST_M).all(axis=0))
         index = int(bad[0]) if bad.size else 0
         raise PoseError(
@@ -152,9 +165,10 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
             f"{where}: the last row of measurement {first + index} is {block[index, 3]}, not 0 0 0 1; "
             "are the matrices transposed?"
         )
-    deviation = orthonormality(rows)
-    worst = float(deviation.max())
-    if worst > ROTATION_TOLERANCE:
+    gram = _gram_less_identity(rows)
+    worst = max(float(gram.max()), -float(gram.min()))
+    if not worst <= ROTATION_TOLERANCE:  # NaN is refused too
+        deviation = np.abs(gram).max(axis=0)
         index = int(deviation.argmax())
         raise PoseError(
             f"{where}: the rotation of measurement {first + index} is off by {deviation[index]:.3g} "
@@ -170,19 +184,30 @@ def checked_rows(block: Array, first: int, where: str, out: Array | None = None)
         )
     projected = 0
     if worst > ROTATION_ROUNDING:
-        projected = int((deviation > ROTATION_ROUNDING).sum())
+        projected = int((np.abs(gram).max(axis=0) > ROTATION_ROUNDING).sum())
         for _ in range(3):  # quadratic: 1e-3 becomes 1e-6, 1e-12, rounding
             rows[:9] = polar_step(rows)
-    return rows, projected
+        worst = float(orthonormality(rows).max())
+    return CheckedRows(rows, projected, worst)
 
 
 def orthonormality(rows: Array) -> Array:
     """Largest entry of |R'R - I| (b,) of ``rows`` (12 or 9, b)."""
-    c = rows[:9].reshape(3, 3, -1)
-    deviation: Array = np.abs((c[0] * c[0]).sum(axis=0) - 1.0)
-    for i, j in ((1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
-        np.maximum(deviation, np.abs((c[i] * c[j]).sum(axis=0) - (i == j)), out=deviation)
+    deviation: Array = np.abs(_gram_less_identity(rows)).max(axis=0)
     return deviation
+
+
+def _gram_less_identity(rows: Array) -> Array:
+    """The six different entries of R'R - I, (6, b), of ``rows`` (12 or 9, b); the first three are of the diagonal."""
+    c = rows[:9].reshape(3, 3, -1)
+    gram = np.empty((6, c.shape[2]))
+    terms = np.empty_like(c[0])
+    for entry, (i, j) in zip(gram, ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), strict=True):
+        np.multiply(c[i], c[j], out=terms)
+        np.add(terms[0], terms[1], out=entry)
+        entry += terms[2]
+    gram[:3] -= 1.0
+    return gram
 
 
 def determinant(rows: Array) -> Array:
@@ -202,10 +227,10 @@ def polar_step(rows: Array) -> Array:
 
 def one_transform(pose: PoseLike, where: str) -> Array:
     """One pose as a checked (4, 4) array; a PoseError when it is not a valid pose."""
-    transforms = as_transforms([pose] if isinstance(pose, gtsam.Pose3) else np.asarray(pose), None, where)
+    transforms = as_transforms([pose] if isinstance(pose, gtsam.Pose3) else pose, None, where)
     if len(transforms) != 1:
         raise PoseError(f"{where}: {len(transforms)} poses where one is expected; give one")
-    rows, _ = checked_rows(transforms, 0, where)
+    rows = checked_rows(transforms, 0, where).rows
     transform: Array = rows_to_transforms(rows)[0]
     return transform
 

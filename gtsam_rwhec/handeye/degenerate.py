@@ -66,7 +66,7 @@ def _threshold(count: int) -> float:
 
     The fit makes the noise along the answer smaller by the factor (count - 1) / count. The threshold corrects this.
     """
-    return float(free_threshold(3.0 * count, 6 * count - 6)) * count / (count - 1.0)
+    return float(free_threshold(3.0 * count, 0.0, 3.0 * (count - 1.0))) * count / (count - 1.0)
 
 
 def _records(request: Request, q: Array, turns: Array, moves: Array) -> tuple[FreeDirection, ...]:

@@ -88,7 +88,7 @@ def _fill(C: Array, H: Array, first: int, rows: Array, sums: Array) -> None:
     """Fill a block's ``Motions.rows``, and the sums (2, b) of the scalar parts and of the dual scalar parts."""
     b = len(C)
     try:  # both at once, in half the calls
-        checked, _ = checked_rows(np.concatenate([C, H]), first, "C and H")
+        checked = checked_rows(np.concatenate([C, H]), first, "C and H").rows
     except PoseError:
         checked_rows(C, first, "C")  # each alone: the error names the argument and the motion
         checked_rows(H, first, "H")

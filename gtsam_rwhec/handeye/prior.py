@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from gtsam_rwhec.errors import PriorError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.quaternions import conjugate, left
+from gtsam_rwhec.geometry.real_numbers import is_between, is_one_of
 from gtsam_rwhec.handeye.cost import DualQuaternionCost
 from gtsam_rwhec.handeye.dual_quaternions import from_transforms
 from gtsam_rwhec.handeye.weights import LARGEST
@@ -49,12 +51,14 @@ class DualQuaternionPrior:
 
     def __post_init__(self) -> None:
         for name, weight in (("a", self.a), ("b", self.b)):
-            if not (isinstance(weight, (int, float, np.number)) and np.isreal(weight) and 0.0 <= weight <= LARGEST):
-                raise PriorError(f"the prior's {name}={weight!r} is not a weight; give a number from 0 to {LARGEST:g}")
+            if not is_between(weight, 0.0, LARGEST):
+                raise PriorError(
+                    f"the prior's {name}={brief(weight)} is not a weight; give a number from 0 to {LARGEST:g}"
+                )
         if self.a == 0.0 and self.b == 0.0:
             raise PriorError("the prior's weights a and b are both 0; give a weight above 0, or leave the prior out")
-        if self.form not in ("imaginary", "distance"):
-            raise PriorError(f"the prior's form={self.form!r} is not 'imaginary' (eq. 26) or 'distance' (eq. 25)")
+        if not is_one_of(self.form, get_args(PriorForm)):
+            raise PriorError(f"the prior's form={brief(self.form)} is not 'imaginary' (eq. 26) or 'distance' (eq. 25)")
         object.__setattr__(self, "T", one_transform(self.T, "the prior's pose"))
 
     @cached_property

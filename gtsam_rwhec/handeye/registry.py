@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, get_args
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import OptionError, PriorError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, to_pose3
+from gtsam_rwhec.geometry.real_numbers import is_one_of
 from gtsam_rwhec.handeye.alpha import estimate_alpha
 from gtsam_rwhec.handeye.approximate import dq2ndord, dq2ndord_lambda, dq2steps, dqconvrlx, dqitr
 from gtsam_rwhec.handeye.certified import certified
@@ -154,7 +156,7 @@ def solve(
     """
     start = time.perf_counter()
     if not isinstance(method, str) or method not in METHODS:
-        raise OptionError(f"method={method!r} is not known; choose one of {', '.join(METHODS)}")
+        raise OptionError(f"method={brief(method)} is not known; choose one of {', '.join(METHODS)}")
     chosen = METHODS[method]
     _check_options(chosen, weights, covariances, prior, scale)
     motions = motions_of(C, H, order)
@@ -216,8 +218,8 @@ def _check_options(
     prior: DualQuaternionPrior | None,
     scale: ScaleMode,
 ) -> None:
-    if scale not in ("known", "unknown"):
-        raise OptionError(f"scale={scale!r} is not known; choose 'known' or 'unknown'")
+    if not is_one_of(scale, get_args(ScaleMode)):
+        raise OptionError(f"scale={brief(scale)} is not known; choose 'known' or 'unknown'")
     check_one_kind(weights, covariances)
     if prior is not None and not isinstance(prior, DualQuaternionPrior):
         raise PriorError(f"the prior is a {type(prior).__name__}; give a gtsam_rwhec.handeye.DualQuaternionPrior")

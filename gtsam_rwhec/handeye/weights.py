@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import is_between, real_array
 
 #: Weights above this, and below its inverse, leave no room for squares and sums in double precision.
 LARGEST = 1e100
@@ -20,26 +22,19 @@ def check_one_kind(weights: ArrayLike | None, covariances: ArrayLike | None) -> 
 
 def check_alpha(alpha: float | str) -> float:
     """Alpha as a float; an OptionError when it is not a positive number from 1 / LARGEST to LARGEST."""
-    try:
-        number = float(alpha)
-    except (TypeError, ValueError):
-        number = float("nan")
-    if not 1.0 / LARGEST <= number <= LARGEST:
+    if not is_between(alpha, 1.0 / LARGEST, LARGEST):
         raise OptionError(
-            f"alpha={alpha!r} is not a positive number from {1.0 / LARGEST:g} to {LARGEST:g}; it weighs translation "
-            "residuals (1/m) against rotation residuals, about sigma_rotation / sigma_translation; 'estimate' finds it "
-            "from the residuals"
+            f"alpha={brief(alpha)} is not a positive number from {1.0 / LARGEST:g} to {LARGEST:g}; it weighs "
+            "translation residuals (1/m) against rotation residuals, about sigma_rotation / sigma_translation; "
+            "'estimate' finds it from the residuals"
         )
-    return number
+    return float(alpha)
 
 
 def _numbers(given: ArrayLike, what: str) -> Array:
     try:
-        array = np.asarray(given)
-        if array.dtype.kind == "c":
-            raise TypeError("complex numbers")
-        return np.asarray(array, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        return real_array(given)
+    except ValueError as error:
         raise NoiseError(f"{what} cannot be read as numbers ({error}); give an array of real numbers") from error
 
 

@@ -1,8 +1,9 @@
-"""The Fisher information that a part's motions give about poses and scales, and the share that A's noise creates.
+"""The Fisher information that a part's motions give about poses and scales.
 
 Users perturb the parameters. Each free frame has [omega, v], a right perturbation T Expmap(xi) in GTSAM's order (rad,
 m); each unknown scale has its logarithm. The information is the *expected* one: it takes B's prediction Y^-1 A X at the
-answer, not B's noisy measurement. So only the noise of A can pass for information, and the moments of A suffice. With
+answer, not B's noisy measurement. So only A's noise can pass for information (``noise_bounds``), and A's
+moments suffice. With
 c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carrier's frame):
 
 - rotation residual, weight 2 kappa:        omega_X - (R_Y' R_A R_X)' omega_Y
@@ -16,14 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.moments import ONE, R_A, T_A, T_B
+from gtsam_rwhec.problem.moments import ONE, R_A, T_A
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses
 from gtsam_rwhec.solver.rotations import HATS
 
-#: The noise counts as at least this, in radians and as a part of the measured lengths. If it were zero, rounding errors
-#: of the eigenvalues (1e-16 / floor^2) would look like information.
-FLOOR = 1e-7
 #: A pair has 15 parameters: seven of the target, seven of the sensor, the logarithm of the shared scale. A frame has
 #: seven: rotation, translation, logarithm of its own scale.
 OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
@@ -32,72 +30,25 @@ _UPPER = np.triu_indices(15, 1)
 
 
 @dataclass(frozen=True)
-class PartVarianceFactors:
-    """Variance factors of each pair's residuals, (E,): 1 where the weights are true.
-
-    ``degrees_of_freedom`` is equations minus unknowns of the whole part.
-    """
-
-    translation: Array
-    rotation: Array
-    degrees_of_freedom: int
-
-
-def variance_factors(part: Part, J_t: Array, J_R: Array) -> PartVarianceFactors:
-    """Variance factors from the costs J_t, J_R (E,) of the pairs at the optimum, in the physical model.
-
-    A pair has the variance factor of the part, or its own where that is larger. J_t is sum |r|^2 / (2 sigma^2), and J_R
-    is sum kappa |dR|_F^2 / 2 = sum kappa theta^2. Both have expectation 3 N / 2, as rotations have variance 1 / (2
-    kappa) an axis. The part's factors are corrected for the unknowns that were fitted.
-    """
-    counts, N = part.moments.count, part.number_of_measurements
-    degrees_of_freedom = 6 * N - part.number_of_unknowns
-    if degrees_of_freedom <= 0:  # the noise cannot be estimated: use the weights
-        return PartVarianceFactors(np.ones(len(counts)), np.ones(len(counts)), degrees_of_freedom)
-    correction = 6.0 * N / degrees_of_freedom
-    lengths = np.einsum("eii->e", part.moments.translation[:, T_B, T_B])
-    factors = []
-    for J, floor in (
-        (J_t, (lengths + 1e-4 * part.moments.weight) * FLOOR**2 / counts),  # t_B counts as 1 cm at least
-        (J_R, 2.0 * part.moments.kappa * FLOOR**2 / counts),
-    ):
-        of_part = correction * float(J.sum()) / (1.5 * N)
-        factors.append(np.maximum(np.maximum(J / (1.5 * counts), of_part), floor))
-    return PartVarianceFactors(factors[0], factors[1], degrees_of_freedom)
-
-
-@dataclass(frozen=True)
 class PairInformation:
-    """Of every pair: the information of its rotation and translation residuals, and what noise alone would create.
-
-    rotation, translation (E, 15, 15); noise_rotation, noise_translation (E, 15), diagonal; used (E, 15): whether the
-    pair has the parameter; carrier_noise (E,) in rad^2: the largest variance that an axis of A's rotations may have.
-    """
+    """Of every pair: the information of its rotation and translation residuals (E, 15, 15)."""
 
     rotation: Array
     translation: Array
-    noise_rotation: Array
-    noise_translation: Array
+    #: (E, 15): whether the pair has the parameter.
     used: np.ndarray
-    carrier_noise: Array
+    #: (E, 3) and (E, 3, 3): sum w c and sum w c c', in the sensor carrier's frame.
+    lever: Array
+    lever_squares: Array
 
 
-def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -> PairInformation:
-    """The information of every pair and its noise, all pairs at once.
-
-    In a direction that the true motions leave free, A's rotation error eps (variance q^2 an axis) turns a zero into
-    eps x omega or eps x v, with expected square 2 q^2 |.|^2. Both ends move together along a free direction, so each
-    takes half. The residuals do not separate A's noise from B's, but they bound A's noise. The rotation residuals hold
-    all of it, so q^2 <= f_R / (2 kappa). The translation residuals hold it on a lever arm a, so 2 q^2 |a|^2 <= 3 f_t
-    sigma^2. If A's rotation error is about the origin of its target carrier, the arm is t_X. If it is about the origin
-    of its sensor carrier, the arm is c. The shorter arm gives the safe bound. A's translation noise is at most f_t
-    sigma^2 an axis: 2 f_t |omega_Y|^2, and 3 f_t for a scale.
-    """
+def pair_information(part: Part, poses: PairPoses) -> PairInformation:
+    """The information of every pair, all pairs at once."""
     E = len(part.pairs)
     R_X, t_X, R_Y, t_Y, alpha = poses.R_X, poses.t_X, poses.R_Y, poses.t_Y, poses.alpha
     free, owners = frozenset(part.free), frozenset(part.scale_owners)
     G, W = part.moments.translation, part.moments.weight
-    K, n = part.moments.kappa, part.moments.count
+    K = part.moments.kappa
 
     # Moments of c = R_A t_X + t_A - t_Y, linear in A's features: c = [t_X' (x) I, I, -t_Y] f.
     linear = np.zeros((E, 3, 25))
@@ -133,17 +84,6 @@ def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -
         full[:, _UPPER[1], _UPPER[0]] = full[:, _UPPER[0], _UPPER[1]]
     translation *= (alpha**2)[:, None, None]
 
-    given_t_X = t_X + np.array([part.frame_shift(target) for target, _ in part.pairs])
-    arm = np.minimum((given_t_X**2).sum(axis=1), square / W)
-    by_arm = 1.5 * noise.translation * n / np.maximum(alpha**2 * W * arm, 1e-300)
-    q2 = np.maximum(np.minimum(noise.rotation * n / (2.0 * K), by_arm), FLOOR**2)
-    noise_rotation, noise_translation = np.zeros((E, 15)), np.zeros((E, 15))
-    for omega, v in ((OMEGA_X, V_X), (OMEGA_Y, V_Y)):
-        noise_rotation[:, omega] = (2.0 * K * q2)[:, None]
-        noise_translation[:, omega] = (noise.translation * n)[:, None]
-        noise_translation[:, v] = (alpha**2 * W * q2)[:, None]
-    noise_translation[:, SHARED] = 3.0 * noise.translation * n
-
     used = np.zeros((E, 15), dtype=bool)
     for e, pair in enumerate(part.pairs):
         if pair.is_motion:  # both ends are one frame: fold the first onto the second
@@ -151,9 +91,6 @@ def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -
                 full[7:14] += full[:7]
                 full[:, 7:14] += full[:, :7]
                 full[:7] = full[:, :7] = 0.0
-            noise_rotation[e, 7:14] += noise_rotation[e, :7]
-            noise_translation[e, 7:14] += noise_translation[e, :7]
-            noise_rotation[e, :7] = noise_translation[e, :7] = 0.0
         used[e, :6] = pair.target in free and not pair.is_motion
         used[e, 7:13] = pair.sensor in free
         used[e, SHARED] = part.scale == "shared"
@@ -162,9 +99,8 @@ def pair_information(part: Part, poses: PairPoses, noise: PartVarianceFactors) -
             for full in (translation[e], translation[e].T):
                 full[at] += full[SHARED]
             translation[e, at, at] = alpha[e] ** 2 * square[e]
-            noise_translation[e, at] = noise_translation[e, SHARED]
             used[e, at] = True
-    return PairInformation(rotation, translation, noise_rotation, noise_translation, used, q2)
+    return PairInformation(rotation, translation, used, c, cc)
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,20 @@ from gtsam_rwhec.geometry.poses import Array
 
 #: The probability that a free direction counts as determined.
 SIGNIFICANCE = 1e-3
+#: Fewer equations to spare than this count as so many; the quantile is 1e60 there, and would overflow below.
+LEAST_SPARE = 0.1
 
 
-def free_threshold(squares: Array | float, degrees_of_freedom: int) -> Array:
+def free_threshold(squares: Array | float, fitted: Array | float, spare: Array | float) -> Array:
     """Information up to which a direction is free, in units of the information that noise alone would create in it.
 
-    This is the F quantile of both numbers. With no degrees of freedom only the weights tell the noise, and it is the
-    chi-square quantile over ``squares``. The information sums ``squares`` squares of noise. ``degrees_of_freedom`` is
-    equations minus unknowns. The noise of rotations and that of translations are each estimated from half of them.
+    The information sums ``squares`` squares of noise. The direction is the weakest, so it fits ``fitted`` of them away;
+    one at least is left. ``spare`` is the number of equations to spare that tell the noise. So this is an F quantile,
+    times the share of the squares that is left. Without equations to spare only the weights tell the noise, and it is
+    the chi-square quantile over ``squares``.
     """
-    if degrees_of_freedom <= 0:
-        return np.asarray(chdtri(squares, SIGNIFICANCE) / squares)
-    return np.asarray(fdtri(squares, 0.5 * degrees_of_freedom, 1.0 - SIGNIFICANCE))
+    left = np.maximum(np.subtract(squares, fitted), 1.0)
+    quantile = fdtri(left, np.maximum(spare, LEAST_SPARE), 1.0 - SIGNIFICANCE)
+    if np.min(spare, initial=1.0) <= 0.0:
+        quantile = np.where(np.greater(spare, 0.0), quantile, chdtri(left, SIGNIFICANCE) / left)
+    return np.asarray(quantile * left / squares)

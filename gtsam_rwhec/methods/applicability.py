@@ -21,6 +21,8 @@ _FOR_SCALE: dict[ScaleMode, frozenset[Takes]] = {
 
 def refusal(method: Method[Any], problem: Problem) -> RwhecError | None:
     """The error with which a method refuses a problem; None if it takes the problem."""
+    if not isinstance(method, Method) or not isinstance(problem, Problem):
+        check_problem(method, problem)  # raises: such a call is wrong, whatever the method can do
     try:
         check_problem(method, problem)
     except RwhecError as error:
@@ -34,6 +36,8 @@ def check_problem(method: Method[Any], problem: Problem) -> None:
     Raises CountError, FrameError, MeasurementsNotKeptError, OptionError, PriorError or ScaleError, or what the method's
     own check raises.
     """
+    if not isinstance(method, Method):
+        raise OptionError(f"the method is a {type(method).__name__}; give a record of gtsam_rwhec.methods.METHODS")
     takes = method.takes
     if not isinstance(problem, Problem):
         raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")

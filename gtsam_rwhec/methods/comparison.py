@@ -8,14 +8,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import gtsam
+import numpy as np
 
-from gtsam_rwhec.errors import RwhecError
-from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.errors import OptionError, RwhecError
+from gtsam_rwhec.files.progress import Progress, check_progress
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.methods import certified
 from gtsam_rwhec.methods.applicability import check_problem, refusal
 from gtsam_rwhec.methods.estimate import Estimate
 from gtsam_rwhec.methods.method import Method, MethodOptions
-from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
+from gtsam_rwhec.methods.registry import METHODS, check_options, estimate_of, method_of, run
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solving.solution import Solution
@@ -108,6 +110,10 @@ def compare(
     OptionError
         When a method's name is unknown.
     """
+    if methods is not None and (isinstance(methods, str) or not np.iterable(methods)):
+        raise OptionError(f"methods={brief(methods)}; give a list of names: ['shah2013']")
+    check_options(options)
+    check_progress(progress)
     chosen = dict.fromkeys(method_of(name) for name in (METHODS if methods is None else methods))
     options = options or MethodOptions()
     check_problem(certified.METHOD, problem)

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.identifiability.identification import identify
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.solver.full_form import full_forms
+from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
-from gtsam_rwhec.solver.variables import as_variables, given_answer
-from gtsam_rwhec.solving.arguments import check_against_knowledge
+from gtsam_rwhec.solver.variables import given_answer
+from gtsam_rwhec.solving.arguments import check_against_knowledge, check_types
 
 
 @dataclass(frozen=True)
@@ -30,10 +32,12 @@ class Evaluation:
     free_directions: tuple[FreeDirection, ...]
 
 
+@np.errstate(all="ignore")
 def evaluate(
     problem: Problem, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], scale: float | Mapping[str, float] = 1.0
 ) -> Evaluation:
     """Evaluate an answer; arguments and errors are those of ``cost_of_answer``."""
+    check_types(problem, None)
     parts = parts_of(problem)
     check_against_knowledge(problem, X, Y, scale)
     cost = 0.0
@@ -41,8 +45,7 @@ def evaluate(
     free: list[FreeDirection] = []
     for part in parts:
         answer = given_answer(part, X, Y, scale)
-        full, _ = full_forms(part)
-        cost += max(full.value(*as_variables(part, answer)), 0.0)
+        cost += max(PartForm.of(part).evaluated(answer).cost, 0.0)
         poses = PairPoses.of(part, answer)
         J_t, J_R = costs_of_pairs(part, poses)
         residuals |= residuals_of_pairs(part, poses, J_t, J_R)

@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any, Generic, Literal, ParamSpec
 
-import numpy as np
-
-from gtsam_rwhec.errors import FrameError, OptionError, ScaleError
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_whole
 from gtsam_rwhec.methods.estimate import Outcome, Poses
+from gtsam_rwhec.problem.knowledge import checked_scale
 from gtsam_rwhec.problem.problem import Problem
 
 Arguments = ParamSpec("Arguments")
@@ -124,13 +125,15 @@ class MethodOptions:
             and all(isinstance(part, kind) for part, kind in zip(start, (Mapping, Mapping, Real), strict=True))
         ):
             raise OptionError(
-                f"MethodOptions.start={start!r:.100}; give (X, Y, scale): poses of targets and of sensors by name, and "
+                f"MethodOptions.start={brief(start)}; give (X, Y, scale): poses of targets and of sensors by name, and "
                 "a scale (1.0 if known)"
             )
         for name, least in (("seed", 0), ("max_iterations", 1)):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-                raise OptionError(f"MethodOptions.{name}={value!r}; give a whole number of at least {least}")
+            if not is_whole(value, least):
+                raise OptionError(
+                    f"MethodOptions.{name}={brief(value)}; give a whole number from {least} to {LARGEST_WHOLE}"
+                )
 
 
 def checked_start(
@@ -142,6 +145,4 @@ def checked_start(
         missing = [name for name in names if name not in poses]
         if missing:
             raise FrameError(f"the start's {what} has no {missing[0]}; it has {', '.join(poses) or 'none'}")
-    if not (isinstance(scale, (int, float)) and np.isfinite(scale) and scale > 0.0):
-        raise ScaleError(f"the start's scale is {scale!r}; give a positive number, 1.0 if it is known")
-    return start
+    return X, Y, checked_scale(scale, "the start's scale (1.0 if it is known)")

@@ -7,6 +7,7 @@ import time
 import gtsam
 
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform
 from gtsam_rwhec.methods import (
     certified,
@@ -78,8 +79,7 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
         When the measurements do not determine the method's equations.
     """
     method = method_of(name)
-    if options is not None and not isinstance(options, MethodOptions):
-        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.methods.MethodOptions")
+    check_options(options)
     check_problem(method, problem)
     start = time.perf_counter()
     found = method.function(problem, options or MethodOptions())
@@ -87,12 +87,18 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
     return estimate_of(method.name, problem, found, seconds)
 
 
+def check_options(options: object) -> None:
+    """Raise an OptionError for options of another type."""
+    if options is not None and not isinstance(options, MethodOptions):
+        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.methods.MethodOptions")
+
+
 def method_of(name: str) -> Method[[Problem, MethodOptions]]:
     """The method of a name; OptionError for an unknown name."""
     try:
         return METHODS[name]
     except (KeyError, TypeError):
-        raise OptionError(f"method {name!r} is not one of {', '.join(METHODS)}") from None
+        raise OptionError(f"method {brief(name)} is not one of {', '.join(METHODS)}") from None
 
 
 def estimate_of(name: str, problem: Problem, found: Outcome[Poses], seconds: float) -> Estimate[dict[str, gtsam.Pose3]]:

@@ -107,7 +107,7 @@ class Observations:
             fewest = int(np.isfinite(seen).all(axis=2).sum(axis=1).min())
             if fewest < 4:
                 raise CountError(f"{where}: an image has {fewest} corners; leave out images with fewer than 4")
-            rows, _ = checked_rows(transforms, 0, f"A of {where}")
+            rows = checked_rows(transforms, 0, f"A of {where}").rows
             checked[target, sensor] = Views(rows_to_transforms(rows), seen)
         if not checked:
             raise CountError("there are no views; give images of a target by a camera")

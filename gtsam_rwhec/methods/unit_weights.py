@@ -15,8 +15,9 @@ from gtsam_rwhec.errors import FrameError, ScaleError
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.methods.estimate import Outcome, Poses
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.reduced_form import Forms, ReducedForm, reduce
+from gtsam_rwhec.solver.reduced_form import ReducedForm, reduce
 from gtsam_rwhec.solver.variables import answer_of
 
 #: The name of this cost in ``Estimate.proof``.
@@ -31,7 +32,7 @@ class UnitForm:
     """
 
     part: Part
-    forms: Forms
+    forms: PartForm
     turned: bool
 
     @staticmethod
@@ -43,7 +44,7 @@ class UnitForm:
                 f"the measurements fall into {len(parts)} unconnected parts (one part has "
                 f"{', '.join(parts[0].names)}); solve each part as a problem of its own"
             )
-        return UnitForm(parts[0], Forms.of(parts[0]), turned)
+        return UnitForm(parts[0], PartForm.of(parts[0]), turned)
 
     @property
     def reduced(self) -> ReducedForm:

@@ -21,7 +21,8 @@ from gtsam_rwhec.solver.descent import descend
 from gtsam_rwhec.solver.interior_point import Relaxation
 from gtsam_rwhec.solver.local_blocks import scatter
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_by_clarabel
-from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers, vec
+from gtsam_rwhec.solver.rotations import CONSTRAINTS, kkt_multipliers
+from gtsam_rwhec.solver.variables import answer_of, as_point
 
 #: The interior-point solver stops at this relative gap and infeasibility.
 TOLERANCE = 1e-10
@@ -73,9 +74,13 @@ def certified_rotations(form: UnitForm) -> CertifiedRotations:
     relaxation = solve_by_clarabel(Q, TOLERANCE, STEPS)
     ends = [descend(reduced, R, STEPS) for R in round_to_rotations(relaxation)]
     best = min(ends, key=lambda end: end.cost)
-    r = vec(best.R).ravel()
-    of_answer = kkt_multipliers(best.R, reduced.apply(np.append(r, 1.0))[:-1].reshape(-1, 9))
-    bounds = [lower_bound(reduced, multipliers, r).lower_bound for multipliers in (relaxation.multipliers, of_answer)]
+    whole = form.forms
+    point = as_point(form.part, answer_of(form.part, reduced, best.R))
+    evaluation = whole.cost.at(point)
+    of_answer = kkt_multipliers(best.R, evaluation.gradient[:-1].reshape(-1, 13)[:, 4:])
+    bounds = [
+        lower_bound(whole, evaluation, multipliers).lower_bound for multipliers in (relaxation.multipliers, of_answer)
+    ]
     bounds.append(_relaxation_bound(Q, relaxation))
     values = np.linalg.eigvalsh(relaxation.X)
     return CertifiedRotations(best.R, best.cost, max(bounds), float(max(values[-2], 0.0) / values[-1]))

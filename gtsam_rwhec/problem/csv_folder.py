@@ -12,7 +12,10 @@ of A_i X = Y B_i. The caller names the words for targets and sensors; either wor
 
 from __future__ import annotations
 
+import codecs
+import io
 import math
+import re
 import warnings
 from pathlib import Path
 from typing import NoReturn
@@ -22,14 +25,23 @@ from numpy.typing import NDArray
 
 from gtsam_rwhec.errors import FileFormatError, RwhecWarning
 from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.files.paths import checked_path
+from gtsam_rwhec.files.terminal_text import brief, shown
+from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 
 COLUMNS = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 
+#: A warning names at most this many entries of a folder that are not read.
+MOST_NAMED = 20
 #: A quaternion's norm may be this far from 1, as in `geometry.poses`; the check here can name the line.
 QUATERNION_TOLERANCE = 1e-2
+#: A file of more bytes than this is not read; seven million poses fit.
+MOST_BYTES = 1 << 30
+#: A line of more bytes than this is no pose, however many digits its seven numbers have.
+LONGEST_LINE = 10_000
 #: A line of a file, for messages.
 ROW = ",".join(COLUMNS)
 
@@ -85,7 +97,7 @@ def read_csv(
     CsvWarning
         The folder has other entries; the warning names them.
     """
-    folder = Path(folder)
+    folder = checked_path(folder)
     _check_words(targets, sensors)
     pairs = _find_pairs(folder, targets, sensors)
     problem = Problem(scale=scale, keep_measurements=keep_measurements)
@@ -108,26 +120,28 @@ def read_pose_rows(path: str | Path) -> NDArray[np.float64]:
     that cannot be read or is empty, and for any other line, a FileFormatError has the file and the line.
     """
     path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").rstrip().split("\n")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(
-            f"{path} is not a text file in UTF-8 (byte {error.start}); give lines of {ROW}."
-        ) from error
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
-    if lines == [""]:
+    content = read_whole(path, MOST_BYTES, "Lines of poses were").removeprefix(codecs.BOM_UTF8).rstrip()
+    if not content:
         raise FileFormatError(
             f"{path} is empty; give lines of {ROW}. Delete both files of a pair without measurements."
         )
+    number_of_lines = content.count(b"\n") + 1
+    if too_long := re.search(rb"[^\n]{%d}" % (LONGEST_LINE + 1), content):
+        number = content.count(b"\n", 0, too_long.start()) + 1
+        raise FileFormatError(f"{path}, line {number}: longer than {LONGEST_LINE} bytes. Give {ROW}.")
+    if not content.isascii():
+        _raise_for_first_bad_line(path, content, "it has characters that no number has")
     try:
-        rows = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2, dtype=np.float64)
+        # From a stream, one line after another: a list of them takes many times the bytes of the file.
+        text = io.TextIOWrapper(io.BytesIO(content), "ascii", newline="\n")
+        rows = np.loadtxt(text, delimiter=",", comments=None, ndmin=2, dtype=np.float64)
     except ValueError as error:
-        _raise_for_first_bad_line(path, lines, str(error))
+        _raise_for_first_bad_line(path, content, brief(str(error)))
     # loadtxt passes over blank lines and accepts nan: A and B would no longer fit, without a message.
-    if rows.shape != (len(lines), len(COLUMNS)) or not np.isfinite(rows).all():
-        _raise_for_first_bad_line(path, lines, f"read {rows.shape[0]} rows of {rows.shape[1]} numbers")
-    norms = np.linalg.norm(rows[:, :4], axis=1)
+    if rows.shape != (number_of_lines, len(COLUMNS)) or not np.isfinite(rows).all():
+        _raise_for_first_bad_line(path, content, f"read {rows.shape[0]} rows of {rows.shape[1]} numbers")
+    with np.errstate(over="ignore"):  # an infinite norm is not 1 either
+        norms = np.linalg.norm(rows[:, :4], axis=1)
     worst = int(np.argmax(np.abs(norms - 1.0)))
     if abs(norms[worst] - 1.0) > QUATERNION_TOLERANCE:
         raise FileFormatError(
@@ -137,18 +151,26 @@ def read_pose_rows(path: str | Path) -> NDArray[np.float64]:
     return rows
 
 
-def _raise_for_first_bad_line(path: Path, lines: list[str], otherwise: str) -> NoReturn:
+def _raise_for_first_bad_line(path: Path, content: bytes, otherwise: str) -> NoReturn:
     """Find the line that `np.loadtxt` cannot read; where there is none, the message is `otherwise`."""
-    for number, line in enumerate(lines, start=1):
-        fields = [field.strip() for field in line.split(",")]
+    begins = 0
+    for number, raw in enumerate(io.BytesIO(content), start=1):
+        try:
+            line = raw.decode()
+        except UnicodeDecodeError as error:
+            at = begins + error.start
+            raise FileFormatError(f"{path} is not a text file in UTF-8 (byte {at}); give lines of {ROW}.") from error
+        begins += len(raw)
+        count = line.count(",") + 1
+        fields = [field.strip() for field in line.split(",", len(COLUMNS))]
         wrong = [(name, field) for name, field in zip(COLUMNS, fields, strict=False) if not _is_finite_number(field)]
         fault = ""
         if not line.strip():
             fault = f"blank line between poses; a measurement may be missing here. Give {ROW}."
-        elif len(fields) != len(COLUMNS):
-            fault = f"{len(fields)} fields in place of {len(COLUMNS)} ({ROW}): {line[:80]!r}."
+        elif count != len(COLUMNS):
+            fault = f"{count} fields in place of {len(COLUMNS)} ({ROW}): {line.strip()[:80]!r}."
         elif wrong:
-            fault = f"not a finite number: {', '.join(f'{name} is {field!r}' for name, field in wrong)}."
+            fault = f"not a finite number: {', '.join(f'{name} is {brief(field)}' for name, field in wrong)}."
             if number == 1 and len(wrong) == len(COLUMNS):
                 fault += " If it is a header, delete it."
         if fault:
@@ -158,27 +180,27 @@ def _raise_for_first_bad_line(path: Path, lines: list[str], otherwise: str) -> N
 
 def _is_finite_number(field: str) -> bool:
     try:
-        return math.isfinite(float(field)) and "_" not in field
+        return field.isascii() and "_" not in field and math.isfinite(float(field))
     except ValueError:
         return False
 
 
 def _check_words(targets: str, sensors: str) -> None:
     for argument, word in (("targets", targets), ("sensors", sensors)):
-        if not word or "/" in word:
+        if not isinstance(word, str) or not word or "/" in word:
             raise FileFormatError(
-                f'{argument}={word!r}: give the word for {argument} in the file names, such as "tag" or "cam".'
+                f'{argument}={brief(word)}: give the word for {argument} in the file names, such as "tag" or "cam".'
             )
     if f"{targets}_".startswith(f"{sensors}_") or f"{sensors}_".startswith(f"{targets}_"):
         raise FileFormatError(
-            f"targets={targets!r} and sensors={sensors!r} cannot be told apart in file names, because one word begins "
-            "with the other word; rename the files."
+            f"targets={brief(targets)} and sensors={brief(sensors)} cannot be told apart in file names, because one "
+            "word begins with the other word; rename the files."
         )
 
 
 def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Path, Path]]:
     """Both files of every pair, in natural order; warn of all other entries of the folder."""
-    example = f"{targets}_0_{sensors}_0_A.csv"
+    example = shown(f"{targets}_0_{sensors}_0_A.csv")
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
         raise FileFormatError(f"{folder} {what}; give a folder with files such as {example}.")
@@ -189,6 +211,8 @@ def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Pa
         if parsed is None:
             unknown.append(path.name)
             continue
+        if not _is_unicode(path.name):
+            raise FileFormatError(f"{path}: the file's name is not text in UTF-8; rename the file.")
         target, sensor, side = parsed
         sides = found.setdefault(Pair(target, sensor), {})
         if side in sides:
@@ -196,19 +220,25 @@ def _find_pairs(folder: Path, targets: str, sensors: str) -> dict[Pair, tuple[Pa
         sides[side] = path
     if unknown:
         unknown.sort(key=natural_key)
+        more = f" and {len(unknown) - MOST_NAMED} more" if len(unknown) > MOST_NAMED else ""
         warnings.warn(
             f"{folder}: {len(unknown)} {'entry' if len(unknown) == 1 else 'entries'} not read, with other names than "
-            f"{example}: {', '.join(unknown)}",
+            f"{example}: {', '.join(map(shown, unknown[:MOST_NAMED]))}{more}",
             CsvWarning,
             stacklevel=3,
         )
     if not found:
         raise FileFormatError(
             f"{folder} has no files named like {example}. Give the words of the file names for targets (now "
-            f"{targets!r}) and sensors (now {sensors!r})."
+            f"{brief(targets)}) and sensors (now {brief(sensors)})."
         )
     in_order = sorted(found, key=lambda pair: (natural_key(pair.target), natural_key(pair.sensor)))
     return {pair: _both(found[pair], folder) for pair in in_order}
+
+
+def _is_unicode(name: str) -> bool:
+    """Whether a file's name is text; Python has surrogates for bytes that are none."""
+    return not any("\ud800" <= sign <= "\udfff" for sign in name)
 
 
 def _both(sides: dict[str, Path], folder: Path) -> tuple[Path, Path]:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from numbers import Real
 from typing import Literal, get_args
 
 import numpy as np
 
-from gtsam_rwhec.errors import OptionError, PriorError, ScaleError
+from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
-from gtsam_rwhec.problem.measurements import positive_weights
+from gtsam_rwhec.geometry.real_numbers import is_between, is_one_of
+from gtsam_rwhec.problem.measurements import LARGEST_WEIGHT, SMALLEST_WEIGHT, positive_weights
 
 ScaleMode = Literal["known", "shared", "per_target"]
+#: Scales below this are refused, as weights are: no target has them, and their squares overflow.
+SMALLEST_SCALE = SMALLEST_WEIGHT
+#: Scales above this are refused too.
+LARGEST_SCALE = LARGEST_WEIGHT
 #: Two priors on one frame contradict one another when they differ by more than this many standard deviations.
 CONTRADICTION_SIGMAS = 6.0
 
@@ -41,6 +46,22 @@ def difference(T: Array, S: Array) -> str:
     """The distance of two poses, in words."""
     angle = np.degrees(2.0 * np.arcsin(min(1.0, np.linalg.norm(T[:3, :3] - S[:3, :3]) / np.sqrt(8.0))))
     return f"{1e3 * np.linalg.norm(T[:3, 3] - S[:3, 3]):.4g} mm and {angle:.4g} deg apart"
+
+
+def check_name(name: object, what: str) -> None:
+    """Raise a FrameError for a name that is no text, or empty."""
+    if not isinstance(name, str) or not name:
+        raise FrameError(f"{what} is {brief(name)}; give a string that is not empty")
+
+
+def checked_scale(scale: object, what: str) -> float:
+    """A scale, measured over true length; a ScaleError for anything but a number whose square is far from rounding."""
+    if not is_between(scale, SMALLEST_SCALE, LARGEST_SCALE):
+        raise ScaleError(
+            f"{what} is {brief(scale)}; give a positive number from {SMALLEST_SCALE:g} to {LARGEST_SCALE:g} "
+            "(measured / true length)"
+        )
+    return float(scale)
 
 
 def _check_agreement(name: str, first: Prior, second: Prior) -> None:
@@ -72,8 +93,8 @@ class Knowledge:
     """
 
     def __init__(self, scale: ScaleMode) -> None:
-        if scale not in get_args(ScaleMode):
-            raise OptionError(f"scale={scale!r} is not one of {', '.join(map(repr, get_args(ScaleMode)))}")
+        if not is_one_of(scale, get_args(ScaleMode)):
+            raise OptionError(f"scale={brief(scale)} is not one of {', '.join(map(repr, get_args(ScaleMode)))}")
         self.scale: ScaleMode = scale
         self.fixed: dict[str, Array] = {}
         self.priors: dict[str, list[Prior]] = {}
@@ -87,6 +108,7 @@ class Knowledge:
         PriorError
             The frame is fixed at another pose already, or a prior contradicts the pose.
         """
+        check_name(name, "the name of a frame that is fixed")
         T = one_transform(T_carrier_frame, f"the pose at which {name} is fixed")
         known = self.fixed.get(name)
         if known is not None and np.abs(known - T).max() > 1e-9:
@@ -116,6 +138,7 @@ class Knowledge:
         PriorError
             The prior contradicts the fixed pose or another prior of the frame, or has neither sigma nor kappa.
         """
+        check_name(name, "the name of a frame with a prior")
         where = f"the prior of {name}"
         T = one_transform(T_carrier_frame, where)
         if sigma is None and kappa is None:
@@ -137,16 +160,17 @@ class Knowledge:
         Raises
         ------
         ScaleError
-            The scale is not positive, it is fixed at another value, or the problem's scale is not "per_target".
+            The scale is not a number from 1e-15 to 1e15, it is fixed at another value, or the problem's scale is not
+            "per_target".
         """
+        check_name(name, "the name of a target of known size")
         if self.scale != "per_target":
             raise ScaleError(f"fix_scale({name!r}) needs scale='per_target'; this problem has scale={self.scale!r}")
-        if not (isinstance(scale, Real) and np.isfinite(scale) and scale > 0):
-            raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number (measured / true length)")
+        scale = checked_scale(scale, f"the scale of {name}")
         if self.fixed_scales.get(name, scale) != scale:
             known = self.fixed_scales[name]
             raise ScaleError(f"the scale of {name} is fixed at {known} already, and now at {scale}; fix it once")
-        self.fixed_scales[name] = float(scale)
+        self.fixed_scales[name] = scale
 
     def _learn(self, other: Knowledge) -> None:
         """Add the knowledge of another problem, which must not contradict the knowledge here."""

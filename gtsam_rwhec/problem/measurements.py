@@ -9,11 +9,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CountError, NoiseError, UnitsWarning
-from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, as_transforms
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.poses import (
+    Array,
+    PosesLike,
+    QuaternionOrder,
+    as_transforms,
+    checked_rows,
+    rows_to_transforms,
+)
+from gtsam_rwhec.geometry.real_numbers import real_array
 from gtsam_rwhec.problem.moments import BLOCK, Gauge
 
-#: sigma and kappa below this or above its inverse are refused: other terms of a sum would be lost to rounding.
+#: sigma and kappa below this are refused: other terms of a sum would be lost to rounding.
 SMALLEST_WEIGHT = 1e-15
+#: sigma and kappa above this are refused too.
+LARGEST_WEIGHT = 1e15
 #: Translations with a median size beyond this, in metres, look like millimetres: no camera sees a tag at 100 m.
 MILLIMETRES_M = 100.0
 
@@ -53,6 +64,17 @@ class Measurements:
         """The measurements where ``mask`` (N,) is true."""
         arrays = {part.name: getattr(self, part.name) for part in fields(self)}
         return replace(self, **{name: array[mask] for name, array in arrays.items() if array is not None})
+
+    def projected(self, where: str) -> Measurements:
+        """The measurements with the rotations that the moments are made of: those that were not exact are projected.
+
+        A PoseError names a pose that is not valid.
+        """
+        A, B = (
+            rows_to_transforms(checked_rows(poses, 0, f"{name} of {where}").rows)
+            for name, poses in (("A", self.A), ("B", self.B))
+        )
+        return replace(self, A=A, B=B)
 
     def kept(self) -> KeptMeasurements:
         """A copy, since the caller's arrays may change, with one sigma and one kappa for each measurement."""
@@ -146,9 +168,11 @@ def positive_weights(value: ArrayLike | None, count: int, name: str, where: str)
     if value is None:
         return np.array(1.0)
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise NoiseError(f"{where}: {name}={value!r} cannot be read as numbers; give a number") from error
+        array = np.array(real_array(value))
+    except ValueError as error:
+        raise NoiseError(
+            f"{where}: {name}={brief(value)} cannot be read as numbers ({error}); give a number"
+        ) from error
     if array.shape not in ((), (count,)) or count == 0 != array.ndim:
         many = f" or one for each of {count}" if count else ""
         raise CountError(f"{where}: {name} has shape {array.shape}; give one number{many}")
@@ -156,12 +180,12 @@ def positive_weights(value: ArrayLike | None, count: int, name: str, where: str)
     if bad.size:
         index = f" of measurement {bad[0]}" if array.ndim else ""
         raise NoiseError(f"{where}: {name}{index} is {array.flat[bad[0]]}; it must be positive and finite")
-    unlikely = np.flatnonzero((array < SMALLEST_WEIGHT) | (array > 1.0 / SMALLEST_WEIGHT))
+    unlikely = np.flatnonzero((array < SMALLEST_WEIGHT) | (array > LARGEST_WEIGHT))
     if unlikely.size:
         value_there = array.flat[unlikely[0]]
         raise NoiseError(
             f"{where}: {name} is {value_there:.3g}; give a number from {SMALLEST_WEIGHT:g} to "
-            f"{1.0 / SMALLEST_WEIGHT:g}. sigma is in metres, kappa is 1 / (2 s^2) for s in radians"
+            f"{LARGEST_WEIGHT:g}. sigma is in metres, kappa is 1 / (2 s^2) for s in radians"
         )
     return array
 
@@ -170,7 +194,10 @@ def checked_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.nd
     """Stamps as (count,) integer nanoseconds; a CountError for another count or other numbers."""
     if stamps_ns is None:
         return None
-    stamps = np.asarray(stamps_ns)
+    try:
+        stamps = np.asarray(stamps_ns)
+    except (TypeError, ValueError) as error:
+        raise CountError(f"{where}: stamps_ns cannot be read as numbers ({error}); give integer nanoseconds") from error
     if stamps.shape != (count,):
         raise CountError(f"{where}: stamps_ns has shape {stamps.shape} for {count} measurements")
     if not np.issubdtype(stamps.dtype, np.integer):
@@ -182,7 +209,10 @@ def checked_covariances(covariances: ArrayLike | None, count: int, where: str) -
     """Covariances of B as (count, 6, 6); a CountError or NoiseError where they are not positive definite matrices."""
     if covariances is None:
         return None
-    array = np.array(covariances, dtype=np.float64)
+    try:
+        array = np.array(real_array(covariances))
+    except ValueError as error:
+        raise NoiseError(f"{where}: covariances cannot be read as numbers ({error}); give 6 x 6 matrices") from error
     if array.shape == (6, 6):
         array = np.broadcast_to(array, (count, 6, 6))
     if array.shape != (count, 6, 6):

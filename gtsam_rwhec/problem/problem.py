@@ -10,9 +10,10 @@ from typing import Literal
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError, RotationsProjectedWarning
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder
 from gtsam_rwhec.problem.accumulation import Accumulator, Batch
-from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode
+from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
 from gtsam_rwhec.problem.measurements import GivenMeasurements, KeptMeasurements, Measurements, warn_of_millimetres
 from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.pairs import Pair
@@ -113,7 +114,13 @@ class Problem(Knowledge):
             )
         return kept.joined()
 
+    def batches(self, target: str, sensor: str) -> tuple[Measurements, ...]:
+        """Raw measurements of a pair as they were added, batch by batch, without a copy; only what was kept."""
+        return self._kept[self._pair(target, sensor)].batches
+
     def _pair(self, target: str, sensor: str) -> Pair:
+        check_name(target, "the target's name")
+        check_name(sensor, "the sensor's name")
         pair = Pair(target, sensor)
         if pair not in self._kept:
             raise FrameError(f"no measurements of {pair}; there are {', '.join(map(str, self.pairs))}")
@@ -162,6 +169,8 @@ class Problem(Knowledge):
         PoseError, CountError, NoiseError, FrameError
             A name, pose, weight, stamp or covariance is not valid; nothing of the batch is added then.
         """
+        check_name(target, "the target's name")
+        check_name(sensor, "the sensor's name")
         pair = Pair(target, sensor)
         if pair.is_motion:
             raise FrameError(f"{target!r} is given as target and as sensor; names are unique across both")
@@ -184,10 +193,13 @@ class Problem(Knowledge):
 
         A is the carrier's motion and B the motion that the sensor measured, both T_before_after.
         """
+        check_name(sensor, "the sensor's name")
         given = GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source)
         self._add(Pair(sensor, sensor), given)
 
     def _add(self, pair: Pair, given: GivenMeasurements) -> None:
+        if given.source is not None and not isinstance(given.source, str):
+            raise OptionError(f"source is a {type(given.source).__name__}; give text: the name of a file or topic")
         where = f"{pair} ({given.source})" if given.source else pair.label
         self._check_names(pair, where)
         raw = given.checked(where)
@@ -200,6 +212,7 @@ class Problem(Knowledge):
                 RotationsProjectedWarning,
                 stacklevel=3,
             )
+            raw = raw.projected(where)
         warn_of_millimetres(raw.A, raw.B, accumulator.gauge, pair.is_motion, where)
         # The problem changes only after all checks and warnings: a warning may be raised as an error.
         self._accumulator = accumulator
@@ -210,8 +223,6 @@ class Problem(Knowledge):
 
     def _check_names(self, pair: Pair, where: str) -> None:
         for name, kind in zip(pair, ("target", "sensor"), strict=True):
-            if not isinstance(name, str) or not name:
-                raise FrameError(f"{where}: the {kind}'s name is {name!r}; give a string that is not empty")
             if not pair.is_motion and self._kind.get(name, kind) != kind:
                 raise FrameError(
                     f"{where}: {name!r} is a {self._kind[name]} already and cannot be a {kind} too; "
@@ -231,6 +242,7 @@ class Problem(Knowledge):
         CountError
             There are no measurements.
         """
+        _check_measurements(measurements)
         if not measurements:
             raise CountError(f"nothing is left of {self}: keep at least one measurement")
         moments = {
@@ -283,3 +295,14 @@ class Problem(Knowledge):
             f"Problem({len(self.targets)} targets, {len(self.sensors)} sensors, {len(self._kept)} pairs, "
             f"{self.number_of_measurements} measurements, scale={self.scale!r})"
         )
+
+
+def _check_measurements(measurements: object) -> None:
+    if not isinstance(measurements, Mapping):
+        raise OptionError(f"measurements is a {type(measurements).__name__}; give {{pair: Measurements}}")
+    for pair, raw in measurements.items():
+        if not isinstance(pair, Pair) or not isinstance(raw, Measurements):
+            raise OptionError(
+                f"measurements has a {type(raw).__name__} for {brief(pair)}; give "
+                "{Pair(target, sensor): Measurements}"
+            )

@@ -26,7 +26,7 @@ from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.search import Found, Search
-from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables, scales_of
+from gtsam_rwhec.solver.variables import Answer, rotations_as_variables, scales_of
 
 #: With more free frames than this a gap stays open on the way. The semidefinite relaxation would take most of the time,
 #: and the final, full solution has its own certificate.
@@ -47,6 +47,7 @@ class CertifiedFit:
     certified: bool
 
 
+@np.errstate(all="ignore")
 def certified_fit(problem: Problem, previous: CertifiedFit | None) -> CertifiedFit:
     """The global optimum; the search starts at the previous poses if there are any.
 
@@ -112,4 +113,4 @@ def _solve(part: Part, previous: CertifiedFit | None) -> tuple[Answer, bool]:
         if found is None or again.cost < found.cost:
             found = again
     found = search.with_positive_scale(found)
-    return answer_of(part, search.form, found.R), found.is_closed
+    return found.answer, found.is_closed

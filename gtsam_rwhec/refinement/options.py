@@ -8,7 +8,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from gtsam_rwhec.errors import NoiseError, OptionError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
 from gtsam_rwhec.problem.pairs import ByPair
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
@@ -41,9 +43,9 @@ class CarrierNoise:
     about: About = "targetcarrier"
 
     def __post_init__(self) -> None:
-        if self.about not in get_args(About):
+        if not is_one_of(self.about, get_args(About)):
             raise OptionError(
-                f"CarrierNoise.about={self.about!r} is not one of {', '.join(map(repr, get_args(About)))}"
+                f"CarrierNoise.about={brief(self.about)} is not one of {', '.join(map(repr, get_args(About)))}"
             )
         if self.covariances is not None:
             if self.rotation_rad or self.translation_m:
@@ -54,10 +56,10 @@ class CarrierNoise:
             return
         for name in ("rotation_rad", "translation_m"):
             value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and np.isfinite(value) and value > 0.0):
+            if not (is_real(value) and 0.0 < value <= np.finfo(np.float64).max):
                 raise NoiseError(
-                    f"CarrierNoise.{name} is {value!r}; give a positive standard deviation (or no CarrierNoise at all, "
-                    "if A is exact)"
+                    f"CarrierNoise.{name} is {brief(value)}; give a positive standard deviation (or no CarrierNoise at "
+                    "all, if A is exact)"
                 )
 
 
@@ -111,19 +113,25 @@ class RefineOptions:
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
-            if getattr(self, name) not in get_args(choices):
+            if not is_one_of(getattr(self, name), get_args(choices)):
                 raise OptionError(
-                    f"RefineOptions.{name}={getattr(self, name)!r} is not one of "
+                    f"RefineOptions.{name}={brief(getattr(self, name))} is not one of "
                     f"{', '.join(map(repr, get_args(choices)))}"
                 )
         if not (isinstance(self.inlier_confidence, float) and 0.5 < self.inlier_confidence < 1.0):
-            raise OptionError(f"RefineOptions.inlier_confidence={self.inlier_confidence!r}; give one between 0.5 and 1")
+            raise OptionError(
+                f"RefineOptions.inlier_confidence={brief(self.inlier_confidence)}; give one between 0.5 and 1"
+            )
         if not isinstance(self.time_offsets, (bool, tuple)):
             raise OptionError(
-                f"RefineOptions.time_offsets={self.time_offsets!r}; give True, or a tuple of sensors' names: ('cam_0',)"
+                f"RefineOptions.time_offsets={brief(self.time_offsets)}; give True, or a tuple of sensors' names: "
+                "('cam_0',)"
             )
-        if not (isinstance(self.max_iterations, int) and self.max_iterations > 0):
-            raise OptionError(f"RefineOptions.max_iterations={self.max_iterations!r}; give a positive number")
+        if not is_whole(self.max_iterations, 1):
+            raise OptionError(
+                f"RefineOptions.max_iterations={brief(self.max_iterations)}; give a whole number from 1 to "
+                f"{LARGEST_WHOLE}"
+            )
         if self.carrier_noise is not None and not isinstance(self.carrier_noise, CarrierNoise):
             raise OptionError(
                 f"RefineOptions.carrier_noise is a {type(self.carrier_noise).__name__}; give "

@@ -11,8 +11,10 @@ import numpy as np
 from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.pose_covariances import error_of, relative_jacobian, standard_deviations
 from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.geometry.real_numbers import is_real, is_whole
 from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.pairs import Pair
@@ -139,6 +141,7 @@ class RefinedPoses:
         Two cameras of a rig often have a far smaller relative covariance than each camera on its carrier. FrameError if
         the problem has no such frame, or the frames are on two carriers.
         """
+        first, second = (self._name(name) for name in (first, second))
         poses = next((p for p in (self.X, self.Y) if first in p and second in p), None)
         if poses is None:
             for name in (first, second):
@@ -155,7 +158,7 @@ class RefinedPoses:
 
     def standard_deviations(self, name: str) -> tuple[Array, Array]:
         """A frame's standard deviations (3,) in degrees about and (3,) in millimetres along its own x, y, z."""
-        if name not in self.X and name not in self.Y:
+        if self._name(name) not in self.X and name not in self.Y:
             raise FrameError(
                 f"{name!r} is not a frame and has no axes; there are {', '.join(self.X | self.Y)} (of a scale or an "
                 "offset take the root of covariance(name))"
@@ -172,8 +175,10 @@ class RefinedPoses:
 
         It is a chi-square quantile if the noise was given; if the noise was estimated, dimension times an F quantile.
         """
-        if not 0.0 < confidence < 1.0:
-            raise OptionError(f"confidence={confidence!r}; give one between 0 and 1")
+        if not (is_real(confidence) and 0.0 < confidence < 1.0):
+            raise OptionError(f"confidence={brief(confidence)}; give one between 0 and 1")
+        if not is_whole(dimension, 1):
+            raise OptionError(f"dimension={brief(dimension)}; give a whole number of at least 1")
         if np.isinf(self.degrees_of_freedom):
             return float(chdtri(dimension, 1.0 - confidence))
         return float(dimension * fdtri(dimension, self.degrees_of_freedom, confidence))
@@ -187,12 +192,16 @@ class RefinedPoses:
             If the problem has no such frame, or the pose is not valid.
         """
         poses = self.X | self.Y
-        if name not in poses:
+        if self._name(name) not in poses:
             raise FrameError(f"there is no frame {name!r}; there are {', '.join(poses)}")
         xi = error_of(poses[name], T_carrier_frame)
         if name not in self.names:
             return bool(np.abs(xi).max() < 1e-9)
         return bool(xi @ self.information(name) @ xi <= self.squared_radius(6, confidence))
+
+    @staticmethod
+    def _name(name: object) -> str:
+        return str(Unknown.of(name))
 
     def _rows_of(self, unknown: Unknown) -> Array:
         """The matrix (m, d) that selects an unknown's rows; zero for a fixed frame."""

@@ -17,7 +17,7 @@ from gtsam_rwhec.errors import (
     RwhecWarning,
     WeightsWarning,
 )
-from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -86,6 +86,7 @@ def refine(
         If iterations ended at their limit.
     """
     options = RefineOptions() if options is None else options
+    check_progress(progress)
     tell = progress or silent
     check_inputs(problem, solution, options)
     estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)

@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.files.terminal_text import brief
+
 
 class UnknownKind(Enum):
     """The kind of an unknown; the value is its word in files and names."""
@@ -27,10 +30,12 @@ class Unknown(NamedTuple):
     owner: str = ""
 
     @staticmethod
-    def of(name: str | Unknown) -> Unknown:
-        """The unknown of a name: "cam_0", "scale", "scale:tag_0" or "time_offset:cam_0"."""
+    def of(name: object) -> Unknown:
+        """The unknown of a name: "cam_0", "scale", "scale:tag_0" or "time_offset:cam_0"; else a FrameError."""
         if isinstance(name, Unknown):
             return name
+        if not isinstance(name, str):
+            raise FrameError(f"{brief(name)} is not a name; give the name of a frame, a scale or a time offset")
         if name == UnknownKind.SCALE.value:
             return Unknown(UnknownKind.SCALE)
         word, separator, owner = name.partition(":")

@@ -17,7 +17,9 @@ import gtsam
 import numpy as np
 from pydantic import ValidationError
 
+from gtsam_rwhec.files.terminal_text import brief, printable, shown
 from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.results.json_text import DEEPEST, MOST_ROWS, MOST_VALUES, refuse_depth
 from gtsam_rwhec.solver.certificate import Certificate
 
 #: Fields at the top of a file: those of the refined answer if there is one, else those of the certified answer.
@@ -26,6 +28,10 @@ POSED = ("sensors", "targets", "scale", "scale_mode")
 ROWS = ("residuals", "pairs", "noise", "inlier_counts")
 #: The field in which a record says in words what it means. It is for people and is not read back.
 SENTENCE = "sentence"
+#: Fields of a covariance of all unknowns; they have far more numbers than all others together.
+MATRICES = ("finite", "free", "unit")
+#: With more faults than this a message has their number alone: to list a million faults takes a gigabyte.
+MOST_FAULTS = 1_000
 #: Fields that may be infinite, and the infinity for which null stands in each.
 INFINITIES = {
     **dict.fromkeys(("lower_bound", "float_bound", "min_eigenvalue"), -math.inf),
@@ -62,27 +68,77 @@ def to_json(value: Any, place: str, field: str = "") -> Any:
     raise ValueError(f"{place}: must be finite{allowed} (found {value})")
 
 
-def from_json(value: Any, place: str, field: str) -> Any:
-    """Reverse `to_json`; a pair that is a key becomes its JSON text.
+def from_json(tree: dict[str, Any]) -> dict[str, Any]:
+    """Reverse `to_json` for a whole file; a pair that is a key becomes its JSON text.
 
-    Raises `ValueError` if a number is infinite or NaN, or if a row lacks its target or sensor.
+    Raises `ValueError` if a number is infinite or NaN, if a row lacks its target or sensor or its pair is there twice,
+    or if there is more of anything than `json_text` allows.
     """
-    if isinstance(value, dict):
-        told = {key: item for key, item in value.items() if key != SENTENCE or not isinstance(item, str)}
-        return {key: from_json(item, f"{place}.{key}", key) for key, item in told.items()}
-    if isinstance(value, list) and field in ROWS and all(isinstance(row, dict) for row in value):
-        rows = {}
-        for index, row in enumerate(from_json(value, place, "")):
-            if not {"target", "sensor"} <= row.keys():
-                raise ValueError(f"{place}[{index}]: a target and a sensor are missing")
-            key = json.dumps([row.pop("target"), row.pop("sensor")])
+    restored: dict[str, Any] = _Restored().of(tree, "$", "", 0)
+    return restored
+
+
+class _Restored:
+    """Restores the values of one file, and counts them."""
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def of(self, value: Any, place: str, field: str, depth: int) -> Any:
+        """The value at a place, inside `depth` lists and objects; `field` is the name of the field that holds it."""
+        if isinstance(value, dict | list):
+            if depth == DEEPEST:
+                refuse_depth()
+            if len(value) > MOST_ROWS:
+                raise ValueError(f"{_cut(place)}: {len(value)} entries; at most {MOST_ROWS} are read")
+            self.number += len(value)
+            if self.number > MOST_VALUES:
+                raise ValueError(f"{_cut(place)}: the file has more than {MOST_VALUES} values up to here")
+        if isinstance(value, dict):
+            told = {key: item for key, item in value.items() if key != SENTENCE or not isinstance(item, str)}
+            matrices = MATRICES if field == "joint" else ()
+            return {
+                key: _checked_matrix(item, f"{place}.{key}")
+                if key in matrices
+                else self.of(item, f"{place}.{shown(key)}", key, depth + 1)
+                for key, item in told.items()
+            }
+        if isinstance(value, list) and field in ROWS and all(isinstance(row, dict) for row in value):
+            return self._rows(value, place, depth)
+        if isinstance(value, list):
+            return [self.of(item, f"{place}[{index}]", field, depth + 1) for index, item in enumerate(value)]
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"{_cut(place)}: {value} is not a number of JSON")
+        return INFINITIES[field] if value is None and field in INFINITIES else value
+
+    def _rows(self, value: list[dict[str, Any]], place: str, depth: int) -> dict[str, Any]:
+        rows: dict[str, Any] = {}
+        for index, given in enumerate(value):
+            row = self.of(given, f"{place}[{index}]", "", depth + 1)
+            pair = [row.pop(name, None) for name in ("target", "sensor")]
+            if not all(isinstance(name, str) for name in pair):
+                raise ValueError(f"{_cut(place)}[{index}]: a target and a sensor are missing")
+            key = json.dumps(pair)
+            if key in rows:
+                raise ValueError(f"{_cut(place)}[{index}]: the pair {shown(key)} is there twice; keep one")
             rows[key] = row["value"] if row.keys() == {"value"} else row
         return rows
-    if isinstance(value, list):
-        return [from_json(item, f"{place}[{index}]", field) for index, item in enumerate(value)]
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"{place}: {value} is not a number of JSON")
-    return INFINITIES[field] if value is None and field in INFINITIES else value
+
+
+def _checked_matrix(rows: Any, place: str) -> Any:
+    """The rows of a matrix, or one row, of finite numbers; pydantic would tell of each number that is none."""
+    if not isinstance(rows, list):
+        raise ValueError(f"{place}: must be a list (found {brief(rows)})")
+    for i, row in enumerate(rows):
+        for j, number in enumerate(row if isinstance(row, list) else [row]):
+            if type(number) not in (float, int) or not math.isfinite(number):
+                where = f"[{i}][{j}]" if isinstance(row, list) else f"[{i}]"
+                raise ValueError(f"{place}{where}: must be a finite number (found {brief(number)})")
+    return rows
+
+
+def _cut(place: str) -> str:
+    return shown(place, 200)
 
 
 def in_words(error: Exception, moved: tuple[str, ...] = POSED) -> str:
@@ -92,13 +148,15 @@ def in_words(error: Exception, moved: tuple[str, ...] = POSED) -> str:
     """
     if not isinstance(error, ValidationError):
         return f"{error}."
+    if error.error_count() > MOST_FAULTS:
+        return f"{error.error_count()} fields are missing, unknown or wrong."
     faults = []
     for fault in error.errors(include_url=False):
         keys = fault["loc"][1:] if fault["loc"][:2] in [("refined", name) for name in moved] else fault["loc"]
         place = "$" + "".join(_step(key) for key in keys)
-        given = repr(fault["input"])
-        value = f" (found {given})" if len(given) <= 60 and fault["type"] != "missing" else ""
-        faults.append(f"{place}: {fault['msg'].removeprefix('Value error, ')}{value}")
+        given = brief(fault["input"], 60)
+        value = f" (found {given})" if "characters ...]" not in given and fault["type"] != "missing" else ""
+        faults.append(f"{_cut(place)}: {printable(fault['msg'].removeprefix('Value error, '), 1000)}{value}")
     rest = f"; and {len(faults) - 3} more" if len(faults) > 3 else ""
     return "; ".join(faults[:3]) + rest + "."
 
@@ -107,4 +165,4 @@ def _step(key: int | str) -> str:
     """One step of a JSON path; a key that begins with [ is a pair already."""
     if isinstance(key, int):
         return f"[{key}]"
-    return key if key.startswith("[") else f".{key}"
+    return shown(key) if key.startswith("[") else f".{shown(key)}"

@@ -19,6 +19,9 @@ SIZE_SIGMAS = 5.0
 SIZE_SHARE = 0.004
 #: Seconds whose nanoseconds fit 64 bits; rig files have the same limit.
 Seconds: TypeAlias = Annotated[float, Field(ge=-4e9, le=4e9)]
+Count: TypeAlias = Annotated[int, Field(ge=0)]
+Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
+NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
 
 
 class _Record(BaseModel):
@@ -30,7 +33,7 @@ class _Count(_Record):
 
     target: str = Field(description="the target's name")
     sensor: str = Field(description="the sensor's name")
-    used: int = Field(description="measurements that went on to the next stage")
+    used: Count = Field(description="measurements that went on to the next stage")
 
     @property
     def pair(self) -> Pair:
@@ -41,7 +44,7 @@ class _Count(_Record):
 class TrackCount(_Count):
     """How many measurements of a pair a stage used, and how many it removed for which reason."""
 
-    removed: dict[str, int] = Field(default={}, description="number of removed measurements, by reason")
+    removed: dict[str, Count] = Field(default={}, description="number of removed measurements, by reason")
 
     def __str__(self) -> str:
         return f"{self.target} in {self.sensor}: {', '.join(f'{count} {why}' for why, count in self.removed.items())}"
@@ -55,15 +58,15 @@ class TrackCount(_Count):
 class OutlierCount(_Count):
     """How many measurements of a pair the answer uses, and how many were left out as outliers."""
 
-    left_out: int = Field(default=0, description="measurements that were left out as outliers")
+    left_out: Count = Field(default=0, description="measurements that were left out as outliers")
 
 
 class FrameOutliers(_Record):
     """How many measurements of one sensor or target were left out as outliers."""
 
     frame: str = Field(description="name of the sensor or target")
-    left_out: int = Field(description="measurements that were left out as outliers")
-    measurements: int = Field(description="all measurements of the frame, with the outliers")
+    left_out: Count = Field(description="measurements that were left out as outliers")
+    measurements: Count = Field(description="all measurements of the frame, with the outliers")
 
     def __str__(self) -> str:
         return f"{self.left_out} of {self.measurements} measurements of {self.frame} contradict the answer"
@@ -78,14 +81,14 @@ class DetectionReport(_Record):
     """What the detection stage reports."""
 
     sources: tuple[str, ...] = Field(description="file names of the logs")
-    images: dict[str, int] = Field(description="number of images, or of a detection driver's messages, by sensor")
+    images: dict[str, Count] = Field(description="number of images, or of a detection driver's messages, by sensor")
     undecoded: dict[str, tuple[str, ...]] = Field(description="images that could not be used, and why, by sensor")
     tracks: tuple[TrackCount, ...] = Field(description="detections of each target in each sensor")
-    strangers: dict[str, int] = Field(
+    strangers: dict[str, Count] = Field(
         description="how often each tag that belongs to no target was seen, by family and id"
     )
     unseen: tuple[str, ...] = Field(default=(), description="targets that no sensor saw")
-    corner_px: dict[str, float] = Field(
+    corner_px: dict[str, NotNegative] = Field(
         description="measured standard deviation of a corner along each axis, pixels, by target/sensor"
     )
 
@@ -97,7 +100,7 @@ class CleaningReport(_Record):
     time_offsets_s: dict[str, Seconds] = Field(
         description="of each sensor, used to synchronise: as given, or found from turning rates"
     )
-    coarse_sigma_s: dict[str, float] = Field(
+    coarse_sigma_s: dict[str, NotNegative] = Field(
         description="standard deviations of the time offsets that were found from turning rates"
     )
 
@@ -106,9 +109,11 @@ class SizeFields(_Record):
     """What the measurements say about a target's stated size."""
 
     target: str = Field(description="the target's name")
-    stated_m: float = Field(description="the length in the rig file, metres")
-    scale: float = Field(description="stated length / true length")
-    sigma: float | None = Field(description="standard deviation of scale; null where the motion does not determine it")
+    stated_m: Positive = Field(description="the length in the rig file, metres")
+    scale: Positive = Field(description="stated length / true length")
+    sigma: NotNegative | None = Field(
+        description="standard deviation of scale; null where the motion does not determine it"
+    )
     is_free: bool = Field(description="true: the size was estimated, as it does not fit the motion, or on request")
 
     @property
@@ -128,7 +133,7 @@ class TimeOffsetFields(_Record):
 
     sensor: str = Field(description="the sensor's name")
     offset_s: Seconds = Field(description="the sensor's stamp t is the carriers' t + offset")
-    sigma_s: float | None = Field(
+    sigma_s: NotNegative | None = Field(
         description="standard deviation; null where the offset was given, or the motion does not determine it"
     )
 

@@ -13,13 +13,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from gtsam_rwhec.errors import FileFormatError, ResultVersionError
+from gtsam_rwhec.errors import FileFormatError, OptionError, ResultVersionError
 from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.paths import checked_path
+from gtsam_rwhec.files.terminal_text import brief, shown
+from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
-from gtsam_rwhec.results.agreement import check_certificates, check_joint, check_top, check_verdict
-from gtsam_rwhec.results.earlier_versions import FIRST_VERSION, as_version_4
+from gtsam_rwhec.results.agreement import (
+    check_certificates,
+    check_log,
+    check_says_what_it_is_about,
+    check_scale,
+    check_sizes,
+    check_top,
+    check_verdict,
+)
+from gtsam_rwhec.results.covariance_agreement import check_frames, check_joint
+from gtsam_rwhec.results.earlier_versions import FIRST_VERSION, FIRST_WITH_VERDICT, as_version_4
+from gtsam_rwhec.results.json_text import MOST_BYTES, parse_json
 from gtsam_rwhec.results.json_tree import POSED, from_json, in_words, to_json
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.schema import (
@@ -81,6 +94,7 @@ def write_solution(solution: Solution, path: str | Path) -> None:
     FileFormatError
         The file cannot be written (the message says why), or a number of the solution is NaN.
     """
+    path = checked_path(path)
     write_atomically(path, _content(path, solution, None, None))
 
 
@@ -98,6 +112,9 @@ def write_refined(refined: Refined, path: str | Path, log: LogFields | None = No
     log : LogFields, optional
         What became of the measurements, if they come from a log.
     """
+    path = checked_path(path)
+    if not isinstance(refined, Refined):
+        raise OptionError(f"refined is a {type(refined).__name__}; give what gtsam_rwhec.refine returned")
     write_atomically(path, _content(path, refined.solution, refined, log))
 
 
@@ -139,36 +156,38 @@ def read_refined(path: str | Path) -> RefinedPoses:
 
 def read_result(path: str | Path) -> Result:
     """Read everything that a file holds; raises as `read_solution` does."""
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
-    return parse_result(content, path)
+    return parse_result(read_whole(path, MOST_BYTES, "A result was"), path)
 
 
 def parse_result(content: bytes, path: str | Path) -> Result:
     """Read the content of a file; messages name `path`. Raises as `read_solution` does."""
     try:
-        header = _Header.model_validate_json(content)
-    except ValidationError as error:
+        raw = parse_json(content)
+        fields = {name: raw[name] for name in _Header.model_fields if name in raw} if isinstance(raw, dict) else raw
+        header = _Header.model_validate(fields)
+    except ValueError as error:
         raise FileFormatError(f"{path} is not a result of gtsam-rwhec: {in_words(error)}") from error
     if header.format != FORMAT:
         raise FileFormatError(
-            f"{path}: $.format is {header.format!r}, expected {FORMAT!r}: this is another kind of file."
+            f"{path}: $.format is {brief(header.format)}, expected {FORMAT!r}: this is another kind of file."
         )
     number = header.format_version
     if not FIRST_VERSION <= number <= FORMAT_VERSION:
         remedy = "Install a newer gtsam-rwhec" if number > FORMAT_VERSION else "Calibrate again to write a new file"
         raise ResultVersionError(
-            f"{path} has version {number} of the result format (written by {header.written_by}); this gtsam-rwhec "
-            f"reads versions {FIRST_VERSION} to {FORMAT_VERSION}. {remedy}."
+            f"{path} has version {number} of the result format (written by {shown(header.written_by)}); this "
+            f"gtsam-rwhec reads versions {FIRST_VERSION} to {FORMAT_VERSION}. {remedy}."
         )
     try:
-        raw = json.loads(content)
-        file = _checked(raw if number == FORMAT_VERSION else as_version_4(raw))
+        if number < FIRST_WITH_VERDICT:
+            raw = as_version_4(raw)
+        if number == FORMAT_VERSION:
+            check_says_what_it_is_about(raw)
+        file = _checked({**raw, "format_version": FORMAT_VERSION})  # version 4 lacks fields that have defaults
         result = _result_of(file)
-        if number == FORMAT_VERSION:  # earlier versions had no verdict
-            check_verdict(file.verdict, judge(result.solution, result.refined, result.log).verdict)
+        if number >= FIRST_WITH_VERDICT:
+            found = judge(result.solution, result.refined, result.log)
+            check_verdict(file.verdict, file.verdict_grounds, found)
     except ValueError as error:
         of_version = (
             "" if number == FORMAT_VERSION else f" of version {number} (converted places are those of {FORMAT_VERSION})"
@@ -213,10 +232,11 @@ def _content(path: str | Path, solution: Solution, refined: Refined | None, log:
             **parts,
         }
         content = json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        encoded = content.encode("utf-8")  # a name may have half a character
         _checked(json.loads(content))
     except ValueError as error:
         raise FileFormatError(f"{path} was not written, because the result is not valid: {in_words(error)}") from error
-    return content.encode("utf-8")
+    return encoded
 
 
 def _posed(tree: dict[str, Any], answer: Solution | RefinedPoses, carriers: Mapping[str, str]) -> dict[str, Any]:
@@ -241,10 +261,16 @@ def _checked(tree: dict[str, Any]) -> ResultFile:
     rest = {name: value for name, value in tree.items() if name not in posed}
     if isinstance(tree.get("refined"), dict):
         rest["refined"] = {**tree["refined"], **posed}
-    file = ResultFile.model_validate_json(json.dumps(from_json(rest, "$", "")))
+    file = ResultFile.model_validate_json(json.dumps(from_json(rest)))
     check_certificates(file.certified)
+    check_scale(file.certified, "$.certified.scale")
+    check_sizes(file.certified, file.refined)
+    if file.log is not None:
+        check_log(file.log)
     if file.refined is None:
         check_top(tree)
     else:
+        check_scale(file.refined, "$.scale")
         check_joint(file.refined, file.certified)
+        check_frames(file.refined, _of_class(RefinedPoses, file.refined))
     return file

@@ -29,7 +29,7 @@ from gtsam_rwhec.solving.solution import Solution
 
 FORMAT: Final = "gtsam-rwhec result"
 #: It grows whenever a reader of the version before would misread or refuse the file.
-FORMAT_VERSION: Final = 4
+FORMAT_VERSION: Final = 5
 
 CONVENTIONS = {
     "poses": (
@@ -85,6 +85,8 @@ class Pose(BaseModel):
     @model_validator(mode="after")
     def _is_a_rotation(self) -> Pose:
         R = np.array(self.rotation_matrix)
+        if np.abs(R).max() > 2.0 or np.abs(self.quaternion_wxyz).max() > 2.0:  # larger ones could not be squared
+            raise ValueError(f"rotation_matrix or quaternion_wxyz of {self.child} is not a rotation")
         w, *v = self.quaternion_wxyz
         x, y, z = v
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -142,8 +144,18 @@ def _told_as(kind: type[Any]) -> GetPydanticSchema:
     return _as(kind, lambda record: kind.__bases__[0](**vars(record)))
 
 
+def _pair_of(key: str) -> Pair:
+    try:
+        names = json.loads(key)
+    except (json.JSONDecodeError, RecursionError):
+        names = None
+    if not (isinstance(names, list) and len(names) == 2 and all(isinstance(name, str) for name in names)):
+        raise ValueError("rows with a target and a sensor were expected")
+    return Pair(*names)
+
+
 #: `json_tree.from_json` makes such keys of a file's rows {target, sensor, ...}.
-PairKey = Annotated[Pair, BeforeValidator(lambda key: Pair(*json.loads(key)))]
+PairKey = Annotated[Pair, BeforeValidator(_pair_of)]
 UnknownKey = Annotated[Unknown, BeforeValidator(Unknown.of)]
 Rows = Annotated[slice, _as(tuple[int, int], lambda ends: slice(*ends))]
 Poses = _as(tuple[Pose, ...], _poses_of)
@@ -230,7 +242,7 @@ class ResultFile(BaseModel):
     model_config = CONFIG
 
     format: Literal["gtsam-rwhec result"] = Field(description="what kind of file this is")
-    format_version: Literal[4] = Field(description="the version of these fields")
+    format_version: Literal[5] = Field(description="the version of these fields")
     written_by: str = Field(description="the library and its version")
     verdict: Verdict = Field(description="use, care or do_not_use")
     verdict_reason: str = Field(description="the reasons as a sentence")

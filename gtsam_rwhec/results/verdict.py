@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.cause import Status
@@ -85,6 +86,8 @@ def judge(solution: Solution, refined: RefinedPoses | None = None, log: LogField
     log : LogFields, optional
         What became of the measurements, if they come from a log.
     """
+    if not isinstance(solution, Solution):
+        raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
     certificate = solution.certificate
     found: dict[Ground, str] = {}
     if certificate.status is Status.FAILED:

@@ -3,7 +3,9 @@ from .cause import Multipliers as Multipliers
 from .cause import SearchPath as SearchPath
 from .cause import Start as Start
 from .cause import Status as Status
+from .certificate import Basis as Basis
 from .certificate import Certificate as Certificate
 from .certificate import Objective as Objective
 from .options import SolveOptions as SolveOptions
+from .region import Region as Region
 from .residuals import Residual as Residual

@@ -1,194 +1,369 @@
-"""A lower bound on the optimum of a reduced form, from any multipliers. It is rigorous in floating point.
+"""A lower bound on the cost of every answer, from any multipliers, that is rigorous in floating point.
 
-Let y = [vec R_1, ..., vec R_n, 1] be feasible and Z = Q' - Lambda for any multipliers. Then y'Q'y = y'Z y, because each
-constraint is zero at y. Write y = x + [z, 0] for any x whose last entry is 1::
+Let L(y) = J(y) - sum lambda_k c_k(y), where c_k(y) = 0 are the constraints of rotations. L is quadratic in all
+variables, translations included. About any point x, with g half its gradient and Z half its second derivative::
 
-    y' Z y = x' Z x + 2 g' z + z' Z_rr z,      g = (Z x) without its last entry
+    J(y) = L(y) = L(x) + 2 g'd + d'Z d,      d = y - x
 
-If Z_rr >= diag(m) with m > 0, the right side is at least x' Z x - sum g^2 / m. This is the dual certificate of design
-fact 3 without its null vector, so rounding errors do not decide the test of definiteness. Free directions, or no
-certificate, leave only Z_rr >= -diag(m). Then |z_i| <= sqrt(3) + |r_i| for each rotation bounds the loss.
+L(x) and g come from the raw measurements, where nothing cancels (`measured_form`). The moments enter Z alone, whose
+rounding only has to be small against its eigenvalues. If Z >= diag(m) with m > 0, then for any vector v, with
+rho = g - Z v: 2 g'd + d'Z d >= -(2 g - Z v)'v - sum rho^2 / m. With v near Z^-1 g this loses next to nothing.
 
-With an unknown scale nothing couples to h: (R, alpha) and (-R, -alpha) cost the same, and r itself is a null vector of
-Z_rr. Then an entry j of r takes the role of h: y_r = a r + z with z_j = 0 and a = y_j / r_j, |a| <= 1 / |r_j|.
+**Null vectors.** Where the measurements leave directions V free, Z is singular. For each, one variable is held: d =
+V a + z, where z is zero at the held variables and a is d there. Then Z has to be definite for z only, and ::
 
-Z_rr is singular where an answer is free or has a twin. ``deflation`` removes the null directions first and loses almost
-nothing. The verified test of all of Z_rr would lose the whole allowance.
+    L(y) >= L(x) + 2 (V'g)'a + a'(V'Z V) a - |g + Z V a|^2 in the norm of the inverse of Z
 
-x'Zx and g are evaluated in extended precision, with a bound on their rounding; ``verified`` tests the definiteness.
-The bound is a true bound on the optimum of the stored D, C, E, G of ``ReducedForm``.
+V'ZV, V'g and Z V come from what V does to the raw measurements, which is next to nothing. Held entries of rotations
+have |a| <= 2; held translations and scales are limited by a `Region`. With an unknown scale nothing couples to h, and x
+itself is a null vector.
+
+**Rotations in floating point** satisfy their constraints up to rounding only. The bound covers those too.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver import arrow
-from gtsam_rwhec.solver.deflation import deflated_eigenvalue
-from gtsam_rwhec.solver.lagrangian import Wide, lagrangian
-from gtsam_rwhec.solver.reduced_form import ReducedForm
-from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
-from gtsam_rwhec.solver.verified import UNIT, arrow_is_positive_definite, cholesky_allowance, gamma
+from gtsam_rwhec.geometry.rounding import UNIT, gamma
+from gtsam_rwhec.solver.arrow import ArrowFactor
+from gtsam_rwhec.solver.curvature import Curvature
+from gtsam_rwhec.solver.null_vectors import NullVectors, free_vectors, point_as_null_vector, stationary_along
+from gtsam_rwhec.solver.part_form import PartForm
+from gtsam_rwhec.solver.point import Evaluation
+from gtsam_rwhec.solver.region import AT_LEAST, LARGER, Region, half_widths, smallest_region
+from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT, constraint_values
+from gtsam_rwhec.solver.variables import Answer
+from gtsam_rwhec.solver.verified import cholesky_allowance
+from gtsam_rwhec.solver.weakest_rotation import smallest_eigenpair
 
-#: Above this size Lanczos finds the eigenvalue of a failed certificate; below it, a dense decomposition does.
-DENSE_EIGEN_SIZE = 700
-#: Each margin of definiteness is this factor times the one tried before; a power of two does not round.
-MORE_ROOM = 16.0
+#: Each entry of R'R - I of an answer in floating point, and of what the other constraints ask, is at most this.
+ROTATION_IN_DOUBLES = 1e-15
+#: Margins of definiteness as parts of the form's diagonal: the largest that is proven costs least.
+ROOMS = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+#: A factor of the slack between tries.
+MORE_SLACK = 3.0
+#: A loss below this part of the value does not ask for another try.
+NEGLIGIBLE = 1e-9
+#: A loss above this part of the value asks for other null vectors.
+OPEN = 1e-6
 
 
 @dataclass(frozen=True)
 class Bound:
     """A rigorous lower bound, and what was proven about Z for it; ``Bound()`` claims nothing."""
 
-    lower_bound: float = -np.inf  #: never above the optimum of the stored reduced form
-    value: float = -np.inf  #: x' Z x, without any allowance: the bound in exact arithmetic if Z_rr is positive definite
-    #: Whether Z_rr (without one entry, for an unknown scale) is proven positive definite: the optimum is unique.
-    definite: bool = False
-    semidefinite: bool = False  #: whether Z_rr is proven positive semidefinite up to rounding
-    eigenvalue: float = -np.inf  #: a proven lower bound on the smallest eigenvalue of Z_rr
-    direction: Array | None = None  #: (9 n,): an eigenvector of a negative eigenvalue of Z_rr, for a better start
+    lower_bound: float = -np.inf  #: no answer (of the region) costs less
+    value: float = -np.inf  #: the smallest value of L without any allowance: the bound in exact arithmetic
+    definite: bool = False  #: whether Z is proven positive definite (but for x, for an unknown scale)
+    semidefinite: bool = False  #: whether Z is proven positive semidefinite up to rounding
+    eigenvalue: float = -np.inf  #: a lower bound on Z's smallest eigenvalue
+    direction: Array | None = None  #: (9 n,): rotations along which Z is negative, for a better start
+    region: Region | None = None  #: where the bound holds; None: for all answers
+    #: (13 n + 1,): a step along free directions, in the form's variables, that lowers the cost by more than is enough.
+    step: Array | None = None
+
+    def at_most(self, cost: float) -> Bound:
+        """The bound, no higher than a cost that an answer has; and zero for less, as J is a sum of squares."""
+        lower = min(self.lower_bound, cost)
+        if np.isfinite(lower) and lower <= 0.0:
+            return replace(self, lower_bound=0.0, region=None)
+        return replace(self, lower_bound=lower)
 
 
-def lower_bound(form: ReducedForm, multipliers: Array, r: Array) -> Bound:
-    """The bound from multipliers (n, 20) and a point r (9 n,). It is true for any, and tight for optimal ones."""
-    if not (np.isfinite(multipliers).all() and np.isfinite(r).all()):  # a solver failed
-        return Bound()
-    L, n = form.leaves, form.rotations
-    value, z, value_error, z_error = lagrangian(form, multipliers, np.append(r, 1.0))
-    g, g_error, constant = z[:-1], z_error[:-1], z[-1]
-    reach = np.abs(g.astype(float)) * (1.0 + 4.0 * UNIT) + g_error  # |g|, entry by entry, rounded up
+def lower_bound(
+    form: PartForm,
+    evaluation: Evaluation,
+    multipliers: Array,
+    *,
+    enough: float = 0.0,
+    of_scale: float = 0.0,
+    contains: Answer | None = None,
+) -> Bound:
+    """The bound from multipliers (n, 20) at an evaluated point. It is true for any, and tight for optimal ones.
 
-    D, C, E, rounded = _curvature(form, multipliers)
-    k, b = len(form.G), len(E)
-    wide, square = arrow.with_low_rank(C, E, form.G_leaf, form.G_border[:, :-1])
-    size = 9 * n + k
-    leaf_diagonal, border_diagonal = np.einsum("lii->li", D), np.diagonal(E)
-    leaf_unit = cholesky_allowance(leaf_diagonal, size) + rounded[: 9 * L].reshape(L, 9)
-    border_unit = cholesky_allowance(border_diagonal, size) + rounded[9 * L :]
-    rows_margin = np.zeros(k)
+    ``enough`` is a loss that does not matter; a region is as large as it allows, and has the answer ``contains`` in it.
+    ``of_scale`` is the multiplier of alpha >= 0.
+    """
+    if not (np.isfinite(multipliers).all() and np.isfinite(evaluation.cost) and np.isfinite(evaluation.gradient).all()):
+        return Bound()  # a solver failed, or the answer is no answer
+    lagrangian = _Lagrangian.of(form, evaluation, multipliers, of_scale, contains)
+    bound = lagrangian.definite() or lagrangian.semidefinite(enough) or lagrangian.indefinite(enough)
+    return bound if np.isfinite(bound.lower_bound) else Bound(value=lagrangian.value, direction=bound.direction)
 
-    def proven(leaf_margin: Array, border_margin: Array, pin: int | None = None) -> bool:
-        """Whether Z_rr, without the border's row and column ``pin``, exceeds the margins."""
-        margin = np.r_[border_margin + rounded[9 * L :], rows_margin]
-        keep = np.delete(np.arange(b + k), pin) if pin is not None else slice(None)
-        return arrow_is_positive_definite(
-            D, wide[:, :, keep], square[keep][:, keep], leaf_margin + rounded[: 9 * L].reshape(L, 9), margin[keep]
+
+@dataclass(frozen=True)
+class _Lagrangian:
+    """L at the point x: its value and half its gradient, with bounds on their errors, and Z."""
+
+    form: PartForm
+    evaluation: Evaluation
+    multipliers: Array
+    value: float
+    value_error: float
+    g: Array
+    g_error: Array
+    Z: Curvature
+    is_homogeneous: bool
+    of_scale: float
+    contains: Answer | None
+
+    @staticmethod
+    def of(
+        form: PartForm, evaluation: Evaluation, multipliers: Array, of_scale: float, contains: Answer | None
+    ) -> _Lagrangian:
+        point = evaluation.point
+        n = len(multipliers)
+        constraints = constraint_values(point.rotations)
+        linear = of_scale * point.alpha
+        value = evaluation.cost - float((multipliers * constraints).sum()) - linear
+        value_error = evaluation.cost_error + gamma(20 * n + 8) * float(np.abs(multipliers * constraints).sum())
+        value_error += gamma(8) * (abs(evaluation.cost) + abs(linear) + abs(value))
+        Lambda = (multipliers @ CONSTRAINTS_FLAT).reshape(n, 10, 10)
+        size = (np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)).reshape(n, 10, 10)
+        r = np.c_[point.numbers[:, 4:], np.ones(n)]
+        g, g_error = evaluation.gradient.copy(), evaluation.gradient_error.copy()
+        of_numbers, of_errors = g[:-1].reshape(n, 13), g_error[:-1].reshape(n, 13)
+        of_numbers[:, 4:] -= np.einsum("nij,nj->ni", Lambda[:, :9], r)
+        of_errors[:, 4:] += gamma(36) * np.einsum("nij,nj->ni", size[:, :9], np.abs(r))
+        g[-1] -= 0.5 * of_scale
+        g_error += gamma(2) * np.abs(g)
+        is_homogeneous = n > 0 and not (form.curvature.is_coupled_to_h or multipliers[:, 11:].any() or of_scale)
+        Z = form.curvature.less(multipliers)
+        return _Lagrangian(
+            form, evaluation, multipliers, value, value_error, g, g_error, Z, is_homogeneous, of_scale, contains
         )
 
-    pin, reach_of_a = None, 1.0
-    if _is_homogeneous(form, multipliers) and r[9 * L :].any():
-        pin = int(np.abs(r[9 * L :]).argmax())
-        # Rotations have entries of at most 1.
-        reach_of_a = float(1.0 / r[9 * L + pin] ** 2) * (1.0 + 1e-10)
-    # z_i = vec R_i - r_i of a rotation R_i, so |z_i| <= sqrt(3) + |r_i|.
-    size_z = np.sqrt(3.0) + np.linalg.norm(r.reshape(n, 9), axis=1)
-    of_g = float((2.0 * np.linalg.norm(reach.reshape(n, 9), axis=1) * size_z).sum()) * (1.0 + 1e-10)
-    if proven(leaf_unit, border_unit, pin):
-        room = np.r_[leaf_unit.ravel(), border_unit]
-        by_room = float((reach**2 / room).sum()) * (1.0 + 1e-10)
-        by_size = of_g if pin is None else np.inf  # better with a large g and little room: z'Z_rr z >= 0
-        # Each try needs a factorisation: it is worth it only if the bound loses enough to g.
-        more = MORE_ROOM
-        while min(by_room, by_size) > 1e-9 * abs(float(value)) + 1e-17 * size * form.magnitude:
-            if not proven(more * leaf_unit, more * border_unit, pin):
+    # -- three cases --------------------------------------------------------------------------------------------
+
+    def definite(self) -> Bound | None:
+        """Z is positive definite, but for x where nothing couples to h."""
+        if self.is_homogeneous:
+            return self._definite_but_for_the_point()
+        room = self._room(self.Z)
+        if room is None:
+            return None
+        none = NullVectors.none(self.Z.size)
+        lower = self._lower(none, room, None)
+        return Bound(lower, self._value(none, room, None), True, True, float(room.min()), None, None)
+
+    def _definite_but_for_the_point(self) -> Bound | None:
+        """The better of two bounds: from the multipliers, and from those that make the gradient vanish along x."""
+        nulls = self._point()
+        if nulls is None:
+            return None
+        bounds = []
+        for each in (self._with(stationary_along(nulls.V, nulls.Vg, self.evaluation, self.multipliers)), self):
+            of_each = each._point()
+            room = None if of_each is None else each._room(each.Z.with_held(of_each.held))
+            if of_each is None or room is None:
+                continue
+            lower = each._lower(of_each, room, None)
+            bounds.append(Bound(lower, each._value(of_each, room, None), True, True, float(room.min()), None, None))
+            if self.value - lower <= NEGLIGIBLE * abs(self.value):
                 break
-            room, by_room, more = MORE_ROOM * room, by_room / MORE_ROOM, MORE_ROOM * more
-        loss = min(by_room, by_size)
-        if pin is None:
-            lower = value - Wide(value_error) - Wide(loss)
-        else:
-            # y'Zy = constant + a^2 (r'Z_rr r) + ..., and the constant is the last entry of Z x.
-            negative = max(0.0, float(constant - value + Wide(value_error) + Wide(loss)))
-            lower = constant - Wide(value_error) - Wide(negative * reach_of_a * (1.0 + 1e-10))
-        return Bound(_round_down(lower), float(value), True, True, float(room.min(initial=np.inf)), None)
+        return max(bounds, key=lambda bound: bound.lower_bound, default=None)
 
-    smallest, direction = 0.0, None
-    # Half of this is what the factorisation itself asks for.
-    slack_leaf, slack_border = 2.0 * leaf_unit, 2.0 * border_unit
-    semidefinite = proven(-slack_leaf, -slack_border)
-    if not semidefinite:
-        smallest, direction = _smallest_eigenpair(D, C, E, form)
-        extra = 1.01 * max(-smallest, 0.0)
-        for _ in range(60):
-            slack_leaf, slack_border = leaf_unit + extra, border_unit + extra
-            if proven(-slack_leaf, -slack_border):
+    def _point(self) -> NullVectors | None:
+        return point_as_null_vector(
+            self.evaluation, self.multipliers, self.value, self.value_error, self.g, self.g_error
+        )
+
+    def semidefinite(self, enough: float) -> Bound | None:
+        """Z is positive semidefinite up to rounding: its null vectors are taken out."""
+        bounds = []
+        for by_rounding in (True, False):
+            found = free_vectors(
+                self.form, self.evaluation, self.multipliers, self.Z, self.of_scale, by_rounding=by_rounding
+            )
+            if found is None:
+                continue
+            nulls, multipliers = found
+            better = self._with(multipliers)
+            room = better._room(better.Z.with_held(nulls.held))
+            if room is None:
+                continue
+            lower, region = better._over_region(nulls, room, enough)
+            value = better._value(nulls, room, region)
+            step = self._step_along(nulls, enough)
+            bounds.append(Bound(lower, value, False, True, -float(room.min()), None, region, step))
+            if self.value - lower <= OPEN * abs(self.value) + enough:
                 break
-            extra = 1.5 * extra + 4.0 * float(max(leaf_unit.max(initial=0.0), border_unit.max(initial=0.0)))
-        else:  # the estimate of the eigenvalue is wrong by 1.5^60: claim nothing
-            return Bound(value=float(value), direction=direction)
-    slack = np.r_[slack_leaf.ravel(), slack_border].reshape(n, 9)
-    loss = float((slack.max(axis=1) * size_z**2).sum())
-    if semidefinite and 9 * n <= DENSE_EIGEN_SIZE:
-        below = deflated_eigenvalue(form, multipliers, arrow.dense(D, C, E), rounded, slack)
-        loss = min(loss, max(-below, 0.0) * float((size_z**2).sum()))
-    loss = (loss + of_g) * (1.0 + 1e-10)
-    lower = _round_down(value - Wide(value_error) - Wide(loss))
-    return Bound(lower, float(value), False, semidefinite, -float(slack.max()), None if semidefinite else direction)
+        return max(bounds, key=lambda bound: bound.lower_bound, default=None)
+
+    def indefinite(self, enough: float) -> Bound:
+        """Z has a negative eigenvalue: rotations are limited, so a slack on their entries costs a limited amount."""
+        smallest, direction = smallest_eigenpair(self.form.reduced, self.multipliers)
+        slack = max(-1.01 * smallest, 4.0 * UNIT * self.form.reduced.magnitude)
+        limit = 1e3 * self.form.reduced.magnitude
+        # The first of slack, 3 slack, 9 slack, ... that is proven: by doubling of the exponent, then by halving.
+        last = math.ceil(math.log(limit / slack, MORE_SLACK)) - 1 if 0.0 < slack < limit else -1
+        failed, exponent, best = -1, 0, None
+        while best is None and failed < last:
+            exponent = min(2 * failed + 1, last) if failed >= 0 else 0
+            best = self._with_slack(slack * MORE_SLACK**exponent, direction, enough)
+            failed = failed if best else exponent
+        while best is not None and exponent - failed > 1:
+            middle = (failed + exponent) // 2
+            smaller = self._with_slack(slack * MORE_SLACK**middle, direction, enough)
+            best, exponent, failed = (smaller, middle, failed) if smaller else (best, exponent, middle)
+        return best or Bound(value=self.value, direction=direction)
+
+    def _with_slack(self, slack: float, direction: Array, enough: float) -> Bound | None:
+        """The bound with slack on the entries of rotations; None where Z is not proven to be definite with it."""
+        rotation = self.Z.is_rotation
+        # J >= L with slack on Z, less what the slack can add: entries of rotations are at most 1.
+        # The sum with the diagonal rounds, too.
+        added = slack * (1.0 + 1e-9) + 4.0 * UNIT * np.abs(self.Z.diagonal)[:-1].reshape(-1, 13)[:, 4:]
+        loss = float((added * (1.0 + np.abs(self.evaluation.point.numbers[:, 4:])) ** 2).sum()) * (1.0 + 1e-9)
+        relaxed = replace(self, Z=self.Z.plus(slack * rotation), value=self.value - loss)
+        nulls = NullVectors.none(self.Z.size)
+        room = relaxed._room(relaxed.Z)
+        if room is None:
+            found = free_vectors(self.form, self.evaluation, self.multipliers, relaxed.Z, self.of_scale, slack)
+            if found is not None:
+                nulls, multipliers = found
+                better = self._with(multipliers)
+                relaxed = replace(better, Z=better.Z.plus(slack * rotation), value=better.value - loss)
+                room = relaxed._room(relaxed.Z.with_held(nulls.held))
+        if room is None:
+            return None
+        lower, region = relaxed._over_region(nulls, room, enough)
+        return Bound(lower, self.value, False, False, -slack, direction, region)
+
+    def _with(self, multipliers: Array) -> _Lagrangian:
+        """The same point with other multipliers."""
+        return _Lagrangian.of(self.form, self.evaluation, multipliers, self.of_scale, self.contains)
+
+    # -- parts of a proof ---------------------------------------------------------------------------------------
+
+    def _room(self, Z: Curvature) -> Array | None:
+        """A margin (13 n + 1,) by which Z is proven to be definite; None where it is not proven."""
+        scale = np.abs(self.form.curvature.diagonal)
+        for part in ROOMS:
+            room = np.maximum(part * scale, 1e-290)
+            if Z.exceeds(room):
+                return room
+        room = 0.25 * cholesky_allowance(scale, Z.size)
+        return room if Z.exceeds(room) else None
+
+    def _over_region(self, nulls: NullVectors, room: Array, enough: float) -> tuple[float, Region | None]:
+        """The bound over the largest region that costs little, or over all of space where no region is needed."""
+        if self.Z.is_rotation[nulls.held].all():
+            return self._lower(nulls, room, None), None
+        smallest = smallest_region(self.form.part, self.evaluation.point, self.contains)
+        best = self._lower(nulls, room, smallest)
+        for times in LARGER:
+            region = smallest.larger(times)
+            lower = self._lower(nulls, room, region)
+            if best - lower <= enough:
+                return lower, region
+        return best, smallest
+
+    def _lower(self, nulls: NullVectors, room: Array, region: Region | None) -> float:
+        """The lower bound, rounded down."""
+        lower = self._value_less_loss(nulls, room, region)
+        lower = max(lower - self._slack_by_multipliers(), self._less_rounding_of_rotations(lower))
+        return float(np.nextafter(lower, -np.inf))
+
+    def _value_less_loss(self, nulls: NullVectors, room: Array, region: Region | None) -> float:
+        """The smallest value of L, less the errors of what it is made of."""
+        held = self.Z.with_held(nulls.held)
+        factor = held.factor()
+        if factor is None:
+            return -np.inf
+        point = self.evaluation.point
+        width = half_widths(self.form.part, point, region or Region(0.0, 0.0))[nulls.held]
+        root = _root_of_loss(held, factor, self.g, self.g_error, nulls.held, room)
+        of_nulls = np.array(
+            [
+                _root_of_loss(held, factor, nulls.ZV[:, k], nulls.ZV_error[:, k], nulls.held, room)
+                for k in range(len(width))
+            ]
+        )
+        loss = root * root + _loss_along(nulls, root, of_nulls, width)
+        return self.value - self.value_error - loss * (1.0 + 1e-9)
+
+    def _value(self, nulls: NullVectors, room: Array, region: Region | None) -> float:
+        """The bound without any allowance for rounding: an estimate of what exact arithmetic gives."""
+        exact = replace(self, value_error=0.0, g_error=np.zeros_like(self.g))
+        return exact._value_less_loss(nulls.without_errors(), room, region)
+
+    def _step_along(self, nulls: NullVectors, enough: float) -> Array | None:
+        """The step along free translations and scales to the lowest value, where the cost surely rises along them.
+
+        None if it gains no more than is enough.
+        """
+        moving = ~self.Z.is_rotation[nulls.held]
+        if not moving.any():
+            return None
+        smallest = smallest_region(self.form.part, self.evaluation.point, None)
+        reach = half_widths(self.form.part, self.evaluation.point, smallest)[nulls.held[moving]] / AT_LEAST
+        VZV = nulls.VZV[np.ix_(moving, moving)] * reach[:, None] * reach
+        values, vectors = np.linalg.eigh(0.5 * (VZV + VZV.T))
+        unsure = float((nulls.VZV_error[np.ix_(moving, moving)] * reach[:, None] * reach).sum())
+        surely = values > max(2.0 * unsure, enough)
+        slope = vectors.T @ (nulls.Vg[moving] * reach)
+        if float((slope[surely] ** 2 / values[surely]).sum()) <= enough:
+            return None
+        step: Array = -nulls.V[:, moving] @ (reach * (vectors[:, surely] @ (slope[surely] / values[surely])))
+        return step
+
+    def _slack_by_multipliers(self) -> float:
+        """What L and J differ by at most at rotations in floating point."""
+        return ROTATION_IN_DOUBLES * float(np.abs(self.multipliers).sum()) * (1.0 + 1e-9)
+
+    def _less_rounding_of_rotations(self, lower: float) -> float:
+        """The bound for rotations in floating point, from that for exact ones: the root of J is a norm of residuals."""
+        if lower <= 0.0:
+            return -np.inf
+        diagonal = self.form.curvature.diagonal + self.form.curvature.rounding
+        change = ROTATION_IN_DOUBLES * float(np.sqrt(np.maximum(diagonal[self.Z.is_rotation], 0.0)).sum())
+        root = np.sqrt(lower) * (1.0 - 4.0 * UNIT) - change
+        return float(root * root) * (1.0 - 4.0 * UNIT) if root > 0.0 else -np.inf
 
 
-def _is_homogeneous(form: ReducedForm, multipliers: Array) -> bool:
-    """Whether nothing couples to h: an unknown scale, no known frames or priors, no handedness multipliers."""
-    coupled = multipliers[:, 11:].any() or form.C[:, :, -1].any() or form.E[-1, :-1].any() or form.G[:, -1].any()
-    return not coupled
+def _loss_along(nulls: NullVectors, root: float, of_nulls: Array, width: Array) -> float:
+    """An upper bound on -min of 2 (V'g)'a + a'(V'ZV)a - (root + sum |a_k| of_nulls_k)^2 + root^2, over |a| <= width.
+
+    In a direction in which V'ZV is surely positive no limit is needed.
+    """
+    k = len(width)
+    if k == 0:
+        return 0.0
+    # (sum |a_k| r_k)^2 <= k sum a_k^2 r_k^2. In units of the limits, so that directions compare.
+    curved = nulls.VZV - np.diag(k * of_nulls**2)
+    curved = 0.5 * (curved + curved.T) * width[:, None] * width
+    slope = (np.abs(nulls.Vg) + nulls.Vg_error + root * of_nulls) * width
+    if not (np.isfinite(curved).all() and np.isfinite(slope).all()):
+        return np.inf
+    values, vectors = np.linalg.eigh(curved)
+    unsure = float((nulls.VZV_error * width[:, None] * width).sum()) + 1e-13 * k * float(np.abs(curved).sum())
+    loss = 0.0
+    for value, vector in zip(values - unsure, vectors.T, strict=True):
+        h = float(np.abs(vector) @ slope)
+        reach = float(np.abs(vector).sum())
+        box = 2.0 * h * reach + max(-float(value), 0.0) * reach**2
+        loss += min(box, h * h / float(value)) if value > 0.0 else box
+    return loss * (1.0 + 1e-9)
 
 
-def exact_value(form: ReducedForm, x: Array) -> tuple[float, float]:
-    """x' Q' x in extended precision, and a bound on its rounding error."""
-    value, _, error, _ = lagrangian(form, np.zeros((form.rotations, 20)), x)
-    return float(value), error + UNIT * abs(float(value))
-
-
-def _round_down(value: Any) -> float:
-    return float(np.nextafter(float(value), -np.inf))
-
-
-def _curvature(form: ReducedForm, multipliers: Array) -> tuple[Array, Array, Array, Array]:
-    """Z_rr before G'G is subtracted, as arrow (D, C, E); last, a diagonal (9 n,) that dominates its rounding."""
-    L, n = form.leaves, form.rotations
-    Lambda = (multipliers @ CONSTRAINTS_FLAT).reshape(n, 10, 10)[:, :9, :9]
-    size = (np.abs(multipliers) @ np.abs(CONSTRAINTS_FLAT)).reshape(n, 10, 10)[:, :9, :9].copy()
-    D = form.D - Lambda[:L]
-    E = form.E[:-1, :-1].copy()
-    size[:L] += np.abs(form.D)
-    for p in range(n - L):
-        block = slice(9 * p, 9 * p + 9)
-        size[L + p] += np.abs(E[block, block])
-        E[block, block] -= Lambda[L + p]
-    # Each entry sums at most 20 products (exact, as the constraints' entries are integers) and one subtraction.
-    rounded = gamma(22) * size.sum(axis=2).ravel()
-    return D, form.C[:, :, :-1], E, rounded
-
-
-def _smallest_eigenpair(D: Array, C: Array, E: Array, form: ReducedForm) -> tuple[float, Array]:
-    """Smallest eigenvalue of arrow(D, C, E) - G'G and its vector; an estimate."""
-    size = len(form.G.T) - 1
-    G = form.G[:, :-1]
-    if size <= DENSE_EIGEN_SIZE:
-        matrix = arrow.dense(D, C, E) - G.T @ G
-        values, vectors = scipy.linalg.eigh(matrix, subset_by_index=[0, 0], check_finite=False)
-        return float(values[0]), vectors[:, 0]
-    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh  # slow to import, few problems need it
-
-    split = 9 * form.leaves
-    wide = C.reshape(split, -1)
-
-    def apply(v: Array) -> Array:
-        v = v.ravel()
-        leaf = np.matmul(D, v[:split].reshape(-1, 9, 1)).ravel() + wide @ v[split:]
-        result: Array = np.r_[leaf, wide.T @ v[:split] + E @ v[split:]] - G.T @ (G @ v)
-        return result
-
-    operator = LinearOperator((size, size), matvec=apply, dtype=np.float64)
-    start = np.random.default_rng(0).standard_normal(size)
-    try:
-        values, vectors = eigsh(operator, k=1, which="SA", v0=start, tol=1e-6, maxiter=2000)
-        return float(values[0]), vectors[:, 0]
-    except ArpackNoConvergence as stopped:
-        if len(stopped.eigenvalues):
-            return float(stopped.eigenvalues[0]), np.real(stopped.eigenvectors[:, 0])
-        return -form.magnitude, start / np.linalg.norm(start)
+def _root_of_loss(Z: Curvature, factor: ArrowFactor, h: Array, h_error: Array, held: np.ndarray, room: Array) -> float:
+    """The root of an upper bound on -min 2 h'z + z'Z z, over z whose ``held`` entries are zero."""
+    h, h_error = h.copy(), h_error.copy()
+    h[held], h_error[held] = 0.0, 0.0
+    v = factor.solve_vector(h)
+    v[held] = 0.0
+    Zv, error = Z.times(v), Z.rounding_of_product(v)
+    rest = h - Zv
+    rest[held], error[held] = 0.0, 0.0
+    taken = float((h + rest) @ v) + gamma(len(v) + 8) * float((np.abs(h) + np.abs(rest)) @ np.abs(v))
+    taken += float(error @ np.abs(v))
+    rho = np.abs(rest) * (1.0 + 4.0 * UNIT) + error
+    square = max(taken, 0.0) + float((rho**2 / room).sum())
+    root = np.sqrt(square) + np.sqrt(float((h_error**2 / room).sum()))
+    return float(root) * (1.0 + 1e-9)

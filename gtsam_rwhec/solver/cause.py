@@ -140,14 +140,14 @@ class Cause(StrEnum):
     ROUNDING = (
         "rounding",
         Status.GAP,
-        "the bound reaches the cost in exact arithmetic, but not with the allowance for rounding; free directions and "
-        "mirror images cause this",
+        "the bound reaches the cost in exact arithmetic, but not with the allowance for rounding; free directions, "
+        "mirror images, far origins and extreme weights cause this, and more so where the measurements are not kept",
     )
     MIRROR_IMAGE = (
         "mirror_image",
         Status.GAP,
-        "the mirror image, which has a negative scale, costs {mirror_cost:.8g}, less than this answer's {cost:.8g}: "
-        "with planar motion only the noise decides the sign of the scale",
+        "the mirror image, which has a negative scale, costs no more: {mirror_cost:.8g} against this "
+        "answer's {cost:.8g}; with planar motion only the noise decides the sign of the scale",
     )
     #: Fact 4 (a) or (b) applies; method="local" does not find out which.
     LOCAL_MINIMUM_POSSIBLE = (
@@ -171,6 +171,7 @@ class Cause(StrEnum):
     )
     #: The search found a better answer than the one that was to be certified.
     BETTER_ANSWER = "better_answer", Status.GAP, "a better answer exists: {better_cost:.8g} against {cost:.8g}"
+    #: Only in result files of format version 4 and older, whose bound was about the reduced form.
     DIGITS_LOST = (
         "digits_lost",
         Status.GAP,
@@ -178,7 +179,7 @@ class Cause(StrEnum):
         "form that the bound is about; the motion turns too little for the accuracy that sigma claims",
     )
     NO_BOUND = "no_bound", Status.FAILED, "no finite lower bound was found"
-    #: Rounding alone can bring this about.
+    #: As DIGITS_LOST: now no answer can cost less than the bound, rounding included.
     BELOW_BOUND = (
         "below_bound",
         Status.FAILED,

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.moments import SWAPPED, edge_forms
+from gtsam_rwhec.geometry.rounding import gamma
+from gtsam_rwhec.problem.moments import ONE, R_A, SWAPPED, T_A, T_B, edge_forms
 from gtsam_rwhec.solver.parts import Part
 
 #: Positions among an edge's 28 numbers: leaf (13), center (13), alpha, h.
@@ -58,22 +59,34 @@ class FullForm:
         return float(own + 2.0 * coupled + tail @ self.tail @ tail)
 
 
-def full_forms(part: Part) -> tuple[FullForm, FullForm]:
+@dataclass(frozen=True)
+class Slots:
+    """What the variables of each pair are in the form.
+
+    ``leaf`` and ``center`` (E,) are indices, one past the last where there is none. ``of_pair`` (E, 25, 28): the 25
+    variables of a pair from the numbers of its leaf (13) and center (13), alpha and h.
+    """
+
+    leaf: np.ndarray
+    center: np.ndarray
+    of_pair: Array
+
+
+def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
     """Q of a part, and the form of its rotation residuals alone; both with the priors."""
     translation, rotation = part.moments.translation, part.moments.rotation
     if part.kind == "inverse":
         translation = translation[:, SWAPPED[:, None], SWAPPED]
         rotation = rotation.transpose(0, 2, 1)
     of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa)
-    slots = _edge_slots(part)
-    full, alone = (_assembled(part, *slots, of_edges) for of_edges in (of_translations + of_rotations, of_rotations))
+    full, alone = (_assembled(part, slots, of_edges) for of_edges in (of_translations + of_rotations, of_rotations))
     for form in (full, alone):
         _add_priors(form, part)
     return full, alone
 
 
-def _edge_slots(part: Part) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Each edge's leaf and center (one past the last index: none), and (25, 28), what its variables are in the form.
+def slots_of(part: Part) -> Slots:
+    """The slots of a part's pairs.
 
     [t_X, t_Y, alpha, r_X, r_Y] become numbers of leaf, center, alpha and h. A fixed frame becomes constants times h
     (its translation times alpha, where t is alpha times the translation); a known scale becomes h; both ends of a
@@ -96,7 +109,7 @@ def _edge_slots(part: Part) -> tuple[np.ndarray, np.ndarray, Array]:
                 S[e, [t, t + 1, t + 2], [first, first + 1, first + 2]] = 1.0
                 S[e, range(r, r + 9), range(first + 4, first + 13)] = 1.0
             else:
-                T = _as_variable(part.fixed[name], part)
+                T = as_variable(part.fixed[name], part)
                 S[e, t : t + 3, t_of_fixed] = T[:3, 3]
                 S[e, r : r + 9, H] = T[:3, :3].T.ravel()
         if part.scale == "shared":
@@ -105,10 +118,69 @@ def _edge_slots(part: Part) -> tuple[np.ndarray, np.ndarray, Array]:
             S[e, 6, 13 * place[target][0] + 3] = 1.0
         else:
             S[e, 6, H] = 1.0 / part.fixed_scales.get(target, 1.0)
-    return leaf, center, S
+    return Slots(leaf, center, S)
 
 
-def _as_variable(T: Array, part: Part) -> Array:
+def rounding_of_fixed(part: Part) -> Array:
+    """What rounding may take from a fixed frame's translation about the gauge where alpha multiplies it, (E, 2, 3)."""
+    result = np.zeros((len(part.pairs), 2, 3))
+    if part.kind == "direct" and part.scale == "shared" and part.fixed:
+        for e, pair in enumerate(part.pairs):
+            for side, name in enumerate(pair):
+                if name in part.fixed:
+                    shift = np.abs(part.frame_shift(name))
+                    result[e, side] = 2.0 * gamma(1) * (np.abs(part.fixed[name][:3, 3]) + 2.0 * shift)
+    return result
+
+
+def _rounding_of_pairs(part: Part) -> Array:
+    """What rounding did to each pair's form, as diagonals (E, 25) that dominate it.
+
+    The form of the measurements in exact arithmetic differs from the form as stored for two reasons: the rounding of
+    the moments (`Moments`), and that R'R is the identity only up to rounding. If every entry of a pair's form is off by
+    at most v_p v_q, then the pair's form is off by at most (sum v_p |x_p|)^2 <= 16 sum v_p^2 x_p^2, as 16 of its
+    variables carry translations.
+    """
+    moments = part.moments
+    # An error of a fixed frame's translation about the gauge acts like one of the measured translation.
+    of_fixed = rounding_of_fixed(part).sum(axis=(1, 2)) * np.sqrt(moments.weight)
+    magnitude, error = moments.magnitude, moments.feature_error.copy()
+    error[:, T_A] += of_fixed[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Of the larger length: where A does not move, its own undetermined column must not spoil the others.
+        length = np.maximum(magnitude[:, T_A].max(axis=1), magnitude[:, T_B].max(axis=1))
+        worst = np.nan_to_num(error[:, T_A].max(axis=1) / length, nan=1.0, posinf=1.0)
+    if part.kind == "inverse":
+        magnitude, error = magnitude[:, SWAPPED], error[:, SWAPPED]
+    # Sums over the pairs come on top of the sums over their measurements.
+    operations = moments.operations + len(part.pairs) + 20
+    unit = np.array([gamma(int(count)) for count in operations])
+    # g m m' + m e' + e m' + e e' <= g m m' + (c m + e / c)(c m + e / c)' for any c up to 1.
+    c = np.sqrt(np.clip(worst, 1e-30, 1.0))[:, None]
+    square = unit[:, None] * magnitude**2 + (c * magnitude + error / c) ** 2  # of the errors of features
+    off = 4.0 * moments.deviation  # of R'R from the identity, as a matrix norm
+    v = np.zeros((len(part.pairs), 25))
+    v[:, 0:3] = 0.5 * (square[:, R_A].sum(axis=1) + off * moments.weight)[:, None]
+    v[:, 3:6] = 0.5 * square[:, ONE, None]
+    v[:, 6] = 0.5 * square[:, T_A].sum(axis=1)
+    v[:, 16:25] = 0.5 * np.repeat(square[:, T_B], 3, axis=1)
+    v *= 16.0
+    v[:, 7:] += (moments.kappa * (1.5 * unit + off))[:, None]
+    return v
+
+
+def rounding_of(part: Part, slots: Slots) -> Array:
+    """What rounding did to Q, as a diagonal (13 n + 1,) over [leaves, centers, alpha] that dominates it."""
+    of_slots = np.einsum("ep,epq->eq", _rounding_of_pairs(part), slots.of_pair**2)
+    L, P = len(part.leaves), len(part.centers)
+    leaves, centers = np.zeros((L + 1, 13)), np.zeros((P + 1, 13))
+    np.add.at(leaves, slots.leaf, of_slots[:, :13])
+    np.add.at(centers, slots.center, of_slots[:, 13:26])
+    result: Array = np.r_[leaves[:L].ravel(), centers[:P].ravel(), of_slots[:, ALPHA].sum()]
+    return result
+
+
+def as_variable(T: Array, part: Part) -> Array:
     """A pose as the form's variables see it: itself, or its inverse."""
     if part.kind == "direct":
         return T
@@ -118,9 +190,10 @@ def _as_variable(T: Array, part: Part) -> Array:
     return inverse
 
 
-def _assembled(part: Part, leaf_of: np.ndarray, center_of: np.ndarray, S: Array, of_edges: Array) -> FullForm:
+def _assembled(part: Part, slots: Slots, of_edges: Array) -> FullForm:
     """The blocks of Q: the sum of the edges' forms (E, 25, 25)."""
     L, P = len(part.leaves), len(part.centers)
+    leaf_of, center_of, S = slots.leaf, slots.center, slots.of_pair
     Q = S.transpose(0, 2, 1) @ of_edges @ S
     one, two, tail = slice(0, 13), slice(13, 26), slice(26, 28)
     # One row more than there are frames: where an edge has no leaf or no center, its zeros go there.
@@ -165,7 +238,7 @@ def _prior_form(T: Array, sigma: float | None, kappa: float | None, part: Part) 
     if kappa is not None:
         residual = np.zeros((9, 14))
         residual[:, 4:13] = np.eye(9)
-        residual[:, 13] = -_as_variable(T, part)[:3, :3].T.ravel()  # r - r_0 h
+        residual[:, 13] = -as_variable(T, part)[:3, :3].T.ravel()  # r - r_0 h
         rows.append(residual * np.sqrt(kappa))
     stacked = np.concatenate(rows)
     return 0.5 * stacked.T @ stacked

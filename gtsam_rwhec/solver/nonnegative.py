@@ -1,14 +1,8 @@
 """The variant with alpha >= 0 as a constraint (RWHEC paper Section 4.3), for very noisy data.
 
 (R, t, alpha) and (-R, -t, -alpha) cost the same, but only one of them has det R = 1, so noise can put the optimum at a
-negative scale. With all but rotations and scale eliminated, the cost is x'Q'x + (alpha - a)^2 / s, where a = row . r is
-the best scale for the rotations (eq. 47) and s = ``scale_spread``. alpha >= 0 enters the relaxation as one linear
-inequality on h alpha, with one multiplier nu >= 0. For any nu, the elimination of the scale from cost - nu h alpha
-gives, on alpha >= 0::
-
-    cost >= x'Q'x - nu h a - nu^2 s h^2 / 4
-
-The right side is a form like Q', and ``bound`` bounds it in the same way.
+negative scale. alpha >= 0 enters the relaxation as one linear inequality on h alpha, with one multiplier nu >= 0. For
+any nu, J - nu alpha is at most J wherever alpha >= 0, and ``bound`` bounds it in the same way (``of_scale``).
 """
 
 from __future__ import annotations
@@ -21,15 +15,15 @@ from gtsam_rwhec.errors import OptionError, ScaleError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start
-from gtsam_rwhec.solver.descent import Descent, descend
+from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
 from gtsam_rwhec.solver.interior_point import Relaxation
+from gtsam_rwhec.solver.point import Point
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_with_scale
 from gtsam_rwhec.solver.rotations import vec
 from gtsam_rwhec.solver.search import Found, Search
 from gtsam_rwhec.solver.small_dual import stationary_multipliers
 from gtsam_rwhec.solver.variables import answer_of
-from gtsam_rwhec.solver.verified import gamma
 
 #: Up to this many frames the relaxation is solved: the size of Clarabel's cone grows with the fourth power.
 MAX_FRAMES = 8
@@ -46,18 +40,6 @@ def scale_spread(form: ReducedForm) -> float:
     return float(form.border_factor[-1] @ form.border_factor[-1])
 
 
-def with_scale_multiplier(form: ReducedForm, nu: float) -> ReducedForm:
-    """A form whose cost is at most the true cost wherever alpha >= 0."""
-    half = 0.5 * nu * scale_row(form)
-    split = 9 * form.leaves
-    C, E = form.C.copy(), form.E.copy()
-    C[:, :, -1] -= half[:split].reshape(-1, 9)
-    E[:-1, -1] -= half[split:]
-    E[-1, :-1] -= half[split:]
-    E[-1, -1] -= 0.25 * nu * nu * scale_spread(form)
-    return dataclasses.replace(form, C=C, E=E)
-
-
 def run_with_nonnegative_scale(search: Search) -> Found:
     """Solve with alpha >= 0 as a constraint; the answer is the unconstrained optimum where that has a positive scale.
 
@@ -67,7 +49,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
     found = search.run("auto", None)
     if search.part.kind != "direct":
         raise OptionError("nonnegative_scale needs the direct form: leave out priors on translations")
-    if answer_of(search.part, search.form, found.R).scale > 0.0:
+    if found.answer.scale > 0.0:
         return found
     if search.form.rotations > MAX_FRAMES:
         raise OptionError(
@@ -90,8 +72,10 @@ def run_with_nonnegative_scale(search: Search) -> Found:
         ends = _descend(form, starts + [end.R for end in at_zero], options.max_descent_iterations)
     positive = [end for end in ends if answer_of(search.part, form, end.R).scale > 0.0]
     with search.stages.of("dual certificate"):
-        bound = max(_bounds(form, relaxation, at_zero[0].R), key=lambda each: each.lower_bound)
-    lower = max(bound.lower_bound, found.bound.lower_bound)  # a bound without the constraint holds with it
+        bounds = _bounds(search, relaxation, at_zero[0].R, positive[0].R if positive else None)
+    # A bound without the constraint holds with it.
+    bound = max([*bounds, found.bound], key=lambda each: each.lower_bound)
+    lower = bound.lower_bound
     if not positive or positive[0].cost > at_zero[0].cost:
         proven = at_zero[0].cost - lower <= search.tolerance(at_zero[0].cost)
         raise ScaleError(
@@ -99,12 +83,15 @@ def run_with_nonnegative_scale(search: Search) -> Found:
             f"{at_zero[0].cost:.6g}, no answer below {lower:.6g}; the unconstrained optimum, {found.cost:.6g}, has a "
             "negative scale): the noise is too large to find the scale"
         )
-    best = positive[0]
+    answer, evaluation = search.whole.answer_near(positive[0].R)
+    lowest = evaluation.cost - 2.0 * evaluation.cost_error
     constrained = Found(
-        R=best.R,
-        cost=best.cost,
-        bound=dataclasses.replace(bound, lower_bound=min(lower, best.cost)),
-        tolerance=search.tolerance(best.cost),
+        answer=answer,
+        R=evaluation.point.rotations,
+        cost=evaluation.upper,
+        bound=bound.at_most(lowest),
+        tolerance=search.tolerance(evaluation.upper),
+        is_known=found.is_known,
         path=SearchPath(Start.NONNEGATIVE_SCALE, Multipliers.RELAXATION),
         cause=Cause.NOT_TIGHT,
         figures={"relaxation_cost": relaxation.dual},
@@ -125,28 +112,19 @@ def _descend(form: ReducedForm, starts: list[Array], max_iterations: int) -> lis
     return sorted((descend(form, start, max_iterations) for start in starts), key=lambda end: end.cost)
 
 
-def _bounds(form: ReducedForm, relaxation: Relaxation, at_zero: Array) -> list[Bound]:
-    """Bounds from the relaxation's multipliers: at the relaxation's own point, and at the best point of scale zero."""
-    r = vec(at_zero).ravel()
+def _bounds(search: Search, relaxation: Relaxation, at_zero: Array, positive: Array | None) -> list[Bound]:
+    """Bounds from the relaxation's multipliers, about the best answer, and about the best point of scale zero."""
+    whole, form = search.whole, search.form
+    leaf, center, _ = without_scale(form).recover(homogeneous(at_zero))
+    numbers = np.c_[np.concatenate([leaf, center]), vec(at_zero)]
+    zero = whole.cost.at(Point(numbers, 0.0))
     # At scale zero the multiplier of the scale is the slope of the cost.
-    of_slope = max(-2.0 * float(scale_row(form) @ r) / scale_spread(form), 0.0)
-    bounds = []
-    for nu, point in (
-        (max(relaxation.scale_multiplier, 0.0), relaxation.X[:-1, -1] / relaxation.X[-1, -1]),
-        (of_slope, r),
-    ):
-        held = with_scale_multiplier(form, nu)
-        multipliers = relaxation.multipliers
-        if point is r:
-            multipliers = stationary_multipliers(held, at_zero, multipliers)
-        bound = lower_bound(held, multipliers, point)
-        bounds.append(dataclasses.replace(bound, lower_bound=bound.lower_bound - _rounding(form, nu)))
-    return bounds
-
-
-def _rounding(form: ReducedForm, nu: float) -> float:
-    """A bound on the rounding in ``with_scale_multiplier`` at any rotations: their entries are at most 1."""
-    of_row = np.abs(form.border_factor[-1]) @ np.abs(form.G)
-    linear = nu * float(of_row.sum()) + 2.0 * float(np.abs(form.C[:, :, -1]).sum() + np.abs(form.E[:-1, -1]).sum())
-    constant = nu * nu * scale_spread(form) + abs(float(form.E[-1, -1]))
-    return gamma(len(form.G) + 10) * (linear + constant)
+    of_slope = max(2.0 * float(zero.gradient[-1]), 0.0)
+    gradient = zero.gradient[:-1].reshape(-1, 13)[:, 4:]
+    tries = [
+        (zero, of_slope, stationary_multipliers(gradient, at_zero, relaxation.multipliers)),
+        (zero, max(relaxation.scale_multiplier, 0.0), relaxation.multipliers),
+    ]
+    if positive is not None:
+        tries.append((whole.answer_near(positive)[1], max(relaxation.scale_multiplier, 0.0), relaxation.multipliers))
+    return [lower_bound(whole, at, multipliers, of_scale=nu) for at, nu, multipliers in tries]

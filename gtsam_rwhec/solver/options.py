@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
-import numpy as np
-
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
 
 Method = Literal["auto", "sdp", "local"]
 
@@ -48,15 +49,20 @@ class SolveOptions:
 
     def __post_init__(self) -> None:
         if not isinstance(self.nonnegative_scale, bool):
-            raise OptionError(f"SolveOptions.nonnegative_scale={self.nonnegative_scale!r}; it is True or False")
+            raise OptionError(f"SolveOptions.nonnegative_scale={brief(self.nonnegative_scale)}; it is True or False")
         for option in fields(self)[:-1]:
             value = getattr(self, option.name)
-            number = isinstance(value, (int, float)) and not isinstance(value, bool) and np.isfinite(value)
-            if not number or value < 0 or (value == 0 and option.name not in ("random_starts", "seed")):
-                raise OptionError(f"SolveOptions.{option.name}={value!r}; it must be positive and finite")
+            if isinstance(option.default, float):
+                if not (is_real(value) and 0.0 < value <= sys.float_info.max):
+                    raise OptionError(f"SolveOptions.{option.name}={brief(value)}; it must be positive and finite")
+            elif not is_whole(value, least := 0 if option.name in ("random_starts", "seed") else 1):
+                raise OptionError(
+                    f"SolveOptions.{option.name}={brief(value)}; it must be positive and finite: a whole number from "
+                    f"{least} to {LARGEST_WHOLE}"
+                )
 
 
 def check_method(method: str) -> None:
     """Raise an ``OptionError`` for an unknown method."""
-    if method not in get_args(Method):
-        raise OptionError(f"method={method!r} is not one of {', '.join(map(repr, get_args(Method)))}")
+    if not is_one_of(method, get_args(Method)):
+        raise OptionError(f"method={brief(method)} is not one of {', '.join(map(repr, get_args(Method)))}")

@@ -13,6 +13,7 @@ from gtsam_rwhec.problem.knowledge import Prior, ScaleMode
 from gtsam_rwhec.problem.moments import Gauge, Moments, MomentStack
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.solver.given import Given
 
 #: "direct" is Problem 3 of the RWHEC paper, A X = Y B; "inverse" is the inverse equation, B X^-1 = Y^-1 A, which a
 #: scale for each target needs (design fact 7).
@@ -39,6 +40,7 @@ class Part:
     kind: Kind  #: which equation's residuals the form has
     scale: ScaleMode
     is_relative: bool  #: whether all weights are 1, so that costs have no statistical meaning
+    given: Given | None  #: the raw measurements, fixed frames and priors; None where measurements were not kept
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -141,6 +143,7 @@ def _part(problem: Problem, members: frozenset[str]) -> Part:
         kind="inverse" if is_inverse else "direct",
         scale=problem.scale,
         is_relative=problem.is_relative,
+        given=Given.of(problem, pairs, members),
     )
     _check(part)
     return part

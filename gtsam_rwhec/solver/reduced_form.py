@@ -14,8 +14,7 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver import arrow
-from gtsam_rwhec.solver.full_form import FullForm, full_forms
-from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.full_form import FullForm
 
 #: With a unit diagonal, a smaller eigenvalue of the eliminated block is rounding error. The pseudo-inverse of eq. 48
 #: leaves its direction out.
@@ -114,21 +113,6 @@ class ReducedForm:
         for i in np.flatnonzero(self.leaf_null[:, 3].any(axis=1)):
             leaf[i] += _toward_unit_scale(leaf[i], self.leaf_null[i], np.array([3]))
         return leaf, w[:-1].reshape(-1, 4), w[-1:]
-
-
-@dataclass(frozen=True)
-class Forms:
-    """The quadratic forms of a part: full, of the rotation residuals alone, and reduced."""
-
-    full: FullForm
-    rotation: FullForm
-    reduced: ReducedForm
-
-    @staticmethod
-    def of(part: Part) -> Forms:
-        """Build the forms from the part's moments."""
-        full, rotation = full_forms(part)
-        return Forms(full, rotation, reduce(full))
 
 
 def reduce(form: FullForm) -> ReducedForm:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.rounding import Doubled, product
 
 
 def _constraints() -> Array:
@@ -47,6 +48,30 @@ ALL_CONSTRAINTS = _constraints()
 CONSTRAINTS = ALL_CONSTRAINTS[:20]
 #: The same as rows (20, 100).
 CONSTRAINTS_FLAT = CONSTRAINTS.reshape(20, 100)
+
+
+def _terms() -> tuple[np.ndarray, np.ndarray, Array]:
+    """For each constraint the entries p, q (20, 4) of its products and their factors, zero where there are fewer."""
+    p, q, factor = np.zeros((20, 4), dtype=int), np.zeros((20, 4), dtype=int), np.zeros((20, 4))
+    for k, A in enumerate(CONSTRAINTS):
+        for i, (row, column) in enumerate(zip(*np.nonzero(np.triu(A)), strict=True)):
+            p[k, i], q[k, i] = row, column
+            factor[k, i] = A[row, column] * (1 if row == column else 2)
+    return p, q, factor
+
+
+_TERMS = _terms()
+#: The constraints with a diagonal entry of R'R or R R', whose constant part is -h^2.
+WITH_CONSTANT = CONSTRAINTS[:, 9, 9] != 0.0
+
+
+def constraint_values(R: Array) -> Array:
+    """y'A y of the 20 constraints at stored rotations (n, 20): rounding errors of R, right to their last digit."""
+    y = np.c_[vec(R), np.ones(len(R))]
+    p, q, factor = _TERMS
+    exact = product(y[:, p], y[:, q])
+    result: Array = Doubled(exact.hi * factor, exact.lo * factor).summed(axis=2).value
+    return result
 
 
 #: e_k^, the cross product with each axis (3, 3, 3): the opposite of the Levi-Civita symbol.

@@ -9,19 +9,21 @@ import numpy as np
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver import small_dual
-from gtsam_rwhec.solver.bound import Bound, exact_value, lower_bound
+from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start
-from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
+from gtsam_rwhec.solver.descent import Descent, descend
 from gtsam_rwhec.solver.interior_point import Relaxation
 from gtsam_rwhec.solver.mirror import mirrored
 from gtsam_rwhec.solver.options import Method, SolveOptions
+from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.reduced_form import Forms, ReducedForm
+from gtsam_rwhec.solver.point import Evaluation
+from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_relaxation
-from gtsam_rwhec.solver.rotations import kkt_multipliers, project, random_rotations, unvec, vec
+from gtsam_rwhec.solver.rotations import kkt_multipliers, project, random_rotations, unvec
 from gtsam_rwhec.solver.stages import Stages
 from gtsam_rwhec.solver.start import spectral_start, unconstrained_start
-from gtsam_rwhec.solver.variables import answer_of
+from gtsam_rwhec.solver.variables import Answer, answer_of
 
 #: A mirror image may cost this part more, and the measurements may still mean it. Above, it is another answer.
 MIRROR_COST = 0.01
@@ -29,16 +31,29 @@ MIRROR_COST = 0.01
 TWIN_DISTANCE = 1e-3
 #: A search has this bound before it has tried any multipliers.
 NOTHING_YET = Bound()
+#: What a region costs the bound matters from this part of the tolerance on.
+REGION_SHARE = 1e-4
+#: With unit weights and exact data, costs below this part of the form's magnitude are the rounding of the measurements.
+OF_MEASUREMENTS = 1e-30
+#: The same where only moments are known, whose sums are rounded.
+OF_MOMENTS = 1e-13
+#: Moments whose rounding may change the cost by more than this part of it prove nothing.
+KNOWN = 1e-3
+#: Directions that only the noise of measured rotations determines are known from the raw measurements alone. The answer
+#: takes at most so many steps along them.
+STEPS_ALONG_FREE_DIRECTIONS = 3
 
 
 @dataclass(frozen=True)
 class Found:
-    """The best rotations of a part and the best bound on the cost of any answer."""
+    """The best answer of a part and the best bound on the cost of any answer."""
 
-    R: Array  #: (n, 3, 3), in the order of ``part.free``, as the form has them
-    cost: float  #: x'Q'x at R
-    bound: Bound  #: its ``lower_bound`` is at most ``cost``
+    answer: Answer  #: about the part's gauge
+    R: Array  #: (n, 3, 3), its rotations in the order of ``part.free``, as the form has them
+    cost: float  #: J at the answer, rounded up
+    bound: Bound  #: its ``lower_bound`` is at most the exact cost of the answer
     tolerance: float  #: the absolute gap up to which the answer counts as proven optimal
+    is_known: bool  #: whether the moments, where measurements were not kept, tell the cost
     path: SearchPath
     cause: Cause
     figures: dict[str, float] = field(default_factory=dict)  #: numbers in the cause's sentence, by name
@@ -46,30 +61,37 @@ class Found:
     @property
     def is_closed(self) -> bool:
         """Whether the gap is within the tolerance: the answer is proven optimal."""
-        return self.cost - self.bound.lower_bound <= self.tolerance
+        return self.cost - self.bound.lower_bound <= self.tolerance and self.is_known
 
 
 @dataclass(frozen=True)
 class Search:
-    """The search of one part: its forms, and the times of the stages."""
+    """The search of one part: its cost, and the times of the stages.
+
+    A bound that holds in a region only has the answer ``contains``, if there is one, in its region.
+    """
 
     part: Part
     options: SolveOptions
     stages: Stages
-    forms: Forms
+    whole: PartForm
+    contains: Answer | None = None
 
     @staticmethod
-    def of(part: Part, options: SolveOptions, progress: Progress | None = None) -> Search:
+    def of(
+        part: Part, options: SolveOptions, progress: Progress | None = None, *, contains: Answer | None = None
+    ) -> Search:
         """Build the forms; the search calls ``progress`` with the name of each stage as the stage begins."""
         stages = Stages(progress)
         with stages.of("quadratic form"):
-            forms = Forms.of(part)
-        return Search(part, options, stages, forms)
+            whole = PartForm.of(part)
+            _ = whole.reduced
+        return Search(part, options, stages, whole, contains)
 
     @property
     def form(self) -> ReducedForm:
         """Q'."""
-        return self.forms.reduced
+        return self.whole.reduced
 
     @property
     def is_large(self) -> bool:
@@ -77,14 +99,22 @@ class Search:
         return self.form.rotations > self.options.max_dense_frames
 
     def tolerance(self, cost: float) -> float:
-        """The absolute gap that counts as zero (design fact 10), and at least the rounding of the form's entries.
+        """The absolute gap that counts as zero (design fact 10).
 
-        With unit weights a cost of 1 has no meaning, and with exact data the cost is zero. Then only the rounding is
-        left to compare with.
+        With unit weights a cost of 1 has no meaning, and with exact data the cost is zero but for the rounding of the
+        measurements. Of moments alone, no more than the rounding of the form's entries is known.
         """
-        unit = 0.0 if self.part.is_relative else 1.0
-        rounding = 1e-15 * self.form.size * self.form.magnitude + 1e-250
-        return max(self.options.relative_tolerance * max(cost, unit), rounding)
+        if not self.part.is_relative:
+            return self.options.relative_tolerance * max(cost, 1.0)
+        zero = OF_MOMENTS if self.part.given is None else OF_MEASUREMENTS
+        # At rest a motion's equation cancels in the form, and its terms are of the size of kappa.
+        magnitude = max(self.form.magnitude, float(self.part.moments.kappa.sum()))
+        return max(self.options.relative_tolerance * cost, zero * self.form.size * magnitude + 1e-250)
+
+    @property
+    def rounding(self) -> float:
+        """What rounding can change in x'Q'x: smaller differences between descents mean nothing."""
+        return 1e-15 * self.form.size * self.form.magnitude + 1e-250
 
     def random_starts(self, count: int) -> list[Array]:
         """Random rotations (n, 3, 3); the same ones in each call."""
@@ -100,7 +130,7 @@ class Search:
             attempt = _Attempt(self, [initial], Start.GIVEN)
         else:
             with self.stages.of("spectral start"):
-                starts = spectral_start(self.part, self.forms.rotation)
+                starts = spectral_start(self.part, self.whole.rotation)
             attempt = _Attempt(self, starts, Start.SPECTRAL)
         if attempt.certify() or method == "local" or attempt.is_closed_but_for_rounding:
             return attempt.found()
@@ -123,23 +153,22 @@ class Search:
             return found
         with self.stages.of("descent"):
             end = descend(self.form, mirrored(self.part, found.R), self.options.max_descent_iterations)
-        likely = end.cost - found.cost <= max(self.tolerance(found.cost), MIRROR_COST * found.cost)
+        likely = end.cost - found.cost <= max(self.tolerance(found.cost), self.rounding, MIRROR_COST * found.cost)
         if not (likely and self._has_positive_scales(end.R)):
             return found
-        cost, _ = exact_value(self.form, homogeneous(end.R))
-        image = replace(
-            found,
-            R=end.R,
-            cost=cost,
-            bound=replace(found.bound, lower_bound=min(found.bound.lower_bound, cost)),
-            tolerance=self.tolerance(cost),
-            path=replace(found.path, is_mirrored=True),
-        )
+        attempt = _Attempt(self, [end.R], found.path.start)
+        attempt.certify()
+        image = attempt.found(Cause.MIRROR_IMAGE, mirror_cost=found.cost)
+        image = replace(image, path=replace(image.path, is_mirrored=True))
+        if not image.is_closed and found.bound.region is None:  # found's bound holds for all answers
+            image = replace(image, bound=found.bound.at_most(attempt.lowest))
         if image.is_closed:
-            return image if found.is_closed else replace(image, cause=Cause.PROVEN_AFTER_LOCAL_MINIMUM, figures={})
-        if cost > found.cost:
+            cause = image.cause if image.cause is not Cause.MIRROR_IMAGE else found.cause
+            proven = cause if found.is_closed else Cause.PROVEN_AFTER_LOCAL_MINIMUM
+            return replace(image, cause=proven, figures={})
+        if image.cost > found.cost + self.tolerance(found.cost):
             return replace(image, cause=Cause.MIRROR_IMAGE, figures={"mirror_cost": found.cost})
-        return image
+        return replace(image, cause=Cause.ROUNDING, figures={})
 
     def has_twin(self, found: Found) -> bool:
         """Whether descents from random starts find another answer of the same cost.
@@ -153,14 +182,12 @@ class Search:
             for start in self.random_starts(2 * self.options.random_starts):
                 end = descend(self.form, start, self.options.max_descent_iterations)
                 elsewhere = float(np.abs(end.R - found.R).max(initial=0.0)) > TWIN_DISTANCE
-                if elsewhere and end.cost <= found.cost + self.tolerance(found.cost):
+                if elsewhere and end.cost <= found.cost + max(self.tolerance(found.cost), self.rounding):
                     return self._has_positive_scales(end.R)
         return False
 
     def _has_positive_scales(self, R: Array) -> bool:
-        answer = answer_of(self.part, self.form, R)
-        own = answer.own_scale[np.isfinite(answer.own_scale)]
-        return answer.scale > 0.0 and bool((own > 0.0).all())
+        return answer_of(self.part, self.form, R).has_positive_scales
 
     def _relax(self) -> Relaxation:
         options = self.options
@@ -177,6 +204,7 @@ class _Attempt:
         self.search, self.form, self.stages = search, search.form, search.stages
         self.best = Descent(starts[0], np.inf, 0, converged=False)
         self.start, self.multipliers, self.bound = start, Multipliers.KKT, NOTHING_YET
+        self._reached: tuple[Answer, Evaluation] | None = None
         self.descend(starts, start)
         self.first_cost = self.best.cost
 
@@ -186,30 +214,62 @@ class _Attempt:
         with self.stages.of("descent"):
             for R in starts:
                 end = descend(self.form, R, self.search.options.max_descent_iterations)
-                if end.cost < self.best.cost - 0.01 * self.search.tolerance(end.cost):
+                if end.cost < self.best.cost - max(0.01 * self.search.tolerance(end.cost), self.search.rounding):
                     improved = True
-                    self.best, self.start, self.bound = end, start, NOTHING_YET
+                    self.best, self.start, self.bound, self._reached = end, start, NOTHING_YET, None
         return improved
+
+    @property
+    def reached(self) -> tuple[Answer, Evaluation]:
+        """The answer at the best point, and its cost by the raw measurements."""
+        if self._reached is None:
+            with self.stages.of("cost of the measurements"):
+                self._reached = self.search.whole.answer_near(self.best.R)
+        return self._reached
+
+    @property
+    def cost(self) -> float:
+        """The cost of the answer at the best point, rounded up."""
+        return self.reached[1].upper
+
+    @property
+    def lowest(self) -> float:
+        """What the exact cost of the answer at the best point is at least."""
+        evaluation = self.reached[1]
+        return float(np.nextafter(evaluation.cost - evaluation.cost_error * (1.0 + 1e-9), -np.inf))
 
     def certify(self, relaxation: Relaxation | None = None) -> bool:
         """Bound the optimum at the best point: KKT multipliers, then all constraints', then the relaxation's."""
-        R, r = self.best.R, vec(self.best.R).ravel()
         with self.stages.of("dual certificate"):
-            kkt = kkt_multipliers(R, self.form.apply(homogeneous(R))[:-1].reshape(-1, 9))
-            self._add(Multipliers.KKT, kkt, r)
+            kkt = self._add_kkt()
+            for _ in range(STEPS_ALONG_FREE_DIRECTIONS):
+                if self.bound.step is None:
+                    break
+                answer, evaluation = self.search.whole.moved(self.reached[1], self.bound.step)
+                if not (evaluation.cost < self.reached[1].cost and answer.has_positive_scales):
+                    break
+                self._reached, self.bound = (answer, evaluation), NOTHING_YET
+                kkt = self._add_kkt()
+        evaluation = self.reached[1]
+        R, gradient = evaluation.point.rotations, _by_rotations(evaluation)
         if self.is_closed or self.search.is_large:
             return self.is_closed
         with self.stages.of("small dual"):
             multipliers, _ = small_dual.improve(self.form, R, kkt)
-            self._add(Multipliers.ALL_CONSTRAINTS, multipliers, r)
+            self._add(Multipliers.ALL_CONSTRAINTS, multipliers)
         if self.is_closed or relaxation is None:
             return self.is_closed
         with self.stages.of("dual certificate"):
-            polished = small_dual.stationary_multipliers(self.form, R, relaxation.multipliers)
-            self._add(Multipliers.RELAXATION, polished, r)
-            own = relaxation.X[:-1, -1] / relaxation.X[-1, -1]
-            self._add(Multipliers.RELAXATION, relaxation.multipliers, own)
+            self._add(Multipliers.RELAXATION, small_dual.stationary_multipliers(gradient, R, relaxation.multipliers))
+            self._add(Multipliers.RELAXATION, relaxation.multipliers)
         return self.is_closed
+
+    def _add_kkt(self) -> Array:
+        """Add the bound from the multipliers of R'R = I, (n, 20), at the answer reached."""
+        evaluation = self.reached[1]
+        kkt = kkt_multipliers(evaluation.point.rotations, _by_rotations(evaluation))
+        self._add(Multipliers.KKT, kkt)
+        return kkt
 
     def look_elsewhere(self) -> bool:
         """Look for a lower critical point: along the negative curvature of Z, from Q' as a whole, at random."""
@@ -225,29 +285,35 @@ class _Attempt:
     @property
     def is_closed(self) -> bool:
         """Whether the bound reaches the cost."""
-        return self.best.cost - self.bound.lower_bound <= self.search.tolerance(self.best.cost)
+        return self.is_known and self.cost - self.bound.lower_bound <= self.search.tolerance(self.cost)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether rounding leaves three digits of the cost, where only moments tell it."""
+        return self.search.part.is_relative or self.reached[1].unknown <= KNOWN * max(self.cost, 1.0)
 
     @property
     def is_closed_but_for_rounding(self) -> bool:
         """Whether Z is positive semidefinite up to rounding: no other point and no other multipliers do better."""
-        return self.bound.semidefinite and self.best.cost - self.bound.value <= self.search.tolerance(self.best.cost)
+        return self.bound.semidefinite and self.cost - self.bound.value <= self.search.tolerance(self.cost)
 
     def after_relaxation(self, relaxation: Relaxation) -> Found:
         """Bound with the relaxation's multipliers too; where the gap stays open, compare with the relaxation's cost."""
         self.certify(relaxation)
-        if self.best.cost - relaxation.dual > self.search.tolerance(self.best.cost):
+        if self.cost - relaxation.dual > self.search.tolerance(self.cost):
             return self.found(Cause.NOT_TIGHT, relaxation_cost=relaxation.dual)
         return self.found(Cause.ROUNDING)
 
     def found(self, cause_of_gap: Cause = Cause.LOCAL_MINIMUM_POSSIBLE, **figures: float) -> Found:
         """The best point and its bound; ``cause_of_gap`` and its figures count where the gap is open."""
-        exact, rounding = exact_value(self.form, homogeneous(self.best.R))
-        cost = max(exact, 0.0)
+        answer, evaluation = self.reached
         found = Found(
-            R=self.best.R,
-            cost=cost,
-            bound=replace(self.bound, lower_bound=min(self.bound.lower_bound, exact + rounding, cost)),
-            tolerance=self.search.tolerance(cost),
+            answer=answer,
+            R=evaluation.point.rotations,
+            cost=self.cost,
+            bound=self.bound.at_most(self.lowest),
+            tolerance=self.search.tolerance(self.cost),
+            is_known=self.is_known,
             path=SearchPath(self.start, self.multipliers),
             cause=cause_of_gap,
             figures=figures,
@@ -259,14 +325,22 @@ class _Attempt:
         return found
 
     def _cause_of_proof(self) -> Cause:
-        if self.first_cost - self.best.cost > self.search.tolerance(self.first_cost):
+        lowered = self.first_cost - self.best.cost
+        if lowered > max(self.search.tolerance(self.first_cost), self.search.rounding):
             return Cause.PROVEN_AFTER_LOCAL_MINIMUM
         return Cause.PROVEN if self.multipliers is Multipliers.KKT else Cause.PROVEN_WITH_REDUNDANT_CONSTRAINTS
 
-    def _add(self, kind: Multipliers, multipliers: Array, r: Array) -> None:
-        """Keep the bound that multipliers give at a point, if this bound is the best."""
-        bound = lower_bound(self.form, multipliers, r)
+    def _add(self, kind: Multipliers, multipliers: Array) -> None:
+        """Keep the bound that multipliers give at the best point, if this bound is the best."""
+        search, evaluation = self.search, self.reached[1]
+        enough = REGION_SHARE * search.tolerance(self.cost)
+        bound = lower_bound(search.whole, evaluation, multipliers, enough=enough, contains=search.contains)
         if self.bound is NOTHING_YET or bound.lower_bound > self.bound.lower_bound:
             if bound.direction is None and not bound.semidefinite:
                 bound = replace(bound, direction=self.bound.direction)
             self.bound, self.multipliers = bound, kind
+
+
+def _by_rotations(evaluation: Evaluation) -> Array:
+    """Half the gradient by the entries of the rotations, (n, 9)."""
+    return evaluation.gradient[:-1].reshape(-1, 13)[:, 4:]

@@ -38,10 +38,13 @@ def _normals(R: Array) -> Array:
     return columns
 
 
-def stationary_multipliers(form: ReducedForm, R: Array, multipliers: Array) -> Array:
-    """The multipliers (n, 20) nearest to the given ones with Z x = 0 at x = [vec R, 1], a critical point."""
+def stationary_multipliers(gradient: Array, R: Array, multipliers: Array) -> Array:
+    """The multipliers (n, 20) nearest to the given ones with Z x = 0 at x = [vec R, 1], a critical point.
+
+    ``gradient`` (n, 9) is half that of the cost by the entries of the rotations.
+    """
     normals = _normals(R)
-    residual = form.apply(homogeneous(R))[:-1].reshape(-1, 9) - np.einsum("npk,nk->np", normals, multipliers)
+    residual = gradient - np.einsum("npk,nk->np", normals, multipliers)
     correction = np.matmul(np.linalg.pinv(normals, rcond=1e-9), residual[:, :, None])[:, :, 0]
     result: Array = multipliers + correction
     return result

@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.errors import ScaleError
+from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.problem.knowledge import checked_scale
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.point import Point
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import vec
 
@@ -28,21 +31,31 @@ class Answer:
     own_scale: Array
     scale: float
 
+    @property
+    def has_positive_scales(self) -> bool:
+        """Whether every scale is positive and finite."""
+        scales = np.append(self.own_scale[~np.isnan(self.own_scale)], self.scale)
+        return bool(((scales > 0.0) & np.isfinite(scales)).all())
+
 
 def answer_of(part: Part, form: ReducedForm, R: Array) -> Answer:
     """The answer with the optimal translations and scales for given rotations of the form (eq. 47)."""
     leaf, center, alpha = form.recover(homogeneous(R))
-    numbers = np.concatenate([leaf, center])
+    return answer_at(part, R, np.concatenate([leaf, center]), float(alpha[0]))
+
+
+def answer_at(part: Part, R: Array, numbers: Array, alpha: float) -> Answer:
+    """The answer at values of the form's variables: R (n, 3, 3), numbers (n, 4) as [t, own scale], and alpha."""
     t, s = numbers[:, :3], numbers[:, 3]
     owners = set(part.scale_owners)
     own = np.array([name in owners for name in part.free], dtype=bool)
     own_scale = np.full(len(R), np.nan)
     if part.kind == "direct":
-        scale = float(alpha[0]) if part.scale == "shared" else 1.0
+        scale = alpha if part.scale == "shared" else 1.0
         return Answer(R, t / scale if scale else t, own_scale, scale)
     with np.errstate(divide="ignore"):
         own_scale[own] = 1.0 / s[own]
-        scale = float(1.0 / alpha[0]) if part.scale == "shared" else 1.0
+        scale = float(1.0 / np.float64(alpha)) if part.scale == "shared" else 1.0
     inverse_R = R.transpose(0, 2, 1)
     return Answer(inverse_R, -np.einsum("nij,nj->ni", inverse_R, t), own_scale, scale)
 
@@ -54,23 +67,22 @@ def scales_of(part: Part, answer: Answer) -> dict[str, float]:
     return scales | {name: own[name] for name in part.scale_owners}
 
 
-def as_variables(part: Part, answer: Answer) -> tuple[Array, Array, Array]:
-    """The form's leaf (L, 13), center (P, 13) and tail (2,) at an answer: the inverse of ``answer_of``."""
-    n, L = len(answer.R), len(part.leaves)
-    numbers = np.zeros((n, 13))
+def as_point(part: Part, answer: Answer) -> Point:
+    """The values of the form's variables at an answer, about the part's gauge: the inverse of ``answer_of``."""
+    numbers = np.zeros((len(answer.R), 13))
     if part.kind == "direct":
         alpha = answer.scale if part.scale == "shared" else 1.0
         numbers[:, :3] = alpha * answer.t
         numbers[:, 4:] = vec(answer.R)
-        tail = np.array([answer.scale, 1.0])
-    else:
-        inverse_R = answer.R.transpose(0, 2, 1)
-        numbers[:, :3] = -np.einsum("nij,nj->ni", inverse_R, answer.t)
-        has = np.isfinite(answer.own_scale)
+        return Point(numbers, answer.scale)
+    inverse_R = answer.R.transpose(0, 2, 1)
+    numbers[:, :3] = -np.einsum("nij,nj->ni", inverse_R, answer.t)
+    has = np.isfinite(answer.own_scale)
+    with np.errstate(divide="ignore"):
         numbers[has, 3] = 1.0 / answer.own_scale[has]
-        numbers[:, 4:] = vec(inverse_R)
-        tail = np.array([1.0 / answer.scale, 1.0])
-    return numbers[:L], numbers[L:], tail
+        alpha = float(1.0 / np.float64(answer.scale))
+    numbers[:, 4:] = vec(inverse_R)
+    return Point(numbers, alpha)
 
 
 def rotations_as_variables(part: Part, R: Array) -> Array:
@@ -91,12 +103,21 @@ def given_answer(
     own = np.full(len(part.free), np.nan)
     for i, name in enumerate(part.free):
         if name in part.scale_owners:
-            own[i] = _positive(scale[name] if isinstance(scale, Mapping) and name in scale else scale, name)
-    shared = _positive(scale, "all targets") if part.scale == "shared" else 1.0
+            own[i] = _scale_of(name, scale)
+    shared = checked_scale(scale, "the answer's scale of all targets") if part.scale == "shared" else 1.0
     return Answer(np.ascontiguousarray(stacked[:, :3, :3]), stacked[:, :3, 3] - shift, own, shared)
 
 
-def _positive(scale: float | Mapping[str, float], name: str) -> float:
-    if isinstance(scale, Mapping) or not (np.isfinite(scale) and scale > 0.0):
-        raise ScaleError(f"the scale of {name} is {scale!r}; give a positive number")
-    return float(scale)
+def given_translations(part: Part, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike]) -> Array:
+    """The translations (n, 3) of the user's poses as they were given, in metres about the user's origin."""
+    poses = [(X if name in part.targets else Y)[name] for name in part.free]
+    return np.array([one_transform(pose, "the answer")[:3, 3] for pose in poses]).reshape(-1, 3)
+
+
+def _scale_of(name: str, scale: float | Mapping[str, float]) -> float:
+    """A frame's own scale: its entry, or the one number for all."""
+    if isinstance(scale, Mapping):
+        if name not in scale:
+            raise ScaleError(f"the answer's scale lacks {name}; it has {', '.join(map(shown, scale)) or 'nothing'}")
+        return checked_scale(scale[name], f"the answer's scale of {name}")
+    return checked_scale(scale, f"the answer's scale of {name}")

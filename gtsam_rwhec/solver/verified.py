@@ -16,27 +16,17 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.rounding import SAFETY, UNIT, gamma
 from gtsam_rwhec.solver import arrow
 
-#: Unit roundoff of double precision.
-UNIT = 2.0**-53
-#: A bound times this factor covers the rounding errors of the few operations that compute it.
-_SAFETY = 1.0 + 1e-10
 #: This number is added to a bound; underflow can lose less.
 _TINY = 1e-290
-
-
-def gamma(terms: int, unit: float = UNIT) -> float:
-    """gamma_n = n u / (1 - n u): the relative error of n rounded operations (Higham 2002, section 3.1)."""
-    if terms * unit >= 0.5:
-        raise OverflowError(f"{terms} terms are too many for a rounding bound with unit {unit:g}")
-    return _SAFETY * terms * unit / (1.0 - terms * unit)
 
 
 def cholesky_allowance(diagonal: Array, size: int) -> Array:
     """A bound on the rounding in the factorisation of a matrix of this size and diagonal, as a diagonal matrix."""
     g = gamma(size + 1)
-    allowance: Array = _SAFETY * size * g / (1.0 - g) * np.abs(diagonal) + _TINY
+    allowance: Array = SAFETY * size * g / (1.0 - g) * np.abs(diagonal) + _TINY
     return allowance
 
 

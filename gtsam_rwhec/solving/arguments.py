@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError
+from gtsam_rwhec.files.progress import Progress, check_progress
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform
-from gtsam_rwhec.problem.knowledge import difference
+from gtsam_rwhec.geometry.real_numbers import is_real
+from gtsam_rwhec.problem.knowledge import checked_scale, difference
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.options import SolveOptions
 
@@ -19,12 +22,13 @@ Scale = float | Mapping[str, float]
 ROUNDING = 1e-9
 
 
-def check_types(problem: Problem, options: SolveOptions | None) -> None:
-    """Raise an ``OptionError`` for a problem or options of a wrong type."""
+def check_types(problem: Problem, options: SolveOptions | None, progress: Progress | None = None) -> None:
+    """Raise an ``OptionError`` for a problem, options or progress of a wrong type."""
     if not isinstance(problem, Problem):
         raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
     if options is not None and not isinstance(options, SolveOptions):
         raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.SolveOptions")
+    check_progress(progress)
 
 
 def check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) -> None:
@@ -32,20 +36,16 @@ def check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) 
     for what, poses, names in (("X", X, problem.targets), ("Y", Y, problem.sensors)):
         if not isinstance(poses, Mapping):
             raise OptionError(f"{what} is a {type(poses).__name__}; give poses by name: {{name: pose}}")
+        strange = [name for name in poses if not isinstance(name, str)]
+        if strange:
+            raise FrameError(f"{what} has the name {brief(strange[0])}; names are strings: {{name: pose}}")
         missing = [name for name in names if name not in poses and name not in problem.fixed]
         if missing:
-            raise FrameError(f"{what} has no pose of {missing[0]!r}; it has {', '.join(map(repr, poses)) or 'none'}")
+            raise FrameError(f"{what} has no pose of {missing[0]!r}; it has {_listed(poses)}")
         unknown = [name for name in poses if name not in names]
         if unknown:
-            raise FrameError(f"{what} has {unknown[0]!r}, which the problem does not; it has {', '.join(names)}")
-    if problem.scale == "known" and scale != 1.0:
-        raise ScaleError(
-            f"the answer's scale is {scale!r}, but this problem has scale='known', which is 1; leave it out"
-        )
-    if isinstance(scale, Mapping):
-        for name, known in problem.fixed_scales.items():
-            if name in scale and not np.isclose(scale[name], known, rtol=ROUNDING, atol=0.0):
-                raise ScaleError(f"the answer's scale of {name} is {scale[name]!r}, but it is fixed at {known!r}")
+            raise FrameError(f"{what} has {brief(unknown[0])}, which the problem does not; it has {_listed(names)}")
+    _check_scale(problem, scale)
     for name, T in problem.fixed.items():
         poses, what = (X, "X") if name in problem.targets else (Y, "Y")
         if name in poses:
@@ -55,3 +55,42 @@ def check_against_knowledge(problem: Problem, X: Poses, Y: Poses, scale: Scale) 
                     f"{what}[{name!r}] is not the pose at which {name} is fixed: {difference(given, T)}; leave it out, "
                     "or do not fix the frame"
                 )
+
+
+def _check_scale(problem: Problem, scale: Scale) -> None:
+    """Raise a ``ScaleError`` for a scale that is no scale, or not one of this problem."""
+    if problem.scale == "known":
+        if not (is_real(scale) and scale == 1.0):
+            raise ScaleError(
+                f"the answer's scale is {brief(scale)}, but this problem has scale='known', which is 1; leave it out"
+            )
+        return
+    if not isinstance(scale, Mapping):
+        checked_scale(scale, "the answer's scale")
+        return
+    if problem.scale == "shared":
+        raise ScaleError(
+            f"the answer's scale is {brief(scale)}, but all targets share one scale; give a positive number"
+        )
+    owners = tuple(dict.fromkeys(pair.target for pair in problem.pairs))
+    for name in scale:
+        if name not in owners:
+            raise ScaleError(
+                f"the answer's scale has {brief(name)}, which has no scale; give a positive number for each of "
+                f"{_listed(owners)}"
+            )
+    for name in owners:
+        fixed = problem.fixed_scales.get(name)
+        if name in scale:
+            given = checked_scale(scale[name], f"the answer's scale of {name}")
+            if fixed is not None and abs(given - fixed) > ROUNDING * fixed:
+                raise ScaleError(f"the answer's scale of {name} is {given!r}, but it is fixed at {fixed!r}")
+        elif fixed is None:
+            raise ScaleError(f"the answer's scale lacks {name!r}; it has {_listed(scale)}")
+
+
+def _listed(names: Iterable[object]) -> str:
+    """Names for a message: the first ten."""
+    known = list(map(brief, names))
+    more = f" and {len(known) - 10} more" if len(known) > 10 else ""
+    return (", ".join(known[:10]) + more) or "none"

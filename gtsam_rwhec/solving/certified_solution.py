@@ -5,7 +5,9 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 
-from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OptionError, WeightsWarning
+import numpy as np
+
+from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError, WeightsWarning
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.identifiability.verdicts import Identifiability
@@ -15,10 +17,18 @@ from gtsam_rwhec.solver.cause import Cause
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.nonnegative import run_with_nonnegative_scale
 from gtsam_rwhec.solver.options import Method, SolveOptions, check_method
-from gtsam_rwhec.solver.parts import connected_components, parts_of
+from gtsam_rwhec.solver.parts import Part, connected_components, parts_of
+from gtsam_rwhec.solver.region import scale_ratio
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.variables import as_variables, given_answer, rotations_as_variables, scales_of
+from gtsam_rwhec.solver.variables import (
+    Answer,
+    as_point,
+    given_answer,
+    given_translations,
+    rotations_as_variables,
+    scales_of,
+)
 from gtsam_rwhec.solving.arguments import Poses, Scale, check_against_knowledge, check_types
 from gtsam_rwhec.solving.part_solution import PartSolution
 from gtsam_rwhec.solving.solution import Solution, SolvedPart
@@ -61,7 +71,7 @@ def solve(
         When a scale is not positive at the optimum.
     """
     check_method(method)
-    check_types(problem, options)
+    check_types(problem, options, progress)
     options = options or SolveOptions()
     if method == "local" and initial is None:
         raise OptionError("method='local' needs initial=(X, Y, scale): poses by name to descend from")
@@ -75,20 +85,31 @@ def solve(
                 "initial is (X, Y, scale): poses of targets and of sensors by name, and a scale (1.0 if known)"
             )
         check_against_knowledge(problem, *initial)
-    results = []
-    for part in parts_of(problem):
-        search = Search.of(part, options, progress)
-        if options.nonnegative_scale:
-            found = run_with_nonnegative_scale(search)
-        elif initial is not None:
-            given = given_answer(part, *initial)
-            found = search.run(method, rotations_as_variables(part, given.R))
-        else:
-            found = search.with_positive_scale(search.run(method, None))
-        results.append(PartSolution.of(search, found))
+    with np.errstate(all="ignore"):
+        results = [_solved(part, method, initial, options, progress) for part in parts_of(problem)]
     return _merge(problem, results)
 
 
+def _solved(
+    part: Part,
+    method: Method,
+    initial: tuple[Poses, Poses, Scale] | None,
+    options: SolveOptions,
+    progress: Progress | None,
+) -> PartSolution:
+    """The solution of one part."""
+    search = Search.of(part, options, progress)
+    if options.nonnegative_scale:
+        found = run_with_nonnegative_scale(search)
+    elif initial is not None:
+        given = given_answer(part, *initial)
+        found = search.run(method, rotations_as_variables(part, given.R))
+    else:
+        found = search.with_positive_scale(search.run(method, None))
+    return PartSolution.of(search, found)
+
+
+@np.errstate(all="ignore")
 def certify(
     problem: Problem,
     X: Poses,
@@ -123,31 +144,38 @@ def certify(
     PriorError, ScaleError
         For an answer that contradicts a fixed frame or a known scale.
     """
-    check_types(problem, options)
+    check_types(problem, options, progress)
     options = options or SolveOptions()
     parts = parts_of(problem)
     check_against_knowledge(problem, X, Y, scale)
     certificates = []
     for part in parts:
         given = given_answer(part, X, Y, scale)
-        search = Search.of(part, options, progress)
+        search = Search.of(part, options, progress, contains=given)
         found = search.run("auto", rotations_as_variables(part, given.R))
-        cost = search.forms.full.value(*as_variables(part, given))
+        evaluation = search.whole.evaluated(given, given_translations(part, X, Y))
+        cost = evaluation.upper
+        if not np.isfinite(cost):
+            raise ScaleError("the cost of the answer overflows; are its translations in metres, and its scale right?")
         tolerance = search.tolerance(cost)
         best = PartSolution.of(search, found).certificate
         gap = cost - found.bound.lower_bound
         cause, figures = best.cause, best.figures
-        if gap < -tolerance:
-            cause, figures = Cause.BELOW_BOUND, {"reduced_bound": found.bound.lower_bound}
-        elif best.cause is not Cause.NO_BOUND and (
+        if best.cause is not Cause.NO_BOUND and (
             cost - found.cost > tolerance or (gap > tolerance and best.is_optimal)
         ):
             cause, figures = Cause.BETTER_ANSWER, {"better_cost": found.cost}
-        # The bound holds to the last digit of the stored form; the cost of the given answer has rounding of its own.
         lower, floating = min(best.lower_bound, cost), min(best.float_bound, cost)
-        best = replace(best, cost=cost, lower_bound=lower, float_bound=floating, tolerance=tolerance)
+        region = best.region and best.region.around(*_distance(part, found.answer, given))
+        best = replace(best, cost=cost, lower_bound=lower, float_bound=floating, tolerance=tolerance, region=region)
         certificates.append(replace(best, status=cause.status, cause=cause, figures=figures))
     return Certificate.merged(certificates)
+
+
+def _distance(part: Part, first: Answer, second: Answer) -> tuple[float, float]:
+    """How far apart the translations of two answers are at most, in metres, and the largest ratio of their scales."""
+    distance = float(np.linalg.norm(first.t - second.t, axis=1).max(initial=0.0))
+    return distance * (1.0 + 1e-9), scale_ratio(as_point(part, first), as_point(part, second))
 
 
 def _merge(problem: Problem, results: list[PartSolution]) -> Solution:

@@ -12,11 +12,11 @@ from gtsam_rwhec.identifiability.identification import identify
 from gtsam_rwhec.identifiability.verdicts import Identifiability
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.solver.cause import Cause
-from gtsam_rwhec.solver.certificate import Certificate, Objective
+from gtsam_rwhec.solver.certificate import Basis, Certificate, Objective
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
 from gtsam_rwhec.solver.search import Found, Search
-from gtsam_rwhec.solver.variables import Answer, answer_of, as_variables, scales_of
+from gtsam_rwhec.solver.variables import Answer, scales_of
 
 TWIN = FreeDirection(FreeKind.TWIN, FreeReason.SYMMETRY)
 
@@ -37,25 +37,14 @@ class PartSolution:
         """Complete what a search found; a ``ScaleError`` for a scale that is not positive."""
         part = search.part
         with search.stages.of("identifiability"):
-            answer = answer_of(part, search.form, found.R)
+            answer = found.answer
             _check_scale(part, answer, found.is_closed)
             poses = PairPoses.of(part, answer)
             J_t, J_R = costs_of_pairs(part, poses)
             known = identify(part, poses, J_t, J_R)
-        # The bound is about the reduced form. The cost in the full form shows how many digits the reduction lost.
-        cost = max(search.forms.full.value(*as_variables(part, answer)), 0.0)
         bound = found.bound
-        if not np.isfinite(bound.lower_bound):
+        if not (np.isfinite(bound.lower_bound) and np.isfinite(found.cost)):
             found = replace(found, cause=Cause.NO_BOUND, figures={})
-        elif abs(cost - found.cost) > found.tolerance:
-            found = replace(
-                found,
-                cost=cost,
-                tolerance=search.tolerance(cost),
-                cause=Cause.DIGITS_LOST,
-                figures={"reduced_cost": found.cost},
-            )
-            bound = replace(bound, lower_bound=0.0)  # zero still holds: J is a sum of squares
         elif found.is_closed and not known.is_unique:
             number = float(len(known.free_directions))
             found = replace(found, cause=Cause.FREE_DIRECTIONS, figures={"free_directions": number})
@@ -65,7 +54,9 @@ class PartSolution:
         certificate = Certificate(
             status=found.cause.status,
             cause=found.cause,
-            objective=Objective(part.kind, bool(part.priors)),
+            objective=Objective.of(part),
+            basis=Basis.MOMENTS if part.given is None else Basis.MEASUREMENTS,
+            region=bound.region,
             path=found.path,
             cost=found.cost,
             lower_bound=bound.lower_bound,

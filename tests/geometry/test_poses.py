@@ -66,7 +66,7 @@ def test_matrices_are_not_copied() -> None:
 def test_single_precision_and_integers_are_read() -> None:
     assert as_transforms(np.eye(4, dtype=int)[None], None, "A").dtype == np.float64
     # Single precision is off by more than rounding in double, and by less than the tolerance: projected, and said.
-    rows, projected = checked_rows(as_transforms(TRANSFORMS.astype(np.float32), None, "A"), 0, "A")
+    rows, projected, _ = checked_rows(as_transforms(TRANSFORMS.astype(np.float32), None, "A"), 0, "A")
     assert projected == len(TRANSFORMS)
     R = rows_to_transforms(rows)[:, :3, :3]
     assert np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < 1e-15 * 4
@@ -81,7 +81,7 @@ def test_rotations_slightly_off_are_projected_to_the_nearest(seed: int, size: fl
     T = random_poses(3, 1.0, generator)
     noisy = T.copy()
     noisy[:, :3, :3] += size * generator.uniform(-0.5, 0.5, (3, 3, 3))
-    rows, projected = checked_rows(noisy, 0, "A")
+    rows, projected, _ = checked_rows(noisy, 0, "A")
     U, _, Vt = np.linalg.svd(noisy[:, :3, :3])  # the nearest in the Frobenius norm
     np.testing.assert_allclose(rows_to_transforms(rows)[:, :3, :3], U @ Vt, rtol=0.0, atol=1e-13)
     np.testing.assert_array_equal(rows_to_transforms(rows)[:, :3, 3], T[:, :3, 3])
@@ -89,7 +89,7 @@ def test_rotations_slightly_off_are_projected_to_the_nearest(seed: int, size: fl
 
 
 def test_exact_rotations_are_left_as_they_are() -> None:
-    rows, projected = checked_rows(TRANSFORMS, 0, "A")
+    rows, projected, _ = checked_rows(TRANSFORMS, 0, "A")
     assert projected == 0
     np.testing.assert_array_equal(rows_to_transforms(rows), TRANSFORMS)
 
@@ -102,7 +102,7 @@ def test_rotations_further_off_are_refused_with_the_size(off: float) -> None:
         checked_rows(bad, 0, "A")
     almost = TRANSFORMS.copy()
     almost[3, :3, :3] *= np.sqrt(1.0 + 0.99 * ROTATION_TOLERANCE)
-    assert checked_rows(almost, 0, "A")[1] == 1
+    assert checked_rows(almost, 0, "A").projected == 1
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["wxyz", "xyzw"]))

@@ -359,6 +359,42 @@ def test_a_free_direction_is_practically_never_called_determined(
     assert sum(pairs) <= 2
 
 
+def few(kind: Any, seed: int, count: int, noise_in_A: Noise | None, scale: Any = "known") -> rw.Problem:
+    """A precise sensor, and a carrier whose rotations are off about the rig, or about the world's origin."""
+    of_B = Noise(1e-4, 2e6)  # 0.1 mm, 0.03 degrees
+    motion = Motion(kind, max_angle_rad=0.3 if kind != "general" else 1.0)
+    problem = general(1, 1, seed=seed, motion=motion, noise=of_B, number_of_measurements=count, scale=scale).problem
+    data = problem.measurements("target0", "sensor0")
+    A = perturb(data.A, noise_in_A, seed) if seed % 2 else inverse(perturb(inverse(data.A), noise_in_A, seed))
+    noisy = rw.Problem(scale)
+    noisy.add("target0", "sensor0", A, data.B, data.sigma, data.kappa)
+    return noisy
+
+
+@pytest.mark.parametrize("scale", ["known", "shared"])
+@pytest.mark.parametrize("kind", ["single_axis", "planar"])
+@pytest.mark.parametrize("count", [3, 4])
+def test_few_equations_to_spare_do_not_make_the_test_brave(kind: Any, count: int, scale: Any) -> None:
+    """The fit puts the target where A's noise takes up residuals, by metres; the noise must not seem small."""
+    wholes = []
+    for seed in range(RUNS // 3):
+        try:
+            known = identify(few(kind, seed, count, Noise(1e-4, 2e4), scale))  # 0.3 degrees
+        except ScaleError:
+            continue
+        (pair,) = known.pairs.values()
+        assert pair.is_unique is known.is_unique
+        wholes.append(known.is_unique)
+    assert len(wholes) > RUNS // 12
+    assert not any(wholes)
+
+
+def test_three_rich_measurements_are_enough() -> None:
+    """Turns of up to 60 degrees, with noise of 0.06 and 0.03 degrees: three determine the pair."""
+    verdicts = [identify(few("general", seed, 3, Noise(1e-4, 5e5))).is_unique for seed in range(RUNS // 2)]
+    assert sum(verdicts) >= RUNS // 2 - 1
+
+
 @pytest.mark.parametrize("count", [10, 40])
 @pytest.mark.parametrize(
     ("of_B", "of_A"), [(Noise(0.001, 5e5), Noise(0.005, 2500.0)), (Noise(0.002, 1e5), Noise(0.007, 1800.0))]

@@ -1,4 +1,4 @@
-"""The information that motions give, against residuals differentiated numerically; the noise, against draws of it."""
+"""The information that motions give, against residuals differentiated numerically."""
 
 from __future__ import annotations
 
@@ -7,18 +7,11 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from rwhec_factors.se3 import inverse, pose
+from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.identifiability.information import (
-    FLOOR,
-    PartVarianceFactors,
-    information,
-    pair_information,
-    prior_information,
-    variance_factors,
-)
-from gtsam_rwhec.simulate import Noise, general, perturb
+from gtsam_rwhec.identifiability.information import information, pair_information, prior_information
+from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.transforms import random_poses
 from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.parts import Part, parts_of
@@ -109,13 +102,12 @@ def numeric_information(problem: rw.Problem, part: Part, poses: dict[str, np.nda
 
 
 def our_information(part: Part, answer: Answer) -> np.ndarray:
-    level = PartVarianceFactors(np.ones(len(part.pairs)), np.ones(len(part.pairs)), 1)
-    pairs = pair_information(part, PairPoses.of(part, answer), level)
+    pairs = pair_information(part, PairPoses.of(part, answer))
     rotation_prior, translation_prior = prior_information(part)
     info = information(
         part,
         pairs.rotation + pairs.translation,
-        pairs.noise_rotation + pairs.noise_translation,
+        np.zeros_like(pairs.used, dtype=float),
         pairs.used,
         rotation_prior + translation_prior,
     )
@@ -166,106 +158,6 @@ def test_a_prior_of_a_rotation_counts_twice_kappa_an_axis() -> None:
     np.testing.assert_allclose(rotation[at], [20.0, 20.0, 20.0, 0.0, 0.0, 0.0, 0.0])
     np.testing.assert_allclose(translation[at], [0.0, 0.0, 0.0, 4.0, 4.0, 4.0, 0.0])
     assert not rotation[1 - at].any()
-
-
-# -- noise ------------------------------------------------------------------------------------------
-
-
-def level_of(problem: rw.Problem) -> PartVarianceFactors:
-    solution = rw.solve(problem)
-    (part,) = parts_of(problem)
-    poses = {name: T.matrix() for name, T in {**solution.X, **solution.Y}.items()}
-    stacked = np.array([poses[name] for name in part.free])
-    shift = np.array([part.frame_shift(name) for name in part.free])
-    scale = solution.scale
-    own = [scale[name] if name in part.scale_owners and isinstance(scale, dict) else np.nan for name in part.free]
-    answer = Answer(
-        stacked[:, :3, :3], stacked[:, :3, 3] - shift, np.array(own), scale if isinstance(scale, float) else 1.0
-    )
-    return variance_factors(part, *costs_of_pairs(part, PairPoses.of(part, answer)))
-
-
-@pytest.mark.parametrize(("scale", "count"), [("known", 6), ("known", 40), ("shared", 40)])
-def test_true_weights_make_variance_factors_of_one(scale: Any, count: int) -> None:
-    """Fitted unknowns are accounted for: with six measurements they eat a third of the residuals."""
-    levels = [
-        level_of(general(1, 1, seed=seed, noise=Noise(0.01, 2000.0), scale=scale, number_of_measurements=count).problem)
-        for seed in range(60)
-    ]
-    translation = np.mean([level.translation for level in levels])
-    rotation = np.mean([level.rotation for level in levels])
-    # A mean of 60 chi-squares of about 6 count - 12 degrees of freedom each: four standard errors.
-    allowed = 4.0 * np.sqrt(2.0 / (60 * (6 * count - 12)))
-    assert abs(0.5 * (rotation + translation) - 1.0) < allowed
-    # Apart, they share the correction for what was fitted, which is not quite half and half.
-    assert abs(rotation - 1.0) < 2.0 * allowed + 1.0 / count
-    assert abs(translation - 1.0) < 2.0 * allowed + 1.0 / count
-    assert levels[0].degrees_of_freedom == 6 * count - 12 - (scale != "known")
-
-
-def test_weights_too_small_make_variance_factors_to_match() -> None:
-    simulation = general(1, 1, seed=0, noise=Noise(0.01, 2000.0), number_of_measurements=300)
-    data = simulation.problem.measurements("target0", "sensor0")
-    problem = rw.Problem()
-    problem.add("target0", "sensor0", data.A, data.B, 1.0, 1.0)
-    level = level_of(problem)
-    assert level.translation[0] == pytest.approx(0.01**2, rel=0.2)
-    assert level.rotation[0] == pytest.approx(1.0 / 2000.0, rel=0.2)
-
-
-def test_exact_data_have_a_floor() -> None:
-    problem = general(1, 1, seed=0, number_of_measurements=10).problem
-    level = level_of(problem)
-    assert level.rotation[0] == pytest.approx(2.0 * FLOOR**2, rel=1e-6)
-    assert level.translation[0] > 0.0
-
-
-@pytest.mark.parametrize("turned_at", ["the world", "the rig"])
-@pytest.mark.parametrize("A_noise", [Noise(1e-4, 2e4), Noise(1e-4, 500.0)])
-def test_the_bound_on_the_carriers_noise_holds(turned_at: str, A_noise: Noise) -> None:
-    """q^2 is told to be at least what A's rotations were off by, wherever they turned wrongly."""
-    for seed in range(20):
-        simulation = general(1, 1, seed=seed, noise=Noise(0.005, 500.0), number_of_measurements=60, motion="planar")
-        data = simulation.problem.measurements("target0", "sensor0")
-        if turned_at == "the world":
-            A = perturb(data.A, A_noise, seed)
-        else:
-            A = inverse(perturb(inverse(data.A), A_noise, seed))
-        problem = rw.Problem()
-        problem.add("target0", "sensor0", A, data.B, data.sigma, data.kappa)
-        (part,) = parts_of(problem)
-        # At the truth, so that it is the bound that is tested.
-        T = np.array([{**simulation.X, **simulation.Y}[name] for name in part.free])
-        shift = np.array([part.frame_shift(name) for name in part.free])
-        poses = PairPoses.of(part, Answer(T[:, :3, :3], T[:, :3, 3] - shift, np.full(2, np.nan), 1.0))
-        level = variance_factors(part, *costs_of_pairs(part, poses))
-        bound = pair_information(part, poses, level).carrier_noise[0]
-        assert bound > 0.8 / (2.0 * A_noise.kappa)
-
-
-def test_noise_feigns_what_it_is_said_to() -> None:
-    """A carrier at rest whose orientation is measured with noise: the information of turning both frames together."""
-    q2 = 1.0 / (2.0 * 2000.0)
-    ratios = []
-    for seed in range(40):
-        generator = np.random.default_rng(seed)
-        count = 30
-        A = perturb(np.tile(np.eye(4), (count, 1, 1)), Noise(1e-9, 2000.0), generator)
-        X, Y = pose(np.eye(3), [1.0, 0.0, 0.0]), np.eye(4)
-        B = np.tile(inverse(Y) @ X, (count, 1, 1))
-        problem = rw.Problem()
-        problem.add("tag", "cam", A, B, 0.1, 50.0)
-        (part,) = parts_of(problem)
-        T = np.array([{"tag": X, "cam": Y}[name] for name in part.free])
-        shift = np.array([part.frame_shift(name) for name in part.free])
-        poses = PairPoses.of(part, Answer(T[:, :3, :3], T[:, :3, 3] - shift, np.full(2, np.nan), 1.0))
-        # Rotation residuals that say exactly how much A's rotations are off: f_R = 2 kappa q^2.
-        level = PartVarianceFactors(np.array([1e9]), np.array([2.0 * 50.0 * q2]), 6 * count - 12)
-        pairs = pair_information(part, poses, level)
-        together = np.zeros(15)
-        together[[2, 9]] = 1.0  # both frames about z
-        ratios.append((together @ pairs.rotation[0] @ together) / (together**2 @ pairs.noise_rotation[0]))
-    assert np.mean(ratios) == pytest.approx(1.0, abs=0.1)
 
 
 def test_costs_of_pairs_add_up_to_the_cost() -> None:

@@ -9,7 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from counted_calls import counted_calls
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from places import DEMO
+from strategies import damaged, tables
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, NoiseError
@@ -102,7 +105,11 @@ def test_windows_line_ends_byte_order_mark_spaces_and_a_last_blank_line(tmp_path
         ("# 1,0,0,0,0,0,0", ["qw is '# 1'"]),
         ("0,0,0,0,1,2,3", ["norm 0 in place of 1"]),
         ("1,2,3,1,0,0,0", ["norm 3.87298"]),
+        ("1,0,0,-1.7e308,0,0,0", ["norm inf in place of 1"]),
         ("1;0;0;0;1;2;3", ["1 fields in place of 7"]),
+        ("1,0,0,0,1,2," + "3" * 10_000, ["longer than 10000 bytes"]),
+        (",".join("0" * 5001), ["longer than 10000 bytes"]),
+        ("1,0,0,0,1,2,\u0663", ["tz is '\u0663'"]),
     ],
 )
 @pytest.mark.parametrize("side", ["A", "B"])
@@ -207,3 +214,31 @@ def test_no_loop_over_lines(tmp_path: Path) -> None:
     problem, calls = counted_calls(lambda: rw.read_csv(tmp_path, keep_measurements=False))
     assert problem.number_of_measurements == lines
     assert calls < lines / 2
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    content=tables(7, GOOD).map(lambda text: text.encode(errors="surrogatepass")) | damaged([f"{GOOD}\n".encode() * 4])
+)
+def test_any_content_gives_rows_or_an_error_of_ours(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.csv"
+    path.write_bytes(content)
+    try:
+        rows = read_pose_rows(path)
+    except FileFormatError as error:
+        assert "any.csv" in str(error)  # noqa: PT017
+        assert len(str(error)) < 2000  # noqa: PT017
+    else:
+        assert rows.shape == (content.decode("utf-8-sig").rstrip().count("\n") + 1, 7)
+        assert np.isfinite(rows).all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(name=st.text(st.sampled_from("tagcm_01AB.sv\n\x1b "), min_size=1, max_size=20))
+def test_any_name_of_a_file_is_read_or_named_in_a_warning(tmp_path_factory: pytest.TempPathFactory, name: str) -> None:
+    folder = tmp_path_factory.mktemp("names")
+    (folder / f"{name.strip('.') or 'x'}.csv").write_text(GOOD)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CsvWarning)
+        with pytest.raises(FileFormatError, match=r"is missing|has no files named"):
+            rw.read_csv(folder)

@@ -16,9 +16,9 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments, edge_forms
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.reduced_form import Forms
-from gtsam_rwhec.solver.variables import Answer, as_variables
+from gtsam_rwhec.solver.variables import Answer, as_point
 
 NOISE = Noise(0.02, 200.0)
 
@@ -49,7 +49,7 @@ def cost_from_moments(
     shift = np.array([part.frame_shift(name) for name in part.free]).reshape(-1, 3)
     own = [scale[name] if isinstance(scale, dict) and name in part.scale_owners else np.nan for name in part.free]
     answer = Answer(T[:, :3, :3], T[:, :3, 3] - shift, np.array(own), scale if isinstance(scale, float) else 1.0)
-    return Forms.of(part).full.value(*as_variables(part, answer))
+    return PartForm.of(part).cost.at(as_point(part, answer)).cost
 
 
 CASES = {
@@ -166,7 +166,7 @@ def order_of_variables(part: Part) -> dict[str, int]:
 
 def dense_form(part: Part) -> np.ndarray:
     """The library's Q over [t, s, vec R of each free frame; alpha, h], from its blocks."""
-    full = Forms.of(part).full
+    full = PartForm.of(part).full
     L, P = full.leaves, full.centers
     size = 13 * (L + P) + 2
     Q = np.zeros((size, size))
@@ -238,7 +238,7 @@ def test_the_reduced_form_is_that_of_the_paper(graph: str) -> None:
     simulation = general(**GRAPHS[graph], seed=13, noise=NOISE, number_of_measurements=5)
     problem = with_uneven_weights(simulation.problem, np.random.default_rng(3))
     (part,) = parts_of(problem)
-    reduced = Forms.of(part).reduced
+    reduced = PartForm.of(part).reduced
     expected = eliminated_by_pinv(part, naive_form(problem, part))
     close(reduced.dense(), expected, 1e-10)
     x = np.random.default_rng(0).standard_normal(reduced.size)
@@ -248,7 +248,7 @@ def test_the_reduced_form_is_that_of_the_paper(graph: str) -> None:
 @pytest.mark.parametrize("options", [dict(scale="per_target"), dict(scale="per_target", known_sizes=("target0",))])
 def test_the_form_turned_round_is_reduced_alike(options: dict) -> None:
     (part,) = parts_of(general(3, 2, **options, seed=17, noise=NOISE, number_of_measurements=5).problem)
-    close(Forms.of(part).reduced.dense(), eliminated_by_pinv(part, dense_form(part)), 1e-10)
+    close(PartForm.of(part).reduced.dense(), eliminated_by_pinv(part, dense_form(part)), 1e-10)
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
@@ -256,7 +256,7 @@ def test_free_translations_take_the_pseudo_inverse(scale: str) -> None:
     """Planar motion leaves a translation open: eq. 48's inverse does not exist, its pseudo-inverse does."""
     problem = general(2, 2, seed=19, motion="planar", noise=NOISE, scale=scale, number_of_measurements=6).problem
     (part,) = parts_of(problem)
-    close(Forms.of(part).reduced.dense(), eliminated_by_pinv(part, naive_form(problem, part)), 1e-9)
+    close(PartForm.of(part).reduced.dense(), eliminated_by_pinv(part, naive_form(problem, part)), 1e-9)
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
@@ -265,7 +265,7 @@ def test_forms_of_the_real_dataset(utias_folder: Path, scale: Any) -> None:
     (part,) = parts_of(problem)
     Q = naive_form(problem, part)
     close(dense_form(part), Q)
-    close(Forms.of(part).reduced.dense(), eliminated_by_pinv(part, Q), 1e-10)
+    close(PartForm.of(part).reduced.dense(), eliminated_by_pinv(part, Q), 1e-10)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.integers(1, 9))

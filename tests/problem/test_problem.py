@@ -225,9 +225,10 @@ def test_moments_alone_give_the_same_solution() -> None:
         2, 2, seed=1, noise=Noise(0.01, 500.0), odometry=5, odometry_noise=Noise(0.02, 100.0), keep_measurements=False
     )
     first, second = rw.solve(kept.problem), rw.solve(lean.problem)
-    assert first.cost == second.cost
+    # One cost is that of the measurements, the other that of their moments, which are rounded.
+    assert first.cost == pytest.approx(second.cost, rel=1e-11)
     for name, T in {**first.X, **first.Y}.items():
-        np.testing.assert_array_equal(T.matrix(), {**second.X, **second.Y}[name].matrix())
+        np.testing.assert_allclose(T.matrix(), {**second.X, **second.Y}[name].matrix(), atol=1e-11)
 
 
 def test_knowledge_of_frames() -> None:

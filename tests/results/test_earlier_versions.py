@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.report import certificate_sentence
 from gtsam_rwhec.results.result_file import read_result
+from gtsam_rwhec.solver.cause import Cause
+from gtsam_rwhec.solver.certificate import Basis
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -21,6 +24,12 @@ def stored(version: int) -> tuple[Path, dict[str, Any]]:
     raw: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     assert raw["format_version"] == version
     return path, raw
+
+
+def changed(raw: dict[str, Any], folder: Path) -> Path:
+    path = folder / "changed.json"
+    path.write_text(json.dumps(raw), encoding="utf-8")
+    return path
 
 
 def assert_poses(poses: dict[str, Any], rows: list[dict[str, Any]]) -> None:
@@ -127,6 +136,55 @@ def test_the_first_files_of_version_3_did_not_name_contradicted_frames(tmp_path:
     log = read_result(tmp_path / "result.json").log
     assert log is not None
     assert [counts.frame for counts in log.contradicted] == ["cam_side"]
+
+
+def test_the_bound_of_version_4_was_of_the_reduced_form() -> None:
+    path, raw = stored(4)
+    result, fields = read_result(path), raw["certified"]
+    assert "basis" not in fields["certificate"]
+    assert "region" not in fields["certificate"]
+    assert "origin_m" not in fields["certificate"]["objective"]
+    certificates = [result.solution.certificate, *(part.certificate for part in result.solution.parts)]
+    assert len(certificates) == 2
+    for certificate in certificates:
+        assert certificate.basis is Basis.REDUCED_FORM
+        assert certificate.region is None
+        assert certificate.status == fields["certificate"]["status"] == "certified"
+        assert certificate.lower_bound == fields["certificate"]["lower_bound"]
+        assert (certificate.objective.form, certificate.objective.origin_m) == ("inverse", None)
+    assert certificate_sentence(certificates[0]).endswith("whose rounding is not in it.")
+    assert result.refined is not None
+    assert_poses(result.refined.X, raw["targets"])
+    assert_poses(result.refined.Y, raw["sensors"])
+    assert_poses(result.solution.X, fields["targets"])
+    assert_poses(result.solution.Y, fields["sensors"])
+    assert result.refined.scale == raw["scale"]
+    assert result.solution.scale == fields["scale"]
+    for name, frame in raw["refined"]["frames"].items():
+        np.testing.assert_allclose(result.refined.covariance(name), frame["covariance"], rtol=1e-12)
+
+
+def test_the_verdict_of_version_4_is_checked(tmp_path: Path) -> None:
+    _, raw = stored(4)
+    assert raw["verdict"] == "use"
+    with pytest.raises(rw.errors.FileFormatError, match=r"of version 4 .*\$\.verdict: the file says 'care'"):
+        read_result(changed({**raw, "verdict": "care"}, tmp_path))
+
+
+def test_version_4_told_when_digits_were_lost(tmp_path: Path) -> None:
+    """No new certificate has this cause. A file with it is read, and written again as it was."""
+    path = GOLDEN / "result_version_4_digits_lost.json"
+    solution = rw.read_solution(path)
+    assert solution.certificate.cause is Cause.DIGITS_LOST
+    assert solution.certificate.status is rw.Status.GAP
+    assert (
+        solution.certificate.reason
+        in json.loads(path.read_text(encoding="utf-8"))["certified"]["certificate"]["sentence"]
+    )
+    rw.write_solution(solution, tmp_path / "again.json")
+    again = rw.read_solution(tmp_path / "again.json")
+    assert again.certificate == solution.certificate
+    assert again.certificate.basis is Basis.REDUCED_FORM
 
 
 def test_version_1_was_not_refined() -> None:

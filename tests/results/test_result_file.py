@@ -14,12 +14,15 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from places import DEMO
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from places import DEMO, GOLDEN
 from pydantic import BaseModel
+from strategies import changed_trees, damaged
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError
-from gtsam_rwhec.results.result_file import read_solution, write_solution
+from gtsam_rwhec.results.result_file import parse_result, read_solution, write_solution
 from gtsam_rwhec.results.schema import FORMAT_VERSION, ResultFile
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.cause import Cause
@@ -115,7 +118,8 @@ def test_infinities_are_null_and_come_back(demo_solution: rw.Solution, tmp_path:
         min_eigenvalue=-math.inf,
     )
     identifiability = dataclasses.replace(demo_solution.identifiability, weakest=math.inf)
-    solution = dataclasses.replace(demo_solution, certificate=certificate, identifiability=identifiability)
+    parts = tuple(dataclasses.replace(part, certificate=certificate) for part in demo_solution.parts)
+    solution = dataclasses.replace(demo_solution, certificate=certificate, identifiability=identifiability, parts=parts)
     write_solution(solution, tmp_path / "result.json")
     raw = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
     assert raw["certified"]["certificate"]["lower_bound"] is None
@@ -135,11 +139,12 @@ def test_what_null_would_not_bring_back_is_not_written(demo_solution: rw.Solutio
 def test_awkward_numbers_come_back(demo_solution: rw.Solution, tmp_path: Path) -> None:
     numbers = np.array([5e-324, -0.0, 0.1 + 0.2])
     pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(1e-300, np.nextafter(1.0, 2.0), -3.0), numbers)
-    solution = dataclasses.replace(demo_solution, X=demo_solution.X | {"tag_0": pose}, cost=1.7976931348623157e308)
+    known = dataclasses.replace(demo_solution.identifiability, weakest=1.7976931348623157e308)
+    solution = dataclasses.replace(demo_solution, X=demo_solution.X | {"tag_0": pose}, identifiability=known)
     write_solution(solution, tmp_path / "result.json")
     back = read_solution(tmp_path / "result.json")
     assert back.X["tag_0"].matrix().tobytes() == pose.matrix().tobytes()
-    assert back.cost == solution.cost
+    assert back.identifiability.weakest == known.weakest
 
 
 def test_the_file_explains_itself(demo_solution: rw.Solution, written: Path) -> None:
@@ -240,6 +245,12 @@ def test_another_version_says_what_to_do(written: Path, version: int, remedy: st
             r"tag_0 is not a rotation",
         ),
         (
+            lambda raw: raw["certified"]["targets"][0].update(
+                rotation_matrix=[[1e200] * 3] * 3, quaternion_wxyz=[1e200] * 4
+            ),
+            r"quaternion_wxyz of tag_0 is not a rotation",
+        ),
+        (
             lambda raw: raw["certified"]["targets"][0].update(quaternion_wxyz=[1.0, 0.0, 0.0, 0.0]),
             r"\$\.certified\.targets\[0\]: rotation_matrix and quaternion_wxyz of tag_0 are different rotations",
         ),
@@ -308,7 +319,8 @@ def test_many_faults_are_counted(written: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"", "not a result of gtsam-rwhec: .*EOF"),
+        (b"", "not a result of gtsam-rwhec: it is empty"),
+        (b" \n", "not a result of gtsam-rwhec: it is empty"),
         (b'{"format": "gtsam-rwhec result",', r"not a result of gtsam-rwhec: \$: Invalid JSON.*line 1 column"),
         (b"[1, 2]", "not a result of gtsam-rwhec"),
         (b"{}", r"\$\.format: Field required"),
@@ -334,3 +346,19 @@ def test_a_path_that_cannot_be_used(demo_solution: rw.Solution, tmp_path: Path) 
         read_solution(tmp_path / "nowhere.json")
     with pytest.raises(FileFormatError, match="cannot be written: No such file"):
         write_solution(demo_solution, tmp_path / "nowhere" / "result.json")
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_content_gives_a_result_or_an_error_of_ours(written: Path, data: st.DataObject) -> None:
+    own = written.read_bytes()
+    earlier = (GOLDEN / f"result_version_{data.draw(st.integers(1, 3))}.json").read_bytes()
+    tree = json.loads(data.draw(st.sampled_from([own, own, earlier])))
+    content = data.draw(damaged([own, earlier]) | changed_trees(tree).map(lambda t: json.dumps(t).encode()))
+    try:
+        result = parse_result(content, "any.json")
+    except FileFormatError as error:
+        assert str(error).startswith("any.json")  # noqa: PT017
+        assert len(str(error)) < 5000  # noqa: PT017
+    else:
+        str(result.solution.certificate)

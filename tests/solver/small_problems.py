@@ -9,11 +9,14 @@ import numpy as np
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, Simulation, general
+from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
 from gtsam_rwhec.solver.full_form import FullForm
 from gtsam_rwhec.solver.options import SolveOptions
+from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.reduced_form import Forms, ReducedForm
+from gtsam_rwhec.solver.point import Evaluation
+from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import kkt_multipliers, vec
 from gtsam_rwhec.solver.search import Search
 from gtsam_rwhec.solver.start import spectral_start
@@ -37,7 +40,7 @@ def part_of(problem: rw.Problem) -> Part:
 
 def reduced(problem: rw.Problem) -> ReducedForm:
     """Q' of a connected problem."""
-    return Forms.of(part_of(problem)).reduced
+    return PartForm.of(part_of(problem)).reduced
 
 
 def searched(problem: rw.Problem, **options: Any) -> Search:
@@ -48,7 +51,7 @@ def searched(problem: rw.Problem, **options: Any) -> Search:
 def optimum(problem: rw.Problem) -> Descent:
     """Where the descent from the spectral start ends."""
     part = part_of(problem)
-    forms = Forms.of(part)
+    forms = PartForm.of(part)
     ends = [descend(forms.reduced, start, 200) for start in spectral_start(part, forms.rotation)]
     return min(ends, key=lambda end: end.cost)
 
@@ -56,6 +59,20 @@ def optimum(problem: rw.Problem) -> Descent:
 def multipliers_at(form: ReducedForm, R: Array) -> Array:
     """Those of R'R = I at a point."""
     return kkt_multipliers(R, form.apply(homogeneous(R))[:-1].reshape(-1, 9))
+
+
+def whole(problem: rw.Problem) -> PartForm:
+    """All that is known of the cost of a connected problem."""
+    return PartForm.of(part_of(problem))
+
+
+def bound_at(form: PartForm, R: Array, multipliers: Array | None = None) -> tuple[Bound, Evaluation]:
+    """The bound at rotations of the form, by the multipliers of R'R = I unless others are given; and the cost there."""
+    _, evaluation = form.answer_near(R)
+    if multipliers is None:
+        gradient = evaluation.gradient[:-1].reshape(-1, 13)[:, 4:]
+        multipliers = kkt_multipliers(evaluation.point.rotations, gradient)
+    return lower_bound(form, evaluation, multipliers), evaluation
 
 
 def gradient_norm(form: ReducedForm, R: Array) -> float:

@@ -1,31 +1,23 @@
-"""Lower bounds against exact arithmetic: whatever the multipliers and the point, no feasible point costs less."""
+"""Lower bounds: whatever the multipliers and the point, no answer costs less; and optimal ones lose nothing."""
 
 from __future__ import annotations
 
-from fractions import Fraction
-from functools import cache
-
-import exact_arithmetic as exact
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_problems import GROSS_NOISE, SMALL_NOISE, flat, multipliers_at, optimum, reduced, simulated
+from small_problems import GROSS_NOISE, SMALL_NOISE, bound_at, optimum, simulated, whole
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver import small_dual
-from gtsam_rwhec.solver.bound import Bound, exact_value, lower_bound
-from gtsam_rwhec.solver.descent import Descent, homogeneous
-from gtsam_rwhec.solver.local_blocks import scatter
-from gtsam_rwhec.solver.reduced_form import ReducedForm
+from gtsam_rwhec.solver.bound import Bound, lower_bound
+from gtsam_rwhec.solver.part_form import PartForm
+from gtsam_rwhec.solver.point import Point
+from gtsam_rwhec.solver.region import half_widths
 from gtsam_rwhec.solver.relaxation import solve_relaxation
-from gtsam_rwhec.solver.rotations import CONSTRAINTS, random_rotations
-
-
-def assert_below(bound: Bound, cost: Fraction) -> None:
-    assert bound.lower_bound == -np.inf or Fraction(bound.lower_bound) <= cost
+from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations, vec
 
 
 def badly_scaled(seed: int, scale: str) -> rw.Problem:
@@ -39,20 +31,20 @@ def badly_scaled(seed: int, scale: str) -> rw.Problem:
     return general(2, 2, seed=seed, noise=noise, number_of_measurements=8, scale=scale).problem
 
 
-def joined_by_scale(seed: int) -> rw.Problem:
-    """Two pairs that share nothing but their scale."""
-    return simulated(2, 2, seed, graph=[(0, 0), (1, 1)], scale="shared").problem
-
-
-def planar(seed: int, scale: str) -> rw.Problem:
-    return simulated(2, 1, seed, motion="planar", scale=scale).problem
-
-
 def with_motion_and_priors(seed: int, scale: str) -> rw.Problem:
     simulation = simulated(2, 1, seed, odometry=5, odometry_noise=SMALL_NOISE, scale=scale)
     for name, T in simulation.X.items():
         simulation.problem.add_prior(name, T, sigma=0.02, kappa=300.0)
     return simulation.problem
+
+
+def without_raw_measurements(problem: rw.Problem) -> rw.Problem:
+    """The same problem from its moments."""
+    lean = rw.Problem(problem.scale, keep_measurements=False)
+    for pair in problem.pairs:
+        raw = problem.measurements(*pair)
+        lean.add(*pair, raw.A, raw.B, raw.sigma, raw.kappa)
+    return lean
 
 
 PROBLEMS = {
@@ -61,186 +53,177 @@ PROBLEMS = {
     "per target": lambda seed: simulated(2, 1, seed, scale="per_target").problem,
     "badly scaled, known": lambda seed: badly_scaled(seed, "known"),
     "badly scaled, shared": lambda seed: badly_scaled(seed, "shared"),
-    "joined by scale": joined_by_scale,
-    "planar, known": lambda seed: planar(seed, "known"),
-    "planar, shared": lambda seed: planar(seed, "shared"),
+    "joined by scale": lambda seed: simulated(2, 2, seed, graph=[(0, 0), (1, 1)], scale="shared").problem,
+    "planar, known": lambda seed: simulated(2, 1, seed, motion="planar").problem,
+    "planar, shared": lambda seed: simulated(2, 1, seed, motion="planar", scale="shared").problem,
+    "one axis, per target": lambda seed: simulated(2, 1, seed, motion="single_axis", scale="per_target").problem,
     "no noise": lambda seed: simulated(2, 1, seed, noise=None).problem,
     "gross noise": lambda seed: simulated(1, 1, seed, noise=GROSS_NOISE, number_of_measurements=4).problem,
     "motion and priors": lambda seed: with_motion_and_priors(seed, "known"),
     "motion and priors, turned round": lambda seed: with_motion_and_priors(seed, "shared"),
+    "of moments": lambda seed: without_raw_measurements(simulated(2, 1, seed).problem),
+    "of moments, planar": lambda seed: without_raw_measurements(simulated(2, 1, seed, motion="planar").problem),
 }
 SEEDS = range(2)
 
 
-@cache
-def solved(name: str, seed: int) -> tuple[ReducedForm, Descent, Fraction]:
-    """The form, the end of the descent, and the optimum: exactly but for some 40 digits, and never below it."""
-    problem = PROBLEMS[name](seed)
-    form, end = reduced(problem), optimum(problem)
-    return form, end, exact.lowest_cost(form, end.R)
+def other_points(form: PartForm, bound: Bound, point: Point, generator: np.random.Generator, count: int) -> list[Point]:
+    """Answers of the region: random ones, with the best translations and without, and ones near the point."""
+    points = []
+    n = len(point.numbers)
+    width = np.full(13 * n + 1, 3.0) if bound.region is None else half_widths(form.part, point, bound.region)
+    for k in range(count):
+        R = random_rotations(n, generator)
+        if k % 3 == 0:
+            points.append(form.answer_near(R)[1].point)
+            continue
+        moved = np.append(point.numbers.ravel(), point.alpha)
+        moved += width * generator.uniform(-1, 1, len(width)) * (1e-6 if k % 3 == 1 else 1.0) * (moved != 0.0)
+        numbers = moved[:-1].reshape(n, 13)
+        numbers[:, 4:] = point.numbers[:, 4:] if k % 2 else vec(R)
+        points.append(Point(numbers, float(moved[-1])))
+    return points
+
+
+def assert_never_beaten(form: PartForm, bound: Bound, point: Point, seed: int, count: int = 12) -> None:
+    for other in other_points(form, bound, point, np.random.default_rng(seed), count):
+        assert bound.lower_bound <= form.cost.at(other).upper
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_kkt_bound_is_below_the_polished_optimum_and_close(name: str, seed: int) -> None:
-    form, end, cost = solved(name, seed)
-    bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
-    assert_below(bound, cost)
-    if bound.definite:
-        assert float(cost - Fraction(bound.lower_bound)) <= 1e-14 * form.magnitude
-        assert bound.eigenvalue > 0.0
-        assert bound.direction is None
+def test_the_bound_is_below_the_optimum_and_close(name: str, seed: int) -> None:
+    problem = PROBLEMS[name](seed)
+    form, end = whole(problem), optimum(problem)
+    bound, evaluation = bound_at(form, end.R)
+    assert bound.lower_bound <= evaluation.upper
     if bound.semidefinite:
-        assert float(cost - Fraction(bound.lower_bound)) <= 1e-10 * form.magnitude
+        # What the stored moments do far along a free direction is rounding.
+        lost = 1e-9 if form.part.given is not None or bound.definite else 1e-4
+        assert evaluation.upper - bound.lower_bound <= lost * evaluation.upper + 1e-25 * form.reduced.magnitude
+    assert bound.definite == (bound.semidefinite and bound.eigenvalue > 0.0)
+    assert_never_beaten(form, bound, evaluation.point, seed)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_any_multipliers_at_any_point_bound_the_optimum(name: str, seed: int) -> None:
-    """Of every size; those of h-coupled constraints too; points that are rotations and points that are none."""
-    form, end, cost = solved(name, seed)
+    """Of every size; those of h-coupled constraints too; points that are optimal and points that are not."""
+    problem = PROBLEMS[name](seed)
+    form, end = whole(problem), optimum(problem)
     generator = np.random.default_rng(seed)
-    n = form.rotations
-    kkt = multipliers_at(form, end.R)
-    for _ in range(4):
-        size = form.magnitude * 10.0 ** generator.uniform(-16, 0)
+    n = len(end.R)
+    _, best = form.answer_near(end.R)
+    elsewhere = form.cost.at(Point(np.c_[generator.standard_normal((n, 4)), vec(random_rotations(n, generator))], 1.0))
+    kkt = kkt_multipliers(best.point.rotations, best.gradient[:-1].reshape(-1, 13)[:, 4:])
+    for _ in range(2):
+        size = form.reduced.magnitude * 10.0 ** generator.uniform(-16, 0)
         random = size * generator.standard_normal((n, 20))
         orthogonality = np.where(np.arange(20) < 11, random, 0.0)
         shift = size * np.r_[1.0, 1.0, 1.0, np.zeros(17)]
-        points = (
-            flat(end.R),
-            flat(random_rotations(n, generator)),
-            generator.standard_normal(9 * n) * 10.0 ** generator.uniform(-3, 3),
-            np.zeros(9 * n),
-        )
         for multipliers in (random, kkt + random, kkt + orthogonality, kkt + shift, kkt - shift, np.zeros((n, 20))):
-            for point in points:
-                assert_below(lower_bound(form, multipliers, point), cost)
-
-
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_no_feasible_point_costs_less(name: str) -> None:
-    """At exact rotations all over SO(3)^n, in exact arithmetic."""
-    form, end, _ = solved(name, 0)
-    bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
-    Q = exact.stored_matrix(form)
-    generator = np.random.default_rng(0)
-    for _ in range(20):
-        assert_below(bound, exact.cost(Q, exact.random_quaternions(form.rotations, generator)))
+            for at in (best, elsewhere):
+                bound = lower_bound(form, at, multipliers)
+                if bound.region is None:  # else the best answer may lie outside
+                    assert bound.lower_bound <= best.upper
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", ["known", "shared", "gross noise", "joined by scale"])
 def test_small_duals_and_relaxations_multipliers_bound_the_optimum(name: str, seed: int) -> None:
-    form, end, cost = solved(name, seed)
-    relaxation = solve_relaxation(form.dense(), 1e-8, 100)
-    improved, _ = small_dual.improve(form, end.R, multipliers_at(form, end.R))
-    assert_below(lower_bound(form, improved, flat(end.R)), cost)
-    assert_below(lower_bound(form, relaxation.multipliers, relaxation.X[:-1, -1]), cost)
-    assert_below(lower_bound(form, relaxation.multipliers, flat(end.R)), cost)
-
-
-@pytest.mark.parametrize("factor", [1.0, 3.0, 100.0])
-@pytest.mark.parametrize("name", ["planar, known", "gross noise"])
-def test_points_outside_the_unit_balls_do_not_break_the_slack_branch(name: str, factor: float) -> None:
-    """z = y - r is as long as r is; a bound that took |z| <= 2 sqrt(3) for granted would claim too much."""
-    form, end, cost = solved(name, 1)
-    shift = 1e-6 * form.magnitude * np.r_[1.0, 1.0, 1.0, np.zeros(17)]
-    bound = lower_bound(form, multipliers_at(form, end.R) + shift, factor * flat(end.R))
-    assert not bound.definite
-    assert_below(bound, cost)
+    problem = PROBLEMS[name](seed)
+    form, end = whole(problem), optimum(problem)
+    relaxation = solve_relaxation(form.reduced.dense(), 1e-8, 100)
+    bound, evaluation = bound_at(form, end.R, relaxation.multipliers)
+    assert bound.lower_bound <= evaluation.upper
+    gradient = evaluation.gradient[:-1].reshape(-1, 13)[:, 4:]
+    kkt = kkt_multipliers(evaluation.point.rotations, gradient)
+    improved, _ = small_dual.improve(form.reduced, evaluation.point.rotations, kkt)
+    assert bound_at(form, end.R, improved)[0].lower_bound <= evaluation.upper
 
 
 class TestBranches:
     """Every branch is really taken by the problems above."""
 
     def test_definite(self) -> None:
-        form, end, _ = solved("known", 0)
-        bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
+        problem = PROBLEMS["known"](0)
+        bound, _ = bound_at(whole(problem), optimum(problem).R)
         assert bound.definite
         assert bound.semidefinite
+        assert bound.region is None
         assert bound.lower_bound < bound.value
 
     @pytest.mark.parametrize("name", ["shared", "joined by scale", "badly scaled, shared"])
-    def test_pinned(self, name: str) -> None:
-        """Nothing couples to h, and Z has the null vector r: one entry short of definite."""
-        form, end, _ = solved(name, 0)
-        dense = form.dense()
-        assert not dense[-1].any()
-        kkt = multipliers_at(form, end.R)
-        bound = lower_bound(form, kkt, flat(end.R))
+    def test_definite_but_for_the_point(self, name: str) -> None:
+        """Nothing couples to h, and Z has the null vector x: the bound holds for all of space."""
+        problem = PROBLEMS[name](0)
+        form = whole(problem)
+        assert not form.curvature.is_coupled_to_h
+        bound, _ = bound_at(form, optimum(problem).R)
         assert bound.definite
-        # Multipliers that couple r to h close that branch.
-        kkt[0, 12] = 1e-300
-        assert not lower_bound(form, kkt, flat(end.R)).definite
+        assert bound.region is None
 
     @pytest.mark.parametrize("scale", ["known", "shared"])
-    def test_slack(self, scale: str) -> None:
-        """On planar motion Z is semidefinite and no more, without a direction to go down."""
-        form, end, _ = solved(f"planar, {scale}", 0)
-        bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
+    def test_semidefinite(self, scale: str) -> None:
+        """On planar motion the height is free: the bound names how far it holds."""
+        problem = PROBLEMS[f"planar, {scale}"](0)
+        bound, evaluation = bound_at(whole(problem), optimum(problem).R)
         assert not bound.definite
         assert bound.semidefinite
         assert bound.direction is None
-        assert bound.eigenvalue < 0.0
+        assert bound.region is not None
+        assert bound.region.radius_m >= 100.0
+        assert evaluation.upper - bound.lower_bound <= 1e-9 * evaluation.upper
 
     def test_negative(self) -> None:
-        """At a point that is no optimum Z has a negative eigenvalue: it is found, bounded, and its vector given."""
-        form, _, _ = solved("known", 0)
-        R = random_rotations(form.rotations, np.random.default_rng(0))
-        kkt = multipliers_at(form, R)
-        bound = lower_bound(form, kkt, flat(R))
+        """At a point that is no optimum Z has a negative eigenvalue: the bound is far below, and a direction given."""
+        problem = PROBLEMS["known"](0)
+        form = whole(problem)
+        R = random_rotations(3, np.random.default_rng(0))
+        at = form.cost.at(Point(np.c_[np.zeros((3, 4)), vec(R)], 1.0))
+        multipliers = kkt_multipliers(R, at.gradient[:-1].reshape(-1, 13)[:, 4:])
+        bound = lower_bound(form, at, multipliers)
         assert not bound.semidefinite
         assert bound.direction is not None
-        Z = dense_curvature(form, kkt)
-        smallest = np.linalg.eigvalsh(Z)[0]
-        assert bound.eigenvalue <= smallest < 0.0
-        assert bound.eigenvalue >= 1.1 * smallest
-        assert bound.direction @ Z @ bound.direction == pytest.approx(smallest)
-
-
-def dense_curvature(form: ReducedForm, multipliers: Array) -> Array:
-    """Z_rr in floating point."""
-    Z: Array = form.dense() - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
-    return Z[:-1, :-1]
+        assert bound.eigenvalue < 0.0
+        assert np.isfinite(bound.lower_bound)
+        assert bound.lower_bound < form.answer_near(optimum(problem).R)[1].cost
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
-def test_large_problems_find_their_negative_eigenvalue_by_lanczos(scale: str) -> None:
-    """Above the size of dense eigenvalues (700): the bound still holds and the direction still goes down."""
-    simulation = simulated(60, 20, 1, graph="random", scale=scale)
-    form = reduced(simulation.problem)
-    assert form.size > 701
-    R = random_rotations(form.rotations, np.random.default_rng(0))
-    kkt = multipliers_at(form, R)
-    bound = lower_bound(form, kkt, flat(R))
-    Z = dense_curvature(form, kkt)
-    assert np.isfinite(bound.lower_bound)
-    assert bound.lower_bound < optimum(simulation.problem).cost
-    assert bound.direction is not None
-    assert bound.direction @ Z @ bound.direction == pytest.approx(np.linalg.eigvalsh(Z)[0], rel=1e-3)
+def test_large_problems(scale: str) -> None:
+    """Above the size of dense eigenvalues: at the optimum the bound is tight, elsewhere it holds with a direction."""
+    problem = simulated(60, 20, 1, graph="random", scale=scale).problem
+    form, end = whole(problem), optimum(problem)
+    bound, evaluation = bound_at(form, end.R)
+    assert bound.definite
+    assert evaluation.upper - bound.lower_bound <= 1e-10 * evaluation.upper
+    R = random_rotations(len(end.R), np.random.default_rng(0))
+    elsewhere, _ = bound_at(form, R)
+    assert elsewhere.lower_bound < evaluation.cost
+    assert elsewhere.direction is not None
+
+
+def test_large_problems_with_a_free_direction_have_a_region() -> None:
+    problem = simulated(90, 2, 1, motion="planar").problem
+    form, end = whole(problem), optimum(problem)
+    bound, evaluation = bound_at(form, end.R)
+    assert bound.semidefinite
+    assert bound.region is not None
+    assert evaluation.upper - bound.lower_bound <= 1e-9 * evaluation.upper
 
 
 def test_numbers_that_are_none_prove_nothing() -> None:
-    form, end, _ = solved("known", 0)
-    multipliers = multipliers_at(form, end.R)
+    problem = PROBLEMS["known"](0)
+    form, end = whole(problem), optimum(problem)
+    multipliers: Array = np.zeros((len(end.R), 20))
     multipliers[0, 0] = np.nan
-    for bound in (
-        lower_bound(form, multipliers, flat(end.R)),
-        lower_bound(form, multipliers_at(form, end.R), np.full(9 * form.rotations, np.inf)),
-    ):
-        assert bound.lower_bound == -np.inf
-        assert not bound.definite
-
-
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_cost_in_extended_precision_is_within_its_stated_error(name: str) -> None:
-    form, end, _ = solved(name, 0)
-    x = homogeneous(end.R)
-    value, error = exact_value(form, x)
-    true = exact.fractions(x) @ (exact.stored_matrix(form) @ exact.fractions(x))
-    assert abs(Fraction(value) - true) <= Fraction(error)
-    assert error <= 1e-14 * form.magnitude
+    bound, _ = bound_at(form, end.R, multipliers)
+    assert bound.lower_bound == -np.inf
+    assert not bound.definite
+    with np.errstate(all="ignore"):
+        infinite = form.cost.at(Point(np.full((len(end.R), 13), np.inf), 1.0))
+    assert lower_bound(form, infinite, np.zeros((len(end.R), 20))).lower_bound == -np.inf
 
 
 @given(
@@ -249,23 +232,18 @@ def test_cost_in_extended_precision_is_within_its_stated_error(name: str) -> Non
     sensors=st.integers(1, 2),
     scale=st.sampled_from(["known", "shared", "per_target"]),
     motion=st.sampled_from(["general", "planar", "single_axis", "none"]),
-    sigma=st.floats(-4.0, 1.0),
-    kappa=st.floats(-1.0, 6.0),
-    log_size=st.floats(-18.0, 0.0),
+    sigma=st.floats(-6.0, 1.0),
+    kappa=st.floats(-1.0, 12.0),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_bounds_hold_on_any_small_problem(
-    seed: int, targets: int, sensors: int, scale: str, motion: str, sigma: float, kappa: float, log_size: float
+    seed: int, targets: int, sensors: int, scale: str, motion: str, sigma: float, kappa: float
 ) -> None:
     noise = Noise(10.0**sigma, 10.0**kappa)
-    problem = simulated(
-        targets, sensors, seed, scale=scale, motion=motion, noise=noise, number_of_measurements=5
+    problem = general(
+        targets, sensors, seed=seed, noise=noise, number_of_measurements=6, scale=scale, motion=motion
     ).problem
-    form, end = reduced(problem), optimum(problem)
-    cost = exact.lowest_cost(form, end.R)
-    multipliers = multipliers_at(form, end.R)
-    assert_below(lower_bound(form, multipliers, flat(end.R)), cost)
-    generator = np.random.default_rng(seed)
-    multipliers += 10.0**log_size * form.magnitude * generator.standard_normal(multipliers.shape)
-    assert_below(lower_bound(form, multipliers, flat(end.R)), cost)
-    assert_below(lower_bound(form, multipliers, flat(random_rotations(form.rotations, generator))), cost)
+    form, end = whole(problem), optimum(problem)
+    bound, evaluation = bound_at(form, end.R)
+    assert bound.lower_bound <= evaluation.upper
+    assert_never_beaten(form, bound, evaluation.point, seed, count=6)

@@ -7,7 +7,8 @@ from dataclasses import FrozenInstanceError, replace
 import pytest
 
 from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start, Status
-from gtsam_rwhec.solver.certificate import Certificate, Objective
+from gtsam_rwhec.solver.certificate import Basis, Certificate, Objective
+from gtsam_rwhec.solver.region import Region
 
 CERTIFIED = Certificate(
     status=Status.CERTIFIED,
@@ -69,12 +70,60 @@ def test_unit_weights_are_said() -> None:
     assert "(unit weights: relative)" in str(replace(CERTIFIED, is_relative=True))
 
 
+def test_a_bound_of_moments_says_so() -> None:
+    """The bound of a certificate is of all that was measured, unless it says otherwise beside the bound."""
+    measured = replace(CERTIFIED, basis=Basis.MEASUREMENTS)
+    assert str(measured) == (
+        "certified: cost 100, no answer below 99.999999, relative gap 1.0e-08; proven globally optimal"
+    )
+    of_moments = str(replace(CERTIFIED, basis=Basis.MOMENTS))
+    assert of_moments == str(measured).replace("below 99.999999,", "below 99.999999 (of the moments),")
+    of_older = str(replace(CERTIFIED, basis=Basis.REDUCED_FORM))
+    assert of_older == str(measured).replace("below 99.999999,", "below 99.999999 (of the stored form),")
+
+
+def test_a_region_is_the_last_of_what_is_said() -> None:
+    text = str(replace(CERTIFIED, basis=Basis.MOMENTS, region=Region(353.19, 100.0)))
+    assert "(of the moments)" in text
+    assert text.endswith(
+        "; proven globally optimal; the bound holds for translations within 353 m of the answer's, and for unknown "
+        "scales within a factor of 100"
+    )
+
+
+@pytest.mark.parametrize(
+    ("radius_m", "factor", "said"),
+    [
+        (0.0123456, 99.96, "within 0.0123 m of the answer's, and for unknown scales within a factor of 99.9"),
+        (9999.9, 1e5, "within 9990 m of the answer's, and for unknown scales within a factor of 100000"),
+        (12345.6, 123456.7, "within 12.3 km of the answer's, and for unknown scales within a factor of 123000"),
+        (2.5e12, 1.239e9, "within 2.5e+09 km of the answer's, and for unknown scales within a factor of 1.23e+09"),
+    ],
+)
+def test_a_region_is_never_said_to_be_larger_than_it_is(radius_m: float, factor: float, said: str) -> None:
+    assert str(Region(radius_m, factor)).endswith(said)
+
+
 def test_nothing_can_be_changed_afterwards() -> None:
     with pytest.raises(FrozenInstanceError):
         CERTIFIED.cost = 0.0  # type: ignore[misc]
 
 
 class TestMerged:
+    def test_the_weakest_claim_counts(self) -> None:
+        """The region is what all parts have in common, and the basis the weakest; a part without a region has all."""
+        parts = [
+            replace(CERTIFIED, basis=Basis.MEASUREMENTS),
+            replace(CERTIFIED, basis=Basis.MEASUREMENTS, region=Region(300.0, 1e4)),
+            replace(CERTIFIED, basis=Basis.MOMENTS, region=Region(500.0, 100.0)),
+        ]
+        assert Certificate.merged(parts[:2]).region == Region(300.0, 1e4)
+        assert Certificate.merged(parts[:2]).basis is Basis.MEASUREMENTS
+        assert Certificate.merged(parts).region == Region(300.0, 100.0)
+        assert Certificate.merged(parts).basis is Basis.MOMENTS
+        assert Certificate.merged([*parts, replace(CERTIFIED, basis=Basis.REDUCED_FORM)]).basis is Basis.REDUCED_FORM
+        assert Certificate.merged([parts[0], parts[0]]).region is None
+
     def test_one_is_itself(self) -> None:
         assert Certificate.merged([CERTIFIED]) is CERTIFIED
 
@@ -103,7 +152,8 @@ class TestMerged:
         for order in ([CERTIFIED, other], [other, CERTIFIED]):
             both = Certificate.merged(order)
             assert both.status is worst
-            assert both.cost == 150.0
+            assert both.cost == pytest.approx(150.0, rel=1e-15)
+            assert both.cost >= 150.0
             assert both.lower_bound == pytest.approx(140.0 - 1e-6)
             assert both.float_bound == pytest.approx(145.0)
             assert both.min_eigenvalue == -3.0

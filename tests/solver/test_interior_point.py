@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_problems import GROSS_NOISE, flat, multipliers_at, optimum, reduced, simulated
+from small_problems import GROSS_NOISE, bound_at, optimum, reduced, simulated, whole
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion, Noise
-from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.interior_point import Relaxation, solve_by_blocks
 from gtsam_rwhec.solver.local_blocks import scatter
 from gtsam_rwhec.solver.relaxation import solve_by_clarabel
@@ -84,7 +83,7 @@ def test_tight_relaxations_reach_the_certified_optimum(frames: int, scale: Scale
     for seed in range(3):
         problem = problem_of(frames, scale, seed)
         form, end = reduced(problem), optimum(problem)
-        bound = lower_bound(form, multipliers_at(form, end.R), flat(end.R))
+        bound, _ = bound_at(whole(problem), end.R)
         assert end.cost - bound.lower_bound < 1e-6 * end.cost
         relaxation = solve_by_blocks(form.dense(), 1e-9, 100)
         assert relaxation.dual == pytest.approx(end.cost, abs=accuracy(form.dense()))

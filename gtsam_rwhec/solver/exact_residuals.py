@@ -1,0 +1,265 @@
+"""Residuals of raw measurements for given coefficients, right to about 2^-70 of their largest term.
+
+A measurement's twelve residuals are linear in the entries of its two poses: nine of the rotation equation, three of the
+translation equation. Features and coefficients are split into a high slice, whose products and their sums are exact in
+double precision in any order, and a low slice, whose products are so small that their rounding does not count (Ozaki,
+Ogita, Oishi and Rump 2012). So large terms cancel exactly, a BLAS product does the work, and no platform's long double
+is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import fsum
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.rounding import Doubled, gamma
+from gtsam_rwhec.problem.measurements import Measurements
+
+#: So many measurements are evaluated at once: the slices of a block stay in the processor's cache.
+BLOCK = 1024
+#: Batches of fewer measurements are evaluated together.
+SMALL = 256
+#: A stack of small batches has about so many measurements: more at once, as calls take longer than numbers there.
+STACK = 4096
+#: Batches in one stack have at least this part of its longest batch, so that little is padding.
+FULL = 0.6
+#: Bits of a feature's high slice.
+FEATURE_BITS = 24
+#: Bits of a coefficient's high slice. Products of 52 bits leave one bit for the rounding of the slices.
+COEFFICIENT_BITS = 28
+#: The low slices' products round by less than this part of the largest sum of terms.
+LOW_PART = 2.0**-70
+#: Operations of a residual's last sum, its weight, and its square.
+_FEW = 12
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """The residuals of E pairs as linear functions of the features, in D directions.
+
+    ``front``, ``back`` (E, 12, 12 D) belong to the features [R | t], row by row, of the first and the second pose;
+    ``one`` (E, 12 D) is constant. Twelve numbers a direction: the rotation residual row by row, then the translation
+    residual.
+    """
+
+    front: Doubled
+    back: Doubled
+    one: Doubled
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Measurements of k batches, padded to the longest: A, B (k, m, 12), weight, kappa (k, m), pairs (k,)."""
+
+    pairs: np.ndarray
+    A: Array
+    B: Array
+    weight: Array
+    kappa: Array
+
+
+@dataclass(frozen=True)
+class Measured:
+    """All measurements of a part, batch by batch with the index of the pair, and the gauge's points a, c (E, 3).
+
+    With ``is_swapped``, B is the front pose and A the back pose (the inverse equation).
+    """
+
+    batches: list[tuple[int, Measurements]]
+    a: Array
+    c: Array
+    is_swapped: bool
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Weighted sums over the measurements of each pair, each with a bound on its rounding.
+
+    ``products``: of products of residuals in two directions; (E, 1, 1, 12) for one direction, and for several the sum
+    over pairs and residuals, (1, D, D, 1). ``front``, ``back`` (E, 12, 12 D) and
+    ``one`` (E, 12 D): of features times residuals, with the translations of A about the gauge.
+    """
+
+    products: Array
+    products_error: Array
+    front: Array
+    front_error: Array
+    back: Array
+    back_error: Array
+    one: Array
+    one_error: Array
+
+
+def stacks_of(batches: list[tuple[int, Measurements]]) -> Iterator[Stack]:
+    """The measurements in stacks."""
+    small = sorted((b for b in batches if len(b[1].A) <= SMALL), key=lambda b: len(b[1].A), reverse=True)
+    while small:
+        longest = len(small[0][1].A)
+        count = 1
+        while count < len(small) and count * longest < STACK and len(small[count][1].A) >= FULL * longest:
+            count += 1
+        taken, small = small[:count], small[count:]
+        filled = np.arange(longest) < np.array([len(raw.A) for _, raw in taken])[:, None]
+        A: Array = np.zeros((count, longest, 12))
+        B: Array = np.zeros((count, longest, 12))
+        weight: Array = np.zeros((count, longest))
+        kappa: Array = np.zeros((count, longest))
+        A[filled] = _rows(np.concatenate([raw.A for _, raw in taken]))
+        B[filled] = _rows(np.concatenate([raw.B for _, raw in taken]))
+        weight[filled] = 1.0 / np.concatenate([raw.sigma for _, raw in taken]) ** 2
+        kappa[filled] = np.concatenate([raw.kappa for _, raw in taken])
+        yield Stack(np.array([pair for pair, _ in taken]), A, B, weight, kappa)
+    for pair, raw in batches:
+        if len(raw.A) <= SMALL:
+            continue
+        for first in range(0, len(raw.A), BLOCK):
+            part = slice(first, first + BLOCK)
+            weight = 1.0 / raw.sigma[None, part] ** 2
+            yield Stack(
+                np.array([pair]), _rows(raw.A[part])[None], _rows(raw.B[part])[None], weight, raw.kappa[None, part]
+            )
+
+
+def _rows(T: Array) -> Array:
+    """The first three rows of transforms (n, 4, 4), as (n, 12)."""
+    return T.reshape(len(T), 16)[:, :12]
+
+
+def weighted_sums(measured: Measured, coefficients: Coefficients) -> Sums:
+    """Sum the products of residuals, and of features with residuals, over all measurements of each pair."""
+    pairs = len(measured.a)
+    outputs = coefficients.one.hi.shape[1]
+    D = outputs // 12
+    products: dict[int, list[Array]] = {}
+    # In several directions only the sum over pairs and residuals counts: one product of matrices makes it.
+    shape = (pairs, 1, 1, 12) if D == 1 else (1, D, D, 1)
+    products_error = np.zeros(shape)
+    tables: list[Array] = [np.zeros((pairs, 12, outputs)), np.zeros((pairs, 12, outputs)), np.zeros((pairs, outputs))]
+    errors, sizes = ([np.zeros_like(table) for table in tables] for _ in range(2))
+    for stack in stacks_of(measured.batches):
+        front, back = (stack.B, stack.A) if measured.is_swapped else (stack.A, stack.B)
+        r, low = _residuals(stack.pairs, front, back, coefficients)
+        A, off = _centred(stack, measured)
+        front, back = (stack.B, A) if measured.is_swapped else (A, stack.B)
+        k, m = stack.weight.shape
+        weights = np.empty((k, m, 12))
+        weights[:, :, :9], weights[:, :, 9:] = stack.kappa[:, :, None], stack.weight[:, :, None]
+        of_directions = r.reshape(k, m, D, 12)
+        weighted = of_directions * weights[:, :, None, :]
+        own = np.einsum("kmdo,kmdo->kdo", weighted, of_directions)
+        flat = weighted.reshape(k, m, outputs)
+        unit = gamma(m + _FEW)
+        total = np.repeat(weights.sum(axis=1)[:, None, :], D, axis=1)  # (k, D, 12)
+        # |r| has an error of low: by Cauchy and Schwarz each root of a sum of squares is off by sqrt(total) low.
+        slack = np.sqrt(total) * low.reshape(k, D, 12)
+        root = np.sqrt(np.maximum(own, 0.0)) * (1.0 + unit) + slack
+        if D == 1:
+            square, places = own[:, :, None], stack.pairs
+            error = (unit * root * root + 2.0 * slack * root)[:, :, None]
+        else:
+            square, error = _together(weighted, of_directions, root, slack)
+            places = np.zeros(1, dtype=int)
+        one = flat.sum(axis=1)
+        one_error = (np.sqrt(total) * (unit * root + slack)).reshape(k, outputs)
+        front_reach, back_reach = np.abs(front).max(axis=1), np.abs(back).max(axis=1)
+        of_size = (np.sqrt(total) * root).reshape(k, 1, outputs) * off[:, :, None]
+        np.add.at(products_error, places, error)
+        for pair, of_pair in zip(places.tolist(), square, strict=True):
+            products.setdefault(pair, []).append(of_pair)
+        new = (
+            np.matmul(front.transpose(0, 2, 1), flat),
+            np.matmul(back.transpose(0, 2, 1), flat),
+            one,
+        )
+        reaches = [front_reach[:, :, None] * one_error[:, None], back_reach[:, :, None] * one_error[:, None], one_error]
+        reaches[int(measured.is_swapped)] += of_size
+        for table, bound, size, value, reach in zip(tables, errors, sizes, new, reaches, strict=True):
+            np.add.at(table, stack.pairs, value)
+            np.add.at(bound, stack.pairs, reach)
+            np.add.at(size, stack.pairs, np.abs(value))
+    # Blocks of one pair are added up exactly, so that a million measurements lose no more than one block does.
+    summed = np.zeros(shape)
+    for pair, parts in products.items():
+        if len(parts) == 1:
+            summed[pair] = parts[0]
+        else:
+            columns = np.array(parts).reshape(len(parts), -1).T
+            summed[pair] = np.reshape([fsum(column) for column in columns], shape[1:])
+    blocks = gamma(2 + max((len(parts) for parts in products.values()), default=1))
+    for bound, size in zip(errors, sizes, strict=True):
+        bound += blocks * size
+        bound *= 1.0 + 1e-9
+    products_error += gamma(2) * np.abs(summed)
+    products_error *= 1.0 + 1e-9
+    return Sums(summed, products_error, tables[0], errors[0], tables[1], errors[1], tables[2], errors[2])
+
+
+def _together(weighted: Array, residuals: Array, root: Array, slack: Array) -> tuple[Array, Array]:
+    """Products of directions summed over a stack's measurements and residuals, and a bound on them: (1, D, D, 1) each.
+
+    weighted, residuals (k, m, D, 12); root, slack (k, D, 12): of each sum of squares, and of what it may be off by.
+    """
+    D = residuals.shape[2]
+    left, right = (each.transpose(2, 0, 1, 3).reshape(D, -1) for each in (weighted, residuals))
+    roots, slacks = (each.transpose(1, 0, 2).reshape(D, -1) for each in (root, slack))
+    crossed = slacks @ roots.T
+    error = gamma(left.shape[1] + _FEW) * (roots @ roots.T) + crossed + crossed.T
+    return (left @ right.T).reshape(1, D, D, 1), error.reshape(1, D, D, 1)
+
+
+def _centred(stack: Stack, measured: Measured) -> tuple[Array, Array]:
+    """A with its translations about the gauge, t_A + R_A c - a, and a bound (k, 12) on their rounding."""
+    k, m = stack.weight.shape
+    A, a, c = stack.A.copy(), measured.a[stack.pairs], measured.c[stack.pairs]
+    rows = A.reshape(k, m, 3, 4)
+    rows[..., 3] += np.matmul(rows[..., :3], c[:, None, :, None])[..., 0] - a[:, None, :]
+    rows[stack.weight == 0.0] = 0.0  # padding
+    off = np.zeros((k, 3, 4))
+    off[:, :, 3] = np.abs(stack.A.reshape(k, m, 3, 4)[..., 3]).max(axis=1) + np.abs(c).sum(axis=1)[:, None] + np.abs(a)
+    return A, 8.0 * gamma(1) * off.reshape(k, 12)
+
+
+def _residuals(
+    pairs: np.ndarray, front_rows: Array, back_rows: Array, coefficients: Coefficients
+) -> tuple[Array, Array]:
+    """Residuals (k, m, 12 D), to their last digit and an absolute error of at most the second array (k, 12 D)."""
+    front, back, one = (
+        Doubled(c.hi[pairs], c.lo[pairs]) for c in (coefficients.front, coefficients.back, coefficients.one)
+    )
+    front_unit, back_unit = _feature_units(front_rows), _feature_units(back_rows)
+    total = (front_unit[:, :, None] * np.abs(front.hi)).sum(axis=1)
+    total += (back_unit[:, :, None] * np.abs(back.hi)).sum(axis=1) + np.abs(one.hi)
+    top: Array = _power_above(total * (1.0 + 1e-9))
+    result: Array = np.zeros((*front_rows.shape[:2], total.shape[1]))
+    low = np.zeros_like(result)
+    for x, unit, c in ((front_rows, front_unit, front), (back_rows, back_unit, back)):
+        grid = top[:, None, :] * 2.0**-COEFFICIENT_BITS / unit[:, :, None]
+        c_high = np.rint(c.hi / grid) * grid
+        c_low = (c.hi - c_high) + c.lo
+        step = (1.5 * 2.0 ** (52 - FEATURE_BITS) * unit)[:, None, :]  # its last bit is the slice's
+        x_high = (x + step) - step
+        result += np.matmul(x_high, c_high)
+        low += np.matmul(x_high, c_low)
+        low += np.matmul(x - x_high, c.hi)
+    of_one = top * 2.0 ** -(FEATURE_BITS + COEFFICIENT_BITS)
+    one_high = np.rint(one.hi / of_one) * of_one
+    result += one_high[:, None, :]
+    low += ((one.hi - one_high) + one.lo)[:, None, :]
+    result += low
+    return result, top * LOW_PART
+
+
+def _feature_units(x: Array) -> Array:
+    """A power of two (k, 12) that no feature of a batch exceeds."""
+    return _power_above(np.abs(x).max(axis=1))
+
+
+def _power_above(values: Array) -> Array:
+    """The smallest powers of two that are not below the values; 1 for zero."""
+    mantissa, exponent = np.frexp(values)
+    powers: Array = np.where(values > 0.0, np.ldexp(1.0, exponent - (mantissa == 0.5)), 1.0)
+    return powers

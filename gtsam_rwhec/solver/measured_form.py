@@ -1,0 +1,286 @@
+"""The cost of a part from its raw measurements as they were given, enclosed: what the certificate is about.
+
+In both kinds a pair's residuals are those of a *front* pose F and a *back* pose K (design facts 1 and 7)::
+
+    R_F R_1 - R_2 R_K,       R_F u + s t_F + one - R_2 (t_K + R_K c)
+
+direct (A X = Y B): F = A, K = B, R_1 = R_X, R_2 = R_Y, u = alpha t_X, s = alpha, one = -alpha t_Y, c = 0.
+inverse (B X' = Y' A): F = B, K = A, R_1 = R_X', R_2 = R_Y', u = t_X', s = 1 / scale, one = -t_Y' + R_Y' a, and c is the
+gauge's point in the target carrier; A is taken about the gauge there, which the cost depends on.
+
+They are linear in the variables and in the features of the measurements. The coefficients are made in twice the
+precision, so that a distant origin costs no digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.rounding import Doubled, difference, gamma, product, reciprocal, turned
+from gtsam_rwhec.solver.exact_residuals import Coefficients, Measured, Sums, weighted_sums
+from gtsam_rwhec.solver.full_form import ALPHA, Slots, rounding_of_fixed
+from gtsam_rwhec.solver.given import Given
+from gtsam_rwhec.solver.measured_priors import MeasuredPriors
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.plain_residuals import plain_sums
+from gtsam_rwhec.solver.point import Action, Evaluation, Point
+from gtsam_rwhec.solver.variables import Answer, as_point
+
+
+@dataclass(frozen=True)
+class _Ends:
+    """Coefficients of E pairs in D directions: R_1, R_2 (E, D, 3, 3), u, one (E, D, 3), s (E, D)."""
+
+    R_1: Array
+    R_2: Array
+    u: Doubled
+    s: Doubled
+    one: Doubled
+
+
+@dataclass(frozen=True)
+class _Measured(Evaluation):
+    """An evaluation, and the coefficients that it was made with."""
+
+    ends: _Ends | None = None
+
+
+@dataclass(frozen=True)
+class MeasuredForm:
+    """The cost of a part; ``given`` are its measurements."""
+
+    part: Part
+    given: Given
+    slots: Slots
+
+    @cached_property
+    def _priors(self) -> MeasuredPriors:
+        return MeasuredPriors(self.part, self.given.priors)
+
+    @cached_property
+    def _centres(self) -> tuple[Array, Array]:
+        """The gauge's points a and c (E, 3): a motion has both ends in the sensor's carrier."""
+        gauge = self.part.gauge
+        a = np.broadcast_to(gauge.sensor_carrier, (len(self.part.pairs), 3))
+        c = np.where(self.part.moments.motion[:, None], gauge.sensor_carrier, gauge.target_carrier)
+        return a, c
+
+    @cached_property
+    def _of_fixed(self) -> Array:
+        return rounding_of_fixed(self.part)
+
+    def at_poses(self, R: Array, t: Array, answer: Answer) -> Evaluation:
+        """The cost of poses as they are returned: R (n, 3, 3), t (n, 3) about the user's origin, and their scales."""
+        frames = {name: (R[i], t[i]) for i, name in enumerate(self.part.free)}
+        frames |= {name: (T[:3, :3], T[:3, 3]) for name, T in self.given.fixed.items()}
+        (R_X, t_X), (R_Y, t_Y) = (
+            [np.array(each) for each in zip(*(frames[name] for name in side), strict=True)]
+            for side in zip(*self.part.pairs, strict=True)
+        )
+        ends = self._of_poses(R_X, t_X, R_Y, t_Y, answer)
+        return self._evaluated(as_point(self.part, answer), ends, self._priors.at_poses(R, t))
+
+    def at(self, point: Point) -> Evaluation:
+        """The cost at values of the variables about the gauge."""
+        return self._evaluated(point, self._of_point(point), self._priors.at(point))
+
+    def action(self, evaluation: Evaluation, V: Array) -> Action:
+        """What the form does to directions."""
+        D = V.shape[1]
+        point = evaluation.point
+        ends = evaluation.ends if isinstance(evaluation, _Measured) else None
+        if ends is None:
+            ends = self._of_point(point)
+        sums = weighted_sums(*self._coefficients(self._joined(self._of_directions(V, 0.0), ends)))
+        QV, QV_error = self._by_variables(sums, range(D))
+        products = 0.5 * sums.products.sum(axis=(0, 3))
+        error = 0.5 * sums.products_error.sum(axis=(0, 3)) + gamma(len(self.part.pairs) + 16) * 0.5 * np.abs(
+            sums.products
+        ).sum(axis=(0, 3))
+        of_priors = self._priors.action(point, V)
+        return Action(
+            QV + of_priors.QV,
+            QV_error + of_priors.QV_error + gamma(2) * np.abs(QV),
+            products[:D, :D] + of_priors.VQV,
+            error[:D, :D] + of_priors.VQV_error + gamma(2) * np.abs(products[:D, :D]),
+            products[:D, D] + of_priors.VQx,
+            error[:D, D] + of_priors.VQx_error + gamma(2) * np.abs(products[:D, D]),
+        )
+
+    # -- coefficients -------------------------------------------------------------------------------------------
+
+    def _of_poses(self, R_X: Array, t_X: Array, R_Y: Array, t_Y: Array, answer: Answer) -> _Ends:
+        """The coefficients at poses about the user's origin."""
+        part, (_, c) = self.part, self._centres
+        E = len(part.pairs)
+        if part.kind == "direct":
+            alpha = np.full((E, 1), answer.scale if part.scale == "shared" else 1.0)
+            one = product(alpha, t_Y)
+            return _stacked(R_X, R_Y, product(alpha, t_X), Doubled.of(alpha[:, 0]), Doubled(-one.hi, -one.lo))
+        R_1, R_2 = R_X.transpose(0, 2, 1), R_Y.transpose(0, 2, 1)
+        arm = turned(R_1, difference(t_X, c))
+        own = dict(zip(part.free, answer.own_scale.tolist(), strict=True))
+        if part.scale == "shared":
+            scales = np.full(E, answer.scale)
+        else:
+            scales = np.array([own.get(target, 1.0) for target, _ in part.pairs])
+            for e, (target, _) in enumerate(part.pairs):
+                if target not in part.scale_owners:
+                    scales[e] = part.fixed_scales.get(target, 1.0)
+        return _stacked(R_1, R_2, Doubled(-arm.hi, -arm.lo), reciprocal(scales), turned(R_2, Doubled.of(t_Y)))
+
+    def _of_directions(self, V: Array, h: float) -> _Ends:
+        """The coefficients of directions V (13 n + 1, D) about the gauge; with h = 1, of values of the variables."""
+        part, (a, c) = self.part, self._centres
+        leaf, center, S = self.slots.leaf, self.slots.center, self.slots.of_pair
+        L, P = len(part.leaves), len(part.centers)
+        D = V.shape[1]
+        leaves = np.concatenate([V[: 13 * L].reshape(L, 13, D), np.zeros((1, 13, D))])
+        centers = np.concatenate([V[13 * L : -1].reshape(P, 13, D), np.zeros((1, 13, D))])
+        tail = np.stack([V[-1], np.full(D, h)])
+        x = np.matmul(S, np.concatenate([leaves[leaf], centers[center], np.broadcast_to(tail, (len(S), 2, D))], axis=1))
+        x = x.transpose(0, 2, 1)  # (E, D, 25)
+        R_1, R_2 = (x[:, :, at : at + 9].reshape(-1, D, 3, 3).transpose(0, 1, 3, 2) for at in (7, 16))
+        t_1, t_2, s = Doubled.of(x[:, :, 0:3].copy()), Doubled.of(x[:, :, 3:6].copy()), Doubled.of(x[:, :, 6].copy())
+        factor = V[-1] if part.kind == "direct" and part.scale == "shared" else np.full(D, h)
+        if part.kind == "inverse":
+            for e, (target, _) in enumerate(part.pairs):
+                if part.scale != "shared" and target not in part.scale_owners:
+                    known = reciprocal(np.array(part.fixed_scales.get(target, 1.0)))
+                    s.hi[e], s.lo[e] = h * known.hi, h * known.lo
+        # A fixed frame's translation about the gauge is a difference, which a double would round.
+        for e, pair in enumerate(part.pairs):
+            for name, t, centre in zip(pair, (t_1, t_2), (c[e], a[e]), strict=True):
+                if name not in part.fixed:
+                    continue
+                T = self.given.fixed[name]
+                exact = difference(T[:3, 3], centre)
+                if part.kind == "inverse":
+                    exact = turned(T[None, :3, :3].transpose(0, 2, 1), Doubled(-exact.hi[None], -exact.lo[None]))
+                    exact = Doubled(exact.hi[0], exact.lo[0])
+                scaled = Doubled(exact.hi[None], exact.lo[None]).times(factor[:, None])
+                t.hi[e], t.lo[e] = scaled
+        if part.kind == "direct":  # R_A (t_1 + s c) + s t_A - (t_2 + s a)
+            u = t_1.plus(_by_rows(s, c))
+            one = t_2.plus(_by_rows(s, a))
+            return _Ends(R_1, R_2, u, s, Doubled(-one.hi, -one.lo))
+        moved = Doubled(R_2, np.zeros_like(R_2)).times(a[:, None, None, :]).summed(axis=3)
+        return _Ends(R_1, R_2, t_1, s, moved.minus(t_2))
+
+    def _of_point(self, point: Point) -> _Ends:
+        """The coefficients at values of the variables."""
+        return self._of_directions(np.append(point.numbers.ravel(), point.alpha)[:, None], 1.0)
+
+    def _joined(self, first: _Ends, second: _Ends) -> _Ends:
+        def of(name: str) -> Doubled:
+            both = zip(getattr(first, name), getattr(second, name), strict=True)
+            return Doubled(*(np.concatenate(each, axis=1) for each in both))
+
+        R_1, R_2 = np.concatenate([first.R_1, second.R_1], axis=1), np.concatenate([first.R_2, second.R_2], axis=1)
+        return _Ends(R_1, R_2, of("u"), of("s"), of("one"))
+
+    def _coefficients(self, ends: _Ends) -> tuple[Measured, Coefficients]:
+        """What the sums over the measurements are made of."""
+        E, D = ends.R_1.shape[:2]
+        front, back = Doubled.zeros(E, 3, 4, D, 12), Doubled.zeros(E, 3, 4, D, 12)
+        one = Doubled.zeros(E, D, 12)
+        R_1, R_2 = ends.R_1.transpose(0, 2, 1, 3), ends.R_2  # R_1 as [e, k, d, q]; R_2 as [e, d, p, k]
+        for p in range(3):
+            front.hi[:, p, :3, :, 3 * p : 3 * p + 3] = R_1
+            back_p = -R_2[:, :, p, :].transpose(0, 2, 1)  # [e, k, d]
+            for q in range(3):
+                back.hi[:, :, q, :, 3 * p + q] = back_p
+            back.hi[:, :, 3, :, 9 + p] = back_p
+            for of_front, u, s in zip(front, ends.u, ends.s, strict=True):
+                of_front[:, p, :3, :, 9 + p] = u.transpose(0, 2, 1)
+                of_front[:, p, 3, :, 9 + p] = s
+            for of_one, value in zip(one, ends.one, strict=True):
+                of_one[:, :, 9 + p] = value[:, :, p]
+        if self.part.kind == "inverse":
+            c = self._centres[1]
+            for p in range(3):
+                moved = product(-R_2[:, :, p, :].transpose(0, 2, 1)[:, :, None, :], c[:, None, :, None])  # [e, k, m, d]
+                back.hi[:, :, :3, :, 9 + p], back.lo[:, :, :3, :, 9 + p] = moved
+        coefficients = Coefficients(
+            Doubled(*(each.reshape(E, 12, 12 * D) for each in front)),
+            Doubled(*(each.reshape(E, 12, 12 * D) for each in back)),
+            Doubled(*(each.reshape(E, 12 * D) for each in one)),
+        )
+        a, c = self._centres
+        return Measured(self.given.batches, a, c, self.part.kind == "inverse"), coefficients
+
+    # -- results ------------------------------------------------------------------------------------------------
+
+    def _evaluated(self, point: Point, ends: _Ends, priors: Evaluation) -> Evaluation:
+        measured, coefficients = self._coefficients(ends)
+        sums = plain_sums(measured, coefficients) or weighted_sums(measured, coefficients)
+        cost = 0.5 * float(np.sum(sums.products))
+        error = 0.5 * float(sums.products_error.sum()) + gamma(len(self.part.pairs) + 16) * cost
+        gradient, gradient_error = self._by_variables(sums, range(1))
+        gradient, gradient_error = gradient[:, 0] + priors.gradient, gradient_error[:, 0] + priors.gradient_error
+        total = cost + priors.cost
+        return _Measured(
+            point,
+            total,
+            error + priors.cost_error + gamma(2) * total,
+            gradient,
+            gradient_error + gamma(2) * np.abs(gradient),
+            ends=ends,
+        )
+
+    def _by_variables(self, sums: Sums, directions: range) -> tuple[Array, Array]:
+        """The sums over features as Q V (13 n + 1, D) by variables, with a bound on its error: the chain rule."""
+        leaf, center, S = self.slots.leaf, self.slots.center, self.slots.of_pair
+        L, P, E = len(self.part.leaves), len(self.part.centers), len(self.part.pairs)
+        size, D = 13 * (L + P) + 1, len(directions)
+        result, bound = np.zeros((size, D)), np.zeros((size, D))
+        for d in directions:
+            at = slice(12 * d, 12 * d + 12)
+            value = _by_pair(sums.front[..., at], sums.back[..., at], sums.one[:, at], 1.0)
+            error = _by_pair(sums.front_error[..., at], sums.back_error[..., at], sums.one_error[:, at], -1.0)
+            front, back, one = (np.abs(each[..., at]) for each in (sums.front, sums.back, sums.one))
+            error += gamma(8) * _by_pair(front, back, one, -1.0)
+            shares = 0.5 * np.einsum("ep,epq->eq", value, S)
+            slack = 0.5 * np.einsum("ep,epq->eq", error + gamma(E + 40) * np.abs(value), np.abs(S))
+            slack[:, ALPHA] += 0.5 * np.einsum("esk,esk->e", self._of_fixed, np.abs(value[:, :6]).reshape(E, 2, 3))
+            for of_pairs, out in ((shares, result), (slack, bound)):
+                leaves, centers = np.zeros((L + 1, 13)), np.zeros((P + 1, 13))
+                np.add.at(leaves, leaf, of_pairs[:, :13])
+                np.add.at(centers, center, of_pairs[:, 13:26])
+                out[:, d] = np.r_[leaves[:L].ravel(), centers[:P].ravel(), of_pairs[:, ALPHA].sum()]
+        return result, bound * (1.0 + 1e-9)
+
+
+def _by_pair(front: Array, back: Array, one: Array, minus: float) -> Array:
+    """Derivatives (E, 25) by [t_X, t_Y, alpha, vec R_X, vec R_Y]; minus = -1 for sums of absolute values."""
+    E = len(one)
+    F, K, of_one = front.reshape(E, 3, 4, 12), back.reshape(E, 3, 4, 12), one[:, 9:]
+    by_R1, by_R2, by_u, by_s = np.zeros((E, 3, 3)), np.empty((E, 3, 3)), np.zeros((E, 3)), np.zeros(E)
+    for p in range(3):
+        by_R1 += F[:, p, :3, 3 * p : 3 * p + 3]  # [k, q]
+        by_u += F[:, p, :3, 9 + p]
+        by_s += F[:, p, 3, 9 + p]
+        of_turn = K[:, :, 0, 3 * p] + K[:, :, 1, 3 * p + 1] + K[:, :, 2, 3 * p + 2]
+        by_R2[:, p] = -minus * (of_turn + K[:, :, 3, 9 + p])  # [p, k]
+    of_rotations = [by_R.transpose(0, 2, 1).reshape(E, 9) for by_R in (by_R1, by_R2)]
+    return np.concatenate([by_u, -minus * of_one, by_s[:, None], *of_rotations], axis=1)
+
+
+def _stacked(R_1: Array, R_2: Array, u: Doubled, s: Doubled, one: Doubled) -> _Ends:
+    """One direction."""
+    return _Ends(
+        R_1[:, None],
+        R_2[:, None],
+        Doubled(u.hi[:, None], u.lo[:, None]),
+        Doubled(s.hi[:, None], s.lo[:, None]),
+        Doubled(one.hi[:, None], one.lo[:, None]),
+    )
+
+
+def _by_rows(s: Doubled, v: Array) -> Doubled:
+    """s v for s (E, D) and v (E, 3), (E, D, 3)."""
+    return Doubled(s.hi[:, :, None], s.lo[:, :, None]).times(v[:, None, :])

@@ -1,0 +1,149 @@
+"""The region in which a bound holds, where the measurements leave a translation or a scale free.
+
+Exactly free directions exist only in exact arithmetic. The measurements as given differ from that by the rounding of
+their doubles, and an answer that is far enough away can use this. So where a bound rests on a free direction, it holds
+up to a distance, and the certificate names it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import ROUND_DOWN, Context
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.moments import T_A, T_B
+from gtsam_rwhec.solver.parts import Part
+from gtsam_rwhec.solver.point import Point
+from gtsam_rwhec.solver.variables import Answer, as_point
+
+#: The region reaches at least this many times the extent of the data, and the scale at least by this factor.
+AT_LEAST = 100.0
+#: Regions larger than the smallest one by these factors are tried first.
+LARGER = (1e4, 1e3, 1e2, 1e1)
+
+
+@dataclass(frozen=True)
+class Region:
+    """The answers that a lower bound is about: all rotations, and translations and scales as below; ``str()`` says it.
+
+    Attributes
+    ----------
+    radius_m : float
+        The translation of each frame differs from that of the returned pose by at most this much, in metres.
+    scale_factor : float
+        Each unknown scale is at most this many times the returned scale, and at least the returned scale over this.
+        Known scales do not vary: then it says nothing.
+    """
+
+    radius_m: float
+    scale_factor: float
+
+    def larger(self, times: float) -> Region:
+        """The region with so many times the radius and the factor."""
+        return Region(times * self.radius_m, times * self.scale_factor)
+
+    @staticmethod
+    def common(regions: list[Region | None]) -> Region | None:
+        """What is in all of the regions; None stands for all answers."""
+        named = [region for region in regions if region is not None]
+        if not named:
+            return None
+        return Region(min(r.radius_m for r in named), min(r.scale_factor for r in named))
+
+    def around(self, distance_m: float, scale_ratio: float) -> Region:
+        """What is surely left of it about another answer, so far away, whose scales differ by at most this ratio."""
+        return Region(self.radius_m - distance_m, self.scale_factor / scale_ratio)
+
+    def __str__(self) -> str:
+        return (
+            f"the bound holds for translations within {self.distance} of the answer's, and for unknown scales within a "
+            f"factor of {self.factor}"
+        )
+
+    @property
+    def distance(self) -> str:
+        """The radius in words, rounded down: "353 m", "35.3 km"."""
+        return f"{_down(self.radius_m)} m" if self.radius_m < 1e4 else f"{_down(1e-3 * self.radius_m)} km"
+
+    @property
+    def factor(self) -> str:
+        """The scale's factor in words, rounded down."""
+        return _down(self.scale_factor)
+
+
+def _down(number: float) -> str:
+    """Three digits of a number, rounded towards zero."""
+    cut = Context(prec=3, rounding=ROUND_DOWN).create_decimal_from_float(number)
+    return f"{cut:f}" if cut < 10**6 else f"{float(cut):.3g}"
+
+
+def extent_of(part: Part, point: Point) -> float:
+    """The size of what was measured, in metres, about the gauge: no translation of A, B, X or Y is larger.
+
+    Where the measurements were not kept, it is an estimate for unequal weights.
+    """
+    moments, scale = part.moments, np.ones(len(part.pairs))
+    if part.scale == "shared":
+        scale[:] = abs(point.alpha) if part.kind == "direct" else 1.0 / abs(point.alpha)
+    for e, (target, _) in enumerate(part.pairs):
+        if target in part.scale_owners:
+            scale[e] = 1.0 / abs(point.numbers[part.free.index(target), 3])
+        elif target in part.fixed_scales:
+            scale[e] = part.fixed_scales[target]
+    reach = np.linalg.norm(point.numbers[:, :3], axis=1).max(initial=0.0)
+    largest = [reach / scale[0] if part.kind == "direct" else reach]
+    if part.given is None:
+        for features, per in ((T_A, np.ones_like(scale)), (T_B, scale)):
+            square = np.einsum("ekk->e", moments.translation[:, features, features]) / moments.weight
+            largest.append(float((np.sqrt(np.maximum(square * moments.count, 0.0)) / per).max()))
+    else:
+        a = part.gauge.sensor_carrier
+        for e, raw in part.given.batches:
+            c = a if part.pairs[e].is_motion else part.gauge.target_carrier
+            centred = raw.A[:, :3, 3] + raw.A[:, :3, :3] @ c - a
+            largest.append(float(np.linalg.norm(centred, axis=1).max()))
+            largest.append(float(np.linalg.norm(raw.B[:, :3, 3], axis=1).max() / scale[e]))
+    finite = [each for each in largest if np.isfinite(each)]
+    return max(float(max(finite, default=0.0)), 1e-9) * (1.0 + 1e-9)
+
+
+def smallest_region(part: Part, point: Point, contains: Answer | None) -> Region:
+    """The region that a bound is given for at least; twice as large as it takes to have ``contains`` in it."""
+    radius, factor = AT_LEAST * extent_of(part, point), AT_LEAST
+    if contains is not None:
+        reach = float(np.linalg.norm(contains.t, axis=1).max(initial=0.0))
+        radius = 2.5 * max(radius, reach)
+        ratio = scale_ratio(point, as_point(part, contains))
+        factor = 2.0 * max(factor, ratio * ratio)
+    return Region(radius, factor)
+
+
+def scale_ratio(first: Point, second: Point) -> float:
+    """The largest ratio of an unknown scale of one point to that of the other; at least 1."""
+    ratios = [1.0]
+    for a, b in ((first.numbers[:, 3], second.numbers[:, 3]), ([first.alpha], [second.alpha])):
+        for p, q in zip(np.abs(a), np.abs(b), strict=True):
+            if p > 0.0 and q > 0.0:
+                ratios += [float(p / q), float(q / p)]
+    return max(ratios)
+
+
+def half_widths(part: Part, point: Point, region: Region) -> Array:
+    """How far each of the form's variables (13 n + 1,) is from the point at most, for any answer in the region."""
+    n = len(point.numbers)
+    width = np.empty((n, 13))
+    width[:, 4:] = 1.0 + np.abs(point.numbers[:, 4:])
+    reach = np.linalg.norm(point.numbers[:, :3], axis=1, keepdims=True)
+    scale, factor = abs(point.alpha), region.scale_factor
+    if part.kind == "direct" and part.scale == "shared":
+        # alpha t - alpha_0 t_0, with alpha up to factor times alpha_0; reach is alpha_0 |t_0|
+        width[:, :3] = factor * (scale * region.radius_m + reach)
+    elif part.kind == "direct":
+        width[:, :3] = region.radius_m
+    else:  # -R't and -R_0't_0
+        width[:, :3] = region.radius_m + 2.0 * reach
+    width[:, 3] = factor * np.abs(point.numbers[:, 3])
+    result: Array = np.append(width.ravel(), factor * scale) * (1.0 + 1e-9)
+    return result

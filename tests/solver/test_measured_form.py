@@ -1,0 +1,148 @@
+"""The cost of raw measurements, in exact arithmetic: doubles are fractions, and every residual is squared exactly."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from exact_arithmetic import fractions
+from small_problems import optimum, simulated, whole
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solver.given import Given
+from gtsam_rwhec.solver.measured_form import MeasuredForm
+from gtsam_rwhec.solver.part_form import PartForm
+from gtsam_rwhec.solver.variables import Answer
+
+
+def far_from_the_origin(seed: int, scale: str, offset_m: float, noise: Noise, *, with_knowledge: bool) -> rw.Problem:
+    """Two targets, two sensors and motions, with the origins of both carriers moved away."""
+    simulation = general(
+        2, 2, seed=seed, noise=noise, number_of_measurements=5, scale=scale, odometry=3, odometry_noise=noise
+    )
+    generator = np.random.default_rng(seed)
+    left, right = np.eye(4), np.eye(4)
+    left[:3, 3], right[:3, 3] = offset_m * generator.standard_normal((2, 3))
+    problem = rw.Problem(scale)
+    for pair in simulation.problem.pairs:
+        raw = simulation.problem.measurements(*pair)
+        if pair.is_motion:
+            problem.add_motion(pair.sensor, left @ raw.A @ np.linalg.inv(left), raw.B, raw.sigma, raw.kappa)
+        else:
+            problem.add(*pair, left @ raw.A @ right, raw.B, raw.sigma, raw.kappa)
+    if with_knowledge:
+        X = {name: np.linalg.inv(right) @ T for name, T in simulation.X.items()}
+        problem.add_prior("target0", X["target0"], sigma=0.02, kappa=300.0)
+        problem.add_prior("target0", X["target0"], kappa=30.0)
+        if scale == "per_target":
+            problem.fix_scale("target1", 1.25)
+        problem.fix("target1", X["target1"])
+    return problem
+
+
+def exact_cost(problem: rw.Problem, form: PartForm, answer: Answer) -> Fraction:
+    """J of the poses as they are returned, exactly."""
+    part = form.part
+    poses = {name: T for name, T in problem.fixed.items()}
+    for i, name in enumerate(part.free):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = answer.R[i], answer.t[i] + part.frame_shift(name)
+        poses[name] = T
+    own = dict(zip(part.free, answer.own_scale.tolist(), strict=True))
+    total = Fraction(0)
+    for pair in problem.pairs:
+        raw = problem.measurements(*pair)
+        X, Y = (fractions(poses[name]) for name in pair)
+        R_X, t_X, R_Y, t_Y = X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3]
+        scale = answer.scale if problem.scale == "shared" else 1.0
+        if problem.scale == "per_target":
+            scale = own[pair.target] if pair.target in part.scale_owners else problem.fixed_scales[pair.target]
+        alpha = Fraction(scale)
+        c = fractions(part.gauge.sensor_carrier if pair.is_motion else part.gauge.target_carrier)
+        for A, B, sigma, kappa in zip(fractions(raw.A), fractions(raw.B), raw.sigma, raw.kappa, strict=True):
+            R_A, t_A, R_B, t_B = A[:3, :3], A[:3, 3], B[:3, :3], B[:3, 3]
+            off = R_A.dot(t_X) + t_A - t_Y
+            if part.kind == "direct":
+                t, R = alpha * off - R_Y.dot(t_B), R_A.dot(R_X) - R_Y.dot(R_B)
+            else:
+                turned = R_B.dot(R_X.T) - R_Y.T.dot(R_A)
+                t, R = t_B / alpha - R_Y.T.dot(off) - turned.dot(t_X - c), turned
+            total += (t.dot(t) / Fraction(float(sigma)) ** 2 + Fraction(float(kappa)) * (R * R).sum()) / 2
+    for name, priors in problem.priors.items():
+        for prior in priors:
+            off = fractions(poses[name]) - fractions(prior.transform)
+            if prior.sigma is not None:
+                total += off[:3, 3].dot(off[:3, 3]) / Fraction(prior.sigma) ** 2 / 2
+            if prior.kappa is not None:
+                total += Fraction(prior.kappa) * (off[:3, :3] * off[:3, :3]).sum() / 2
+    return total
+
+
+CASES = [
+    (scale, offset, noise, known)
+    for scale in ("known", "shared", "per_target")
+    for offset, noise in ((0.0, Noise(0.01, 6500.0)), (1e3, Noise(1e-6, 1e12)), (1e6, Noise(1e-6, 1e5)))
+    for known in (False, True)
+]
+
+
+@pytest.mark.parametrize(("scale", "offset_m", "noise", "known"), CASES)
+def test_the_cost_of_returned_poses_is_enclosed(scale: str, offset_m: float, noise: Noise, known: bool) -> None:
+    problem = far_from_the_origin(3, scale, offset_m, noise, with_knowledge=known)
+    form = whole(problem)
+    answer, evaluation = form.answer_near(optimum(problem).R)
+    exact = exact_cost(problem, form, answer)
+    # A prior's residual t' + R'(t_0 - c) has the length of t - t_0 for exact rotations: the stored ones are rounded.
+    allowed = Fraction(evaluation.cost_error) + (Fraction(1, 10**14) * exact if problem.priors else 0)
+    assert abs(Fraction(evaluation.cost) - exact) <= allowed
+    assert evaluation.cost_error <= 1e-8 * evaluation.cost
+    assert Fraction(evaluation.upper) * (1 + Fraction(1, 10**14)) >= exact
+
+
+@pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
+@pytest.mark.parametrize("known", [False, True])
+def test_the_gradient_and_the_action_are_those_of_the_stored_form(scale: str, known: bool) -> None:
+    """Near the origin both ways to the cost agree up to the rounding of the moments."""
+    problem = far_from_the_origin(1, scale, 0.0, Noise(0.01, 6500.0), with_knowledge=known)
+    lean = rw.Problem(scale, keep_measurements=False)
+    for pair in problem.pairs:
+        raw = problem.measurements(*pair)
+        if pair.is_motion:
+            lean.add_motion(pair.sensor, raw.A, raw.B, raw.sigma, raw.kappa)
+        else:
+            lean.add(*pair, raw.A, raw.B, raw.sigma, raw.kappa)
+    lean._learn(problem)
+    measured, stored = whole(problem), whole(lean)
+    point = measured.answer_near(optimum(problem).R)[1].point
+    one, other = measured.cost.at(point), stored.cost.at(point)
+    assert one.cost == pytest.approx(other.cost, rel=1e-11)
+    scales = np.sqrt(np.maximum(measured.curvature.diagonal, 1e-300) * one.cost)
+    used = np.append(np.isin(np.arange(13 * len(point.numbers)) % 13, (3,), invert=True), scale == "shared")
+    np.testing.assert_allclose((one.gradient - other.gradient)[used] / scales[used], 0.0, atol=1e-9)
+    V: Array = np.random.default_rng(0).standard_normal((len(one.gradient), 2)) * used[:, None]
+    of_one, of_other = measured.cost.action(one, V), stored.cost.action(other, V)
+    size = float(np.abs(of_other.VQV).max())
+    np.testing.assert_allclose(of_one.VQV, of_other.VQV, atol=1e-11 * size)
+    np.testing.assert_allclose(of_one.VQx, of_other.VQx, atol=1e-10 * np.sqrt(size * one.cost))
+    np.testing.assert_allclose(of_one.QV[used], of_other.QV[used], atol=1e-10 * size)
+
+
+def test_many_measurements_in_blocks_are_the_same_as_in_stacks() -> None:
+    """5,000 measurements of one pair go block by block; in batches of 100 they go stack by stack."""
+    raw = simulated(1, 1, number_of_measurements=5000).problem.measurements("target0", "sensor0")
+    whole_batch, small_batches = rw.Problem(), rw.Problem()
+    whole_batch.add("target0", "sensor0", raw.A, raw.B, raw.sigma, raw.kappa)
+    for first in range(0, 5000, 100):
+        part = slice(first, first + 100)
+        small_batches.add("target0", "sensor0", raw.A[part], raw.B[part], raw.sigma[part], raw.kappa[part])
+    form = whole(whole_batch)
+    point = form.answer_near(optimum(whole_batch).R)[1].point
+    in_batches = Given.of(small_batches, form.part.pairs, frozenset(form.part.names))
+    assert in_batches is not None
+    one, other = form.cost.at(point), MeasuredForm(form.part, in_batches, form.slots).at(point)
+    assert abs(one.cost - other.cost) <= one.cost_error + other.cost_error
+    assert (np.abs(one.gradient - other.gradient) <= one.gradient_error + other.gradient_error).all()
+    assert max(one.cost_error, other.cost_error) <= 1e-12 * one.cost
