@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 import gtsam_rwhec as rw
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver import arrow
+from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solver.reduced_form import Forms
 
 NOISE = Noise(sigma_m=0.01, kappa=1e3)
 
@@ -36,7 +36,7 @@ def star(leaves: int, side: str) -> rw.Problem:
 def draw_fill(axes: Axes, side: str) -> None:
     """Entries of Q': there before the shared translations and the scale were eliminated, or filled by that."""
     (part,) = parts_of(star(8, side))
-    form = Forms.of(part).reduced
+    form = PartForm.of(part).reduced
     before = np.abs(arrow.dense(form.D, form.C, form.E)) > 1e-9 * form.magnitude
     after = np.abs(form.dense()) > 1e-9 * form.magnitude
     picture = np.where(before, 1, np.where(after, 2, 0))

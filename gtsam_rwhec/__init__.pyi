@@ -12,8 +12,11 @@ from .problem import read_csv as read_csv
 from .identifiability import FreeDirection as FreeDirection
 from .identifiability import Identifiability as Identifiability
 from .identifiability import PairIdentifiability as PairIdentifiability
+from .solver import Basis as Basis
 from .solver import Cause as Cause
 from .solver import Certificate as Certificate
+from .solver import Objective as Objective
+from .solver import Region as Region
 from .solver import Residual as Residual
 from .solver import SolveOptions as SolveOptions
 from .solver import Status as Status

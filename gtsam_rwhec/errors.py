@@ -67,6 +67,10 @@ class MessageError(LogError):
     """A message of a log does not fit its schema, or has values that are not valid."""
 
 
+class BudgetError(LogError):
+    """A log asks for more memory or work than a file of its size may: it is damaged, or made to exhaust its reader."""
+
+
 class TransformError(RwhecError):
     """No chain of transforms joins two frames, or the chain is a loop; the message has the chain."""
 

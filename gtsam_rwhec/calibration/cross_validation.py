@@ -24,8 +24,10 @@ from gtsam_rwhec.errors import (
     ScaleError,
     UnderdeterminedError,
 )
-from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import is_one_of, is_whole
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -117,6 +119,7 @@ def cross_validate(
         If no measurement can be predicted from the rest.
     """
     _check(problem, folds, by)
+    check_progress(progress)
     raw = {pair: problem.measurements(*pair) for pair in problem.pairs}
     calibrate = _Calibrator(options, solve_options)
     notes: dict[str, None] = {}
@@ -158,10 +161,12 @@ def cross_validate(
 
 
 def _check(problem: Problem, folds: int, by: str) -> None:
-    if by not in get_args(Split):
-        raise OptionError(f"by={by!r} is not one of {', '.join(map(repr, get_args(Split)))}")
-    if not (isinstance(folds, int) and not isinstance(folds, bool) and folds >= 2):
-        raise OptionError(f"folds={folds!r}; give a number of at least 2")
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    if not is_one_of(by, get_args(Split)):
+        raise OptionError(f"by={brief(by)} is not one of {', '.join(map(repr, get_args(Split)))}")
+    if not is_whole(folds, 2):
+        raise OptionError(f"folds={brief(folds)}; give a whole number of at least 2")
     problem.require_pairs()
     problem.require_raw_measurements("cross_validate")
     largest = max(problem.moments(*pair).count for pair in problem.pairs)

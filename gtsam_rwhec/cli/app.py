@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.calibrate import calibrate
@@ -23,9 +25,38 @@ from gtsam_rwhec.cli.failures import failures_in_words
 from gtsam_rwhec.cli.fetch import utias
 from gtsam_rwhec.cli.init import init
 from gtsam_rwhec.cli.solve import solve
+from gtsam_rwhec.files.terminal_text import printable, say
+
+#: Typer has a click of its own, whose classes have no public names: this is the base of all usage errors.
+_UsageError: Any = typer.BadParameter.__base__
+
+
+class PrintableUsage(TyperGroup):
+    """Subcommands whose usage errors cannot steer the terminal: they repeat arguments, and a shell may write those."""
+
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        """The context of the command itself."""
+        with _printable_usage():
+            return super().make_context(*arguments, **options)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Parse the subcommand's arguments and run it."""
+        with _printable_usage():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _printable_usage() -> Iterator[None]:
+    try:
+        yield
+    except _UsageError as error:
+        error.message = printable(error.message)
+        raise
+
 
 app = typer.Typer(
     name="gtsam-rwhec",
+    cls=PrintableUsage,
     help="Find the poses of cameras and other sensors on a robot or rig, with a proof that no answer is better.",
     epilog=HELP,
     no_args_is_help=True,
@@ -56,7 +87,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        typer.echo(f"gtsam-rwhec {rw.__version__} (gtsam {version('gtsam')})")
+        say(f"gtsam-rwhec {rw.__version__} (gtsam {version('gtsam')})")
         raise typer.Exit
 
 

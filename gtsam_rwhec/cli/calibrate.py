@@ -28,6 +28,7 @@ from gtsam_rwhec.cli.options import (
 )
 from gtsam_rwhec.cli.roads import refuse
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 Method = Literal["auto", "sdp", "local"]
 Refine = Literal["given", "estimate"]
@@ -131,7 +132,7 @@ def calibrate(
     check_folder_of(output)
     with StageDisplay() as stage, said_in_the_report():
         stage(f"reading {source}")
-        problem = rw.read_csv(source, scale, sigma, kappa, targets, sensors, keep_measurements=refine is not None)
+        problem = rw.read_csv(source, scale, sigma, kappa, targets, sensors)
         earlier = None if initial is None else rw.read_solution(initial)
         start = None if earlier is None else (earlier.X, earlier.Y, earlier.scale)
         solution = rw.solve(problem, method=method, initial=start, progress=stage)
@@ -150,7 +151,7 @@ def calibrate(
     try:
         if output is not None:
             write(output)
-            typer.echo(f"Written to {output}.", err=True)
+            say(f"Written to {shown_path(output)}.", to_errors=True)
     finally:  # the report is printed even if the file cannot be written
         report()
     return exit_status(rw.judge(solution, refined))
@@ -173,5 +174,5 @@ def calibrate_log(source: Path, rig: Path | None, output: Path, *, images: bool,
             progress=stage,
         )
     status = show(calibrated)
-    typer.echo(f"Written to {output}: {', '.join(rw.pipeline.OUTPUTS)}.", err=True)
+    say(f"Written to {shown_path(output)}: {', '.join(rw.pipeline.OUTPUTS)}.", to_errors=True)
     return status

@@ -11,6 +11,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.options import McapOption, RigOption
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 
 def clean(
@@ -22,6 +23,9 @@ def clean(
     with StageDisplay() as stage:
         report = rw.pipeline.clean_log(detected, output, None if rig is None else rw.rig.read_rig(rig), progress=stage)
         used = sum(track.used for track in report.tracks)
-        typer.echo(f"Written to {output}: {used} measurements to use, and the removed measurements with the reasons.")
-        typer.echo(f"Next: gtsam-rwhec solve {output} -o FOLDER")
+        say(
+            f"Written to {shown_path(output)}: {used} measurements to use, and the removed measurements with the "
+            "reasons."
+        )
+        say(f"Next: gtsam-rwhec solve {shown_path(output)} -o FOLDER")
     return ExitStatus.DONE

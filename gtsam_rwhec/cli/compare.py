@@ -13,6 +13,7 @@ from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
 from gtsam_rwhec.cli.failures import check_folder_of
 from gtsam_rwhec.cli.options import FOLDER_OF_CSV, KappaOption, ScaleOption, SensorsOption, SigmaOption, TargetsOption
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 
 def _names_of_methods(beginning: str) -> list[str]:
@@ -52,7 +53,7 @@ def compare(
     try:
         if output is not None:
             rw.methods.write_comparison(comparison, output)
-            typer.echo(f"Written to {output}.", err=True)
+            say(f"Written to {shown_path(output)}.", to_errors=True)
     finally:
         rw.report.print_comparison(comparison)
     return ExitStatus.NOT_CERTIFIED if comparison.solution is None else exit_status(rw.judge(comparison.solution))

@@ -13,6 +13,7 @@ from gtsam_rwhec.cli.options import McapOption
 from gtsam_rwhec.cli.roads import refuse
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
 
@@ -56,5 +57,5 @@ def convert(
                     f"{source} is a folder of images. Name the file with the robot's poses as well: --poses FILE"
                 )
             said = f"{rw.logs.convert_ros_bag(source, output)} messages"
-    typer.echo(f"Written to {output}: {said}.\nNext: gtsam-rwhec init {output} -o rig.yaml")
+    say(f"Written to {shown_path(output)}: {said}.\nNext: gtsam-rwhec init {shown_path(output)} -o rig.yaml")
     return ExitStatus.DONE

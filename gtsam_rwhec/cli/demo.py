@@ -11,6 +11,7 @@ import typer
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.calibrate import calibrate_log
 from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.files.terminal_text import say
 
 
 def demo(
@@ -24,7 +25,7 @@ def demo(
     log, rig = folder / rw.datasets.LOG, folder / rw.datasets.RIG
     command = shlex.join(["gtsam-rwhec", "calibrate", str(log), "--rig", str(rig), "-o", str(output)])
     with rw.pipeline.replacing_output(output, log.name):
-        typer.echo(f"This is the same as: {command}", err=True)
+        say(f"This is the same as: {command}", to_errors=True)
         status = calibrate_log(log, rig, output, images=False, workers=None)
     result = rw.results.read_result(output / rw.pipeline.RESULT_FILE)
     if result.refined is not None and result.log is not None:

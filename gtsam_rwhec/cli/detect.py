@@ -11,6 +11,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.options import ImagesOption, LogArgument, McapOption, WorkersOption
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 
 def detect(
@@ -31,8 +32,10 @@ def detect(
         )
         used = sum(track.used for track in report.tracks)
         rejected = sum(track.seen for track in report.tracks) - used
-        typer.echo(f"Written to {output}: {used} detections to use, and {rejected} rejected ones with the reasons.")
+        say(
+            f"Written to {shown_path(output)}: {used} detections to use, and {rejected} rejected ones with the reasons."
+        )
         if draw is not None:
-            typer.echo(f"Written to {draw}: {rw.pipeline.draw_log(log, output, draw, progress=stage)} pictures.")
-        typer.echo(f"Next: gtsam-rwhec clean {output} -o cleaned.mcap")
+            say(f"Written to {shown_path(draw)}: {rw.pipeline.draw_log(log, output, draw, progress=stage)} pictures.")
+        say(f"Next: gtsam-rwhec clean {shown_path(output)} -o cleaned.mcap")
     return ExitStatus.DONE

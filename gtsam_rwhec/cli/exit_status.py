@@ -21,25 +21,26 @@ class ExitStatus(IntEnum):
     DOWNLOAD_FAILED = 5
     """No network, or not the expected files; complete files stay."""
     CONTRADICTED = 6
-    """Most measurements of a sensor or target are outliers: do not use the poses."""
+    """Most measurements of a sensor or target are outliers, or the motion contradicts a stated size that was used."""
     INTERRUPTED = 130
     """Ctrl-C."""
 
 
 HELP = (
     "Exit status: 0 success, and certified; 2 bad input; 3 certified, but the measurements do not determine every "
-    "frame; 4 not certified; 5 download failed; 6 most measurements of a frame are outliers; 130 interrupted."
+    "frame; 4 not certified; 5 download failed; 6 most measurements of a frame are outliers, or a stated size is "
+    "wrong; 130 interrupted."
 )
 
 
 def exit_status(judgement: rw.Judgement) -> ExitStatus:
-    """The exit status for the most serious ground of a judgement."""
+    """The exit status for the most serious ground of a judgement; 0 only without any ground."""
     ground = rw.Ground
     status = {
         ground.NO_BOUND: ExitStatus.NOT_CERTIFIED,
         ground.NOT_CERTIFIED: ExitStatus.NOT_CERTIFIED,
         ground.NOT_UNIQUE: ExitStatus.NOT_UNIQUE,
         ground.CONTRADICTED: ExitStatus.CONTRADICTED,
-        ground.SIZE_DOUBTED: ExitStatus.CERTIFIED,
+        ground.SIZE_DOUBTED: ExitStatus.CONTRADICTED,
     }
     return status[judgement.grounds[0]] if judgement.grounds else ExitStatus.CERTIFIED

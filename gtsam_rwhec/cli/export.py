@@ -10,6 +10,7 @@ import typer
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 
 def export(
@@ -19,5 +20,5 @@ def export(
     """Last stage: write a launch file, tf, URDF, a Kalibr camchain and plots from a solved log."""
     with StageDisplay() as stage:
         for path in rw.pipeline.export_solved(solved, output, progress=stage):
-            typer.echo(str(path))
+            say(shown_path(path))
     return ExitStatus.DONE

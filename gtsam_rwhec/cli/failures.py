@@ -30,10 +30,11 @@ def failures_in_words() -> Iterator[None]:
     keep their traceback.
     """
     # Imported here, because completion in a shell must start fast.
-    from rich.console import Console
     from rich.text import Text
 
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    from gtsam_rwhec.files.terminal import SafeConsole
+
+    console = SafeConsole(stderr=True, soft_wrap=True)
     told: set[str] = set()
     with warnings.catch_warnings():
         warnings.simplefilter("always", RwhecWarning)
@@ -48,7 +49,7 @@ def failures_in_words() -> Iterator[None]:
             line: str | None = None,
         ) -> None:
             if issubclass(category, RwhecWarning):
-                words = printable(str(message))
+                words = _indented(str(message))
                 if words not in told:  # several passes over a log repeat a warning
                     told.add(words)
                     console.print(Text("Warning: ", style="bold yellow").append(words, style="not bold default"))
@@ -59,12 +60,17 @@ def failures_in_words() -> Iterator[None]:
         try:
             yield
         except RwhecError as error:
-            console.print(Text("Error: ", style="bold red").append(printable(str(error)), style="not bold default"))
+            console.print(Text("Error: ", style="bold red").append(_indented(str(error)), style="not bold default"))
             status = ExitStatus.DOWNLOAD_FAILED if isinstance(error, FetchError) else ExitStatus.BAD_INPUT
             raise typer.Exit(status) from error
         except KeyboardInterrupt as error:
             console.print("Interrupted.")
             raise typer.Exit(ExitStatus.INTERRUPTED) from error
+
+
+def _indented(message: str) -> str:
+    """A message whose later lines are indented, so that no name with a line break begins a message of its own."""
+    return printable(message).replace("\n", "\n  ")
 
 
 @contextmanager

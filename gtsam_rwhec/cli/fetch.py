@@ -11,6 +11,7 @@ import typer
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 
 def utias(
@@ -30,9 +31,9 @@ def utias(
             rw.datasets.UTIAS_URL if base_url is None else base_url,
             lambda done, total, name: stage(f"downloading file {done + 1} of {total}: {name}"),
         )
-    typer.echo(
-        f"{len(fetched.downloaded)} files downloaded to {fetched.folder}, {len(fetched.already_there)} existed "
-        "already; all are verified."
+    say(
+        f"{len(fetched.downloaded)} files downloaded to {shown_path(fetched.folder)}, {len(fetched.already_there)} "
+        "existed already; all are verified."
     )
-    typer.echo(f"Next: gtsam-rwhec calibrate {shlex.quote(str(fetched.folder))} --scale shared")
+    say(f"Next: gtsam-rwhec calibrate {shlex.quote(str(fetched.folder))} --scale shared")
     return ExitStatus.DONE

@@ -13,7 +13,7 @@ from gtsam_rwhec.cli.options import LogArgument
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.files.terminal_text import printable
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 
 def init(
@@ -28,8 +28,8 @@ def init(
         with rw.logs.open_log(log) as opened:
             text, notes = rw.first_rig.propose_rig(opened, output)
     write_atomically(output, text.encode())
-    typer.echo(f"Written to {output}. Complete the lines marked TODO.")
-    typer.echo(f"Next: gtsam-rwhec calibrate {log} --rig {output} -o out\n")
+    say(f"Written to {shown_path(output)}. Complete the lines marked TODO.")
+    say(f"Next: gtsam-rwhec calibrate {shown_path(log)} --rig {shown_path(output)} -o out\n")
     for note in notes:
-        typer.echo(printable(note))
+        say(note)
     return ExitStatus.DONE

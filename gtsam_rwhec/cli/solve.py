@@ -12,6 +12,7 @@ from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import said_in_the_report
 from gtsam_rwhec.cli.options import RigOption, show
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 
 def solve(
@@ -25,6 +26,9 @@ def solve(
             cleaned, None if rig is None else rw.rig.read_rig(rig), output, progress=stage
         )
     status = show(calibrated)
-    typer.echo(f"Written: {output / rw.pipeline.RESULT_FILE}, {output / rw.pipeline.CLEAN_LOG}.", err=True)
-    typer.echo(f"Next: gtsam-rwhec export {output / rw.pipeline.CLEAN_LOG} -o FOLDER", err=True)
+    say(
+        f"Written: {shown_path(output / rw.pipeline.RESULT_FILE)}, {shown_path(output / rw.pipeline.CLEAN_LOG)}.",
+        to_errors=True,
+    )
+    say(f"Next: gtsam-rwhec export {shown_path(output / rw.pipeline.CLEAN_LOG)} -o FOLDER", to_errors=True)
     return status

@@ -10,8 +10,13 @@ from typing import Self
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from gtsam_rwhec.files.terminal import SafeConsole
+from gtsam_rwhec.files.terminal_text import shown
+
 #: Seconds before anything is shown, and between lines in a log.
 INTERVAL_S = 1.0
+#: A stage is shown with at most this many characters.
+LONGEST_STAGE = 200
 
 
 class StageDisplay:
@@ -24,7 +29,7 @@ class StageDisplay:
     """
 
     def __init__(self, console: Console | None = None) -> None:
-        self._console = Console(stderr=True, highlight=False) if console is None else console
+        self._console = SafeConsole(stderr=True) if console is None else console
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}", markup=False),
@@ -52,14 +57,14 @@ class StageDisplay:
 
     def __call__(self, stage: str) -> None:
         """Show the stage that begins now."""
-        self._stage = stage
-        self._progress.update(self._task, description=stage)
+        self._stage = shown(stage, LONGEST_STAGE)
+        self._progress.update(self._task, description=self._stage)
 
     def _tick(self) -> None:
-        shown = ""
+        said = ""
         while not self._finished.wait(INTERVAL_S):
             if self._console.is_interactive:
                 self._progress.start()  # does nothing when it runs already
-            elif self._stage != shown:
-                shown = self._stage
-                self._console.print(f"[{time.monotonic() - self._begun_s:.0f} s] {shown}", markup=False, soft_wrap=True)
+            elif self._stage != said:
+                said = self._stage
+                self._console.print(f"[{time.monotonic() - self._begun_s:.0f} s] {said}", markup=False, soft_wrap=True)

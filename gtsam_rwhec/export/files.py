@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,8 +11,11 @@ from gtsam_rwhec.export.static_tf import static_tf_launch
 from gtsam_rwhec.export.tf_tree import tf_yaml
 from gtsam_rwhec.export.urdf import urdf_xacro
 from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
+#: A warning in a file has at most this many characters.
+LONGEST_COMMENT = 2_000
 #: These functions give the text of each file, by its name.
 FILES: dict[str, Callable[[RigFrames], str]] = {
     "static_tf.launch.py": static_tf_launch,
@@ -53,6 +57,11 @@ def _warned(text: str, warnings: tuple[str, ...], name: str) -> str:
         return text
     if name.endswith(".xacro"):
         declaration, rest = text.split("\n", 1)  # the first line of XML is its declaration
-        comment = "\n".join(warnings).replace("--", "- -")
+        comment = re.sub("-(?=-)", "- ", "\n".join(map(_comment, warnings)))  # XML's comments hold no "--"
         return f"{declaration}\n<!--\n{comment}\n-->\n{rest}"
-    return "".join(f"# {warning}\n" for warning in warnings) + text
+    return "".join(f"# {_comment(warning)}\n" for warning in warnings) + text
+
+
+def _comment(warning: str) -> str:
+    """A warning on one line: names in it come from a log, and a line break would end the comment."""
+    return shown(warning, LONGEST_COMMENT)

@@ -19,11 +19,14 @@ from typing import Any, NoReturn, TypeAlias
 import yaml
 
 from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.files.whole_files import read_whole
 
 KeyPath: TypeAlias = tuple[str | int, ...]
 
 #: A file of more bytes than this is not read.
 MOST_BYTES = 1_000_000
+#: A file has at most this many keys, values and items: a second's work. OpenCV's files with all image points fit.
+MOST_VALUES = 60_000
 #: At most this many mappings and lists may be inside one another.
 DEEPEST = 20
 #: OpenCV's files have this tag; `parse_yaml` can ignore it.
@@ -86,15 +89,7 @@ def read_text(path: str | Path) -> str:
     FileFormatError
         When the file cannot be read, is larger than `MOST_BYTES` or is not UTF-8.
     """
-    try:
-        with open(path, "rb") as stream:
-            content = stream.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
-    except ValueError as error:  # a name with a null character
-        raise FileFormatError(f"{str(path)!r} cannot be read: {error}.") from error
-    if len(content) > MOST_BYTES:
-        raise FileFormatError(f"{path} is larger than {MOST_BYTES} bytes; is it the right file? YAML was expected.")
+    content = read_whole(path, MOST_BYTES, "YAML was")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -181,6 +176,7 @@ class _Reader:
     tags: frozenset[str]
     events: Iterator[Any]
     lines: dict[KeyPath, int] = field(default_factory=dict)
+    nodes: int = 0
 
     def document(self) -> Any:
         next(self.events)  # the stream begins
@@ -219,6 +215,9 @@ class _Reader:
     def _node(self) -> Any:
         """The next event: a node without alias, anchor and tag, or the end of a list or mapping."""
         event = next(self.events)
+        self.nodes += 1
+        if self.nodes > MOST_VALUES:
+            self._refuse(event, f"more than {MOST_VALUES} keys and values; is it the right file?")
         if isinstance(event, yaml.AliasEvent):
             self._refuse(event, f"the alias *{event.anchor}: aliases are not read; write the value out")
         if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):

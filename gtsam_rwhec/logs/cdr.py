@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gtsam_rwhec.errors import MessageError
+from gtsam_rwhec.files.budgets import LEVELS, PARTS_OF_A_MESSAGE, PARTS_OF_A_WALK
 
 _SIZES = {
     "bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "uint16": "u2", "int16": "i2",
@@ -34,14 +35,14 @@ _BUILTIN = {
     "builtin_interfaces/Duration": (("int32", "sec"), ("uint32", "nanosec")),
 }
 _FIELD = re.compile(r"([A-Za-z][\w/]*)(?:<=\d+)?(?:\[(<=)?(\d{0,9})\])?\s+([A-Za-z]\w*)(\s*=.*|\s.*)?$")
-#: A message contains at most this many messages; each of ROS's own messages contains far fewer.
-MOST_PARTS = 100_000
-#: Messages inside messages have at most this many levels; each of ROS's own messages has far fewer.
-DEEPEST = 16
 #: Messages of more bytes than this are not stacked, because copying them costs more than walking them.
 STACKED_BYTES = 1 << 16
 #: One call tells at most this many shapes of one length apart. It walks the rest of the messages one by one.
 MOST_SHAPES = 64
+#: To compare this many bytes of messages takes as long as to walk over one part.
+BYTES_FOR_A_PART = 1 << 11
+#: Up to this many pieces of the messages are compared one by one, and more of them together.
+FEW_PIECES = 32
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,22 @@ class Shape:
     tree: dict[str, Any]
     fixed: list[tuple[int, int]] = field(default_factory=list)
 
+    def same_as_first(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Which of the messages (N, length) have the first one's strings and counts; (N,)."""
+        pieces: list[list[int]] = []
+        for start, end in self.fixed:
+            if pieces and pieces[-1][1] == start:
+                pieces[-1][1] = end
+            else:
+                pieces.append([start, end])
+        if len(pieces) > FEW_PIECES:
+            columns = np.concatenate([np.arange(start, end) for start, end in pieces])
+            return np.asarray((rows[:, columns] == rows[0, columns]).all(axis=1))
+        same = np.ones(len(rows), dtype=bool)
+        for start, end in pieces:
+            same &= (rows[:, start:end] == rows[0, start:end]).all(axis=1)
+        return same
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -89,7 +106,11 @@ class Batch:
         leaf = find(tree, path)
         if not isinstance(leaf, Numbers):
             raise MessageError(f"field {path} has no numbers")
-        size = np.dtype(leaf.dtype).itemsize * (1 if leaf.count is None else leaf.count)
+        return self.column(leaf)
+
+    def column(self, leaf: Numbers) -> NDArray[Any]:
+        """(N,) or (N, count) numbers where they stand."""
+        size = int(leaf.dtype[-1]) * (1 if leaf.count is None else leaf.count)
         columns = np.ascontiguousarray(self.rows[:, leaf.offset : leaf.offset + size])
         if leaf.count is None:
             return columns.view(leaf.dtype)[:, 0]
@@ -105,11 +126,19 @@ def find(tree: Any, path: str) -> Any:
     return tree
 
 
-class MessageType:
-    """A ROS 2 message type, made from the log's definition. An unreadable or incomplete one raises a MessageError."""
+def _take_nothing(count: int) -> None:
+    """What parts cost where nobody counts them."""
 
-    def __init__(self, name: str, text: str) -> None:
+
+class MessageType:
+    """A ROS 2 message type, made from the log's definition. An unreadable or incomplete one raises a MessageError.
+
+    `take` is told how many parts were read, and raises an error when they are too many.
+    """
+
+    def __init__(self, name: str, text: str, take: Callable[[int], None] = _take_nothing) -> None:
         self._root = _short(name)
+        self._take = take
         self._fields = {
             key: tuple(Field(type_, name, None) for type_, name in parts) for key, parts in _BUILTIN.items()
         }
@@ -125,6 +154,7 @@ class MessageType:
         self._fields[current] = _parse(current, lines)
         if not self._fields[self._root]:
             raise MessageError(f"schema {name}: the log has no definition of its fields")
+        self._least: dict[str, int] = {}
 
     def batches(self, messages: Sequence[bytes | memoryview]) -> Iterator[tuple[list[int], Batch | MessageError]]:
         """Group messages by shape; yield their places in `messages` with their batch, or with the error."""
@@ -145,9 +175,8 @@ class MessageType:
                     yield [int(rest[0])], error
                     rest, rows = rest[1:], rows[1:]
                 else:
-                    same = np.ones(len(rest), dtype=bool)
-                    for start, end in shape.fixed:
-                        same &= (rows[:, start:end] == rows[0, start:end]).all(axis=1)
+                    self._take(rows.size // BYTES_FOR_A_PART)
+                    same = shape.same_as_first(rows)
                     if same.all():
                         yield rest.tolist(), Batch(shape, rows)
                         rest = rest[:0]
@@ -170,23 +199,52 @@ class MessageType:
 
         A MessageError says that the message ends too early, is not CDR, or has a string that is not UTF-8.
         """
-        return _Walk(self._fields, message).walk(self._root)
+        walk = _Walk(self._fields, self._least_bytes, message)
+        try:
+            return walk.walk(self._root)
+        finally:
+            self._take(PARTS_OF_A_WALK * walk.parts)
+
+    def _least_bytes(self, type_: str, depth: int = 0) -> int:
+        """The fewest bytes that one value of a type takes; at least one, also where it has no bytes."""
+        if type_ in _SIZES:
+            return int(_SIZES[type_][1])
+        if type_ == "string":
+            return 4
+        if type_ not in self._least:
+            self._least[type_] = 1  # until it is known: a type may contain itself
+            if depth <= LEVELS:
+                each = (
+                    (1 if field.count is None else field.count) * self._least_bytes(field.type, depth + 1)
+                    if field.count != -1
+                    else 4
+                    for field in self._fields.get(type_, ())
+                )
+                self._least[type_] = max(1, sum(each))
+        return self._least[type_]
 
 
 class _Walk:
     """One pass over one message."""
 
-    def __init__(self, fields: dict[str, tuple[Field, ...]], message: bytes | memoryview) -> None:
+    def __init__(
+        self,
+        fields: dict[str, tuple[Field, ...]],
+        least_bytes: Callable[[str], int],
+        message: bytes | memoryview,
+    ) -> None:
         # The first four bytes name the encoding: 0 and 1 are CDR (big and little endian), 6 and 7 are XCDR2, which
         # aligns to 4 bytes at most. Alignment counts from the byte after them.
         if len(message) < 4 or message[0] != 0 or message[1] not in (0, 1, 6, 7):
             raise MessageError(f"not CDR: begins with the bytes {bytes(message[:4]).hex(' ')}")
         self._fields = fields
+        self._least_bytes = least_bytes
         self._message = message
         self._endian = "<" if message[1] & 1 else ">"
         self._widest = 4 if message[1] >= 6 else 8
         self._at = 4
-        self._parts = 0
+        #: How many messages, numbers, lists and strings were passed.
+        self.parts = 0
         self._fixed = [(0, 4)]
 
     def walk(self, root: str) -> Shape:
@@ -196,9 +254,9 @@ class _Walk:
         fields = self._fields.get(key)
         if fields is None:
             raise MessageError(f"the log has no definition of {key}")
-        self._parts += 1
-        if depth > DEEPEST or self._parts > MOST_PARTS:
-            raise MessageError(f"more than {MOST_PARTS} parts, or parts inside parts more than {DEEPEST} deep")
+        self._count()
+        if depth > LEVELS:
+            raise MessageError(f"messages inside messages, more than {LEVELS} deep")
         if not fields:
             self._numbers("u1", None)  # a message without fields has one byte
         return {field.name: self._field(field, depth) for field in fields}
@@ -207,14 +265,35 @@ class _Walk:
         count = self._length() if field.count == -1 else field.count
         if field.type in _SIZES:
             return self._numbers(_SIZES[field.type], count)
-        # Every part and string takes at least one byte, so a wrong count cannot make this loop longer than the message.
+        if count is not None:
+            self._check_list(field, count)
         if field.type == "string":
             return self._string() if count is None else [self._string() for _ in range(count)]
         if count is None:
             return self._part(field.type, depth + 1)
         return [self._part(field.type, depth + 1) for _ in range(count)]
 
+    def _count(self) -> None:
+        self.parts += 1
+        if self.parts > PARTS_OF_A_MESSAGE:
+            raise MessageError(f"has more than {PARTS_OF_A_MESSAGE} numbers, strings, lists and messages")
+
+    def _check_list(self, field: Field, count: int) -> None:
+        """Refuse a list that what is left of the message cannot hold, before anything is made for its entries."""
+        left, least = len(self._message) - self._at, self._least_bytes(field.type)
+        if count * least > left:
+            raise MessageError(
+                f"field {field.name[:80]}: a list of {count} {field.type[:80]} needs {count * least} bytes or more, "
+                f"and {left} bytes are left"
+            )
+        if count > PARTS_OF_A_MESSAGE - self.parts:
+            raise MessageError(
+                f"field {field.name[:80]}: a list of {count} {field.type[:80]}; at most {PARTS_OF_A_MESSAGE} numbers, "
+                "strings, lists and messages are read in one message"
+            )
+
     def _numbers(self, code: str, count: int | None) -> Numbers:
+        self._count()
         size = int(code[1])
         if count != 0:
             step = min(size, self._widest)

@@ -13,6 +13,8 @@ from gtsam_rwhec.logs.records import Array
 QUATERNION_TOLERANCE = 1e-2
 #: A position further away than this, in metres, is refused.
 LARGEST_M = 1e12
+#: A covariance with a larger entry, m^2 or rad^2, says nothing: it is of a place further away than `LARGEST_M`.
+LARGEST_VARIANCE = LARGEST_M**2
 
 
 def transforms(positions: Array, quaternions_xyzw: Array) -> tuple[Array, dict[int, str]]:
@@ -44,15 +46,17 @@ def gtsam_covariances(T: Array, covariances: Array) -> list[Array | None]:
 
     ROS has (x, y, z, rotations about the fixed axes x, y, z) in the parent frame: t + d, Exp(phi) R. A right
     perturbation [omega, v] moves (R, t) to (R Exp(omega), t + R v), so omega = R' phi and v = R' d. A covariance that
-    is all zeros or has a negative variance (so ROS marks an unknown covariance) or is not finite becomes None.
+    is all zeros or has a negative variance (so ROS marks an unknown covariance), is not finite or has entries beyond
+    `LARGEST_VARIANCE` becomes None.
     """
     diagonal = np.diagonal(covariances, axis1=1, axis2=2)
-    known: NDArray[np.bool_] = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
-    with np.errstate(invalid="ignore"):
-        known &= (diagonal >= 0).all(axis=1) & diagonal.any(axis=1)
+    # Every comparison with NaN is false, so NaN is unknown.
+    known: NDArray[np.bool_] = np.asarray((np.abs(covariances) <= LARGEST_VARIANCE).all(axis=(1, 2)))
+    known &= (diagonal >= 0).all(axis=1) & diagonal.any(axis=1)
     if not known.any():
         return [None] * len(T)
-    symmetric = np.where(known[:, None, None], 0.5 * (covariances + covariances.transpose(0, 2, 1)), 0.0)
+    given = np.where(known[:, None, None], covariances, 0.0)
+    symmetric = 0.5 * (given + given.transpose(0, 2, 1))
     # (N, 2, 2, 3, 3) blocks, rotation first
     blocks = symmetric.reshape(-1, 2, 3, 2, 3).transpose(0, 1, 3, 2, 4)[:, ::-1, ::-1]
     R = T[:, None, None, :3, :3]

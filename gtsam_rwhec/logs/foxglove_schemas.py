@@ -10,13 +10,16 @@ from __future__ import annotations
 import base64
 import json
 import operator
+import reprlib
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from gtsam_rwhec.errors import MessageError
+from gtsam_rwhec.errors import BudgetError, MessageError
+from gtsam_rwhec.files.budgets import JSON_OF_A_PART, MESSAGE, PARTS_OF_A_MESSAGE, PARTS_OF_A_POSE
 from gtsam_rwhec.logs.checked_poses import LARGEST_M, image_fault, transforms
 from gtsam_rwhec.logs.message_kinds import MEASURED_PAIR, TAG_DETECTIONS
 from gtsam_rwhec.logs.records import (
@@ -35,6 +38,8 @@ Read = Sequence[Record] | str
 Row = tuple[int, str, str, tuple[float, ...]]
 #: A message's list has at most this many numbers, enough for the corners of a board of 100 x 100 squares.
 MOST_NUMBERS = 20_000
+#: A message has at most this many poses or tags.
+MOST_POSES = 10_000
 #: A damaged message can raise these errors when it is converted to numbers.
 _FAULTS = (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, IndexError)
 
@@ -70,7 +75,7 @@ class Access:
         """A string."""
         value = self.get(message, name)
         if not isinstance(value, str):
-            raise TypeError(f"{name} is {value!r} in place of a string")
+            raise TypeError(f"{name} is {reprlib.repr(value)} in place of a string")
         return value
 
     def frame(self, message: Any, name: str = "frame_id") -> str:
@@ -81,7 +86,14 @@ class Access:
         """An unsigned 32-bit number."""
         value = self.get(message, name)
         if type(value) is not int or not 0 <= value < 1 << 32:
-            raise ValueError(f"{name} is {value!r}")
+            raise ValueError(f"{name} is {reprlib.repr(value)}")
+        return value
+
+    def listed(self, message: Any, name: str) -> Any:
+        """A list of poses or tags."""
+        value = self.get(message, name)
+        if len(value) > MOST_POSES:
+            raise ValueError(f"{name} has {len(value)} entries, and at most {MOST_POSES} are read")
         return value
 
     def vector(self, message: Any, name: str, most: int = 1000) -> Array:
@@ -94,11 +106,12 @@ PROTOBUF = Access(getattr, "seconds", "nanos", bytes)
 
 
 def decoder(
-    schema: str, parse: Callable[[bytes | memoryview], Any], access: Access
+    schema: str, parse: Callable[[bytes | memoryview], Any], access: Access, take: Callable[[int], None]
 ) -> Callable[[str, Sequence[bytes | memoryview], list[int]], list[Read]]:
     """Make the function that reads messages of a schema in `SCHEMAS`: (topic, messages, logged_ns) -> records of each.
 
-    `parse` makes a JSON object or a protobuf message of bytes, or raises `MessageError`.
+    `parse` makes a JSON object or a protobuf message of bytes, or raises `MessageError`. `take` is told how many parts
+    of messages were read, and raises an error when they are too many.
     """
     rows_of = _POSES.get(schema)
 
@@ -112,7 +125,10 @@ def decoder(
                 else:
                     first = len(rows)
                     rows += rows_of(parse(message), access)
+                    take(PARTS_OF_A_POSE * (len(rows) - first))
                     out.append(range(first, len(rows)))
+            except BudgetError:
+                raise
             except MessageError as error:
                 out.append(str(error))
             except (KeyError, AttributeError) as error:
@@ -135,10 +151,27 @@ def _with_poses(out: list[Any], rows: list[Row], topic: str, logged_ns: list[int
     return out
 
 
-def parse_json(message: bytes | memoryview) -> Any:
-    """The JSON object of a message. Anything else raises a MessageError."""
+def parse_json(message: bytes | memoryview, take: Callable[[int], None]) -> Any:
+    """The JSON object of a message. Anything else raises a MessageError, and so does one of too many parts.
+
+    Parts are counted before they are made: a number, list or string of two characters becomes an object of up to a
+    hundred bytes.
+    """
     try:
-        value = json.loads(bytes(message))
+        text = str(message, "utf-8")
+    except UnicodeDecodeError as error:
+        raise MessageError(f"not JSON: {error}") from error
+    parts = 1 + sum(map(text.count, ",[{"))
+    take(parts // JSON_OF_A_PART)
+    if parts > PARTS_OF_A_MESSAGE:
+        raise MessageError(
+            f"JSON of {parts} numbers, strings, lists and objects; at most {PARTS_OF_A_MESSAGE} are read"
+        )
+    # With a character beyond Latin-1, all take two or four bytes in memory.
+    if sys.getsizeof(text) > 2 * max(MESSAGE, len(message)):
+        raise MessageError(f"JSON of {len(message)} bytes that needs {sys.getsizeof(text)} in memory")
+    try:
+        value = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise MessageError(f"not JSON: {error}") from error
     if not isinstance(value, dict):
@@ -147,10 +180,9 @@ def parse_json(message: bytes | memoryview) -> Any:
 
 
 def _vector(values: Any, name: str, most: int = 1000) -> Array:
-    array = np.array([float(value) for value in values], dtype=np.float64)
-    if len(array) > most:
-        raise ValueError(f"{name} has {len(array)} numbers")
-    return array
+    if len(values) > most:
+        raise ValueError(f"{name} has {len(values)} numbers, and at most {most} are read")
+    return np.array([float(value) for value in values], dtype=np.float64)
 
 
 def _frame_transform(message: Any, access: Access) -> list[Row]:
@@ -160,7 +192,7 @@ def _frame_transform(message: Any, access: Access) -> list[Row]:
 
 
 def _frame_transforms(message: Any, access: Access) -> list[Row]:
-    return [row for part in access.get(message, "transforms") for row in _frame_transform(part, access)]
+    return [row for part in access.listed(message, "transforms") for row in _frame_transform(part, access)]
 
 
 def _pose_in_frame(message: Any, access: Access) -> list[Row]:
@@ -169,7 +201,7 @@ def _pose_in_frame(message: Any, access: Access) -> list[Row]:
 
 def _poses_in_frame(message: Any, access: Access) -> list[Row]:
     stamp, frame = access.stamp(message), access.frame(message)
-    return [(stamp, frame, "", access.pose(pose)) for pose in access.get(message, "poses")]
+    return [(stamp, frame, "", access.pose(pose)) for pose in access.listed(message, "poses")]
 
 
 def _compressed_image(message: Any, access: Access, topic: str, logged: int) -> Read:
@@ -206,15 +238,17 @@ def _tag_detections(message: Any, access: Access, topic: str, logged: int) -> Re
     """This library's ``gtsam_rwhec.TagDetections`` (see `written_schemas`)."""
     stamp, frame = access.stamp(message), access.frame(message)
     records = []
-    for tag in message["detections"]:
+    tags = access.listed(message, "detections")
+    posed = [i for i, tag in enumerate(tags) if tag.get("pose") is not None]
+    numbers = np.array([access.pose(tags[i]["pose"]) for i in posed], dtype=np.float64).reshape(-1, 7)
+    transforms_of, faults = transforms(numbers[:, :3], numbers[:, 3:])
+    if faults:
+        return next(iter(faults.values()))
+    T_of = dict(zip(posed, transforms_of, strict=True))
+    for i, tag in enumerate(tags):
         given = {name: value for name, value in tag.items() if value is not None}
         arrays = {name: float(given[name]) for name in ("size_m", "reprojection_px") if name in given}
-        T = corners = covariance = None
-        if "pose" in given:
-            numbers = np.array([access.pose(tag["pose"])])
-            (T,), faults = transforms(numbers[:, :3], numbers[:, 3:])
-            if faults:
-                return faults[0]
+        corners = covariance = None
         if "covariance" in given:
             covariance = access.vector(tag, "covariance").reshape(6, 6)
         if "corners_px" in given:
@@ -222,14 +256,15 @@ def _tag_detections(message: Any, access: Access, topic: str, logged: int) -> Re
             corners = corners.reshape(-1, 2)
         for field, value in {"covariance": covariance, "corners_px": corners, **arrays}.items():
             if value is not None and not np.isfinite(value).all():
-                return f"{field} is not finite: {np.asarray(value).tolist()}"
-        indices = tuple(int(i) for i in given["corner_indices"]) if "corner_indices" in given else None
+                return f"{field} is not finite: {reprlib.repr(np.asarray(value).tolist())}"
+        indices = tuple(int(index) for index in given["corner_indices"]) if "corner_indices" in given else None
         if indices is not None and (corners is None or len(indices) != len(corners)):
             return f"{len(indices)} corner_indices for {0 if corners is None else len(corners)} corners"
         records.append(
             DetectionRecord(
-                logged, stamp, topic, frame, access.text(tag, "family"), access.text(tag, "id"), corners, T, covariance,
-                reason=access.text(tag, "reason") if "reason" in tag else "", corner_indices=indices, **arrays,
+                logged, stamp, topic, frame, access.text(tag, "family"), access.text(tag, "id"), corners, T_of.get(i),
+                covariance, reason=access.text(tag, "reason") if "reason" in tag else "", corner_indices=indices,
+                **arrays,
             )
         )  # fmt: skip
     return records
@@ -240,7 +275,8 @@ def _measured_pair(message: Any, access: Access, topic: str, logged: int) -> Rea
     A, B = (access.vector(message, name).reshape(4, 4) for name in "AB")
     for name, T in (("A", A), ("B", B)):
         R = T[:3, :3]
-        is_rotation = np.isfinite(T).all() and np.abs(R.T @ R - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0.0
+        is_small = np.isfinite(T).all() and np.abs(R).max() < 2.0  # larger entries could not be squared
+        is_rotation = is_small and np.abs(R.T @ R - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0.0
         if not (is_rotation and np.abs(T[:3, 3]).max() <= LARGEST_M and T[3].tolist() == [0, 0, 0, 1]):
             return f"{name} is not a transform: {T.tolist()}"
     target, sensor, reason = (access.text(message, name) for name in ("target", "sensor", "reason"))

@@ -11,6 +11,7 @@ column names and lines that begin with # are passed over. The first field is
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -18,8 +19,11 @@ from typing import Literal
 
 import numpy as np
 
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import FileFormatError, LogError
+from gtsam_rwhec.files.budgets import MESSAGE, POSES_TEXT
 from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.files.paths import checked_path
+from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.logs.checked_poses import transforms
 from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.records import Array
@@ -27,13 +31,17 @@ from gtsam_rwhec.logs.records import Array
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
 #: Foxglove gives the formats of images these names; the keys are the files' endings.
 FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
+#: A table of poses has at most this many lines, and a line at most this many characters.
+MOST_LINES, LONGEST_LINE = 500_000, 10_000
+#: Bytes of the largest file that is taken as an image. A log keeps images as they are.
+LARGEST_IMAGE = MESSAGE
 #: A stamp in nanoseconds has at least this many digits.
 NANOSECOND_DIGITS = 16
 
 
 def is_image_folder(path: str | Path) -> bool:
     """Whether a folder has images and no file of a bag."""
-    names = [file.suffix.lower() for file in Path(path).glob("*")]
+    names = [file.suffix.lower() for file in checked_path(path).glob("*")]
     return any(suffix in FORMATS for suffix in names) and not {".db3", ".bag", ".mcap"} & set(names)
 
 
@@ -76,7 +84,7 @@ def write_image_folder(
         The folder has no images, a line is not a pose, or a name is neither an image nor a stamp. The message has the
         file and the line.
     """
-    images, poses = Path(images), Path(poses)
+    images, poses = checked_path(images), checked_path(poses)
     files = sorted((f for f in images.glob("*") if f.suffix.lower() in FORMATS), key=lambda f: natural_key(f.name))
     if not files:
         raise LogError(f"{images} has no images ({', '.join(FORMATS)}).")
@@ -90,24 +98,35 @@ def write_image_folder(
                 out.transforms("/tf", stamp, [(parent, child, T[i])])
                 continue
             try:
-                data = files[i].read_bytes()
-            except OSError as error:
-                raise LogError(f"{files[i]} cannot be read: {error.strerror}.") from error
+                data = read_whole(files[i], LARGEST_IMAGE, "An image was")
+            except FileFormatError as error:
+                raise LogError(str(error)) from error
             out.compressed_image(f"/{camera}/image", stamp, camera, FORMATS[files[i].suffix.lower()], data)
     return len(files), len(T)
 
 
 def _read_poses(path: Path, columns: Columns) -> tuple[list[str], Array]:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise LogError(f"{path} cannot be read as text: {error}.") from error
+        content = read_whole(path, POSES_TEXT, "A table of poses was")
+    except FileFormatError as error:
+        raise LogError(str(error)) from error
+    number_of_lines = content.count(b"\n") + content.count(b"\r")
+    if number_of_lines > MOST_LINES:
+        raise LogError(f"{path} has {number_of_lines} lines; at most {MOST_LINES} are read.")
+    try:
+        lines = content.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise LogError(f"{path} is not text in UTF-8 (byte {error.start}); give lines of poses.") from error
     found: list[tuple[int, str, list[float]]] = []
     has_header = False
     for number, line in enumerate(lines, start=1):
-        fields = re.split(r"\s*,\s*|\s+", line.strip())
         if not line.strip() or line.lstrip().startswith("#"):
             continue
+        if len(line) > LONGEST_LINE:
+            raise LogError(
+                f"{path}, line {number}: longer than {LONGEST_LINE} characters. Give a name or stamp, {columns}."
+            )
+        fields = re.split(r"\s*,\s*|\s+", line.strip())
         try:
             row = [float(field) for field in fields[1:]]
         except ValueError:
@@ -134,7 +153,7 @@ def _stamps(files: Sequence[Path], names: Sequence[str], poses: Path) -> tuple[l
     known = {file.name: i for i, file in enumerate(files)} | {file.stem: i for i, file in enumerate(files)}
     if all(name in known for name in names):
         if len(set(names)) < len(names):
-            raise LogError(f"{poses}: an image has two poses: {next(n for n in names if names.count(n) > 1)}.")
+            raise LogError(f"{poses}: an image has two poses: {Counter(names).most_common(1)[0][0]}.")
         if all(_as_ns(file.stem) is None for file in files):
             return [(i + 1) * 10**9 for i in range(len(files))], [(known[name] + 1) * 10**9 for name in names]
     image_stamps = [_as_ns(file.stem) for file in files]

@@ -2,7 +2,7 @@
 
 The module trusts nothing in the file: it holds lengths against the file's size, decompresses up to a limit, and
 compares checksums. It reads a file once from front to back where the file has no index or a wrong one. It reads a
-truncated file as far as the file goes; `losses` says what is missing.
+truncated file as far as the file goes; `losses` says what is missing. ``files/budgets.py`` has the limits.
 
 The `mcap` library reads single records. Finding, opening and cutting blocks stays here: the library is slower and loses
 more messages of damaged files. Measured on 2026-11-21 with mcap 1.6.0 (tests/benchmarks/own_code_against_libraries.py):
@@ -13,45 +13,36 @@ without a limit on their size.
 
 from __future__ import annotations
 
-import io
-import struct
-import zlib
+import os
 from array import array
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import BinaryIO
 
-import lz4.frame
 import numpy as np
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, Footer, McapRecord, Schema, Statistics
-from mcap.stream_reader import StreamReader
+from mcap.records import Attachment, Channel, Schema
 from numpy.lib.stride_tricks import sliding_window_view
 
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import BudgetError, FileFormatError, LogError
+from gtsam_rwhec.files.budgets import Spending
+from gtsam_rwhec.files.whole_files import opened
+from gtsam_rwhec.logs.mcap_chunks import ChunkPlace, opened_chunk, stated_size
+from gtsam_rwhec.logs.mcap_index import MAGIC, Extra, Seen, read_index
+from gtsam_rwhec.logs.mcap_records import FAULTS, RECORD, Descriptions, entries_of, parsed
 
-MAGIC = b"\x89MCAP0\r\n"
-#: A chunk is opened only if it has at most this many bytes, both those that it states and those that it yields.
-LARGEST_CHUNK = 1 << 29
 #: A block of messages outside chunks has about this many bytes.
 LOOSE_BLOCK = 1 << 22
-#: Every record begins with its opcode and its length.
-_RECORD = struct.Struct("<BQ")
 #: A message record begins with these fields.
 _HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")])
-_FOOTER_BYTES = _RECORD.size + 20
-#: The readers of records raise these errors for bytes that are not a record.
-_FAULTS = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError)
 
 
 @dataclass(frozen=True)
 class Block:
     """The place of messages (the record of a chunk, or records outside chunks), and their first log time.
 
-    `is_cut` says that the file ends inside the chunk.
+    `is_cut` says that the file ends inside the chunk; `indexed_size` is the opened size that the index states.
     """
 
     offset: int
@@ -59,6 +50,7 @@ class Block:
     is_chunk: bool
     start_ns: int
     is_cut: bool = False
+    indexed_size: int | None = None
 
 
 @dataclass(frozen=True)
@@ -75,45 +67,40 @@ class Messages:
 
 
 @dataclass
-class Seen:
-    """How many messages a channel has, and their first and last log time."""
-
-    count: int = 0
-    first_ns: int | None = None
-    last_ns: int | None = None
-
-
-@dataclass
 class McapFile:
-    """An MCAP file's schemas, channels and blocks. A file that cannot be opened or is not MCAP raises a LogError."""
+    """An MCAP file's schemas, channels and blocks.
+
+    A file that cannot be opened or is not MCAP raises a LogError; one that asks for more than a file of its size may, a
+    BudgetError.
+    """
 
     path: Path
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
     blocks: list[Block] = field(default_factory=list)
     seen: dict[int, Seen] = field(default_factory=dict)
+    extras: list[Extra] = field(default_factory=list)
     losses: list[str] = field(default_factory=list)
     is_indexed: bool = False
 
     def __post_init__(self) -> None:
+        self._stream = self._opened_file()  # read from for as long as the object lives
+        self.size = os.fstat(self._stream.fileno()).st_size
+        self.spending = Spending(self.path, self.size)
+        self._descriptions = Descriptions(self.path)
         try:
-            self.size = self.path.stat().st_size
-            self._stream = open(self.path, "rb")  # noqa: SIM115  (read from for as long as the object lives)
-        except OSError as error:
-            raise LogError(f"{self.path} cannot be read: {error.strerror}.") from error
-        first = self._read(0, len(MAGIC))
-        if first != MAGIC:
+            self._find_blocks()
+        except LogError:
             self.close()
-            begins = f"begins with {first!r}" if first else "is empty"
-            raise LogError(
-                f"{self.path} is not an MCAP file (version 0): it {begins}. ROS 1 bags and db3 bags must be converted "
-                "first: gtsam-rwhec convert."
-            )
-        with suppress(*_FAULTS):
-            self.is_indexed = self._read_summary()
-        if not self.is_indexed:
-            self.schemas, self.channels, self.blocks, self.seen = {}, {}, [], {}
-            self._read_through()
+            raise
+
+    @property
+    def schemas(self) -> dict[int, Schema]:
+        """By identifier."""
+        return self._descriptions.schemas
+
+    @property
+    def channels(self) -> dict[int, Channel]:
+        """By identifier."""
+        return self._descriptions.channels
 
     def close(self) -> None:
         """Close the file."""
@@ -121,65 +108,105 @@ class McapFile:
 
     def open(self, block: Block) -> Messages:
         """Read, check and decompress a block. A wrong compression, size or checksum raises a LogError."""
-        raw = self._read(block.offset, block.length)
-        return self._split(self._opened(raw, block) if block.is_chunk else raw, block.offset)
+        if not block.is_chunk:
+            return self._split(self._read(block.offset, block.length), block.offset)
+        place = ChunkPlace(block.offset, block.length, block.is_cut, block.indexed_size)
+        where = f"{self.path}, chunk at byte {block.offset}"
+        return self._split(opened_chunk(self._read, place, where, self.spending), block.offset)
 
-    def _read(self, offset: int, length: int) -> bytes:
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """The metadata records by name; the last record of a name counts. Damaged ones are left out."""
+        found: dict[str, dict[str, str]] = {}
+        for _, content, name in self._extras(Opcode.METADATA):
+            entries: dict[str, str] = {}
+            try:
+                for key, value in entries_of(content):
+                    self.spending.take_parts(1)
+                    entries[key] = value
+                found[name or str(content[4 : 4 + int.from_bytes(content[:4], "little")], "utf-8")] = entries
+            except BudgetError:
+                raise
+            except FAULTS:
+                continue  # as for a damaged chunk, the rest counts; `read_metadata` misses what is not there
+        return found
+
+    def attachment(self, name: str) -> bytes | None:
+        """The content that is attached under a name, or None if there is none; the last one counts."""
+        data = None
+        for _, content, named in self._extras(Opcode.ATTACHMENT):
+            if named not in ("", name):
+                continue
+            try:
+                attached = parsed(Attachment, content)
+            except FAULTS:
+                continue
+            data = attached.data if attached.name == name else data
+        return data
+
+    def _extras(self, opcode: int) -> Iterator[tuple[int, bytes, str]]:
+        # Opened anew: metadata may be asked for after the log is closed.
+        with self._opened_file() as stream:
+            for extra in self.extras:
+                if extra.opcode == opcode:
+                    record = self._read(extra.offset, extra.length, stream)
+                    if len(record) >= RECORD.size and record[0] == opcode:
+                        yield extra.offset, record[RECORD.size :], extra.name
+
+    def _opened_file(self) -> BinaryIO:
         try:
-            self._stream.seek(offset)
-            return self._stream.read(length)
+            return opened(self.path)
+        except FileFormatError as error:
+            raise LogError(str(error)) from error
+
+    def _read(self, offset: int, length: int, stream: BinaryIO | None = None) -> bytes:
+        stream = self._stream if stream is None else stream
+        try:
+            stream.seek(offset)
+            return stream.read(max(0, min(length, self.size - offset)))
         except OSError as error:
             raise LogError(f"{self.path}, byte {offset}: {error.strerror}") from error
 
-    def _read_summary(self) -> bool:
-        """Take schemas, channels, chunks and counts from the index; return whether the index fits the file."""
-        footer_at = self.size - len(MAGIC) - _FOOTER_BYTES
-        if footer_at < len(MAGIC):
-            return False
-        footer = self._records(footer_at)[0]
-        start = footer.summary_start if isinstance(footer, Footer) else 0
-        if not len(MAGIC) <= start < footer_at:
-            return False
-        records = self._records(start)
-        for record in records:
-            self._note(record)
-        statistics = next((record for record in records if isinstance(record, Statistics)), None)
-        chunks = [record for record in records if isinstance(record, ChunkIndex)]
-        if (
-            statistics is None
-            or statistics.chunk_count != len(chunks)
-            or not set(statistics.channel_message_counts) <= set(self.channels)
-            or (statistics.message_count and not chunks)
-        ):
-            return False
-        self.seen = {channel: Seen(count) for channel, count in statistics.channel_message_counts.items()}
-        for chunk in chunks:
-            inside = len(MAGIC) <= chunk.chunk_start_offset <= start - chunk.chunk_length
-            if not inside or chunk.message_start_time > chunk.message_end_time:
-                return False
-            self.blocks.append(Block(chunk.chunk_start_offset, chunk.chunk_length, True, chunk.message_start_time))
-            # A channel's span is the span of its chunks: the indexes of single messages are not read.
-            for channel in chunk.message_index_offsets:
-                _widen(self.seen.setdefault(channel, Seen()), chunk.message_start_time, chunk.message_end_time)
-        return True
+    def _find_blocks(self) -> None:
+        first = self._read(0, len(MAGIC))
+        if first != MAGIC:
+            begins = f"begins with {first!r}" if first else "is empty"
+            raise LogError(
+                f"{self.path} is not an MCAP file (version 0): it {begins}. ROS 1 bags and db3 bags must be converted "
+                "first: gtsam-rwhec convert."
+            )
+        try:
+            index = read_index(self._read, self.path, self.size, self._descriptions, self.spending)
+        except BudgetError:
+            raise
+        except FAULTS:
+            index = None
+        if index is not None:
+            self.blocks = [
+                Block(offset, length, True, start_ns, indexed_size=size)
+                for offset, length, start_ns, size in index.chunks
+            ]
+            self.seen, self.extras, self.is_indexed = index.seen, index.extras, True
+            return
+        self._descriptions = Descriptions(self.path)
+        self.spending.begin_pass()
+        self.spending.check_opened(
+            sum(stated_size(self._read, at) for opcode, at, _ in self._records() if opcode == Opcode.CHUNK)
+        )
+        self._read_through()
 
-    def _records(self, start: int) -> list[McapRecord]:
-        """The records from a place in the file to its end. They come from memory: a wrong length allocates nothing."""
-        stream = io.BytesIO(self._read(start, self.size - start))
-        return list(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
-
-    def _note(self, record: McapRecord) -> None:
-        if isinstance(record, Schema):
-            self.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            self.channels[record.id] = record
+    def _records(self) -> Iterator[tuple[int, int, int]]:
+        """The opcode, place and length of each record, from front to back; the last one may not be whole."""
+        at = len(MAGIC)
+        while at + RECORD.size <= self.size:
+            opcode, length = RECORD.unpack(self._read(at, RECORD.size))
+            yield opcode, at, RECORD.size + length
+            at += RECORD.size + length
 
     def _read_through(self) -> None:
         """Find the blocks of a file without an index, and the place where it ends or is damaged."""
         at, loose_at, is_cut = len(MAGIC), 0, False
-        while at + _RECORD.size <= self.size:
-            opcode, length = _RECORD.unpack(self._read(at, _RECORD.size))
-            whole = _RECORD.size + length
+        for opcode, begins, whole in self._records():
+            at, length = begins, whole - RECORD.size
             if opcode == Opcode.DATA_END or (opcode == Opcode.FOOTER and length == 20):
                 self._count_loose(loose_at, at)
                 return
@@ -194,6 +221,8 @@ class McapFile:
                 loose_at = at if is_loose else 0
             if opcode == Opcode.CHUNK:
                 self._count(Block(at, whole, True, 0))
+            elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+                self.extras.append(Extra(opcode, at, whole, ""))
             at += whole
         self._count_loose(loose_at, at)
         saved = self._count(Block(at, self.size - at, True, 0, is_cut=True)) if is_cut else 0
@@ -210,87 +239,52 @@ class McapFile:
         """Open a block once, for its schemas, channels, counts and span; return how many messages it has."""
         try:
             messages = self.open(block)
+        except BudgetError:
+            raise
         except LogError as error:
             self.losses.append(str(error))
             return 0
-        channels, log_time = messages.heads["channel"], messages.heads["log_time"]
-        for channel in np.unique(channels).tolist():
-            times = log_time[channels == channel]
+        log_time = messages.heads["log_time"]
+        if not len(log_time):
+            return 0
+        order = np.argsort(messages.heads["channel"], kind="stable")
+        channels, times = messages.heads["channel"][order], log_time[order]
+        # All channels at once: a block may have thousands.
+        firsts = np.flatnonzero(np.append(True, np.diff(channels) != 0))
+        counts = np.diff(np.append(firsts, len(channels)))
+        earliest, latest = np.minimum.reduceat(times, firsts), np.maximum.reduceat(times, firsts)
+        columns = (channels[firsts], counts, earliest, latest)
+        for channel, count, first_ns, last_ns in zip(*(column.tolist() for column in columns), strict=True):
             seen = self.seen.setdefault(channel, Seen())
-            seen.count += len(times)
-            _widen(seen, int(times.min()), int(times.max()))
-        if len(log_time):
-            self.blocks.append(replace(block, start_ns=int(log_time.min())))
+            seen.count += count
+            seen.widen(first_ns, last_ns)
+        self.blocks.append(replace(block, start_ns=int(log_time.min())))
         return len(log_time)
-
-    def _opened(self, raw: bytes, block: Block) -> bytes:
-        """The records in a chunk. A chunk that is cut gives as many records as there are."""
-        where = f"{self.path}, chunk at byte {block.offset}"
-        stream = ReadDataStream(io.BytesIO(raw))
-        try:
-            opcode, length = _RECORD.unpack(stream.read(_RECORD.size))
-            chunk = Chunk.read(stream)
-        except _FAULTS as error:
-            raise LogError(f"{where}: no chunk can be read there ({error}); its messages are lost") from error
-        if opcode != Opcode.CHUNK or (_RECORD.size + length != len(raw) and not block.is_cut):
-            raise LogError(f"{where}: no whole chunk is there; its messages are lost")
-        size = chunk.uncompressed_size
-        if size > LARGEST_CHUNK:
-            raise LogError(f"{where}: {size} bytes when opened, beyond the limit of {LARGEST_CHUNK}; not opened")
-        try:
-            data = _decompressed(chunk)
-        except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-            raise LogError(f"{where}: does not decompress ({error}); its messages are lost") from error
-        except KeyError as error:
-            raise LogError(f"{where}: compression {error} is not supported; its messages are lost") from error
-        if block.is_cut:
-            return data
-        if len(data) != size:
-            raise LogError(
-                f"{where}: has {len(data)} bytes after decompression, and states {size}; its messages are lost"
-            )
-        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
-            raise LogError(f"{where}: wrong checksum; its messages are lost")
-        return data
 
     def _split(self, data: bytes, offset: int) -> Messages:
         starts, ends = array("Q"), array("Q")
-        at = 0
-        unpack, record_bytes, head_bytes = _RECORD.unpack_from, _RECORD.size, _HEAD.itemsize
-        while at + record_bytes <= len(data):
+        at = count = 0
+        unpack, record_bytes, head_bytes = RECORD.unpack_from, RECORD.size, _HEAD.itemsize
+        most = self.spending.budget.parts
+        while at + record_bytes <= len(data) and count <= most:
             opcode, length = unpack(data, at)
             start = at + record_bytes
             at = start + length
+            count += 1
             if at > len(data):
                 break
             if opcode == Opcode.MESSAGE and length >= head_bytes:
                 starts.append(start + head_bytes)
                 ends.append(at)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                kind = Schema if opcode == Opcode.SCHEMA else Channel
                 try:
-                    self._note(kind.read(ReadDataStream(io.BytesIO(data[start:at]))))
-                except _FAULTS as error:
-                    what = f"a schema or channel cannot be read: {error}"
-                    raise LogError(f"{self.path}, byte {offset}: {what}") from error
+                    self._descriptions.note(opcode, data[start:at])
+                except BudgetError:
+                    raise
+                except LogError as error:
+                    raise LogError(f"{self.path}, byte {offset}: {error}") from error
+        self.spending.take_parts(count)
         if not starts:
             return Messages(data, np.zeros(0, _HEAD), starts, ends)
         windows = sliding_window_view(np.frombuffer(data, np.uint8), head_bytes)
         return Messages(data, windows[np.array(starts) - head_bytes].view(_HEAD)[:, 0], starts, ends)
-
-
-def _decompressed(chunk: Chunk) -> bytes:
-    """The chunk's data, which has at most one byte more than the chunk states."""
-    most = chunk.uncompressed_size + 1
-    if chunk.compression == "zstd":
-        decompressor = zstandard.ZstdDecompressor(max_window_size=1 << 27)
-        with decompressor.stream_reader(chunk.data, read_across_frames=True) as stream:
-            return bytes(stream.read(most))
-    if chunk.compression == "lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
-    return {"": chunk.data, "none": chunk.data}[chunk.compression]
-
-
-def _widen(seen: Seen, first_ns: int, last_ns: int) -> None:
-    seen.first_ns = first_ns if seen.first_ns is None else min(seen.first_ns, first_ns)
-    seen.last_ns = last_ns if seen.last_ns is None else max(seen.last_ns, last_ns)

@@ -10,31 +10,30 @@ for record in log.records(["/tf", "/detections"]):
 from __future__ import annotations
 
 import heapq
-import struct
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import McapReader, make_reader
 
-from gtsam_rwhec.errors import LogError, LogWarning, MessageError
+from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, MessageError
+from gtsam_rwhec.files.budgets import MIB, LogBudget
+from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.logs.decoders import Decoder, decoder_for
-from gtsam_rwhec.logs.mcap_blocks import Block, McapFile
+from gtsam_rwhec.logs.mcap_blocks import Block, McapFile, Messages
 from gtsam_rwhec.logs.message_kinds import Topic
 from gtsam_rwhec.logs.records import Array, PoseRecord, PoseSeries, Record
 
 OnBad = Literal["warn", "raise"]
-#: This number of messages is decoded together.
+#: At most this number of messages is decoded together.
 SLICE = 4096
-#: Opened blocks that overlap in time and are held together have at most this many bytes.
-MOST_OPEN_BYTES = 1 << 30
+#: Messages that are decoded together have at most this many bytes, but for a single one of more.
+SLICE_BYTES = MIB
+#: The records of a slice take about this many times its bytes: a transform of 80 bytes becomes 600.
+RECORDS_FOR_A_BYTE = 4
 #: An error lists at most this many topics, since logs may have thousands.
 MOST_NAMED = 50
-
-_Entry = TypeVar("_Entry")
 
 
 def open_log(path: str | Path | Iterable[str | Path]) -> Log:
@@ -49,10 +48,14 @@ def open_log(path: str | Path | Iterable[str | Path]) -> Log:
     ------
     LogError
         A file cannot be read or is not MCAP, or there is none.
+    FileFormatError
+        What is given is no path.
+    BudgetError
+        A file asks for more memory or work than one of its size may (``files/budgets.py``).
     """
-    given = [path] if isinstance(path, str | Path) else list(path)
+    given = [path] if isinstance(path, str | Path) or not isinstance(path, Iterable) else list(path)
     paths: list[Path] = []
-    for each in map(Path, given):
+    for each in map(checked_path, given):
         paths += sorted(each.glob("*.mcap")) if each.is_dir() else [each]
     if not paths:
         raise LogError(f"{', '.join(map(str, given)) or 'an empty list'}: no MCAP files there.")
@@ -71,7 +74,9 @@ class Log:
 
     def __init__(self, files: list[McapFile]) -> None:
         self.files = files
-        self._decoders: dict[tuple[int, int], Decoder | str] = {}
+        self._budget = LogBudget(sum(file.size for file in files))
+        # By file, schema and encoding: thousands of channels may share one schema.
+        self._decoders: dict[tuple[int, int, str], Decoder | str] = {}
         self.losses = [loss for file in files for loss in file.losses]
         if self.losses:
             warnings.warn("; ".join(self.losses), LogWarning, stacklevel=3)
@@ -109,22 +114,14 @@ class Log:
     def metadata(self) -> dict[str, dict[str, str]]:
         """The metadata records of all files by name; the last record of a name counts.
 
-        They are found through a file's index: a file without an index, or a truncated file, gives none.
+        They are found through a file's index, or, without one, by going through the file.
         """
-        return {entry.name: dict(entry.metadata) for entry in self._indexed(lambda reader: reader.iter_metadata())}
+        return {name: entries for file in self.files for name, entries in file.metadata().items()}
 
     def attachment(self, name: str) -> bytes | None:
         """The content that is attached under a name, or None if there is none. It is found as `metadata` is."""
-        found = [entry.data for entry in self._indexed(lambda reader: reader.iter_attachments()) if entry.name == name]
+        found = [data for file in self.files if (data := file.attachment(name)) is not None]
         return found[-1] if found else None
-
-    def _indexed(self, entries: Callable[[McapReader], Iterator[_Entry]]) -> Iterator[_Entry]:
-        for file in self.files:
-            with open(file.path, "rb") as stream:
-                try:
-                    yield from entries(make_reader(stream))
-                except (McapError, struct.error, ValueError, EOFError):
-                    continue  # `losses` says what is wrong with the file
 
     def records(self, topics: Iterable[str] | None = None, on_bad: OnBad = "warn") -> Iterator[Record]:
         """Go through the log in the order of log time.
@@ -142,13 +139,16 @@ class Log:
         Raises
         ------
         LogError
-            A topic is not in the log (the message has the log's topics) or cannot be read; or blocks of more than
-            `MOST_OPEN_BYTES` overlap in time.
+            A topic is not in the log (the message has the log's topics) or cannot be read.
+        BudgetError
+            Too many bytes of chunks overlap in time; or the log asks for more memory or work than one of its size may.
         MessageError
             With ``on_bad="raise"``.
         """
         wanted = self._checked_topics(topics)
         bad = _Bad(on_bad)
+        for file in self.files:
+            file.spending.begin_pass()
         waiting = sorted(
             ((block.start_ns, number, block) for number, file in enumerate(self.files) for block in file.blocks),
             key=lambda entry: entry[:2],
@@ -160,17 +160,26 @@ class Log:
         while waiting or heap:
             if waiting and (not heap or waiting[-1][0] <= heap[0][0]):
                 _, number, block = waiting.pop()
-                records = self._records_of(number, block, wanted, bad)
+                messages = self._opened(number, block, bad)
+                if messages is None:
+                    continue
+                size = len(messages.data) + RECORDS_FOR_A_BYTE * min(len(messages.data), SLICE_BYTES)
+                open_bytes += size
+                if heap and open_bytes > self._budget.open:
+                    raise BudgetError(
+                        f"{self.files[number].path}: {len(heap) + 1} chunks overlap in time, which take {open_bytes} "
+                        f"bytes together, and a log of {self._budget.size} bytes may take {self._budget.open}. Sort "
+                        "the log first (mcap sort)."
+                    )
+                records = self._records_of(number, messages, wanted, bad)
                 first = next(records, None)
-                if first is not None:
-                    heapq.heappush(heap, (first.logged_ns, order, first, records, block.length))
+                if first is None:
+                    open_bytes -= size
+                else:
+                    heapq.heappush(heap, (first.logged_ns, order, first, records, size))
                     order += 1
-                    open_bytes += block.length
-                    if len(heap) > 1 and open_bytes > MOST_OPEN_BYTES:
-                        raise LogError(
-                            f"{self.files[number].path}: {len(heap)} chunks of {open_bytes} bytes overlap in time; "
-                            "sort the log first (mcap sort)."
-                        )
+                # The generator keeps the messages for as long as they are needed; this frame must not.
+                del messages, records
                 continue
             _, tie, record, records, size = heapq.heappop(heap)
             limit = min(heap[0][0] if heap else 1 << 64, waiting[-1][0] if waiting else 1 << 64)
@@ -226,31 +235,39 @@ class Log:
 
     def _decoder(self, number: int, channel_id: int) -> Decoder | str:
         """The function for a channel's messages, or the reason why there is none."""
-        key = number, channel_id
+        file = self.files[number]
+        channel = file.channels.get(channel_id)
+        if channel is None:
+            return f"channel {channel_id} is not described in the file"
+        key = number, channel.schema_id, channel.message_encoding
         if key not in self._decoders:
-            file = self.files[number]
-            channel = file.channels.get(channel_id)
             try:
-                if channel is None:
-                    raise MessageError(f"channel {channel_id} is not described in the file")
-                self._decoders[key] = decoder_for(channel, file.schemas.get(channel.schema_id))
+                self._decoders[key] = decoder_for(channel, file.schemas.get(channel.schema_id), file.spending)
+            except BudgetError:
+                raise
             except MessageError as error:
                 self._decoders[key] = str(error)
         return self._decoders[key]
 
-    def _records_of(self, number: int, block: Block, wanted: set[str] | None, bad: _Bad) -> Iterator[Record]:
-        """Records of one block, in the order of log time. They are decoded a slice at a time."""
+    def _opened(self, number: int, block: Block, bad: _Bad) -> Messages | None:
+        """The messages of a block; None if it is damaged, which `bad` notes."""
         file = self.files[number]
         try:
-            messages = file.open(block)
+            return file.open(block)
+        except BudgetError:
+            raise
         except LogError as error:
             bad.add(f"{file.path}", error)
-            return
+            return None
+
+    def _records_of(self, number: int, messages: Messages, wanted: set[str] | None, bad: _Bad) -> Iterator[Record]:
+        """Records of one block, in the order of log time. They are decoded a slice at a time."""
+        file = self.files[number]
         log_time = messages.heads["log_time"]
         order = np.argsort(log_time, kind="stable")
         data = memoryview(messages.data)
-        for start in range(0, len(order), SLICE):
-            places = order[start : start + SLICE]
+        sizes = np.asarray(messages.end, dtype=np.int64) - np.asarray(messages.start, dtype=np.int64)
+        for places in _slices(order, sizes):
             channels = messages.heads["channel"][places]
             read: dict[int, Sequence[Record]] = {}
             for channel_id in np.unique(channels).tolist():
@@ -263,8 +280,17 @@ class Log:
                 topic = file.channels[channel_id].topic
                 if wanted is not None and topic not in wanted:
                     continue
+                is_cdr = file.channels[channel_id].message_encoding == "cdr"
+                if not is_cdr and len(members) == 1 and sizes[members[0]] > file.spending.budget.message:
+                    fault = (
+                        f"{file.path}, topic {topic}: a message of {sizes[members[0]]} bytes is beyond the limit of "
+                        f"{file.spending.budget.message} for a log of {file.size} bytes"
+                    )
+                    bad.add(f"topic {topic}", MessageError(fault))
+                    continue
                 cut = [data[messages.start[i] : messages.end[i]] for i in members]
                 results = decoder(topic, cut, log_time[members].tolist())
+                file.spending.take_parts(sum(len(result) for result in results if not isinstance(result, str)))
                 for i, result in zip(members, results, strict=True):
                     if isinstance(result, str):
                         bad.add(f"topic {topic}", MessageError(f"{file.path}, topic {topic}: {result}"))
@@ -272,6 +298,18 @@ class Log:
                         read[i] = result
             for i in places.tolist():
                 yield from read.pop(i, ())
+
+
+def _slices(order: np.ndarray, sizes: np.ndarray) -> Iterator[np.ndarray]:
+    """Parts of `order` of at most `SLICE` messages and `SLICE_BYTES` bytes; a larger message is alone."""
+    ends = np.cumsum(sizes[order])
+    start = 0
+    while start < len(order):
+        before = int(ends[start - 1]) if start else 0
+        end = int(np.searchsorted(ends, before + SLICE_BYTES, side="right"))
+        end = max(start + 1, min(end, start + SLICE))
+        yield order[start:end]
+        start = end
 
 
 class _Bad:

@@ -23,7 +23,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import BudgetError, LogError
 from gtsam_rwhec.files.atomic_write import atomic_stream
 from gtsam_rwhec.logs.mcap_reader import Log
 from gtsam_rwhec.logs.message_kinds import IMAGE_SCHEMAS, MEASURED_PAIR, TAG_DETECTIONS, VIDEO_SCHEMAS, schema_word
@@ -94,9 +94,12 @@ class LogWriter:
         wanted = None if topics is None else set(topics)
         copied = 0
         for file in log.files:
+            file.spending.begin_pass()
             for block in sorted(file.blocks, key=lambda block: block.start_ns):
                 try:
                     messages = file.open(block)
+                except BudgetError:
+                    raise
                 except LogError:
                     continue
                 made: dict[int, int | None] = {}

@@ -46,13 +46,16 @@ class Tag:
     has_corners: bool = False
 
 
-def decoder(schema: str, definition: str) -> Callable[[str, Sequence[bytes | memoryview], list[int]], list[Read]]:
+def decoder(
+    schema: str, definition: str, take: Callable[[int], None]
+) -> Callable[[str, Sequence[bytes | memoryview], list[int]], list[Read]]:
     """Make the function that reads messages of a schema: (topic, messages, logged_ns) -> records of each.
 
+    `take` is told how many parts of messages were read, and raises an error when they are too many.
     A MessageError says that the definition in the log cannot be read.
     """
     decode = SCHEMAS[schema.replace("/msg/", "/")]
-    message_type = MessageType(schema, definition)
+    message_type = MessageType(schema, definition, take)
 
     def read(topic: str, messages: Sequence[bytes | memoryview], logged_ns: list[int]) -> list[Read]:
         out: list[Read] = [()] * len(messages)
@@ -90,17 +93,47 @@ def _parts(batch: Batch, name: str) -> list[Any]:
     return value
 
 
-def _pose(batch: Batch, tree: Any, where: Pose) -> tuple[Array, Sequence[Array | None], dict[int, str]]:
-    """Transforms, covariances and faults of one pose of each message."""
+def _pose_columns(batch: Batch, tree: Any, where: Pose) -> list[Numbers]:
+    """Where a pose's x, y, z and x, y, z, w stand."""
     pose = find(tree, where.pose)
     position, rotation = ("translation", "rotation") if where.pose == "transform" else ("position", "orientation")
-    T, faults = transforms(_columns(batch, find(pose, position), "xyz"), _columns(batch, find(pose, rotation), "xyzw"))
-    if not where.covariance:
-        return T, [None] * len(T), faults
-    numbers = batch.numbers(tree, where.covariance).astype(np.float64)
-    if numbers.shape[1:] != (36,):
-        raise MessageError(f"field covariance has {numbers.shape[1:]} numbers in place of 36")
-    return T, gtsam_covariances(T, numbers.reshape(-1, 6, 6)), faults
+    leaves = [find(find(pose, position), name) for name in "xyz"]
+    leaves += [find(find(pose, rotation), name) for name in "xyzw"]
+    for leaf in leaves:
+        if not isinstance(leaf, Numbers) or leaf.count is not None:
+            raise MessageError(f"field {where.pose} has no {position} and {rotation}")
+    return leaves
+
+
+def _pose(batch: Batch, trees: list[Any], where: Pose) -> tuple[Array, list[Sequence[Array | None]], dict[int, str]]:
+    """Transforms (P, N, 4, 4) and covariances of P poses of each of N messages, and the faults of messages."""
+    count = len(batch.rows)
+    table = np.empty((len(trees), count, 7))
+    # A message of its own shape has all its poses read together; of many messages, one pose of all is.
+    if count < len(trees):
+        offsets = np.array([[leaf.offset for leaf in _pose_columns(batch, tree, where)] for tree in trees])
+        dtype = {leaf.dtype for leaf in _pose_columns(batch, trees[0], where)}.pop()
+        size = np.dtype(dtype).itemsize
+        places = offsets[:, :, None] + np.arange(size)
+        table[:] = batch.rows[:, places].view(dtype)[..., 0].transpose(1, 0, 2)
+    else:
+        for i, tree in enumerate(trees):
+            for j, leaf in enumerate(_pose_columns(batch, tree, where)):
+                table[i, :, j] = batch.column(leaf)
+    rows = table.reshape(-1, 7)
+    T, wrong = transforms(rows[:, :3], rows[:, 3:])
+    faults: dict[int, str] = {}
+    for i, fault in wrong.items():
+        faults.setdefault(i % count, fault)
+    T = T.reshape(len(trees), count, 4, 4)
+    covariances: list[Sequence[Array | None]] = [[None] * count for _ in trees]
+    if where.covariance:
+        for i, tree in enumerate(trees):
+            numbers = batch.numbers(tree, where.covariance).astype(np.float64)
+            if numbers.shape[1:] != (36,):
+                raise MessageError(f"field covariance has {numbers.shape[1:]} numbers in place of 36")
+            covariances[i] = gtsam_covariances(T[i], numbers.reshape(-1, 6, 6))
+    return T, covariances, faults
 
 
 def _columns(batch: Batch, tree: Any, names: str) -> Array:
@@ -116,14 +149,15 @@ def _by_message(parts: Sequence[Sequence[Record]], faults: dict[int, str], count
 
 
 def _poses(where: Pose, batch: Batch, topic: str, logged_ns: list[int]) -> list[Read]:
+    trees = _parts(batch, where.parts)
+    if not trees:
+        return [()] * len(logged_ns)
     parts: list[list[PoseRecord]] = []
-    faults: dict[int, str] = {}
-    for tree in _parts(batch, where.parts):
-        T, covariances, wrong = _pose(batch, tree, where)
+    T, covariances, faults = _pose(batch, trees, where)
+    for tree, T_of_part, of_part in zip(trees, T, covariances, strict=True):
         parent, child = _frame(batch, tree), _frame(batch, tree, where.child) if where.child else ""
-        each = zip(logged_ns, _stamps(batch, tree), T, covariances, strict=True)
+        each = zip(logged_ns, _stamps(batch, tree), T_of_part, of_part, strict=True)
         parts.append([PoseRecord(logged, stamp, topic, parent, child, T_i, S) for logged, stamp, T_i, S in each])
-        faults = wrong | faults
     return _by_message(parts, faults, len(logged_ns))
 
 
@@ -143,8 +177,8 @@ def _detections(tags: Sequence[Tag], batch: Batch, topic: str, logged_ns: list[i
                 for i in np.flatnonzero(~np.isfinite(corners).all(axis=(1, 2))).tolist():
                     faults.setdefault(i, f"corners {corners[i].tolist()} are not finite")
             if tag.pose is not None:
-                T, covariances, wrong = _pose(batch, tree, tag.pose)
-                poses = zip(T, covariances, strict=True)
+                T, covariances, wrong = _pose(batch, [tree], tag.pose)
+                poses = zip(T[0], covariances[0], strict=True)
                 faults = wrong | faults
             each = zip(logged_ns, stamps, ids, corners, poses, strict=False)
             parts.append(

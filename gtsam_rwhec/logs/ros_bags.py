@@ -1,20 +1,49 @@
 """ROS 1 bags and ROS 2 db3 bags converted to MCAP by the `rosbags` library (the extra ``gtsam-rwhec[rosbags]``).
 
-ROS 1 messages are encoded as CDR with the same fields and numbers; ROS 2 messages are copied byte for byte.
+ROS 1 messages are encoded as CDR with the same fields and numbers; ROS 2 messages are copied byte for byte. `rosbags`
+runs in a process of its own, with limits that grow with the bag (``ros_bag_process.py``).
 """
 
 from __future__ import annotations
 
-import struct
+import errno
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import tempfile
+from importlib.util import find_spec
 from pathlib import Path
-
-from mcap.writer import Writer as McapWriter
+from typing import BinaryIO
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.atomic_write import atomic_stream
+from gtsam_rwhec.files.budgets import Spending
+from gtsam_rwhec.files.paths import checked_path
+from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.logs.ros1_checks import check_ros1_bag
+from gtsam_rwhec.logs.ros2_checks import check_ros2_bag
 
-#: Messages are compressed and written when they have this many bytes.
-CHUNK_BYTES = 1 << 20
+#: Bytes. Reading a bag may take this much memory,
+MEMORY = 200 << 20
+#: and this many bytes for each byte of the bag: an index entry of 16 bytes becomes an object of 150.
+MEMORY_FOR_A_BYTE = 12
+#: Bytes. The log that is written, and each file that is decompressed on the way, may have this many,
+WRITTEN = 256 << 20
+#: and this many for each byte of the bag.
+WRITTEN_FOR_A_BYTE = 100
+#: Seconds of the processor. Reading a bag may take this long,
+TIME_S = 5
+#: and this many seconds for each megabyte of the bag. Honest bags of small messages take one or two.
+TIME_FOR_A_MEGABYTE_S = 30
+#: What ended the process, in words.
+_ENDED_BY = {
+    signal.SIGXCPU: "it takes more time than a bag of its size may",
+    signal.SIGKILL: "it takes more time or memory than a bag of its size may",
+    signal.SIGXFSZ: "it decompresses to more than a bag of its size may",
+}
 
 
 def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
@@ -35,51 +64,69 @@ def convert_ros_bag(bag: str | Path, path: str | Path) -> int:
     Raises
     ------
     LogError
-        `rosbags` is not installed; the bag cannot be read or has no definitions of its messages; the file cannot be
-        written.
+        `rosbags` is not installed; the bag cannot be read, has no definitions of its messages, or takes more memory or
+        time than a bag of its size may; the file cannot be written; or a ROS 2 bag is in MCAP already.
+    BudgetError
+        The bag states more, or yields more, than one of its size may (``files/budgets.py``).
     """
+    bag, path = checked_path(bag), checked_path(path)
+    if find_spec("rosbags") is None:
+        raise LogError("rosbags is not installed: pip install gtsam-rwhec[rosbags]")
+    size = _size(bag)
+    # What can be told before `rosbags` reads is told in words; its process only ends.
+    if bag.is_dir() or bag.suffix != ".bag":
+        check_ros2_bag(bag, Spending(bag, size))
+    else:
+        check_ros1_bag(bag)
     try:
-        import apsw
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.rosbag1 import ReaderError as Ros1Error
-        from rosbags.rosbag2 import ReaderError as Ros2Error
-        from rosbags.serde import SerdeError
-        from rosbags.typesys import Stores, TypesysError, get_typestore
-    except ImportError as error:
-        raise LogError("rosbags is not installed: pip install gtsam-rwhec[rosbags]") from error
-    # rosbags raises the last five for damaged bags that it does not recognise as damaged.
-    faults = (
-        AnyReaderError, Ros1Error, Ros2Error, SerdeError, TypesysError, apsw.Error,
-        AssertionError, ValueError, KeyError, IndexError, struct.error,
-    )  # fmt: skip
-    bag, path = Path(bag), Path(path)
-    count = 0
-    try:
-        with AnyReader([bag]) as reader, atomic_stream(path) as stream:
-            writer = McapWriter(stream, CHUNK_BYTES)
-            writer.start(profile="ros2", library="gtsam-rwhec")
-            # ROS 2's Header lacks ROS 1's seq. All other definitions are the bag's own.
-            definitions = dict(reader.typestore.fielddefs)
-            if not reader.is2:
-                definitions["std_msgs/msg/Header"] = get_typestore(Stores.LATEST).fielddefs["std_msgs/msg/Header"]
-            types = get_typestore(Stores.EMPTY)
-            types.register(definitions)
-            schemas: dict[str, int] = {}
-            channels: dict[int, int] = {}
-            for connection in reader.connections:
-                name = connection.msgtype
-                if name not in schemas:
-                    definition, _ = types.generate_msgdef(name, ros_version=2)
-                    schemas[name] = writer.register_schema(name, "ros2msg", definition.encode())
-                channels[id(connection)] = writer.register_channel(connection.topic, "cdr", schemas[name])
-            for connection, stamp_ns, raw in reader.messages():
-                data = raw if reader.is2 else bytes(types.ros1_to_cdr(raw, connection.msgtype))
-                writer.add_message(channels[id(connection)], stamp_ns, data, stamp_ns)
-                count += 1
-            writer.finish()  # type: ignore[no-untyped-call]
-    except faults as error:
-        what = str(error) or type(error).__name__
-        raise LogError(f"{bag} cannot be read as a ROS bag: {what}") from error
+        with atomic_stream(path) as stream:
+            return _converted(bag, size, stream, path)
     except OSError as error:
-        raise LogError(f"{bag} cannot be converted to {path}: {error.strerror or error}") from error
-    return count
+        raise LogError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
+def _size(bag: Path) -> int:
+    """Bytes of the bag's files; pipes and devices are refused."""
+    try:
+        files = sorted(bag.iterdir()) if bag.is_dir() else [bag]
+        states = [file.stat() for file in files]
+    except OSError as error:
+        raise LogError(f"{bag} cannot be read as a ROS bag: {error.strerror}.") from error
+    for file, state in zip(files, states, strict=True):
+        if not (stat.S_ISREG(state.st_mode) or stat.S_ISDIR(state.st_mode)):
+            raise LogError(f"{bag} cannot be read as a ROS bag: {file} is not a file.")
+    return sum(state.st_size for state in states)
+
+
+def _converted(bag: Path, size: int, stream: BinaryIO, path: Path) -> int:
+    limits = (
+        MEMORY + MEMORY_FOR_A_BYTE * size,
+        WRITTEN + WRITTEN_FOR_A_BYTE * size,
+        TIME_S + TIME_FOR_A_MEGABYTE_S * size // 1_000_000,
+    )
+    script = Path(__file__).with_name("ros_bag_process.py")
+    # -P: no folder of the caller's comes before the libraries. Threads of BLAS would only reserve memory.
+    command = [sys.executable, "-P", str(script), os.path.abspath(bag), *map(str, limits)]
+    found_in = os.pathsep.join(folder for folder in sys.path if os.path.isabs(folder))
+    with tempfile.TemporaryDirectory() as scratch:  # for what rosbags decompresses; it is emptied however rosbags ends
+        environment = {**os.environ, "PYTHONPATH": found_in, "TMPDIR": scratch, "OPENBLAS_NUM_THREADS": "1"}
+        ended = subprocess.run(
+            command, stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.PIPE, env=environment, check=False
+        )
+    last = ended.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+    if ended.returncode == 0:
+        told = json.loads(last)
+        if "count" in told:
+            return int(told["count"])
+        if told["errno"] in (errno.ENOSPC, errno.EDQUOT):
+            raise LogError(f"{path} cannot be written: {told['refused']}.")
+        what = _ENDED_BY[signal.SIGXFSZ] if told["errno"] == errno.EFBIG else shown(told["refused"], 500)
+        raise LogError(f"{bag} cannot be read as a ROS bag: {what}.")
+    if ended.returncode < 0:
+        name = signal.Signals(-ended.returncode)
+        raise LogError(f"{bag} cannot be read as a ROS bag: {_ENDED_BY.get(name, f'rosbags ended by {name.name}')}.")
+    kind, _, said = last.partition(": ")
+    what = said or kind.rpartition(".")[2]
+    if kind == "MemoryError":
+        what = "it takes more memory than a bag of its size may"
+    raise LogError(f"{bag} cannot be read as a ROS bag: {shown(what, 500)}")

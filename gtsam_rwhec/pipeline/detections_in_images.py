@@ -59,7 +59,7 @@ def draw_log(
                 if not isinstance(image, ImageRecord):
                     continue
                 try:
-                    gray = decode_gray(image)
+                    gray = decode_gray(image, (cameras[sensor].width, cameras[sensor].height))
                 except ImageError:
                     continue  # the report of detection names it
                 picture = draw(gray, of_stamp[image.stamp_ns], cameras[sensor])

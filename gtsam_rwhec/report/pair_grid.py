@@ -11,6 +11,7 @@ from rich.style import Style
 from rich.text import Text
 
 from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.identifiability.verdicts import Identifiability
 from gtsam_rwhec.problem.pairs import Pair
 
@@ -49,12 +50,12 @@ class PairGrid:
         observed = [pair for pair in self.identifiability.pairs if not pair.is_motion]
         targets = sorted({target for target, _ in observed}, key=natural_key)
         sensors = sorted({sensor for _, sensor in observed}, key=natural_key)
-        prefix, labels = _without_common_prefix(targets)
-        side = max((len(sensor) for sensor in sensors), default=0)
+        prefix, labels = _without_common_prefix(list(map(shown, targets)))
+        side = max((len(shown(sensor)) for sensor in sensors), default=0)
         for block in _blocks(list(zip(targets, labels, strict=True)), options.max_width - side):
             yield Text(f"{'':{side}}" + "".join(f" {label:>{_width(label)}}" for _, label in block))
             for sensor in sensors:
-                line = Text(f"{sensor:<{side}}")
+                line = Text(f"{shown(sensor):<{side}}")
                 for target, label in block:
                     state = self.state(target, sensor)
                     symbol = state.ascii_symbol if options.ascii_only else state.symbol
@@ -75,7 +76,7 @@ def _motions(identifiability: Identifiability) -> Iterator[Text]:
     for pair, alone in identifiability.pairs.items():
         if pair.is_motion:
             verdict = "determined" if alone.is_unique else "not determined"
-            yield Text(f"{pair.sensor} from its own motion: {verdict}")
+            yield Text(f"{shown(pair.sensor)} from its own motion: {verdict}")
 
 
 def _width(label: str) -> int:

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.files.terminal_text import printable, shown
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solving.solution import Solution
 
@@ -40,7 +41,7 @@ class FrameTable:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Print the widest layout that fits."""
-        yield Text(self.title, style="italic")
+        yield Text(printable(self.title), style="italic")
         layouts = (
             [slice(0, None)],
             [slice(0, SPLIT), slice(SPLIT, None)],
@@ -54,7 +55,7 @@ class FrameTable:
                 return
         for name, cells in self.rows.items():
             numbers = [f"{heading} {cell}" for heading, cell in zip(self.headings, cells, strict=True)]
-            yield Text("\n".join(_filled(f"{name}:", numbers, options.max_width)))
+            yield Text("\n".join(_filled(f"{shown(name)}:", numbers, options.max_width)))
         yield Text()
 
     def _table(self, columns: slice) -> Table:
@@ -64,7 +65,7 @@ class FrameTable:
         for heading in self.headings[columns]:
             table.add_column(heading, justify="right", no_wrap=True)
         for name, cells in self.rows.items():
-            table.add_row(Text(name), *cells[columns])
+            table.add_row(Text(shown(name)), *map(Text, cells[columns]))
         return table
 
 

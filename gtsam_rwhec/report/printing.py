@@ -7,7 +7,8 @@ from collections.abc import Iterable
 from rich.console import Console
 from rich.text import Text
 
-from gtsam_rwhec.files.terminal_text import printable
+from gtsam_rwhec.files.terminal import SafeConsole
+from gtsam_rwhec.files.terminal_text import LONGEST_LINE, printable, shown
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.results.verdict import Judgement, Verdict
 from gtsam_rwhec.solving.solution import Solution
@@ -20,8 +21,8 @@ STYLES = {Verdict.USE: "bold green", Verdict.CARE: "bold yellow", Verdict.DO_NOT
 
 def report_console() -> Console:
     """A console on standard output; in a file it is plain and as wide as the tables need."""
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH, no_color=True)
+    console = SafeConsole()
+    return console if console.is_terminal else SafeConsole(width=PLAIN_WIDTH, no_color=True)
 
 
 def print_verdict(console: Console, judgement: Judgement, solution: Solution) -> None:
@@ -35,7 +36,7 @@ def print_verdict(console: Console, judgement: Judgement, solution: Solution) ->
 def print_heading(console: Console, words: str) -> None:
     """Print the heading of a section."""
     console.print()
-    console.print(Text(words, style="bold"))
+    console.print(Text(printable(words), style="bold"))
     console.print()
 
 
@@ -55,4 +56,4 @@ def print_list(console: Console, words: Iterable[str], style: str = "") -> None:
 
 def print_sentence(console: Console, words: str, style: str = "") -> None:
     """Print a sentence: wrapped on a terminal, in one line in a file, where people search for words."""
-    console.print(Text(printable(words), style=style), soft_wrap=not console.is_terminal)
+    console.print(Text(shown(words, LONGEST_LINE), style=style), soft_wrap=not console.is_terminal)

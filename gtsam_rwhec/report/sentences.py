@@ -6,23 +6,40 @@ from collections.abc import Iterator, Mapping
 
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.solver.cause import Status
-from gtsam_rwhec.solver.certificate import Certificate
+from gtsam_rwhec.solver.certificate import Basis, Certificate
 from gtsam_rwhec.solving.solution import Solution
 
 
 def certificate_sentence(certificate: Certificate, answer: str = "this answer") -> str:
     """What the certificate proves about the cost of the answer, which the sentence calls ``answer``."""
+    region = certificate.region
+    no_answer = "no answer" if region is None else f"no answer within {region.distance}"
     proof = (
-        f"{answer} costs {certificate.cost:.10g}, and no answer can cost less than {certificate.lower_bound:.10g} "
+        f"{answer} costs {certificate.cost:.10g}, and {no_answer} can cost less than {certificate.lower_bound:.10g} "
         f"(relative gap {certificate.relative_gap:.1e}; {certificate.path.words})"
     )
+    limits = _limits(certificate)
     if certificate.status is Status.CERTIFIED:
-        return f"Certified globally optimal: {proof}."
+        return f"Certified globally optimal: {proof}.{limits}"
     if certificate.status is Status.CERTIFIED_NOT_UNIQUE:
-        return f"Certified, but not unique: {proof}; other answers fit equally well, up to noise."
+        return f"Certified, but not unique: {proof}; other answers fit equally well, up to noise.{limits}"
     if certificate.status is Status.GAP:
-        return f"Not certified: {proof}; {certificate.reason}."
+        return f"Not certified: {proof}; {certificate.reason}.{limits}"
     return f"Not certified: {answer} costs {certificate.cost:.10g}; {certificate.reason}."
+
+
+def _limits(certificate: Certificate) -> str:
+    """What the bound is not about, in sentences with a blank before each; empty where it is about everything."""
+    region, basis = certificate.region, _BASES[certificate.basis]
+    said = "" if region is None else f" {str(region)[0].upper()}{str(region)[1:]}."
+    return said + (f" {basis}" if basis else "")
+
+
+_BASES = {
+    Basis.MEASUREMENTS: "",
+    Basis.MOMENTS: "It is of the moments: the measurements were not kept, so the rounding of the sums is not in it.",
+    Basis.REDUCED_FORM: "It is of the form that an older version stored, whose rounding is not in it.",
+}
 
 
 def part_sentences(solution: Solution) -> Iterator[str]:

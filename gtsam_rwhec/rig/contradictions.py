@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from typing import Any
@@ -12,7 +11,7 @@ from gtsam_rwhec.files.yaml_lines import KeyPath, suggestion
 from gtsam_rwhec.rig.sections import Carriers, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.options import DetectionOptions
-from gtsam_rwhec.vision.targets import Checkerboard, Target, is_same_print
+from gtsam_rwhec.vision.targets import Checkerboard, Target, print_of
 
 Fault = tuple[KeyPath, str]
 
@@ -93,20 +92,27 @@ def _detection(detection: Mapping[str, Any]) -> Iterator[Fault]:
 
 
 def _lookalikes(targets: list[Target]) -> Iterator[Fault]:
-    for first, second in itertools.combinations(targets, 2):
-        if isinstance(first, Checkerboard) and isinstance(second, Checkerboard):
-            if {first.columns, first.rows} == {second.columns, second.rows}:
+    boards: dict[frozenset[int], str] = {}
+    prints: dict[tuple[str, int], str] = {}
+    for target in targets:
+        if isinstance(target, Checkerboard):
+            other = boards.setdefault(frozenset((target.columns, target.rows)), target.name)
+            if other != target.name:
                 yield (
-                    ("targets", second.name),
-                    f"a checkerboard of {second.columns} x {second.rows} inner corners, like {first.name}: the boards "
+                    ("targets", target.name),
+                    f"a checkerboard of {target.columns} x {target.rows} inner corners, like {other}: the boards "
                     "look the same in images; use boards with tags",
                 )
             continue
-        shared = sorted(set(first.ids) & set(second.ids))
-        if shared and is_same_print(first.family, second.family):
-            some = ", ".join(map(str, shared[:5])) + (", ..." if len(shared) > 5 else "")
+        shared: dict[str, list[int]] = {}
+        for id_ in target.ids:
+            other = prints.setdefault((print_of(target.family), id_), target.name)
+            if other != target.name:
+                shared.setdefault(other, []).append(id_)
+        for other, ids in shared.items():
+            some = ", ".join(map(str, sorted(ids)[:5])) + (", ..." if len(ids) > 5 else "")
             yield (
-                ("targets", second.name),
-                f"tags {some} of {second.family} also belong to target {first.name}: the targets look the same in "
+                ("targets", target.name),
+                f"tags {some} of {target.family} also belong to target {other}: the targets look the same in "
                 "images; print targets with different ids",
             )

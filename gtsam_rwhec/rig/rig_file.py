@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -93,18 +92,27 @@ def parse_rig(text: str, where: str, folder: Path = Path()) -> Rig:
     try:
         said = RigFile.model_validate(file.data)
     except ValidationError as error:
-        faults = sorted({(file.line(path), file.fault(path, words)) for path, words in _in_words(error, file)})
-        rest = [f"and {len(faults) - MOST_FAULTS} more faults"] if len(faults) > MOST_FAULTS else []
-        raise RigError("\n".join([words for _, words in faults[:MOST_FAULTS]] + rest)) from error
+        raise RigError(_in_words(error, file)) from error
     return Rig(**{name: getattr(said, name) for name in RigFile.model_fields}, folder=folder)
 
 
-def _in_words(error: ValidationError, file: YamlFile) -> Iterator[tuple[KeyPath, str]]:
-    for fault in error.errors(include_url=False):
-        path = _path(fault["loc"])
-        if fault["type"].startswith("union_tag") and path[0] == "targets":
-            path = (*path, "type")
-        yield path, _words(fault, path, file)
+def _in_words(error: ValidationError, file: YamlFile) -> str:
+    """The faults in the order of their lines: the first `MOST_FAULTS`, and how many more there are."""
+    faults = [(_place(fault), fault) for fault in error.errors(include_url=False)]
+    faults.sort(key=lambda entry: file.line(entry[0]))
+    named: set[tuple[int, str]] = set()
+    rest: set[tuple[KeyPath, str]] = set()
+    for path, fault in faults:
+        if len(named) < MOST_FAULTS:
+            named.add((file.line(path), file.fault(path, _words(fault, path, file))))
+        else:  # no words for the rest: there may be thousands
+            rest.add((path, fault["type"]))
+    return "\n".join([words for _, words in sorted(named)] + ([f"and {len(rest)} more faults"] if rest else []))
+
+
+def _place(fault: ErrorDetails) -> KeyPath:
+    path = _path(fault["loc"])
+    return (*path, "type") if fault["type"].startswith("union_tag") and path[0] == "targets" else path
 
 
 def _path(loc: tuple[str | int, ...]) -> KeyPath:

@@ -54,7 +54,7 @@ class Trajectory:
         stamps = increasing_stamps(stamps_ns, len(transforms), where)
         if len(transforms) == 0:
             raise PoseError(f"{where}: there are no poses; give at least one")
-        rows, _ = checked_rows(transforms, 0, where)
+        rows = checked_rows(transforms, 0, where).rows
         return Trajectory(stamps, rows_to_transforms(rows), where)
 
     @property

@@ -13,10 +13,19 @@ from collections.abc import Callable
 #: Files begin with these bytes.
 PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG, _BMP, _RIFF = b"\xff\xd8", b"BM", b"RIFF"
+#: These chunks of a PNG make its pixels.
+_PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
 #: TIFF has these tags for width and height, and two types for whole numbers, of 16 and 32 bits.
 _WIDTH, _HEIGHT = 256, 257
 _WHOLE = {3: "H", 4: "I"}
+
+#: Decoding takes about this many bytes for each pixel: gray of 8 bits, and what the decoder itself needs.
+_LEAN = 3
+#: WebP is decoded in colour, and converted.
+_WEBP_BYTES = 6
+#: TIFF and PNG of 16 bits are decoded to up to 8 bytes for each pixel.
+_WIDE = 9
 
 Size = tuple[int, int]
 
@@ -57,12 +66,20 @@ def _jpeg(data: bytes) -> Size | None:
     return None
 
 
-def _webp(data: bytes) -> Size:
-    if data[12:16] == b"VP8X":  # only this kind can state more than 16384 x 16384
-        if len(data) < 30:
-            raise struct.error("no canvas")
+def _webp(data: bytes) -> Size | None:
+    """The canvas of the extended format, or the frame of the other two."""
+    if len(data) < 30:
+        return None
+    kind = data[12:16]
+    if kind == b"VP8X":
         return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
-    return 1 << 14, 1 << 14
+    if kind == b"VP8L" and data[20] == 0x2F:
+        bits = int.from_bytes(data[21:25], "little")
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    if kind == b"VP8 " and data[23:26] == b"\x9d\x01\x2a":
+        width, height = struct.unpack_from("<HH", data, 26)
+        return width & 0x3FFF, height & 0x3FFF
+    return None
 
 
 def _tiff(data: bytes) -> Size | None:
@@ -83,3 +100,46 @@ def _bmp(data: bytes) -> Size:
     (header,) = struct.unpack_from("<I", data, 14)
     width, height = struct.unpack_from("<HH" if header == 12 else "<ii", data, 18)
     return abs(width), abs(height)
+
+
+def bytes_a_pixel(data: bytes) -> int:
+    """About how many bytes decoding takes for each pixel."""
+    if data[:4] in _TIFF or (data.startswith(PNG) and data[24:25] == b"\x10"):
+        return _WIDE
+    return _WEBP_BYTES if data.startswith(_RIFF) else _LEAN
+
+
+def jpeg_scans(data: bytes) -> int:
+    """How many scans a JPEG has, with those of its thumbnails; none for another file."""
+    return data.count(b"\xff\xda") if data.startswith(_JPEG) else 0
+
+
+def is_whole_png(data: bytes) -> bool:
+    """Whether the chunks of a PNG, IEND among them, lie inside the file: OpenCV allocates what a chunk states."""
+    at = len(PNG)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        kind = data[at + 4 : at + 8]
+        at += 12 + length
+        if kind == b"IEND":
+            return bool(at <= len(data))
+    return False
+
+
+def with_pixels_only(data: bytes) -> bytes:
+    """A PNG without its text, profiles and further frames, which libpng would decompress at any cost.
+
+    It ends with its first IEND: OpenCV reads on behind it where no pixels came before, and allocates what it finds
+    there as a length. A file that is not a PNG, or that has nothing to leave out, comes back as it is.
+    """
+    if not data.startswith(PNG):
+        return data
+    kept, at, kind = [data[: len(PNG)]], len(PNG), b""
+    while kind != b"IEND" and at + 8 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        end, kind = at + 12 + length, data[at + 4 : at + 8]
+        if kind in _PIXEL_CHUNKS or end > len(data):
+            kept.append(data[at:end])
+        at = end
+    pixels = b"".join(kept)
+    return pixels if len(pixels) < len(data) else data

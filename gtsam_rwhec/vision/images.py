@@ -7,9 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gtsam_rwhec.errors import ImageError
+from gtsam_rwhec.files.budgets import SCANS, pixel_budget
 from gtsam_rwhec.logs.records import ImageRecord
 from gtsam_rwhec.vision.camera import MOST_PIXELS
-from gtsam_rwhec.vision.image_sizes import PNG, stated_size
+from gtsam_rwhec.vision.image_sizes import (
+    PNG,
+    Size,
+    bytes_a_pixel,
+    is_whole_png,
+    jpeg_scans,
+    stated_size,
+    with_pixels_only,
+)
 
 Gray = NDArray[np.uint8]
 
@@ -25,31 +34,56 @@ _RAW: dict[str, tuple[int, int, int | None]] = {
     "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2GRAY_YUY2), "yuyv": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
 }  # fmt: skip
 RAW_ENCODINGS = tuple(_RAW)
+#: Pixels are scaled to 8 bits in pieces of about this many.
+_PIECE = 1 << 20
 
 
-def decode_gray(image: ImageRecord) -> Gray:
+def decode_gray(image: ImageRecord, size: Size | None = None) -> Gray:
     """Pixels (height, width), 8 bits, of a log's image; 16 bits are scaled so that the brightest pixel is 255.
+
+    Parameters
+    ----------
+    image
+    size : (width, height), optional
+        The size that the camera's intrinsics are for. An image of another size is refused before it is decoded.
 
     Raises
     ------
     ImageError
-        The image cannot be decoded, has more than `MOST_PIXELS`, or has an encoding that is not supported.
+        The image cannot be decoded, has another size, has more pixels than an image of its bytes may have
+        (``files/budgets.py``), or has an encoding that is not supported.
     """
     where = f"topic {image.topic}, image at {image.stamp_ns} ns"
-    return _compressed(image, where) if image.is_compressed else _raw(image, where)
+    gray = _compressed(image, where, size) if image.is_compressed else _raw(image, where, size)
+    _check_size(where, (gray.shape[1], gray.shape[0]), size)
+    return gray
 
 
-def _compressed(image: ImageRecord, where: str) -> Gray:
+def _check_size(where: str, found: Size, wanted: Size | None) -> None:
+    if wanted is not None and found != wanted:
+        raise ImageError(
+            f"{where}: {found[0]} x {found[1]} pixels, but the intrinsics are for {wanted[0]} x {wanted[1]}"
+        )
+
+
+def _compressed(image: ImageRecord, where: str, wanted: Size | None) -> Gray:
     begins, claims = image.data[:8].hex(), image.encoding[:40]
     what = f"{where}: {len(image.data)} bytes that begin with {begins} and claim to be {claims!r}"
     size = stated_size(image.data)
     if size is None:
         raise ImageError(f"{what} are not a JPEG, PNG, WebP, TIFF or BMP file with a size")
-    if size[0] * size[1] > MOST_PIXELS:
-        raise ImageError(f"{where}: {size[0]} x {size[1]} pixels are more than the {MOST_PIXELS} that are decoded")
-    if image.data.startswith(PNG) and b"IEND" not in image.data:  # libpng would print a line for each
+    most = min(MOST_PIXELS, pixel_budget(len(image.data), bytes_a_pixel(image.data)))
+    if size[0] * size[1] > most:
+        raise ImageError(
+            f"{where}: {size[0]} x {size[1]} pixels are more than the {most} that are decoded of an image of "
+            f"{len(image.data)} bytes"
+        )
+    _check_size(where, size, wanted)
+    if image.data.startswith(PNG) and not is_whole_png(image.data):  # libpng would print a line for each
         raise ImageError(f"{where}: {len(image.data)} bytes of a PNG file that is cut short")
-    buffer = np.frombuffer(image.data, dtype=np.uint8)
+    if jpeg_scans(image.data) > SCANS:
+        raise ImageError(f"{where}: a JPEG of {jpeg_scans(image.data)} scans, more than the {SCANS} that are decoded")
+    buffer = np.frombuffer(with_pixels_only(image.data), dtype=np.uint8)
     # Intrinsics are for the pixels as recorded: ignore EXIF's orientation. Keep more than 8 bits until they are scaled.
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -63,13 +97,22 @@ def _compressed(image: ImageRecord, where: str) -> Gray:
 
 def _eight_bits(wide: NDArray[np.generic]) -> Gray:
     """Pixels scaled so that the brightest pixel is 255; negative and non-finite pixels become black."""
-    values = np.nan_to_num(wide.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-    brightest = float(values.max(initial=0.0))
-    gray: Gray = np.rint(np.maximum(values, 0.0) * (255.0 / brightest if brightest > 0.0 else 0.0)).astype(np.uint8)
+    rows = max(1, _PIECE // max(1, wide.shape[1]))
+    pieces = [wide[start : start + rows] for start in range(0, len(wide), rows)]
+    brightest = max((float(_finite(piece).max(initial=0.0)) for piece in pieces), default=0.0)
+    factor = np.float32(255.0 / brightest if brightest > 0.0 else 0.0)
+    gray: Gray = np.empty(wide.shape, dtype=np.uint8)
+    for i, piece in enumerate(pieces):
+        gray[i * rows : i * rows + rows] = np.rint(np.maximum(_finite(piece), 0.0) * factor)
     return gray
 
 
-def _raw(image: ImageRecord, where: str) -> Gray:
+def _finite(wide: NDArray[np.generic]) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):
+        return np.nan_to_num(wide.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _raw(image: ImageRecord, where: str, wanted: Size | None) -> Gray:
     width, height, step = image.width, image.height, image.step
     if width is None or height is None or step is None:
         raise ImageError(f"{where}: a raw image without width, height or step")
@@ -84,6 +127,7 @@ def _raw(image: ImageRecord, where: str) -> Gray:
         )
     if width * height > MOST_PIXELS:
         raise ImageError(f"{where}: {width} x {height} pixels are more than the {MOST_PIXELS} that are decoded")
+    _check_size(where, (width, height), wanted)
     rows = np.frombuffer(image.data, dtype=np.uint8, count=step * height).reshape(height, step)
     rows = np.ascontiguousarray(rows[:, : width * channels * size])
     if size == 2:

@@ -7,7 +7,7 @@ in a long log processes take over, which need a second or two to start.
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,9 +18,11 @@ import numpy as np
 from loky import ProcessPoolExecutor, cpu_count
 
 from gtsam_rwhec.errors import ImageError
+from gtsam_rwhec.files.budgets import PIXELS_TOGETHER
 from gtsam_rwhec.logs.records import ImageRecord
-from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.camera import MOST_PIXELS, Camera
 from gtsam_rwhec.vision.detection import Detector, ImageDetections
+from gtsam_rwhec.vision.image_sizes import stated_size
 from gtsam_rwhec.vision.images import Gray, decode_gray
 
 #: A batch has this number of images: enough to make their common refinement cheap, and few enough for the memory.
@@ -152,26 +154,29 @@ def _look(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> li
 def _decoded(image: ImageRecord, camera: Camera) -> Gray | str:
     """The pixels of an image, or the fault that it has."""
     try:
-        gray = decode_gray(image)
+        return decode_gray(image, (camera.width, camera.height))
     except ImageError as error:
         return str(error)
-    if gray.shape == (camera.height, camera.width):
-        return gray
-    return (
-        f"topic {image.topic}, image at {image.stamp_ns} ns: {gray.shape[1]} x {gray.shape[0]} pixels, but the "
-        f"intrinsics are for {camera.width} x {camera.height}"
-    )
 
 
 def _batches(images: Iterable[ImageRecord]) -> Iterator[list[ImageRecord]]:
-    """Batches of up to `BATCH` images of one topic."""
+    """Batches of up to `BATCH` images of one topic; fewer of large images, as their pixels are in memory together."""
     open_batches: dict[str, list[ImageRecord]] = {}
+    pixels: Counter[str] = Counter()
     for image in images:
         batch = open_batches.setdefault(image.topic, [])
         batch.append(image)
-        if len(batch) == BATCH:
+        pixels[image.topic] += _pixels(image)
+        if len(batch) == BATCH or pixels[image.topic] >= PIXELS_TOGETHER:
+            del pixels[image.topic]
             yield open_batches.pop(image.topic)
     yield from open_batches.values()
+
+
+def _pixels(image: ImageRecord) -> int:
+    """How many pixels an image states, and at most as many as are decoded."""
+    width, height = stated_size(image.data) or (0, 0) if image.is_compressed else (image.width or 0, image.height or 0)
+    return min(width * height, MOST_PIXELS)
 
 
 @contextmanager

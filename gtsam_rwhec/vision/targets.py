@@ -215,8 +215,12 @@ def is_same_print(first: str, second: str) -> bool:
 
     ArUco's larger dictionaries begin with the tags of its smaller dictionaries: their sizes do not matter.
     """
-    a, b = (re.sub(r"^(\dx\d)_\d+$", r"\1", _bare(word)) for word in (first, second))
-    return a == b
+    return print_of(first) == print_of(second)
+
+
+def print_of(family: str) -> str:
+    """What tags of a family look like, in one word: two families with one word share the tags of each id."""
+    return re.sub(r"^(\dx\d)_\d+$", r"\1", _bare(family))
 
 
 def family_named(word: str) -> str | None:

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from strategies import damaged, tables
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import ImageRecord, PoseRecord, open_log
@@ -58,6 +60,8 @@ def test_by_stamp(tmp_path: Path) -> None:
         (["a.png"], f"b {POSE}", "'b' is neither the name of an image nor a stamp"),
         (["a.png"], f"1700000000.5 {POSE}", "'a.png' is neither"),
         (["a.png"], f"a {POSE}\na {POSE}", "an image has two poses: a"),
+        (["a.png"], "\n" * 500_001, "has 500001 lines; at most 500000 are read"),
+        (["a.png"], f"a {POSE}" + " 1" * 5000, "line 1: longer than 10000 characters"),
         (["a.png"], f"a {POSE}\nb 1 2 3", "line 2: not a name or stamp"),
         (["a.png"], "x y\nx y\n", "line 2: not a name or stamp"),
         (["a.png"], "# comment\na 1 2 3 4 5 6 7", r"line 2: quaternion .* norm"),
@@ -68,3 +72,19 @@ def test_what_does_not_fit(tmp_path: Path, names: list[str], text: str, words: s
     with pytest.raises(LogError, match=words):
         written(tmp_path, names, text)
     assert not (tmp_path / "out.mcap").exists()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    content=(tables(8, f"a {POSE}", " ").map(lambda text: text.encode(errors="surrogatepass")))
+    | damaged([b"a 1 2 3 0 0 0.6 0.8\n"])
+)
+def test_any_table_gives_poses_or_an_error_of_ours(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+    here = tmp_path_factory.getbasetemp() / "any"
+    images = folder(here, []) and folder(here / "images", ["a.png"])
+    (here / "any.txt").write_bytes(content)
+    try:
+        write_image_folder(images, here / "any.txt", here / "out.mcap")
+    except LogError as error:
+        assert "any.txt" in str(error)  # noqa: PT017
+        assert len(str(error)) < 2000  # noqa: PT017

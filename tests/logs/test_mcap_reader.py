@@ -21,7 +21,7 @@ from mcap.writer import Writer as McapWriter
 from mcap_protobuf.writer import Writer as ProtobufWriter
 
 from gtsam_rwhec.errors import LogError, LogWarning, MessageError, RwhecError
-from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, PoseRecord, mcap_blocks, open_log
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, PoseRecord, open_log
 
 T0 = 1_700_000_000_000_000_000
 #: of POSE and TRANSFORM: about z, cos = 0.8^2 - 0.6^2
@@ -78,6 +78,14 @@ def test_ros2_poses_of_every_kind(tmp_path: Path) -> None:
     for record in (records[1], records[5]):
         np.testing.assert_allclose(record.covariance, expected, atol=1e-15)
     assert records[0].covariance is None
+
+
+@pytest.mark.parametrize("entry", [np.nan, np.inf, -1.0, 1.7e308])
+def test_a_covariance_that_no_pose_has_is_unknown(tmp_path: Path, entry: float) -> None:
+    covariance = np.diag([1.0, 4, 9, 0.01, 0.04, entry]).ravel().tolist()
+    message = {"header": header(T0), "pose": {"pose": POSE, "covariance": covariance}}
+    (record,) = read(ros2_log(tmp_path / "a.mcap", [("/a", "geometry_msgs/PoseWithCovarianceStamped", message, T0)]))
+    assert record.covariance is None
 
 
 def test_ros2_images_intrinsics_and_detections(tmp_path: Path) -> None:
@@ -333,7 +341,7 @@ def test_decompression_is_bounded(tmp_path: Path, compression: str) -> None:
     with open_log(path) as log:
         (block,) = log.files[0].blocks
     at = block.offset + 9 + 16  # the chunk's stated size follows its record's head and two stamps
-    for claim, words in ((1000, "1001 bytes after decompression"), (mcap_blocks.LARGEST_CHUNK + 1, "beyond the limit")):
+    for claim, words in ((1000, "1001 bytes after decompression"), (1 << 40, "beyond the limit")):
         path.write_bytes(content[:at] + struct.pack("<Q", claim) + content[at + 8 :])
         with pytest.warns(LogWarning, match=words):
             assert read(path) == []

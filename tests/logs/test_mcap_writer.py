@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import errno
+import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from log_files import POSE, header, ros2_log
 from mcap.reader import make_reader
 from rwhec_factors import se3
+from strategies import changed_trees, damaged
 
-from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs import DetectionRecord, IntrinsicsRecord, LogWriter, PairRecord, PoseRecord, open_log
+from gtsam_rwhec.errors import LogError, LogWarning
+from gtsam_rwhec.files.budgets import Spending
+from gtsam_rwhec.logs import (
+    DetectionRecord,
+    IntrinsicsRecord,
+    LogWriter,
+    PairRecord,
+    PoseRecord,
+    foxglove_schemas,
+    open_log,
+)
 
 T0 = 1_700_000_000_000_000_001
 T = se3.expmap(np.random.default_rng(0).normal(size=(4, 6)))
@@ -55,6 +69,49 @@ def test_detections_and_pairs_come_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.A, T[1])
     np.testing.assert_array_equal(back.B, T[2])
     assert (back.target, back.sensor, back.is_inlier, back.reason) == ("tag", "cam", False, "too fast")
+
+
+def test_a_pair_with_entries_that_cannot_be_squared_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "out.mcap"
+    huge = T[1].copy()
+    huge[:3, :3] *= 1e200
+    with LogWriter(path) as out:
+        out.pair(PairRecord(T0, T0, "/pairs", "tag", "cam", T[1], huge, is_inlier=True))
+    with pytest.warns(LogWarning, match="B is not a transform"):
+        assert read(path) == []
+
+
+@pytest.fixture(scope="module")
+def own_messages(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, bytes]]:
+    """Schema and JSON of a message of each kind that this library writes and reads."""
+    path = tmp_path_factory.mktemp("own") / "out.mcap"
+    corners, covariance = np.arange(8.0).reshape(4, 2), np.eye(6)
+    with LogWriter(path) as out:
+        out.transforms("/tf", T0, [("rig", "cam", T[0])])
+        out.poses("/poses", T0, "cam", T[2:])
+        out.detections(
+            "/tags", T0, "cam", [DetectionRecord(0, 0, "", "", "36h11", "7", corners, T[0], covariance, 0.1)]
+        )
+        out.pair(PairRecord(T0, T0, "/pairs", "tag", "cam", T[1], T[2], is_inlier=True, covariance=covariance))
+        out.calibration(
+            IntrinsicsRecord(T0, T0, "/i", "c", 640, 480, "", 500 * np.eye(3), np.zeros(5), np.eye(3), T[0, :3])
+        )
+        out.compressed_image("/image", T0, "cam", "png", b"abc")
+    with open(path, "rb") as stream:
+        return [(schema.name, message.data) for schema, _, message in make_reader(stream).iter_messages() if schema]
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data())
+def test_any_message_gives_records_or_a_sentence(own_messages: list[tuple[str, bytes]], data: st.DataObject) -> None:
+    schema, message = data.draw(st.sampled_from(own_messages))
+    content = data.draw(damaged([message]) | changed_trees(json.loads(message)).map(lambda t: json.dumps(t).encode()))
+    take = Spending(Path("a.mcap"), len(content)).take_parts
+    read_one = foxglove_schemas.decoder(
+        schema, partial(foxglove_schemas.parse_json, take=take), foxglove_schemas.JSON, take
+    )
+    (found,) = read_one("/topic", [content], [0])
+    assert all(record.topic == "/topic" for record in found) if not isinstance(found, str) else 0 < len(found) < 5000
 
 
 def test_calibrations_come_back(tmp_path: Path) -> None:

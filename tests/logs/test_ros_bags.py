@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import bz2
+import os
+import resource
+import sqlite3
+import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import open_log
@@ -19,10 +27,13 @@ T0 = 1_700_000_000_000_000_000
 NAME = "geometry_msgs/msg/PoseStamped"
 
 
-def bag_of_poses(path: Path, version: int) -> Path:
+def bag_of_poses(path: Path, version: int, compression: Any = None) -> Path:
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if version == 1 else typesys.Stores.ROS2_HUMBLE)
     types = store.types
-    with rosbag1.Writer(path) if version == 1 else rosbag2.Writer(path, version=9) as writer:
+    opened = rosbag1.Writer(path) if version == 1 else rosbag2.Writer(path, version=9)
+    if compression is not None:
+        opened.set_compression(*compression)
+    with opened as writer:
         connection = writer.add_connection("/pose", NAME, typestore=store)
         for i in range(10):
             stamp = types["builtin_interfaces/msg/Time"](sec=T0 // 10**9, nanosec=i)
@@ -72,7 +83,7 @@ def test_damaged_bags_give_messages_or_an_error_of_ours(tmp_path: Path, version:
     content = file.read_bytes()
     rng = np.random.default_rng(version)
     failed = 0
-    for _ in range(40):
+    for _ in range(8):
         damaged = bytearray(content)
         for at in rng.integers(len(content), size=4):
             damaged[at] = rng.integers(256)
@@ -81,4 +92,114 @@ def test_damaged_bags_give_messages_or_an_error_of_ours(tmp_path: Path, version:
             convert_ros_bag(bag, tmp_path / "out.mcap")
         except LogError:
             failed += 1
-    assert 0 < failed < 40
+    assert failed > 0
+    assert list(tmp_path.glob(".*")) == []
+
+
+def records(content: bytes) -> list[tuple[int, int, dict[bytes, bytes], bytes]]:
+    """Begin, end, header and data of each record of a ROS 1 bag."""
+    found, at = [], content.index(b"\n") + 1
+    while at < len(content):
+        begins, (length,) = at, struct.unpack_from("<I", content, at)
+        header, fields, at = content[at + 4 : at + 4 + length], {}, at + 4 + length
+        while header:
+            (size,) = struct.unpack_from("<I", header)
+            name, _, value = header[4 : 4 + size].partition(b"=")
+            fields[name], header = value, header[4 + size :]
+        (length,) = struct.unpack_from("<I", content, at)
+        found.append((begins, at + 4 + length, fields, content[at + 4 : at + 4 + length]))
+        at += 4 + length
+    return found
+
+
+def bz2_bomb(folder: Path) -> Path:
+    """A chunk of 80 kB becomes 2 GB."""
+    bag = bag_of_poses(folder / "in.bag", 1, (rosbag1.Writer.CompressionFormat.BZ2,))
+    content = bag.read_bytes()
+    begins, ends, header, data = next(record for record in records(content) if record[2][b"op"] == b"\x05")
+    more = bz2.compress(bytes(1 << 20)) * 2000
+    old = content[begins:ends]
+    new = old[: -len(data) - 4] + struct.pack("<I", len(data) + len(more)) + data + more
+    _, _, first, _ = records(content)[0]
+    moved = struct.pack("<Q", struct.unpack("<Q", first[b"index_pos"])[0] + len(more))
+    changed = content[:begins].replace(b"index_pos=" + first[b"index_pos"], b"index_pos=" + moved)
+    assert header[b"compression"] == b"bz2"
+    bag.write_bytes(changed + new + content[ends:])
+    return bag
+
+
+def zstd_bomb(folder: Path) -> Path:
+    """A message of 40 kB becomes 2 GB."""
+    mode, kind = rosbag2.CompressionMode.MESSAGE, rosbag2.CompressionFormat.ZSTD
+    bag = bag_of_poses(folder / "in", 2, (mode, kind))
+    with sqlite3.connect(next(bag.glob("*.db3"))) as database:
+        frame = zstandard.ZstdCompressor().compress(bytes(16 << 20))
+        database.execute("UPDATE messages SET data = ?", (frame * 128,))
+    database.close()
+    return bag
+
+
+def zstd_file_bomb(folder: Path) -> Path:
+    """A file of 400 kB becomes 20 GB."""
+    mode, kind = rosbag2.CompressionMode.FILE, rosbag2.CompressionFormat.ZSTD
+    bag = bag_of_poses(folder / "in", 2, (mode, kind))
+    frame = zstandard.ZstdCompressor().compress(bytes(16 << 20))
+    next(bag.glob("*.zstd")).write_bytes(frame * 1280)
+    return bag
+
+
+def odd_metadata(folder: Path) -> Path:
+    """A duration of text, which rosbags adds to a number."""
+    bag = bag_of_poses(folder / "in", 2)
+    metadata = bag / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("nanoseconds: 9", "nanoseconds: ten"))
+    return bag
+
+
+def odd_type(folder: Path) -> Path:
+    """A type whose name is no name of Python: rosbags makes code of types."""
+    bag = bag_of_poses(folder / "in.bag", 1)
+    bag.write_bytes(bag.read_bytes().replace(b"type=geometry_msgs/PoseStamped", b"type=0eometry_msgs/PoseStamped"))
+    return bag
+
+
+def pipe(folder: Path) -> Path:
+    os.mkfifo(folder / "in.bag")
+    return folder / "in.bag"
+
+
+BAD_BAGS: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "bz2": (bz2_bomb, "it takes more memory than a bag of its size may"),
+    "zstd message": (zstd_bomb, "a message yields more than"),
+    "zstd file": (zstd_file_bomb, "its chunks yield"),
+    "metadata": (odd_metadata, "cannot be read as a ROS bag"),
+    "type": (odd_type, "cannot be read as a ROS bag"),
+    "pipe": (pipe, "is not a file"),
+    "device": (lambda folder: Path("/dev/zero"), "is not a file"),
+    "missing": (lambda folder: folder / "none.bag", "No such file"),
+    "empty folder": (lambda folder: folder, "cannot be read as a ROS bag"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_BAGS)
+def test_a_bag_that_means_harm_is_refused(tmp_path: Path, kind: str) -> None:
+    make, words = BAD_BAGS[kind]
+    (tmp_path / "bags").mkdir()
+    bag = make(tmp_path / "bags")
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss  # of the children of every test before
+    with pytest.raises(LogError, match=words) as caught:
+        convert_ros_bag(bag, tmp_path / "out.mcap")
+    assert len(str(caught.value)) < 1000
+    assert [file.name for file in tmp_path.iterdir()] == ["bags"]
+    largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    assert largest < max(500_000, before + 1)  # kB
+
+
+def test_a_module_of_the_callers_folder_is_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = bag_of_poses(tmp_path / "in.bag", 1)
+    (tmp_path / "rosbags.py").write_text("open('imported', 'w')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend("")
+    assert convert_ros_bag("in.bag", "out.mcap") == len(range(10))
+    assert bag.exists()
+    assert not (tmp_path / "imported").exists()

@@ -38,6 +38,19 @@ def test_a_wrong_size_and_a_late_clock_come_out(tmp_path: Path) -> None:
     assert abs(calibrated.refined.time_offsets_s["cam_1"] - 0.04) < 2e-3
 
 
+def test_a_stated_size_that_the_motion_contradicts_is_no_success(tmp_path: Path) -> None:
+    """All tags are printed at half the size that the rig file states, so no measurement contradicts another."""
+    log = made.write(tmp_path / "raw.mcap", made.recording(6.0, true_size=dict.fromkeys(made.TAGS, 0.5)))
+    (tmp_path / "rig.yaml").write_text(made.rig_text(sizes="sizes: known"), encoding="utf-8")
+    command = [sys.executable, "-m", "gtsam_rwhec", "calibrate", log, "--rig", tmp_path / "rig.yaml"]
+    done = subprocess.run([*command, "-o", tmp_path / "out"], capture_output=True, text=True)
+    assert done.returncode == 6, done.stdout + done.stderr
+    said = " ".join(done.stdout.split())
+    assert said.startswith("Use these poses with care: the stated size of tag_0, tag_1, tag_2 does not fit the motion.")
+    assert "The stated size of tag_0 is 100.0" in said or "The stated size of tag_0 is 99." in said
+    assert json.loads((tmp_path / "out" / "result.json").read_bytes())["verdict"] == "care"
+
+
 def test_what_contradicts_is_named_with_its_exit_status_and_in_all_that_is_written(tmp_path: Path) -> None:
     log = made.write(tmp_path / "raw.mcap", made.recording(12.0, offsets_s={"cam_1": 0.3}))
     (tmp_path / "rig.yaml").write_text(made.rig_text(sizes="sizes: known"), encoding="utf-8")

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
+from counted_calls import counted_calls
 from rig_texts import FULL, MINIMAL
 
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.rig import parse_rig
+from gtsam_rwhec.rig.rig_file import MOST_FAULTS
 
 # What stands in place of what, the line that the message has, and its words.
 FAULTS = [
@@ -180,3 +184,29 @@ def test_all_faults_are_listed_by_line_and_counted() -> None:
     with pytest.raises(RigError) as caught:
         parse_rig("\n".join(f"key{i}: 1" for i in range(30)), "f")
     assert str(caught.value).split("\n")[20:] == ["and 13 more faults"]
+
+
+def refused(text: str) -> str:
+    with pytest.raises(RigError) as caught:
+        parse_rig(text, "f")
+    return str(caught.value)
+
+
+def tags(count: int) -> str:
+    lines = "".join(f"  t{i}: {{type: tag, family: tag36h11, id: {i % 100}, size_m: 0.1}}\n" for i in range(count))
+    return MINIMAL.rpartition("targets:")[0] + "targets:\n" + lines
+
+
+def unknown_keys(count: int) -> str:
+    return MINIMAL + "".join(f"extra{i}: 1\n" for i in range(count))
+
+
+@pytest.mark.parametrize(
+    ("text", "fault", "calls"),
+    [(tags, "tags 0 of tag36h11 also belong to target t0", 1800), (unknown_keys, "extra0: unknown key", 400)],
+)
+def test_thousands_of_faults_take_work_in_proportion(text: Callable[[int], str], fault: str, calls: int) -> None:
+    said, counted = counted_calls(lambda: refused(text(600)))
+    assert fault in said
+    assert len(said.split("\n")) == MOST_FAULTS + 1
+    assert counted < 600 * calls

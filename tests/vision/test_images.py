@@ -165,11 +165,13 @@ def jpeg_that_claims(width: int, height: int, before: bytes = b"") -> bytes:
     ("image", "words"),
     [
         (compressed(b""), "0 bytes"),
-        (compressed(encoded(GRAY, ".png")[:-40] + b"IEND", "png"), "OpenCV cannot decode them"),
+        (compressed(encoded(GRAY, ".png")[:-40] + b"IEND", "png"), "of a PNG file that is cut short"),
         (compressed(b"\xff\xd8"), "2 bytes that begin with ffd8 and claim to be 'jpeg'"),
         (compressed(b"not an image at all", "png"), "19 bytes that begin with 6e6f7420616e2069 and claim to be 'png'"),
         (compressed(encoded(GRAY, ".jpg")[:-60]), "OpenCV cannot decode them"),
         (compressed(encoded(GRAY, ".png")[:-40], "png"), "of a PNG file that is cut short"),
+        # a chunk that states 4 GB, which OpenCV would allocate
+        (compressed(encoded(GRAY, ".png")[:33] + b"\xf0\0\0\0IDATxIEND", "png"), "of a PNG file that is cut short"),
         (compressed(png_that_claims(60_000, 60_000), "png"), "60000 x 60000 pixels are more than"),
         (compressed(png_that_claims(0, 5), "png"), "OpenCV cannot decode them"),
         (compressed(jpeg_that_claims(60_000, 60_000)), "60000 x 60000 pixels are more than"),

@@ -1,0 +1,188 @@
+"""Budgets: the memory, the parts and the pixels that reading a file may cost, by the file's own size.
+
+Nothing that is read is trusted. A few bytes can state, or be opened to, many gigabytes; so every reader of logs and
+images asks here before it opens, decodes or counts. Each budget is a part that any file has, however small, plus a part
+that grows with the file. Together they keep a crafted file below 200 MB of memory beyond its own size, and a small one
+below two seconds.
+
+The figures of honest files were measured on 2026-11-22 (tests/logs/test_hostile_logs.py has logs of each kind):
+
+- Opened bytes for each byte of a log: poses 2 to 48, the shipped logs 1 to 2. Raw images that are black without a bit
+  of noise reach 2,200 to 4,300 (640 x 480, zstd, chunks of 768 KiB to 4 MiB); `OPENED` alone has room for 2,600.
+- Parts for each byte of a log: at most 5 (thirty frames that never move, JSON, zstd).
+- Pixels for each byte of an image: black JPEG 85, black PNG up to 1,025; images with noise 1 to 10.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gtsam_rwhec.errors import BudgetError
+
+MIB = 1 << 20
+
+#: Bytes. A chunk of a log yields at most this much when it is opened. Recorders write chunks of 1 to 4 MiB, and larger
+#: ones only for larger messages, such as a raw image of 19 megapixels in colour.
+CHUNK = 56 * MIB
+#: A chunk may yield this share of the file's size more: large files may have large chunks.
+CHUNK_SHARE = 0.25
+#: Bytes. Chunks that overlap in time are open together; they and what is decoded of them take at most this much.
+OPEN = 96 * MIB
+#: Chunks that are open together may take this share of the file's size more.
+OPEN_SHARE = 0.5
+#: Bytes. All chunks of a log yield at most this much, which takes less than a second to open.
+OPENED = 768 * MIB
+#: Opened bytes for each byte of the file: twenty times what poses reach. Only logs of nothing but black raw images
+#: reach more, and those have the room above.
+OPENED_FOR_A_BYTE = 1024
+#: Bytes. A message in JSON or protobuf has at most this much; decoding holds up to four copies of it.
+MESSAGE = 24 * MIB
+#: A message may have this share of the file's size more, as the bytes of real images are in the file itself.
+MESSAGE_SHARE = 0.25
+#: Parts of a log: records, messages, metadata entries, numbers and strings that are read one by one. Each takes one or
+#: two microseconds; what takes more or less counts by these shares.
+PARTS = 300_000
+#: Parts for each byte of the file. Poses that never move, in JSON, reach 5.
+PARTS_FOR_A_BYTE = 6
+#: A number, string or list of a CDR message that has to be walked over counts as this many parts.
+PARTS_OF_A_WALK = 2
+#: This many numbers, strings and lists in JSON count as one part.
+JSON_OF_A_PART = 4
+#: A pose in JSON or protobuf counts as this many parts, besides what its text counts.
+PARTS_OF_A_POSE = 3
+#: Parts of one message. A board of 100 x 100 squares has 20,000 numbers for its corners, and as many again in JSON.
+PARTS_OF_A_MESSAGE = 100_000
+#: Levels of messages or lists inside one another. ROS's and Foxglove's own have at most six.
+LEVELS = 16
+#: Bytes. One schema's definition is read only if it has at most this much; ROS's largest have 60 kB.
+SCHEMA = MIB // 2
+#: Bytes. The definitions that are read for a log have at most this much; a second's work. Robots have up to 1 MB.
+SCHEMAS_READ = 2 * MIB
+#: Bytes. All schemas of a log together, read or not.
+SCHEMAS = 16 * MIB
+#: Bytes. All channels of a log together; a thousand channels with their quality of service take 1 MB.
+CHANNELS = 2 * MIB
+#: Message types that the descriptors of one protobuf schema define; Foxglove's have at most ten.
+MESSAGE_TYPES = 1000
+#: Bytes of text with poses for a folder of images: half a million lines.
+POSES_TEXT = 64 * MIB
+
+#: Bytes. A chunk or a compressed message of a ROS bag yields at most this much, and `CHUNK_SHARE` of the bag's size
+#: more: `rosbags` and the conversion hold six copies of it.
+BAG_CHUNK = 24 * MIB
+#: Bytes of bz2 count as this many opened bytes: it opens more slowly than zstd and lz4.
+BZ2_BYTES = 8
+#: Bytes. The definitions of a ROS bag's messages have at most this much; `rosbags` takes 20 us to read one of them.
+BAG_DEFINITIONS = 96 * 1024
+#: Bytes of definitions for each byte of the bag, which has them uncompressed, and most often twice.
+BAG_DEFINITIONS_SHARE = 0.125
+#: Entries of a list of fixed length, unless they are numbers: `rosbags` makes code for each of them.
+FIXED_LIST = 1000
+#: Bytes of the metadata of a ROS 2 bag; `rosbags` takes 40 us to read one of them. Fifty topics have 30 kB.
+BAG_METADATA = 32 * 1024
+#: Bytes of metadata for each byte of the bag.
+BAG_METADATA_SHARE = 1 / 64
+
+#: Pixels that any compressed image may have, whatever its size in bytes.
+PIXELS = 1 << 24
+#: Pixels for each byte of a compressed image. Black JPEG reaches 85; black PNG of up to 22 megapixels fits as well.
+PIXELS_FOR_A_BYTE = 256
+#: Bytes that decoding a compressed image may take; each byte of the image allows `DECODED_FOR_A_BYTE` more.
+DECODED = 160_000_000
+DECODED_FOR_A_BYTE = 4
+#: Pixels of the images that one thread decodes before it looks for targets: 32 images of two megapixels.
+PIXELS_TOGETHER = 1 << 26
+#: Scans of a JPEG. Encoders write up to 12; each takes a pass over all pixels, and needs 20 bytes of the file.
+SCANS = 64
+
+
+@dataclass(frozen=True)
+class LogBudget:
+    """What a log of `size` bytes may cost."""
+
+    #: Bytes of the file, or of all files of a bag.
+    size: int
+
+    @property
+    def chunk(self) -> int:
+        """Bytes that one chunk may yield."""
+        return CHUNK + int(CHUNK_SHARE * self.size)
+
+    @property
+    def bag_chunk(self) -> int:
+        """Bytes that one chunk, or one compressed message, of a ROS bag may yield."""
+        return BAG_CHUNK + int(CHUNK_SHARE * self.size)
+
+    @property
+    def open(self) -> int:
+        """Bytes of chunks that are open together."""
+        return OPEN + int(OPEN_SHARE * self.size)
+
+    @property
+    def opened(self) -> int:
+        """Bytes that all chunks may yield in one pass over the log."""
+        return OPENED + OPENED_FOR_A_BYTE * self.size
+
+    @property
+    def message(self) -> int:
+        """Bytes of one message in JSON or protobuf."""
+        return MESSAGE + int(MESSAGE_SHARE * self.size)
+
+    @property
+    def parts(self) -> int:
+        """Parts that may be read in one pass over the log."""
+        return PARTS + PARTS_FOR_A_BYTE * self.size
+
+
+class Spending:
+    """What one pass over a log has cost, held against the log's budget.
+
+    Every method raises a BudgetError, which names the file, once the pass costs more than the budget has.
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        self.path = path
+        self.budget = LogBudget(size)
+        self._parts = self._opened = self._schemas = 0
+
+    def begin_pass(self) -> None:
+        """Count anew: the log is read once more. What its schemas cost is not counted anew, as they are kept."""
+        self._parts = self._opened = 0
+
+    def take_parts(self, count: int) -> None:
+        """Count parts that were read, or that are about to be read."""
+        self._parts += count
+        if self._parts > self.budget.parts:
+            raise BudgetError(
+                f"{self.path}: more than {self.budget.parts} messages, records, numbers and strings are in it, and a "
+                f"log of {self.budget.size} bytes may have no more. It is damaged, or made to exhaust who reads it."
+            )
+
+    def take_opened(self, count: int) -> None:
+        """Count bytes that a chunk yields, before it is opened."""
+        self._opened += count
+        self.check_opened(self._opened)
+
+    def check_opened(self, total: int) -> None:
+        """Refuse the bytes that all chunks together yield."""
+        if total > self.budget.opened:
+            raise BudgetError(
+                f"{self.path}: its chunks yield {total} bytes or more, and those of a log of {self.budget.size} bytes "
+                f"may yield {self.budget.opened}. It is damaged, or made to exhaust who reads it."
+            )
+
+    def take_schema(self, size: int) -> None:
+        """Count the bytes of a definition that is about to be read."""
+        self._schemas += size
+        if self._schemas > SCHEMAS_READ:
+            raise BudgetError(
+                f"{self.path}: the definitions of its messages have more than {SCHEMAS_READ} bytes. It is damaged, or "
+                "made to exhaust who reads it."
+            )
+
+
+def pixel_budget(size: int, bytes_a_pixel: int) -> int:
+    """Pixels that a compressed image of `size` bytes may have, if decoding takes so many bytes for each of them."""
+    by_memory = (DECODED + DECODED_FOR_A_BYTE * size) // bytes_a_pixel
+    return min(PIXELS + PIXELS_FOR_A_BYTE * size, by_memory)
