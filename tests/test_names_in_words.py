@@ -21,7 +21,7 @@ from gtsam_rwhec.logs.written_schemas import json_schema
 
 PAGES = [
     path
-    for pattern in ("README.md", "CONTRIBUTING.md", "docs/*.md", "factors/README.md")
+    for pattern in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "docs/*.md", "factors/README.md")
     for path in sorted(REPOSITORY.glob(pattern))
 ]
 SOURCES = [

@@ -19,8 +19,8 @@ from scs_relaxation import ScsResult, solve_by_scs
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.solver.options import Method
+from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import parts_of
-from gtsam_rwhec.solver.reduced_form import Forms
 
 COST = 8.2812454
 SCALE = 1.0254
@@ -71,7 +71,7 @@ def speed(repetitions: int) -> list[Row]:
     """Times of "auto" and "sdp" against SCS on the same relaxation."""
     problem = real_problem("known")
     (part,) = parts_of(problem)
-    Q = Forms.of(part).reduced.dense()
+    Q = PartForm.of(part).reduced.dense()
     few = max(1, repetitions // 5)
     timed(problem, "auto")  # warms up
     auto = [timed(problem, "auto") for _ in range(repetitions)]

@@ -194,6 +194,17 @@ def test_bad_input_of_the_robot_world_call():
             opencv.calibrateRobotWorldHandEye(about_z, poses[1], about_z, poses[3], method=method)
 
 
+@pytest.mark.parametrize("method", [[10**400] * 1000, [[[[]]]], "x" * 100_000, {1: 2}])
+def test_a_method_that_is_no_number_is_told_in_few_words(method):
+    deep = []
+    for _ in range(2000):
+        deep = [deep]
+    for each in (method, deep):
+        with pytest.raises(OptionError, match="is not one of CALIB_HAND_EYE_TSAI = 0") as caught:
+            opencv.calibrateHandEye(None, None, None, None, method=each)
+        assert len(str(caught.value)) < 1000
+
+
 def test_an_unknown_method_is_refused():
     with pytest.raises(OptionError, match="method=9 is not one of CALIB_HAND_EYE_TSAI = 0"):
         opencv.calibrateHandEye([], [], [], [], method=9)

@@ -19,6 +19,8 @@ from gtsam_rwhec.report import certificate_sentence, print_solution, sensor_tabl
 from gtsam_rwhec.report.pose_table import pooled_residual
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver import Cause
+from gtsam_rwhec.solver.certificate import Basis
+from gtsam_rwhec.solver.region import Region
 
 NOISE = Noise(sigma_m=0.005, kappa=6000.0)
 
@@ -113,6 +115,34 @@ def test_free_directions_are_printed_as_not_to_be_used() -> None:
     assert text.startswith("Do not use these poses: ")
     for direction in solution.identifiability.free_directions:
         assert f"  - Not determined: {direction}" in text
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.NotUniqueWarning")
+def test_a_bound_with_a_region_claims_no_more() -> None:
+    """The verdict comes first, and one short sentence says where the bound holds."""
+    solution = rw.solve(general(2, 2, seed=5, motion="planar", scale="shared", noise=NOISE).problem)
+    region = solution.certificate.region
+    assert region is not None
+    lines = printed(solution).splitlines()
+    assert lines[0].startswith("Do not use these poses: ")
+    (line,) = [line for line in lines if line.startswith("Certified, but not unique")]
+    assert f"no answer within {region.distance} can cost less" in line
+    assert line.endswith(
+        f"up to noise. The bound holds for translations within {region.distance} of the answer's, and for unknown "
+        f"scales within a factor of {region.factor}."
+    )
+
+
+def test_what_a_bound_is_not_about_is_said(demo_solution: rw.Solution) -> None:
+    whole = certificate_sentence(demo_solution.certificate)
+    assert "and no answer can cost less" in whole
+    of_moments = certificate_sentence(dataclasses.replace(demo_solution.certificate, basis=Basis.MOMENTS))
+    assert of_moments.startswith(whole)
+    assert of_moments.endswith(
+        " It is of the moments: the measurements were not kept, so the rounding of the sums is not in it."
+    )
+    region = certificate_sentence(dataclasses.replace(demo_solution.certificate, region=Region(300.0, 100.0)))
+    assert "no answer within 300 m can cost less" in region
 
 
 def test_a_gap_is_printed_with_its_reason(demo_solution: rw.Solution) -> None:

@@ -1,0 +1,39 @@
+"""What the fuzzing driver needs to know of a reader."""
+
+from __future__ import annotations
+
+import random
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+#: Changes one input. It gets the input, a source of chance, and libFuzzer's own change of bytes.
+Mutate = Callable[[bytes, random.Random, Callable[[bytes], bytes]], bytes]
+
+
+@dataclass(frozen=True)
+class Harness:
+    """One reader under attack.
+
+    Attributes
+    ----------
+    read : callable
+        Reads one input. Whatever leaves it but RwhecError is a finding.
+    seeds : callable
+        Valid inputs, made by code, from which the changes start.
+    mutate : callable or None
+        Changes that know the format, so that they get behind its first checks; None for changes of bytes alone.
+    limit_s : float
+        Seconds of the processor that one input may take.
+    """
+
+    read: Callable[[bytes], None]
+    seeds: Callable[[], Iterable[bytes]]
+    mutate: Mutate | None = None
+    limit_s: float = 10.0
+
+
+def scratch() -> Path:
+    """A new folder, which `run.py` puts into memory and deletes: files are written for every input."""
+    return Path(tempfile.mkdtemp(prefix="fuzz-"))

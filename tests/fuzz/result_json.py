@@ -1,0 +1,53 @@
+"""Result files, of this version and of the earlier ones."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+
+from harness import Harness, scratch
+from mutations import json_tree
+
+from gtsam_rwhec.refinement import refined, refining
+from gtsam_rwhec.results import result_file, verdict
+from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solving import certified_solution
+
+GOLDEN = Path(__file__).resolve().parents[1] / "golden"
+
+
+def read(data: bytes) -> None:
+    """The file, what it says in words, and the verdict on it."""
+    result = result_file.parse_result(data, "fuzzed.json")
+    str(result.solution.certificate)
+    for direction in result.solution.identifiability.free_directions:
+        str(direction)
+    verdict.judge(result.solution, result.refined, result.log)
+
+
+def seeds() -> Iterable[bytes]:
+    """Certified, with a free direction, with scales, and refined; and the files of earlier versions."""
+    folder = scratch()
+    noise = Noise(0.005, 6000.0)
+    problems = [
+        general(1, 1, seed=1, noise=noise, number_of_measurements=8).problem,
+        general(1, 1, seed=1, noise=noise, motion="planar", number_of_measurements=8).problem,
+        general(
+            2, 1, scale="per_target", seed=1, noise=noise, number_of_measurements=8, known_sizes=("target0",)
+        ).problem,
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for problem in problems:
+            solution = certified_solution.solve(problem)
+            result_file.write_solution(solution, folder / "a.json")
+            yield (folder / "a.json").read_bytes()
+        better: refined.Refined = refining.refine(problems[0], certified_solution.solve(problems[0]))
+    result_file.write_refined(better, folder / "b.json")
+    yield (folder / "b.json").read_bytes()
+    for version in (1, 2, 3):
+        yield (GOLDEN / f"result_version_{version}.json").read_bytes()
+
+
+HARNESS = Harness(read, seeds, json_tree)

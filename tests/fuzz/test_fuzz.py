@@ -1,0 +1,57 @@
+"""A short coverage-guided fuzzing of every reader, the same each time; `run.py` goes on for an hour, from any seed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("atheris", reason="atheris has no wheel for this Python or system: nothing was fuzzed")
+
+import run
+
+#: So many executions take about five seconds.
+EXECUTIONS = {
+    "csv": 12_000, "results": 2_000, "foxglove": 10_000, "rig": 1_500, "mcap": 1_000, "cdr": 10_000,
+    "intrinsics": 3_000, "protobuf": 30_000, "poses": 12_000, "images": 60_000,
+}  # fmt: skip
+PLANTED = """
+from harness import Harness
+from gtsam_rwhec.errors import FileFormatError
+
+def read(data):
+    if len(data) != 4:
+        raise FileFormatError("four bytes are expected")
+    if data[0] % 8 == 1:
+        {}["no such key"]
+    if data == b"loop":
+        while True:
+            pass
+    if data[0] % 8 == 3:
+        b"x" * (600 << 20)
+
+HARNESS = Harness(read, lambda: [b"loop", b"pine", b"too long"], limit_s=1.0)
+"""
+
+
+@pytest.mark.parametrize("reader", run.READERS)
+def test_only_our_errors_leave_a_reader(reader: str, tmp_path: Path) -> None:
+    most = EXECUTIONS[reader]
+    outcome = run.fuzz(reader, 120.0, tmp_path / "corpus", tmp_path / "findings", seed=1, most=most)
+    said = [(folder / "traceback.txt").read_text() for folder in outcome.findings.values()]
+    assert not outcome.findings, "\n".join([str(outcome), *said])
+    assert outcome.executions >= most
+    assert outcome.coverage > 50
+    assert outcome.peak_mb <= run.LIMIT_MB
+
+
+def test_errors_loops_and_memory_of_a_planted_reader_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "planted.py").write_text(PLANTED)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(run.HERE)}", prepend=":")
+    outcome = run.fuzz("planted", 8.0, tmp_path / "corpus", tmp_path / "findings", seed=1)
+    kinds = " ".join(outcome.findings)
+    for kind in ("KeyError at planted.py:9 read", "TooLongError at planted.py:1", "MemoryError: peak"):
+        assert kind in kinds
+    assert 0 < outcome.refused < outcome.executions
+    inputs = {(folder / "input.bin").read_bytes()[0] % 8 for folder in outcome.findings.values()}
+    assert inputs == {1, b"l"[0] % 8, 3}
