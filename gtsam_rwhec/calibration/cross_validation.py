@@ -26,6 +26,7 @@ from gtsam_rwhec.errors import (
 )
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_one_of, is_whole
 from gtsam_rwhec.problem.measurements import Measurements
@@ -72,6 +73,7 @@ class CrossValidation:
     notes: tuple[str, ...]
 
 
+@one_blas_thread()
 def cross_validate(
     problem: Problem,
     folds: int = 5,

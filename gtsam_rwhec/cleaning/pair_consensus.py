@@ -14,6 +14,7 @@ import numpy as np
 
 from gtsam_rwhec.cleaning.removed import Kept, RemovalReason
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.rotations import project
 
@@ -72,6 +73,7 @@ class Consensus:
     scale: float
 
 
+@one_blas_thread()
 def find_consensus(A: Array, B: Array, stamps_ns: np.ndarray, options: ConsensusOptions | None = None) -> Consensus:
     """Keep the measurements of a pair that agree on one hypothesis.
 

@@ -26,6 +26,7 @@ from gtsam_rwhec.compat.robot_world import li, shah
 from gtsam_rwhec.compat.stations import Stations, stations_of
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 
 CALIB_HAND_EYE_TSAI = 0
@@ -59,6 +60,7 @@ _ROBOT_WORLD: dict[int, Callable[[Array, Array, Array, Array], tuple[Array, Arra
 }
 
 
+@one_blas_thread()
 def calibrateHandEye(
     R_gripper2base: Any,
     t_gripper2base: Any,
@@ -111,6 +113,7 @@ def calibrateHandEye(
     return _into(R_cam2gripper, R), _into(t_cam2gripper, t[:, None])
 
 
+@one_blas_thread()
 def calibrateRobotWorldHandEye(
     R_world2cam: Any,
     t_world2cam: Any,

@@ -136,7 +136,7 @@ def by_resultant(of: Curve) -> float:
         "'dqoptpoly_resultant' finds no change of the resultant's sign: two roots are too close for double precision; "
         "its answer is the relaxation's: use method='dqopt'",
         NotConvergedWarning,
-        stacklevel=5,
+        stacklevel=6,
     )
     return 1.0  # eq. 22's bound
 

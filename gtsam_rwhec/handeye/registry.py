@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import OptionError, PriorError
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PosesLike, QuaternionOrder, to_pose3
 from gtsam_rwhec.geometry.real_numbers import is_one_of
 from gtsam_rwhec.handeye.alpha import estimate_alpha
@@ -105,6 +106,7 @@ ROUNDING = 1e-12
 NOTHING = 1e-28
 
 
+@one_blas_thread()
 def solve(
     C: PosesLike,
     H: PosesLike,

@@ -13,6 +13,7 @@ import numpy as np
 from gtsam_rwhec.errors import OptionError, RwhecError
 from gtsam_rwhec.files.progress import Progress, check_progress
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.methods import certified
 from gtsam_rwhec.methods.applicability import check_problem, refusal
 from gtsam_rwhec.methods.estimate import Estimate
@@ -84,6 +85,7 @@ class Comparison:
         return gap is not None and self.certificate is not None and gap <= self.certificate.tolerance
 
 
+@one_blas_thread()
 def compare(
     problem: Problem,
     options: MethodOptions | None = None,

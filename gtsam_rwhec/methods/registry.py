@@ -8,6 +8,7 @@ import gtsam
 
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import PoseLike, one_transform
 from gtsam_rwhec.methods import (
     certified,
@@ -59,6 +60,7 @@ METHODS: dict[str, Method[[Problem, MethodOptions]]] = {
 }
 
 
+@one_blas_thread()
 def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Estimate[dict[str, gtsam.Pose3]]:
     """Solve a problem by a published method.
 

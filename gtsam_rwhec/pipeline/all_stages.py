@@ -8,6 +8,7 @@ from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export import export_all
 from gtsam_rwhec.export.files import FILES
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.changed_rig import changes
@@ -35,6 +36,7 @@ from gtsam_rwhec.rig import Rig
 OUTPUTS = (CLEAN_LOG, RESULT_FILE, *FILES, PLOTS_FOLDER)
 
 
+@one_blas_thread()
 def calibrate_log(
     log_path: str | Path | list[str | Path],
     rig: Rig | None,
@@ -133,6 +135,7 @@ def solve_into(
     return calibrated
 
 
+@one_blas_thread()
 def export_solved(solved_path: str | Path, out: str | Path, *, progress: Progress | None = None) -> list[Path]:
     """Write the files for other programs, and plots, from a solved log into a folder; return their paths.
 

@@ -18,6 +18,7 @@ from gtsam_rwhec.cleaning import (
 )
 from gtsam_rwhec.errors import LogError, StampError
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
@@ -36,6 +37,7 @@ from gtsam_rwhec.trajectories.trajectory import Trajectory
 SPEED_STEP_NS = 20_000_000
 
 
+@one_blas_thread()
 def clean_log(
     detected_path: str | Path,
     out_path: str | Path,

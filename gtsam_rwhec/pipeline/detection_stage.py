@@ -9,6 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
@@ -25,6 +26,7 @@ from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 
 
+@one_blas_thread()
 def detect_log(
     log_path: str | Path | list[str | Path],
     rig: Rig,

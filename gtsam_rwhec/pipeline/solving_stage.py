@@ -8,6 +8,7 @@ from pathlib import Path
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
@@ -58,6 +59,7 @@ class Calibrated(Solved):
     refined: Refined
 
 
+@one_blas_thread()
 def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progress | None = None) -> Calibrated:
     """Calibrate from a cleaned log.
 

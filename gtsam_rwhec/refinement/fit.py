@@ -97,13 +97,13 @@ def fit(
                 else "Join groups (noise_groups='sensor' or 'all'), or give sigma and kappa (noise='given')"
             ),
             NotConvergedWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     if optimum.iterations >= options.max_iterations:
         warnings.warn(
             f"GTSAM stopped after {optimum.iterations} iterations without converging; raise "
             "RefineOptions.max_iterations",
             NotConvergedWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     return SettledFit(graph, optimum, information, factors, degrees_of_freedom, iterations)

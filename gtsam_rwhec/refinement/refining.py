@@ -18,6 +18,7 @@ from gtsam_rwhec.errors import (
     WeightsWarning,
 )
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -45,6 +46,7 @@ from gtsam_rwhec.trajectories.local_paths import WINDOW_S
 MAX_CHOICES = 10
 
 
+@one_blas_thread()
 def refine(
     problem: Problem,
     solution: Solution,
@@ -137,7 +139,7 @@ def refine(
             "the measurements leave directions free, along which variances are infinite: "
             + "; ".join(map(str, space.directions)),
             NotUniqueWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
     if not estimates:
         _warn_of_weights(problem, variables, settled, options)
@@ -183,7 +185,7 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit
             f"({cost / ratio:.4g}): standard deviations are too small by about {math.sqrt(ratio):.2g}; "
             "take noise='estimate', robust='gnc' if some measurements are wrong, or carrier_noise if A is not exact",
             WeightsWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
@@ -197,7 +199,7 @@ def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> 
                 f"{what} is {offset_s:.3g} s, but the carriers' motion is known only within {WINDOW_S:g} s of each "
                 "stamp; shift the stamps first (cleaning.coarse_time_offset finds the shift)",
                 NotConvergedWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         elif part * offset_s > 0.5 * math.sqrt(joint.covariance_of(joint.selector((unknown,)))[0, 0]):
             warnings.warn(
@@ -205,7 +207,7 @@ def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> 
                 f"by about {1e3 * part * offset_s:.2g} ms. This is more than half of its standard deviation; move "
                 "faster, or log poses more often",
                 WeightsWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import NotCertifiedWarning, NotUniqueWarning, OptionError, ScaleError, WeightsWarning
 from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import to_pose3
 from gtsam_rwhec.identifiability.verdicts import Identifiability
 from gtsam_rwhec.problem.pairs import Pair
@@ -85,7 +86,7 @@ def solve(
                 "initial is (X, Y, scale): poses of targets and of sensors by name, and a scale (1.0 if known)"
             )
         check_against_knowledge(problem, *initial)
-    with np.errstate(all="ignore"):
+    with one_blas_thread(), np.errstate(all="ignore"):
         results = [_solved(part, method, initial, options, progress) for part in parts_of(problem)]
     return _merge(problem, results)
 
@@ -109,6 +110,7 @@ def _solved(
     return PartSolution.of(search, found)
 
 
+@one_blas_thread()
 @np.errstate(all="ignore")
 def certify(
     problem: Problem,
