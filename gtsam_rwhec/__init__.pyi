@@ -25,6 +25,17 @@ from .solving import SolvedPart as SolvedPart
 from .solving import certify as certify
 from .solving import solve as solve
 
+# All of it in one call: outliers, noise, a verdict, and how far off a point is.
+from .calibration import CalibrateOptions as CalibrateOptions
+from .calibration import Calibration as Calibration
+from .calibration import Choice as Choice
+from .calibration import Finding as Finding
+from .calibration import Ground as Ground
+from .calibration import Judgement as Judgement
+from .calibration import PointUncertainty as PointUncertainty
+from .calibration import Verdict as Verdict
+from .calibration import calibrate as calibrate
+
 # Refine it: covariances, outliers, time offsets; and predict measurements that it has not seen.
 from .calibration import CrossValidation as CrossValidation
 from .calibration import cross_validate as cross_validate
@@ -38,9 +49,6 @@ from .refinement import refine as refine
 # Keep it in files, print it, draw it.
 from . import report as report
 from . import results as results
-from .results import Ground as Ground
-from .results import Judgement as Judgement
-from .results import Verdict as Verdict
 from .results import judge as judge
 from .results import read_refined as read_refined
 from .results import read_solution as read_solution

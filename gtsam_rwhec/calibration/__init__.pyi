@@ -1,2 +1,13 @@
+from .calibrated import Calibration as Calibration
+from .calibrated import NoiseFound as NoiseFound
+from .calibrated import Outliers as Outliers
+from .calibrating import calibrate as calibrate
+from .choices import Choice as Choice
 from .cross_validation import CrossValidation as CrossValidation
 from .cross_validation import cross_validate as cross_validate
+from .options import CalibrateOptions as CalibrateOptions
+from .task_units import PointUncertainty as PointUncertainty
+from .verdict import Finding as Finding
+from .verdict import Ground as Ground
+from .verdict import Judgement as Judgement
+from .verdict import Verdict as Verdict

@@ -11,7 +11,7 @@ class ExitStatus(IntEnum):
     """Exit statuses of every subcommand."""
 
     DONE = CERTIFIED = 0
-    """The command succeeded; a calibration is certified, and the measurements determine it."""
+    """The command succeeded; the poses of a calibration may be used, with care or without."""
     BAD_INPUT = 2
     """An option, a file or a measurement cannot be used; the message says which."""
     NOT_UNIQUE = 3
@@ -21,26 +21,28 @@ class ExitStatus(IntEnum):
     DOWNLOAD_FAILED = 5
     """No network, or not the expected files; complete files stay."""
     CONTRADICTED = 6
-    """Most measurements of a sensor or target are outliers, or the motion contradicts a stated size that was used."""
+    """The measurements contradict the answer: they were misread, a stated size is wrong, most measurements of a frame
+    are outliers, or a sensor has no measurement that agrees."""
     INTERRUPTED = 130
     """Ctrl-C."""
 
 
 HELP = (
-    "Exit status: 0 success, and certified; 2 bad input; 3 certified, but the measurements do not determine every "
-    "frame; 4 not certified; 5 download failed; 6 most measurements of a frame are outliers, or a stated size is "
-    "wrong; 130 interrupted."
+    "Exit status: 0 success, and the poses may be used; 2 bad input; 3 the measurements do not determine every frame; "
+    "4 not proven optimal; 5 download failed; 6 the measurements contradict the answer (misread, a wrong size, a "
+    "sensor without an answer); 130 interrupted."
 )
 
 
 def exit_status(judgement: rw.Judgement) -> ExitStatus:
-    """The exit status for the most serious ground of a judgement; 0 only without any ground."""
+    """0 if the poses may be used, with care or without; else the status of the most serious ground."""
+    if judgement.verdict is not rw.Verdict.DO_NOT_USE:
+        return ExitStatus.CERTIFIED
     ground = rw.Ground
     status = {
         ground.NO_BOUND: ExitStatus.NOT_CERTIFIED,
         ground.NOT_CERTIFIED: ExitStatus.NOT_CERTIFIED,
         ground.NOT_UNIQUE: ExitStatus.NOT_UNIQUE,
-        ground.CONTRADICTED: ExitStatus.CONTRADICTED,
-        ground.SIZE_DOUBTED: ExitStatus.CONTRADICTED,
+        ground.NO_COVARIANCE: ExitStatus.NOT_UNIQUE,
     }
-    return status[judgement.grounds[0]] if judgement.grounds else ExitStatus.CERTIFIED
+    return status.get(judgement.grounds[0], ExitStatus.CONTRADICTED)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.pipeline.solving_stage import Solved
-from gtsam_rwhec.results.verdict import Verdict, judge
+from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.rig import RigFrames
 
 

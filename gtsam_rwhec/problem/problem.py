@@ -30,13 +30,30 @@ class Problem(Knowledge):
     scale : "known", "shared" or "per_target"
         Lengths in B are true, or true times one unknown factor, or true times one unknown factor per target (t_B =
         scale * true length). With "per_target", ``fix_scale`` names targets of known size.
+    sensor_carrier, target_carrier : str, optional
+        Your names for the two things that carry the sensors and the targets, such as "hand" and "base": reports and
+        ``Calibration.uncertainty_at`` use them.
     keep_measurements : bool
         Whether raw measurements are kept beside the moments. Refinement with covariances, time offsets or outliers
         needs them; the certified solution does not. Without them memory does not grow with their number.
     """
 
-    def __init__(self, scale: ScaleMode = "known", *, keep_measurements: bool = True) -> None:
+    def __init__(
+        self,
+        scale: ScaleMode = "known",
+        *,
+        keep_measurements: bool = True,
+        sensor_carrier: str | None = None,
+        target_carrier: str | None = None,
+    ) -> None:
         super().__init__(scale)
+        for name, what in ((sensor_carrier, "sensor_carrier"), (target_carrier, "target_carrier")):
+            if name is not None:
+                check_name(name, what)
+        if sensor_carrier is not None and sensor_carrier == target_carrier:
+            raise FrameError(f"both carriers are named {brief(sensor_carrier)}; give each its own name")
+        self.sensor_carrier = sensor_carrier
+        self.target_carrier = target_carrier
         self.keep_measurements = keep_measurements
         self.is_relative = False
         self._kind: dict[str, Literal["target", "sensor"]] = {}
@@ -272,6 +289,8 @@ class Problem(Knowledge):
         merged = copy.copy(self)
         merged.keep_measurements = self.keep_measurements and other.keep_measurements
         merged.is_relative = self.is_relative or other.is_relative
+        merged.sensor_carrier = self.sensor_carrier or other.sensor_carrier
+        merged.target_carrier = self.target_carrier or other.target_carrier
         merged._take_knowledge(self)
         merged._kind = dict(self._kind)
         merged._kept = dict(self._kept)

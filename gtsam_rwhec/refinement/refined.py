@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal
@@ -22,6 +23,9 @@ from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.solving.solution import Solution
+
+#: A function that a free direction moves by no more than this, in units, is not moved: the rest is rounding.
+NOT_MOVED = 1e-9
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,29 @@ class RefinedPoses:
         for unknown, (first, end) in zip(asked, pairwise(np.cumsum([0, *(u.dimension for u in asked)])), strict=True):
             if unknown in self.joint.slots:
                 covariance[first:end, first:end] += self.joint.turned(unknown)
+        return covariance
+
+    def covariance_of(self, jacobians: Mapping[str | Unknown, Array]) -> Array:
+        """The covariance (m, m) of a function of frames, scales and time offsets, to first order.
+
+        Parameters
+        ----------
+        jacobians : dict of str or Unknown to (m, d) array
+            The function's derivative by each unknown that it depends on: by the right perturbation of a frame (d = 6),
+            by a scale or a time offset (d = 1). Fixed frames add nothing.
+
+        Raises
+        ------
+        FrameError
+            If the problem has no such name.
+        """
+        named = {Unknown.of(name): J for name, J in jacobians.items()}
+        G = np.sum([J @ self._rows_of(unknown) for unknown, J in named.items()], axis=0)
+        covariance = self.joint.covariance_of(G)
+        if np.abs(self.joint.reach(G)).max(initial=0.0) > NOT_MOVED:
+            for unknown, J in named.items():
+                if unknown in self.joint.slots:
+                    covariance += J @ self.joint.turned(unknown) @ J.T
         return covariance
 
     @property

@@ -20,8 +20,8 @@ from gtsam_rwhec.report.log_report import print_log
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, RESIDUAL_LEGEND, FrameTable, pose_cells, residual_table
 from gtsam_rwhec.report.printing import print_heading, print_sentence, print_tables, print_verdict, report_console
 from gtsam_rwhec.report.solution_report import print_solution_details
+from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.results.log_history import LogFields
-from gtsam_rwhec.results.verdict import judge
 
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
 #: The carrier that has the noise of A.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.report.advice import print_advice
 from gtsam_rwhec.report.pair_grid import PairGrid
 from gtsam_rwhec.report.pose_table import POSE_LEGEND, sensor_table, target_table
@@ -22,7 +23,7 @@ from gtsam_rwhec.report.sentences import (
     time_sentence,
     weights_sentence,
 )
-from gtsam_rwhec.results.verdict import Verdict, judge
+from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.solving.solution import Solution
 
 

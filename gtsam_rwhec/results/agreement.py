@@ -13,18 +13,21 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
+from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
 from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.results.json_tree import POSED
 from gtsam_rwhec.results.log_history import LogFields, contradictions
 from gtsam_rwhec.results.schema import RefinedFields, SolutionFields
-from gtsam_rwhec.results.verdict import Ground, Judgement, Verdict
 from gtsam_rwhec.solver.cause import Cause, Status
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solving.solution import Solution
 
 #: Largest share by which sums of the same doubles in another order may differ.
 ROUNDING = 1e-9
+#: Up to this version these grounds asked for care alone; after it, such poses are not to be used.
+LAST_WITH_CARE = 4
+ONCE_CARE = {Ground.NOT_CERTIFIED, Ground.SIZE_DOUBTED}
 
 
 def check_top(tree: Mapping[str, Any]) -> None:
@@ -135,11 +138,17 @@ def check_scale(answer: Solution | RefinedPoses, place: str) -> None:
         raise ValueError(f"{place}: must be 1.0 with scale_mode 'known' (found {answer.scale})")
 
 
-def check_verdict(stated: Verdict, grounds: tuple[Ground, ...], found: Judgement) -> None:
-    """The verdict of a file, and its grounds, are what its facts lead to."""
-    if stated is not found.verdict:
+def check_verdict(stated: Verdict, grounds: tuple[Ground, ...], found: Judgement, version: int) -> None:
+    """The verdict of a file, and its grounds, are what its facts lead to.
+
+    Up to version 4 an answer that was not proven, and a doubted size, asked for care.
+    """
+    led_to = found.verdict
+    if version <= LAST_WITH_CARE and found.grounds and set(found.grounds) <= ONCE_CARE:
+        led_to = Verdict.CARE
+    if stated is not led_to:
         raise ValueError(
-            f"$.verdict: the file says '{stated}', but its content leads to '{found.verdict}'; write it again"
+            f"$.verdict: the file says '{stated.value}', but its content leads to '{led_to.value}'; write it again"
         )
     if grounds != found.grounds:
         names = [", ".join(each) or "none" for each in (grounds, found.grounds)]

@@ -5,12 +5,12 @@ The logs that stages write hold these records, and so does the result file.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable
 from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from gtsam_rwhec.calibration.disagreement import contradicted_frames
 from gtsam_rwhec.problem.pairs import Pair
 
 #: Standard deviations by which a stated size must differ from the measured size before it is doubted.
@@ -70,11 +70,6 @@ class FrameOutliers(_Record):
 
     def __str__(self) -> str:
         return f"{self.left_out} of {self.measurements} measurements of {self.frame} contradict the answer"
-
-    @property
-    def is_majority(self) -> bool:
-        """Whether more than half of the measurements are outliers."""
-        return 2 * self.left_out > self.measurements
 
 
 class DetectionReport(_Record):
@@ -154,32 +149,6 @@ class LogFields(_Record):
 
 
 def contradictions(outliers: Iterable[OutlierCount]) -> tuple[FrameOutliers, ...]:
-    """The sensors and targets of which more than half of the measurements were left out as outliers.
-
-    Then the answer is as likely to be wrong as the outliers are: a clock, a size or a mounting may have changed. The
-    frame with most outliers comes first. Its outliers then count for no other frame: the targets are not to blame for
-    a camera that contradicts all of them.
-    """
-    rest = outliers = tuple(outliers)
-    everything = _by_frame(outliers)
-    names: list[str] = []
-    while majorities := [counts for counts in _by_frame(rest).values() if counts.is_majority]:
-        names.append(max(majorities, key=lambda counts: counts.left_out).frame)
-        rest = tuple(count for count in rest if names[-1] not in count.pair)
-    # A frame that was seen only together with contradicted frames rests on them.
-    known = {*names, *_by_frame(rest)}
-    names += [name for name, counts in everything.items() if name not in known and counts.is_majority]
-    return tuple(everything[name] for name in names)
-
-
-def _by_frame(outliers: Iterable[OutlierCount]) -> dict[str, FrameOutliers]:
-    """The counts of each sensor and target, over all its pairs."""
-    left_out, measurements = Counter[str](), Counter[str]()
-    for count in outliers:
-        for name in count.pair:
-            left_out[name] += count.left_out
-            measurements[name] += count.left_out + count.used
-    return {
-        name: FrameOutliers(frame=name, left_out=left_out[name], measurements=number)
-        for name, number in measurements.items()
-    }
+    """The sensors and targets of which more than half of the measurements were left out as outliers."""
+    counts = {count.pair: (count.used, count.used + count.left_out) for count in outliers}
+    return tuple(FrameOutliers(**vars(frame)) for frame in contradicted_frames(counts))

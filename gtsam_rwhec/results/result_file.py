@@ -34,6 +34,7 @@ from gtsam_rwhec.results.covariance_agreement import check_frames, check_joint
 from gtsam_rwhec.results.earlier_versions import FIRST_VERSION, FIRST_WITH_VERDICT, as_version_4
 from gtsam_rwhec.results.json_text import MOST_BYTES, parse_json
 from gtsam_rwhec.results.json_tree import POSED, from_json, in_words, to_json
+from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.schema import (
     CONVENTIONS,
@@ -46,7 +47,6 @@ from gtsam_rwhec.results.schema import (
     ResultFile,
     pose_rows,
 )
-from gtsam_rwhec.results.verdict import judge
 from gtsam_rwhec.solving.solution import Solution
 
 
@@ -187,7 +187,7 @@ def parse_result(content: bytes, path: str | Path) -> Result:
         result = _result_of(file)
         if number >= FIRST_WITH_VERDICT:
             found = judge(result.solution, result.refined, result.log)
-            check_verdict(file.verdict, file.verdict_grounds, found)
+            check_verdict(file.verdict, file.verdict_grounds, found, number)
     except ValueError as error:
         of_version = (
             "" if number == FORMAT_VERSION else f" of version {number} (converted places are those of {FORMAT_VERSION})"
@@ -224,7 +224,7 @@ def _content(path: str | Path, solution: Solution, refined: Refined | None, log:
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
             "written_by": f"gtsam-rwhec {version('gtsam-rwhec')}",
-            "verdict": judgement.verdict,
+            "verdict": judgement.verdict.value,
             "verdict_reason": judgement.reason,
             "verdict_grounds": judgement.grounds,
             **poses,

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.verdict import Ground, Verdict
+from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.results.log_history import FrameOutliers, LogFields, SizeFields
 from gtsam_rwhec.results.result_file import Result, read_result
-from gtsam_rwhec.results.verdict import Ground, Verdict, judge
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 CONTRADICTED = FrameOutliers(frame="cam_side", left_out=20, measurements=23)
@@ -37,7 +38,7 @@ def test_a_good_calibration_is_to_be_used(result: Result) -> None:
 @pytest.mark.parametrize(
     ("status", "verdict", "ground"),
     [
-        (rw.Status.GAP, Verdict.CARE, Ground.NOT_CERTIFIED),
+        (rw.Status.GAP, Verdict.DO_NOT_USE, Ground.NOT_CERTIFIED),
         (rw.Status.FAILED, Verdict.DO_NOT_USE, Ground.NO_BOUND),
         (rw.Status.CERTIFIED_NOT_UNIQUE, Verdict.DO_NOT_USE, Ground.NOT_UNIQUE),
     ],
@@ -68,8 +69,10 @@ def test_contradicted_frames_are_not_to_be_used(result: Result) -> None:
     assert "20 of 23 measurements of cam_side contradict the answer" in judgement.reason
 
 
-@pytest.mark.parametrize(("is_free", "verdict"), [(False, Verdict.CARE), (True, Verdict.USE)])
-def test_a_doubted_size_asks_for_care_unless_it_was_estimated(result: Result, is_free: bool, verdict: Verdict) -> None:
+@pytest.mark.parametrize(("is_free", "verdict"), [(False, Verdict.DO_NOT_USE), (True, Verdict.USE)])
+def test_a_doubted_size_is_not_to_be_used_unless_it_was_estimated(
+    result: Result, is_free: bool, verdict: Verdict
+) -> None:
     size = SizeFields(target="tag_7", stated_m=0.1, scale=1.02, sigma=0.001, is_free=is_free)
     assert judge(result.solution, result.refined, changed(result.log, sizes=(size,))).verdict is verdict
 

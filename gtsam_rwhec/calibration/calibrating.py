@@ -1,0 +1,357 @@
+"""``calibrate``: one call from a problem to the best answer that its measurements hold, with a verdict.
+
+It solves, leaves outliers out, certifies what is kept, refines with the noise that the residuals show, and judges. Each
+step that cannot be taken is a choice that says so; only input that cannot be used raises an error.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from gtsam_rwhec.calibration.calibrated import (
+    REFINEMENT,
+    Calibration,
+    Carriers,
+    NoiseFound,
+    Outliers,
+    SensorView,
+)
+from gtsam_rwhec.calibration.choices import Choice
+from gtsam_rwhec.calibration.disagreement import contradicted_frames
+from gtsam_rwhec.calibration.options import CalibrateOptions
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
+from gtsam_rwhec.errors import (
+    CountError,
+    NoiseError,
+    NotCertifiedWarning,
+    NotUniqueWarning,
+    OptionError,
+    OutlierError,
+    OutliersWarning,
+    RwhecWarning,
+    UnderdeterminedError,
+    WeightsWarning,
+)
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.refinement.graduated import graduated
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.solving.certified_solution import solve
+from gtsam_rwhec.solving.solution import Solution
+
+#: Without at least so many equations more than unknowns no measurement can be left out: each one has six.
+SPARE_EQUATIONS = 6
+#: The verdict says better what these warn of.
+SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, OutliersWarning)
+
+Inliers = dict[Pair, np.ndarray]
+
+
+def calibrate(
+    problem: Problem, options: CalibrateOptions | None = None, *, progress: Progress | None = None
+) -> Calibration:
+    """Find the best answer that the measurements hold, with an uncertainty and a verdict.
+
+    Parameters
+    ----------
+    problem : Problem
+        With its raw measurements: without them, outliers are not looked for.
+    options : CalibrateOptions, optional
+        Each overrules one choice that is otherwise made from the data.
+    progress : callable, optional
+        Is called with the name of each stage as it begins.
+
+    Returns
+    -------
+    Calibration
+        Always with a verdict: ``Verdict.DO_NOT_USE`` where the measurements do not determine the poses, or contradict
+        them. ``choices`` has every choice with its evidence, also those that could not be made.
+
+    Raises
+    ------
+    RwhecError
+        The input cannot be used: there are fewer equations than unknowns, options contradict the problem, a sensor's
+        name is unknown.
+    """
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    options = CalibrateOptions() if options is None else options
+    if not isinstance(options, CalibrateOptions):
+        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.CalibrateOptions")
+    check_progress(progress)
+    problem.require_pairs()
+    if options.noise == "given" and problem.is_relative:
+        raise OptionError(
+            "noise='given', but some measurements were added without sigma or kappa; take noise='auto', or add sigma "
+            "and kappa"
+        )
+    return _Calibrating(problem, options, progress or silent).done()
+
+
+def estimated(
+    problem: Problem, solution: Solution, inliers: Inliers, options: CalibrateOptions, progress: Progress
+) -> tuple[Refined, NoiseFound]:
+    """The refined calibration of the inliers under the noise that is found, and a record of this noise.
+
+    ``inliers`` is empty where every measurement counts; ``solution`` is the certified one of the inliers. The one place
+    that decides by which model the noise is found.
+
+    Raises
+    ------
+    NoiseError, CountError
+        The measurements are too few for the noise.
+    """
+    kept = selected(problem, inliers) if inliers else problem
+    how = RefineOptions(
+        noise="given" if options.noise == "given" else "estimate",
+        noise_groups=options.noise_groups,
+        residual="geodesic" if problem.has_measurements else "chordal",
+        carrier_noise=options.carrier_noise,
+        time_offsets=_offsets(kept, options),
+        carrier_path=options.carrier_path if _offsets(kept, options) else None,
+    )
+    try:
+        refined = refine(kept, solution, how, progress=progress)
+    except NoiseError:
+        if options.noise != "auto" or problem.is_relative:
+            raise
+        refined = refine(kept, solution, replace(how, noise="given"), progress=progress)
+    counts = {pair: (int(mask.sum()), len(mask)) for pair, mask in inliers.items()}
+    return replace(refined, inliers=inliers, inlier_counts=counts), _noise_of(refined, options)
+
+
+def _noise_of(refined: Refined, options: CalibrateOptions) -> NoiseFound:
+    return NoiseFound(
+        source="estimated from the residuals" if refined.noise_source == "estimated" else "as given",
+        rotation_rad={pair: noise.rotation_rad for pair, noise in refined.noise.items()},
+        translation_m={pair: noise.translation_m for pair, noise in refined.noise.items()},
+        carriers="as given" if options.carrier_noise is not None else "none, A counts as exact",
+    )
+
+
+def _offsets(problem: Problem, options: CalibrateOptions) -> bool | tuple[str, ...]:
+    """The sensors whose time offsets are estimated, of those that the problem has."""
+    if options.time_offsets == "auto":
+        return False
+    if isinstance(options.time_offsets, bool):
+        return options.time_offsets
+    return tuple(name for name in options.time_offsets if name in problem.sensors)
+
+
+@dataclass
+class _Calibrating:
+    """One run of ``calibrate``."""
+
+    problem: Problem
+    options: CalibrateOptions
+    tell: Progress
+    choices: list[Choice] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    notes: dict[str, None] = field(default_factory=dict)
+
+    def done(self) -> Calibration:
+        """All steps, one after the other."""
+        problem, options = self.problem, self.options
+        self._check_offsets()
+        with self._noted():
+            first = solve(problem, options=options.solve, progress=self.tell)
+            solution, inliers = self._without_outliers(first)
+            refined, noise = self._refined(solution, inliers)
+        outliers = self._outliers(inliers)
+        judgement = Judgement.of([*findings_of(solution, refined), *self.findings], proof_of(refined))
+        best = solution if refined is None else refined
+        return Calibration(
+            X=best.X,
+            Y=best.Y,
+            scale=best.scale,
+            time_offsets_s={} if refined is None else refined.time_offsets_s,
+            judgement=judgement,
+            solution=solution,
+            refined=refined,
+            noise=noise,
+            outliers=outliers,
+            findings=tuple(self.findings),
+            choices=tuple(self.choices),
+            notes=tuple(self.notes),
+            views=views_of(problem, inliers, best.scale),
+            carriers=Carriers(problem.sensor_carrier, problem.target_carrier),
+            options=options,
+        )
+
+    # -- steps --------------------------------------------------------------------------------------------------
+
+    def _check_offsets(self) -> None:
+        given = self.options.time_offsets
+        if isinstance(given, tuple):
+            unknown = [name for name in given if name not in self.problem.sensors]
+            if unknown:
+                raise OptionError(
+                    f"CalibrateOptions.time_offsets names {unknown[0]!r}, which is not a sensor; give any of "
+                    f"{', '.join(self.problem.sensors)}"
+                )
+
+    def _without_outliers(self, first: Solution) -> tuple[Solution, Inliers]:
+        """The certified solution of the measurements that agree, and which these are."""
+        problem, options, what = self.problem, self.options, "outliers"
+        spare = spare_equations(problem)
+        if options.robust == "none":
+            self._choose(what, "every measurement counts", "an option says so")
+            return first, {}
+        if not problem.has_measurements:
+            self._choose(what, "every measurement counts", "the raw measurements were not kept")
+            return first, {}
+        if options.robust == "auto" and spare < SPARE_EQUATIONS:
+            self._choose(
+                what,
+                "not looked for",
+                f"{problem.number_of_measurements} measurements have {spare} equations more than unknowns, and to "
+                f"leave one out takes {SPARE_EQUATIONS}",
+            )
+            return first, {}
+        noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
+        try:
+            if (
+                problem.has_covariances
+                or options.carrier_noise is not None
+                or options.time_offsets not in ("auto", False)
+            ):
+                solution, inliers = self._inliers_under_the_full_noise(first)
+            else:
+                found = graduated(problem, confidence=options.inlier_confidence, noise_scale=noise, progress=self.tell)
+                solution, inliers = found.solution, found.inliers
+        except (OutlierError, NoiseError) as error:
+            self._choose(what, "not left out", f"it is not possible: {error}")
+            self.findings.append(
+                Finding(Ground.CONTRADICTED, "too few measurements agree with one another to find out which are wrong")
+            )
+            return first, {}
+        number = sum(int((~mask).sum()) for mask in inliers.values())
+        if number == 0:
+            self._choose(what, "none", "every measurement agrees with the others")
+            return solution, inliers
+        self._choose(
+            what,
+            f"{number} of {problem.number_of_measurements} measurements were left out",
+            f"they are farther off than {100 * options.inlier_confidence:g} % of good measurements are",
+        )
+        return solution, inliers
+
+    def _inliers_under_the_full_noise(self, first: Solution) -> tuple[Solution, Inliers]:
+        """Inliers where sigma and kappa do not hold the whole noise: ``refine`` chooses them again under it."""
+        options = self.options
+        how = RefineOptions(
+            noise="given" if options.noise == "given" else "estimate",
+            noise_groups=options.noise_groups,
+            robust="gnc",
+            inlier_confidence=options.inlier_confidence,
+            carrier_noise=options.carrier_noise,
+            carrier_model="propagated",
+            time_offsets=_offsets(self.problem, options),
+            carrier_path=options.carrier_path if _offsets(self.problem, options) else None,
+        )
+        refined = refine(self.problem, first, how, progress=self.tell)
+        return refined.solution, refined.inliers
+
+    def _refined(self, solution: Solution, inliers: Inliers) -> tuple[Refined | None, NoiseFound]:
+        self.tell("refining")
+        try:
+            refined, noise = estimated(self.problem, solution, inliers, self.options, self.tell)
+        except (NoiseError, CountError, UnderdeterminedError) as error:
+            self._choose(REFINEMENT, "none", f"the noise cannot be found: {error}")
+            self.findings.append(
+                Finding(
+                    Ground.NO_COVARIANCE,
+                    f"the {self.problem.number_of_measurements} measurements are too few to tell how well the poses "
+                    "are known",
+                )
+            )
+            return None, NoiseFound("not known", {}, {}, "not known")
+        if self.options.noise == "given":
+            self._choose("noise of B", "as given", "an option says so")
+        elif refined.noise_source == "given":
+            self._choose("noise of B", "as given", "the residuals are too few to estimate it")
+        else:
+            freedom = refined.degrees_of_freedom
+            self._choose("noise of B", "estimated", f"the residuals have at least {freedom:.0f} degrees of freedom")
+        return refined, noise
+
+    def _outliers(self, inliers: Inliers) -> Outliers:
+        """The outliers, and what they say against frames."""
+        problem = self.problem
+        counts = {
+            pair: (int(inliers[pair].sum()) if inliers else problem.moments(*pair).count, problem.moments(*pair).count)
+            for pair in problem.pairs
+        }
+        for frame in contradicted_frames(counts):
+            self.findings.append(Finding(Ground.CONTRADICTED, str(frame)))
+        left = {name for pair, (kept, _) in counts.items() if kept for name in pair}
+        left_out = tuple(name for name in (*problem.sensors, *problem.targets) if name not in left)
+        for name in left_out:
+            if name in problem.sensors:
+                self.findings.append(Finding(Ground.NO_ANSWER, f"{name} has no pose, as no measurement of it was kept"))
+        return Outliers(inliers, counts, left_out)
+
+    # -- records ------------------------------------------------------------------------------------------------
+
+    def _choose(self, what: str, chosen: str, evidence: str) -> None:
+        self.choices.append(Choice(what, chosen, evidence))
+
+    @contextmanager
+    def _noted(self) -> Iterator[None]:
+        """Warnings of this library become notes, but for those that the verdict says better; others stay warnings."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            yield
+        for warning in caught:
+            if not isinstance(warning.message, RwhecWarning):
+                warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+            elif not isinstance(warning.message, SAID_BY_THE_VERDICT):
+                self.notes.setdefault(str(warning.message))
+
+
+def spare_equations(problem: Problem) -> int:
+    """How many more equations than unknowns there are: six for each measurement, and those of priors."""
+    free = [name for name in (*problem.targets, *problem.sensors) if name not in problem.fixed]
+    beliefs = [prior for name in free for prior in problem.priors.get(name, [])]
+    scales = {"known": 0, "shared": 1}.get(problem.scale)
+    if scales is None:
+        scales = len({pair.target for pair in problem.pairs} - set(problem.fixed_scales))
+    known = sum(3 * (prior.sigma is not None) + 3 * (prior.kappa is not None) for prior in beliefs)
+    return 6 * problem.number_of_measurements + known - 6 * len(free) - scales
+
+
+def views_of(problem: Problem, inliers: Inliers, scale: float | dict[str, float]) -> dict[str, SensorView]:
+    """Where each sensor saw its targets: their median distance, in their mean direction, true metres."""
+    points: dict[str, list[np.ndarray]] = {}
+    if not problem.has_measurements:
+        return {}
+    for pair in problem.pairs:
+        if pair.is_motion:
+            continue
+        seen = problem.measurements(*pair).B[:, :3, 3]
+        if inliers:
+            seen = seen[inliers[pair]]
+        length = scale.get(pair.target) if isinstance(scale, dict) else scale
+        if len(seen) and length is not None:
+            points.setdefault(pair.sensor, []).append(seen / length)
+    return {sensor: _view(np.concatenate(seen)) for sensor, seen in points.items()}
+
+
+def _view(seen: np.ndarray) -> SensorView:
+    distances = np.linalg.norm(seen, axis=1)
+    mean = (seen / np.maximum(distances, 1e-300)[:, None]).mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    # Seen all around, the mean has no direction; then z, which is forward for cameras.
+    direction = mean / length if length > 0.1 else np.array([0.0, 0.0, 1.0])
+    x, y, z = (float(np.median(distances)) * direction).tolist()
+    return SensorView((x, y, z), bool((seen[:, 2] > 0.0).all()))

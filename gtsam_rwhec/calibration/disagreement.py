@@ -1,0 +1,56 @@
+"""Frames that most of their own measurements contradict, by the counts of outliers."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from gtsam_rwhec.problem.pairs import Pair
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """How many measurements of one sensor or target were left out as outliers; ``str()`` is a sentence's part."""
+
+    frame: str
+    left_out: int
+    measurements: int
+
+    def __str__(self) -> str:
+        return f"{self.left_out} of {self.measurements} measurements of {self.frame} contradict the answer"
+
+    @property
+    def is_majority(self) -> bool:
+        """Whether more than half of the measurements are outliers."""
+        return 2 * self.left_out > self.measurements
+
+
+def contradicted_frames(counts: Mapping[Pair, tuple[int, int]]) -> tuple[LeftOut, ...]:
+    """The sensors and targets of which more than half of the measurements were left out as outliers.
+
+    ``counts`` has the number that was kept and the number of all, by pair. Where most are outliers the answer is as
+    likely to be wrong as they are: a clock, a size or a mounting may have changed. The frame with most outliers comes
+    first. Its outliers then count for no other frame: the targets are not to blame for a camera that contradicts all of
+    them.
+    """
+    rest = counts
+    everything = _by_frame(counts)
+    names: list[str] = []
+    while majorities := [frame for frame in _by_frame(rest).values() if frame.is_majority]:
+        names.append(max(majorities, key=lambda frame: frame.left_out).frame)
+        rest = {pair: count for pair, count in rest.items() if names[-1] not in pair}
+    # A frame that was seen only together with contradicted frames rests on them.
+    known = {*names, *_by_frame(rest)}
+    names += [name for name, frame in everything.items() if name not in known and frame.is_majority]
+    return tuple(everything[name] for name in names)
+
+
+def _by_frame(counts: Mapping[Pair, tuple[int, int]]) -> dict[str, LeftOut]:
+    """The counts of each sensor and target, over all its pairs."""
+    left_out, measurements = Counter[str](), Counter[str]()
+    for pair, (kept, number) in counts.items():
+        for name in pair.frames:
+            left_out[name] += number - kept
+            measurements[name] += number
+    return {name: LeftOut(name, left_out[name], number) for name, number in measurements.items()}

@@ -1,0 +1,80 @@
+"""The options of ``calibrate``: each overrules one choice that is otherwise made from the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.real_numbers import is_one_of, is_real
+from gtsam_rwhec.refinement.options import CarrierNoise, NoiseGroups
+from gtsam_rwhec.solver.options import SolveOptions
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+
+NoiseChoice = Literal["auto", "given", "estimate"]
+RobustChoice = Literal["auto", "gnc", "none"]
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """The options of ``calibrate``; the defaults leave every choice to the data.
+
+    Attributes
+    ----------
+    noise : "auto", "given" or "estimate"
+        The noise of B. "auto" and "estimate": from the residuals; what the measurements state gives the ratios between
+        them. "auto" takes the stated noise where the residuals are too few to estimate it. "given": as stated.
+    noise_groups : "all", "sensor" or "pair"
+        Which measurements share an estimate of the noise.
+    carrier_noise : CarrierNoise, optional
+        The noise of A, if you know it.
+    robust : "auto", "gnc" or "none"
+        "auto" and "gnc": measurements that contradict the others are left out, and the rest is certified again. "auto"
+        leaves this out where there are too few measurements to tell. "none": every measurement counts.
+    inlier_confidence : float
+        Probability that a good measurement is kept.
+    time_offsets : "auto", bool or tuple of str
+        Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps.
+    carrier_path : Trajectory, optional
+        T_sensorcarrier_targetcarrier over time, along which time offsets move A.
+    level : float
+        Probability of the ellipsoids in the report, in task units.
+    solve : SolveOptions
+        Options of the certified solver.
+    """
+
+    noise: NoiseChoice = "auto"
+    noise_groups: NoiseGroups = "all"
+    carrier_noise: CarrierNoise | None = None
+    robust: RobustChoice = "auto"
+    inlier_confidence: float = 0.997
+    time_offsets: Literal["auto"] | bool | tuple[str, ...] = "auto"
+    carrier_path: Trajectory | None = None
+    level: float = 0.95
+    solve: SolveOptions = field(default_factory=SolveOptions)
+
+    def __post_init__(self) -> None:
+        for name, choices in (("noise", NoiseChoice), ("noise_groups", NoiseGroups), ("robust", RobustChoice)):
+            if not is_one_of(getattr(self, name), get_args(choices)):
+                raise OptionError(
+                    f"CalibrateOptions.{name}={brief(getattr(self, name))} is not one of "
+                    f"{', '.join(map(repr, get_args(choices)))}"
+                )
+        for name, least in (("inlier_confidence", 0.5), ("level", 0.0)):
+            value = getattr(self, name)
+            if not (is_real(value) and least < value < 1.0):
+                raise OptionError(f"CalibrateOptions.{name}={brief(value)}; give one between {least:g} and 1")
+        if self.time_offsets != "auto" and not isinstance(self.time_offsets, (bool, tuple)):
+            raise OptionError(
+                f"CalibrateOptions.time_offsets={brief(self.time_offsets)}; give 'auto', True, False, or a tuple of "
+                "sensors' names: ('cam_0',)"
+            )
+        for name, kind in (("carrier_noise", CarrierNoise), ("carrier_path", Trajectory)):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise OptionError(f"CalibrateOptions.{name} is a {type(value).__name__}; give a {kind.__name__}")
+        if not isinstance(self.solve, SolveOptions):
+            raise OptionError(f"CalibrateOptions.solve is a {type(self.solve).__name__}; give a SolveOptions")
+        if self.carrier_path is not None and self.time_offsets is False:
+            raise OptionError("CalibrateOptions.carrier_path has no use with time_offsets=False; leave out one of them")

@@ -1,0 +1,190 @@
+"""The verdict on a calibration: may its poses be used? Reports, files, exports and the exit status share this rule."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.solver.cause import Status
+from gtsam_rwhec.solving.solution import Solution
+
+
+class Verdict(StrEnum):
+    """What to do with the poses. ``str()`` is a sentence; the value is the word that files have."""
+
+    #: The answer is certified, and the measurements determine it and do not contradict it.
+    USE = "use"
+    #: The poses may be right, but a person should first look at the grounds.
+    CARE = "care"
+    #: Some poses are wrong, or the measurements do not determine them.
+    DO_NOT_USE = "do_not_use"
+
+    @property
+    def words(self) -> str:
+        """The instruction to the user, as the beginning of a sentence."""
+        return {
+            Verdict.USE: "Use these poses",
+            Verdict.CARE: "Use these poses with care",
+            Verdict.DO_NOT_USE: "Do not use these poses",
+        }[self]
+
+    def __str__(self) -> str:
+        return {
+            Verdict.USE: "Use these poses.",
+            Verdict.CARE: "Use these poses with care: read the reason and do what it says before you rely on them.",
+            Verdict.DO_NOT_USE: "Do not use these poses: do what the reason says, and calibrate again.",
+        }[self]
+
+    def __format__(self, spec: str) -> str:
+        return format(str(self), spec)
+
+
+class Ground(StrEnum):
+    """Reasons not to use the poses, the most serious first."""
+
+    #: The measurements fit far better when they are read in another way.
+    MISREAD = "misread"
+    #: The residuals are larger than any noise of measurement.
+    IMPLAUSIBLE = "implausible"
+    #: No lower bound of the cost was found.
+    NO_BOUND = "no_bound"
+    #: The lower bound is below the cost: a better answer may exist.
+    NOT_CERTIFIED = "not_certified"
+    #: The measurements leave a direction free.
+    NOT_UNIQUE = "not_unique"
+    #: Most measurements of a sensor or target were left out as outliers.
+    CONTRADICTED = "contradicted"
+    #: A sensor has no measurement in the answer, and so no pose.
+    NO_ANSWER = "no_answer"
+    #: The stated size of a target was used, but it does not fit the motion.
+    SIZE_DOUBTED = "size_doubted"
+    #: The measurements are too few to tell how well the poses are known.
+    NO_COVARIANCE = "no_covariance"
+    #: Errors of neighbouring measurements are alike, beyond what the model of the noise holds.
+    CORRELATED = "correlated"
+    #: Errors depend on the configuration: an arm's kinematics, intrinsics, a board that is not flat.
+    SYSTEMATIC = "systematic"
+    #: Another reason for which the standard deviations may be too small.
+    COVARIANCE_DOUBTED = "covariance_doubted"
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict to which this ground leads."""
+        return Verdict.CARE if self in _CARE else Verdict.DO_NOT_USE
+
+    @property
+    def advice(self) -> str:
+        """What to do about it, as an imperative without its full stop."""
+        return _ADVICE[self]
+
+
+_CARE = (Ground.CORRELATED, Ground.SYSTEMATIC, Ground.COVARIANCE_DOUBTED)
+_ADVICE = {
+    Ground.MISREAD: "correct how the file is read, and calibrate again",
+    Ground.IMPLAUSIBLE: (
+        "check that A = T_sensorcarrier_targetcarrier and B = T_sensor_target, the order of the quaternions, the "
+        "units, and that A and B are of the same instants"
+    ),
+    Ground.NO_BOUND: "check the units and the frames of A and B, then calibrate again",
+    Ground.NOT_CERTIFIED: "measure with more and larger rotations, then calibrate again",
+    Ground.NOT_UNIQUE: "turn the carriers about at least two different axes and measure again, or fix what you know",
+    Ground.CONTRADICTED: (
+        "check whether the named frame has moved or has another frame's name, and whether its clock is late"
+    ),
+    Ground.NO_ANSWER: "measure with this sensor, or leave it out of the problem",
+    Ground.SIZE_DOUBTED: "measure the named target again, or let its size be estimated",
+    Ground.NO_COVARIANCE: "take more measurements",
+    Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
+    Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",
+    Ground.COVARIANCE_DOUBTED: "use the poses, but do not rely on their standard deviations",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A ground that was found, with its words: the fact, with figures and names, without a full stop."""
+
+    ground: Ground
+    words: str
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict with its grounds.
+
+    Attributes
+    ----------
+    verdict : Verdict
+        What to do with the poses.
+    grounds : tuple of Ground
+        Reasons not to use the poses, the most serious first; empty for ``Verdict.USE``.
+    reason : str
+        The grounds in words, and what to do about the first.
+    """
+
+    verdict: Verdict
+    grounds: tuple[Ground, ...]
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.verdict.words}: {self.reason}."
+
+    @staticmethod
+    def of(findings: list[Finding], praise: str) -> Judgement:
+        """The judgement that some findings lead to; without any, ``praise`` is why the poses are to be used."""
+        if not findings:
+            return Judgement(Verdict.USE, (), praise)
+        by_ground: dict[Ground, list[str]] = {}
+        for finding in sorted(findings, key=lambda finding: list(Ground).index(finding.ground)):
+            words = by_ground.setdefault(finding.ground, [])
+            if finding.words not in words:
+                words.append(finding.words)
+        grounds = tuple(by_ground)
+        worst = max((ground.verdict for ground in grounds), key=list(Verdict).index)
+        facts = "; ".join(words for group in by_ground.values() for words in group)
+        return Judgement(worst, grounds, f"{facts}. What to do: {grounds[0].advice}")
+
+
+def proof_of(refined: RefinedPoses | None) -> str:
+    """Why poses without any finding against them are to be used."""
+    first = (
+        "the answer is proven optimal, and"
+        if refined is None
+        else "the first answer is proven optimal, the refinement started from it, and"
+    )
+    return f"{first} the measurements determine every pose"
+
+
+def findings_of(solution: Solution, refined: RefinedPoses | None = None) -> list[Finding]:
+    """What the certificate and the free directions say against the poses.
+
+    Parameters
+    ----------
+    solution : Solution
+        The certified solution.
+    refined : RefinedPoses, optional
+        The refined calibration.
+    """
+    certificate: Mapping[Status, Finding] = {
+        Status.FAILED: Finding(
+            Ground.NO_BOUND, "no lower bound of the cost was found, so a much better answer may exist"
+        ),
+        Status.GAP: Finding(
+            Ground.NOT_CERTIFIED,
+            "a better answer may exist; its cost would be lower by at most "
+            f"{100.0 * solution.certificate.relative_gap:.2g} %",
+        ),
+    }
+    status = solution.certificate.status
+    found = [certificate[status]] if status in certificate else []
+    is_unique = solution.identifiability.is_unique and status is not Status.CERTIFIED_NOT_UNIQUE
+    if not is_unique or (refined is not None and refined.free_directions):
+        found.append(
+            Finding(
+                Ground.NOT_UNIQUE,
+                "the measurements do not determine all poses; other poses fit them equally well",
+            )
+        )
+    return found

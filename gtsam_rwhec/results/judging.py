@@ -1,0 +1,43 @@
+"""The judgement of a calibration by the facts that its result file holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.solving.solution import Solution
+
+
+def judge(
+    solution: Solution,
+    refined: RefinedPoses | None = None,
+    log: LogFields | None = None,
+    findings: Sequence[Finding] = (),
+) -> Judgement:
+    """Judge a calibration by its facts.
+
+    Parameters
+    ----------
+    solution : Solution
+        The certified solution.
+    refined : RefinedPoses, optional
+        The refined calibration.
+    log : LogFields, optional
+        What became of the measurements, if they come from a log.
+    findings : sequence of Finding, optional
+        What ``calibrate`` found besides: misreadings, sizes, sensors without an answer.
+    """
+    if not isinstance(solution, Solution):
+        raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
+    found = [*findings_of(solution, refined), *findings]
+    if log is not None:
+        if log.contradicted:
+            found.append(Finding(Ground.CONTRADICTED, "; ".join(map(str, log.contradicted))))
+        doubted = [size.target for size in log.sizes if size.is_doubted and not size.is_free]
+        if doubted:
+            words = f"the stated size of {', '.join(doubted)} does not fit the motion"
+            found.append(Finding(Ground.SIZE_DOUBTED, words))
+    return Judgement.of(found, proof_of(refined))

@@ -1,0 +1,161 @@
+"""One call: the best answer, with a verdict and every choice said."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from refinement_problems import KAPPA, SIGMA_M, copied, rig
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.calibrating import spare_equations
+from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.problem.pairs import Pair
+
+
+def choice(calibration: rw.Calibration, what: str) -> rw.Choice:
+    return next(choice for choice in calibration.choices if choice.what == what)
+
+
+def test_a_good_problem_is_to_be_used_and_its_truth_is_inside() -> None:
+    simulated = rig()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        calibration = rw.calibrate(simulated.problem)
+    assert calibration.verdict is rw.Verdict.USE
+    assert calibration.judgement.grounds == ()
+    assert calibration.solution.certificate.is_certified
+    assert calibration.refined is not None
+    assert calibration.X is calibration.refined.X
+    for name, truth in (simulated.X | simulated.Y).items():
+        assert calibration.contains(name, truth, 0.9999)
+    assert choice(calibration, "outliers").chosen == "none"
+    assert choice(calibration, "noise of B").chosen == "estimated"
+    assert "No outliers among 80 measurements" in str(calibration.outliers)
+    assert str(calibration).startswith("Use these poses: ")
+
+
+def with_outliers(problem: rw.Problem, share: float, of: tuple[str, ...] = ()) -> rw.Problem:
+    rng = np.random.default_rng(1)
+
+    def spoilt(pair: Pair, raw: Measurements) -> np.ndarray:
+        B = raw.B.copy()
+        if not of or pair.sensor in of:
+            bad = rng.permutation(len(B))[: round(share * len(B))]
+            B[bad, :3, 3] += rng.uniform(0.5, 2.0, (len(bad), 3))
+        return B
+
+    return copied(problem, B=spoilt)
+
+
+def test_outliers_are_left_out_and_the_rest_is_certified_again() -> None:
+    simulated = rig()
+    calibration = rw.calibrate(with_outliers(simulated.problem, 0.2))
+    assert calibration.verdict is rw.Verdict.USE
+    assert calibration.outliers.number == 16
+    assert calibration.solution.counts.endswith("64 measurements")
+    assert "16 of 80 measurements were left out" in str(choice(calibration, "outliers"))
+    for name, truth in (simulated.X | simulated.Y).items():
+        assert calibration.contains(name, truth, 0.9999)
+    everything = rw.calibrate(with_outliers(simulated.problem, 0.2), rw.CalibrateOptions(robust="none"))
+    assert everything.outliers.number == 0
+    assert choice(everything, "outliers").evidence == "an option says so"
+
+
+def test_a_sensor_whose_measurements_disagree_is_not_to_be_used() -> None:
+    calibration = rw.calibrate(with_outliers(rig(sensors=3).problem, 1.0, of=("sensor2",)))
+    assert calibration.verdict is rw.Verdict.DO_NOT_USE
+    assert rw.Ground.CONTRADICTED in calibration.judgement.grounds
+    assert "sensor2" in calibration.verdict_reason
+
+
+def test_planar_motion_is_not_determined() -> None:
+    calibration = rw.calibrate(rig(1, 1, motion="planar").problem)
+    assert calibration.verdict is rw.Verdict.DO_NOT_USE
+    assert calibration.judgement.grounds[0] is rw.Ground.NOT_UNIQUE
+    assert "turn the carriers about at least two different axes" in calibration.verdict_reason
+    assert all("is not determined" in str(point) for point in calibration.points.values())
+
+
+def test_too_few_measurements_say_which_choice_was_not_made_and_why() -> None:
+    """A target that was seen once takes up its one measurement, and nothing is left to tell its noise."""
+    problem = rig().problem
+    raw = problem.measurements("target0", "sensor0")
+    once = rw.Problem()
+    once.add("target0", "sensor0", raw.A, raw.B)
+    other = problem.measurements("target1", "sensor0")
+    once.add("target1", "sensor0", other.A[:1], other.B[:1])
+    calibration = rw.calibrate(once, rw.CalibrateOptions(noise_groups="pair"))
+    assert calibration.verdict is rw.Verdict.DO_NOT_USE
+    assert calibration.judgement.grounds == (rw.Ground.NO_COVARIANCE,)
+    assert calibration.refined is None
+    assert calibration.X is calibration.solution.X
+    assert "of target1-sensor0 cannot be estimated" in choice(calibration, "covariances").evidence
+    with pytest.raises(rw.errors.UnderdeterminedError, match="has no covariances"):
+        calibration.covariance("sensor0")
+
+
+def test_two_measurements_are_too_few_to_leave_one_out() -> None:
+    """Twelve equations, twelve unknowns."""
+    raw = rig(1, 1).problem.measurements("target0", "sensor0")
+    few = rw.Problem()
+    few.add("target0", "sensor0", raw.A[:2], raw.B[:2])
+    assert spare_equations(few) == 0
+    calibration = rw.calibrate(few)
+    assert calibration.judgement.grounds == (rw.Ground.NOT_UNIQUE,)
+    assert choice(calibration, "outliers").chosen == "not looked for"
+    assert "2 measurements have 0 equations more than unknowns" in choice(calibration, "outliers").evidence
+
+
+def test_stated_noise_serves_where_the_residuals_are_too_few() -> None:
+    problem = rig().problem
+    once = rw.Problem()
+    for target, number in (("target0", 20), ("target1", 1)):
+        raw = problem.measurements(target, "sensor0")
+        once.add(target, "sensor0", raw.A[:number], raw.B[:number], SIGMA_M, KAPPA)
+    calibration = rw.calibrate(once, rw.CalibrateOptions(noise_groups="pair"))
+    assert calibration.refined is not None
+    assert calibration.refined.noise_source == "given"
+    assert choice(calibration, "noise of B").evidence == "the residuals are too few to estimate it"
+
+
+def test_moments_alone_are_calibrated_without_outliers() -> None:
+    simulated = rig()
+    kept = rw.Problem(keep_measurements=False)
+    for pair in simulated.problem.pairs:
+        raw = simulated.problem.measurements(*pair)
+        kept.add(*pair, raw.A, raw.B, raw.sigma, raw.kappa)
+    calibration = rw.calibrate(kept)
+    assert calibration.verdict is rw.Verdict.USE
+    assert choice(calibration, "outliers").evidence == "the raw measurements were not kept"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"noise": "guess"}, "noise='guess' is not one of"),
+        ({"robust": "huber"}, "robust='huber' is not one of"),
+        ({"level": 1.0}, "level=1.0; give one between 0 and 1"),
+        ({"time_offsets": "always"}, "time_offsets='always'"),
+        ({"carrier_noise": 0.1}, "carrier_noise is a float; give a CarrierNoise"),
+    ],
+)
+def test_options_that_are_not_valid_are_refused(options: dict[str, object], words: str) -> None:
+    with pytest.raises(rw.errors.OptionError, match=words):
+        rw.CalibrateOptions(**options)  # type: ignore[arg-type]
+
+
+def test_input_that_cannot_be_used_raises() -> None:
+    with pytest.raises(rw.errors.OptionError, match="the problem is a str"):
+        rw.calibrate("cell")  # type: ignore[arg-type]
+    with pytest.raises(rw.errors.CountError, match="the problem is empty"):
+        rw.calibrate(rw.Problem())
+    simulated = rig()
+    with pytest.raises(rw.errors.OptionError, match="names 'cam', which is not a sensor"):
+        rw.calibrate(simulated.problem, rw.CalibrateOptions(time_offsets=("cam",)))
+    relative = copied(simulated.problem, sigma=lambda pair, raw: None, kappa=lambda pair, raw: None)
+    with pytest.raises(rw.errors.OptionError, match="noise='given', but"):
+        rw.calibrate(relative, rw.CalibrateOptions(noise="given"))
+    with pytest.raises(rw.errors.NoiseError, match="give a positive standard deviation"):
+        rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(0.0, 0.001))

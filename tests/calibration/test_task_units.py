@@ -1,0 +1,129 @@
+"""How far off a point is: against sampling, against the frame's own covariance, and what cannot be asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from refinement_problems import rig
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.calibrated import Carriers
+from gtsam_rwhec.calibration.task_units import ball_radius, ellipsoid
+
+POINT = np.array([0.1, -0.2, 0.8])
+
+
+@pytest.fixture(scope="module")
+def calibration() -> rw.Calibration:
+    return rw.calibrate(rig(seed=3).problem)
+
+
+@pytest.mark.parametrize("variances", [(1.0, 1.0, 1.0), (9.0, 1.0, 0.04), (1.0, 1e-6, 0.0), (1.0, 1.0, 0.0)])
+@pytest.mark.parametrize("freedom", [np.inf, 7.0])
+def test_the_ball_holds_the_share_of_samples_that_it_says(variances: tuple[float, ...], freedom: float) -> None:
+    rng = np.random.default_rng(0)
+    e = rng.standard_normal((400_000, 3)) * np.sqrt(variances)
+    if np.isfinite(freedom):
+        e *= np.sqrt(freedom / rng.chisquare(freedom, (len(e), 1)))
+    inside = np.mean(np.linalg.norm(e, axis=1) <= ball_radius(np.array(variances), 0.95, freedom))
+    assert inside == pytest.approx(0.95, abs=0.0015)  # four standard deviations of the share
+
+
+def test_the_covariance_is_that_of_sampled_poses(calibration: rw.Calibration) -> None:
+    rng = np.random.default_rng(0)
+    pose, covariance = calibration.Y["sensor0"], calibration.covariance("sensor0")
+    twists = rng.multivariate_normal(np.zeros(6), covariance, 20_000)
+    points = np.array([pose.retract(xi).transformFrom(POINT) for xi in twists])
+    found = calibration.uncertainty_at(POINT, frame="sensor0", seen_from="hand")
+    np.testing.assert_allclose(found.centre_m, pose.transformFrom(POINT))
+    np.testing.assert_allclose(found.covariance_m2, np.cov(points.T), atol=0.03 * np.trace(found.covariance_m2))
+
+
+def test_another_sensor_sees_it_with_the_relative_covariance(calibration: rw.Calibration) -> None:
+    found = calibration.uncertainty_at(POINT, "sensor0", "sensor1")
+    pose, covariance = calibration.relative("sensor1", "sensor0")
+    J = np.zeros((3, 6), order="F")
+    np.testing.assert_allclose(found.centre_m, pose.transformFrom(POINT, J, np.zeros((3, 3), order="F")))
+    np.testing.assert_allclose(found.covariance_m2, J @ covariance @ J.T, rtol=1e-9, atol=1e-15)
+
+
+def test_axes_and_half_lengths_are_of_the_ellipsoid(calibration: rw.Calibration) -> None:
+    found = calibration.uncertainty_at(POINT, "target0", level=0.9)
+    assert calibration.refined is not None
+    square = calibration.refined.squared_radius(3, 0.9)
+    V = found.axes @ np.diag(found.half_lengths_mm**2) @ found.axes.T
+    np.testing.assert_allclose(V, 1e6 * square * found.covariance_m2, rtol=1e-9, atol=1e-9)
+    assert found.half_lengths_mm[0] >= found.half_lengths_mm[2]
+    assert found.half_lengths_mm[0] >= found.radius_mm > found.half_lengths_mm[2]
+    assert found.measurement_mm is None
+
+
+def test_a_shared_scale_is_part_of_it() -> None:
+    calibration = rw.calibrate(rig(scale="shared").problem)
+    near, far = (calibration.uncertainty_at([0.0, 0.0, z], "sensor0") for z in (1.0, 100.0))
+    along = calibration.Y["sensor0"].rotation().matrix()[:, 2]
+    sigma = np.sqrt(calibration.covariance("scale")[0, 0]) / float(np.asarray(calibration.scale))
+    assert near.radius_mm < far.radius_mm
+    assert np.sqrt(along @ far.covariance_m2 @ along) == pytest.approx(100.0 * sigma, rel=0.1)
+
+
+def test_carriers_have_the_names_that_the_problem_states(calibration: rw.Calibration) -> None:
+    assert str(calibration.uncertainty_at(POINT, "sensor0")).startswith(
+        "A point 0.83 m from sensor0, expressed in the frame that carries sensor0, is within "
+    )
+    named = replace(calibration, carriers=Carriers("arm/flange", "floor"))
+    assert named.uncertainty_at(POINT, "sensor0", "arm/flange").seen_from == "arm/flange"
+    assert named.uncertainty_at(POINT, "target0", "targetcarrier").seen_from == "floor"
+    with pytest.raises(rw.errors.FrameError, match=r"'hand' is no frame .* \(arm/flange, sensorcarrier\) and sensor1"):
+        named.uncertainty_at(POINT, "sensor0", "hand")
+
+
+def test_what_cannot_be_asked_is_refused(calibration: rw.Calibration) -> None:
+    with pytest.raises(rw.errors.FrameError, match="there is no frame 'cam_9'; there are the sensors sensor0, sensor1"):
+        calibration.uncertainty_at(POINT, "cam_9")
+    with pytest.raises(rw.errors.FrameError, match="'target0' is no frame in which a point of sensor0"):
+        calibration.uncertainty_at(POINT, "sensor0", "target0")
+    with pytest.raises(rw.errors.PoseError, match="give three"):
+        calibration.uncertainty_at([0.0, 0.8], "sensor0")
+    with pytest.raises(rw.errors.OptionError, match=r"level=1.5; give one between 0 and 1"):
+        calibration.uncertainty_at(POINT, "sensor0", level=1.5)
+
+
+def test_a_point_behind_a_camera_is_refused() -> None:
+    """A camera saw every target in front of it."""
+    simulated = rig(1, 1)
+    pair = simulated.problem.pairs[0]
+    raw = simulated.problem.measurements(*pair)
+    # In a frame that is turned about the mean line of sight, every target is in front.
+    mean = raw.B[:, :3, 3].mean(axis=0)
+    z = mean / np.linalg.norm(mean)
+    x = np.linalg.svd(z[None])[2][1]
+    turn = np.eye(4)
+    turn[:3, :3] = np.stack([x, np.cross(z, x), z])
+    ahead = turn @ raw.B
+    kept = ahead[:, 2, 3] > 0.0
+    problem = rw.Problem(sensor_carrier="hand", target_carrier="base")
+    problem.add("board", "camera", raw.A[kept], ahead[kept])
+    calibration = rw.calibrate(problem)
+    assert "expressed in hand" in str(calibration.uncertainty_at([0.0, 0.0, 0.8], frame="camera", seen_from="hand"))
+    with pytest.raises(rw.errors.PoseError, match="is behind camera, which saw every target in front of it"):
+        calibration.uncertainty_at([0.0, 0.0, -0.8], frame="camera", seen_from="hand")
+
+
+def test_a_free_axis_is_infinite() -> None:
+    axes, half_lengths, radius = ellipsoid(np.diag([np.inf, 4.0, 1.0]), 0.95, np.inf)
+    assert np.isinf(half_lengths[0])
+    assert np.isinf(radius)
+    np.testing.assert_allclose(np.abs(axes), np.eye(3))
+    assert half_lengths[1] == pytest.approx(2.0 * half_lengths[2])
+
+
+def test_a_fixed_frame_has_no_error() -> None:
+    simulated = rig()
+    simulated.problem.fix("sensor0", simulated.Y["sensor0"])
+    found = rw.calibrate(simulated.problem).uncertainty_at(POINT, "sensor0")
+    assert found.radius_mm == 0.0
+    assert isinstance(simulated.Y["sensor0"], np.ndarray | gtsam.Pose3)

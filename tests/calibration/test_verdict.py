@@ -1,0 +1,46 @@
+"""Grounds lead to verdicts, and a judgement says what to do."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
+
+
+@pytest.mark.parametrize("verdict", Verdict)
+def test_a_verdict_is_a_sentence_and_a_word_in_files(verdict: Verdict) -> None:
+    assert str(verdict) == f"{verdict}"
+    assert str(verdict).startswith(verdict.words)
+    assert str(verdict).endswith(".")
+    assert Verdict(verdict.value) is verdict
+    assert json.loads(json.dumps(verdict)) == verdict.value
+
+
+@pytest.mark.parametrize("ground", Ground)
+def test_every_ground_says_what_to_do(ground: Ground) -> None:
+    judgement = Judgement.of([Finding(ground, "a fact")], "praise")
+    assert judgement.verdict is ground.verdict
+    assert str(judgement) == f"{ground.verdict.words}: a fact. What to do: {ground.advice}."
+    assert not ground.advice.endswith(".")
+
+
+def test_the_most_serious_ground_comes_first_and_decides() -> None:
+    findings = [
+        Finding(Ground.CORRELATED, "neighbours are alike"),
+        Finding(Ground.CONTRADICTED, "cam_1 disagrees"),
+        Finding(Ground.CONTRADICTED, "cam_2 disagrees"),
+        Finding(Ground.CONTRADICTED, "cam_2 disagrees"),
+        Finding(Ground.MISREAD, "the quaternions of B are x, y, z, w"),
+    ]
+    judgement = Judgement.of(findings, "praise")
+    assert judgement.verdict is Verdict.DO_NOT_USE
+    assert judgement.grounds == (Ground.MISREAD, Ground.CONTRADICTED, Ground.CORRELATED)
+    facts = "the quaternions of B are x, y, z, w; cam_1 disagrees; cam_2 disagrees; neighbours are alike"
+    assert judgement.reason == f"{facts}. What to do: {Ground.MISREAD.advice}"
+
+
+def test_without_findings_the_poses_are_to_be_used() -> None:
+    judgement = Judgement.of([], "all is well")
+    assert (judgement.verdict, judgement.grounds, str(judgement)) == (Verdict.USE, (), "Use these poses: all is well.")
