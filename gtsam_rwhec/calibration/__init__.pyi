@@ -11,3 +11,6 @@ from .verdict import Finding as Finding
 from .verdict import Ground as Ground
 from .verdict import Judgement as Judgement
 from .verdict import Verdict as Verdict
+from .misreadings import Misreading as Misreading
+from .plausibility import Implausible as Implausible
+from .readings import Mistake as Mistake

@@ -1,0 +1,86 @@
+"""A sample of a problem's measurements, small enough that many readings of it can be tried."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.calibration.readings import Reading
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+
+#: At most so many measurements of a pair, from all over its rows.
+MOST_OF_A_PAIR = 200
+#: At most so many pairs: those that join the frames with the most measurements.
+MOST_PAIRS = 24
+#: At most so many measurements in all.
+MOST_IN_ALL = 2000
+#: A pair with fewer measurements is not sampled where others have more: it says little, and has its own unknowns.
+FEWEST_OF_A_PAIR = 4
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """The raw measurements of some pairs, and which rows of each are looked at."""
+
+    whole: dict[Pair, Measurements]
+    rows: dict[Pair, np.ndarray]
+
+    @staticmethod
+    def of(problem: Problem) -> Sampled | None:
+        """A sample of a problem; None where it kept no measurements."""
+        if not problem.has_measurements:
+            return None
+        pairs = _pairs(problem)
+        most = max(min(MOST_OF_A_PAIR, MOST_IN_ALL // len(pairs)), FEWEST_OF_A_PAIR)
+        whole = {pair: problem.measurements(*pair) for pair in pairs}
+        rows = {pair: np.unique(np.linspace(0, len(raw.A) - 1, most).astype(int)) for pair, raw in whole.items()}
+        return Sampled(whole, rows)
+
+    @property
+    def count(self) -> int:
+        """The number of measurements."""
+        return sum(map(len, self.rows.values()))
+
+    @property
+    def unknown_poses(self) -> int:
+        """The number of frames."""
+        return len({name for pair in self.rows for name in pair.frames})
+
+    def as_read(self) -> dict[Pair, tuple[Array, Array]]:
+        """A and B as they are."""
+        return {pair: (raw.A[self.rows[pair]], raw.B[self.rows[pair]]) for pair, raw in self.whole.items()}
+
+    def by(self, reading: Reading) -> dict[Pair, tuple[Array, Array]]:
+        """A and B by another reading. Motions have one frame, and their rows belong together: no roles, no shift."""
+        found = {}
+        for pair, raw in self.whole.items():
+            rows, shift = self.rows[pair], 0 if pair.is_motion else reading.shift
+            rows = rows[(rows + shift >= 0) & (rows + shift < len(raw.B))]
+            if len(rows):
+                found[reading.pair(pair)] = reading.changed(raw.A[rows], raw.B[rows + shift])
+        return found
+
+
+def _pairs(problem: Problem) -> list[Pair]:
+    """The pairs with the most measurements, each joined to those before it where there is such a pair."""
+    counts = {pair: problem.moments(*pair).count for pair in problem.pairs}
+    by_frame: dict[str, set[Pair]] = defaultdict(set)
+    for pair in counts:
+        for name in pair:
+            by_frame[name].add(pair)
+    enough = [pair for pair, count in counts.items() if count >= FEWEST_OF_A_PAIR] or list(counts)
+    left = sorted(enough, key=lambda pair: -counts[pair])
+    chosen: list[Pair] = []
+    names: set[str] = set()
+    while left and len(chosen) < MOST_PAIRS:
+        # A pair that closes a loop tells more than one with a frame of its own.
+        best = max(left, key=lambda pair: (sum(name in names for name in pair), counts[pair]))
+        chosen.append(best)
+        names.update(best)
+        left.remove(best)
+    return chosen

@@ -1,0 +1,56 @@
+"""Misreadings are named with their cures, and good problems are not accused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from misread_problems import KINDS, KINDS_OF_GRAPHS, Kind, misread
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.misreadings import misreadings
+from gtsam_rwhec.errors import OptionError, RwhecError
+from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solving.solution import Solution
+
+NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
+
+
+def solved(problem: rw.Problem) -> Solution | None:
+    """The solution, or None where there is none."""
+    try:
+        return rw.solve(problem)
+    except RwhecError:
+        return None
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
+@pytest.mark.parametrize("kind", [*KINDS, *KINDS_OF_GRAPHS], ids=lambda kind: kind.name)
+def test_each_misreading_is_named_with_both_residuals_and_its_cure(kind: Kind) -> None:
+    problem = misread(general(2, 2, seed=1, noise=NOISE, number_of_measurements=15).problem, kind)
+    found = misreadings(problem, solved(problem))
+    assert [one.mistake for one in found] == [kind.mistake]
+    assert kind.words in str(found[0])
+    assert found[0].cure in str(found[0])
+    before, after = zip(found[0].rotation_deg, found[0].translation_mm, strict=True)
+    assert after[0] == pytest.approx(0.3 * 1.54, rel=0.35)
+    assert after[1] == pytest.approx(3.0 * 1.54, rel=0.5)
+    assert math.prod(before) > 100.0 * math.prod(after)
+
+
+def test_a_good_problem_is_not_accused() -> None:
+    problem = general(2, 2, seed=1, noise=NOISE, number_of_measurements=15).problem
+    assert misreadings(problem, rw.solve(problem)) == ()
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
+def test_four_measurements_accuse_nothing() -> None:
+    problem = misread(general(1, 1, seed=2, noise=NOISE, number_of_measurements=4).problem, KINDS[0])
+    assert misreadings(problem, solved(problem)) == ()
+
+
+def test_a_wrong_progress_is_refused() -> None:
+    problem = general(1, 1, seed=2, noise=NOISE).problem
+    with pytest.raises(OptionError, match="progress"):
+        misreadings(problem, None, progress=3)
