@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 import sys
+from collections.abc import Callable
+from importlib.util import find_spec
 from types import ModuleType
 
+import numpy as np
 import pytest
 from places import REPOSITORY
 
@@ -63,3 +67,77 @@ def test_times_of_another_machine_are_not_compared(figures: ModuleType) -> None:
     here, there = (figures.Figure("2x", "<= 3x", True, "0.1.0", machine) for machine in ("one", "another"))
     assert figures.compared(here, there).startswith("on another machine (2x")
     assert figures.compared(here, None) == ""
+
+
+@pytest.fixture
+def imported(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    """Imports a benchmark by its name."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module
+
+
+@pytest.mark.parametrize(
+    ("held", "runs", "meets"),
+    [(95, 100, True), (100, 100, True), (85, 100, False), (985, 1000, True), (993, 1000, False)],
+)
+def test_shares_meet_a_band_by_their_interval(
+    imported: Callable[[str], ModuleType], held: int, runs: int, meets: bool
+) -> None:
+    share = imported("binomial").Share(held, runs)
+    low, high = share.interval()
+    assert low < share.value < high or share.value == high == 1.0
+    assert share.meets(0.93, 0.98) is meets
+
+
+@pytest.mark.skipif(find_spec("kinhec") is None, reason="its package is not here: pip install '.[bench]'")
+def test_sequences_of_the_neutral_benchmark_are_problems_of_ours(imported: Callable[[str], ModuleType]) -> None:
+    sequences, answers, tables = map(imported, ("kinhec_sequences", "kinhec_answers", "kinhec_tables"))
+    plans, generator, io = map(sequences.of_kinhec, ("plans", "generator", "io"))
+    planned = plans.build_plan(plans.load_tier("small"), ["noise"])["noise"]
+    found = []
+    for configuration in ("eye_in_hand", "eye_to_hand"):
+        of_plan = next(c for c in planned if c.configuration == configuration and c.family == "joint_sinusoid")
+        of_plan.sampling |= {"duration_s": 3.0, "camera_rate_hz": 10.0}
+        record = generator.generate_sequence(of_plan)
+        sequence = sequences.of_package(io.Sequence(record.manifest, record.robot_table, record.camera_table), 0, 0)
+        camera = sequence.package_object.camera
+        T_base_hand = camera.T_base_ee_gt
+        A = np.linalg.inv(T_base_hand) if configuration == "eye_in_hand" else T_base_hand
+        assert np.abs(A @ sequence.X - sequence.Y @ camera.T_cam_target_gt).max() < 1e-12
+        keyframes = sequence.keyframes()
+        assert len(keyframes.A) == len(keyframes.B) == len(keyframes.stamps_ns) >= 20
+        ours = answers.our_answer(sequence, keyframes, 0.0)
+        assert ours.status == "unique"
+        assert ours.error[1] < 20.0
+        found.append(
+            answers.Answer(sequence.name, 0, sequence.track, True, True, 30, {"worse": (180.0, 1e3)}, 0.0, ours)
+        )
+    rows = tables.rows(found, "true")
+    assert [row.met for row in rows if "best baseline" in row.what] == [True]
+    assert len(tables.leaderboard(found)) == 1
+
+
+def test_an_arm_reaches_where_its_links_say(imported: Callable[[str], ModuleType]) -> None:
+    arms = imported("simulated_arms")
+    straight = arms.ARM.hand(np.zeros((1, 6)))[0]
+    # All links in one plane, the wrist turned down: the sum of the lengths, the wrist's offsets beside and below.
+    assert straight[:3, 3] == pytest.approx([-0.817, -0.233, 0.063], abs=1e-12)
+    joints = arms.BENT_RAD + np.random.default_rng(0).normal(0.0, 0.5, (5, 6))
+    as_built = arms.ARM.misbuilt(np.radians(0.1), 5e-4, np.random.default_rng(1)).hand(joints)
+    off_mm = 1e3 * np.linalg.norm((as_built - arms.ARM.hand(joints))[:, :3, 3], axis=1)
+    assert ((off_mm > 0.1) & (off_mm < 10.0)).all()
+
+
+def test_runs_with_wrong_assumptions_are_counted(imported: Callable[[str], ModuleType]) -> None:
+    wrong = imported("wrong_assumptions")
+    (found,) = wrong.outcomes(["four times that"], runs=1, jobs=1).values()
+    assert found.runs == sum(found.verdicts.values()) == 1
+    assert {name: found.held[name].runs for name in wrong.NAMES} == {"targets": 2, "sensors": 2, "between sensors": 1}
+    noise = wrong.noise_of(wrong.Wrong(correlation=0.98), np.random.default_rng(0))
+    assert np.abs(np.diff(noise, axis=0)).max() < wrong.TRANSLATION_M
+
+
+def test_halves_of_a_log_are_calibrated_apart(imported: Callable[[str], ModuleType]) -> None:
+    halves = imported("split_halves").run(np.random.SeedSequence(0), frames=120)
+    assert set(halves.squares) == set(halves.bounds) == set(halves.distance_mm)
+    assert min(halves.bounds.values()) >= 16.8  # of chi2(6) at 99 %; more where the noise is estimated

@@ -2,11 +2,12 @@
 
     python tests/benchmarks/run_all.py [--quick] [--store] [--no-scs] [--plot FOLDER]
 
-Takes an hour or two: SCS a minute, outliers ten, coverage half an hour, the paper's tables the rest (these three in
-processes of their own, with their own tables). ``--quick`` takes a few minutes for a small part of each: it tells that
-all run and roughly where they are, and its figures are kept apart from the others. The noise sweep is
-examples/noise_sweep.py. Exits with 1 if a bar is missed. Needs scs, and opencv-python-headless<5 for what is compared
-with OpenCV 4's hand-eye calls: `pip install '.[bench]'`; ``--quick`` leaves out what cannot run.
+Takes some hours: SCS a minute, outliers ten, coverage half an hour, wrong assumptions, split halves and KinHEC some
+hours together, the paper's tables the rest (these in processes of their own, with their own tables). ``--quick`` takes
+a few minutes for a small part of each: it tells that all run and roughly where they are, and its figures are kept apart
+from the others. The noise sweep is examples/noise_sweep.py. Exits with 1 if a bar is missed. Needs scs, kinhec, and
+opencv-python-headless<5 for what is compared with OpenCV 4's hand-eye calls: `pip install '.[bench]'`; ``--quick``
+leaves out what cannot run.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import calibrate_times
 import camera_logs
 import corrupted_detections
 import cv2
@@ -36,6 +38,10 @@ import start_time
 import vision_rate
 import world_origin
 from bars import Row, benchmark_parser, print_rows
+from kinhec_sequences import STANDARD_SEED
+
+#: Scripts with tables of their own whose rows have bars; the others compare theirs with the papers'.
+WITH_BARS = ("coverage.py", "wrong_assumptions.py", "split_halves.py")
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,11 @@ class Sizes:
         ("tables_2_to_5.py", 1000),
         ("method_tables.py", 1000),
         ("lom_tables.py", 300),
+        ("wrong_assumptions.py", 1000),
+        ("split_halves.py", 300),
     )
+    #: Of the neutral benchmark; none are run without its package.
+    neutral_seeds: tuple[int, ...] = (STANDARD_SEED,)
 
 
 FULL = Sizes()
@@ -80,6 +90,7 @@ QUICK = Sizes(
     corrupted_seeds=1,
     log_messages=5_000,
     runs=(),
+    neutral_seeds=(),
 )
 
 
@@ -100,6 +111,7 @@ def parts(sizes: Sizes, plot: Path | None) -> dict[str, Callable[[], list[Row]]]
         "world origin": world_origin.rows,
         "outliers": lambda: outliers.rows(sizes.outlier_seeds, plot),
         "edge summaries in GTSAM": lambda: edge_summaries.rows(sizes.few_repetitions),
+        "time of rw.calibrate": lambda: calibrate_times.rows(sizes.few_repetitions),
         "from camera images": lambda: camera_logs.rows(sizes.log_poses),
         "images a second": lambda: vision_rate.rows(max(1, sizes.few_repetitions // 2), sizes.bare_loop_s),
         "wrong detections": lambda: corrupted_detections.rows(sizes.corrupted_seeds),
@@ -142,11 +154,19 @@ def main() -> int:
     if arguments.plot is not None:
         print(f"Written to {many_frames.plot(arguments.plot, repetitions=5)}.")
     for name, runs in sizes.runs:
-        command = [sys.executable, str(Path(__file__).with_name(name)), "--runs", str(runs)]
-        if arguments.store and name == "coverage.py":  # the others compare each row with the papers', not with a bar
-            command.append("--store")
-        status = max(status, subprocess.run(command, check=False).returncode)
+        status = max(status, script(name, "--runs", str(runs), store=arguments.store and name in WITH_BARS))
+    if sizes.neutral_seeds:
+        seeds = ",".join(map(str, sizes.neutral_seeds))
+        for offsets in ("true", "estimated"):
+            of_neutral = ("--seeds", seeds, "--offsets", offsets, "--no-times")
+            status = max(status, script("kinhec.py", *of_neutral, store=arguments.store))
     return status
+
+
+def script(name: str, *arguments: str, store: bool) -> int:
+    """Run a script of this folder in a process of its own; its exit status."""
+    command = [sys.executable, str(Path(__file__).with_name(name)), *arguments, *(["--store"] if store else [])]
+    return subprocess.run(command, check=False).returncode
 
 
 if __name__ == "__main__":
