@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Any, TypeVar
@@ -35,9 +34,6 @@ def in_processes(
                 results[place] = function(*call)
                 progress.advance(task)
             return results
-        # Many small problems: one thread in each process is fastest. Spawned, so that NumPy there sees the variables.
-        for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-            os.environ.setdefault(variable, "1")
         with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
             places = {pool.submit(function, *call): place for place, call in enumerate(calls)}
             try:

@@ -39,6 +39,7 @@ from gtsam_rwhec.errors import (
     WeightsWarning,
 )
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -57,6 +58,7 @@ SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, Ou
 Inliers = dict[Pair, np.ndarray]
 
 
+@one_blas_thread()
 def calibrate(
     problem: Problem, options: CalibrateOptions | None = None, *, progress: Progress | None = None
 ) -> Calibration:

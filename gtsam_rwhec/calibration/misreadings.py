@@ -18,6 +18,7 @@ from gtsam_rwhec.calibration.readings import DOUBLE, SINGLE, Mistake, Reading, s
 from gtsam_rwhec.calibration.samples import Sampled
 from gtsam_rwhec.calibration.trial_fits import Spread, TrialFit, fitted, residual_of, signal_of
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.solution import Solution
 
@@ -71,6 +72,7 @@ class Misreading:
         return f"{self.likely}: the median residual is {before} as read, and {after} otherwise; {self.cure}"
 
 
+@one_blas_thread()
 def misreadings(
     problem: Problem, solution: Solution | None, *, progress: Progress | None = None
 ) -> tuple[Misreading, ...]:

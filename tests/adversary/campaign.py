@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import os
 import sys
 import time
 import traceback
@@ -21,8 +20,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-#: Each process uses one thread: the processes share the cores.
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 #: A region that a bound is limited to has at least this many times the data's extent.
 LEAST_REGION = 100.0
 #: Seeds are given out in runs of this many.
@@ -169,8 +166,6 @@ def results(first: int, last: int, *, sane: bool, jobs: int) -> Iterator[Result]
         for task in tasks:
             yield from _run(task)
         return
-    for name in THREADS:
-        os.environ[name] = "1"
     with multiprocessing.get_context("spawn").Pool(jobs) as pool:
         for batch in pool.imap(_run, tasks):
             yield from batch

@@ -45,10 +45,7 @@ def statuses(first: int, last: int, *, sane: bool) -> dict[int, tuple[str, float
 
 def of_tree(tree: Path, first: int, last: int, *, sane: bool) -> subprocess.Popen[str]:
     """A process that prints the statuses of another checkout's version."""
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(map(str, (tree, tree / "factors"))),
-        "OPENBLAS_NUM_THREADS": "1",
-    }
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (tree, tree / "factors")))}
     command = [sys.executable, str(Path(__file__).resolve()), "--tree", str(tree), "--seeds", f"{first}:{last}"]
     command += ["--print-own"] + ["--all-kinds"] * (not sane)
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)

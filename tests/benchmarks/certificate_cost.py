@@ -4,8 +4,8 @@
 
 PATH is the root of another checkout (its gtsam_rwhec/ and factors/ are used). The real dataset is solved by both
 versions in processes that take turns; a million measurements, of one pair and of a hundred, are solved beside copies of
-their arrays in one process. All times are seconds of the processor, one thread of BLAS, and the least of many: other
-work on the machine counts little. Without ``--tree`` the rows of the real dataset have no bar.
+their arrays in one process. All times are seconds of the processor, and the least of many: other work on the machine
+counts little. Without ``--tree`` the rows of the real dataset have no bar.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ BAR = 1.5
 BARS_OF_COPIES = {True: 4.0, False: 6.0}
 #: Targets and sensors of many measurements.
 FRAMES = ((1, 1), (10, 10))
-ONE_THREAD = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
 
 
 def least_seconds(repetitions: int, calls: dict[str, Callable[[], object]]) -> dict[str, float]:
@@ -106,7 +105,7 @@ def many_measurements(count: int, targets: int, sensors: int, repetitions: int) 
 
 def in_process(tree: Path, *arguments: object) -> dict[str, float]:
     """The result of a function of this script in a process of its own, which imports the library of ``tree``."""
-    environment = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(map(str, (tree, tree / "factors")))}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (tree, tree / "factors")))}
     command = [sys.executable, str(HERE), "--child", *map(str, arguments)]
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     result: dict[str, float] = json.loads(done.stdout)

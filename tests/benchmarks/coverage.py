@@ -272,8 +272,6 @@ def plot(results: dict[Case, Outcome], folder: Path) -> Path:
 
 def coverage(runs: int, workers: int, seed: int, console: Console) -> dict[Case, Outcome]:
     """All cases, in chunks over processes."""
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
     seeds = dict(zip(CASES, np.random.SeedSequence(seed).spawn(len(CASES)), strict=True))
     results: dict[Case, list[Outcome]] = {case: [] for case in CASES}
     columns = (TextColumn("coverage"), BarColumn(), MofNCompleteColumn(), TextColumn("runs"), TimeRemainingColumn())

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -85,9 +84,6 @@ def in_parallel(
     workers: int | None,
 ) -> list[tuple[Experiment, Runs]]:
     """Every experiment's runs, in order, whatever the number of worker processes; ``solve`` is pickled."""
-    # Many small problems: one thread in each worker is fastest. Spawned, so that NumPy there sees the variables.
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
     parts: dict[Experiment, list[tuple[int, Runs]]] = {experiment: [] for experiment in seeds}
     columns = (TextColumn("solving"), BarColumn(), MofNCompleteColumn(), TextColumn("runs"), TimeRemainingColumn())
     with (

@@ -2,10 +2,10 @@
 
     python tests/benchmarks/run_all.py [--quick] [--store] [--no-scs] [--plot FOLDER]
 
-Takes some hours: SCS a minute, outliers ten, coverage half an hour, wrong assumptions, split halves and KinHEC some
-hours together, the paper's tables the rest (these in processes of their own, with their own tables). ``--quick`` takes
-a few minutes for a small part of each: it tells that all run and roughly where they are, and its figures are kept apart
-from the others. The noise sweep is examples/noise_sweep.py. Exits with 1 if a bar is missed. Needs scs, kinhec, and
+Takes some hours: SCS a minute, outliers ten, few measurements and coverage half an hour each, wrong assumptions, split
+halves and KinHEC some hours together, the paper's tables the rest (these in processes of their own, with their own
+tables). ``--quick`` takes a few minutes for a small part of each: it tells that all run and roughly where they are, and
+its figures are kept apart from the others. The noise sweep is examples/noise_sweep.py. Exits with 1 if a bar is missed. Needs scs, kinhec, and
 opencv-python-headless<5 for what is compared with OpenCV 4's hand-eye calls: `pip install '.[bench]'`; ``--quick``
 leaves out what cannot run.
 """
@@ -20,11 +20,14 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import busy_cores
 import calibrate_times
 import camera_logs
+import certificate_cost
 import corrupted_detections
 import cv2
 import edge_summaries
+import few_measurements
 import hand_eye
 import many_frames
 import million_measurements
@@ -56,6 +59,9 @@ class Sizes:
     measurements: int = 1_000_000
     repetitions: int = 9
     few_repetitions: int = 5
+    processes: int = 6
+    few_counts: tuple[int, ...] = tuple(range(2, 41))
+    few_trials: int = 2000
     outlier_seeds: int = 40
     log_poses: int = 1_000_000
     bare_loop_s: float = 45.0
@@ -84,6 +90,9 @@ QUICK = Sizes(
     measurements=100_000,
     repetitions=3,
     few_repetitions=1,
+    processes=1,
+    few_counts=(2, 3, 4, 5, 6, 8, 12, 20, 40),
+    few_trials=60,
     outlier_seeds=1,
     log_poses=100_000,
     bare_loop_s=3.0,
@@ -106,6 +115,12 @@ def parts(sizes: Sizes, plot: Path | None) -> dict[str, Callable[[], list[Row]]]
         "one X, one Y, against OpenCV": lambda: one_pair.rows(sizes.pair_repetitions),
         "AX = XB by dual quaternions": lambda: hand_eye.rows(sizes.hand_eye_problems, 4, sizes.few_repetitions),
         "OpenCV's hand-eye methods": lambda: opencv_hand_eye.rows(sizes.few_repetitions, sizes.opencv_problems),
+        "beside busy cores": lambda: busy_cores.rows(3 * sizes.few_repetitions),
+        "cost of the certificate": lambda: (
+            certificate_cost.rows_of_real_dataset(None, sizes.processes, sizes.repetitions)
+            + certificate_cost.rows_of_many(sizes.measurements, sizes.repetitions)
+        ),
+        "few measurements": lambda: few_measurements.rows(sizes.few_counts, sizes.few_trials, few_measurements.SEED),
         "a million measurements": lambda: million_measurements.rows(sizes.measurements, sizes.repetitions),
         "many frames": lambda: many_frames.rows(sizes.repetitions),
         "world origin": world_origin.rows,

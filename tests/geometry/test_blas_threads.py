@@ -70,6 +70,7 @@ CALLS: dict[str, Callable[[rw.Problem, Seen], object]] = {
     "solve": lambda problem, seen: rw.solve(problem, progress=seen),
     "certify": certify,
     "refine": lambda problem, seen: rw.refine(problem, rw.solve(problem), progress=seen),
+    "calibrate": lambda problem, seen: rw.calibrate(problem, progress=seen),
     "cross_validate": lambda problem, seen: rw.cross_validate(problem, 2, progress=seen),
     "compare": lambda problem, seen: rw.methods.compare(problem, methods=["shah2013"], progress=seen),
 }
