@@ -5,9 +5,9 @@
 Takes some hours: SCS a minute, outliers ten, few measurements and coverage half an hour each, wrong assumptions, split
 halves and KinHEC some hours together, the paper's tables the rest (these in processes of their own, with their own
 tables). ``--quick`` takes a few minutes for a small part of each: it tells that all run and roughly where they are, and
-its figures are kept apart from the others. The noise sweep is examples/noise_sweep.py. Exits with 1 if a bar is missed. Needs scs, kinhec, and
-opencv-python-headless<5 for what is compared with OpenCV 4's hand-eye calls: `pip install '.[bench]'`; ``--quick``
-leaves out what cannot run.
+its figures are kept apart from the others. The noise sweep is examples/noise_sweep.py. Exits with 1 if a bar is missed.
+Needs scs, kinhec, and opencv-python-headless<5 for what is compared with OpenCV 4's hand-eye calls: `pip install
+'.[bench]'`; ``--quick`` leaves out what cannot run.
 """
 
 from __future__ import annotations
