@@ -41,6 +41,16 @@ def in_millimetres(T: Array) -> Array:
     return pose(T[:, :3, :3], 1e3 * T[:, :3, 3])
 
 
+def in_thousands(T: Array) -> Array:
+    """Poses whose translations were taken for millimetres: they are divided by 1,000."""
+    return pose(T[:, :3, :3], 1e-3 * T[:, :3, 3])
+
+
+def too_large(T: Array) -> Array:
+    """Poses of a target that is smaller than its size was stated, by a fifth."""
+    return pose(T[:, :3, :3], 1.25 * T[:, :3, 3])
+
+
 def transposed(T: Array) -> Array:
     """Poses with the transposes of their rotations."""
     return pose(T[:, :3, :3].transpose(0, 2, 1), T[:, :3, 3])
@@ -73,6 +83,10 @@ KINDS = (
     Kind("B transposed", Mistake.TRANSPOSED, "rotations of B are transposed", of_B=transposed),
     Kind("A left-handed", Mistake.HANDEDNESS, "left-handed", mirrored),
     Kind("B left-handed", Mistake.HANDEDNESS, "left-handed", of_B=mirrored),
+    Kind("A in millimetres", Mistake.UNIT, "A is in millimetres", in_millimetres),
+    Kind("B in millimetres", Mistake.UNIT, "B is in millimetres", of_B=in_millimetres),
+    Kind("A in thousands", Mistake.UNIT, "those of A are too small", in_thousands),
+    Kind("size wrong", Mistake.SCALE, "lengths in B are 1.25 times the true ones", of_B=too_large),
     Kind("rows of A late", Mistake.ROWS_SHIFTED, "rows of A come 1 row later", shift=1),
     Kind("rows of B late", Mistake.ROWS_SHIFTED, "rows of B come 3 rows later", shift=-3),
 )
@@ -89,6 +103,8 @@ def misread(problem: rw.Problem, kind: Kind) -> rw.Problem:
     for pair in problem.pairs:
         raw = problem.measurements(*pair)
         n = len(raw.A)
+        if n <= abs(kind.shift):
+            continue
         first, last = max(kind.shift, 0), max(-kind.shift, 0)
         of_A, of_B = slice(last, n - first), slice(first, n - last)
         given = (kind.of_A(raw.A[of_A]), kind.of_B(raw.B[of_B]), raw.sigma[of_B], raw.kappa[of_B])

@@ -14,20 +14,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.calibration.readings import DOUBLE, SINGLE, Mistake, Reading, shifted
+from gtsam_rwhec.calibration.readings import AS_READ, DOUBLE, SINGLE, Mistake, Reading, shifted
 from gtsam_rwhec.calibration.samples import Sampled
 from gtsam_rwhec.calibration.trial_fits import Spread, TrialFit, fitted, residual_of, signal_of
+from gtsam_rwhec.calibration.wrong_units import WrongUnit, wrong_unit
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.solution import Solution
 
-#: Residuals below this share of what B varies by are plainly those of a sensor: nothing is tried.
-PLAIN_SHARE = 0.05
+#: Residuals whose shares of what B varies by are below this, in the geometric mean, are plainly those of a sensor.
+PLAIN_SHARE = 0.025
+#: And neither share may be above this.
+LARGEST_PLAIN_SHARE = 0.04
+#: With a share above this the calibration explains so little that no mistake is too strange to be tried.
+UNEXPLAINED_SHARE = 0.3
+#: Readings are first tried on so many pairs, measurements and rounds.
+SCREENING_PAIRS, SCREENING_MEASUREMENTS, SCREENING_ROUNDS = 6, 200, 2
+#: A reading is worth a closer look if its product of residuals there is below this share of the given one's.
+PROMISING = 0.85
 #: The product of both residuals' ratios must be at least this: "fits far better".
-FAR_BETTER = 5.0
+FAR_BETTER = 1.8
 #: And it must be above what chance does by this many of its standard deviations.
-SIGMAS = 5.0
+SIGMAS = 4.0
 #: A residual that became smaller must be below this share of what B varies by: the reading then explains it.
 EXPLAINED = 0.3
 #: A residual may be larger by this factor, if the other one gains more.
@@ -96,49 +106,42 @@ def misreadings(
     sampled = Sampled.of(problem)
     if sampled is None or _degrees_of_freedom(sampled) < FEWEST_DEGREES_OF_FREEDOM:
         return ()
-    sample = sampled.as_read()
-    signal = signal_of(sample)
+    signal = signal_of(sampled.as_read())
     given = residual_of(problem, solution) if solution is not None else None
     if given is not None and is_plain(given, signal):
         return ()
     (progress or silent)("trying other readings of the poses")
-    base = fitted(problem, sample)
-    known = [spread for spread in (given, base.residual if base else None) if spread is not None]
-    if not known:
-        known = [signal]
-    before = min(known, key=lambda spread: _log_volume(spread, signal))
-    if is_plain(before, signal):
+    trial = _Trial.of(problem, sampled, signal)
+    if trial is None or is_plain(trial.base.residual, signal):
         return ()
-    trial = _Trial(problem, sampled, signal, before)
-    return trial.found([*SINGLE, *map(shifted, _shifts())]) or trial.found(DOUBLE)
+    found = trial.found([*SINGLE, *trial.shifts()])
+    if not found and problem.scale == "known":
+        found = trial.found([AS_READ], "shared")
+    if found or not trial.is_strange:
+        return found
+    found = trial.found(DOUBLE)
+    if not found and problem.scale == "known":
+        found = trial.found(SINGLE, "shared")
+    return found
 
 
 def is_plain(residual: Spread, signal: Spread) -> bool:
     """Whether residuals are plainly those of a sensor: small beside what B varies by."""
+    shares = _shares(residual, signal)
+    return math.sqrt(shares[0] * shares[1]) < PLAIN_SHARE and max(shares) < LARGEST_PLAIN_SHARE
+
+
+def _shares(residual: Spread, signal: Spread) -> tuple[float, float]:
+    """The residuals as shares of what B varies by."""
     return (
-        residual.rotation_rad < PLAIN_SHARE * signal.rotation_rad
-        and residual.translation_m < PLAIN_SHARE * signal.translation_m
+        residual.rotation_rad / max(signal.rotation_rad, SMALLEST_RAD),
+        residual.translation_m / max(signal.translation_m, 1e-12),
     )
-
-
-def _shifts() -> list[int]:
-    return [sign * n for n in range(1, MOST_SHIFTED + 1) for sign in (1, -1)]
 
 
 def _degrees_of_freedom(sampled: Sampled) -> int:
     """Of the rotations alone, and of the translations alone."""
     return 3 * (sampled.count - sampled.unknown_poses)
-
-
-def _floored(spread: Spread, signal: Spread) -> Spread:
-    return Spread(
-        max(spread.rotation_rad, SMALLEST_RAD), max(spread.translation_m, SMALLEST_SHARE * signal.translation_m, 1e-12)
-    )
-
-
-def _log_volume(spread: Spread, signal: Spread) -> float:
-    floored = _floored(spread, signal)
-    return math.log(floored.rotation_rad) + math.log(floored.translation_m)
 
 
 @dataclass(frozen=True)
@@ -147,44 +150,95 @@ class _Trial:
 
     problem: Problem
     sampled: Sampled
+    screen: Sampled
     signal: Spread
-    before: Spread
+    base: TrialFit
+    on_screen: TrialFit
 
-    @property
-    def needed(self) -> float:
-        """The logarithm of the least product of ratios that is not chance."""
-        variance = 2.0 * INEFFICIENCY_OF_MEDIANS / _degrees_of_freedom(self.sampled)
-        return math.log(FAR_BETTER) + SIGMAS * math.sqrt(variance)
+    @staticmethod
+    def of(problem: Problem, sampled: Sampled, signal: Spread) -> _Trial | None:
+        """The poses as they were read, fitted; None where they have no answer with these scales."""
+        screen = Sampled.of(problem, SCREENING_PAIRS, SCREENING_MEASUREMENTS)
+        assert screen is not None
+        base = fitted(problem, sampled.as_read())
+        on_screen = fitted(problem, screen.as_read(), rounds=SCREENING_ROUNDS)
+        if base is None or on_screen is None:
+            return None
+        return _Trial(problem, sampled, screen, signal, base, on_screen)
 
-    def found(self, readings: Iterable[Reading]) -> tuple[Misreading, ...]:
+    def found(self, readings: Iterable[Reading], mode: ScaleMode | None = None) -> tuple[Misreading, ...]:
         """The readings that fit best, if they fit far better than the given one."""
+        promising = [reading for reading in readings if self.is_promising(reading, mode)]
         gains: list[tuple[float, Misreading]] = []
-        for reading in readings:
-            fit = fitted(self.problem, self.sampled.by(reading), to_beat=self.before)
-            if fit is not None and (gain := self.gain(fit)) > self.needed:
-                gains.append((gain, self.named(reading, fit)))
+        for reading in promising:
+            fit = fitted(self.problem, self.sampled.by(reading), mode)
+            if fit is None or not (gain := self.gain(reading, fit)):
+                continue
+            named = self.named(reading, fit) if mode is None else self.named_with_unit(reading, fit)
+            if named is not None:
+                gains.append((gain, named))
         most = max((gain for gain, _ in gains), default=0.0)
         return tuple(misreading for gain, misreading in gains if gain > most - math.log(ALIKE))
 
-    def gain(self, fit: TrialFit) -> float:
-        """The logarithm of the product of both residuals' ratios; 0 where the reading does not explain its gain."""
-        before, after = _floored(self.before, self.signal), _floored(fit.residual, self.signal)
+    @property
+    def is_strange(self) -> bool:
+        """Whether the poses as read explain next to nothing."""
+        return max(_shares(self.base.residual, self.signal)) > UNEXPLAINED_SHARE
+
+    def shifts(self) -> list[Reading]:
+        """Shifts of rows worth a look: rows that change slowly fit better by one row where they fit better by more."""
+        fewest = [shifted(1), shifted(-1)]
+        if not self.is_strange and not any(self.is_promising(reading, None) for reading in fewest):
+            return []
+        return fewest + [shifted(sign * n) for n in range(2, MOST_SHIFTED + 1) for sign in (1, -1)]
+
+    def is_promising(self, reading: Reading, mode: ScaleMode | None) -> bool:
+        """Whether a reading does better on few measurements in few rounds."""
+        fit = fitted(self.problem, self.screen.by(reading), mode, rounds=SCREENING_ROUNDS)
+        return fit is not None and self._log_product(fit) < self._log_product(self.on_screen) + math.log(PROMISING)
+
+    def gain(self, reading: Reading, fit: TrialFit) -> float:
+        """The logarithm of the product of both residuals' ratios; 0 where it is small, unexplained or chance."""
+        before, after = self._floored(self.base.residual), self._floored(fit.residual)
         ratios = (before.rotation_rad / after.rotation_rad, before.translation_m / after.translation_m)
-        shares = (
-            after.rotation_rad / max(self.signal.rotation_rad, SMALLEST_RAD),
-            after.translation_m / max(self.signal.translation_m, 1e-12),
-        )
-        for ratio, share in zip(ratios, shares, strict=True):
+        for ratio, share in zip(ratios, _shares(after, self.signal), strict=True):
             if ratio < 1.0 / NOT_WORSE or (ratio > NOT_WORSE and share > EXPLAINED):
                 return 0.0
-        return float(np.sum(np.log(ratios)))
+        gain = float(np.sum(np.log(ratios)))
+        chance = math.sqrt(2.0 * INEFFICIENCY_OF_MEDIANS / _degrees_of_freedom(self.sampled))
+        return gain if gain > math.log(FAR_BETTER) + SIGMAS * chance and self.is_significant(reading, fit) else 0.0
 
-    def named(self, reading: Reading, fit: TrialFit) -> Misreading:
-        """The record of a reading that fits."""
-        return Misreading(
-            reading.mistake,
-            reading.likely,
-            reading.cure,
-            (math.degrees(self.before.rotation_rad), math.degrees(fit.residual.rotation_rad)),
-            (1e3 * self.before.translation_m, 1e3 * fit.residual.translation_m),
+    def is_significant(self, reading: Reading, fit: TrialFit) -> bool:
+        """Vuong's test of two models that do not contain each other, over blocks of neighbouring measurements."""
+        remains = self.sampled.remains(reading)
+        differences = fit.log_likelihoods - self.base.log_likelihoods[remains]
+        blocks = self.sampled.blocks()[remains]
+        sums = np.bincount(blocks, differences)[np.unique(blocks)]
+        return float(sums.mean()) > SIGMAS * float(sums.std(ddof=1)) / math.sqrt(len(sums))
+
+    def _floored(self, spread: Spread) -> Spread:
+        return Spread(
+            max(spread.rotation_rad, SMALLEST_RAD),
+            max(spread.translation_m, SMALLEST_SHARE * self.signal.translation_m, 1e-12),
         )
+
+    def _log_product(self, fit: TrialFit) -> float:
+        floored = self._floored(fit.residual)
+        return math.log(floored.rotation_rad) + math.log(floored.translation_m)
+
+    def named(self, reading: Reading, fit: TrialFit, unit: WrongUnit | None = None) -> Misreading:
+        """The record of a reading that fits, and of a unit that is wrong too."""
+        before, factor = self.base.residual, unit.of_B if unit else 1.0
+        parts = [part for part in (reading if reading is not AS_READ else None, unit) if part]
+        return Misreading(
+            parts[0].mistake,
+            ", and ".join(part.likely for part in parts),
+            "; ".join(part.cure for part in parts),
+            (math.degrees(before.rotation_rad), math.degrees(fit.residual.rotation_rad)),
+            (1e3 * before.translation_m, 1e3 * fit.residual.translation_m / factor),
+        )
+
+    def named_with_unit(self, reading: Reading, fit: TrialFit) -> Misreading | None:
+        """The record of a reading that fits with a free scale; None where the scale is no mistake."""
+        unit = wrong_unit(fit.one_scale, *self.sampled.median_lengths)
+        return self.named(reading, fit, unit) if unit else None

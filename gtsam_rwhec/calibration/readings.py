@@ -138,6 +138,8 @@ _BOTH_INVERTED = Reading(
     "give the inverse of each pose in A and in B",
     _of_sides(("A", "B"), _inverted),
 )
+#: The poses as they are; with a free scale it tells a wrong unit.
+AS_READ = Reading(Mistake.UNIT, "", "", lambda A, B: (A, B))
 _ROLES = Reading(
     Mistake.ROLES_EXCHANGED,
     "targets and sensors are exchanged",

@@ -19,6 +19,8 @@ MOST_OF_A_PAIR = 200
 MOST_PAIRS = 24
 #: At most so many measurements in all.
 MOST_IN_ALL = 2000
+#: About so many blocks of neighbouring rows are compared.
+BLOCKS = 24
 #: A pair with fewer measurements is not sampled where others have more: it says little, and has its own unknowns.
 FEWEST_OF_A_PAIR = 4
 
@@ -31,12 +33,12 @@ class Sampled:
     rows: dict[Pair, np.ndarray]
 
     @staticmethod
-    def of(problem: Problem) -> Sampled | None:
+    def of(problem: Problem, most_pairs: int = MOST_PAIRS, most_in_all: int = MOST_IN_ALL) -> Sampled | None:
         """A sample of a problem; None where it kept no measurements."""
         if not problem.has_measurements:
             return None
-        pairs = _pairs(problem)
-        most = max(min(MOST_OF_A_PAIR, MOST_IN_ALL // len(pairs)), FEWEST_OF_A_PAIR)
+        pairs = _pairs(problem, most_pairs)
+        most = max(min(MOST_OF_A_PAIR, most_in_all // len(pairs)), FEWEST_OF_A_PAIR)
         whole = {pair: problem.measurements(*pair) for pair in pairs}
         rows = {pair: np.unique(np.linspace(0, len(raw.A) - 1, most).astype(int)) for pair, raw in whole.items()}
         return Sampled(whole, rows)
@@ -55,18 +57,44 @@ class Sampled:
         """A and B as they are."""
         return {pair: (raw.A[self.rows[pair]], raw.B[self.rows[pair]]) for pair, raw in self.whole.items()}
 
+    @property
+    def median_lengths(self) -> tuple[float, float]:
+        """Median lengths of A's translations about their own median, and of B's."""
+        A, B = (np.concatenate(poses)[:, :3, 3] for poses in zip(*self.as_read().values(), strict=True))
+        return (
+            float(np.median(np.linalg.norm(A - np.median(A, axis=0), axis=1))),
+            float(np.median(np.linalg.norm(B, axis=1))),
+        )
+
     def by(self, reading: Reading) -> dict[Pair, tuple[Array, Array]]:
         """A and B by another reading. Motions have one frame, and their rows belong together: no roles, no shift."""
         found = {}
         for pair, raw in self.whole.items():
-            rows, shift = self.rows[pair], 0 if pair.is_motion else reading.shift
-            rows = rows[(rows + shift >= 0) & (rows + shift < len(raw.B))]
+            rows, shift = self.rows[pair][self._remains(pair, reading)], 0 if pair.is_motion else reading.shift
             if len(rows):
                 found[reading.pair(pair)] = reading.changed(raw.A[rows], raw.B[rows + shift])
         return found
 
+    def remains(self, reading: Reading) -> np.ndarray:
+        """Which measurements of ``as_read`` the reading has too, pair after pair: a shift leaves some out."""
+        return np.concatenate([self._remains(pair, reading) for pair in self.rows])
 
-def _pairs(problem: Problem) -> list[Pair]:
+    def _remains(self, pair: Pair, reading: Reading) -> np.ndarray:
+        shifted = self.rows[pair] + (0 if pair.is_motion else reading.shift)
+        return (shifted >= 0) & (shifted < len(self.whole[pair].B))
+
+    def blocks(self) -> np.ndarray:
+        """A block number of each measurement: blocks are contiguous rows of a pair, since neighbours share errors."""
+        of_a_pair = -(-BLOCKS // len(self.rows))
+        numbers, first = [], 0
+        for rows in self.rows.values():
+            many = min(of_a_pair, len(rows))
+            numbers.append(first + np.arange(len(rows)) * many // len(rows))
+            first += many
+        return np.concatenate(numbers)
+
+
+def _pairs(problem: Problem, most: int) -> list[Pair]:
     """The pairs with the most measurements, each joined to those before it where there is such a pair."""
     counts = {pair: problem.moments(*pair).count for pair in problem.pairs}
     by_frame: dict[str, set[Pair]] = defaultdict(set)
@@ -77,7 +105,7 @@ def _pairs(problem: Problem) -> list[Pair]:
     left = sorted(enough, key=lambda pair: -counts[pair])
     chosen: list[Pair] = []
     names: set[str] = set()
-    while left and len(chosen) < MOST_PAIRS:
+    while left and len(chosen) < most:
         # A pair that closes a loop tells more than one with a frame of its own.
         best = max(left, key=lambda pair: (sum(name in names for name in pair), counts[pair]))
         chosen.append(best)

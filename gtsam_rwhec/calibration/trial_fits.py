@@ -30,12 +30,8 @@ from gtsam_rwhec.solving.solution import Solution
 MEDIAN_OF_CHI = 1.5382
 #: Rounds of re-weighting; weights of measurements settle in three or four.
 ROUNDS = 5
-#: After so many rounds a fit that is not clearly better than what it must beat is given up.
-SCREENING_ROUNDS = 2
-#: "Clearly better": the product of its residuals is below this share of the other's.
-PROMISING = 0.5
-#: Cauchy's constant for a residual in six dimensions: its squared norm is 6 on average.
-CAUCHY_SQUARED = 6.0
+#: Degrees of freedom of Student's t, which weighs outliers down.
+DEGREES_OF_T = 6.0
 #: Standard deviation of rotations before the first round (rad): the balance against translations.
 FIRST_RAD = 0.05
 #: Standard deviation of translations before the first round, as a share of the distances that B has.
@@ -71,10 +67,23 @@ class TrialFit:
         Of B against its prediction, in the unit that B has.
     scale : float or dict of str to float
         Lengths in B over true lengths; negative where A and B are of different handedness.
+    errors : (2, N) array
+        Of each measurement, pair after pair: angle (rad) and distance (in B's unit).
     """
 
     residual: Spread
     scale: float | dict[str, float]
+    errors: Array
+
+    @property
+    def log_likelihoods(self) -> Array:
+        """Of each measurement (N,), up to a constant: Student's t in six dimensions, with the fit's own spreads."""
+        s_R, s_t = self.residual.rotation_rad, self.residual.translation_m
+        squared = (self.errors[0] / s_R) ** 2 + (self.errors[1] / s_t) ** 2
+        dimensions = 6.0
+        tails = 0.5 * (DEGREES_OF_T + dimensions) * np.log1p(MEDIAN_OF_CHI**2 * squared / DEGREES_OF_T)
+        result: Array = -3.0 * np.log(s_R * s_t) - tails
+        return result
 
     @property
     def one_scale(self) -> float:
@@ -90,34 +99,27 @@ class _Answer:
 
 
 def fitted(
-    problem: Problem, sample: Sample, scale: ScaleMode | None = None, *, to_beat: Spread | None = None
+    problem: Problem, sample: Sample, scale: ScaleMode | None = None, *, rounds: int = ROUNDS
 ) -> TrialFit | None:
-    """Fit a sample of a problem robustly.
-
-    ``scale`` overrules the problem's. None where the sample has no answer, and where the fit will not be clearly better
-    than residuals ``to_beat``.
-    """
+    """Fit a sample of a problem robustly; ``scale`` overrules the problem's. None where the sample has no answer."""
     mode = scale or problem.scale
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # the words of trials are for nobody
-            return _fitted(problem, sample, mode, to_beat)
+            return _fitted(problem, sample, mode, rounds)
     except (RwhecError, np.linalg.LinAlgError):
         return None  # too few measurements for this scale, or no finite answer: this reading explains nothing
 
 
-def _fitted(problem: Problem, sample: Sample, mode: ScaleMode, to_beat: Spread | None) -> TrialFit | None:
+def _fitted(problem: Problem, sample: Sample, mode: ScaleMode, rounds: int) -> TrialFit | None:
     distance = median_distance(sample)
     kappa, sigma = 0.5 / FIRST_RAD**2, FIRST_SHARE * distance
     weights: dict[Pair, Array] = {pair: np.ones(len(B)) for pair, (_, B) in sample.items()}
-    limit = PROMISING * _volume(to_beat, distance) if to_beat else np.inf
     starts: list[Array] | None = None
     best: TrialFit | None = None
-    for count in range(ROUNDS):
-        if count == SCREENING_ROUNDS and to_beat and best and _volume(best.residual, distance) > limit:
-            return None
+    for _ in range(rounds):
         trial = _problem_of(problem, sample, mode, weights, sigma, kappa)
-        answer = _solved(trial, starts if count >= SCREENING_ROUNDS else None)
+        answer = _solved(trial, starts)
         starts = answer.rotations
         errors = {pair: residuals(answer.frames, answer.scales[pair.target], pair, *sample[pair]) for pair in sample}
         joined = np.concatenate(list(errors.values()), axis=1)
@@ -127,12 +129,13 @@ def _fitted(problem: Problem, sample: Sample, mode: ScaleMode, to_beat: Spread |
         kept = best is None or _volume(spread, distance) < _volume(best.residual, distance)
         if kept:
             scales = {pair.target: answer.scales[pair.target] for pair in sample}
-            best = TrialFit(spread, scales if mode == "per_target" else next(iter(scales.values())))
+            own = scales if mode == "per_target" else next(iter(scales.values()))
+            best = TrialFit(spread, own, joined)
         s_R = max(spread.rotation_rad, SMALLEST_SHARE) / MEDIAN_OF_CHI
         s_t = max(spread.translation_m, SMALLEST_SHARE * distance) / MEDIAN_OF_CHI
         kappa, sigma = 0.5 / s_R**2, s_t
         weights = {
-            pair: 1.0 / (1.0 + ((rotation / s_R) ** 2 + (translation / s_t) ** 2) / CAUCHY_SQUARED)
+            pair: 1.0 / (1.0 + ((rotation / s_R) ** 2 + (translation / s_t) ** 2) / DEGREES_OF_T)
             for pair, (rotation, translation) in errors.items()
         }
     return best
