@@ -52,6 +52,7 @@ from . import results as results
 from .results import judge as judge
 from .results import read_refined as read_refined
 from .results import read_solution as read_solution
+from .results import write_calibration as write_calibration
 from .results import write_refined as write_refined
 from .results import write_solution as write_solution
 

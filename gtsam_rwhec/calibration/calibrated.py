@@ -31,6 +31,9 @@ from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.unknowns import Unknown
 from gtsam_rwhec.solving.solution import Solution
 
+#: A sentence about outliers names at most this many pairs.
+NAMED = 5
+
 
 @dataclass(frozen=True)
 class NoiseFound:
@@ -94,10 +97,14 @@ class Outliers:
         total = sum(number for _, number in self.counts.values())
         if not self.inliers:
             return f"Outliers were not looked for among {total} measurements."
-        out = [f"{pair} {number - kept} of {number}" for pair, (kept, number) in self.counts.items() if kept < number]
+        out = {pair: (number - kept, number) for pair, (kept, number) in self.counts.items() if kept < number}
         if not out:
             return f"No outliers among {total} measurements."
-        return f"{self.number} of {total} measurements contradict the others and were left out: {', '.join(out)}."
+        most = sorted(out.items(), key=lambda item: -item[1][0])[:NAMED]
+        named = [f"{number} of {of} of {pair}" for pair, (number, of) in most]
+        more = f", and some of {len(out) - NAMED} other pairs" if len(out) > NAMED else ""
+        said = f"{self.number} of {total} measurements contradict the others and were left out"
+        return f"{said}: {', '.join(named)}{more}."
 
 
 @dataclass(frozen=True)

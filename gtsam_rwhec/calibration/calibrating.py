@@ -295,7 +295,9 @@ class _Calibrating:
             for pair in problem.pairs
         }
         for frame in contradicted_frames(counts):
-            self.findings.append(Finding(Ground.CONTRADICTED, str(frame)))
+            is_sensor = frame.frame in problem.sensors
+            ground = Ground.CONTRADICTED if is_sensor else Ground.TARGET_CONTRADICTED
+            self.findings.append(Finding(ground, str(frame)))
         left = {name for pair, (kept, _) in counts.items() if kept for name in pair}
         left_out = tuple(name for name in (*problem.sensors, *problem.targets) if name not in left)
         for name in left_out:

@@ -12,6 +12,7 @@ calibration's error does not.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -74,14 +75,36 @@ class PointUncertainty:
     measurement_mm: float | None
 
     def __str__(self) -> str:
-        distance = float(np.linalg.norm(self.point_m))
-        what = f"A point {distance:.2f} m from {self.frame}, expressed in {self.seen_from},"
-        if not np.isfinite(self.radius_mm):
-            return f"{what} is not determined: the measurements leave a direction free that moves it."
-        said = f"{what} is within {self.radius_mm:.2g} mm of its true place with {100 * self.level:g} % probability"
-        if self.measurement_mm is None:
-            return f"{said}."
-        return f"{said}; the noise of one new measurement adds up to {self.measurement_mm:.2g} mm."
+        return point_sentence(self)
+
+
+class PointInWords(Protocol):
+    """What a sentence about a point needs; ``PointUncertainty`` describes the fields."""
+
+    @property
+    def point_m(self) -> ArrayLike: ...
+    @property
+    def frame(self) -> str: ...
+    @property
+    def seen_from(self) -> str: ...
+    @property
+    def level(self) -> float: ...
+    @property
+    def radius_mm(self) -> float: ...
+    @property
+    def measurement_mm(self) -> float | None: ...
+
+
+def point_sentence(point: PointInWords) -> str:
+    """How far off a point is, as one sentence."""
+    distance = float(np.linalg.norm(point.point_m))
+    what = f"A point {distance:.2f} m from {point.frame}, expressed in {point.seen_from},"
+    if not np.isfinite(point.radius_mm):
+        return f"{what} is not determined: the measurements leave a direction free that moves it."
+    said = f"{what} is within {point.radius_mm:.2g} mm of its true place with {100 * point.level:g} % probability"
+    if point.measurement_mm is None:
+        return f"{said}."
+    return f"{said}; the noise of one new measurement adds up to {point.measurement_mm:.2g} mm."
 
 
 def checked_point(point: ArrayLike) -> Array:

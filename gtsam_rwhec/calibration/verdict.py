@@ -54,7 +54,7 @@ class Ground(StrEnum):
     NOT_CERTIFIED = "not_certified"
     #: The measurements leave a direction free.
     NOT_UNIQUE = "not_unique"
-    #: Most measurements of a sensor or target were left out as outliers.
+    #: Most measurements of a sensor were left out as outliers.
     CONTRADICTED = "contradicted"
     #: A sensor has no measurement in the answer, and so no pose.
     NO_ANSWER = "no_answer"
@@ -62,6 +62,8 @@ class Ground(StrEnum):
     SIZE_DOUBTED = "size_doubted"
     #: The measurements are too few to tell how well the poses are known.
     NO_COVARIANCE = "no_covariance"
+    #: Most measurements of a target were left out as outliers; the sensors' poses rest on other targets.
+    TARGET_CONTRADICTED = "target_contradicted"
     #: Errors of neighbouring measurements are alike, beyond what the model of the noise holds.
     CORRELATED = "correlated"
     #: Errors depend on the configuration: an arm's kinematics, intrinsics, a board that is not flat.
@@ -80,7 +82,7 @@ class Ground(StrEnum):
         return _ADVICE[self]
 
 
-_CARE = (Ground.CORRELATED, Ground.SYSTEMATIC, Ground.COVARIANCE_DOUBTED)
+_CARE = (Ground.TARGET_CONTRADICTED, Ground.CORRELATED, Ground.SYSTEMATIC, Ground.COVARIANCE_DOUBTED)
 _ADVICE = {
     Ground.MISREAD: "correct how the file is read, and calibrate again",
     Ground.IMPLAUSIBLE: (
@@ -96,6 +98,9 @@ _ADVICE = {
     Ground.NO_ANSWER: "measure with this sensor, or leave it out of the problem",
     Ground.SIZE_DOUBTED: "measure the named target again, or let its size be estimated",
     Ground.NO_COVARIANCE: "take more measurements",
+    Ground.TARGET_CONTRADICTED: (
+        "do not use the pose of the named target; check whether it has moved, and measure it again"
+    ),
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
     Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",
     Ground.COVARIANCE_DOUBTED: "use the poses, but do not rely on their standard deviations",

@@ -26,7 +26,7 @@ from gtsam_rwhec.solving.solution import Solution
 #: Largest share by which sums of the same doubles in another order may differ.
 ROUNDING = 1e-9
 #: Up to this version these grounds asked for care alone; after it, such poses are not to be used.
-LAST_WITH_CARE = 4
+LAST_WITH_CARE = 5
 ONCE_CARE = {Ground.NOT_CERTIFIED, Ground.SIZE_DOUBTED}
 
 
@@ -80,7 +80,7 @@ def check_certificates(solution: SolutionFields) -> None:
 
 
 def check_says_what_it_is_about(raw: dict[str, Any]) -> None:
-    """A certificate of format version 5 has both fields that limit it: left out, one of them would claim too much."""
+    """A certificate of format version 5 or later has both fields that limit it: left out, one of them would claim too much."""
     certified = raw.get("certified")
     if not isinstance(certified, dict):
         return  # said by the schema
@@ -141,7 +141,7 @@ def check_scale(answer: Solution | RefinedPoses, place: str) -> None:
 def check_verdict(stated: Verdict, grounds: tuple[Ground, ...], found: Judgement, version: int) -> None:
     """The verdict of a file, and its grounds, are what its facts lead to.
 
-    Up to version 4 an answer that was not proven, and a doubted size, asked for care.
+    Up to version 5 an answer that was not proven, and a doubted size, asked for care.
     """
     led_to = found.verdict
     if version <= LAST_WITH_CARE and found.grounds and set(found.grounds) <= ONCE_CARE:

@@ -3,7 +3,8 @@
 In these versions ``sensors`` and ``targets`` at the top were the certified poses; ``refined`` had the refined poses.
 Version 1 had no ``refined``, version 2 had no ``log``, and no version had a verdict.
 
-Version 4 needs no conversion: the fields of certificates that it lacks have defaults, which claim less.
+Versions 4 and 5 need no conversion: the fields of certificates that version 4 lacks have defaults, which claim less, and
+both lack what ``calibrate`` found.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from gtsam_rwhec.solver.cause import Cause, SearchPath
 
 FIRST_VERSION = 1
 FIRST_WITH_VERDICT = 4
+#: From this version on a certificate says what its bound is about.
+FIRST_WITH_REGION = 5
 
 _RESIDUAL = ("translation_rms_m", "rotation_rms_rad")
 

@@ -17,8 +17,10 @@ import gtsam
 import numpy as np
 from pydantic import ValidationError
 
+from gtsam_rwhec.calibration.choices import Choice
 from gtsam_rwhec.files.terminal_text import brief, printable, shown
 from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.results.calibration_fields import PointFields
 from gtsam_rwhec.results.json_text import DEEPEST, MOST_ROWS, MOST_VALUES, refuse_depth
 from gtsam_rwhec.solver.certificate import Certificate
 
@@ -28,6 +30,8 @@ POSED = ("sensors", "targets", "scale", "scale_mode")
 ROWS = ("residuals", "pairs", "noise", "inlier_counts")
 #: The field in which a record says in words what it means. It is for people and is not read back.
 SENTENCE = "sentence"
+#: Records with a sentence.
+SAID = (Certificate, FreeDirection, Choice, PointFields)
 #: Fields of a covariance of all unknowns; they have far more numbers than all others together.
 MATRICES = ("finite", "free", "unit")
 #: With more faults than this a message has their number alone: to list a million faults takes a gigabyte.
@@ -36,6 +40,7 @@ MOST_FAULTS = 1_000
 INFINITIES = {
     **dict.fromkeys(("lower_bound", "float_bound", "min_eigenvalue"), -math.inf),
     **dict.fromkeys(("weakest", "degrees_of_freedom", "standard_deviations_deg", "standard_deviations_mm"), math.inf),
+    "radius_mm": math.inf,
 }
 
 
@@ -46,7 +51,7 @@ def to_json(value: Any, place: str, field: str = "") -> Any:
     """
     if is_dataclass(value) and not isinstance(value, type):
         tree = {f.name: to_json(getattr(value, f.name), f"{place}.{f.name}", f.name) for f in fields(value)}
-        return {**tree, SENTENCE: str(value)} if isinstance(value, Certificate | FreeDirection) else tree
+        return {**tree, SENTENCE: str(value)} if isinstance(value, SAID) else tree
     if isinstance(value, Mapping):
         if field in ROWS:
             return [

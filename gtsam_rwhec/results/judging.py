@@ -34,8 +34,11 @@ def judge(
         raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
     found = [*findings_of(solution, refined), *findings]
     if log is not None:
-        if log.contradicted:
-            found.append(Finding(Ground.CONTRADICTED, "; ".join(map(str, log.contradicted))))
+        sensors = {count.sensor for count in log.outliers}
+        found += [
+            Finding(Ground.CONTRADICTED if one.frame in sensors else Ground.TARGET_CONTRADICTED, str(one))
+            for one in log.contradicted
+        ]
         doubted = [size.target for size in log.sizes if size.is_doubted and not size.is_free]
         if doubted:
             words = f"the stated size of {', '.join(doubted)} does not fit the motion"

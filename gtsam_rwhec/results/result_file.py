@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.errors import FileFormatError, OptionError, ResultVersionError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.paths import checked_path
@@ -30,8 +32,9 @@ from gtsam_rwhec.results.agreement import (
     check_top,
     check_verdict,
 )
+from gtsam_rwhec.results.calibration_fields import CalibrationFields
 from gtsam_rwhec.results.covariance_agreement import check_frames, check_joint
-from gtsam_rwhec.results.earlier_versions import FIRST_VERSION, FIRST_WITH_VERDICT, as_version_4
+from gtsam_rwhec.results.earlier_versions import FIRST_VERSION, FIRST_WITH_REGION, FIRST_WITH_VERDICT, as_version_4
 from gtsam_rwhec.results.json_text import MOST_BYTES, parse_json
 from gtsam_rwhec.results.json_tree import POSED, from_json, in_words, to_json
 from gtsam_rwhec.results.judging import judge
@@ -49,6 +52,8 @@ from gtsam_rwhec.results.schema import (
 )
 from gtsam_rwhec.solving.solution import Solution
 
+CARRIERS = {"X": TARGET_CARRIER, "Y": SENSOR_CARRIER}
+
 
 @dataclass(frozen=True)
 class Result:
@@ -62,11 +67,20 @@ class Result:
         The refined calibration; None if the solution was not refined.
     log : LogFields or None
         What became of the measurements; None if they do not come from a log.
+    calibration : CalibrationFields or None
+        What ``calibrate`` found and chose; None if it did not run.
     """
 
     solution: Solution
     refined: RefinedPoses | None
     log: LogFields | None
+    calibration: CalibrationFields | None = None
+
+    @property
+    def judgement(self) -> Judgement:
+        """The verdict, with its grounds."""
+        findings = () if self.calibration is None else self.calibration.findings
+        return judge(self.solution, self.refined, self.log, findings)
 
 
 class _Header(BaseModel):
@@ -118,9 +132,33 @@ def write_refined(refined: Refined, path: str | Path, log: LogFields | None = No
     write_atomically(path, _content(path, refined.solution, refined, log))
 
 
-def refined_json(refined: Refined, log: LogFields | None = None) -> bytes:
-    """What `write_refined` writes."""
-    return _content("the result", refined.solution, refined, log)
+def write_calibration(calibration: Calibration, path: str | Path, log: LogFields | None = None) -> None:
+    """Write a calibration as JSON: verdict, poses, certificate, covariances, and every choice with its evidence.
+
+    The factor graph is not written. Raises as `write_solution` does.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The result of `gtsam_rwhec.calibrate`.
+    path : str or Path
+        The file; an existing file is replaced. Its folder must exist.
+    log : LogFields, optional
+        What became of the measurements, if they come from a log.
+    """
+    path = checked_path(path)
+    if not isinstance(calibration, Calibration):
+        raise OptionError(f"calibration is a {type(calibration).__name__}; give what gtsam_rwhec.calibrate returned")
+    write_atomically(path, calibration_json(calibration, log, path))
+
+
+def calibration_json(
+    calibration: Calibration, log: LogFields | None = None, path: str | Path = "the result"
+) -> bytes:
+    """What `write_calibration` writes."""
+    record, names = CalibrationFields.of(calibration), calibration.carriers
+    carriers = {"X": names.targets or TARGET_CARRIER, "Y": names.sensors or SENSOR_CARRIER}
+    return _content(path, calibration.solution, calibration.refined, log, record, carriers)
 
 
 def read_solution(path: str | Path) -> Solution:
@@ -149,7 +187,7 @@ def read_refined(path: str | Path) -> RefinedPoses:
     if refined is None:
         raise FileFormatError(
             f"{path} holds a solution that was not refined. Read it with read_solution, or refine it and write it "
-            "again (gtsam-rwhec calibrate --refine, or rw.write_refined)."
+            "again (rw.calibrate and rw.write_calibration, or rw.write_refined)."
         )
     return refined
 
@@ -181,13 +219,12 @@ def parse_result(content: bytes, path: str | Path) -> Result:
     try:
         if number < FIRST_WITH_VERDICT:
             raw = as_version_4(raw)
-        if number == FORMAT_VERSION:
+        if number >= FIRST_WITH_REGION:
             check_says_what_it_is_about(raw)
         file = _checked({**raw, "format_version": FORMAT_VERSION})  # version 4 lacks fields that have defaults
         result = _result_of(file)
         if number >= FIRST_WITH_VERDICT:
-            found = judge(result.solution, result.refined, result.log)
-            check_verdict(file.verdict, file.verdict_grounds, found, number)
+            check_verdict(file.verdict, file.verdict_grounds, result.judgement, number)
     except ValueError as error:
         of_version = (
             "" if number == FORMAT_VERSION else f" of version {number} (converted places are those of {FORMAT_VERSION})"
@@ -198,17 +235,23 @@ def parse_result(content: bytes, path: str | Path) -> Result:
 
 def _result_of(file: ResultFile) -> Result:
     refined = None if file.refined is None else _of_class(RefinedPoses, file.refined)
-    return Result(_of_class(Solution, file.certified), refined, file.log)
+    return Result(_of_class(Solution, file.certified), refined, file.log, file.calibration)
 
 
 def _of_class(base: Any, record: Any) -> Any:
     return base(**{field.name: getattr(record, field.name) for field in fields(base)})
 
 
-def _content(path: str | Path, solution: Solution, refined: Refined | None, log: LogFields | None) -> bytes:
+def _content(
+    path: str | Path,
+    solution: Solution,
+    refined: Refined | None,
+    log: LogFields | None,
+    calibration: CalibrationFields | None = None,
+    carriers: Mapping[str, str] = CARRIERS,
+) -> bytes:
     """The content of a file. It is read back here once, so that every written file can be read."""
-    judgement = judge(solution, refined, log)
-    carriers = {"X": TARGET_CARRIER, "Y": SENSOR_CARRIER}
+    judgement = judge(solution, refined, log, () if calibration is None else calibration.findings)
     if log is not None:
         carriers = {"X": log.target_carrier, "Y": log.sensor_carrier}
     try:
@@ -218,6 +261,8 @@ def _content(path: str | Path, solution: Solution, refined: Refined | None, log:
         if refined is not None:
             parts["refined"] = _posed(to_json(_refined_fields(refined), "$.refined"), refined, carriers)
             poses = {name: parts["refined"].pop(name) for name in POSED}
+        if calibration is not None:
+            parts["calibration"] = to_json(calibration, "$.calibration")
         if log is not None:
             parts["log"] = log.model_dump(mode="json")
         tree = {

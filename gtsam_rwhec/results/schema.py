@@ -23,13 +23,14 @@ from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.refined import PairNoise, RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown
+from gtsam_rwhec.results.calibration_fields import CalibrationFields
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solving.solution import Solution
 
 FORMAT: Final = "gtsam-rwhec result"
 #: It grows whenever a reader of the version before would misread or refuse the file.
-FORMAT_VERSION: Final = 5
+FORMAT_VERSION: Final = 6
 
 CONVENTIONS = {
     "poses": (
@@ -242,7 +243,7 @@ class ResultFile(BaseModel):
     model_config = CONFIG
 
     format: Literal["gtsam-rwhec result"] = Field(description="what kind of file this is")
-    format_version: Literal[5] = Field(description="the version of these fields")
+    format_version: Literal[6] = Field(description="the version of these fields")
     written_by: str = Field(description="the library and its version")
     verdict: Verdict = Field(description="use, care or do_not_use")
     verdict_reason: str = Field(description="the reasons as a sentence")
@@ -250,6 +251,7 @@ class ResultFile(BaseModel):
     conventions: dict[str, str] = Field(description="what poses, scale and units mean; not read back")
     certified: SolutionFields = Field(description="the certified solution, at which a refinement began")
     refined: RefinedFields | None = Field(default=None, description="the refined calibration, if there is one")
+    calibration: CalibrationFields | None = Field(default=None, description="what calibrate found and chose, if it ran")
     log: LogFields | None = Field(default=None, description="what became of the measurements, if they come from a log")
 
     @model_validator(mode="after")
