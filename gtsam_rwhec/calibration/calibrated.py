@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from gtsam_rwhec.calibration.choices import Choice
+from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.options import CalibrateOptions
+from gtsam_rwhec.calibration.plausibility import Implausible
 from gtsam_rwhec.calibration.task_units import (
     CARRIER_WORDS,
     PointUncertainty,
@@ -82,11 +84,14 @@ class Outliers:
         The number kept, and the number of all.
     left_out : tuple of str
         Sensors and targets that have no measurement left, and so no pose.
+    looked_for : bool
+        Whether outliers were looked for.
     """
 
     inliers: dict[Pair, np.ndarray]
     counts: dict[Pair, tuple[int, int]]
-    left_out: tuple[str, ...] = ()
+    left_out: tuple[str, ...]
+    looked_for: bool
 
     @property
     def number(self) -> int:
@@ -95,7 +100,7 @@ class Outliers:
 
     def __str__(self) -> str:
         total = sum(number for _, number in self.counts.values())
-        if not self.inliers:
+        if not self.looked_for:
             return f"Outliers were not looked for among {total} measurements."
         out = {pair: (number - kept, number) for pair, (kept, number) in self.counts.items() if kept < number}
         if not out:
@@ -138,14 +143,20 @@ class Calibration:
         By sensor, if estimated: the sensor's stamp t is the carriers' t + offset.
     judgement : Judgement
         The verdict with its grounds; ``str()`` is one sentence.
-    solution : Solution
-        The certified solution of the measurements that were kept.
+    solution : Solution or None
+        The certified solution of the measurements that were kept. None where there is no answer with a positive scale;
+        then there are no poses either.
     refined : Refined or None
-        The refined calibration: graph, values, joint covariance. None if it could not be made; ``choices`` say why.
+        The refined calibration: graph, values, joint covariance. None if it could not be made, or was not because the
+        measurements were misread; ``choices`` say why.
     noise : NoiseFound
         The noise that was found.
     outliers : Outliers
         The measurements that were left out.
+    misreadings : tuple of Misreading
+        Likely mistakes in the reading of A and B, each with its cure; two or more fit alike.
+    implausible : Implausible or None
+        Residuals that no sensor has.
     findings : tuple of Finding
         What was found against the poses besides what certificate and free directions say.
     choices : tuple of Choice
@@ -163,10 +174,12 @@ class Calibration:
     scale: float | dict[str, float]
     time_offsets_s: dict[str, float]
     judgement: Judgement
-    solution: Solution
+    solution: Solution | None
     refined: Refined | None
     noise: NoiseFound
     outliers: Outliers
+    misreadings: tuple[Misreading, ...]
+    implausible: Implausible | None
     findings: tuple[Finding, ...]
     choices: tuple[Choice, ...]
     notes: tuple[str, ...]

@@ -6,6 +6,7 @@ step that cannot be taken is a choice that says so; only input that cannot be us
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +25,9 @@ from gtsam_rwhec.calibration.calibrated import (
 )
 from gtsam_rwhec.calibration.choices import Choice
 from gtsam_rwhec.calibration.disagreement import contradicted_frames
+from gtsam_rwhec.calibration.misreadings import Misreading, misreadings
 from gtsam_rwhec.calibration.options import CalibrateOptions
+from gtsam_rwhec.calibration.plausibility import Implausible, implausible
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import (
     CountError,
@@ -35,6 +38,7 @@ from gtsam_rwhec.errors import (
     OutlierError,
     OutliersWarning,
     RwhecWarning,
+    ScaleError,
     UnderdeterminedError,
     WeightsWarning,
 )
@@ -56,6 +60,7 @@ SPARE_EQUATIONS = 6
 SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, OutliersWarning)
 
 Inliers = dict[Pair, np.ndarray]
+NOT_KNOWN = NoiseFound("not known", {}, {}, "not known")
 
 
 @one_blas_thread()
@@ -165,27 +170,36 @@ class _Calibrating:
         """All steps, one after the other."""
         problem, options = self.problem, self.options
         self._check_offsets()
+        inliers: Inliers = {}
+        refined, noise = None, NOT_KNOWN
         with self._noted():
-            first = solve(problem, options=options.solve, progress=self.tell)
-            solution, inliers = self._without_outliers(first)
-            refined, noise = self._refined(solution, inliers)
+            solution, why = self._solved()
+            misread, odd = self._misread(solution)
+            if not (misread or odd):
+                solution, inliers = self._without_outliers(solution)
+                if solution is not None:
+                    refined, noise = self._refined(solution, inliers)
+        if solution is None:
+            self.findings.append(Finding(Ground.NO_SCALE, why))
         outliers = self._outliers(inliers)
         judgement = Judgement.of([*findings_of(solution, refined), *self.findings], proof_of(refined))
         best = solution if refined is None else refined
         return Calibration(
-            X=best.X,
-            Y=best.Y,
-            scale=best.scale,
+            X={} if best is None else best.X,
+            Y={} if best is None else best.Y,
+            scale=math.nan if best is None else best.scale,
             time_offsets_s={} if refined is None else refined.time_offsets_s,
             judgement=judgement,
             solution=solution,
             refined=refined,
             noise=noise,
             outliers=outliers,
+            misreadings=misread,
+            implausible=odd,
             findings=tuple(self.findings),
             choices=tuple(self.choices),
             notes=tuple(self.notes),
-            views=views_of(problem, inliers, best.scale),
+            views={} if best is None else views_of(problem, inliers, best.scale),
             carriers=Carriers(problem.sensor_carrier, problem.target_carrier),
             options=options,
         )
@@ -202,7 +216,32 @@ class _Calibrating:
                     f"{', '.join(self.problem.sensors)}"
                 )
 
-    def _without_outliers(self, first: Solution) -> tuple[Solution, Inliers]:
+    def _solved(self) -> tuple[Solution | None, str]:
+        """The certified solution of all measurements; without one, why there is none."""
+        try:
+            return solve(self.problem, options=self.options.solve, progress=self.tell), ""
+        except ScaleError as error:
+            return None, str(error)
+
+    def _misread(self, solution: Solution | None) -> tuple[tuple[Misreading, ...], Implausible | None]:
+        """Likely misreadings of the poses, or residuals that no sensor has; with these there is no more to do."""
+        what = "reading of A and B"
+        if not self.options.misreadings:
+            self._choose(what, "as given", "an option says so")
+            return (), None
+        found = misreadings(self.problem, solution, progress=self.tell)
+        odd = None if found else implausible(self.problem, solution)
+        if found:
+            self.findings.append(Finding(Ground.MISREAD, " (or: ".join(map(str, found)) + ")" * (len(found) - 1)))
+            self._choose(what, "nothing else is computed", "another reading of the poses fits far better")
+        elif odd is not None:
+            self.findings.append(Finding(Ground.IMPLAUSIBLE, str(odd)))
+            self._choose(what, "nothing else is computed", "the residuals are those of no sensor")
+        else:
+            self._choose(what, "as given", "no likely mistake of reading explains the measurements far better")
+        return found, odd
+
+    def _without_outliers(self, first: Solution | None) -> tuple[Solution | None, Inliers]:
         """The certified solution of the measurements that agree, and which these are."""
         problem, options, what = self.problem, self.options, "outliers"
         spare = spare_equations(problem)
@@ -222,16 +261,13 @@ class _Calibrating:
             return first, {}
         noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
         try:
-            if (
-                problem.has_covariances
-                or options.carrier_noise is not None
-                or options.time_offsets not in ("auto", False)
-            ):
+            has_more = problem.has_covariances or options.carrier_noise is not None or bool(_offsets(problem, options))
+            if first is not None and has_more:
                 solution, inliers = self._inliers_under_the_full_noise(first)
             else:
                 found = graduated(problem, confidence=options.inlier_confidence, noise_scale=noise, progress=self.tell)
                 solution, inliers = found.solution, found.inliers
-        except (OutlierError, NoiseError) as error:
+        except (OutlierError, NoiseError, ScaleError) as error:
             self._choose(what, "not left out", f"it is not possible: {error}")
             self.findings.append(
                 Finding(Ground.CONTRADICTED, "too few measurements agree with one another to find out which are wrong")
@@ -277,7 +313,7 @@ class _Calibrating:
                     "are known",
                 )
             )
-            return None, NoiseFound("not known", {}, {}, "not known")
+            return None, NOT_KNOWN
         if self.options.noise == "given":
             self._choose("noise of B", "as given", "an option says so")
         elif refined.noise_source == "given":
@@ -302,8 +338,10 @@ class _Calibrating:
         left_out = tuple(name for name in (*problem.sensors, *problem.targets) if name not in left)
         for name in left_out:
             if name in problem.sensors:
-                self.findings.append(Finding(Ground.NO_ANSWER, f"{name} has no pose, as no measurement of it was kept"))
-        return Outliers(inliers, counts, left_out)
+                self.findings.append(
+                    Finding(Ground.NO_ANSWER, f"{name} has no pose, because no measurement of it is in the answer")
+                )
+        return Outliers(inliers, counts, left_out, looked_for=bool(inliers))
 
     # -- records ------------------------------------------------------------------------------------------------
 

@@ -34,6 +34,9 @@ class CalibrateOptions:
         leaves this out where there are too few measurements to tell. "none": every measurement counts.
     inlier_confidence : float
         Probability that a good measurement is kept.
+    misreadings : bool
+        Look for likely mistakes in the reading of A and B, and for residuals that no sensor has. Where there are any,
+        nothing else is done.
     time_offsets : "auto", bool or tuple of str
         Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps.
     carrier_path : Trajectory, optional
@@ -49,6 +52,7 @@ class CalibrateOptions:
     carrier_noise: CarrierNoise | None = None
     robust: RobustChoice = "auto"
     inlier_confidence: float = 0.997
+    misreadings: bool = True
     time_offsets: Literal["auto"] | bool | tuple[str, ...] = "auto"
     carrier_path: Trajectory | None = None
     level: float = 0.95
@@ -65,6 +69,8 @@ class CalibrateOptions:
             value = getattr(self, name)
             if not (is_real(value) and least < value < 1.0):
                 raise OptionError(f"CalibrateOptions.{name}={brief(value)}; give one between {least:g} and 1")
+        if not isinstance(self.misreadings, bool):
+            raise OptionError(f"CalibrateOptions.misreadings={brief(self.misreadings)}; give True or False")
         if self.time_offsets != "auto" and not isinstance(self.time_offsets, (bool, tuple)):
             raise OptionError(
                 f"CalibrateOptions.time_offsets={brief(self.time_offsets)}; give 'auto', True, False, or a tuple of "

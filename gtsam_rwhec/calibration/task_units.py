@@ -12,7 +12,6 @@ calibration's error does not.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -75,36 +74,21 @@ class PointUncertainty:
     measurement_mm: float | None
 
     def __str__(self) -> str:
-        return point_sentence(self)
+        distance_m = float(np.linalg.norm(self.point_m))
+        return point_sentence(self.frame, self.seen_from, distance_m, self.level, self.radius_mm, self.measurement_mm)
 
 
-class PointInWords(Protocol):
-    """What a sentence about a point needs; ``PointUncertainty`` describes the fields."""
-
-    @property
-    def point_m(self) -> ArrayLike: ...
-    @property
-    def frame(self) -> str: ...
-    @property
-    def seen_from(self) -> str: ...
-    @property
-    def level(self) -> float: ...
-    @property
-    def radius_mm(self) -> float: ...
-    @property
-    def measurement_mm(self) -> float | None: ...
-
-
-def point_sentence(point: PointInWords) -> str:
+def point_sentence(
+    frame: str, seen_from: str, distance_m: float, level: float, radius_mm: float, measurement_mm: float | None
+) -> str:
     """How far off a point is, as one sentence."""
-    distance = float(np.linalg.norm(point.point_m))
-    what = f"A point {distance:.2f} m from {point.frame}, expressed in {point.seen_from},"
-    if not np.isfinite(point.radius_mm):
+    what = f"A point {distance_m:.2f} m from {frame}, expressed in {seen_from},"
+    if not np.isfinite(radius_mm):
         return f"{what} is not determined: the measurements leave a direction free that moves it."
-    said = f"{what} is within {point.radius_mm:.2g} mm of its true place with {100 * point.level:g} % probability"
-    if point.measurement_mm is None:
+    said = f"{what} is within {radius_mm:.2g} mm of its true place with {100 * level:g} % probability"
+    if measurement_mm is None:
         return f"{said}."
-    return f"{said}; the noise of one new measurement adds up to {point.measurement_mm:.2g} mm."
+    return f"{said}; the noise of one new measurement adds up to {measurement_mm:.2g} mm."
 
 
 def checked_point(point: ArrayLike) -> Array:

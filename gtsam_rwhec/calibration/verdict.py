@@ -48,6 +48,8 @@ class Ground(StrEnum):
     MISREAD = "misread"
     #: The residuals are larger than any noise of measurement.
     IMPLAUSIBLE = "implausible"
+    #: The scale at the optimum is not positive, so there is no answer.
+    NO_SCALE = "no_scale"
     #: No lower bound of the cost was found.
     NO_BOUND = "no_bound"
     #: The lower bound is below the cost: a better answer may exist.
@@ -88,6 +90,9 @@ _ADVICE = {
     Ground.IMPLAUSIBLE: (
         "check that A = T_sensorcarrier_targetcarrier and B = T_sensor_target, the order of the quaternions, the "
         "units, and that A and B are of the same instants"
+    ),
+    Ground.NO_SCALE: (
+        "check that B = T_sensor_target and that A is not inverted, turn about a second axis, or state the sizes"
     ),
     Ground.NO_BOUND: "check the units and the frames of A and B, then calibrate again",
     Ground.NOT_CERTIFIED: "measure with more and larger rotations, then calibrate again",
@@ -162,16 +167,18 @@ def proof_of(refined: RefinedPoses | None) -> str:
     return f"{first} the measurements determine every pose"
 
 
-def findings_of(solution: Solution, refined: RefinedPoses | None = None) -> list[Finding]:
+def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) -> list[Finding]:
     """What the certificate and the free directions say against the poses.
 
     Parameters
     ----------
-    solution : Solution
+    solution : Solution, optional
         The certified solution.
     refined : RefinedPoses, optional
         The refined calibration.
     """
+    if solution is None:
+        return []
     certificate: Mapping[Status, Finding] = {
         Status.FAILED: Finding(
             Ground.NO_BOUND, "no lower bound of the cost was found, so a much better answer may exist"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,9 +14,9 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
 from gtsam_rwhec.cli.failures import check_folder_of, said_in_the_report
 from gtsam_rwhec.cli.options import (
+    CHOICES_PANEL,
     CSV_PANEL,
     FOLDER_OF_CSV,
-    REFINEMENT_PANEL,
     ImagesOption,
     KappaOption,
     RigOption,
@@ -31,23 +32,28 @@ from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
 Method = Literal["auto", "sdp", "local"]
-Refine = Literal["given", "estimate"]
-Robust = Literal["none", "gnc", "huber", "cauchy", "tukey", "geman_mcclure"]
+Noise = Literal["auto", "given", "estimate"]
+Robust = Literal["auto", "gnc", "none"]
 
 #: Parameters that count for a log; its rig file states the rest.
 OF_LOG = frozenset({"source", "rig", "images", "workers", "output"})
 #: Parameters that count for a folder of CSV files.
-OF_FOLDER = frozenset({"source", "scale", "sigma", "kappa", "method", "initial", "targets", "sensors", "output"})
-#: Parameters that count for the refinement.
-OF_REFINEMENT = frozenset({"refine", "robust", "carrier_noise_deg", "carrier_noise_mm"})
+OF_FOLDER = frozenset({"source", "scale", "sigma", "kappa", "targets", "sensors", "certified_only", "output"})
+#: Parameters that overrule a choice of ``rw.calibrate``.
+OF_CHOICES = frozenset({"noise", "robust", "carrier_noise_deg", "carrier_noise_mm", "as_read"})
+#: Parameters of the certified solution alone.
+OF_SOLVE = frozenset({"method", "initial"})
 # The options that each input refuses, by the reason and what to do.
 NOT_FOR_A_LOG = {
     "not for a log. Its rig file states sizes, noise and names, and its calibration is always refined. Change the rig "
-    "file, or leave the option out.": (OF_FOLDER | OF_REFINEMENT) - OF_LOG,
+    "file, or leave the option out.": (OF_FOLDER | OF_CHOICES | OF_SOLVE) - OF_LOG,
 }
 NOT_FOR_A_FOLDER = {"only for a log. A folder of CSV files has no images: leave the option out.": OF_LOG - OF_FOLDER}
-NOT_WITHOUT_REFINEMENT = NOT_FOR_A_FOLDER | {
-    "only with --refine. Add --refine given or --refine estimate, or leave the option out.": OF_REFINEMENT
+NOT_WITH_ALL = NOT_FOR_A_FOLDER | {
+    "only with --certified-only. Add it, or leave the option out.": OF_SOLVE,
+}
+NOT_CERTIFIED_ONLY = NOT_FOR_A_FOLDER | {
+    "not with --certified-only, which neither looks for outliers nor refines. Leave one of them out.": OF_CHOICES,
 }
 
 
@@ -58,48 +64,62 @@ def calibrate(
     scale: ScaleOption = "known",
     sigma: SigmaOption = None,
     kappa: KappaOption = None,
-    method: Annotated[
-        Method,
-        typer.Option(
-            rich_help_panel=CSV_PANEL,
-            help="auto: search, then the cheapest proof that succeeds. sdp: always solve the semidefinite relaxation. "
-            "local: search from the answer in --initial only.",
-        ),
-    ] = "auto",
     targets: TargetsOption = "tag",
     sensors: SensorsOption = "cam",
-    initial: Annotated[
-        Path | None,
+    noise: Annotated[
+        Noise,
         typer.Option(
-            rich_help_panel=CSV_PANEL, help="With --method local: result file (JSON) of an earlier calibration."
+            rich_help_panel=CHOICES_PANEL,
+            help="The noise of B. auto, estimate: what the residuals show. given: --sigma and --kappa as they are.",
         ),
-    ] = None,
-    refine: Annotated[
-        Refine | None,
-        typer.Option(
-            rich_help_panel=REFINEMENT_PANEL,
-            help="Refine the certified answer and print covariances. given: with the noise in --sigma and --kappa. "
-            "estimate: with the noise that the residuals show.",
-        ),
-    ] = None,
+    ] = "auto",
     robust: Annotated[
         Robust,
         typer.Option(
-            rich_help_panel=REFINEMENT_PANEL,
-            help="gnc: leave outliers out and certify the rest. The other words are robust losses.",
+            rich_help_panel=CHOICES_PANEL,
+            help="auto, gnc: leave outliers out and certify the rest. none: every measurement counts.",
         ),
-    ] = "none",
+    ] = "auto",
     carrier_noise_deg: Annotated[
         float | None,
         typer.Option(
-            rich_help_panel=REFINEMENT_PANEL,
-            help="Standard deviation of the carriers' poses A about each axis, degrees.",
+            rich_help_panel=CHOICES_PANEL, help="Standard deviation of the carriers' poses A about each axis, degrees."
         ),
     ] = None,
     carrier_noise_mm: Annotated[
         float | None,
         typer.Option(
-            rich_help_panel=REFINEMENT_PANEL, help="Standard deviation of the carriers' poses A along each axis, mm."
+            rich_help_panel=CHOICES_PANEL, help="Standard deviation of the carriers' poses A along each axis, mm."
+        ),
+    ] = None,
+    as_read: Annotated[
+        bool,
+        typer.Option(
+            "--as-read",
+            rich_help_panel=CHOICES_PANEL,
+            help="Do not look for likely mistakes in the reading of A and B.",
+        ),
+    ] = False,
+    certified_only: Annotated[
+        bool,
+        typer.Option(
+            "--certified-only",
+            rich_help_panel=CSV_PANEL,
+            help="The certified solution of all measurements as they are: no search for outliers, no refinement.",
+        ),
+    ] = False,
+    method: Annotated[
+        Method,
+        typer.Option(
+            rich_help_panel=CSV_PANEL,
+            help="With --certified-only. auto: search, then the cheapest proof that succeeds. sdp: always solve the "
+            "semidefinite relaxation. local: search from the answer in --initial only.",
+        ),
+    ] = "auto",
+    initial: Annotated[
+        Path | None,
+        typer.Option(
+            rich_help_panel=CSV_PANEL, help="With --method local: result file (JSON) of an earlier calibration."
         ),
     ] = None,
     images: ImagesOption = False,
@@ -109,7 +129,7 @@ def calibrate(
         typer.Option("--output", "-o", help="For CSV files: result file (JSON). For a log: folder for all files."),
     ] = None,
 ) -> ExitStatus:
-    """Calibrate from a log or from a folder of CSV files; print the verdict, what to do, the poses and the details.
+    """Calibrate from a log or from a folder of CSV files; print the verdict, what to do, and how far off a point is.
 
     A log needs a rig file, which states the sizes of the targets. Its calibration writes clean.mcap, result.json,
     static_tf.launch.py, tf.yaml, rig.urdf.xacro, camchain.yaml and plots.
@@ -122,39 +142,40 @@ def calibrate(
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
         return calibrate_log(source, rig, output, images=images, workers=workers)
-    refuse(context, NOT_WITHOUT_REFINEMENT if refine is None else NOT_FOR_A_FOLDER)
+    refuse(context, NOT_CERTIFIED_ONLY if certified_only else NOT_WITH_ALL)
     if (method == "local") != (initial is not None):
         raise typer.BadParameter("--method local and --initial FILE go together: give both, or neither")
     if (carrier_noise_deg is None) != (carrier_noise_mm is None):
         raise typer.BadParameter("--carrier-noise-deg and --carrier-noise-mm go together: give both, or neither")
-    if refine == "given" and (sigma is None or kappa is None):
-        raise typer.BadParameter("--refine given needs --sigma and --kappa: give both, or use --refine estimate")
+    if noise == "given" and (sigma is None or kappa is None):
+        raise typer.BadParameter("--noise given needs --sigma and --kappa: give both, or use --noise estimate")
     check_folder_of(output)
+    carriers = None
+    if carrier_noise_deg is not None and carrier_noise_mm is not None:
+        carriers = rw.CarrierNoise(math.radians(carrier_noise_deg), 1e-3 * carrier_noise_mm)
     with StageDisplay() as stage, said_in_the_report():
         stage(f"reading {source}")
         problem = rw.read_csv(source, scale, sigma, kappa, targets, sensors)
-        earlier = None if initial is None else rw.read_solution(initial)
-        start = None if earlier is None else (earlier.X, earlier.Y, earlier.scale)
-        solution = rw.solve(problem, method=method, initial=start, progress=stage)
-        refined = None
-        if refine is not None:
-            noise = None
-            if carrier_noise_deg is not None and carrier_noise_mm is not None:
-                noise = rw.CarrierNoise(math.radians(carrier_noise_deg), 1e-3 * carrier_noise_mm)
-            how = rw.RefineOptions(noise=refine, robust=robust, carrier_noise=noise)
-            refined = rw.refine(problem, solution, how, progress=stage)
-            solution = refined.solution  # it is another solution if outliers were left out
-    if refined is None:
-        write, report = partial(rw.write_solution, solution), partial(rw.report.print_solution, solution)
-    else:
-        write, report = partial(rw.write_refined, refined), partial(rw.report.print_refined, refined)
+        write: Callable[[Path], None]
+        if certified_only:
+            earlier = None if initial is None else rw.read_solution(initial)
+            start = None if earlier is None else (earlier.X, earlier.Y, earlier.scale)
+            solution = rw.solve(problem, method=method, initial=start, progress=stage)
+            write, report = partial(rw.write_solution, solution), partial(rw.report.print_solution, solution)
+            judgement = rw.judge(solution)
+        else:
+            options = rw.CalibrateOptions(noise=noise, robust=robust, carrier_noise=carriers, misreadings=not as_read)
+            calibration = rw.calibrate(problem, options, progress=stage)
+            write = partial(rw.write_calibration, calibration)
+            report = partial(rw.report.print_calibration, calibration)
+            judgement = calibration.judgement
     try:
         if output is not None:
             write(output)
             say(f"Written to {shown_path(output)}.", to_errors=True)
     finally:  # the report is printed even if the file cannot be written
         report()
-    return exit_status(rw.judge(solution, refined))
+    return exit_status(judgement)
 
 
 def is_log(source: Path) -> bool:
@@ -174,5 +195,6 @@ def calibrate_log(source: Path, rig: Path | None, output: Path, *, images: bool,
             progress=stage,
         )
     status = show(calibrated)
-    say(f"Written to {shown_path(output)}: {', '.join(rw.pipeline.OUTPUTS)}.", to_errors=True)
+    written = [name for name in rw.pipeline.OUTPUTS if (output / name).exists()]
+    say(f"Written to {shown_path(output)}: {', '.join(written)}.", to_errors=True)
     return status

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
@@ -21,4 +21,7 @@ def export(
     with StageDisplay() as stage:
         for path in rw.pipeline.export_solved(solved, output, progress=stage):
             say(shown_path(path))
-    return ExitStatus.DONE
+    judgement = rw.pipeline.read_solved(solved).judgement
+    if judgement.verdict is rw.Verdict.DO_NOT_USE:
+        say(f"No files for other programs were written. {judgement}", to_errors=True)
+    return exit_status(judgement)

@@ -14,7 +14,7 @@ FOLDER_OF_CSV = "folder of CSV files such as tag_0_cam_0_A.csv and tag_0_cam_0_B
 #: Headings in the help.
 CSV_PANEL = "Options for a folder of CSV files"
 LOG_PANEL = "Options for a log"
-REFINEMENT_PANEL = "Options for the refinement of CSV files"
+CHOICES_PANEL = "Choices for a folder of CSV files, which are otherwise made from the data"
 Scale = Literal["known", "shared", "per_target"]
 
 ScaleOption = Annotated[
@@ -67,6 +67,5 @@ WorkersOption = Annotated[
 
 def show(calibrated: rw.pipeline.Calibrated) -> ExitStatus:
     """Print the report of a calibrated log; its exit status."""
-    refined = calibrated.refined
-    rw.report.print_refined(refined, log=calibrated.log)
-    return exit_status(rw.judge(refined.solution, refined, calibrated.log))
+    rw.report.print_calibration(calibrated.calibration, log=calibrated.log)
+    return exit_status(calibrated.judgement)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export import export_all
 from gtsam_rwhec.export.files import FILES
@@ -29,7 +30,7 @@ from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solution_plots import plot_all
 from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
-from gtsam_rwhec.results.result_file import write_refined
+from gtsam_rwhec.results.result_file import write_calibration
 from gtsam_rwhec.rig import Rig
 
 #: Names of all that `calibrate_log` leaves in its folder.
@@ -130,7 +131,7 @@ def solve_into(
     """
     out = made_folder(out)
     calibrated = solve_log(clean_path, rig, progress=progress)
-    write_refined(calibrated.refined, out / RESULT_FILE, calibrated.log)
+    write_calibration(calibrated.calibration, out / RESULT_FILE, calibrated.log)
     write_solved(clean_path, calibrated, out / CLEAN_LOG, images=images)
     return calibrated
 
@@ -138,6 +139,9 @@ def solve_into(
 @one_blas_thread()
 def export_solved(solved_path: str | Path, out: str | Path, *, progress: Progress | None = None) -> list[Path]:
     """Write the files for other programs, and plots, from a solved log into a folder; return their paths.
+
+    Poses that are not to be used get plots only, and no files for other programs: those of an earlier calibration in
+    this folder are removed.
 
     Raises
     ------
@@ -150,6 +154,11 @@ def export_solved(solved_path: str | Path, out: str | Path, *, progress: Progres
     tell = progress or silent
     tell("exporting")
     solved = read_solved(solved_path)
-    written = export_all(frames_of(solved), out)
+    written = []
+    if solved.judgement.verdict is Verdict.DO_NOT_USE:
+        for name in FILES:
+            (out / name).unlink(missing_ok=True)
+    else:
+        written = export_all(frames_of(solved), out)
     tell("plotting")
     return written + plot_all(solved, solved_path, made_folder(out / PLOTS_FOLDER))

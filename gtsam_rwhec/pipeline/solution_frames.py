@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.pipeline.solving_stage import Solved
-from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.rig import RigFrames
 
 
 def frames_of(solved: Solved) -> RigFrames:
     """The calibrated frames; a sensor has the name of its frame."""
     rig, refined = solved.rig, solved.refined
-    judgement = judge(solved.solution, refined, solved.log)
     frame = {name: rig.frame_of(name) for name in refined.Y}
     return RigFrames(
         sensor_carrier=rig.carriers.sensors,
@@ -21,5 +19,5 @@ def frames_of(solved: Solved) -> RigFrames:
         cameras={frame[name]: camera for name, camera in solved.cameras.items() if name in frame},
         time_offsets_s={frame[o.sensor]: o.offset_s for o in solved.log.time_offsets if o.sensor in frame},
         topics={frame[n]: s.images for n, s in rig.sensors.items() if s.images is not None and n in frame},
-        warnings=() if judgement.verdict is Verdict.USE else (str(judgement),),
+        warnings=() if solved.judgement.verdict is Verdict.USE else (str(solved.judgement),),
     )

@@ -17,7 +17,7 @@ from gtsam_rwhec.pipeline.log_contract import (
 from gtsam_rwhec.pipeline.log_metadata import LogMetadata, read_cameras, read_embedded_rig
 from gtsam_rwhec.pipeline.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
-from gtsam_rwhec.results.result_file import parse_result, refined_json
+from gtsam_rwhec.results.result_file import calibration_json, parse_result
 
 #: A calibrated frame's name gets this ending if the raw log has transforms of a frame with the same name.
 CALIBRATED = "_calibrated"
@@ -55,7 +55,9 @@ def write_solved(
                 "free_directions": "; ".join(map(str, refined.free_directions)),
             },
         )
-        out.attachment(RESULT_FILE, "application/json", refined_json(refined, calibrated.log), first_ns)
+        out.attachment(
+            RESULT_FILE, "application/json", calibration_json(calibrated.calibration, calibrated.log), first_ns
+        )
 
 
 def read_solved(path: str | Path) -> Solved:
@@ -79,7 +81,7 @@ def read_solved(path: str | Path) -> Solved:
     if strangers or not pairs:
         why = f"frames that its rig file lacks: {', '.join(sorted(strangers)[:10])}" if strangers else "no measurements"
         raise LogError(f"{path} has a {RESULT_FILE}, and {why}: they are not of one calibration")
-    return Solved(refined, result.solution, pairs, result.log, read_cameras(log), rig)
+    return Solved(refined, result.solution, pairs, result.log, read_cameras(log), rig, result.judgement)
 
 
 def _raw_children(log: Log) -> set[str]:

@@ -10,6 +10,9 @@ from typing import Literal
 
 import numpy as np
 
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.calibration.calibrating import calibrate
+from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import RwhecError, RwhecWarning, ScaleError
 from gtsam_rwhec.files.progress import Progress
@@ -113,6 +116,19 @@ class SolvingRounds:
                 warnings.simplefilter("ignore", RwhecWarning)
             solution = solve(problem, progress=self.progress)
             return refine(problem, solution, options, progress=self.progress)
+
+    def calibrated(self, given: SynchronisedPairs, free_sizes: Collection[str]) -> Calibration:
+        """The answer from the measurements that are left, with everything that ``calibrate`` finds and judges."""
+        problem = problem_of(given.pairs, self.rig, given.offsets_s, free_sizes)
+        problem.sensor_carrier, problem.target_carrier = self.rig.carriers.sensors, self.rig.carriers.targets
+        options = CalibrateOptions(
+            noise="estimate" if self.rig.noise == "estimate" else "given",
+            robust="none",  # the outliers are marked already
+            carrier_noise=self.motion.noise,
+            time_offsets=self.estimated or False,
+            carrier_path=self.motion.trajectory if self.estimated else None,
+        )
+        return calibrate(problem, options, progress=self.progress)
 
     def sizes(self, given: SynchronisedPairs) -> tuple[tuple[SizeFields, ...], SynchronisedPairs]:
         """Estimate the sizes of all targets, and the time offsets that go with these sizes.

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gtsam_rwhec.calibration.calibrated import Calibration, Outliers
+from gtsam_rwhec.calibration.choices import Choice
+from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Progress, silent
@@ -18,6 +21,7 @@ from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, sigma_of, without_outlier_marks
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TimeOffsetFields, contradictions
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.solution import Solution
@@ -42,6 +46,8 @@ class Solved:
         Intrinsics.
     rig : Rig
         The rig file that was used.
+    judgement : Judgement
+        The verdict, with its grounds.
     """
 
     refined: RefinedPoses
@@ -50,13 +56,21 @@ class Solved:
     log: LogFields
     cameras: dict[str, Camera]
     rig: Rig
+    judgement: Judgement
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated(Solved):
-    """A calibration that was just computed: `refined` is a `Refined`, with all that refinement found."""
+    """A calibration that was just computed: `refined` is a `Refined`, with all that refinement found.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        What ``calibrate`` found and chose; its refined poses, time offsets and outliers are those of the whole log.
+    """
 
     refined: Refined
+    calibration: Calibration
 
 
 @one_blas_thread()
@@ -103,7 +117,9 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     settled = rounds.settled(given, free)
     if rig.sizes == "known":
         sizes = rounds.sizes_as_seen(settled)
-    refined = rounds.refined(settled, free, "answer")
+    calibration = rounds.calibrated(settled, free)
+    # Without a refined calibration (the measurements look misread) the poses are refined all the same, for the plots.
+    refined = calibration.refined or rounds.refined(settled, free, "answer")
     offsets = settled.offsets_s | {n: settled.offsets_s[n] + value for n, value in refined.time_offsets_s.items()}
     outliers = tuple(_outlier_count(measured) for measured in settled.pairs.values())
     refined = replace(
@@ -133,7 +149,48 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         ),
         contradicted=contradictions(outliers),
     )
-    return Calibrated(refined, refined.solution, settled.pairs, fields, dict(metadata.cameras), rig)
+    judgement = judge(refined.solution, refined, fields, calibration.findings)
+    calibration = replace(
+        calibration,
+        refined=refined,
+        time_offsets_s=refined.time_offsets_s,
+        judgement=judgement,
+        outliers=_outliers(outliers, looked_for=rig.cleaning.robust == "gnc"),
+        choices=(*_choices_before(rig, estimated, outliers), *_without_outliers(calibration.choices)),
+    )
+    solution, cameras = refined.solution, dict(metadata.cameras)
+    return Calibrated(refined, solution, settled.pairs, fields, cameras, rig, judgement, calibration)
+
+
+def _outliers(counts: tuple[OutlierCount, ...], *, looked_for: bool) -> Outliers:
+    """The outliers of the whole log."""
+    used = {name for count in counts if count.used for name in count.pair}
+    return Outliers(
+        inliers={},
+        counts={count.pair: (count.used, count.used + count.left_out) for count in counts},
+        left_out=tuple(dict.fromkeys(name for count in counts for name in count.pair if name not in used)),
+        looked_for=looked_for,
+    )
+
+
+def _choices_before(rig: Rig, estimated: tuple[str, ...], counts: tuple[OutlierCount, ...]) -> tuple[Choice, ...]:
+    """What was chosen in the rounds before the answer."""
+    number, left_out = sum(count.used + count.left_out for count in counts), sum(count.left_out for count in counts)
+    choices = []
+    if rig.cleaning.robust == "gnc":
+        chosen = f"{left_out} of {number} measurements were left out" if left_out else "none"
+        choices.append(Choice("outliers", chosen, "the others agree with one another at the estimated time offsets"))
+    else:
+        choices.append(Choice("outliers", "every measurement counts", "the rig file says so"))
+    if estimated:
+        choices.append(
+            Choice("time offsets", f"estimated for {', '.join(estimated)}", "the rig file states none for them")
+        )
+    return tuple(choices)
+
+
+def _without_outliers(choices: tuple[Choice, ...]) -> tuple[Choice, ...]:
+    return tuple(choice for choice in choices if choice.what != "outliers")
 
 
 def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:

@@ -1,3 +1,4 @@
+from .calibration_report import print_calibration as print_calibration
 from .comparison_report import print_comparison as print_comparison
 from .covariance_report import print_refined as print_refined
 from .cross_validation_table import print_cross_validation as print_cross_validation

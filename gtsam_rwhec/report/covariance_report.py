@@ -49,6 +49,12 @@ def print_refined(refined: Refined, console: Console | None = None, *, log: LogF
     solution = refined.solution
     print_verdict(console, judge(solution, refined, log), solution)
     print_advice(console, refined.free_directions or solution.identifiability.free_directions, log)
+    print_refined_body(console, refined, log)
+
+
+def print_refined_body(console: Console, refined: Refined, log: LogFields | None = None) -> None:
+    """Print the refined poses with their standard deviations, and the details."""
+    solution = refined.solution
     print_heading(console, "Poses")
     sensor_frame, target_frame = (
         ("of their carrier", "of their carrier") if log is None else (log.sensor_carrier, log.target_carrier)
@@ -72,7 +78,9 @@ def print_refined(refined: Refined, console: Console | None = None, *, log: LogF
     for sentence in refined_sentences(refined):
         print_sentence(console, sentence)
     console.print()
-    print_solution_details(console, solution, "as given" if log is None else _weights_of_log(refined))
+    weights_from = "as given" if log is None else _weights_of_log(refined)
+    estimated = refined.noise_source == "estimated"
+    print_solution_details(console, solution, weights_from, noise_is_estimated=estimated)
 
 
 def legend(refined: Refined) -> str:

@@ -65,8 +65,16 @@ def scale_sentence(solution: Solution) -> str:
     )
 
 
-def weights_sentence(solution: Solution, source: str = "as given") -> str:
-    """Where the weights of the measurements come from (`source`), and what the cost means with these weights."""
+def weights_sentence(solution: Solution, source: str = "as given", *, noise_is_estimated: bool = False) -> str:
+    """Where the weights of the measurements come from (`source`), and what the cost means with these weights.
+
+    ``noise_is_estimated``: there are covariances from the noise that the residuals show.
+    """
+    if solution.is_relative and noise_is_estimated:
+        return (
+            "Weights: sigma or kappa was not given, so the certified cost is relative. The covariances are not: they "
+            "come from the noise that the residuals show."
+        )
     if solution.is_relative:
         return (
             "Weights: sigma or kappa was not given and 1 was used, so costs and covariances are relative. Give both "

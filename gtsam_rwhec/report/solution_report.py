@@ -40,6 +40,11 @@ def print_solution(solution: Solution, console: Console | None = None) -> None:
     console = report_console() if console is None else console
     print_verdict(console, judge(solution), solution)
     print_advice(console, solution.identifiability.free_directions)
+    print_solution_body(console, solution)
+
+
+def print_solution_body(console: Console, solution: Solution) -> None:
+    """Print the certified poses, and the details."""
     print_heading(console, "Poses")
     print_tables(console, (sensor_table(solution), target_table(solution)), POSE_LEGEND)
     print_sentence(console, scale_sentence(solution))
@@ -49,7 +54,9 @@ def print_solution(solution: Solution, console: Console | None = None) -> None:
         print_sentence(console, "Refine the answer for the exact model of each target's scale.")
 
 
-def print_solution_details(console: Console, solution: Solution, weights_from: str = "as given") -> None:
+def print_solution_details(
+    console: Console, solution: Solution, weights_from: str = "as given", *, noise_is_estimated: bool = False
+) -> None:
     """Print the facts behind a certified solution: the grid of Figure 8, the certificate, and its objective."""
     print_sentence(console, f"Calibration of {solution.counts}.")
     console.print()
@@ -59,7 +66,7 @@ def print_solution_details(console: Console, solution: Solution, weights_from: s
     print_sentence(console, certificate_sentence(solution.certificate), style)
     for sentence in (
         *part_sentences(solution),
-        weights_sentence(solution, weights_from),
+        weights_sentence(solution, weights_from, noise_is_estimated=noise_is_estimated),
         f"Objective: {solution.certificate.objective}",
         time_sentence(solution.certificate),
     ):

@@ -27,6 +27,7 @@ from gtsam_rwhec.solving.solution import Solution
 ROUNDING = 1e-9
 #: Up to this version these grounds asked for care alone; after it, such poses are not to be used.
 LAST_WITH_CARE = 5
+ONCE_CALLED = {Ground.TARGET_CONTRADICTED: Ground.CONTRADICTED}
 ONCE_CARE = {Ground.NOT_CERTIFIED, Ground.SIZE_DOUBTED}
 
 
@@ -80,7 +81,7 @@ def check_certificates(solution: SolutionFields) -> None:
 
 
 def check_says_what_it_is_about(raw: dict[str, Any]) -> None:
-    """A certificate of format version 5 or later has both fields that limit it: left out, one of them would claim too much."""
+    """A certificate of version 5 and later has both fields that limit it: without one it would claim too much."""
     certified = raw.get("certified")
     if not isinstance(certified, dict):
         return  # said by the schema
@@ -141,17 +142,22 @@ def check_scale(answer: Solution | RefinedPoses, place: str) -> None:
 def check_verdict(stated: Verdict, grounds: tuple[Ground, ...], found: Judgement, version: int) -> None:
     """The verdict of a file, and its grounds, are what its facts lead to.
 
-    Up to version 5 an answer that was not proven, and a doubted size, asked for care.
+    Up to version 5 an answer that was not proven, and a doubted size, asked for care, and nobody asked for sensors
+    without an answer.
     """
-    led_to = found.verdict
-    if version <= LAST_WITH_CARE and found.grounds and set(found.grounds) <= ONCE_CARE:
-        led_to = Verdict.CARE
+    led_to, found_grounds = found.verdict, found.grounds
+    if version <= LAST_WITH_CARE:
+        once = (ONCE_CALLED.get(ground, ground) for ground in found.grounds if ground is not Ground.NO_ANSWER)
+        found_grounds = tuple(dict.fromkeys(once))
+        led_to = Verdict.USE
+        if found_grounds:
+            led_to = Verdict.CARE if set(found_grounds) <= ONCE_CARE else Verdict.DO_NOT_USE
     if stated is not led_to:
         raise ValueError(
             f"$.verdict: the file says '{stated.value}', but its content leads to '{led_to.value}'; write it again"
         )
-    if grounds != found.grounds:
-        names = [", ".join(each) or "none" for each in (grounds, found.grounds)]
+    if grounds != found_grounds:
+        names = [", ".join(each) or "none" for each in (grounds, found_grounds)]
         raise ValueError(
             f"$.verdict_grounds: the file says {names[0]}, but its content leads to {names[1]}; write it again"
         )

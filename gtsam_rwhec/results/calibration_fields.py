@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from gtsam_rwhec.calibration.calibrated import Calibration
@@ -36,15 +37,14 @@ class PointFields:
     measurement_mm: float | None
 
     def __str__(self) -> str:
-        return point_sentence(self)
+        distance_m = math.hypot(*self.point_m)
+        return point_sentence(self.frame, self.seen_from, distance_m, self.level, self.radius_mm, self.measurement_mm)
 
     @staticmethod
     def of(point: PointUncertainty) -> PointFields:
         """The record of a point."""
         x, y, z = point.point_m.tolist()
-        return PointFields(
-            point.frame, point.seen_from, (x, y, z), point.level, point.radius_mm, point.measurement_mm
-        )
+        return PointFields(point.frame, point.seen_from, (x, y, z), point.level, point.radius_mm, point.measurement_mm)
 
 
 @dataclass(frozen=True)

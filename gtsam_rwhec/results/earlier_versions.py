@@ -3,8 +3,8 @@
 In these versions ``sensors`` and ``targets`` at the top were the certified poses; ``refined`` had the refined poses.
 Version 1 had no ``refined``, version 2 had no ``log``, and no version had a verdict.
 
-Versions 4 and 5 need no conversion: the fields of certificates that version 4 lacks have defaults, which claim less, and
-both lack what ``calibrate`` found.
+Versions 4 and 5 need no conversion: the fields of certificates that version 4 lacks have defaults, which claim less,
+and both lack what ``calibrate`` found.
 """
 
 from __future__ import annotations

@@ -39,6 +39,12 @@ def judge(
             Finding(Ground.CONTRADICTED if one.frame in sensors else Ground.TARGET_CONTRADICTED, str(one))
             for one in log.contradicted
         ]
+        used = {count.sensor for count in log.outliers if count.used}
+        found += [
+            Finding(Ground.NO_ANSWER, f"{name} has no pose, because no measurement of it is in the answer")
+            for name in log.detection.images
+            if name not in used
+        ]
         doubted = [size.target for size in log.sizes if size.is_doubted and not size.is_free]
         if doubted:
             words = f"the stated size of {', '.join(doubted)} does not fit the motion"

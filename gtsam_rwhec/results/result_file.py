@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from gtsam_rwhec.calibration.calibrated import Calibration
-from gtsam_rwhec.calibration.verdict import Judgement
+from gtsam_rwhec.calibration.verdict import Judgement, Verdict
 from gtsam_rwhec.errors import FileFormatError, OptionError, ResultVersionError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.paths import checked_path
@@ -152,11 +152,11 @@ def write_calibration(calibration: Calibration, path: str | Path, log: LogFields
     write_atomically(path, calibration_json(calibration, log, path))
 
 
-def calibration_json(
-    calibration: Calibration, log: LogFields | None = None, path: str | Path = "the result"
-) -> bytes:
+def calibration_json(calibration: Calibration, log: LogFields | None = None, path: str | Path = "the result") -> bytes:
     """What `write_calibration` writes."""
     record, names = CalibrationFields.of(calibration), calibration.carriers
+    if calibration.solution is None:
+        return _without_answer(path, calibration, record)
     carriers = {"X": names.targets or TARGET_CARRIER, "Y": names.sensors or SENSOR_CARRIER}
     return _content(path, calibration.solution, calibration.refined, log, record, carriers)
 
@@ -216,6 +216,9 @@ def parse_result(content: bytes, path: str | Path) -> Result:
             f"{path} has version {number} of the result format (written by {shown(header.written_by)}); this "
             f"gtsam-rwhec reads versions {FIRST_VERSION} to {FORMAT_VERSION}. {remedy}."
         )
+    if number == FORMAT_VERSION and "certified" not in raw and raw.get("verdict") == Verdict.DO_NOT_USE.value:
+        why = shown(str(raw.get("verdict_reason")))
+        raise FileFormatError(f"{path} has no poses, because the calibration has no answer: {why}")
     try:
         if number < FIRST_WITH_VERDICT:
             raw = as_version_4(raw)
@@ -266,12 +269,7 @@ def _content(
         if log is not None:
             parts["log"] = log.model_dump(mode="json")
         tree = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "written_by": f"gtsam-rwhec {version('gtsam-rwhec')}",
-            "verdict": judgement.verdict.value,
-            "verdict_reason": judgement.reason,
-            "verdict_grounds": judgement.grounds,
+            **_heading(judgement),
             **poses,
             "conventions": CONVENTIONS,
             **parts,
@@ -282,6 +280,30 @@ def _content(
     except ValueError as error:
         raise FileFormatError(f"{path} was not written, because the result is not valid: {in_words(error)}") from error
     return encoded
+
+
+def _without_answer(path: str | Path, calibration: Calibration, record: CalibrationFields) -> bytes:
+    """The content of a file for a calibration that has no answer: its verdict, for programs, and no poses."""
+    judgement = calibration.judgement
+    tree = {
+        **_heading(judgement),
+        "sensors": [],
+        "targets": [],
+        "conventions": CONVENTIONS,
+        "calibration": to_json(record, "$.calibration"),
+    }
+    return (json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+
+
+def _heading(judgement: Judgement) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "written_by": f"gtsam-rwhec {version('gtsam-rwhec')}",
+        "verdict": judgement.verdict.value,
+        "verdict_reason": judgement.reason,
+        "verdict_grounds": judgement.grounds,
+    }
 
 
 def _posed(tree: dict[str, Any], answer: Solution | RefinedPoses, carriers: Mapping[str, str]) -> dict[str, Any]:

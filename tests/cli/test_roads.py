@@ -11,11 +11,11 @@ import typer
 from places import CELL, DEMO
 from typer.testing import CliRunner
 
+from gtsam_rwhec.calibration.options import NoiseChoice, RobustChoice
 from gtsam_rwhec.cli import calibrate, convert, options
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.logs.image_folder import Columns
 from gtsam_rwhec.problem import ScaleMode
-from gtsam_rwhec.refinement.options import NoiseSource, Robust
 from gtsam_rwhec.solver import options as solver_options
 
 COMMANDS: Mapping[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
@@ -28,7 +28,8 @@ VALUES = {
     "sigma": "0.01",
     "kappa": "1000",
     "initial": "earlier.json",
-    "refine": "given",
+    "certified_only": None,
+    "as_read": None,
     "carrier_noise_deg": "0.1",
     "carrier_noise_mm": "1",
     "images": None,
@@ -38,16 +39,16 @@ VALUES = {
 # What is typed, what the way refuses, and what it takes.
 ROADS = {
     "log": (LOG, calibrate.NOT_FOR_A_LOG, calibrate.OF_LOG),
-    "folder": (FOLDER, calibrate.NOT_WITHOUT_REFINEMENT, calibrate.OF_FOLDER),
-    "refined": (
-        (*FOLDER, "--refine", "given"),
-        calibrate.NOT_FOR_A_FOLDER,
-        calibrate.OF_FOLDER | calibrate.OF_REFINEMENT,
+    "folder": (FOLDER, calibrate.NOT_WITH_ALL, calibrate.OF_FOLDER | calibrate.OF_CHOICES),
+    "certified": (
+        (*FOLDER, "--certified-only"),
+        calibrate.NOT_CERTIFIED_ONLY,
+        calibrate.OF_FOLDER | calibrate.OF_SOLVE,
     ),
     "bag": (BAG, convert.NOT_FOR_A_BAG, {"source", "output", "poses"}),
 }
 # These choose the way, and so are never passed over.
-CHOOSING = {"folder": {"rig", "refine"}, "refined": {"rig"}}
+CHOOSING = {"folder": {"rig"}, "certified": {"rig"}}
 
 
 def names_of(refused: Mapping[str, Collection[str]]) -> set[str]:
@@ -93,14 +94,14 @@ def test_choices_are_those_of_the_library() -> None:
     """The command writes them again, so that its help need not import the library."""
     assert set(get_args(options.Scale)) == set(get_args(ScaleMode))
     assert set(get_args(calibrate.Method)) == set(get_args(solver_options.Method))
-    assert {*get_args(calibrate.Refine), "auto"} == set(get_args(NoiseSource))
-    assert set(get_args(calibrate.Robust)) == set(get_args(Robust))
+    assert set(get_args(calibrate.Noise)) == set(get_args(NoiseChoice))
+    assert set(get_args(calibrate.Robust)) == set(get_args(RobustChoice))
     assert set(get_args(convert.Columns)) == set(get_args(Columns))
 
 
 def test_all_refused_options_are_named_at_once() -> None:
-    arguments = (*FOLDER, "--images", "--workers", 2, "--robust", "gnc")
+    arguments = (*FOLDER, "--images", "--workers", 2, "--method", "sdp")
     done = CliRunner().invoke(app, list(map(str, arguments)))
     said = " ".join(done.stderr.replace("│", " ").split())
     assert "--images, --workers: only for a log." in said
-    assert "--robust: only with --refine." in said
+    assert "--method: only with --certified-only." in said

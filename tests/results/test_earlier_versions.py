@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.verdict import Finding, Judgement
 from gtsam_rwhec.report import certificate_sentence
+from gtsam_rwhec.results.agreement import check_verdict
 from gtsam_rwhec.results.result_file import read_result
 from gtsam_rwhec.solver.cause import Cause
 from gtsam_rwhec.solver.certificate import Basis
@@ -169,6 +171,41 @@ def test_the_verdict_of_version_4_is_checked(tmp_path: Path) -> None:
     assert raw["verdict"] == "use"
     with pytest.raises(rw.errors.FileFormatError, match=r"of version 4 .*\$\.verdict: the file says 'care'"):
         read_result(changed({**raw, "verdict": "care"}, tmp_path))
+
+
+def test_version_5_had_not_what_calibrate_found(tmp_path: Path) -> None:
+    path, raw = stored(5)
+    result = read_result(path)
+    assert result.calibration is None
+    assert result.judgement.verdict is rw.Verdict.USE
+    assert result.refined is not None
+    assert_poses(result.refined.Y, raw["sensors"])
+    assert result.solution.certificate.lower_bound == raw["certified"]["certificate"]["lower_bound"]
+    del raw["certified"]["certificate"]["region"]
+    with pytest.raises(rw.errors.FileFormatError, match=r"certificate\.region: is missing"):
+        read_result(changed(raw, tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("stated", "grounds", "now"),
+    [
+        (rw.Verdict.CARE, (rw.Ground.SIZE_DOUBTED,), rw.Ground.SIZE_DOUBTED),
+        (rw.Verdict.CARE, (rw.Ground.NOT_CERTIFIED,), rw.Ground.NOT_CERTIFIED),
+        (rw.Verdict.DO_NOT_USE, (rw.Ground.CONTRADICTED,), rw.Ground.TARGET_CONTRADICTED),
+        (rw.Verdict.USE, (), rw.Ground.NO_ANSWER),
+    ],
+)
+def test_up_to_version_5_the_verdict_had_another_rule(
+    stated: rw.Verdict, grounds: tuple[rw.Ground, ...], now: rw.Ground
+) -> None:
+    found = Judgement.of([Finding(now, "a fact")], "")
+    check_verdict(stated, grounds, found, 5)
+    with pytest.raises(ValueError, match=rf"\$\.verdict: the file says '{stated.value}'"):
+        check_verdict(stated, grounds, found, 6)
+    with pytest.raises(ValueError, match="its content leads to"):
+        check_verdict(
+            rw.Verdict.DO_NOT_USE if stated is not rw.Verdict.DO_NOT_USE else rw.Verdict.USE, grounds, found, 5
+        )
 
 
 def test_version_4_told_when_digits_were_lost(tmp_path: Path) -> None:
