@@ -100,7 +100,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/problem": {
         "problem/test_moments.py": "accumulation",
-        "problem/test_problem.py": "knowledge measurements",
+        "problem/test_problem.py": "knowledge long_translations measurements",
         "problem/test_selection.py": "variance_factors",
     },
     "gtsam_rwhec/refinement": {

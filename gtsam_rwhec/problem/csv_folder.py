@@ -29,6 +29,8 @@ from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.problem.knowledge import ScaleMode
+from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
+from gtsam_rwhec.problem.measurements import GivenMeasurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 
@@ -96,11 +98,14 @@ def read_csv(
     -----
     CsvWarning
         The folder has other entries; the warning names them.
+    UnitsWarning
+        Translations look like millimetres; one warning for all pairs.
     """
     folder = checked_path(folder)
     _check_words(targets, sensors)
     pairs = _find_pairs(folder, targets, sensors)
     problem = Problem(scale=scale, keep_measurements=keep_measurements)
+    long: list[LongTranslations] = []
     for (target, sensor), (path_a, path_b) in pairs.items():
         rows_a, rows_b = read_pose_rows(path_a), read_pose_rows(path_b)
         if len(rows_a) != len(rows_b):
@@ -109,7 +114,10 @@ def read_csv(
                 "line i of both is one measurement."
             )
         source = f"{path_a} and {path_b.name}"
-        problem.add(target, sensor, rows_a, rows_b, sigma, kappa, order="wxyz", source=source)
+        problem.add_batch(
+            Pair(target, sensor), GivenMeasurements(rows_a, rows_b, sigma, kappa, "wxyz", None, None, source), long
+        )
+    warn_of_millimetres(long, stacklevel=2)
     return problem
 
 

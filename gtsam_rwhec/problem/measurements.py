@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gtsam_rwhec.errors import CountError, NoiseError, UnitsWarning
+from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import (
     Array,
@@ -19,14 +18,11 @@ from gtsam_rwhec.geometry.poses import (
     rows_to_transforms,
 )
 from gtsam_rwhec.geometry.real_numbers import real_array
-from gtsam_rwhec.problem.moments import BLOCK, Gauge
 
 #: sigma and kappa below this are refused: other terms of a sum would be lost to rounding.
 SMALLEST_WEIGHT = 1e-15
 #: sigma and kappa above this are refused too.
 LARGEST_WEIGHT = 1e15
-#: Translations with a median size beyond this, in metres, look like millimetres: no camera sees a tag at 100 m.
-MILLIMETRES_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -233,20 +229,3 @@ def checked_covariances(covariances: ArrayLike | None, count: int, where: str) -
             f"{smallest[index]:.3g}); give variances that are positive in every direction"
         )
     return array
-
-
-def warn_of_millimetres(A: Array, B: Array, gauge: Gauge, motion: bool, where: str) -> None:
-    """Warn where translations look like millimetres."""
-    # A is taken about the gauge, so that a distant world origin gives no warning. What a sensor sees (B) is never far.
-    c = gauge.sensor_carrier if motion else gauge.target_carrier
-    centred_A = A[:BLOCK, :3, 3] + A[:BLOCK, :3, :3] @ c - gauge.sensor_carrier
-    spread_A = float(np.median(np.abs(centred_A).max(axis=1)))
-    size_B = float(np.median(np.abs(B[:BLOCK, :3, 3]).max(axis=1)))
-    for name, size in (("A", spread_A), ("B", size_B)):
-        if size > MILLIMETRES_M:
-            warnings.warn(
-                f"{where}: translations of {name} have a median size of {size:.4g}; this looks like millimetres. "
-                "Give metres: divide by 1000",
-                UnitsWarning,
-                stacklevel=4,
-            )

@@ -14,7 +14,8 @@ from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder
 from gtsam_rwhec.problem.accumulation import Accumulator, Batch
 from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
-from gtsam_rwhec.problem.measurements import GivenMeasurements, KeptMeasurements, Measurements, warn_of_millimetres
+from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
+from gtsam_rwhec.problem.measurements import GivenMeasurements, KeptMeasurements, Measurements
 from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.pairs import Pair
 
@@ -191,7 +192,7 @@ class Problem(Knowledge):
         pair = Pair(target, sensor)
         if pair.is_motion:
             raise FrameError(f"{target!r} is given as target and as sensor; names are unique across both")
-        self._add(pair, GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source))
+        self.add_batch(pair, GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source))
 
     def add_motion(
         self,
@@ -212,9 +213,13 @@ class Problem(Knowledge):
         """
         check_name(sensor, "the sensor's name")
         given = GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source)
-        self._add(Pair(sensor, sensor), given)
+        self.add_batch(Pair(sensor, sensor), given)
 
-    def _add(self, pair: Pair, given: GivenMeasurements) -> None:
+    def add_batch(self, pair: Pair, given: GivenMeasurements, long: list[LongTranslations] | None = None) -> None:
+        """Add a batch of measurements or motions; ``add`` and ``add_motion`` say which, and have the errors.
+
+        Where ``long`` is given, translations that look like millimetres go there, and the caller warns of all at once.
+        """
         if given.source is not None and not isinstance(given.source, str):
             raise OptionError(f"source is a {type(given.source).__name__}; give text: the name of a file or topic")
         where = f"{pair} ({given.source})" if given.source else pair.label
@@ -230,7 +235,11 @@ class Problem(Knowledge):
                 stacklevel=3,
             )
             raw = raw.projected(where)
-        warn_of_millimetres(raw.A, raw.B, accumulator.gauge, pair.is_motion, where)
+        translations = LongTranslations.of(raw.A, raw.B, accumulator.gauge, pair.is_motion, where)
+        if long is None:
+            warn_of_millimetres([translations], stacklevel=3)
+        else:
+            long.append(translations)
         # The problem changes only after all checks and warnings: a warning may be raised as an error.
         self._accumulator = accumulator
         self.is_relative = self.is_relative or not given.has_noise

@@ -15,7 +15,7 @@ from places import DEMO
 from strategies import damaged, tables
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import FileFormatError, NoiseError
+from gtsam_rwhec.errors import FileFormatError, NoiseError, UnitsWarning
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.problem.csv_folder import CsvWarning, read_pose_rows
 
@@ -64,6 +64,20 @@ def test_poses_are_those_of_the_files(utias_folder: Path) -> None:
 def test_weights_left_out_make_the_problem_relative() -> None:
     assert rw.read_csv(DEMO).is_relative
     assert not rw.read_csv(DEMO, sigma=0.005, kappa=6000.0).is_relative
+
+
+def test_a_folder_in_millimetres_has_one_warning(tmp_path: Path) -> None:
+    line = "1,0,0,0,{},0,0"
+    for name in ("tag_0_cam_0", "tag_0_cam_1", "tag_1_cam_0", "tag_1_cam_1"):
+        # The first row of A is the origin that A is taken about.
+        write_pair(tmp_path, [line.format(x) for x in (-900, 0, 900)], [line.format(x) for x in (700, 800, 900)], name)
+    with pytest.warns(UnitsWarning) as caught:
+        rw.read_csv(tmp_path)
+    (message,) = [str(warning.message) for warning in caught]
+    assert "tag_0-cam_0" in message
+    assert "and 1 more" in message
+    assert "of A and B" in message
+    assert caught[0].filename == __file__
 
 
 def test_measurements_need_not_be_kept() -> None:
