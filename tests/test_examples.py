@@ -73,6 +73,16 @@ def test_the_grid_of_figure_8(utias_folder: Path, tmp_path: Path) -> None:
     assert "The whole is determined." in output
 
 
+def test_one_call_is_short_and_leaves_the_outliers_out(tmp_path: Path) -> None:
+    path = EXAMPLES / "one_call.py"
+    assert len(path.read_text(encoding="utf-8").splitlines()) < 30
+    done = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("Use these poses: ")
+    assert "Outliers: 6 of 60 measurements were left out" in done.stdout
+    assert "A point 0.80 m from camera, expressed in hand, is within" in done.stdout
+
+
 def test_certified_start_then_refinement_is_short_and_goes_on(tmp_path: Path) -> None:
     path = EXAMPLES / "certified_init_then_refine.py"
     assert len(path.read_text(encoding="utf-8").splitlines()) < 30

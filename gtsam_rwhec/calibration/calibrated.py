@@ -46,7 +46,7 @@ class NoiseFound:
     source : str
         Where it comes from: "estimated from the residuals", "as given".
     rotation_rad, translation_m : dict of (target, sensor) to float
-        Of B, by pair: the root mean square over the pair's measurements and axes.
+        Of B, by pair: of the pair's median measurement, root mean square over axes.
     carriers : str
         The noise of A, in words.
     """
@@ -62,7 +62,8 @@ class NoiseFound:
         degrees = [math.degrees(value) for value in self.rotation_rad.values()]
         millimetres = [1e3 * value for value in self.translation_m.values()]
         return (
-            f"Noise of B: {_span(degrees)}° and {_span(millimetres)} mm for each axis, {self.source}. Noise of A: "
+            f"Noise of B: {_span(degrees)}° and {_span(millimetres)} mm for each axis of a typical measurement, "
+            f"{self.source}. Noise of A: "
             f"{self.carriers}."
         )
 

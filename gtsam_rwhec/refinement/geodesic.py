@@ -77,11 +77,15 @@ class GeodesicModel:
 
     @property
     def given_noise(self) -> dict[Pair, tuple[float, float]]:
-        """Given standard deviations, root mean square over each pair's measurements and axes: rad and metres."""
+        """Given standard deviations of each pair's median measurement, root mean square over axes: rad and metres.
+
+        A root mean square over measurements would be that of the few farthest ones, which count least.
+        """
         result = {}
         for item in self.data:
-            variances = np.einsum("nii->i", item.covariance) / item.count
-            result[item.pair] = (float(np.sqrt(variances[:3].mean())), float(np.sqrt(variances[3:].mean())))
+            variances = np.einsum("nii->ni", item.covariance).reshape(-1, 2, 3).mean(axis=2)
+            rotation, translation = np.sqrt(np.median(variances, axis=0)).tolist()
+            result[item.pair] = (rotation, translation)
         return result
 
     def covariances(self, at: dict[Pair, Linearization], factors: FactorsByPair) -> dict[Pair, Array]:

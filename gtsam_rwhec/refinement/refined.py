@@ -38,7 +38,7 @@ class Movement:
 
 @dataclass(frozen=True)
 class PairNoise:
-    """The noise of a pair's B, root mean square over measurements and axes.
+    """The noise of a pair's B, of the median measurement, root mean square over axes (of moments: of all measurements).
 
     ``degrees_of_freedom`` (rotation, translation) of the estimated noise; infinite if the noise was given.
     """

@@ -26,6 +26,11 @@ from gtsam_rwhec.results.log_history import LogFields
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
 #: The carrier that has the noise of A.
 CARRIERS: dict[About, str] = {"targetcarrier": "target carrier", "sensorcarrier": "sensor carrier"}
+#: What the numbers of the noise are, beside the residuals.
+NOISE_LEGEND = (
+    "This is the noise of the median measurement, before any fit. Residuals are weighted: far and oblique measurements "
+    "are noisier and count less, so the residuals' root mean square can be far smaller."
+)
 LEGEND = (
     "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation, along "
     "and about the axes of the frame itself; free: infinite, because the measurements leave a direction free. moved: "
@@ -120,7 +125,7 @@ def scale_and_offset_sentences(refined: Refined) -> list[str]:
 
 def refined_sentences(refined: Refined) -> list[str]:
     """The noise, the cost and the outliers, which decide the standard deviations."""
-    sentences = [_noise_sentence(refined), _carrier_noise_sentence(refined)]
+    sentences = [_noise_sentence(refined), NOISE_LEGEND, _carrier_noise_sentence(refined)]
     loss = "" if refined.options.robust in ("none", "gnc") else f", {refined.options.robust} loss"
     steps = f"{refined.iterations} iteration{'' if refined.iterations == 1 else 's'}"
     sentences.append(
@@ -141,7 +146,7 @@ def _noise_sentence(refined: Refined) -> str:
         return f"Noise of B: {source}; see the table."
     rotation, translation, *behind = next(iter(rows.values()))
     backing = f", with {behind[0]} and {behind[1]} degrees of freedom" if behind else ""
-    return f"Noise of B: {rotation}° and {translation} mm for each axis, {source}{backing}."
+    return f"Noise of B: {rotation}° and {translation} mm for each axis of a typical measurement, {source}{backing}."
 
 
 def _carrier_noise_sentence(refined: Refined) -> str:
@@ -184,7 +189,7 @@ def noise_table(refined: Refined) -> FrameTable:
         if all(rows[label(pair)] == cells for pair, cells in noises.items())
     )
     headings = ("±°", "±mm") if refined.noise_source == "given" else ("±°", "±mm", "d.o.f. (°)", "d.o.f. (mm)")
-    title = "Noise of B for each axis"
+    title = "Noise of B for each axis of a typical measurement"
     if refined.noise_source == "estimated":
         title += ", and degrees of freedom"
         if refined.options.noise_groups == "all":  # one estimate for all rows

@@ -18,7 +18,10 @@ from gtsam_rwhec.files.terminal_text import printable, shown
 from gtsam_rwhec.solver.residuals import Residual
 from gtsam_rwhec.solving.solution import Solution
 
-RESIDUAL_LEGEND = "rms: root mean square residual over the n measurements of a frame, in millimetres and degrees."
+RESIDUAL_LEGEND = (
+    "rms: root mean square length of the residuals of a frame's n measurements, weighted as in the cost, in mm "
+    "and degrees."
+)
 POSE_LEGEND = "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). " + RESIDUAL_LEGEND
 
 POSE_HEADINGS = ("x m", "y m", "z m", "roll°", "pitch°", "yaw°")

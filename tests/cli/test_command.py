@@ -210,7 +210,7 @@ def test_refinement_reports_covariances_and_writes_them(tmp_path: Path) -> None:
     assert done.stdout.index("How far off a point is") < done.stdout.index("What was chosen, and why")
     assert "A point 2.60 m from cam_0, expressed in the frame that carries cam_0, is within " in done.stdout
     assert done.stdout.index("±x mm") < done.stdout.index("Details") < done.stdout.index("Certified globally optimal")
-    assert "Noise of B: 0.5° and 5 mm for each axis, as given." in done.stdout
+    assert "Noise of B: 0.5° and 5 mm for each axis of a typical measurement, as given." in done.stdout
     refined = rw.read_refined(result)
     for name in refined.Y:
         (row, *_) = [line for line in done.stdout.splitlines() if line.startswith(f" {name} ")]

@@ -170,10 +170,11 @@ def test_time_offsets_have_deviations() -> None:
 
 
 def test_noise_in_one_sentence_where_it_is_one(rig: rw.Refined, planar: rw.Refined) -> None:
-    assert "Noise of B: 0.5° and 5 mm for each axis, as given." in refined_sentences(planar)
+    assert "Noise of B: 0.5° and 5 mm for each axis of a typical measurement, as given." in refined_sentences(planar)
     noise = next(iter(rig.noise.values()))
     assert (
-        f"Noise of B: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm for each axis, "
+        f"Noise of B: {math.degrees(noise.rotation_rad):.3g}° and {1e3 * noise.translation_m:.3g} mm for each axis of "
+        "a typical measurement, "
         f"estimated from the residuals, with {noise.degrees_of_freedom[0]:.0f} and {noise.degrees_of_freedom[1]:.0f} "
         "degrees of freedom."
     ) in refined_sentences(rig)
@@ -184,7 +185,7 @@ def test_noise_by_sensor_and_by_pair_in_a_table(rig: rw.Refined) -> None:
     by_sensor = {pair: PairNoise(0.01 if pair[1] == "sensor0" else 0.02, 0.003, (40.0, 38.0)) for pair in rig.noise}
     text = printed(dataclasses.replace(rig, noise=by_sensor))
     assert "Noise of B: estimated from the residuals; see the table." in text
-    assert [row.split() for row in rows_under(text, "Noise of B for each axis")[1:]] == [
+    assert [row.split() for row in rows_under(text, "Noise of B for each axis of a typical measurement")[1:]] == [
         ["sensor0", "0.573", "3", "40", "38"],
         ["sensor1", "1.15", "3", "40", "38"],
     ]
