@@ -19,7 +19,6 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from gtsam_rwhec.errors import CountError, OutlierError, OutliersWarning, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, silent
@@ -28,7 +27,6 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import reweighted
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement.truncated_least_squares import (
-    DOF,
     Iteration,
     NoiseScale,
     TruncatedLeastSquares,
@@ -105,7 +103,7 @@ def graduated(
         that agree, and the other poses do not use the rejected ones.
     """
     tell = progress or silent
-    work = TruncatedLeastSquares(problem, float(chdtri(DOF, 1.0 - confidence)), tell)
+    work = TruncatedLeastSquares(problem, confidence, tell)
     try:
         fit, keep = work.run(noise_scale)
         tell("certifying the inliers' solution")

@@ -12,7 +12,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.refinement.certified_fit import CertifiedFit
+from gtsam_rwhec.refinement.weighted_fit import WeightedFit
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Measured:
         """Values (N,) of all measurements, by pair."""
         return {pair: values[rows] for pair, rows in zip(self.pairs, self.rows, strict=True)}
 
-    def squares(self, fit: CertifiedFit) -> Squares:
+    def squares(self, fit: WeightedFit) -> Squares:
         """The squared residuals at an answer."""
         R = np.empty((len(self.A), 3, 3))
         t = np.empty((len(self.A), 3))

@@ -1,6 +1,8 @@
-"""The minimisation of truncated squares by certified solutions: graduation, trimming, settling and voting.
+"""The minimisation of truncated squares by re-weighted fits: graduation, trimming, settling and voting.
 
-``graduated`` has the equation and the reasons.
+``graduated`` has the equation and the reasons. Every stage has a bound on its number of fits, so that no measurements
+make it run for ever: trimming and settling may go round in circles, and graduation would need ever more steps the
+larger the residuals are.
 """
 
 from __future__ import annotations
@@ -20,9 +22,10 @@ from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import reweighted
 from gtsam_rwhec.problem.variance_factors import AS_STATED, VarianceFactors
-from gtsam_rwhec.refinement.certified_fit import CertifiedFit, certified_fit
+from gtsam_rwhec.refinement.admission import inlier_threshold, judged
 from gtsam_rwhec.refinement.squared_residuals import Measured, Squares
 from gtsam_rwhec.refinement.voting import by_vote
+from gtsam_rwhec.refinement.weighted_fit import WeightedFit, weighted_fit
 
 NoiseScale = Literal["given", "estimate"]
 
@@ -38,15 +41,27 @@ QUIETEST = 1e-8
 PAYS = 1e-6
 #: A measurement has these degrees of freedom: three of rotation, three of translation.
 DOF = 6
-#: Each start gets at most this many re-weighted solutions.
-MAX_ITERATIONS = 100
+#: Graduation takes at most this many steps: where residuals are so large that it would need more, mu grows faster.
+MAX_GRADUATIONS = 40
+#: Trimming and settling take at most this many fits each; five to ten are usual.
+MAX_FITS = 20
+#: Frames vote at most this many times, each time all that have outliers.
+MAX_VOTES = 3
+#: The inliers are judged anew at most this many times; two or three are usual.
+MAX_ADMISSIONS = 10
+#: With estimated noise so many equations must be left when one measurement is left out.
+SPARE = 6
+#: An outlier cannot hide where the unknowns take up no more than this part of the equations.
+PULLED = 0.02
+#: An estimated variance factor is settled when a fit changes it by no more than this part.
+SETTLED = 1e-4
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """One re-weighted solution."""
+    """One re-weighted fit."""
 
-    #: "graduating", "trimming" or "settling".
+    #: "trimming", "graduating", "settling" or "admitting".
     stage: str
     #: The graduation's parameter; nan where weights are 0 or 1.
     mu: float
@@ -54,8 +69,6 @@ class Iteration:
     truncated_cost: float
     #: Number of measurements with d^2 <= c^2.
     inliers: int
-    #: Whether the optimum of the re-weighted problem is certified.
-    certified: bool
 
 
 @dataclass
@@ -63,31 +76,94 @@ class TruncatedLeastSquares:
     """The stages of the minimisation and their common state: ``factors`` and ``history`` change on the way."""
 
     problem: Problem
-    threshold: float
+    confidence: float
     tell: Progress
     factors: VarianceFactors = AS_STATED
     history: list[Iteration] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        #: c^2; it grows when inliers are admitted at the end.
+        self.threshold = float(chdtri(DOF, 1.0 - self.confidence))
         self.measured = Measured.of(self.problem)
         self.smallest_factors = VarianceFactors(
             2.0 * float(np.median(self.measured.kappa)) * QUIETEST**2,
             QUIETEST**2 / float(np.median(self.measured.sigma)) ** 2,
         )
 
-    def run(self, noise_scale: NoiseScale) -> tuple[CertifiedFit, np.ndarray]:
+    def run(self, noise_scale: NoiseScale) -> tuple[WeightedFit, np.ndarray]:
         """The best answer and its inliers (N,)."""
+        self.tell("rejecting outliers: the fit to all measurements")
         everything = self.fit(np.ones(len(self.measured.A)), None)
+        if self.is_clean(everything, noise_scale):
+            return everything, self.everyone
         if noise_scale == "given":
-            return self.best([lambda: self.graduate(everything)])
+            fit, _ = self.best([lambda: self.graduate(everything)])
+            self.threshold = inlier_threshold(self.confidence, len(self.measured.A))
+            return self.settle(fit)
+        if self.spare_equations < SPARE:
+            raise CountError(
+                f"{len(self.measured.A)} measurements leave {max(self.spare_equations, 0)} equations to spare when one "
+                f"is left out; {SPARE} are needed to tell an outlier from noise that is not known"
+            )
         halves = self.trim(everything)
         fit, _ = self.settle(halves, estimates=True)
         fit, _ = self.best([lambda: self.graduate(everything), lambda: fit])
-        return self.settle(fit, estimates=True)
+        return self.admit(*self.settle(fit, estimates=True))
 
-    def best(self, starts: list[Callable[[], CertifiedFit]]) -> tuple[CertifiedFit, np.ndarray]:
+    @property
+    def everyone(self) -> np.ndarray:
+        """The mask (N,) of all measurements."""
+        return np.ones(len(self.measured.A), dtype=bool)
+
+    @property
+    def spare_equations(self) -> int:
+        """Equations less unknowns when one measurement is left out."""
+        unknowns = sum(6 for name in self.problem.targets + self.problem.sensors if name not in self.problem.fixed)
+        if self.problem.scale == "shared":
+            unknowns += 1
+        elif self.problem.scale == "per_target":
+            owners = {pair.target for pair in self.problem.pairs}
+            unknowns += len(owners - self.problem.fixed_scales.keys())
+        return DOF * (len(self.measured.A) - 1) - unknowns
+
+    def is_clean(self, everything: WeightedFit, noise_scale: NoiseScale) -> bool:
+        """Whether the fit to all measurements shows no outlier, so that there is nothing to do.
+
+        If the noise is not known, an outlier may hide in the fit that it has pulled, unless there are many measurements
+        for each unknown: then it cannot pull.
+        """
+        count = len(self.measured.A)
+        if noise_scale == "given":
+            return bool((self.distances(everything) <= inlier_threshold(self.confidence, count)).all())
+        unknowns = DOF * (count - 1) - self.spare_equations
+        if unknowns > PULLED * DOF * count:
+            return False
+        found = judged(self.problem, self.measured, everything, self.everyone, self.confidence, robust=True)
+        if not found.agrees.all():
+            return False
+        self.factors = self._from_inliers(self.measured.squares(everything), self.everyone)
+        self.threshold = inlier_threshold(self.confidence, count)
+        return True
+
+    def admit(self, fit: WeightedFit, keep: np.ndarray) -> tuple[WeightedFit, np.ndarray]:
+        """Judge every measurement anew, under the noise by axis that the inliers show, until the inliers stay."""
+        self.threshold = inlier_threshold(self.confidence, len(keep))
+        for step in range(1, MAX_ADMISSIONS + 1):
+            found = judged(self.problem, self.measured, fit, keep, self.confidence).agrees
+            if (found == keep).all():
+                break
+            try:
+                fit = self.complete(self.fit(found.astype(np.float64), fit))
+            except (UnderdeterminedError, CountError):
+                break
+            keep = found
+            self.record("admitting", step, MAX_ADMISSIONS, np.nan, self.distances(fit))
+        self.factors = self._from_inliers(self.measured.squares(fit), keep)
+        return fit, keep
+
+    def best(self, starts: list[Callable[[], WeightedFit]]) -> tuple[WeightedFit, np.ndarray]:
         """The best fit of all starts, each settled to weights of 0 and 1; a start with too few inliers is left out."""
-        ends: list[tuple[float, CertifiedFit, np.ndarray]] = []
+        ends: list[tuple[float, WeightedFit, np.ndarray]] = []
         failure: UnderdeterminedError | CountError | None = None
         for start in starts:
             try:
@@ -101,35 +177,41 @@ class TruncatedLeastSquares:
         _, fit, keep = min(ends, key=lambda end: end[0])
         return self.vote(fit, keep)
 
-    def vote(self, fit: CertifiedFit, keep: np.ndarray) -> tuple[CertifiedFit, np.ndarray]:
-        """Move single frames to where more of their measurements agree, if this lowers the cost; return the new fit."""
-        least = self.truncated(self.distances(fit))
-        for name in self.problem.targets + self.problem.sensors:
-            good, total = inlier_count(name, self.measured.by_pair(keep))
-            if good >= VOTED * total or name in self.problem.fixed:
-                continue
-            moved, saved = by_vote(name, self.measured, fit, self.factors, self.threshold)
+    def vote(self, fit: WeightedFit, keep: np.ndarray) -> tuple[WeightedFit, np.ndarray]:
+        """Move frames with outliers to where more of their measurements agree, where this lowers the cost."""
+        for _ in range(MAX_VOTES):
+            least = self.truncated(self.distances(fit))
+            moved, saved = fit, 0.0
+            inliers = self.measured.by_pair(keep)
+            for name in self.problem.targets + self.problem.sensors:
+                good, total = inlier_count(name, inliers)
+                if good >= VOTED * total or name in self.problem.fixed:
+                    continue
+                self.tell(f"rejecting outliers: the measurements of {name} vote, {good} of {total} agree")
+                moved, less = by_vote(name, self.measured, moved, self.factors, self.threshold)
+                saved += less
             if saved <= 0.0:
-                continue
+                break
             with contextlib.suppress(UnderdeterminedError, CountError):
                 candidate, kept = self.settle(moved)
-                cost = self.truncated(self.distances(candidate))
-                if cost < least * (1.0 - PAYS):
-                    fit, keep, least = candidate, kept, cost
+                if self.truncated(self.distances(candidate)) < least * (1.0 - PAYS):
+                    fit, keep = candidate, kept
+                    continue
+            break
         return fit, keep
 
-    def complete(self, fit: CertifiedFit) -> CertifiedFit:
+    def complete(self, fit: WeightedFit) -> WeightedFit:
         """The fit with poses by vote for frames that lost all their measurements, so that they may come back."""
         for name in self.problem.targets + self.problem.sensors:
             if name not in fit.poses and name not in self.problem.fixed:
                 fit, _ = by_vote(name, self.measured, fit, self.factors, self.threshold)
         return fit
 
-    def fit(self, weights: Array, previous: CertifiedFit | None) -> CertifiedFit:
+    def fit(self, weights: Array, previous: WeightedFit | None) -> WeightedFit:
         """The certified optimum of weighted measurements."""
-        return certified_fit(reweighted(self.problem, self.measured.by_pair(weights), self.factors), previous)
+        return weighted_fit(reweighted(self.problem, self.measured.by_pair(weights), self.factors), previous)
 
-    def distances(self, fit: CertifiedFit) -> Array:
+    def distances(self, fit: WeightedFit) -> Array:
         """d^2 (N,)."""
         return self.measured.together(self.measured.squares(fit), self.factors)
 
@@ -137,13 +219,15 @@ class TruncatedLeastSquares:
         """sum min(d^2, c^2)."""
         return float(np.minimum(distances, self.threshold).sum())
 
-    def record(self, stage: str, mu: float, fit: CertifiedFit, distances: Array) -> None:
-        """Add an iteration to the history."""
+    def record(self, stage: str, step: int, most: int, mu: float, distances: Array) -> None:
+        """Add an iteration to the history, and tell it."""
         inliers = int((distances <= self.threshold).sum())
-        self.history.append(Iteration(stage, mu, 0.5 * self.truncated(distances), inliers, fit.certified))
-        self.tell(f"rejecting outliers: {stage}, {inliers} of {len(distances)} agree")
+        self.history.append(Iteration(stage, mu, 0.5 * self.truncated(distances), inliers))
+        self.tell(
+            f"rejecting outliers: {stage}, step {step} of at most {most}, {inliers} of {len(distances)} agree"
+        )
 
-    def graduate(self, fit: CertifiedFit) -> CertifiedFit:
+    def graduate(self, fit: WeightedFit) -> WeightedFit:
         """From least squares to truncated least squares with growing mu (Remark 5 and eq. 14 of the paper)."""
         d = self.distances(fit)
         c2 = self.threshold
@@ -151,22 +235,23 @@ class TruncatedLeastSquares:
         if worst <= c2:
             return fit
         mu = c2 / (2.0 * worst - c2)
-        for _ in range(MAX_ITERATIONS):
+        growth = max(GRADUATION, (LAST_MU / mu) ** (1.0 / (MAX_GRADUATIONS - 1)))
+        for step in range(1, MAX_GRADUATIONS + 1):
             w = truncated_weights(d, mu, c2)
             if not w.any():
                 break
             fit = self.fit(w / w.max(), fit)  # all are small at first, and priors would dominate
             d = self.distances(fit)
-            self.record("graduating", mu, fit, d)
-            mu *= GRADUATION
-            if mu > LAST_MU or not ((w > 0.0) & (w < 1.0)).any():
+            self.record("graduating", step, MAX_GRADUATIONS, mu, d)
+            mu *= growth
+            if mu > LAST_MU * growth or not ((w > 0.0) & (w < 1.0)).any():
                 break
         return fit
 
-    def trim(self, fit: CertifiedFit) -> CertifiedFit:
+    def trim(self, fit: WeightedFit) -> WeightedFit:
         """Least trimmed squares: the better half of each pair under the median's noise, until it stays the same."""
         keep = np.zeros(len(self.measured.A), dtype=bool)
-        for _ in range(MAX_ITERATIONS):
+        for step in range(1, MAX_FITS + 1):
             squares = self.measured.squares(fit)
             self.factors = self._from_median(squares)
             d = self.measured.together(squares, self.factors)
@@ -179,13 +264,13 @@ class TruncatedLeastSquares:
                 break
             keep = half
             fit = self.fit(keep.astype(np.float64), fit)
-            self.record("trimming", np.nan, fit, self.distances(fit))
+            self.record("trimming", step, MAX_FITS, np.nan, self.distances(fit))
         return fit
 
-    def settle(self, fit: CertifiedFit, *, estimates: bool = False) -> tuple[CertifiedFit, np.ndarray]:
+    def settle(self, fit: WeightedFit, *, estimates: bool = False) -> tuple[WeightedFit, np.ndarray]:
         """Weights of 0 and 1 until they stay the same: a local minimum of the truncated cost."""
         keep = np.zeros(len(self.measured.A), dtype=bool)
-        for _ in range(MAX_ITERATIONS):
+        for step in range(1, MAX_FITS + 1):
             squares = self.measured.squares(fit)
             d = self.measured.together(squares, self.factors)
             change = 0.0
@@ -195,11 +280,11 @@ class TruncatedLeastSquares:
                 change = float(np.abs(np.log(np.array(self.factors) / np.array(before))).max())
                 d = self.measured.together(squares, self.factors)
             inliers = d <= self.threshold
-            if (inliers == keep).all() and change < 1e-6:
+            if (inliers == keep).all() and change < SETTLED:
                 break
             keep = inliers
             fit = self.complete(self.fit(keep.astype(np.float64), fit))
-            self.record("settling", np.nan, fit, self.distances(fit))
+            self.record("settling", step, MAX_FITS, np.nan, self.distances(fit))
         return fit, keep
 
     def _from_median(self, squares: Squares) -> VarianceFactors:

@@ -8,23 +8,23 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.refinement.certified_fit import CertifiedFit
 from gtsam_rwhec.refinement.squared_residuals import Measured
+from gtsam_rwhec.refinement.weighted_fit import WeightedFit
 
 #: A frame has at most this many proposals, sampled evenly in the order of the residuals.
 PROPOSALS = 50
 
 
 def by_vote(
-    name: str, measured: Measured, fit: CertifiedFit, factors: VarianceFactors, threshold: float
-) -> tuple[CertifiedFit, float]:
+    name: str, measured: Measured, fit: WeightedFit, factors: VarianceFactors, threshold: float
+) -> tuple[WeightedFit, float]:
     """The fit with one frame moved to where most of its measurements agree, and the decrease of sum min(d^2, c^2).
 
     The frame may lack a pose before. The fit stays as given where no proposal is better. ``threshold`` is c^2.
     """
     own = measured.of_pairs([pair for pair in measured.pairs if name in pair and not pair.is_motion])
 
-    def cost_of(candidate: CertifiedFit) -> tuple[float, Array]:
+    def cost_of(candidate: WeightedFit) -> tuple[float, Array]:
         d = own.together(own.squares(candidate), factors)
         return float(np.minimum(d, threshold).sum()), d
 
@@ -42,7 +42,7 @@ def by_vote(
     return best, before - least
 
 
-def _proposed(name: str, index: int, own: Measured, fit: CertifiedFit) -> Array | None:
+def _proposed(name: str, index: int, own: Measured, fit: WeightedFit) -> Array | None:
     """X = A^-1 Y B or Y = A X B^-1 of one measurement, true lengths; None if the pair's other frame has no pose."""
     pair = own.pair_of(index)
     other = pair.sensor if pair.target == name else pair.target

@@ -71,7 +71,6 @@ def test_forty_percent_of_outliers_are_found(
     clean = rw.solve(selected(simulation.problem, good))
     # One inlier more or less moves the answer by a part of its error.
     assert largest_error_m(simulation, found.solution) < 1.3 * largest_error_m(simulation, clean) + 1e-4
-    assert found.history[-1].certified
     if noise_scale == "given":
         assert found.variance_factors == (1.0, 1.0)
     else:

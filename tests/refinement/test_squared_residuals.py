@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.refinement.certified_fit import CertifiedFit, certified_fit
+from gtsam_rwhec.refinement.weighted_fit import WeightedFit, weighted_fit
 from gtsam_rwhec.refinement.squared_residuals import Measured
 from gtsam_rwhec.simulate import Noise, Simulation, general
 
@@ -17,11 +17,11 @@ NOISE = Noise(sigma_m=0.01, kappa=500.0)
 ONE = VarianceFactors(1.0, 1.0)
 
 
-def truth(simulation: Simulation) -> CertifiedFit:
+def truth(simulation: Simulation) -> WeightedFit:
     scale = simulation.scale
     names = [*simulation.X, *simulation.Y]
     alpha = scale if isinstance(scale, dict) else dict.fromkeys(names, scale)
-    return CertifiedFit({**simulation.X, **simulation.Y}, alpha, certified=False)
+    return WeightedFit({**simulation.X, **simulation.Y}, alpha, certified=False)
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
@@ -30,7 +30,7 @@ def test_half_the_sum_of_squares_is_the_certified_cost(scale: rw.ScaleMode) -> N
         2, 2, seed=1, number_of_measurements=9, noise=NOISE, scale=scale, odometry=7, odometry_noise=NOISE
     ).problem
     measured = Measured.of(problem)
-    squares = measured.squares(certified_fit(problem, None))
+    squares = measured.squares(weighted_fit(problem, None))
     assert 0.5 * measured.together(squares, ONE).sum() == pytest.approx(rw.solve(problem).cost, rel=1e-9)
 
 
@@ -75,7 +75,7 @@ def test_frames_without_a_pose_are_infinitely_far() -> None:
     measured = Measured.of(simulation.problem)
     fit = truth(simulation)
     squares = measured.squares(
-        CertifiedFit({n: T for n, T in fit.poses.items() if n != "target1"}, fit.alpha, certified=True)
+        WeightedFit({n: T for n, T in fit.poses.items() if n != "target1"}, fit.alpha)
     )
     by_pair = measured.by_pair(measured.together(squares, ONE))
     assert np.isfinite(by_pair["target0", "sensor0"]).all()

@@ -1,4 +1,4 @@
-"""Poses by vote, and the certified fit that needs no positive scale."""
+"""Poses by vote, and the fit that needs no positive scale."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.refinement.certified_fit import CertifiedFit, certified_fit
+from gtsam_rwhec.refinement.weighted_fit import WeightedFit, weighted_fit
 from gtsam_rwhec.refinement.squared_residuals import Measured
 from gtsam_rwhec.refinement.voting import by_vote
 from gtsam_rwhec.simulate import Noise, general, perturb
@@ -33,7 +33,7 @@ def test_a_frame_goes_where_most_of_its_measurements_agree(scale: Any, name: str
     measured = Measured.of(problem)
     names = [*simulation.X, *simulation.Y]
     alpha = simulation.scale if isinstance(simulation.scale, dict) else dict.fromkeys(names, simulation.scale)
-    truth = CertifiedFit({**simulation.X, **simulation.Y}, alpha, certified=True)
+    truth = WeightedFit({**simulation.X, **simulation.Y}, alpha)
     wrong = {**truth.poses, name: np.eye(4)}
     if missing:
         del wrong[name]
@@ -50,7 +50,7 @@ def test_a_frame_goes_where_most_of_its_measurements_agree(scale: Any, name: str
 def test_without_a_pose_of_the_other_frame_no_pose_is_proposed() -> None:
     simulation = general(1, 1, seed=2, number_of_measurements=5, noise=NOISE)
     fit, saved = by_vote(
-        "target0", Measured.of(simulation.problem), CertifiedFit({}, {}, certified=True), ONE, THRESHOLD
+        "target0", Measured.of(simulation.problem), WeightedFit({}, {}), ONE, THRESHOLD
     )
     assert saved == 0.0
     assert not fit.poses
@@ -59,23 +59,22 @@ def test_without_a_pose_of_the_other_frame_no_pose_is_proposed() -> None:
 @pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
 def test_the_fit_is_what_solve_finds(scale: Any) -> None:
     problem = general(2, 2, seed=3, number_of_measurements=12, scale=scale).problem
-    solution, fit = rw.solve(problem), certified_fit(problem, None)
+    solution, fit = rw.solve(problem), weighted_fit(problem, None)
     for name, pose in (solution.X | solution.Y).items():
         np.testing.assert_allclose(fit.poses[name], pose.matrix(), atol=1e-7)
     for target, _ in problem.pairs:
         expected = solution.scale[target] if isinstance(solution.scale, dict) else solution.scale
         assert fit.alpha[target] == pytest.approx(expected, rel=1e-7)
-    again = certified_fit(problem, fit)
-    assert again.certified
+    again = weighted_fit(problem, fit)
     for name, T in fit.poses.items():
         np.testing.assert_allclose(again.poses[name], T, atol=1e-7)
 
 
 def test_a_poor_start_does_not_matter() -> None:
     problem = general(3, 2, seed=4, number_of_measurements=12, noise=NOISE).problem
-    start = certified_fit(problem, None)
+    start = weighted_fit(problem, None)
     poses = dict(zip(start.poses, perturb(np.array(list(start.poses.values())), Noise(1.0, 0.1), 5), strict=True))
-    fit = certified_fit(problem, replace(start, poses=poses))
+    fit = weighted_fit(problem, replace(start, poses=poses))
     for name, T in start.poses.items():
         np.testing.assert_allclose(fit.poses[name], T, atol=1e-6)
 
@@ -89,11 +88,11 @@ def test_a_negative_scale_on_the_way_is_no_error() -> None:
     problem.add("target0", "sensor0", raw.A, B, 0.01, 1000.0)
     with pytest.raises(rw.errors.ScaleError):
         rw.solve(problem)
-    assert certified_fit(problem, None).alpha["target0"] < 0.0
+    assert weighted_fit(problem, None).alpha["target0"] < 0.0
 
 
 def test_too_few_measurements_raise_an_error() -> None:
     problem = general(1, 1, seed=6, number_of_measurements=5, noise=NOISE).problem
     one = selected(problem, {("target0", "sensor0"): np.arange(5) == 2})
     with pytest.raises(UnderdeterminedError):
-        certified_fit(one, None)
+        weighted_fit(one, None)

@@ -1,4 +1,8 @@
-"""The certified optimum of re-weighted measurements, without the parts of a solution that only a final answer needs.
+"""The optimum of re-weighted measurements on the way of the outlier rejection: found by descents, and not certified.
+
+A certificate on the way would say nothing about the answer, and where the gap is open it takes a search of its own:
+outliers open it often. So a fit is the lowest end of two or three descents, from the last fit and from starts that know
+nothing of it. What is kept at the end is solved and certified once (``graduated``).
 
 With a scale for each target the certified form is C X'_j = Y'_k A (design fact 7). There the noise of a measured
 rotation acts on a lever arm, so at that form's optimum the physical residuals are larger than sigma says. Outliers are
@@ -23,33 +27,34 @@ from gtsam_rwhec.problem.variance_factors import AS_STATED
 from gtsam_rwhec.refinement import graph as graphs
 from gtsam_rwhec.refinement.optimisation import optimise
 from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.solver.descent import descend
+from gtsam_rwhec.solver.mirror import mirrored
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.parts import Part, parts_of
-from gtsam_rwhec.solver.search import Found, Search
-from gtsam_rwhec.solver.variables import Answer, rotations_as_variables, scales_of
+from gtsam_rwhec.solver.search import MIRROR_COST, Search
+from gtsam_rwhec.solver.start import spectral_start, unconstrained_start
+from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables, scales_of
 
-#: With more free frames than this a gap stays open on the way. The semidefinite relaxation would take most of the time,
-#: and the final, full solution has its own certificate.
-FRAMES_RELAXED = 12
+#: So many Newton steps lead from a start to its optimum; three to ten are usual.
+MAX_DESCENT_STEPS = 50
 #: So many Levenberg-Marquardt steps may lead from the certified optimum to the physical one; below ten is usual.
 MAX_STEPS = 30
 
 
 @dataclass(frozen=True)
-class CertifiedFit:
-    """Poses (4, 4) of the frames that have a measurement, metres; alpha by target (or mover); whether all is certified.
+class WeightedFit:
+    """Poses (4, 4) of the frames that have a measurement, metres; alpha by target (or mover).
 
     A scale may be negative: outliers may make it so on the way.
     """
 
     poses: dict[str, Array]
     alpha: dict[str, float]
-    certified: bool
 
 
 @np.errstate(all="ignore")
-def certified_fit(problem: Problem, previous: CertifiedFit | None) -> CertifiedFit:
-    """The global optimum; the search starts at the previous poses if there are any.
+def weighted_fit(problem: Problem, previous: WeightedFit | None) -> WeightedFit:
+    """The lowest optimum that descents find, from the previous poses too if there are any.
 
     Raises
     ------
@@ -58,19 +63,17 @@ def certified_fit(problem: Problem, previous: CertifiedFit | None) -> CertifiedF
     """
     poses: dict[str, Array] = {}
     alpha: dict[str, float] = {}
-    certified = True
     parts = parts_of(problem)
     for part in parts:
-        answer, closed = _solve(part, previous)
-        certified = certified and closed
+        answer = _solve(part, previous)
         for name, R, t in zip(part.free, answer.R, answer.t, strict=True):
             poses[name] = se3.pose(R, t + part.frame_shift(name))
         poses |= {name: problem.fixed[name] for name in part.fixed}
         alpha |= scales_of(part, answer)
-    return at_physical_optimum(problem, parts, CertifiedFit(poses, alpha, certified))
+    return at_physical_optimum(problem, parts, WeightedFit(poses, alpha))
 
 
-def at_physical_optimum(problem: Problem, parts: list[Part], fit: CertifiedFit) -> CertifiedFit:
+def at_physical_optimum(problem: Problem, parts: list[Part], fit: WeightedFit) -> WeightedFit:
     """The nearest minimum of the physical cost for parts of the inverse equation; parts with a negative scale stay."""
     inverse = [
         part
@@ -94,23 +97,28 @@ def at_physical_optimum(problem: Problem, parts: list[Part], fit: CertifiedFit) 
     )
     end = variables.state(optimise(graph, variables.values(start), MAX_STEPS).values)
     moved = {name for part in inverse for name in part.names}
-    return CertifiedFit(
+    return WeightedFit(
         fit.poses | {name: pose.matrix() for name, pose in (end.X | end.Y).items() if name in moved},
         fit.alpha | {pair.target: end.scales[scale] for pair, scale in variables.scale_of_pair.items()},
-        fit.certified,
     )
 
 
-def _solve(part: Part, previous: CertifiedFit | None) -> tuple[Answer, bool]:
-    """A part's answer, and whether its gap is closed."""
-    search = Search.of(part, SolveOptions(max_dense_frames=FRAMES_RELAXED))
-    found: Found | None = None
+def _solve(part: Part, previous: WeightedFit | None) -> Answer:
+    """A part's answer: the lowest end of the descents, or its mirror image where only that has positive scales."""
+    search = Search.of(part, SolveOptions())
+    form = search.form
+    starts = spectral_start(part, search.whole.rotation)
     if previous is not None and all(name in previous.poses for name in part.free):
-        start = np.array([previous.poses[name][:3, :3] for name in part.free]).reshape(-1, 3, 3)
-        found = search.run("local", rotations_as_variables(part, start))
-    if found is None or not found.is_closed:
-        again = search.run("auto", None)
-        if found is None or again.cost < found.cost:
-            found = again
-    found = search.with_positive_scale(found)
-    return found.answer, found.is_closed
+        before = np.array([previous.poses[name][:3, :3] for name in part.free]).reshape(-1, 3, 3)
+        starts.append(rotations_as_variables(part, before))
+    else:
+        starts += unconstrained_start(form)
+    ends = [descend(form, start, MAX_DESCENT_STEPS) for start in starts]
+    best = min(ends, key=lambda end: end.cost)
+    answer = answer_of(part, form, best.R)
+    if not answer.has_positive_scales:
+        image = descend(form, mirrored(part, best.R), MAX_DESCENT_STEPS)
+        reflected = answer_of(part, form, image.R)
+        if reflected.has_positive_scales and image.cost <= best.cost * (1.0 + MIRROR_COST) + search.rounding:
+            return reflected
+    return answer

@@ -10,7 +10,7 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.variance_factors import AS_STATED
-from gtsam_rwhec.refinement.certified_fit import CertifiedFit, at_physical_optimum, certified_fit
+from gtsam_rwhec.refinement.weighted_fit import WeightedFit, at_physical_optimum, weighted_fit
 from gtsam_rwhec.refinement.squared_residuals import Measured
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solver.parts import parts_of
@@ -30,14 +30,14 @@ def problem_of(seed: int, scale: rw.ScaleMode) -> rw.Problem:
     return problem
 
 
-def as_fit(solution: rw.Solution, problem: rw.Problem) -> CertifiedFit:
+def as_fit(solution: rw.Solution, problem: rw.Problem) -> WeightedFit:
     poses = {name: pose.matrix() for name, pose in (solution.X | solution.Y).items()}
     of = solution.scale
     alpha = dict(of) if isinstance(of, dict) else dict.fromkeys(problem.targets + problem.sensors, float(of))
-    return CertifiedFit(poses, alpha, certified=True)
+    return WeightedFit(poses, alpha)
 
 
-def physical_cost(problem: rw.Problem, fit: CertifiedFit) -> float:
+def physical_cost(problem: rw.Problem, fit: WeightedFit) -> float:
     """Summed over every measurement by itself, and the priors."""
     measured = Measured.of(problem)
     total = 0.5 * float(measured.together(measured.squares(fit), AS_STATED).sum())
@@ -69,7 +69,7 @@ def test_the_end_is_a_minimum_of_the_physical_cost(seed: int, scale: rw.ScaleMod
         for factor in (0.999, 1.001):
             moved = replace(end, alpha=end.alpha | {name: factor * end.alpha[name] for name in names})
             assert physical_cost(problem, moved) > cost
-    assert certified_fit(problem, None).poses["target0"] == pytest.approx(end.poses["target0"], abs=1e-6)
+    assert weighted_fit(problem, None).poses["target0"] == pytest.approx(end.poses["target0"], abs=1e-6)
 
 
 def test_a_negative_scale_stays() -> None:
