@@ -107,7 +107,7 @@ TABLE: dict[str, dict[str, str]] = {
         "refinement/test_bad_refinement.py": "input_checks",
         "refinement/test_carrier_noise.py": "graph pair_data",
         "refinement/test_coverage.py": "variance_components",
-        "refinement/test_graduated.py": "truncated_least_squares",
+        "refinement/test_graduated.py": "admission truncated_least_squares",
         "refinement/test_refine.py": "chordal fit free_space geodesic optimisation options refined refining variables",
         "refinement/test_robust.py": "inliers weighting",
     },

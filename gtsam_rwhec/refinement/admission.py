@@ -90,25 +90,34 @@ class _Linear:
 
 
 def judged(
-    problem: Problem, measured: Measured, fit: WeightedFit, keep: np.ndarray, confidence: float, *, robust: bool = False
+    problem: Problem,
+    measured: Measured,
+    fit: WeightedFit,
+    keep: np.ndarray,
+    confidence: float,
+    *,
+    noise_of: np.ndarray | None = None,
+    robust: bool = False,
 ) -> Judged:
     """Judge every measurement at a fit to the kept ones (N,).
 
-    ``robust`` takes the variances from medians: for a fit to all measurements, of which some may be outliers.
+    ``noise_of`` (N,) are the measurements that show the noise, all kept ones by default. ``robust`` takes the variances
+    from medians: for a fit to all measurements, of which some may be outliers.
     """
     linear = _linearized(problem, measured, fit)
     keep = keep & linear.known
-    count = int(keep.sum())
+    noise_of = keep if noise_of is None else noise_of & linear.known
+    count = int(noise_of.sum())
     nu = max(0.5 * (DOF * count - linear.size), 1.0)
     threshold = DOF * float(fdtri(DOF, nu, 1.0 - rejected_share(confidence, len(keep))))
-    variances = _variances(linear, keep, robust=robust)
+    variances = _variances(linear, noise_of, robust=robust)
     square = np.full(len(keep), np.inf)
     if linear.size > MOST_UNKNOWNS:
         square[linear.known] = np.sum(linear.e**2 / variances, axis=1)[linear.known]
         return Judged(square, threshold)
     e, own = _as_if_fitted(linear, keep, variances)
     for _ in range(2):  # the step moves residuals a little, and these the variances
-        variances = _variances(_with(linear, e), keep, robust=robust)
+        variances = _variances(_with(linear, e), noise_of, robust=robust)
         e, own = _as_if_fitted(linear, keep, variances)
     C = np.where(keep[:, None, None], -own, own)
     C[:, np.arange(DOF), np.arange(DOF)] += variances
@@ -207,18 +216,22 @@ def _as_if_fitted(linear: _Linear, keep: np.ndarray, variances: Array) -> tuple[
     size, width = linear.size, linear.blocks.shape[2]
     at = np.where(linear.columns < 0, size, linear.columns)  # a last row and column take what has no unknown
     weighted = linear.blocks[keep] / variances[keep][:, :, None]
-    information, gradient = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     pairs = at[keep]
     products = np.einsum("nij,nik->njk", weighted, linear.blocks[keep])
     flat = pairs[:, :, None] * (size + 1) + pairs[:, None, :]
-    information = np.bincount(flat.ravel(), products.ravel(), (size + 1) ** 2).reshape(size + 1, size + 1)
-    gradient = np.bincount(pairs.ravel(), np.einsum("nij,ni->nj", weighted, linear.e[keep]).ravel(), size + 1)
+    information = _summed(flat, products, (size + 1) ** 2).reshape(size + 1, size + 1)
+    gradient = _summed(pairs, np.einsum("nij,ni->nj", weighted, linear.e[keep]), size + 1)
     C = np.zeros((size + 1, size + 1))
     C[:-1, :-1] = _inverse(information[:-1, :-1])
     step = -C @ gradient
     e = linear.e + np.einsum("nij,nj->ni", linear.blocks, step[at])
     local = C[at[:, :, None], at[:, None, :]].reshape(len(at), width, width)
     return e, linear.blocks @ local @ linear.blocks.transpose(0, 2, 1)
+
+
+def _summed(places: np.ndarray, values: Array, size: int) -> Array:
+    result: Array = np.asarray(np.bincount(places.ravel(), values.ravel(), size), dtype=np.float64)
+    return result
 
 
 def _inverse(information: Array) -> Array:

@@ -15,6 +15,7 @@ from gtsam_rwhec.geometry.poses import Array, to_pose3
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
 from gtsam_rwhec.refinement import graph as graphs
+from gtsam_rwhec.refinement.admission import inlier_threshold
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import NoiseGroups, RefineOptions, Robust
 from gtsam_rwhec.refinement.pair_data import PairData, check_carriers
@@ -61,8 +62,8 @@ class GeodesicModel:
                 )
         share = 1.0
         if options.robust == "gnc":  # of a chi-square with 6 degrees of freedom, cut at its quantile
-            cut = chdtri(6, 1.0 - options.inlier_confidence)
-            share = float(chdtr(8, cut) / options.inlier_confidence)
+            cut = inlier_threshold(options.inlier_confidence, sum(item.count for item in data))
+            share = float(chdtr(8, cut) / chdtr(6, cut))
         return GeodesicModel(data, variables, options, carriers, share)
 
     @property

@@ -4,13 +4,18 @@
 
 (Yang, Antonante, Tzoumas, Carlone: Graduated non-convexity for robust spatial perception, 2020, Section III. At the
 truth d^2 has a chi-square distribution with 6 degrees of freedom; c^2 is a quantile of it.) For given weights the
-problem is again a calibration problem, which is solved to its global optimum from moments of the re-weighted
-measurements. So the scheme does not depend on a start. But graduation is a heuristic: afterwards the measurements of
-each frame with outliers vote on its pose (``voting``).
+problem is again a calibration problem, whose optimum comes from moments of the re-weighted measurements and from starts
+that know nothing of the last one. So the scheme does not depend on a start: the scale of the fit to all measurements
+may be negative. Fits on the way are not certified; what is kept at the end is solved once, with its certificate.
+Graduation is a heuristic: afterwards the measurements of each frame with outliers vote on its pose (``voting``).
 
 If the noise is unknown, d^2 has no unit at first. Least trimmed squares, which keep the better half of each pair, give
 the first noise; the inliers give the next. If more than half of the measurements are outliers, they decide this noise,
 and the estimate is wrong without a sign of it.
+
+The threshold of graduation would leave out good measurements too, three of a thousand or more. So at the end all are
+judged anew, each by a test that keeps all N good ones with 95 % (``admission``): where there are no outliers, nothing
+is left out, and the rejection costs nothing. Where the fit to all measurements passes this test there is nothing to do.
 """
 
 from __future__ import annotations
@@ -20,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.errors import CountError, OutlierError, OutliersWarning, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, OutlierError, OutliersWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -53,7 +58,7 @@ class Graduated:
     inliers: dict[Pair, np.ndarray]
     #: Factors of the noise as given; 1 unless estimated.
     variance_factors: VarianceFactors
-    #: c^2, the largest squared residual of an inlier.
+    #: c^2 at the end, a quantile of chi-square: the largest squared residual of an inlier where noise is given.
     threshold: float
     #: 1/2 sum min(d^2, c^2).
     truncated_cost: float
@@ -63,8 +68,11 @@ class Graduated:
     suspect: dict[str, tuple[int, int]]
     #: The same for pairs of which neither frame is suspect as a whole.
     suspect_pairs: dict[Pair, tuple[int, int]]
-    #: The re-weighted solutions, of all starts together.
+    #: The re-weighted fits, of all starts together; empty where the first fit shows that there is no outlier.
     history: tuple[Iteration, ...]
+    #: Whether outliers were looked for. With noise that is not known, a few measurements cannot tell them from noise:
+    #: then all count as inliers.
+    searched: bool = True
 
 
 def graduated(
@@ -81,19 +89,20 @@ def graduated(
     problem : Problem
         A problem that kept its raw measurements.
     confidence : float
-        Probability that a good measurement is kept: c^2 is this quantile of chi-square with 6 degrees of freedom.
+        Probability that a good measurement is kept during graduation: c^2 is this quantile of chi-square with 6
+        degrees of freedom. At the end each of N is kept with this probability or 1 - 0.05 / N, whichever is larger.
     noise_scale : "given" or "estimate"
         Take sigma and kappa (or covariances) as given; or multiply them by variance factors, one for rotations and one
         for translations, which are estimated from the inliers.
     progress : callable, optional
-        Is called with the name of each stage.
+        Is called with each stage, its step, and the number of measurements that agree.
 
     Raises
     ------
     MeasurementsNotKeptError
         If the problem was made with ``keep_measurements=False``.
     OutlierError
-        If too few measurements agree with each other for an answer.
+        If too few measurements agree with each other for an answer, or give a scale that is not positive.
 
     Warns
     -----
@@ -109,6 +118,11 @@ def graduated(
         tell("certifying the inliers' solution")
         weights = work.measured.by_pair(keep.astype(np.float64))
         solution = solve(reweighted(problem, weights, work.factors), progress=tell)
+    except ScaleError as error:
+        raise OutlierError(
+            f"the {problem.number_of_measurements} measurements have no answer with a positive scale in which most of "
+            f"them agree ({error}). Check that A and B are not exchanged or inverted, and the names of targets"
+        ) from error
     except (UnderdeterminedError, CountError) as error:
         raise OutlierError(
             f"too few of the {problem.number_of_measurements} measurements agree for an answer ({error}). With "
@@ -125,9 +139,16 @@ def graduated(
         for pair, mask in inliers.items()
         if mask.sum() < SUSPECT * len(mask) and not any(name in suspect for name in pair)
     }
+    if not work.searches:
+        warnings.warn(
+            f"{problem.number_of_measurements} measurements are too few to tell outliers from noise that is not known: "
+            "all of them count. Measure more, or give sigma and kappa (noise='given')",
+            OutliersWarning,
+            stacklevel=2,
+        )
     _warn(keep, suspect, suspect_pairs, left_out, work.threshold, noise_scale)
     rotation_rad = float(np.sqrt(0.5 * work.factors.rotation / np.median(work.measured.kappa)))
-    if noise_scale == "estimate" and rotation_rad > GROSS_RAD:
+    if noise_scale == "estimate" and work.searches and rotation_rad > GROSS_RAD:
         warnings.warn(
             f"the estimated noise, {np.degrees(rotation_rad):.0f} degrees an axis, is too large for a sensor: more "
             "than half of the measurements may be outliers. Give sigma and kappa and take noise='given', which "
@@ -145,6 +166,7 @@ def graduated(
         suspect=suspect,
         suspect_pairs=suspect_pairs,
         history=tuple(work.history),
+        searched=work.searches,
     )
 
 

@@ -9,24 +9,20 @@ from gtsam_rwhec.solving.arguments import check_against_knowledge
 from gtsam_rwhec.solving.solution import Solution
 
 
-def check_inputs(problem: Problem, solution: Solution, options: RefineOptions) -> None:
+def check_inputs(problem: Problem, solution: Solution | None, options: RefineOptions) -> None:
     """Refuse a problem that cannot be refined from this solution with these options; ``refine`` lists the errors."""
     if not isinstance(problem, Problem):
         raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
-    if not isinstance(solution, Solution):
-        raise OptionError(f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned")
+    if not isinstance(solution, Solution) and (solution is not None or getattr(options, "robust", "") != "gnc"):
+        raise OptionError(
+            f"the solution is a {type(solution).__name__}; give what gtsam_rwhec.solve returned (or None with "
+            "robust='gnc')"
+        )
     if not isinstance(options, RefineOptions):
         raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.RefineOptions")
-    if solution.scale_mode != problem.scale:
-        raise ScaleError(
-            f"the solution is of a problem with scale={solution.scale_mode!r}, but this problem has "
-            f"scale={problem.scale!r}; solve this problem first"
-        )
     problem.require_pairs()
-    try:
-        check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
-    except FrameError as error:
-        raise FrameError(f"the solution is of another problem; solve this problem first ({error})") from error
+    if solution is not None:
+        _check_solution(problem, solution)
     if options.noise == "given" and problem.is_relative:
         raise OptionError(
             "noise='given', but some measurements were added without sigma or kappa; take noise='estimate', or add "
@@ -34,6 +30,18 @@ def check_inputs(problem: Problem, solution: Solution, options: RefineOptions) -
         )
     if options.robust == "gnc":
         problem.require_raw_measurements("robust='gnc'")
+
+
+def _check_solution(problem: Problem, solution: Solution) -> None:
+    if solution.scale_mode != problem.scale:
+        raise ScaleError(
+            f"the solution is of a problem with scale={solution.scale_mode!r}, but this problem has "
+            f"scale={problem.scale!r}; solve this problem first"
+        )
+    try:
+        check_against_knowledge(problem, solution.X, solution.Y, solution.scale)
+    except FrameError as error:
+        raise FrameError(f"the solution is of another problem; solve this problem first ({error})") from error
 
 
 def sensors_with_offset(problem: Problem, options: RefineOptions) -> tuple[str, ...]:

@@ -83,7 +83,7 @@ class RefineOptions:
         Many gross outliers pull this start away. "gnc" is graduated truncated least squares around the certified
         solver. It needs no good start, and leaves outliers out.
     inlier_confidence : float
-        With "gnc": probability that a good measurement is kept.
+        With "gnc": probability that a good measurement is kept, at least: all good ones together are kept with 95 %.
     carrier_noise : CarrierNoise, optional
         The noise of A. Without it A counts as exact; if A is not exact, covariances are then too small.
     carrier_model : "auto", "propagated" or "variables"

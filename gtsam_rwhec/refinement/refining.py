@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from scipy.special import chdtri
 
 from gtsam_rwhec.errors import (
     NotConvergedWarning,
@@ -22,6 +21,7 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.refinement.admission import inlier_threshold
 from gtsam_rwhec.refinement.chordal import ChordalModel
 from gtsam_rwhec.refinement.fit import Model, SettledFit, fit
 from gtsam_rwhec.refinement.free_space import FreeSpace, free_space_of
@@ -49,7 +49,7 @@ MAX_CHOICES = 10
 @one_blas_thread()
 def refine(
     problem: Problem,
-    solution: Solution,
+    solution: Solution | None,
     options: RefineOptions | None = None,
     *,
     progress: Progress | None = None,
@@ -60,8 +60,9 @@ def refine(
     ----------
     problem : Problem
         A problem that kept its raw measurements, unless ``residual="chordal"`` and ``robust="none"``.
-    solution : Solution
-        The start: the result of ``solve`` for this problem.
+    solution : Solution or None
+        The start: the result of ``solve`` for this problem. With robust="gnc" it may be None, for outliers may leave
+        ``solve`` without an answer (a negative scale); ``moved`` is then from the inliers' solution.
     options : RefineOptions, optional
     progress : callable, optional
         Is called with the name of each stage.
@@ -99,7 +100,7 @@ def refine(
     if options.robust == "gnc":
         tell("rejecting outliers")
         if data and (problem.has_covariances or options.carrier_noise is not None or everything.offsets):
-            guess = everything.start(solution)
+            guess = everything.start(solution or _any_inliers(problem, options, tell))
             if everything.offsets:  # a clock offset makes outliers wherever the carrier moves
                 first = GeodesicModel.of(data, everything, replace(options, robust="huber"))
                 rough = fit(problem, first, everything, guess, options, estimates)
@@ -112,6 +113,8 @@ def refine(
             progress=progress,
         )
         start, inliers = found.solution, found.inliers
+    assert start is not None
+    before = solution or start
     for _ in range(MAX_CHOICES):
         if inliers:
             problem = selected(whole, inliers)
@@ -124,7 +127,7 @@ def refine(
         state = variables.state(settled.optimum.values)
         if judged is whole:
             break
-        threshold = float(chdtri(6, 1.0 - options.inlier_confidence))
+        threshold = inlier_threshold(options.inlier_confidence, whole.number_of_measurements)
         again = inliers_of(data, variables, state, settled.factors, threshold)
         if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
             break
@@ -157,9 +160,9 @@ def refine(
         noise_source="estimated" if estimates else "given",
         noise=_noise(model, settled, options, estimates),
         cost=settled.optimum.cost,
-        initial_cost=settled.graph.error(model.values(variables.start(solution))),
+        initial_cost=settled.graph.error(model.values(variables.start(before))),
         iterations=settled.iterations,
-        moved=_moved(solution, state),
+        moved=_moved(before, state),
         inlier_counts={pair: (int(kept.sum()), len(kept)) for pair, kept in inliers.items()},
         inliers=inliers,
         free_directions=space.directions,
@@ -167,6 +170,13 @@ def refine(
         options=options,
         joint=joint,
     )
+
+
+def _any_inliers(problem: Problem, options: RefineOptions, tell: Progress) -> Solution:
+    """A start from the measurements that agree under isotropic noise, whatever its size."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)  # the inliers are chosen again under the full noise
+        return graduated(problem, confidence=options.inlier_confidence, noise_scale="estimate", progress=tell).solution
 
 
 def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit, options: RefineOptions) -> None:

@@ -10,17 +10,18 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import numpy as np
 from scipy.special import chdtr, chdtri
 
 from gtsam_rwhec.errors import CountError, UnderdeterminedError
-from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.problem.selection import reweighted
+from gtsam_rwhec.problem.selection import reweighted, selected
 from gtsam_rwhec.problem.variance_factors import AS_STATED, VarianceFactors
 from gtsam_rwhec.refinement.admission import inlier_threshold, judged
 from gtsam_rwhec.refinement.squared_residuals import Measured, Squares
@@ -48,7 +49,7 @@ MAX_FITS = 20
 #: Frames vote at most this many times, each time all that have outliers.
 MAX_VOTES = 3
 #: The inliers are judged anew at most this many times; two or three are usual.
-MAX_ADMISSIONS = 10
+MAX_ADMISSIONS = 5
 #: With estimated noise so many equations must be left when one measurement is left out.
 SPARE = 6
 #: An outlier cannot hide where the unknowns take up no more than this part of the equations.
@@ -84,6 +85,8 @@ class TruncatedLeastSquares:
     def __post_init__(self) -> None:
         #: c^2; it grows when inliers are admitted at the end.
         self.threshold = float(chdtri(DOF, 1.0 - self.confidence))
+        #: Whether there are measurements enough to tell an outlier.
+        self.searches = True
         self.measured = Measured.of(self.problem)
         self.smallest_factors = VarianceFactors(
             2.0 * float(np.median(self.measured.kappa)) * QUIETEST**2,
@@ -94,17 +97,15 @@ class TruncatedLeastSquares:
         """The best answer and its inliers (N,)."""
         self.tell("rejecting outliers: the fit to all measurements")
         everything = self.fit(np.ones(len(self.measured.A)), None)
-        if self.is_clean(everything, noise_scale):
+        self.searches = noise_scale == "given" or self.spare_equations >= SPARE
+        if not self.searches or self.is_clean(everything, noise_scale):
             return everything, self.everyone
+        if not everything.has_positive_scales and self.problem.scale == "per_target":
+            everything = with_scales_of_targets_alone(self.problem, self.confidence, noise_scale, self.tell)
         if noise_scale == "given":
             fit, _ = self.best([lambda: self.graduate(everything)])
             self.threshold = inlier_threshold(self.confidence, len(self.measured.A))
             return self.settle(fit)
-        if self.spare_equations < SPARE:
-            raise CountError(
-                f"{len(self.measured.A)} measurements leave {max(self.spare_equations, 0)} equations to spare when one "
-                f"is left out; {SPARE} are needed to tell an outlier from noise that is not known"
-            )
         halves = self.trim(everything)
         fit, _ = self.settle(halves, estimates=True)
         fit, _ = self.best([lambda: self.graduate(everything), lambda: fit])
@@ -146,10 +147,15 @@ class TruncatedLeastSquares:
         return True
 
     def admit(self, fit: WeightedFit, keep: np.ndarray) -> tuple[WeightedFit, np.ndarray]:
-        """Judge every measurement anew, under the noise by axis that the inliers show, until the inliers stay."""
+        """Judge every measurement anew, under the noise by axis that the inliers show, until the inliers stay.
+
+        The noise is that of the inliers of graduation throughout. If it followed the admitted ones, heavy tails would
+        let one another in.
+        """
+        first = keep
         self.threshold = inlier_threshold(self.confidence, len(keep))
         for step in range(1, MAX_ADMISSIONS + 1):
-            found = judged(self.problem, self.measured, fit, keep, self.confidence).agrees
+            found = judged(self.problem, self.measured, fit, keep, self.confidence, noise_of=first).agrees
             if (found == keep).all():
                 break
             try:
@@ -223,9 +229,7 @@ class TruncatedLeastSquares:
         """Add an iteration to the history, and tell it."""
         inliers = int((distances <= self.threshold).sum())
         self.history.append(Iteration(stage, mu, 0.5 * self.truncated(distances), inliers))
-        self.tell(
-            f"rejecting outliers: {stage}, step {step} of at most {most}, {inliers} of {len(distances)} agree"
-        )
+        self.tell(f"rejecting outliers: {stage}, step {step} of at most {most}, {inliers} of {len(distances)} agree")
 
     def graduate(self, fit: WeightedFit) -> WeightedFit:
         """From least squares to truncated least squares with growing mu (Remark 5 and eq. 14 of the paper)."""
@@ -313,6 +317,32 @@ class TruncatedLeastSquares:
         return VarianceFactors(
             max(rotation, self.smallest_factors.rotation), max(translation, self.smallest_factors.translation)
         )
+
+
+def with_scales_of_targets_alone(
+    problem: Problem, confidence: float, noise_scale: NoiseScale, tell: Progress
+) -> WeightedFit:
+    """A start where outliers make a scale negative: each target alone gives its scale, then all are known.
+
+    Outliers pull the scales of the inverse equation to zero and below (design fact 7), and there is no way back from
+    there. A target alone has one scale, which the direct equation holds.
+    """
+    known = selected(problem, {})
+    owners = [name for name in dict.fromkeys(pair.target for pair in problem.pairs) if name not in problem.fixed_scales]
+    for number, name in enumerate(owners, 1):
+        tell(f"rejecting outliers: the scale of {name} alone, {number} of {len(owners)}")
+        alone = Problem("shared")
+        for pair in problem.pairs:
+            if pair.target == name:
+                raw = problem.measurements(*pair)
+                add = alone.add_motion if pair.is_motion else partial(alone.add, pair.target)
+                add(pair.sensor, raw.A, raw.B, raw.sigma, raw.kappa)
+        fit, _ = TruncatedLeastSquares(alone, confidence, silent).run(noise_scale)
+        if not fit.has_positive_scales:
+            raise CountError(f"the measurements of {name} that agree with one another give it no positive scale")
+        known.fix_scale(name, fit.alpha[name])
+    fit, _ = TruncatedLeastSquares(known, confidence, tell).run(noise_scale)
+    return fit
 
 
 def truncated_weights(d2: Array, mu: float, c2: float) -> Array:

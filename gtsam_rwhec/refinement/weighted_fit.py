@@ -51,6 +51,11 @@ class WeightedFit:
     poses: dict[str, Array]
     alpha: dict[str, float]
 
+    @property
+    def has_positive_scales(self) -> bool:
+        """Whether every scale is positive and finite."""
+        return all(0.0 < scale < np.inf for scale in self.alpha.values())
+
 
 @np.errstate(all="ignore")
 def weighted_fit(problem: Problem, previous: WeightedFit | None) -> WeightedFit:

@@ -78,9 +78,9 @@ def long_log(seed: int, measurements: int = 3000) -> LongLog:
     )
     good = generator.random(measurements) >= OUTLIERS
     another = generator.permutation(measurements)
-    wrong = np.where((generator.random(measurements) < 0.5)[:, None, None], B[another], random_poses(
-        measurements, 3.0, generator
-    ))
+    wrong = np.where(
+        (generator.random(measurements) < 0.5)[:, None, None], B[another], random_poses(measurements, 3.0, generator)
+    )
     B = np.where(good[:, None, None], B, wrong)
     A = inverse(_with_drift(truth, generator))[at]  # T_rig_world, as odometry has it
     problem, masks = rw.Problem(), {}
@@ -168,9 +168,7 @@ def rows(seed: int = 0, measurements: int = 3000) -> list[Row]:
         start = time.perf_counter()
         solution = rw.solve(log.problem, progress=telling)
         solved = time.perf_counter()
-        refined = rw.refine(
-            log.problem, solution, rw.RefineOptions(noise="estimate", robust="gnc"), progress=telling
-        )
+        refined = rw.refine(log.problem, solution, rw.RefineOptions(noise="estimate", robust="gnc"), progress=telling)
         end = time.perf_counter()
     telling("the end")
     kept = sum(int((refined.inliers[pair] & ~mask).sum()) for pair, mask in log.good.items())
@@ -186,7 +184,9 @@ def rows(seed: int = 0, measurements: int = 3000) -> list[Row]:
             end - start <= BAR_S,
         ),
         Row(
-            "    longest time without a word", f"{telling.longest:.1f} s ({telling.before})", f"<= {SILENCE_S:.0f} s",
+            "    longest time without a word",
+            f"{telling.longest:.1f} s ({telling.before})",
+            f"<= {SILENCE_S:.0f} s",
             telling.longest <= SILENCE_S,
         ),
         Row("    outliers kept; good ones left out", f"{kept}; {lost}"),

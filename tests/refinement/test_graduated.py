@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from typing import Any
 
@@ -12,11 +13,27 @@ from hypothesis import strategies as st
 from outlier_problems import Pair, corrupted
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import MeasurementsNotKeptError, OutlierError, OutliersWarning
+import gtsam_rwhec.refinement.graduated as graduated_module
+import gtsam_rwhec.refinement.truncated_least_squares as stages_module
+import gtsam_rwhec.solver.search as search_module
+from gtsam_rwhec.errors import (
+    MeasurementsNotKeptError,
+    OptionError,
+    OutlierError,
+    OutliersWarning,
+    RwhecWarning,
+    ScaleError,
+)
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.graduated import Graduated, graduated
-from gtsam_rwhec.refinement.truncated_least_squares import truncated_weights
-from gtsam_rwhec.simulate import Noise, Simulation, general
+from gtsam_rwhec.refinement.truncated_least_squares import (
+    MAX_ADMISSIONS,
+    MAX_FITS,
+    MAX_GRADUATIONS,
+    MAX_VOTES,
+    truncated_weights,
+)
+from gtsam_rwhec.simulate import Noise, Simulation, general, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
 
 NOISE = Noise(sigma_m=0.01, kappa=500.0)
@@ -170,6 +187,122 @@ def test_priors_decide_between_two_targets_that_are_seen_as_often() -> None:
         assert agreeing.mean() > 0.95 if wanted else agreeing.mean() < 0.05
 
 
+def of_negative_scale(frames: tuple[int, int], scale: Any, seed: int, *, weights: bool) -> tuple[rw.Problem, Any]:
+    """A third of all translations is turned round and five times as long: the plain solution's scale is negative."""
+    simulation = general(*frames, seed=seed, number_of_measurements=30, noise=Noise(0.005, 2000.0), scale=scale)
+    generator, problem, good = np.random.default_rng(seed), rw.Problem(scale), {}
+    for pair in simulation.problem.pairs:
+        raw = simulation.problem.measurements(*pair)
+        good[pair] = np.ones(30, dtype=bool)
+        good[pair][generator.permutation(30)[:10]] = False
+        B = raw.B.copy()
+        B[~good[pair], :3, 3] *= -5.0
+        problem.add(*pair, raw.A, B, *((raw.sigma, raw.kappa) if weights else ()))
+    return problem, good
+
+
+@pytest.mark.parametrize("scale", ["shared", "per_target"])
+@pytest.mark.parametrize(("frames", "noise_scale"), [((1, 1), "given"), ((3, 1), "estimate")])
+def test_a_negative_scale_of_the_plain_solution_is_no_obstacle(frames: Any, noise_scale: Any, scale: Any) -> None:
+    """Before, `ScaleError` came first, with the advice to take an option that holds eight frames at most."""
+    problem, good = of_negative_scale(frames, scale, 3, weights=noise_scale == "given")
+    with pytest.raises(ScaleError):
+        rw.solve(problem)
+    found = graduated(problem, noise_scale=noise_scale)
+    assert wrongly_classed(found, good) == (0, 0)
+    assert found.solution.certificate.is_optimal
+
+
+def test_refine_needs_no_plain_solution() -> None:
+    problem, good = of_negative_scale((1, 1), "shared", 3, weights=False)
+    refined = rw.refine(problem, None, rw.RefineOptions(noise="estimate", robust="gnc"))
+    for pair, mask in good.items():
+        np.testing.assert_array_equal(refined.inliers[pair], mask)
+    with pytest.raises(OptionError, match="solution is a NoneType"):
+        rw.refine(problem, None)
+
+
+@pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
+def test_from_three_measurements_all_count(scale: Any) -> None:
+    """Graduation of three measurements, whose noise was estimated on the way, had not returned after 280 s."""
+    problem = general(1, 1, seed=0, number_of_measurements=3, noise=NOISE, scale=scale).problem
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = graduated(problem, noise_scale="estimate")
+    assert not found.searched
+    assert all(mask.all() for mask in found.inliers.values())
+    words = [str(warning.message) for warning in told]
+    assert any("3 measurements are too few to tell outliers from noise" in one for one in words)
+    assert not any("not proven optimal: proven" in one for one in words)
+    assert graduated(problem, noise_scale="given").searched
+
+
+def test_nothing_is_certified_on_the_way_and_fits_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Outliers open gaps, and a search of the relaxation in each of a hundred fits took minutes."""
+    solved, fits = [], []
+    whole, one = graduated_module.solve, stages_module.weighted_fit
+    monkeypatch.setattr(graduated_module, "solve", lambda *a, **k: solved.append(1) or whole(*a, **k))
+    monkeypatch.setattr(stages_module, "weighted_fit", lambda *a, **k: fits.append(1) or one(*a, **k))
+    monkeypatch.setattr(search_module.Search, "run", refuse_unless(lambda: bool(solved), search_module.Search.run))
+    for noise, seed in ((NOISE, 0), (Noise(0.3, 3.0), 1)):  # so noisy that nothing settles
+        solved.clear()
+        fits.clear()
+        simulation = general(3, 2, seed=seed, number_of_measurements=6, noise=noise)
+        problem, _ = corrupted(simulation, 0.4, "random", seed, noise, weights="unit")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)
+            found = graduated(problem, noise_scale="estimate")
+        assert len(solved) == 1
+        assert len(found.history) + 1 == len(fits)
+        assert len(fits) <= MAX_GRADUATIONS + (4 + MAX_VOTES) * MAX_FITS + MAX_ADMISSIONS + 1
+
+
+def refuse_unless(allowed: Any, call: Any) -> Any:
+    """The call, which fails where it is not allowed."""
+
+    def checked(*arguments: Any, **options: Any) -> Any:
+        assert allowed(), "a search with certificates on the way"
+        return call(*arguments, **options)
+
+    return checked
+
+
+def test_progress_moves() -> None:
+    """Each fit is told with its step, the most there can be, and how many measurements agree."""
+    problem, _ = corrupted(general(2, 1, seed=3, noise=NOISE), 0.3, "random", 3, NOISE, weights="unit")
+    told: list[str] = []
+    found = graduated(problem, noise_scale="estimate", progress=told.append)
+    steps = [line for line in told if re.search(r"step \d+ of at most \d+, \d+ of \d+ agree", line)]
+    assert len(steps) == len(found.history)
+    assert len(set(told)) > 0.9 * len(told)
+
+
+@pytest.mark.parametrize("noise_scale", ["given", "estimate"])
+def test_many_clean_measurements_take_one_fit(noise_scale: Any) -> None:
+    problem = general(1, 1, seed=5, number_of_measurements=200, noise=NOISE).problem
+    found = graduated(problem, noise_scale=noise_scale)
+    assert found.history == ()
+    assert all(mask.all() for mask in found.inliers.values())
+    assert found.solution.X["target0"].equals(rw.solve(problem).X["target0"], 1e-3)
+
+
+@pytest.mark.parametrize("count", [8, 30])
+def test_good_measurements_stay_also_where_one_axis_is_noisier(count: int) -> None:
+    """A camera's depth is noisier than what it sees across: one noise for all axes cut good measurements off."""
+    lost = 0
+    for seed in range(10):
+        simulation = general(1, 1, seed=seed, number_of_measurements=count)
+        raw = simulation.problem.measurements("target0", "sensor0")
+        generator = np.random.default_rng(seed)
+        B = perturb(raw.B, Noise(sigma_m=0.001, kappa=0.5 / 0.003**2), generator)
+        B[:, 2, 3] += 0.004 * generator.normal(size=count)
+        problem = rw.Problem()
+        problem.add("target0", "sensor0", raw.A, B)
+        found = graduated(problem, noise_scale="estimate")
+        lost += sum(int((~mask).sum()) for mask in found.inliers.values())
+    assert lost <= 2  # 0.05 in a run are expected; before, one in three runs of 30 lost some
+
+
 def test_exact_data_has_nothing_to_estimate_and_still_finds_outliers() -> None:
     simulation = general(2, 1, seed=9, number_of_measurements=12)
     problem, good = corrupted(simulation, 0.3, "random", 9, NOISE, weights="unit")
@@ -226,5 +359,7 @@ def test_the_real_dataset_with_thirty_percent_corrupted(utias_folder: object) ->
         found = graduated(spoilt, noise_scale="estimate")
         clean = graduated(selected(spoilt, {pair: ~mask for pair, mask in bad.items()}), noise_scale="estimate")
     assert sum(int((found.inliers[pair] & bad[pair]).sum()) for pair in bad) == 0
+    agreeing = np.concatenate([found.inliers[pair][~mask] == clean.inliers[pair] for pair, mask in bad.items()])
+    assert agreeing.mean() > 0.98  # its residuals have heavy tails: some are at the threshold, which depends on N
     for name, pose in clean.solution.Y.items():
-        np.testing.assert_allclose(found.solution.Y[name].matrix(), pose.matrix(), atol=1e-4)
+        np.testing.assert_allclose(found.solution.Y[name].matrix(), pose.matrix(), atol=0.006)

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.refinement.weighted_fit import WeightedFit, weighted_fit
 from gtsam_rwhec.refinement.squared_residuals import Measured
+from gtsam_rwhec.refinement.weighted_fit import WeightedFit, weighted_fit
 from gtsam_rwhec.simulate import Noise, Simulation, general
 
 NOISE = Noise(sigma_m=0.01, kappa=500.0)
@@ -21,7 +21,7 @@ def truth(simulation: Simulation) -> WeightedFit:
     scale = simulation.scale
     names = [*simulation.X, *simulation.Y]
     alpha = scale if isinstance(scale, dict) else dict.fromkeys(names, scale)
-    return WeightedFit({**simulation.X, **simulation.Y}, alpha, certified=False)
+    return WeightedFit({**simulation.X, **simulation.Y}, alpha)
 
 
 @pytest.mark.parametrize("scale", ["known", "shared"])
@@ -74,9 +74,7 @@ def test_frames_without_a_pose_are_infinitely_far() -> None:
     simulation = general(2, 1, seed=4, noise=NOISE, number_of_measurements=5)
     measured = Measured.of(simulation.problem)
     fit = truth(simulation)
-    squares = measured.squares(
-        WeightedFit({n: T for n, T in fit.poses.items() if n != "target1"}, fit.alpha)
-    )
+    squares = measured.squares(WeightedFit({n: T for n, T in fit.poses.items() if n != "target1"}, fit.alpha))
     by_pair = measured.by_pair(measured.together(squares, ONE))
     assert np.isfinite(by_pair["target0", "sensor0"]).all()
     assert np.isinf(by_pair["target1", "sensor0"]).all()

@@ -13,9 +13,9 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import UnderdeterminedError
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.problem.variance_factors import VarianceFactors
-from gtsam_rwhec.refinement.weighted_fit import WeightedFit, weighted_fit
 from gtsam_rwhec.refinement.squared_residuals import Measured
 from gtsam_rwhec.refinement.voting import by_vote
+from gtsam_rwhec.refinement.weighted_fit import WeightedFit, weighted_fit
 from gtsam_rwhec.simulate import Noise, general, perturb
 
 NOISE = Noise(sigma_m=0.01, kappa=2000.0)
@@ -49,9 +49,7 @@ def test_a_frame_goes_where_most_of_its_measurements_agree(scale: Any, name: str
 
 def test_without_a_pose_of_the_other_frame_no_pose_is_proposed() -> None:
     simulation = general(1, 1, seed=2, number_of_measurements=5, noise=NOISE)
-    fit, saved = by_vote(
-        "target0", Measured.of(simulation.problem), WeightedFit({}, {}), ONE, THRESHOLD
-    )
+    fit, saved = by_vote("target0", Measured.of(simulation.problem), WeightedFit({}, {}), ONE, THRESHOLD)
     assert saved == 0.0
     assert not fit.poses
 
