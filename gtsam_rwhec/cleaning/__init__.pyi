@@ -13,4 +13,4 @@ from .synchronisation import synchronise as synchronise
 from .thinning import thin as thin
 from .thinning import without_fast as without_fast
 from .time_offset import TimeOffset as TimeOffset
-from .time_offset import coarse_time_offset as coarse_time_offset
+from .time_offset import estimate_time_offset as estimate_time_offset

@@ -10,7 +10,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.cleaning import (
     ConsensusOptions,
-    coarse_time_offset,
+    estimate_time_offset,
     find_consensus,
     synchronise,
     thin,
@@ -153,7 +153,7 @@ def speeds(path: Trajectory, stamps_ns: np.ndarray) -> tuple[Array, Array]:
 
 
 def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track]) -> tuple[float, float | None]:
-    """A sensor's time offset, as stated or estimated from turning rates, and an estimate's standard deviation."""
+    """A sensor's time offset, as stated or estimated from rotations, and an estimate's standard deviation."""
     given = rig.sensors[sensor].time_offset
     if given != "estimate":
         return float(given), None
@@ -163,7 +163,7 @@ def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track]) -
             f"{sensor}: no target was seen twice, and without this the time offset cannot be estimated; state "
             "time_offset in the rig file"
         )
-    found = coarse_time_offset(path, usable, max_gap_s=rig.carriers.max_gap_s, where=sensor)
+    found = estimate_time_offset(path, usable, max_gap_s=rig.carriers.max_gap_s, where=sensor)
     return found.offset_s, found.sigma_s
 
 

@@ -207,7 +207,7 @@ def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> 
         if offset_s > WINDOW_S:
             warnings.warn(
                 f"{what} is {offset_s:.3g} s, but the carriers' motion is known only within {WINDOW_S:g} s of each "
-                "stamp; shift the stamps first (cleaning.coarse_time_offset finds the shift)",
+                "stamp; shift the stamps first (cleaning.estimate_time_offset finds the shift)",
                 NotConvergedWarning,
                 stacklevel=4,
             )

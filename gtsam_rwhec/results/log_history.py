@@ -93,10 +93,10 @@ class CleaningReport(_Record):
 
     tracks: tuple[TrackCount, ...] = Field(description="measurements of each target by each sensor")
     time_offsets_s: dict[str, Seconds] = Field(
-        description="of each sensor, used to synchronise: as given, or found from turning rates"
+        description="of each sensor, used to synchronise: as given, or found from rotations"
     )
     coarse_sigma_s: dict[str, NotNegative] = Field(
-        description="standard deviations of the time offsets that were found from turning rates"
+        description="standard deviations of the time offsets that were found from rotations"
     )
 
 

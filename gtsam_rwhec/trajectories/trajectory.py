@@ -83,6 +83,13 @@ class Trajectory:
         gap_s = np.where(outside, np.inf, np.where(met, 0.0, gap_ns * 1e-9))
         return poses, gap_s
 
+    def gaps(self, stamps_ns: np.ndarray) -> Array:
+        """The gaps (M,) of ``at``, seconds, without the poses."""
+        after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 0, len(self.T) - 1)
+        before = np.where(self.stamps_ns[after] == stamps_ns, after, np.maximum(after - 1, 0))
+        outside = (stamps_ns < self.stamps_ns[0]) | (stamps_ns > self.stamps_ns[-1])
+        return np.where(outside, np.inf, (self.stamps_ns[after] - self.stamps_ns[before]) * 1e-9)
+
     def speeds(self) -> tuple[Array, Array]:
         """Angular (rad/s) and linear (m/s) speed at each pose, (N,): the faster of the steps before and after it."""
         if len(self.T) < 2:

@@ -13,7 +13,7 @@ import numpy as np
 from kinhec_sequences import CAMERA, TARGET, Keyframes, NeutralSequence, of_kinhec, sequences
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cleaning import coarse_time_offset
+from gtsam_rwhec.cleaning import estimate_time_offset
 from gtsam_rwhec.errors import RwhecError, RwhecWarning, StampError
 from gtsam_rwhec.solver.cause import Status
 
@@ -141,7 +141,9 @@ def answers_of(
 def own_offset_s(sequence: NeutralSequence) -> float:
     """The offset by this library's clocks, in KinHEC's sign; 0 where the turning does not determine it."""
     try:
-        return -coarse_time_offset(sequence.path(), [sequence.detections()], where=sequence.name).offset_s
+        return -estimate_time_offset(
+            sequence.path(), [sequence.detections()], search_s=0.5, where=sequence.name
+        ).offset_s
     except StampError:
         return 0.0
 
