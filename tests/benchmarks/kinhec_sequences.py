@@ -138,6 +138,7 @@ def generated(seed: int, folder: Path | None, tier: str = "small", *, jobs: int 
     pipeline, plans, version = of_kinhec("pipeline"), of_kinhec("plans"), of_kinhec("version").__version__
     root = (folder or Path(tempfile.gettempdir()) / f"kinhec-{version}") / f"{tier}_{seed}"
     if not (root / "complete").is_file():
+        print(f"generating the {tier} tier of seed {seed} in {root}: some minutes ...", file=sys.stderr, flush=True)
         root.mkdir(parents=True, exist_ok=True)
         plan = {k: v for k, v in plans.load_tier(tier).items() if not k.startswith("_")} | {"global_seed": seed}
         of_seed = root / f"{tier}.yaml"
