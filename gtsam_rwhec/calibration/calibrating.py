@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -24,10 +24,12 @@ from gtsam_rwhec.calibration.calibrated import (
     SensorView,
 )
 from gtsam_rwhec.calibration.choices import Choice
+from gtsam_rwhec.calibration.clock_test import clocks_of
 from gtsam_rwhec.calibration.disagreement import contradicted_frames
 from gtsam_rwhec.calibration.misreadings import Misreading, misreadings
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.plausibility import Implausible, implausible
+from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import (
     CountError,
@@ -51,6 +53,7 @@ from gtsam_rwhec.refinement.graduated import graduated
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
@@ -155,6 +158,21 @@ def _offsets(problem: Problem, options: CalibrateOptions) -> bool | tuple[str, .
     return tuple(name for name in options.time_offsets if name in problem.sensors)
 
 
+class _Answer(NamedTuple):
+    """The certified solution of the inliers, the inliers, their refined calibration, and the noise that was found."""
+
+    solution: Solution | None
+    inliers: Inliers
+    refined: Refined | None
+    noise: NoiseFound
+
+
+def _is_known(refined: Refined, sensor: str) -> bool:
+    """Whether the answer has the sensor, and determines its time offset."""
+    offset = Unknown(UnknownKind.TIME_OFFSET, sensor)
+    return sensor in refined.time_offsets_s and bool(np.isfinite(refined.covariance(offset)).all())
+
+
 @dataclass
 class _Calibrating:
     """One run of ``calibrate``."""
@@ -175,10 +193,12 @@ class _Calibrating:
         with self._noted():
             solution, why = self._solved()
             misread, odd = self._misread(solution)
-            if not (misread or odd):
-                solution, inliers = self._without_outliers(solution)
-                if solution is not None:
-                    refined, noise = self._refined(solution, inliers)
+            if misread and all(one.mistake is Mistake.ROWS_SHIFTED for one in misread):
+                late = self._late_instead_of_shifted(solution)
+                if late is not None:
+                    misread, (solution, inliers, refined, noise) = (), late
+            elif not (misread or odd):
+                solution, inliers, refined, noise = self._answer(solution)
         if solution is None:
             self.findings.append(Finding(Ground.NO_SCALE, why))
         outliers = self._outliers(inliers)
@@ -240,6 +260,61 @@ class _Calibrating:
         else:
             self._choose(what, "as given", "no likely mistake of reading explains the measurements far better")
         return found, odd
+
+    def _late_instead_of_shifted(self, first: Solution | None) -> _Answer | None:
+        """The answer where a late clock explains rows that look shifted; None where it does not."""
+        if self.options.time_offsets != "auto":
+            return None
+        as_it_was, self.choices, self.findings = (self.choices, self.findings), [], []
+        answer = self._answer(first)
+        if answer.refined is not None and answer.refined.time_offsets_s:
+            chosen = "rows of A and B look shifted against each other, and a time offset is estimated in place of that"
+            self.choices.insert(0, Choice("reading of A and B", "as given", f"{chosen}, since there are stamps"))
+            return answer
+        self.choices, self.findings = as_it_was
+        return None
+
+    def _answer(self, first: Solution | None) -> _Answer:
+        """The answer without outliers; again with time offsets where its residuals show that clocks are late."""
+        options, what, before = self.options, "time offsets", (list(self.choices), list(self.findings))
+        answer = self._answer_as_told(first)
+        if options.time_offsets != "auto":
+            asked = _offsets(self.problem, options)
+            self._choose(what, "estimated" if asked else "not estimated", "an option says so")
+            return answer
+        if answer.refined is None or not self.problem.has_measurements:
+            self._choose(what, "not estimated", "there are no residuals to test")
+            return answer
+        kept = selected(self.problem, answer.inliers) if answer.inliers else self.problem
+        tests, without = clocks_of(kept, answer.refined, options.carrier_path)
+        late = tuple(test.sensor for test in tests if test.is_late)
+        if not late:
+            found = [str(test) for test in tests] + [
+                f"{name} cannot be tested, as {why}" for name, why in without.items()
+            ]
+            self._choose(what, "not estimated", f"the residuals do not ask for it: {', '.join(found)}")
+            return answer
+        as_it_was = (self.choices, self.findings)
+        self.choices, self.findings = before
+        self.options = replace(options, time_offsets=late)
+        self.tell("estimating time offsets")
+        again = self._answer_as_told(first)
+        self.options = options
+        shown = ", ".join(str(test) for test in tests if test.is_late)
+        if again.refined is None or not all(_is_known(again.refined, name) for name in late):
+            self.choices, self.findings = as_it_was
+            self._choose(what, "not estimated", f"the residuals show {shown}, but the motion does not determine it")
+            words = f"the residuals show a late clock ({shown}), and its offset cannot be estimated"
+            self.findings.append(Finding(Ground.COVARIANCE_DOUBTED, words))
+            return answer
+        self._choose(what, f"estimated for {', '.join(late)}", f"the residuals showed {shown}")
+        return again
+
+    def _answer_as_told(self, first: Solution | None) -> _Answer:
+        solution, inliers = self._without_outliers(first)
+        if solution is None:
+            return _Answer(None, inliers, None, NOT_KNOWN)
+        return _Answer(solution, inliers, *self._refined(solution, inliers))
 
     def _without_outliers(self, first: Solution | None) -> tuple[Solution | None, Inliers]:
         """The certified solution of the measurements that agree, and which these are."""

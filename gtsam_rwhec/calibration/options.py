@@ -38,7 +38,8 @@ class CalibrateOptions:
         Look for likely mistakes in the reading of A and B, and for residuals that no sensor has. Where there are any,
         nothing else is done.
     time_offsets : "auto", bool or tuple of str
-        Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps.
+        Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps. "auto": of each
+        sensor whose residuals show that its clock is late.
     carrier_path : Trajectory, optional
         T_sensorcarrier_targetcarrier over time, along which time offsets move A.
     level : float
