@@ -187,6 +187,8 @@ class _Trial:
 
     def shifts(self) -> list[Reading]:
         """Shifts of rows worth a look: rows that change slowly fit better by one row where they fit better by more."""
+        if self.sampled.has_clock:
+            return []
         fewest = [shifted(1), shifted(-1)]
         if not self.is_strange and not any(self.is_promising(reading, None) for reading in fewest):
             return []

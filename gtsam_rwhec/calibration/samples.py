@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.calibration.readings import Reading
+from gtsam_rwhec.calibration.trial_fits import angles
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
@@ -21,6 +22,8 @@ MOST_PAIRS = 24
 MOST_IN_ALL = 2000
 #: About so many blocks of neighbouring rows are compared.
 BLOCKS = 24
+#: A row turns by at most this share of what rows far apart differ by, where carriers move slowly.
+SLOW_SHARE = 0.3
 #: A pair with fewer measurements is not sampled where others have more: it says little, and has its own unknowns.
 FEWEST_OF_A_PAIR = 4
 
@@ -56,6 +59,21 @@ class Sampled:
     def as_read(self) -> dict[Pair, tuple[Array, Array]]:
         """A and B as they are."""
         return {pair: (raw.A[self.rows[pair]], raw.B[self.rows[pair]]) for pair, raw in self.whole.items()}
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether every pair has stamps, and moves slowly from one row to the next: then rows tell a clock's offset.
+
+        A shift of such rows and an offset of the clock are one thing, and the offset is estimated.
+        """
+        for raw in self.whole.values():
+            if raw.stamps_ns is None or len(raw.A) < 3:
+                return False
+            R = raw.A[np.argsort(raw.stamps_ns), :3, :3]
+            apart = len(R) // 2
+            if np.median(angles(R[1:], R[:-1])) > SLOW_SHARE * np.median(angles(R[apart:], R[: len(R) - apart])):
+                return False
+        return True
 
     @property
     def median_lengths(self) -> tuple[float, float]:

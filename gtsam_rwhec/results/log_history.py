@@ -11,12 +11,9 @@ from typing import Annotated, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from gtsam_rwhec.calibration.disagreement import contradicted_frames
+from gtsam_rwhec.calibration.sizes import is_size_doubted
 from gtsam_rwhec.problem.pairs import Pair
 
-#: Standard deviations by which a stated size must differ from the measured size before it is doubted.
-SIZE_SIGMAS = 5.0
-#: A size is doubted only if it also differs by this share: printers, calipers and intrinsics are seldom more exact.
-SIZE_SHARE = 0.004
 #: Seconds whose nanoseconds fit 64 bits; rig files have the same limit.
 Seconds: TypeAlias = Annotated[float, Field(ge=-4e9, le=4e9)]
 Count: TypeAlias = Annotated[int, Field(ge=0)]
@@ -119,8 +116,7 @@ class SizeFields(_Record):
     @property
     def is_doubted(self) -> bool:
         """Whether the measurements contradict the stated size clearly, and by a share that matters."""
-        off = abs(self.scale - 1.0)
-        return self.sigma is not None and off > SIZE_SHARE and off > SIZE_SIGMAS * self.sigma
+        return is_size_doubted(self.scale, self.sigma)
 
 
 class TimeOffsetFields(_Record):

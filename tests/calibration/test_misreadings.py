@@ -7,11 +7,14 @@ import math
 import numpy as np
 import pytest
 from misread_problems import KINDS, KINDS_OF_GRAPHS, Kind, misread
+from rwhec_factors.se3 import expmap
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import misreadings
+from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.errors import OptionError, RwhecError
-from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.simulate import Noise, general, perturb
+from gtsam_rwhec.simulate.transforms import random_poses
 from gtsam_rwhec.solving.solution import Solution
 
 NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
@@ -49,6 +52,22 @@ def test_a_good_problem_is_not_accused() -> None:
 def test_four_measurements_accuse_nothing() -> None:
     problem = misread(general(1, 1, seed=2, noise=NOISE, number_of_measurements=4).problem, KINDS[0])
     assert misreadings(problem, solved(problem)) == ()
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
+def test_rows_of_a_slow_path_with_stamps_are_a_matter_of_the_clock() -> None:
+    """A path of twenty poses a second, with B one row late: a clock's offset with stamps, shifted rows without."""
+    t = 0.05 * np.arange(121)
+    path = expmap(np.stack([np.sin(f * t + f) for f in (1.0, 1.3, 0.7, 0.9, 1.2, 0.8)], axis=1))
+    X, Y = random_poses(2, 1.0, np.random.default_rng(0))
+    A, B = path[:-1], perturb(np.linalg.inv(Y) @ path[1:] @ X, Noise(1e-3, 1e5), 0)
+    stamps = 50_000_000 * np.arange(120)
+    found = []
+    for stamps_ns in (stamps, None):
+        problem = rw.Problem()
+        problem.add("tag", "cam", A, B, 1e-3, 1e5, stamps_ns=stamps_ns)
+        found.append([one.mistake for one in misreadings(problem, solved(problem))])
+    assert found == [[], [Mistake.ROWS_SHIFTED]]
 
 
 def test_a_wrong_progress_is_refused() -> None:

@@ -1,0 +1,155 @@
+"""Sizes of targets that were said to be known: what the motion says about them.
+
+The sizes are estimated with everything else, and compared with 1. Standard deviations of a refinement are too small
+where errors of neighbouring measurements are alike. So, where one would doubt a size, blocks of rows are left out in
+turn as well (jackknife), and the larger standard deviation counts.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gtsam_rwhec.errors import CountError, NoiseError, OptionError, RwhecWarning, ScaleError, UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.solving.certified_solution import solve
+
+#: Standard deviations by which a stated size must differ from the measured size before it is doubted.
+SIZE_SIGMAS = 5.0
+#: A size is doubted only if it also differs by this share: printers, calipers and intrinsics are seldom more exact.
+SIZE_SHARE = 0.004
+#: So many blocks of each pair's rows are left out in turn.
+BLOCKS = 10
+#: With so few blocks, the standard deviation itself is uncertain: the ratio of Student's and Gauss's quantiles at the
+#: five standard deviations of the test, for nine degrees of freedom.
+STUDENT = 2.6
+
+
+def is_size_doubted(scale: float, sigma: float | None) -> bool:
+    """Whether measurements contradict a stated size clearly, and by a share that matters.
+
+    ``scale`` is the stated over the true length; ``sigma`` its standard deviation, None where it is not determined.
+    """
+    off = abs(scale - 1.0)
+    return sigma is not None and off > SIZE_SHARE and off > SIZE_SIGMAS * sigma
+
+
+@dataclass(frozen=True)
+class TargetSize:
+    """What the motion says about the size of a target that was taken as known; ``str()`` is one sentence.
+
+    Attributes
+    ----------
+    target : str
+        The target; or a sensor, for the lengths of its own motions.
+    scale : float
+        Lengths in B over true lengths: the stated over the true size.
+    sigma : float or None
+        Standard deviation of the scale; None where the motion does not determine it.
+    """
+
+    target: str
+    scale: float
+    sigma: float | None
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether the measurements contradict the stated size clearly, and by a share that matters."""
+        return is_size_doubted(self.scale, self.sigma)
+
+    def __str__(self) -> str:
+        if self.sigma is None:
+            return f"the motion does not tell the size of {self.target}"
+        percent = 100.0 * (self.scale - 1.0)
+        larger = "larger" if percent > 0.0 else "smaller"
+        return (
+            f"the stated size of {self.target} is {abs(percent):.2g} % {larger} than the motion says "
+            f"(standard deviation {100.0 * self.sigma:.2g} %)"
+        )
+
+
+@one_blas_thread()
+def sizes(
+    problem: Problem, options: RefineOptions | None = None, *, progress: Progress | None = None
+) -> tuple[TargetSize, ...]:
+    """Estimate the sizes of all targets of a problem whose scale is said to be known.
+
+    Parameters
+    ----------
+    problem : Problem
+        With scale="known" and its raw measurements, without outliers.
+    options : RefineOptions, optional
+        How the noise is taken; by default it is estimated from the residuals.
+    progress : callable, optional
+
+    Returns
+    -------
+    tuple of TargetSize
+        One for each target. Empty where the scale is not said to be known, the measurements were not kept, or no sizes
+        can be found: then the motion says nothing about them.
+    """
+    check_progress(progress)
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    if problem.scale != "known" or not problem.has_measurements or not problem.pairs:
+        return ()
+    (progress or silent)("looking at the targets' sizes")
+    free = problem.with_measurements({pair: problem.measurements(*pair) for pair in problem.pairs})
+    free.scale = "per_target"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)  # they are about sizes that nobody uses
+        try:
+            refined = refine(free, solve(free), options or RefineOptions(noise="estimate"))
+        except (ScaleError, CountError, NoiseError, UnderdeterminedError):
+            return ()
+        assert isinstance(refined.scale, Mapping)
+        found = [TargetSize(target, scale, _sigma_of(refined, target)) for target, scale in refined.scale.items()]
+        if any(size.is_doubted for size in found):
+            spread = _jackknife(free)
+            found = [replace(size, sigma=_larger(size.sigma, spread.get(size.target))) for size in found]
+    return tuple(found)
+
+
+def _sigma_of(refined: Refined, target: str) -> float | None:
+    variance = float(refined.covariance(Unknown(UnknownKind.SCALE, target))[0, 0])
+    return math.sqrt(variance) if math.isfinite(variance) else None
+
+
+def _larger(first: float | None, second: float | None) -> float | None:
+    """The larger standard deviation; None where either is not determined."""
+    return None if first is None or second is None else max(first, second)
+
+
+def _jackknife(free: Problem) -> dict[str, float]:
+    """Standard deviations of the scales, from leaving out one of `BLOCKS` blocks of each pair at a time."""
+    found: list[dict[str, float]] = []
+    numbers = {pair: np.arange(count) * BLOCKS // count for pair, count in _counts(free).items()}
+    for block in range(BLOCKS):
+        try:
+            scale = solve(selected(free, {pair: of != block for pair, of in numbers.items()})).scale
+        except (ScaleError, CountError, UnderdeterminedError):
+            return {}  # the sizes hang on single blocks
+        assert isinstance(scale, dict)
+        found.append(scale)
+    result = {}
+    for target in found[0]:
+        if all(target in scales for scales in found):
+            values = np.array([scales[target] for scales in found])
+            variance = (BLOCKS - 1) * float(np.var(values))
+            result[target] = math.sqrt(variance) * STUDENT
+    return result
+
+
+def _counts(problem: Problem) -> dict[tuple[str, str], int]:
+    return {pair: problem.moments(*pair).count for pair in problem.pairs}

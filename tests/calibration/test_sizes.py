@@ -1,0 +1,56 @@
+"""Sizes that the motion contradicts are found in Python, by the rule of the log road; right sizes are not doubted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.sizes import SIZE_SHARE, TargetSize, is_size_doubted, sizes
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.results.log_history import SizeFields
+from gtsam_rwhec.simulate import Noise, general
+
+NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
+
+
+def with_wrong_size(factor: float) -> rw.Problem:
+    """Two targets, of which the first was stated too large by a factor."""
+    exact = general(2, 1, seed=4, noise=NOISE, number_of_measurements=40).problem
+    problem = rw.Problem()
+    for pair in exact.pairs:
+        raw = exact.measurements(*pair)
+        B = raw.B.copy()
+        B[:, :3, 3] *= factor if pair.target == "target0" else 1.0
+        problem.add(*pair, raw.A, B)
+    return problem
+
+
+def test_a_wrong_size_is_doubted_and_the_right_one_is_not() -> None:
+    wrong, right = sizes(with_wrong_size(1.03))
+    assert wrong.is_doubted
+    assert wrong.scale == pytest.approx(1.03, abs=0.005)
+    assert "stated size of target0 is 3" in str(wrong)
+    assert "% larger" in str(wrong)
+    assert not right.is_doubted
+    assert right.scale == pytest.approx(1.0, abs=0.005)
+
+
+def test_right_sizes_are_not_doubted() -> None:
+    assert [size.is_doubted for size in sizes(with_wrong_size(1.0))] == [False, False]
+
+
+def test_the_log_road_has_the_same_rule() -> None:
+    for scale, sigma in ((1.02, 0.003), (1.02, 0.005), (1.0 + 0.9 * SIZE_SHARE, 1e-5), (0.98, 0.003), (1.5, None)):
+        of_a_log = SizeFields(target="tag", stated_m=0.1, scale=scale, sigma=sigma, is_free=False)
+        assert of_a_log.is_doubted is TargetSize("tag", scale, sigma).is_doubted is is_size_doubted(scale, sigma)
+
+
+def test_sizes_that_are_not_said_to_be_known_are_not_looked_at() -> None:
+    assert sizes(general(1, 1, seed=0, noise=NOISE, scale="shared").problem) == ()
+    assert sizes(general(1, 1, seed=0, noise=NOISE, keep_measurements=False).problem) == ()
+
+
+def test_what_is_no_problem_is_refused() -> None:
+    with pytest.raises(OptionError, match=r"give a gtsam_rwhec\.Problem"):
+        sizes("folder")  # type: ignore[arg-type]
