@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from rwhec_factors.se3 import inverse, so3_logmap
 
 from gtsam_rwhec.calibration.readings import AS_READ, DOUBLE, SINGLE, Mistake, Reading, shifted
 from gtsam_rwhec.calibration.samples import Sampled
@@ -54,6 +55,10 @@ SMALLEST_RAD = 2e-4
 SMALLEST_SHARE = 2e-4
 #: Rows are shifted by up to so many.
 MOST_SHIFTED = 5
+#: Residuals that follow the motion by this many rows may come from a shift.
+LATE_ROWS = 0.5
+#: Pairs with fewer rows tell no shift.
+FEWEST_ROWS = 8
 
 
 @dataclass(frozen=True)
@@ -108,13 +113,14 @@ def misreadings(
         return ()
     signal = signal_of(sampled.as_read())
     given = residual_of(problem, solution) if solution is not None else None
-    if given is not None and is_plain(given, signal):
+    is_late = solution is not None and _rows_are_late(sampled, solution)
+    if given is not None and is_plain(given, signal) and not is_late:
         return ()
     (progress or silent)("trying other readings of the poses")
     trial = _Trial.of(problem, sampled, signal)
-    if trial is None or is_plain(trial.base.residual, signal):
+    if trial is None or (is_plain(trial.base.residual, signal) and not is_late):
         return ()
-    found = trial.found([*SINGLE, *trial.shifts()])
+    found = trial.found(SINGLE) or trial.found(trial.shifts())
     if not found and problem.scale == "known":
         found = trial.found([AS_READ], "shared")
     if found or not trial.is_strange:
@@ -123,6 +129,31 @@ def misreadings(
     if not found and problem.scale == "known":
         found = trial.found(SINGLE, "shared")
     return found
+
+
+def _rows_are_late(sampled: Sampled, solution: Solution) -> bool:
+    """Whether residuals follow the motion from row to row: where carriers move slowly, late rows cost little.
+
+    A regression of the residual's rotation on that motion tells how many rows B is late; small rotations of X and Y
+    are free in it, since the solution took up what they could.
+    """
+    if sampled.has_clock:
+        return False
+    late = []
+    for pair, raw in sampled.whole.items():
+        if pair.is_motion or len(raw.A) < FEWEST_ROWS:
+            continue
+        R = (inverse(solution.Y[pair.sensor].matrix()) @ raw.A @ solution.X[pair.target].matrix())[:, :3, :3]
+        R_inverse = R.transpose(0, 2, 1)
+        motion = so3_logmap(R_inverse[:-2] @ R[2:]) / 2.0
+        error = so3_logmap(R_inverse[1:-1] @ raw.B[1:-1, :3, :3])
+        size = np.linalg.norm(error, axis=1)
+        w = 1.0 / (1.0 + size / max(float(np.median(size)), SMALLEST_RAD))
+        of_X = np.broadcast_to(np.eye(3), R_inverse[1:-1].shape)
+        columns = np.concatenate([motion[:, :, None], of_X, R_inverse[1:-1]], axis=2) * w[:, None, None]
+        estimate = np.linalg.lstsq(columns.reshape(-1, 7), (error * w[:, None]).ravel(), rcond=None)[0]
+        late += [float(estimate[0])] * len(error)
+    return bool(late) and abs(float(np.median(late))) > LATE_ROWS
 
 
 def is_plain(residual: Spread, signal: Spread) -> bool:

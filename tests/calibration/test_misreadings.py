@@ -18,6 +18,22 @@ from gtsam_rwhec.simulate.transforms import random_poses
 from gtsam_rwhec.solving.solution import Solution
 
 NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
+#: One of each mistake; tests/benchmarks/misreadings.py has all, on real and simulated rigs.
+TRIED = [
+    kind
+    for kind in (*KINDS, *KINDS_OF_GRAPHS)
+    if kind.name
+    in (
+        "xyzw of B",
+        "A inverted",
+        "B transposed",
+        "A left-handed",
+        "B in millimetres",
+        "size wrong",
+        "rows of B late",
+        "roles exchanged",
+    )
+]
 
 
 def solved(problem: rw.Problem) -> Solution | None:
@@ -29,7 +45,7 @@ def solved(problem: rw.Problem) -> Solution | None:
 
 
 @pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
-@pytest.mark.parametrize("kind", [*KINDS, *KINDS_OF_GRAPHS], ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", TRIED, ids=lambda kind: kind.name)
 def test_each_misreading_is_named_with_both_residuals_and_its_cure(kind: Kind) -> None:
     problem = misread(general(1, 2, seed=1, noise=NOISE, number_of_measurements=12).problem, kind)
     found = misreadings(problem, solved(problem))
