@@ -25,6 +25,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.quaternions import conjugate, dual_parts, left, of_rotations, right, to_rotations
 from gtsam_rwhec.methods.absolute import Stack
@@ -98,6 +99,7 @@ def horn2023(problem: Problem, options: MethodOptions, signs: Signs = "aligned")
     )
 
 
+@one_blas_thread()
 def solve_dual_quaternions(
     stack: Stack, signs: Signs = "aligned", seed: int = 0, residual: Residual = "a x - y b"
 ) -> DualQuaternionAnswer:

@@ -27,6 +27,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import CountError, OutlierError, OutliersWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import reweighted
@@ -75,6 +76,7 @@ class Graduated:
     searched: bool = True
 
 
+@one_blas_thread()
 def graduated(
     problem: Problem,
     *,
@@ -154,7 +156,7 @@ def graduated(
             "than half of the measurements may be outliers. Give sigma and kappa and take noise='given', which "
             "withstands more outliers",
             OutliersWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
     return Graduated(
         solution=solution,
@@ -201,4 +203,4 @@ def _warn(
         )
     else:
         return
-    warnings.warn(message, OutliersWarning, stacklevel=3)
+    warnings.warn(message, OutliersWarning, stacklevel=4)

@@ -20,6 +20,7 @@ import numpy as np
 import scipy.linalg
 
 from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.cause import Start
 from gtsam_rwhec.solver.local_blocks import gram, scatter, traces
@@ -39,6 +40,7 @@ class Relaxation:
     solver: Start  #: which method solved it
 
 
+@one_blas_thread()
 def solve_by_blocks(Q: Array, tolerance: float, max_iterations: int, progress: Progress | None = None) -> Relaxation:
     """Solve the relaxation of Q' (9 n + 1 square, symmetric) to a relative gap of ``tolerance``.
 
