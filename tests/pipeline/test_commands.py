@@ -15,7 +15,9 @@ from ros2_twin import CELL, write_twins
 import gtsam_rwhec as rw
 from gtsam_rwhec.logs import ImageRecord, open_log
 
-IMAGES = 12
+IMAGES = 8
+#: `init` looks for the tags of every family in each image.
+IMAGES_OF_INIT = 1
 
 
 def run(*arguments: object, status: int = 0) -> subprocess.CompletedProcess[str]:
@@ -72,8 +74,9 @@ def test_stage_by_stage(log: Path, tmp_path: Path) -> None:
     assert set(rw.read_refined(out / "result.json").Y) == {"cam_left", "cam_wide"}
 
 
-def test_init_writes_a_rig_file_once(log: Path, tmp_path: Path) -> None:
-    rig = tmp_path / "first.yaml"
+def test_init_writes_a_rig_file_once(tmp_path: Path) -> None:
+    log, rig = tmp_path / "ros2.mcap", tmp_path / "first.yaml"
+    write_twins(tmp_path / "json.mcap", log, IMAGES_OF_INIT)
     done = run("init", log, "-o", rig)
     assert "tag36h11" in rig.read_text(encoding="utf-8")
     assert f"Written to {rig}" in done.stdout

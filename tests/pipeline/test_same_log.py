@@ -35,7 +35,7 @@ def rig_text(offsets: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("images", "offsets"), [(8, "stated"), pytest.param(16, "estimate", marks=pytest.mark.slow)], ids=["few", "more"]
+    ("images", "offsets"), [(6, "stated"), pytest.param(16, "estimate", marks=pytest.mark.slow)], ids=["few", "more"]
 )
 def test_ros2_bag_and_foxglove_json_and_stage_by_stage(images: int, offsets: str, tmp_path: Path) -> None:
     """`images` of each camera, as json.mcap and ros2.mcap."""
