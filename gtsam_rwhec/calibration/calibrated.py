@@ -15,6 +15,7 @@ from gtsam_rwhec.calibration.choices import Choice
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.plausibility import Implausible
+from gtsam_rwhec.calibration.sizes import TargetSize
 from gtsam_rwhec.calibration.task_units import (
     CARRIER_WORDS,
     PointUncertainty,
@@ -158,6 +159,10 @@ class Calibration:
         Likely mistakes in the reading of A and B, each with its cure; two or more fit alike.
     implausible : Implausible or None
         Residuals that no sensor has.
+    sizes : tuple of TargetSize
+        What the motion says about sizes that were said to be known.
+    cannot_tell : tuple of str
+        Mistakes in the reading of A and B that would change no residual: no data can show them.
     findings : tuple of Finding
         What was found against the poses besides what certificate and free directions say.
     choices : tuple of Choice
@@ -181,6 +186,8 @@ class Calibration:
     outliers: Outliers
     misreadings: tuple[Misreading, ...]
     implausible: Implausible | None
+    sizes: tuple[TargetSize, ...]
+    cannot_tell: tuple[str, ...]
     findings: tuple[Finding, ...]
     choices: tuple[Choice, ...]
     notes: tuple[str, ...]

@@ -26,10 +26,12 @@ from gtsam_rwhec.calibration.calibrated import (
 from gtsam_rwhec.calibration.choices import Choice
 from gtsam_rwhec.calibration.clock_test import clocks_of
 from gtsam_rwhec.calibration.disagreement import contradicted_frames
+from gtsam_rwhec.calibration.lengths import doubted_lengths, undetectable
 from gtsam_rwhec.calibration.misreadings import Misreading, misreadings
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.plausibility import Implausible, implausible
 from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.calibration.sizes import TargetSize, sizes
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import (
     CountError,
@@ -199,8 +201,11 @@ class _Calibrating:
                     misread, (solution, inliers, refined, noise) = (), late
             elif not (misread or odd):
                 solution, inliers, refined, noise = self._answer(solution)
+            found_sizes = self._sizes(inliers) if refined is not None else ()
         if solution is None:
             self.findings.append(Finding(Ground.NO_SCALE, why))
+        elif lengths := doubted_lengths(problem, solution):
+            self.findings.append(Finding(Ground.MISREAD, str(lengths)))
         outliers = self._outliers(inliers)
         judgement = Judgement.of([*findings_of(solution, refined), *self.findings], proof_of(refined))
         best = solution if refined is None else refined
@@ -216,6 +221,8 @@ class _Calibrating:
             outliers=outliers,
             misreadings=misread,
             implausible=odd,
+            sizes=found_sizes,
+            cannot_tell=undetectable(problem),
             findings=tuple(self.findings),
             choices=tuple(self.choices),
             notes=tuple(self.notes),
@@ -397,6 +404,31 @@ class _Calibrating:
             freedom = refined.degrees_of_freedom
             self._choose("noise of B", "estimated", f"the residuals have at least {freedom:.0f} degrees of freedom")
         return refined, noise
+
+    def _sizes(self, inliers: Inliers) -> tuple[TargetSize, ...]:
+        """What the motion says about sizes that were said to be known."""
+        problem, options, what = self.problem, self.options, "sizes of targets"
+        if problem.scale != "known":
+            return ()
+        if options.sizes == "known":
+            self._choose(what, "as stated", "an option says so")
+            return ()
+        noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
+        how = RefineOptions(noise=noise, noise_groups=options.noise_groups, carrier_noise=options.carrier_noise)
+        # A target of a wrong size contradicts the others: then all of its measurements are asked, not those that agree.
+        kept = {
+            pair: mask if 2 * mask.sum() > len(mask) else np.ones(len(mask), bool) for pair, mask in inliers.items()
+        }
+        found = sizes(selected(problem, kept) if kept else problem, how, progress=self.tell)
+        doubted = [size for size in found if size.is_doubted]
+        self.findings += [Finding(Ground.SIZE_DOUBTED, str(size)) for size in doubted]
+        if doubted:
+            self._choose(what, "as stated, and doubted", "the motion contradicts them")
+        elif any(size.sigma is not None for size in found):
+            self._choose(what, "as stated", "the motion does not contradict them")
+        else:
+            self._choose(what, "as stated", "the motion does not tell them, so a wrong size would not show")
+        return found
 
     def _outliers(self, inliers: Inliers) -> Outliers:
         """The outliers, and what they say against frames."""

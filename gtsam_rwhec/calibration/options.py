@@ -14,6 +14,7 @@ from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 NoiseChoice = Literal["auto", "given", "estimate"]
 RobustChoice = Literal["auto", "gnc", "none"]
+SizesChoice = Literal["check", "known"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,9 @@ class CalibrateOptions:
     misreadings : bool
         Look for likely mistakes in the reading of A and B, and for residuals that no sensor has. Where there are any,
         nothing else is done.
+    sizes : "check" or "known"
+        "check": where the sizes of targets are said to be known (``scale="known"``), a size that the motion contradicts
+        is found. "known": it is not looked for.
     time_offsets : "auto", bool or tuple of str
         Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps. "auto": of each
         sensor whose residuals show that its clock is late.
@@ -54,13 +58,14 @@ class CalibrateOptions:
     robust: RobustChoice = "auto"
     inlier_confidence: float = 0.997
     misreadings: bool = True
+    sizes: SizesChoice = "check"
     time_offsets: Literal["auto"] | bool | tuple[str, ...] = "auto"
     carrier_path: Trajectory | None = None
     level: float = 0.95
     solve: SolveOptions = field(default_factory=SolveOptions)
 
     def __post_init__(self) -> None:
-        for name, choices in (("noise", NoiseChoice), ("noise_groups", NoiseGroups), ("robust", RobustChoice)):
+        for name, choices in _CHOICES.items():
             if not is_one_of(getattr(self, name), get_args(choices)):
                 raise OptionError(
                     f"CalibrateOptions.{name}={brief(getattr(self, name))} is not one of "
@@ -85,3 +90,6 @@ class CalibrateOptions:
             raise OptionError(f"CalibrateOptions.solve is a {type(self.solve).__name__}; give a SolveOptions")
         if self.carrier_path is not None and self.time_offsets is False:
             raise OptionError("CalibrateOptions.carrier_path has no use with time_offsets=False; leave out one of them")
+
+
+_CHOICES = {"noise": NoiseChoice, "noise_groups": NoiseGroups, "robust": RobustChoice, "sizes": SizesChoice}

@@ -124,6 +124,7 @@ class SolvingRounds:
         options = CalibrateOptions(
             noise="estimate" if self.rig.noise == "estimate" else "given",
             robust="none",  # the outliers are marked already
+            sizes="known",  # the rounds have looked at them
             carrier_noise=self.motion.noise,
             time_offsets=self.estimated or False,
             carrier_path=self.motion.trajectory if self.estimated else None,

@@ -156,7 +156,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         time_offsets_s=refined.time_offsets_s,
         judgement=judgement,
         outliers=_outliers(outliers, looked_for=rig.cleaning.robust == "gnc"),
-        choices=(*_choices_before(rig, estimated, outliers), *_without_outliers(calibration.choices)),
+        choices=(*_choices_before(rig, estimated, outliers), *_made_in_the_answer(calibration.choices)),
     )
     solution, cameras = refined.solution, dict(metadata.cameras)
     return Calibrated(refined, solution, settled.pairs, fields, cameras, rig, judgement, calibration)
@@ -189,8 +189,8 @@ def _choices_before(rig: Rig, estimated: tuple[str, ...], counts: tuple[OutlierC
     return tuple(choices)
 
 
-def _without_outliers(choices: tuple[Choice, ...]) -> tuple[Choice, ...]:
-    return tuple(choice for choice in choices if choice.what != "outliers")
+def _made_in_the_answer(choices: tuple[Choice, ...]) -> tuple[Choice, ...]:
+    return tuple(choice for choice in choices if choice.what not in ("outliers", "sizes of targets", "time offsets"))
 
 
 def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:

@@ -48,7 +48,13 @@ def print_calibration(
     if calibration.outliers.looked_for:
         print_list(console, [str(calibration.outliers)])
     print_list(console, calibration.notes, "yellow")
+    if calibration.cannot_tell:
+        print_list(console, [f"Not checked, as no residual shows it: {_facts(calibration)}."], "dim")
     if refined is not None:
         print_refined_body(console, refined, log)
     elif solution is not None:
         print_solution_body(console, solution)
+
+
+def _facts(calibration: Calibration) -> str:
+    return "; ".join(words.removeprefix("data cannot tell: ") for words in calibration.cannot_tell)

@@ -12,6 +12,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.calibrating import spare_equations
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.simulate import Noise
 
 
 def choice(calibration: rw.Calibration, what: str) -> rw.Choice:
@@ -68,6 +69,41 @@ def test_a_sensor_whose_measurements_disagree_is_not_to_be_used() -> None:
     assert calibration.verdict is rw.Verdict.DO_NOT_USE
     assert rw.Ground.CONTRADICTED in calibration.judgement.grounds
     assert "sensor2" in calibration.verdict_reason
+
+
+def test_a_size_that_the_motion_contradicts_is_found() -> None:
+    def larger(pair: Pair, raw: Measurements) -> np.ndarray:
+        B = raw.B.copy()
+        B[:, :3, 3] *= 1.03 if pair.target == "target1" else 1.0
+        return B
+
+    problem = copied(rig(noise=Noise(0.001, 50.0 * KAPPA), number_of_measurements=30).problem, B=larger)
+    calibration = rw.calibrate(problem)
+    assert calibration.judgement.grounds[0] is rw.Ground.SIZE_DOUBTED
+    assert [size.target for size in calibration.sizes if size.is_doubted] == ["target1"]
+    assert "the stated size of target1 is 3 % larger than the motion says" in calibration.verdict_reason
+    told = rw.calibrate(problem, rw.CalibrateOptions(sizes="known"))
+    assert rw.Ground.SIZE_DOUBTED not in told.judgement.grounds
+    assert choice(told, "sizes of targets").evidence == "an option says so"
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.UnitsWarning")
+def test_millimetres_in_both_are_found_in_the_lengths() -> None:
+    """They change no residual."""
+
+    def thousandfold(poses: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.c_[poses[:, :3, :3], 1e3 * poses[:, :3, 3:]], poses[:, 3:]], axis=1)
+
+    problem = copied(
+        rig().problem,
+        A=lambda pair, raw: thousandfold(raw.A),
+        B=lambda pair, raw: thousandfold(raw.B),
+        sigma=lambda pair, raw: 1e3 * raw.sigma,
+    )
+    calibration = rw.calibrate(problem)
+    assert calibration.judgement.grounds == (rw.Ground.MISREAD,)
+    assert "this looks like millimetres in A and B" in calibration.verdict_reason
+    assert any("in another unit than metres" in words for words in calibration.cannot_tell)
 
 
 def test_planar_motion_is_not_determined() -> None:
