@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec.errors import NotConvergedWarning
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.variance_factors import AS_STATED
@@ -44,10 +45,17 @@ class SettledFit:
 
 
 def fit(
-    problem: Problem, model: Model, variables: Variables, start: State, options: RefineOptions, estimates: bool
+    problem: Problem,
+    model: Model,
+    variables: Variables,
+    start: State,
+    options: RefineOptions,
+    estimates: bool,
+    tell: Progress = silent,
+    first: FactorsByPair | None = None,
 ) -> SettledFit:
-    """The optimum under settled weights."""
-    factors: FactorsByPair = dict.fromkeys(problem.pairs, AS_STATED)
+    """The optimum under settled weights; with ``first`` the variance factors start there."""
+    factors: FactorsByPair = {pair: (first or {}).get(pair, AS_STATED) for pair in problem.pairs}
     degrees_of_freedom: dict[tuple[Group, str], float] = {}
     state, values = start, model.values(start)
     iterations = 0
@@ -58,6 +66,8 @@ def fit(
         iterations += optimum.iterations
         state, values = variables.state(optimum.values), optimum.values
     for round_number in range(MAX_ROUNDS):
+        if round_number:
+            tell(f"refining: the weights settle, round {round_number + 1} of at most {MAX_ROUNDS}")
         graph = model.graph(state, factors)
         graphs.add_knowledge(graph, variables, problem, options.residual)
         optimum = optimise(graph, values, options.max_iterations)

@@ -35,7 +35,7 @@ from gtsam_rwhec.refinement.pair_data import PairData, local_paths
 from gtsam_rwhec.refinement.refined import Movement, PairNoise, Refined
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.refinement.variables import State, Variables
-from gtsam_rwhec.refinement.weighting import group_of
+from gtsam_rwhec.refinement.weighting import FactorsByPair, group_of
 from gtsam_rwhec.solver.parts import parts_of
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
@@ -96,6 +96,7 @@ def refine(
     everything = Variables.of(problem, sensors_with_offset(problem, options))
     data = _data(problem, everything, options)
     inliers: dict[Pair, np.ndarray] = {}
+    factors: FactorsByPair = {}
     start, whole, judged = solution, problem, problem
     if options.robust == "gnc":
         tell("rejecting outliers")
@@ -113,28 +114,19 @@ def refine(
             progress=progress,
         )
         start, inliers = found.solution, found.inliers
+        factors = dict.fromkeys(problem.pairs, found.variance_factors) if estimates else {}
     assert start is not None
     before = solution or start
-    for _ in range(MAX_CHOICES):
-        if inliers:
-            problem = selected(whole, inliers)
-        offsets = tuple(name for name in sensors_with_offset(whole, options) if name in problem.sensors)
-        variables, parts = Variables.of(problem, offsets), parts_of(problem)
-        kept = [item.selected(inliers[item.pair]) if inliers else item for item in data if item.pair in problem.pairs]
-        model = GeodesicModel.of(kept, variables, options) if kept else ChordalModel(parts, variables)
-        tell("refining")
-        settled = fit(problem, model, variables, variables.start(start), options, estimates)
-        state = variables.state(settled.optimum.values)
-        if judged is whole:
-            break
-        threshold = inlier_threshold(options.inlier_confidence, whole.number_of_measurements)
-        again = inliers_of(data, variables, state, settled.factors, threshold)
-        if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
-            break
-        inliers = again
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RwhecWarning)  # only the last choice's warnings matter
-            start = solve(selected(whole, inliers))
+    if judged is not whole:
+        start, inliers, factors = _chosen_under_full_noise(whole, data, start, inliers, options, estimates, tell)
+    if inliers:
+        problem = selected(whole, inliers)
+    variables, parts = _variables(whole, problem, options), parts_of(problem)
+    kept = _kept(problem, data, inliers)
+    model = GeodesicModel.of(kept, variables, options) if kept else ChordalModel(parts, variables)
+    tell("refining")
+    settled = fit(problem, model, variables, variables.start(start), options, estimates, tell, factors)
+    state = variables.state(settled.optimum.values)
     tell("covariances")
     space = free_space_of(parts, variables, state, kept, None if options.robust in ("none", "gnc") else settled.factors)
     if space.directions:
@@ -170,6 +162,50 @@ def refine(
         options=options,
         joint=joint,
     )
+
+
+def _variables(whole: Problem, problem: Problem, options: RefineOptions) -> Variables:
+    offsets = tuple(name for name in sensors_with_offset(whole, options) if name in problem.sensors)
+    return Variables.of(problem, offsets)
+
+
+def _kept(problem: Problem, data: list[PairData], inliers: dict[Pair, np.ndarray]) -> list[PairData]:
+    return [item.selected(inliers[item.pair]) if inliers else item for item in data if item.pair in problem.pairs]
+
+
+def _chosen_under_full_noise(
+    whole: Problem,
+    data: list[PairData],
+    start: Solution,
+    inliers: dict[Pair, np.ndarray],
+    options: RefineOptions,
+    estimates: bool,
+    tell: Progress,
+) -> tuple[Solution, dict[Pair, np.ndarray], FactorsByPair]:
+    """The inliers chosen again under the full noise until they stay, their certified solution, and the noise found.
+
+    A's noise is propagated here: to judge single measurements needs no variable for each carrier pose, of which a log
+    has thousands.
+    """
+    single = replace(options, carrier_model="propagated")
+    threshold = inlier_threshold(options.inlier_confidence, whole.number_of_measurements)
+    factors: FactorsByPair = {}
+    for choice in range(1, MAX_CHOICES + 1):
+        tell(f"choosing the inliers under the full noise, step {choice} of at most {MAX_CHOICES}")
+        problem = selected(whole, inliers)
+        variables = _variables(whole, problem, options)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)  # the last fit has its own
+            model = GeodesicModel.of(_kept(problem, data, inliers), variables, single)
+            settled = fit(problem, model, variables, variables.start(start), single, estimates, tell, factors)
+            factors = settled.factors
+            state = variables.state(settled.optimum.values)
+            again = inliers_of(data, variables, state, settled.factors, threshold)
+            if all(np.array_equal(again[pair], mask) for pair, mask in inliers.items()):
+                break
+            inliers = again
+            start = solve(selected(whole, inliers))
+    return start, inliers, factors
 
 
 def _any_inliers(problem: Problem, options: RefineOptions, tell: Progress) -> Solution:

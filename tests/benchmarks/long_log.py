@@ -1,17 +1,19 @@
-"""A long log of a rig that is carried past targets along a path that drifts: how long the robust refinement takes.
+"""A long log of a rig that is carried past targets along a path that drifts: how long ``rw.calibrate`` takes.
 
     python tests/benchmarks/long_log.py [--seed 0] [--measurements 3000] [--store]
 
 Twenty-one targets hang in a room; two cameras on a rig see those in front of them. The rig's pose comes from
 visual-inertial odometry, whose error is a random walk of yaw and position (0.5 degrees and 5 cm a minute). Cameras err
 by 0.3 degrees and 4 mm an axis, and every fifth measurement is no measurement of its target at all: another target's
-pose, or any pose. ``refine(noise="estimate", robust="gnc")`` knows none of this.
+pose, or any pose. Nothing is told of this. ``refine(noise="estimate", robust="gnc")`` is timed beside it. Times are on
+the clock; the processor's own are in brackets, for a machine that does other work too.
 """
 
 from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -162,35 +164,46 @@ class Silence:
 def rows(seed: int = 0, measurements: int = 3000) -> list[Row]:
     """One log: time, silence, and what was found."""
     log = long_log(seed, measurements)
-    telling = Silence()
+    frames = len(log.problem.targets) + len(log.problem.sensors)
+    what = f"long log, {frames} frames, {measurements} measurements, drift, {100 * OUTLIERS:.0f} % outliers"
+    robust = rw.RefineOptions(noise="estimate", robust="gnc")
+    return _timed(f"{what}: rw.calibrate", log, lambda told: _calibrated(log.problem, told)) + _timed(
+        f"{what}: refine alone", log, lambda told: _refined(log.problem, robust, told)
+    )
+
+
+def _calibrated(problem: rw.Problem, told: Silence) -> tuple[Masks, dict[str, Array]]:
+    found = rw.calibrate(problem, progress=told)
+    return dict(found.outliers.inliers), {name: found.Y[name].matrix() for name in found.Y}
+
+
+def _refined(problem: rw.Problem, options: rw.RefineOptions, told: Silence) -> tuple[Masks, dict[str, Array]]:
+    found = rw.refine(problem, None, options, progress=told)
+    return dict(found.inliers), {name: pose.matrix() for name, pose in found.Y.items()}
+
+
+def _timed(what: str, log: LongLog, call: Callable[[Silence], tuple[Masks, dict[str, Array]]]) -> list[Row]:
+    """The rows of one call, which gives its inliers and the cameras' poses."""
+    told = Silence()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RwhecWarning)
-        start = time.perf_counter()
-        solution = rw.solve(log.problem, progress=telling)
-        solved = time.perf_counter()
-        refined = rw.refine(log.problem, solution, rw.RefineOptions(noise="estimate", robust="gnc"), progress=telling)
-        end = time.perf_counter()
-    telling("the end")
-    kept = sum(int((refined.inliers[pair] & ~mask).sum()) for pair, mask in log.good.items())
-    lost = sum(int((~refined.inliers[pair] & mask).sum()) for pair, mask in log.good.items())
-    errors = [np.linalg.norm(refined.Y[name].matrix()[:3, 3] - T[:3, 3]) for name, T in log.Y.items()]
-    frames = len(log.problem.targets) + len(log.problem.sensors)
+        start, work = time.perf_counter(), time.process_time()
+        inliers, Y = call(told)
+        seconds, work = time.perf_counter() - start, time.process_time() - work
+    told("the end")
+    kept = sum(int((inliers[pair] & ~mask).sum()) for pair, mask in log.good.items())
+    lost = sum(int((~inliers[pair] & mask).sum()) for pair, mask in log.good.items())
+    worst = max(float(np.linalg.norm(Y[name][:3, 3] - T[:3, 3])) for name, T in log.Y.items())
     return [
-        Row(
-            f"long log, {frames} frames, {log.problem.number_of_measurements} measurements, drift, "
-            f"{100 * OUTLIERS:.0f} % outliers: solve and refine",
-            f"{end - start:.1f} s (solve {solved - start:.1f} s)",
-            f"<= {BAR_S:.0f} s",
-            end - start <= BAR_S,
-        ),
+        Row(what, f"{seconds:.1f} s ({work:.1f} s)", f"<= {BAR_S:.0f} s", seconds <= BAR_S),
         Row(
             "    longest time without a word",
-            f"{telling.longest:.1f} s ({telling.before})",
+            f"{told.longest:.1f} s (after: {told.before})",
             f"<= {SILENCE_S:.0f} s",
-            telling.longest <= SILENCE_S,
+            told.longest <= SILENCE_S,
         ),
         Row("    outliers kept; good ones left out", f"{kept}; {lost}"),
-        Row("    cameras on the rig, error", f"{1e3 * max(errors):.1f} mm"),
+        Row("    cameras on the rig, largest error", f"{1e3 * worst:.1f} mm"),
     ]
 
 

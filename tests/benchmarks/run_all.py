@@ -29,6 +29,7 @@ import cv2
 import edge_summaries
 import few_measurements
 import hand_eye
+import long_log
 import many_frames
 import million_measurements
 import one_pair
@@ -125,6 +126,7 @@ def parts(sizes: Sizes, plot: Path | None) -> dict[str, Callable[[], list[Row]]]
         "many frames": lambda: many_frames.rows(sizes.repetitions),
         "world origin": world_origin.rows,
         "outliers": lambda: outliers.rows(sizes.outlier_seeds, plot),
+        "a long log with drift and outliers": long_log.rows,
         "edge summaries in GTSAM": lambda: edge_summaries.rows(sizes.few_repetitions),
         "time of rw.calibrate": lambda: calibrate_times.rows(sizes.few_repetitions),
         "from camera images": lambda: camera_logs.rows(sizes.log_poses),

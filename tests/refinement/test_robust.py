@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from refinement_problems import copied, distance, refined, rig
@@ -9,6 +11,7 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.refinement.geodesic import GeodesicModel
 from gtsam_rwhec.simulate import Noise, Simulation, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
 
@@ -123,6 +126,34 @@ def test_gnc_knows_the_noise_of_A(each: bool) -> None:
     inliers = refined(problem, robust="gnc", noise="given", carrier_noise=noise).inliers["target0", "sensor0"]
     assert not inliers[:8].any()
     assert inliers[8:].mean() > 0.9
+
+
+def test_to_choose_inliers_takes_no_variables_for_the_carriers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long log has thousands of carrier poses: with a variable for each, every choice took minutes."""
+    simulation = rig(2, 2, seed=2, number_of_measurements=20)
+    problem, generator = rw.Problem(), np.random.default_rng(0)
+    for pair in simulation.problem.pairs:
+        raw = simulation.problem.measurements(*pair)
+        B = raw.B.copy()
+        B[:4] = random_poses(4, 2.0, generator)
+        problem.add(*pair, raw.A, B, raw.sigma, raw.kappa, stamps_ns=np.arange(20) * 10**8)
+    with_variables: list[bool] = []
+    of = GeodesicModel.of
+
+    def recorded(*arguments: Any) -> GeodesicModel:
+        model = of(*arguments)
+        with_variables.append(model.carriers is not None)
+        return model
+
+    monkeypatch.setattr(GeodesicModel, "of", staticmethod(recorded))
+    told: list[str] = []
+    options = rw.RefineOptions(robust="gnc", noise="estimate", carrier_noise=rw.CarrierNoise(0.0005, 0.0005))
+    r = rw.refine(problem, rw.solve(problem), options, progress=told.append)
+    assert not any(mask[:4].any() for mask in r.inliers.values())
+    assert with_variables[-1]
+    assert with_variables.count(True) == 1
+    assert len(with_variables) >= 2
+    assert any("choosing the inliers under the full noise, step 1 of at most" in one for one in told)
 
 
 @pytest.mark.parametrize("loss", ["huber", "tukey"])
