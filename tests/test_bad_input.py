@@ -174,6 +174,11 @@ BAD: dict[str, tuple[Callable[[rw.Problem], Any], type[Exception], list[str]]] =
         errors.CountError,
         ["tag0-cam0", "kappa has shape (8, 1)", "one for each of 8"],
     ),
+    "stamps that go back": (
+        add(A, B, stamps_ns=[0, 1, 2, 5, 4, 6, 7, 8]),
+        errors.StampError,
+        ["tag0-cam0", "stamp 4 (4 ns) is before", "(5 ns)", "Sort"],
+    ),
     "count of stamps": (add(A, B, stamps_ns=[1, 2]), errors.CountError, ["tag0-cam0", "(2,)", "8"]),
     "stamps in seconds": (
         add(A, B, stamps_ns=np.arange(8) * 0.1),

@@ -3,6 +3,8 @@ from .calibrated import NoiseFound as NoiseFound
 from .calibrated import Outliers as Outliers
 from .calibrating import calibrate as calibrate
 from .choices import Choice as Choice
+from .clocks import Clock as Clock
+from .clocks import offsets_worth_estimating as offsets_worth_estimating
 from .cross_validation import CrossValidation as CrossValidation
 from .cross_validation import cross_validate as cross_validate
 from .options import CalibrateOptions as CalibrateOptions

@@ -24,7 +24,7 @@ from gtsam_rwhec.calibration.calibrated import (
     SensorView,
 )
 from gtsam_rwhec.calibration.choices import Choice
-from gtsam_rwhec.calibration.clock_test import clocks_of
+from gtsam_rwhec.calibration.clocks import Clock, offsets_worth_estimating
 from gtsam_rwhec.calibration.disagreement import contradicted_frames
 from gtsam_rwhec.calibration.lengths import doubted_lengths, undetectable
 from gtsam_rwhec.calibration.misreadings import Misreading, misreadings
@@ -63,6 +63,9 @@ from gtsam_rwhec.solving.solution import Solution
 SPARE_EQUATIONS = 6
 #: The verdict says better what these warn of.
 SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, OutliersWarning)
+
+#: A time offset of so many standard deviations explains rows that look shifted.
+SURELY = 5.0
 
 Inliers = dict[Pair, np.ndarray]
 NOT_KNOWN = NoiseFound("not known", {}, {}, "not known")
@@ -175,6 +178,16 @@ def _is_known(refined: Refined, sensor: str) -> bool:
     return sensor in refined.time_offsets_s and bool(np.isfinite(refined.covariance(offset)).all())
 
 
+def _is_late(refined: Refined, sensor: str) -> bool:
+    """Whether the sensor's time offset is surely not zero."""
+    variance = float(refined.covariance(Unknown(UnknownKind.TIME_OFFSET, sensor))[0, 0])
+    return abs(refined.time_offsets_s[sensor]) > SURELY * math.sqrt(variance)
+
+
+def _worth_estimating(clocks: tuple[Clock, ...]) -> tuple[str, ...]:
+    return tuple(clock.sensor for clock in clocks if clock.is_worth_estimating)
+
+
 @dataclass
 class _Calibrating:
     """One run of ``calibrate``."""
@@ -185,6 +198,8 @@ class _Calibrating:
     choices: list[Choice] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     notes: dict[str, None] = field(default_factory=dict)
+    #: Sensors whose clocks are clearly off.
+    _clearly_off: tuple[str, ...] = ()
 
     def done(self) -> Calibration:
         """All steps, one after the other."""
@@ -274,7 +289,7 @@ class _Calibrating:
             return None
         as_it_was, self.choices, self.findings = (self.choices, self.findings), [], []
         answer = self._answer(first)
-        if answer.refined is not None and answer.refined.time_offsets_s:
+        if answer.refined is not None and any(_is_late(answer.refined, name) for name in answer.refined.time_offsets_s):
             chosen = "rows of A and B look shifted against each other, and a time offset is estimated in place of that"
             self.choices.insert(0, Choice("reading of A and B", "as given", f"{chosen}, since there are stamps"))
             return answer
@@ -282,46 +297,57 @@ class _Calibrating:
         return None
 
     def _answer(self, first: Solution | None) -> _Answer:
-        """The answer without outliers; again with time offsets where its residuals show that clocks are late."""
-        options, what, before = self.options, "time offsets", (list(self.choices), list(self.findings))
-        answer = self._answer_as_told(first)
+        """The answer without outliers, with the time offsets that stamps and motion determine."""
+        options, what = self.options, "time offsets"
         if options.time_offsets != "auto":
+            answer = self._answer_as_told(first)
             asked = _offsets(self.problem, options)
             self._choose(what, "estimated" if asked else "not estimated", "an option says so")
             return answer
-        if answer.refined is None or not self.problem.has_measurements:
+        before = (list(self.choices), list(self.findings))
+        clocks = self._clocks(first, {})
+        self._clearly_off = tuple(clock.sensor for clock in clocks if clock.is_clearly_off)
+        answer = self._answer_as_told(first, _worth_estimating(clocks))
+        if answer.solution is None or answer.refined is None:
             self._choose(what, "not estimated", "there are no residuals to test")
             return answer
-        kept = selected(self.problem, answer.inliers) if answer.inliers else self.problem
-        tests, without = clocks_of(kept, answer.refined, options.carrier_path)
-        late = tuple(test.sensor for test in tests if test.is_late)
-        if not late:
-            found = [str(test) for test in tests] + [
-                f"{name} cannot be tested, as {why}" for name, why in without.items()
-            ]
-            self._choose(what, "not estimated", f"the residuals do not ask for it: {', '.join(found)}")
-            return answer
-        as_it_was = (self.choices, self.findings)
-        self.choices, self.findings = before
-        self.options = replace(options, time_offsets=late)
-        self.tell("estimating time offsets")
-        again = self._answer_as_told(first)
-        self.options = options
-        shown = ", ".join(str(test) for test in tests if test.is_late)
-        if again.refined is None or not all(_is_known(again.refined, name) for name in late):
-            self.choices, self.findings = as_it_was
-            self._choose(what, "not estimated", f"the residuals show {shown}, but the motion does not determine it")
-            words = f"the residuals show a late clock ({shown}), and its offset cannot be estimated"
-            self.findings.append(Finding(Ground.COVARIANCE_DOUBTED, words))
-            return answer
-        self._choose(what, f"estimated for {', '.join(late)}", f"the residuals showed {shown}")
-        return again
+        after = self._clocks(answer.solution, answer.inliers)
+        known = [name for name in _worth_estimating(after) if _is_known(answer.refined, name)]
+        new = [name for name in _worth_estimating(after) if name not in answer.refined.time_offsets_s]
+        if len(known) + len(new) != len(answer.refined.time_offsets_s) or new:
+            # Outliers had hidden what the motion tells, or the motion of what is left tells less.
+            self.choices, self.findings = before
+            self._clearly_off = tuple(clock.sensor for clock in after if clock.is_clearly_off)
+            answer = self._answer_as_told(first, (*known, *new))
+        found = {} if answer.refined is None else answer.refined.time_offsets_s
+        chosen = f"estimated for {', '.join(found)}" if found else "not estimated"
+        self._choose(what, chosen, "; ".join(f"{clock.sensor}: {clock.evidence}" for clock in after))
+        return answer
 
-    def _answer_as_told(self, first: Solution | None) -> _Answer:
+    def _clocks(self, solution: Solution | None, inliers: Inliers) -> tuple[Clock, ...]:
+        if solution is None:
+            return ()
+        kept = selected(self.problem, inliers) if inliers else self.problem
+        return offsets_worth_estimating(kept, solution, self.options.carrier_path)
+
+    def _offsets_for_outliers(self) -> bool | tuple[str, ...]:
+        """Clocks that are clearly off make some of what moves an outlier, so they are taken along."""
+        return self._clearly_off or (_offsets(self.problem, self.options) if self._is_told else ())
+
+    @property
+    def _is_told(self) -> bool:
+        return self.options.time_offsets != "auto"
+
+    def _answer_as_told(self, first: Solution | None, offsets: tuple[str, ...] | None = None) -> _Answer:
+        """The answer with the time offsets of the named sensors, or of those that the options say."""
         solution, inliers = self._without_outliers(first)
         if solution is None:
             return _Answer(None, inliers, None, NOT_KNOWN)
-        return _Answer(solution, inliers, *self._refined(solution, inliers))
+        options = self.options
+        self.options = options if offsets is None else replace(options, time_offsets=offsets)
+        refined = self._refined(solution, inliers)
+        self.options = options
+        return _Answer(solution, inliers, *refined)
 
     def _without_outliers(self, first: Solution | None) -> tuple[Solution | None, Inliers]:
         """The certified solution of the measurements that agree, and which these are."""
@@ -343,7 +369,9 @@ class _Calibrating:
             return first, {}
         noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
         try:
-            has_more = problem.has_covariances or options.carrier_noise is not None or bool(_offsets(problem, options))
+            has_more = (
+                problem.has_covariances or options.carrier_noise is not None or bool(self._offsets_for_outliers())
+            )
             if first is not None and has_more:
                 solution, inliers = self._inliers_under_the_full_noise(first)
             else:
@@ -376,8 +404,8 @@ class _Calibrating:
             inlier_confidence=options.inlier_confidence,
             carrier_noise=options.carrier_noise,
             carrier_model="propagated",
-            time_offsets=_offsets(self.problem, options),
-            carrier_path=options.carrier_path if _offsets(self.problem, options) else None,
+            time_offsets=self._offsets_for_outliers(),
+            carrier_path=options.carrier_path if self._offsets_for_outliers() else None,
         )
         refined = refine(self.problem, first, how, progress=self.tell)
         return refined.solution, refined.inliers

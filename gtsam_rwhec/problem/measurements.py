@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gtsam_rwhec.errors import CountError, NoiseError
+from gtsam_rwhec.errors import CountError, NoiseError, StampError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import (
     Array,
@@ -187,7 +187,11 @@ def positive_weights(value: ArrayLike | None, count: int, name: str, where: str)
 
 
 def checked_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.ndarray | None:
-    """Stamps as (count,) integer nanoseconds; a CountError for another count or other numbers."""
+    """Stamps as (count,) integer nanoseconds that do not decrease.
+
+    A CountError says that their number or type is another one, a StampError which stamp goes back. Measurements of one
+    pair may have one stamp.
+    """
     if stamps_ns is None:
         return None
     try:
@@ -198,7 +202,16 @@ def checked_stamps(stamps_ns: ArrayLike | None, count: int, where: str) -> np.nd
         raise CountError(f"{where}: stamps_ns has shape {stamps.shape} for {count} measurements")
     if not np.issubdtype(stamps.dtype, np.integer):
         raise CountError(f"{where}: stamps_ns is of {stamps.dtype}; give integer nanoseconds")
-    return stamps.astype(np.int64)
+    stamps = stamps.astype(np.int64)
+    back = np.flatnonzero(np.diff(stamps) < 0)
+    if back.size:
+        i = int(back[0]) + 1
+        raise StampError(
+            f"{where}: stamp {i} ({stamps[i]} ns) is before the stamp ahead of it ({stamps[i - 1]} ns): rows are out "
+            "of order, or a clock was set back. Sort the measurements by stamp; where a clock was set back, correct "
+            "the stamps, or leave stamps_ns out"
+        )
+    return stamps
 
 
 def checked_covariances(covariances: ArrayLike | None, count: int, where: str) -> Array | None:

@@ -175,7 +175,7 @@ class Problem(Knowledge):
         order : "wxyz" or "xyzw"
             Order of the quaternions, for rows of 7.
         stamps_ns : (N,) integers, optional
-            Nanoseconds; kept for refinement.
+            Nanoseconds, which do not go back within the batch; kept for refinement.
         covariances : (N, 6, 6), optional
             Covariances of B in place of sigma and kappa: rotation first, right perturbation (GTSAM's order).
             Refinement uses the whole matrix, the certified solution the mean variance of each block.
@@ -184,7 +184,7 @@ class Problem(Knowledge):
 
         Raises
         ------
-        PoseError, CountError, NoiseError, FrameError
+        PoseError, CountError, NoiseError, FrameError, StampError
             A name, pose, weight, stamp or covariance is not valid; nothing of the batch is added then.
         """
         check_name(target, "the target's name")

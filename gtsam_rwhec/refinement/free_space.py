@@ -89,8 +89,9 @@ def free_space_of(
 def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[FreeDirection], dict[str, float]]:
     """Time offsets that the carriers' motion does not determine, and ``FreeSpace.shrinkage`` of the other sensors.
 
-    A carrier must move to determine a time offset. Its velocity comes from noisy poses. If the velocity's mean square
-    is at most ``MOVED`` times the part that the noise of the poses explains, the carrier counts as standing still.
+    A carrier must move to determine a time offset. Its velocity comes from noisy poses, and between poses that are far
+    apart the path is not known. If the velocity's mean square
+    is at most ``MOVED`` times the part that this explains, the carrier counts as standing still.
     """
     free: list[FreeDirection] = []
     shrinkage: dict[str, float] = {}
@@ -101,12 +102,11 @@ def free_offsets(data: list[PairData], variables: Variables) -> tuple[list[FreeD
                 continue
             weight = 1.0 / np.einsum("nii->i", item.covariance).reshape(2, 3).mean(axis=1) * item.count
             squares += weight * (item.paths.twists() ** 2).sum(axis=0).reshape(2, 3).sum(axis=1)
-            variance = item.paths.scatter.reshape(2, 3).sum(axis=1)
+            variance = item.count * item.paths.velocity_variance.reshape(2, 3).sum(axis=1)
             if item.carrier is not None:
-                variance = np.maximum(
-                    variance, np.einsum("nii->i", item.carrier).reshape(2, 3).sum(axis=1) / item.count
-                )
-            noise += weight * item.paths.leverage.sum() * variance
+                stated = np.einsum("nii->i", item.carrier).reshape(2, 3).sum(axis=1) / item.count
+                variance = np.maximum(variance, item.paths.leverage.sum() * stated)
+            noise += weight * variance
         if (squares <= MOVED * noise + 1e-18 * np.maximum(squares.max(), 1.0)).all():
             free.append(FreeDirection(FreeKind.TIME_OFFSET, FreeReason.STANDSTILL, time_offsets_s={sensor: 1.0}))
         else:

@@ -7,7 +7,7 @@ and noise in a velocity pulls the offset towards zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors import se3
@@ -40,11 +40,15 @@ class LocalPaths:
         Variance of c_1 over the variance of a pose's noise, 1/s^2.
     scatter : (6,) array
         Variance of the poses about the cubics, rad^2 and m^2.
+    velocity_variance : (6,) array
+        Mean square error of c_1, (rad/s)^2 and (m/s)^2, from the poses' scatter; where poses are too few to scatter,
+        from how well their neighbours predict them: between stations nothing is known of the path.
     """
 
     coefficients: Array
     leverage: Array
     scatter: Array
+    velocity_variance: Array
 
     def motion(self, offset_s: float) -> Array:
         """Expmap(c_1 d + c_2 d^2 + c_3 d^3), (N, 4, 4); d is limited to the window of the fit."""
@@ -60,7 +64,7 @@ class LocalPaths:
 
     def selected(self, mask: np.ndarray) -> LocalPaths:
         """The motion about the stamps that a mask or an index array selects."""
-        return LocalPaths(self.coefficients[mask], self.leverage[mask], self.scatter)
+        return LocalPaths(self.coefficients[mask], self.leverage[mask], self.scatter, self.velocity_variance)
 
     @staticmethod
     def of(A: Array, stamps_ns: np.ndarray, where: str) -> LocalPaths:
@@ -96,7 +100,9 @@ class LocalPaths:
                 f"{LONGEST_GAP_S:g} s, so the carrier's velocity there is unknown. Leave it out, or estimate no time "
                 "offset for its sensor"
             )
-        return _fitted(poses, stamps, Trajectory(stamps, poses, where), low, high, place)
+        found = _fitted(poses, stamps, Trajectory(stamps, poses, where), low, high, place)
+        unknown = _unpredicted(poses, (stamps - stamps[0]) * 1e-9, found.leverage[first])
+        return replace(found, velocity_variance=np.maximum(found.velocity_variance, unknown))
 
     @staticmethod
     def along(path: Trajectory, stamps_ns: np.ndarray) -> LocalPaths:
@@ -154,7 +160,31 @@ def _fitted(
         leverage[own] = (inverse[:, 1] ** 2).sum(axis=1) / WINDOW_S**2
         squares += (np.where(near[..., None], xi - Z @ solution, 0.0) ** 2).sum(axis=(0, 1))
         degrees_of_freedom += int((count - used.sum(axis=1, keepdims=True)).sum())
-    return LocalPaths(coefficients[place], leverage[place], squares / max(degrees_of_freedom, 1))
+    scatter = squares / max(degrees_of_freedom, 1)
+    return LocalPaths(coefficients[place], leverage[place], scatter, leverage[place].mean() * scatter)
+
+
+def _unpredicted(poses: Array, seconds: Array, leverage: Array) -> Array:
+    """Mean square error of velocities (6,) from each pose's distance to the cubic through two neighbours a side.
+
+    Where the poses are a smooth path and its noise, the distance is noise and the little that a cubic leaves out. Where
+    the carrier stopped between the stamps, or turned back, it is as large as the steps. Ends of the path, and poses
+    beside a gap, are left out, as those without four neighbours are.
+    """
+    beside = np.arange(2, len(seconds) - 2)[:, None] + np.array([-2, -1, 1, 2])
+    beside = beside[np.diff(seconds[beside], axis=1).max(axis=1) <= LONGEST_GAP_S] if len(beside) else beside
+    if not len(beside):
+        return np.zeros(6)
+    middle = beside[:, 1] + 1
+    tau = seconds[beside] - seconds[middle, None]
+    # Lagrange's weights at 0; their squares are what noise in the neighbours adds.
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+    weights = np.prod(-tau[:, others] / (tau[:, :, None] - tau[:, others]), axis=2)
+    steps = (se3.inverse(poses[middle])[:, None] @ poses[beside]).reshape(-1, 4, 4)
+    off = np.einsum("nk,nki->ni", weights, se3.logmap(steps).reshape(-1, 4, 6))
+    squares = off**2 / (1.0 + (weights**2).sum(axis=1))[:, None]
+    result: Array = np.mean(leverage[middle, None] * squares, axis=0)
+    return result
 
 
 def _neighbours(seconds: Array) -> tuple[np.ndarray, np.ndarray]:

@@ -168,7 +168,6 @@ def our_answer(sequence: NeutralSequence, keyframes: Keyframes | None, offset_s:
     other = TARGET if sequence.frame == CAMERA else CAMERA
     errors = of_kinhec("metrics").calibration_errors(poses[sequence.frame], true[sequence.frame])
     refined = calibration.refined
-    moved_s = 0.0 if refined is None else refined.time_offsets_s.get(CAMERA, 0.0)
     return OurAnswer(
         status=status_of(calibration),
         error=(errors["X_rot_err_deg"], errors["X_trans_err_mm"]),
@@ -178,7 +177,7 @@ def our_answer(sequence: NeutralSequence, keyframes: Keyframes | None, offset_s:
         held_far=None if refined is None else calibration.contains(sequence.frame, true[sequence.frame], FAR_LEVEL),
         other_held=None if refined is None else calibration.contains(other, true[other], LEVEL),
         seconds=seconds,
-        offset_error_ms=1e3 * abs(offset_s - moved_s - sequence.time_offset_s),
+        offset_error_ms=1e3 * abs(offset_s - sequence.time_offset_s),  # of the streams, as KinHEC's own is
     )
 
 

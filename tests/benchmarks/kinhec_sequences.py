@@ -115,7 +115,9 @@ class NeutralSequence:
     def problem(self, keyframes: Keyframes) -> rw.Problem:
         """The problem, without a weight: nobody tells the noise."""
         problem = rw.Problem(scale=self.scale_mode)
-        problem.add(TARGET, CAMERA, keyframes.A, keyframes.B, stamps_ns=keyframes.stamps_ns, source=self.name)
+        order = np.argsort(keyframes.stamps_ns, kind="stable")  # jitter can exchange neighbours
+        A, B, stamps = keyframes.A[order], keyframes.B[order], keyframes.stamps_ns[order]
+        problem.add(TARGET, CAMERA, A, B, stamps_ns=stamps, source=self.name)
         return problem
 
     def path(self) -> Trajectory:
@@ -125,9 +127,10 @@ class NeutralSequence:
         return Trajectory.of(np.round(1e9 * robot.t).astype(np.int64), A, f"the robot's log of {self.name}")
 
     def detections(self) -> tuple[NDArray[np.int64], FloatArray]:
-        """All of the camera's measurements, with its own stamps, ns."""
+        """All of the camera's measurements in the order of its own stamps, ns: jitter can exchange neighbours."""
         camera = self.package_object.camera
-        measured = camera.has_measurement
+        measured = np.flatnonzero(camera.has_measurement)
+        measured = measured[np.argsort(camera.t[measured], kind="stable")]
         return np.round(1e9 * camera.t[measured]).astype(np.int64), camera.T_cam_target_meas[measured]
 
 

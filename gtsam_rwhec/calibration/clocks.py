@@ -1,0 +1,226 @@
+"""Whether stamps and motion determine the offset of a sensor's clock, from the certified solution alone.
+
+One step of Gauss-Newton with the offset beside the sensor's pose, its targets' poses and a scale tells how large the
+offset is about and how well it would be known. It is not worth estimating where the carriers' path between the stamps
+is not known: they stood still, or the poses are stations, and what lies between them is not in the data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri, stdtrit
+
+from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.pair_data import PairData, local_paths
+from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.trajectories.local_paths import WINDOW_S, LocalPaths
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+
+#: An offset that would be known less well than this, s, is not estimated: a camera's frames are about as far apart.
+LARGEST_SIGMA_S = 0.02
+#: More of the carriers' squared velocity than this may not be noise, or a guess between poses that are far apart.
+LARGEST_UNKNOWN_SHARE = 0.05
+#: Fewer stamps than this determine no offset that could be checked.
+FEWEST_STAMPS = 10
+#: Why a clock without stamps is not estimated.
+NO_STAMPS = "its measurements have no stamps"
+#: At most this many targets of a sensor are looked at, those with most measurements.
+MOST_TARGETS = 40
+#: An offset of so many standard deviations is not zero.
+CLEARLY = 4.0
+#: Residuals beyond this many standard deviations are left out.
+GROSS = 4.5
+#: Blocks of time, with equal shares of the information; their scatter gives the standard deviation too.
+BLOCKS = 8
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What the data say about one sensor's clock; ``str()`` is one sentence.
+
+    Attributes
+    ----------
+    sensor : str
+    is_worth_estimating : bool
+    evidence : str
+        Why, in words.
+    offset_s, sigma_s : float or None
+        A first estimate of the offset, one step from the certified solution, and its standard deviation.
+    """
+
+    sensor: str
+    is_worth_estimating: bool
+    evidence: str
+    offset_s: float | None = None
+    sigma_s: float | None = None
+
+    @property
+    def is_clearly_off(self) -> bool:
+        """Whether the offset is worth estimating, and zero is not among its likely values."""
+        if not self.is_worth_estimating or self.offset_s is None or self.sigma_s is None:
+            return False
+        return abs(self.offset_s) > CLEARLY * self.sigma_s
+
+    def __str__(self) -> str:
+        chosen = "is estimated" if self.is_worth_estimating else "is taken as right"
+        return f"The clock of {self.sensor} {chosen}, because {self.evidence}."
+
+
+def offsets_worth_estimating(
+    problem: Problem, solution: Solution, carrier_path: Trajectory | None = None
+) -> tuple[Clock, ...]:
+    """For each sensor, whether its clock's offset is worth estimating, and why.
+
+    Parameters
+    ----------
+    problem : Problem
+        Measurements as they were paired. Those with stamps on the carriers' clock may have an offset.
+    solution : Solution
+        The certified solution of this problem, or of its inliers.
+    carrier_path : Trajectory, optional
+        T_sensorcarrier_targetcarrier over time, logged faster than the measurements were made. Without it the
+        measurements' own A give the path.
+
+    Returns
+    -------
+    tuple of Clock
+        In the order of ``problem.sensors``.
+    """
+    return tuple(_clock_of(sensor, problem, solution, carrier_path) for sensor in problem.sensors)
+
+
+def _clock_of(sensor: str, problem: Problem, solution: Solution, carrier_path: Trajectory | None) -> Clock:
+    pairs = sorted(
+        (pair for pair in problem.pairs if pair.sensor == sensor), key=lambda pair: -problem.moments(*pair).count
+    )
+    pairs = pairs[:MOST_TARGETS]
+    if not problem.has_measurements:
+        return Clock(sensor, False, "the raw measurements were not kept")
+    if any(pair.is_motion for pair in pairs):
+        return Clock(sensor, False, "its measurements are motions between two stamps, for which no offset is modelled")
+    raws = [problem.measurements(*pair).stamps_ns for pair in pairs]
+    own = [raw for raw in raws if raw is not None]
+    if len(own) < len(raws):
+        return Clock(sensor, False, NO_STAMPS)
+    stamps = np.unique(np.concatenate(own))
+    if len(stamps) < FEWEST_STAMPS:
+        return Clock(sensor, False, f"{len(stamps)} stamps are too few for an offset")
+    if not all(name in solution.X for name, _ in pairs) or sensor not in solution.Y:
+        return Clock(sensor, False, "it is not in the certified solution")
+    apart_s = float(np.median(np.diff(stamps))) * 1e-9
+    try:
+        paths = local_paths(problem, (sensor,), carrier_path)
+    except CountError as error:
+        return Clock(
+            sensor, False, f"the carriers' path about its stamps is not known ({apart_s:.2g} s apart): {error}"
+        )
+    options = RefineOptions(time_offsets=(sensor,), carrier_path=carrier_path)
+    data = [PairData.of(problem, pair, options, paths[pair]) for pair in pairs]
+    unknown = _unknown_share(paths)
+    if unknown > LARGEST_UNKNOWN_SHARE:
+        noise = (
+            f"{100 * min(unknown, 1.0):.0f} % of the carriers' squared velocity at its stamps, {apart_s:.2g} s apart"
+        )
+        return Clock(
+            sensor,
+            False,
+            f"{noise}, is noise or a guess between poses: they stood still, or what lies between the poses is not known"
+            + ("" if carrier_path is not None else ". A path of the carriers that was logged faster would tell"),
+        )
+    offset_s, sigma_s = _one_step(_Rows.of(data, solution, frozenset(problem.fixed_scales)))
+    # What is wrong in the velocities stretches the offset.
+    sigma_s = float(np.hypot(sigma_s, unknown * offset_s))
+    about = f"motion tells it to +-{1e3 * sigma_s:.2g} ms"
+    if not sigma_s <= LARGEST_SIGMA_S:
+        return Clock(sensor, False, f"{about} only", offset_s, sigma_s)
+    if abs(offset_s) > WINDOW_S:
+        return Clock(
+            sensor,
+            False,
+            f"the offset would be {offset_s:+.2g} s, and beyond {WINDOW_S:g} s the path is not linear enough; find it "
+            "with cleaning.estimate_time_offset, and pair A and B again",
+            offset_s,
+            sigma_s,
+        )
+    return Clock(sensor, True, f"{about}, and it is about {1e3 * offset_s:+.3g} ms", offset_s, sigma_s)
+
+
+def _unknown_share(paths: dict[Pair, LocalPaths]) -> float:
+    """The part of the squared velocity that is error: of turning or of moving, whichever is known better."""
+    squares, error = np.zeros(2), np.zeros(2)
+    for path in paths.values():
+        squares += (path.twists() ** 2).sum(axis=0).reshape(2, 3).sum(axis=1)
+        error += len(path.coefficients) * path.velocity_variance.reshape(2, 3).sum(axis=1)
+    return float(np.min(error / np.maximum(squares, 1e-18)))
+
+
+def _one_step(rows: _Rows) -> tuple[float, float]:
+    """One step of Gauss-Newton from the certified solution: the offset, and its standard deviation, s."""
+    good, weight = np.ones(len(rows.r), dtype=bool), np.ones(2)
+    r = rows.r
+    for _ in range(3):
+        squares = (r**2).reshape(-1, 2, 3).sum(axis=2)
+        variance = np.maximum(np.median(squares[good], axis=0) / chdtri(3, 0.5), 1e-24)
+        good = (squares / variance).max(axis=1) < 3.0 * GROSS**2
+        weight = np.repeat(1.0 / variance, 3)
+        J = rows.J[good]
+        H = np.einsum("nip,i,niq->pq", J, weight, J)
+        unit = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
+        inverse = np.linalg.pinv(H / unit[:, None] / unit, rcond=1e-10, hermitian=True) / unit[:, None] / unit
+        step = -inverse @ np.einsum("nip,i,ni->p", J, weight, rows.r[good])
+        r = rows.r + rows.J @ step
+    if not inverse[0, 0] > 0.0:
+        return float(step[0]), np.inf
+    g = rows.J @ (inverse[:, 0] / inverse[0, 0])  # the offset, with all else following
+    information = np.where(good, np.einsum("ni,i,ni->n", g, weight, g), 0.0)
+    scores = np.where(good, np.einsum("ni,i,ni->n", g, weight, r), 0.0)
+    order = np.argsort(rows.stamps_ns, kind="stable")
+    share = np.cumsum(information[order]) / max(float(information.sum()), 1e-300)
+    block = np.minimum((share * BLOCKS).astype(int), BLOCKS - 1)
+    filled = max(len(np.unique(block)), 2)
+    scatter = np.sqrt(float((np.bincount(block, scores[order], BLOCKS) ** 2).sum()) * filled / (filled - 1))
+    scatter *= float(stdtrit(filled - 1, 0.975)) / 1.96
+    total = float(information.sum())
+    return float(step[0]), max(np.sqrt(total), scatter) / max(total, 1e-300)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Residuals (N, 6) of a sensor and their derivatives (N, 6, p): by the offset, Y, each X, each scale."""
+
+    r: Array
+    J: Array
+    stamps_ns: np.ndarray
+
+    @staticmethod
+    def of(data: list[PairData], solution: Solution, fixed_scales: frozenset[str]) -> _Rows:
+        targets = list(dict.fromkeys(item.pair.target for item in data))
+        owners = [] if solution.scale_mode == "known" else [name for name in targets if name not in fixed_scales]
+        scale_at = {name: 7 + 6 * len(targets) + (i if solution.scale_mode == "per_target" else 0)
+                    for i, name in enumerate(owners)}  # fmt: skip
+        columns = max(scale_at.values(), default=6 + 6 * len(targets)) + 1
+        r, J, stamps = [], [], []
+        for item in data:
+            target, sensor = item.pair
+            scale = 1.0
+            if target in scale_at:
+                scale = solution.scale[target] if isinstance(solution.scale, dict) else solution.scale
+            at = item.residuals.linearize(solution.X[target].matrix(), solution.Y[sensor].matrix(), scale)
+            own = np.zeros((item.count, 6, columns))
+            own[:, :, 0] = at.offset
+            own[:, :, 1:7] = at.sensor
+            k = 7 + 6 * targets.index(target)
+            own[:, :, k : k + 6] = at.target
+            if target in scale_at:
+                own[:, :, scale_at[target]] = at.scale
+            r.append(at.residual)
+            J.append(own)
+            assert item.stamps_ns is not None
+            stamps.append(item.stamps_ns)
+        return _Rows(np.concatenate(r), np.concatenate(J), np.concatenate(stamps))

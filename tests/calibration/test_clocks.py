@@ -1,0 +1,189 @@
+"""Which clocks are worth estimating: motion between the stamps decides, not the stamps alone."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from rwhec_factors import se3
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.clocks import FEWEST_STAMPS, Clock, offsets_worth_estimating
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.simulate import Noise, perturb
+from gtsam_rwhec.simulate.transforms import random_poses
+from gtsam_rwhec.trajectories import Trajectory
+
+X, Y = random_poses(2, 0.5, np.random.default_rng(0))
+SIGMA_RAD, SIGMA_M, STEP_S = np.radians(0.3), 0.003, 0.1
+NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
+
+
+def road(t: np.ndarray) -> np.ndarray:
+    """A motion about all axes; the fastest part takes two seconds."""
+    frequency, phase = np.array([1.1, 0.8, 1.9, 0.9, 1.3, 3.1]), np.arange(6.0)
+    return se3.expmap(np.array([0.4, 0.4, 0.3, 0.3, 0.2, 0.1]) * np.sin(frequency * t[:, None] + phase))
+
+
+def logged(hertz: float = 100.0) -> Trajectory:
+    stamps = np.round(np.arange(-200.0, 6000.0) * 1e9 / hertz).astype(np.int64)
+    return Trajectory.of(stamps[stamps < 60 * 10**9], road(stamps[stamps < 60 * 10**9] * 1e-9))
+
+
+def clock(
+    seconds: np.ndarray,
+    *,
+    offset_s: float = 0.0,
+    seed: int = 0,
+    scale: str = "known",
+    path: Trajectory | None = None,
+    noise_of_A: float = 3e-4,
+) -> Clock:
+    """The decision for measurements at these times, which were paired with an offset that nobody knows of."""
+    generator = np.random.default_rng(seed)
+    A = road(seconds) @ se3.expmap(noise_of_A * generator.normal(size=(len(seconds), 6)))
+    B = perturb(np.linalg.inv(Y) @ road(seconds + offset_s) @ X, NOISE, generator)
+    if scale != "known":
+        B[:, :3, 3] *= 2.0
+    problem = rw.Problem(scale)
+    problem.add("tag", "cam", A, B, stamps_ns=np.round(seconds * 1e9).astype(np.int64))
+    (found,) = offsets_worth_estimating(problem, rw.solve(problem), path)
+    return found
+
+
+@pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
+def test_a_stream_tells(scale: str) -> None:
+    found = clock(np.arange(300) / 30.0, offset_s=0.01, scale=scale)
+    assert found.is_worth_estimating
+    assert found.offset_s == pytest.approx(0.01, abs=4.0 * found.sigma_s)
+    assert found.sigma_s < 0.001
+    assert str(found).startswith("The clock of cam is estimated, because motion tells it to +-")
+
+
+def test_keyframes_close_to_one_another_tell() -> None:
+    seconds = np.cumsum(np.random.default_rng(1).uniform(0.05, 0.2, 120))
+    found = clock(seconds, offset_s=0.008)
+    assert found.is_worth_estimating
+    assert found.offset_s == pytest.approx(0.008, abs=4.0 * found.sigma_s)
+
+
+def test_stations_do_not_tell_but_a_logged_path_does() -> None:
+    far = clock(np.arange(15) * 3.0)
+    assert not far.is_worth_estimating
+    assert "path about its stamps is not known (3 s apart)" in far.evidence
+    near = clock(np.cumsum(np.random.default_rng(2).uniform(0.7, 0.99, 40)))
+    assert not near.is_worth_estimating
+    assert "what lies between the poses is not known" in near.evidence
+    path = logged()
+    seconds = np.cumsum(np.random.default_rng(2).uniform(0.7, 0.99, 40))
+    along = clock(seconds, offset_s=0.004, path=path, noise_of_A=0.0)
+    assert along.is_worth_estimating
+    assert along.offset_s == pytest.approx(0.004, abs=4.0 * along.sigma_s)
+
+
+def test_standstill_does_not_tell() -> None:
+    stops = np.repeat(np.arange(12) * 4.1, 8)
+    stamps = np.concatenate([np.arange(8) * 33_333_333 + k * 4 * 10**9 for k in range(12)])
+    generator = np.random.default_rng(3)
+    A = road(stops) @ se3.expmap(3e-4 * generator.normal(size=(96, 6)))
+    problem = rw.Problem()
+    problem.add("tag", "cam", A, perturb(np.linalg.inv(Y) @ road(stops) @ X, NOISE, generator), stamps_ns=stamps)
+    (found,) = offsets_worth_estimating(problem, rw.solve(problem))
+    assert not found.is_worth_estimating
+    assert "they stood still" in found.evidence
+
+
+def test_what_has_no_stamps_or_too_few_is_said() -> None:
+    problem = rw.Problem()
+    seconds = np.arange(30) / 10.0
+    B = np.linalg.inv(Y) @ road(seconds) @ X
+    problem.add("tag", "cam", road(seconds), B)
+    problem.add("tag", "late", road(seconds[:5]), B[:5], stamps_ns=np.arange(5) * 10**8)
+    cam, late = offsets_worth_estimating(problem, rw.solve(problem))
+    assert cam.evidence == "its measurements have no stamps"
+    assert late.evidence == "5 stamps are too few for an offset"
+    assert str(late) == "The clock of late is taken as right, because 5 stamps are too few for an offset."
+
+
+def test_an_offset_beyond_the_path_is_left_to_the_streams() -> None:
+    found = clock(np.arange(600) / 30.0, offset_s=0.9)
+    assert not (found.is_worth_estimating and abs(found.offset_s) > 0.5)
+
+
+def test_outliers_do_not_decide() -> None:
+    seconds = np.arange(300) / 30.0
+    generator = np.random.default_rng(4)
+    B = perturb(np.linalg.inv(Y) @ road(seconds + 0.006) @ X, NOISE, generator)
+    B[:30] = random_poses(30, 0.5, generator)
+    problem, good = rw.Problem(), rw.Problem()
+    stamps = np.round(seconds * 1e9).astype(np.int64)
+    problem.add("tag", "cam", road(seconds), B, stamps_ns=stamps)
+    good.add("tag", "cam", road(seconds[30:]), B[30:], stamps_ns=stamps[30:])
+    (found,) = offsets_worth_estimating(problem, rw.solve(good))
+    assert found.is_worth_estimating
+    assert found.offset_s == pytest.approx(0.006, abs=0.002)
+
+
+@pytest.mark.campaign
+def test_the_first_estimates_standard_deviation_holds() -> None:
+    seconds = np.arange(300) / 30.0
+    found = [clock(seconds, offset_s=0.005, seed=seed) for seed in range(200)]
+    held = [abs(c.offset_s - 0.005) < 1.96 * c.sigma_s for c in found]
+    assert np.mean(held) > 0.89
+
+
+def moving(seed: int, late_s: float = 0.0, count: int = 120, *, stamped: bool = True) -> tuple[rw.Problem, gtsam.Pose3]:
+    """A carrier on a smooth path at 10 Hz, and T_sensorcarrier_sensor: the stamp t is the carriers' t + late_s."""
+    rng = np.random.default_rng(seed)
+    X, Y = (gtsam.Pose3.Expmap(size * rng.standard_normal(6)) for size in (1.0, 0.3))
+    hertz, phase = rng.uniform(0.1, 0.4, (6, 2)), rng.uniform(0.0, 6.0, (6, 2))
+    size = np.r_[np.full(3, 0.5), np.full(3, 0.3)]
+
+    def A(seconds: Array) -> Array:
+        xi = size * np.sin(2.0 * np.pi * hertz * seconds[:, None, None] + phase).sum(axis=2)
+        return np.array([gtsam.Pose3.Expmap(each).matrix() for each in xi])
+
+    seconds = STEP_S * np.arange(count)
+    noise = np.r_[np.full(3, SIGMA_RAD), np.full(3, SIGMA_M)] * rng.standard_normal((count, 6))
+    exact = np.linalg.inv(Y.matrix()) @ A(seconds + late_s) @ X.matrix()
+    B = exact @ np.array([gtsam.Pose3.Expmap(xi).matrix() for xi in noise])
+    problem = rw.Problem()
+    stamps = np.round(1e9 * seconds).astype(np.int64) if stamped else None
+    problem.add("tag", "cam", A(seconds), B, stamps_ns=stamps)
+    return problem, Y
+
+
+def why_of(calibration: rw.Calibration) -> rw.Choice:
+    return next(choice for choice in calibration.choices if choice.what == "time offsets")
+
+
+@pytest.mark.parametrize("late_s", [0.004, 0.03, -0.07])
+def test_a_late_clock_is_found_and_estimated(late_s: float) -> None:
+    """70 ms at 10 Hz look like rows that are shifted by one; the stamps say that the clock is late."""
+    problem, Y = moving(0, late_s)
+    calibration = rw.calibrate(problem)
+    assert calibration.verdict is rw.Verdict.USE
+    sigma_s = np.sqrt(calibration.covariance("time_offset:cam")[0, 0])
+    assert calibration.time_offsets_s["cam"] == pytest.approx(late_s, abs=max(4.0 * sigma_s, 2e-4))
+    assert calibration.contains("cam", Y, 0.9999)
+    assert why_of(calibration).chosen == "estimated for cam"
+
+
+def test_clocks_that_are_right_are_estimated_too() -> None:
+    """A small offset that was taken as none would be missing in the covariances."""
+    problem, Y = moving(1)
+    calibration = rw.calibrate(problem)
+    sigma_s = np.sqrt(calibration.covariance("time_offset:cam")[0, 0])
+    assert abs(calibration.time_offsets_s["cam"]) < 4.0 * sigma_s
+    assert calibration.contains("cam", Y, 0.9999)
+
+
+def test_calibrate_says_why_an_offset_is_not_estimated() -> None:
+    problem, _ = moving(1, 0.03, stamped=False)
+    assert why_of(rw.calibrate(problem)).evidence == "cam: its measurements have no stamps"
+    few, _ = moving(1, count=FEWEST_STAMPS - 1)
+    assert why_of(rw.calibrate(few)).evidence == f"cam: {FEWEST_STAMPS - 1} stamps are too few for an offset"
+    late, _ = moving(1, 0.03)
+    told = rw.calibrate(late, rw.CalibrateOptions(time_offsets=False))
+    assert why_of(told).evidence == "an option says so"
+    assert told.time_offsets_s == {}
