@@ -43,6 +43,8 @@ class Reading:
     warnings: str
     result: Any
     peak_bytes: int
+    #: Of the largest process that the reader itself started, its imports included.
+    children_peak_bytes: int
     seconds: float
 
     @property
@@ -101,10 +103,10 @@ def _image(path: str, size: list[int] | None = None) -> Any:
     return list(gray.shape)
 
 
-def _bag(path: str) -> Any:
+def _bag(path: str, out: str | None = None) -> Any:
     from gtsam_rwhec.logs.ros_bags import convert_ros_bag
 
-    return convert_ros_bag(path, f"{path}.mcap")
+    return convert_ros_bag(path, out or f"{path}.mcap")
 
 
 HOW: dict[str, Callable[..., Any]] = {"log": _log, "copy": _copy, "image": _image, "bag": _bag}
@@ -134,6 +136,7 @@ def _read(how: str, path: str, options: dict[str, Any]) -> dict[str, Any]:
         "warnings": "; ".join(str(w.message) for w in caught)[:100_000],
         "result": result,
         "peak_bytes": (after.ru_maxrss - before.ru_maxrss) * 1024,
+        "children_peak_bytes": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024,
         "seconds": time.process_time() - started,
     }
 
@@ -162,7 +165,7 @@ def _serve() -> None:
             said = stream.read()
         _, status = os.waitpid(child, 0)
         ended = {"error": f"not ours: ended with status {status}", "message": "", "warnings": "", "result": None}
-        print(said or json.dumps({**ended, "peak_bytes": 0, "seconds": 0.0}), flush=True)
+        print(said or json.dumps({**ended, "peak_bytes": 0, "children_peak_bytes": 0, "seconds": 0.0}), flush=True)
 
 
 if __name__ == "__main__":
