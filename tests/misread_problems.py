@@ -56,6 +56,18 @@ def transposed(T: Array) -> Array:
     return pose(T[:, :3, :3].transpose(0, 2, 1), T[:, :3, 3])
 
 
+def in_degrees(T: Array) -> Array:
+    """Poses whose rotation vectors in degrees were taken for radians."""
+    vectors = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    return pose(Rotation.from_rotvec(np.degrees(vectors)).as_matrix(), T[:, :3, 3])
+
+
+def in_radians(T: Array) -> Array:
+    """Poses whose Euler angles (intrinsic ZYX) in radians were taken for degrees."""
+    angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX")
+    return pose(Rotation.from_euler("ZYX", np.radians(angles)).as_matrix(), T[:, :3, 3])
+
+
 @dataclass(frozen=True)
 class Kind:
     """One way to misread A and B, the mistake that it is, and words of the sentence that must name it."""
@@ -83,6 +95,10 @@ KINDS = (
     Kind("B transposed", Mistake.TRANSPOSED, "rotations of B are transposed", of_B=transposed),
     Kind("A left-handed", Mistake.HANDEDNESS, "left-handed", mirrored),
     Kind("B left-handed", Mistake.HANDEDNESS, "left-handed", of_B=mirrored),
+    Kind("A in degrees", Mistake.ANGLE_UNIT, "rotation vectors of A are in degrees", in_degrees),
+    Kind("B in degrees", Mistake.ANGLE_UNIT, "rotation vectors of B are in degrees", of_B=in_degrees),
+    Kind("A in radians", Mistake.ANGLE_UNIT, "angles of A are in radians", in_radians),
+    Kind("B in radians", Mistake.ANGLE_UNIT, "angles of B are in radians", of_B=in_radians),
     Kind("A in millimetres", Mistake.UNIT, "A is in millimetres", in_millimetres),
     Kind("B in millimetres", Mistake.UNIT, "B is in millimetres", of_B=in_millimetres),
     Kind("A in thousands", Mistake.UNIT, "those of A are too small", in_thousands),

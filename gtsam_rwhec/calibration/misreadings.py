@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from rwhec_factors.se3 import inverse, so3_logmap
 
+from gtsam_rwhec.calibration.angle_units import readings_of_angles
 from gtsam_rwhec.calibration.readings import AS_READ, DOUBLE, SINGLE, Mistake, Reading, shifted
 from gtsam_rwhec.calibration.samples import Sampled
 from gtsam_rwhec.calibration.trial_fits import Spread, TrialFit, fitted, residual_of, signal_of
@@ -120,12 +121,15 @@ def misreadings(
     trial = _Trial.of(problem, sampled, signal)
     if trial is None or (is_plain(trial.base.residual, signal) and not is_late):
         return ()
-    found = trial.found(SINGLE) or trial.found(trial.shifts())
+    angles = list(readings_of_angles(*sampled.all_poses))
+    # Rotations that are all small come first: any reading of them fits them.
+    found = trial.found([each for each in angles if each.of_small_angles]) or trial.found(SINGLE)
+    found = found or trial.found(trial.shifts())
     if not found and problem.scale == "known":
         found = trial.found([AS_READ], "shared")
     if found or not trial.is_strange:
         return found
-    found = trial.found(DOUBLE)
+    found = trial.found([each for each in angles if not each.of_small_angles]) or trial.found(DOUBLE)
     if not found and problem.scale == "known":
         found = trial.found(SINGLE, "shared")
     return found
@@ -234,7 +238,9 @@ class _Trial:
         """The logarithm of the product of both residuals' ratios; 0 where it is small, unexplained or chance."""
         before, after = self._floored(self.base.residual), self._floored(fit.residual)
         ratios = (before.rotation_rad / after.rotation_rad, before.translation_m / after.translation_m)
-        for ratio, share in zip(ratios, _shares(after, self.signal), strict=True):
+        # Angles in another unit change what B varies by.
+        signal = signal_of(self.sampled.by(reading)) if reading.mistake is Mistake.ANGLE_UNIT else self.signal
+        for ratio, share in zip(ratios, _shares(after, signal), strict=True):
             if ratio < 1.0 / NOT_WORSE or (ratio > NOT_WORSE and share > EXPLAINED):
                 return 0.0
         gain = float(np.sum(np.log(ratios)))

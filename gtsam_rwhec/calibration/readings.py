@@ -56,6 +56,7 @@ class Reading:
     changed: Callable[[Array, Array], Rows]
     exchanges_roles: bool = False
     shift: int = 0
+    of_small_angles: bool = False
 
     def pair(self, pair: Pair) -> Pair:
         """The pair as it was meant."""

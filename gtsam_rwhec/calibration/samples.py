@@ -76,13 +76,17 @@ class Sampled:
         return True
 
     @property
+    def all_poses(self) -> tuple[Array, Array]:
+        """A and B (N, 4, 4) of all pairs, as they are."""
+        A, B = (np.concatenate(poses) for poses in zip(*self.as_read().values(), strict=True))
+        return A, B
+
+    @property
     def median_lengths(self) -> tuple[float, float]:
         """Median lengths of A's translations about their own median, and of B's."""
-        A, B = (np.concatenate(poses)[:, :3, 3] for poses in zip(*self.as_read().values(), strict=True))
-        return (
-            float(np.median(np.linalg.norm(A - np.median(A, axis=0), axis=1))),
-            float(np.median(np.linalg.norm(B, axis=1))),
-        )
+        A, B = (poses[:, :3, 3] for poses in self.all_poses)
+        centred = A - np.median(A, axis=0)
+        return float(np.median(np.linalg.norm(centred, axis=1))), float(np.median(np.linalg.norm(B, axis=1)))
 
     def by(self, reading: Reading) -> dict[Pair, tuple[Array, Array]]:
         """A and B by another reading. Motions have one frame, and their rows belong together: no roles, no shift."""
