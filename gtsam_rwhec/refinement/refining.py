@@ -104,7 +104,8 @@ def refine(
             guess = everything.start(solution or _any_inliers(problem, options, tell))
             if everything.offsets:  # a clock offset makes outliers wherever the carrier moves
                 first = GeodesicModel.of(data, everything, replace(options, robust="huber"))
-                rough = fit(problem, first, everything, guess, options, estimates)
+                tell("a first estimate of the time offsets")
+                rough = fit(problem, first, everything, guess, options, estimates, tell)
                 guess = everything.state(rough.optimum.values)
             judged = under_worst_axis(problem, data, everything, guess)
         found = graduated(

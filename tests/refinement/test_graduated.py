@@ -18,6 +18,7 @@ import gtsam_rwhec.refinement.truncated_least_squares as stages_module
 import gtsam_rwhec.solver.search as search_module
 from gtsam_rwhec.errors import (
     MeasurementsNotKeptError,
+    NotUniqueWarning,
     OptionError,
     OutlierError,
     OutliersWarning,
@@ -275,6 +276,19 @@ def test_progress_moves() -> None:
     steps = [line for line in told if re.search(r"step \d+ of at most \d+, \d+ of \d+ agree", line)]
     assert len(steps) == len(found.history)
     assert len(set(told)) > 0.9 * len(told)
+
+
+def test_identifiability_is_that_of_what_is_kept() -> None:
+    """Outliers look like noise so large that it could create all information: the first verdict is about them."""
+    simulation = general(1, 1, seed=0, number_of_measurements=12, noise=Noise(0.003, 5000.0))
+    problem, good = corrupted(simulation, 0.4, "random", 0, NOISE, weights="unit")
+    with pytest.warns(NotUniqueWarning):
+        assert not rw.solve(problem).certificate.is_certified
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", NotUniqueWarning)
+        found = graduated(problem, noise_scale="estimate")
+    assert wrongly_classed(found, good) == (0, 0)
+    assert found.solution.certificate.is_certified
 
 
 @pytest.mark.parametrize("noise_scale", ["given", "estimate"])
