@@ -6,6 +6,7 @@ determines everything, weights that tell the truth, the world's origin within a 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -106,7 +107,7 @@ def seeded(seed: int, *, sane: bool = False) -> Case:
     return (_Sane if sane else _Any)(seed).case()
 
 
-class _Draw:
+class _Draw(ABC):
     """The draws that make one problem, in their order."""
 
     def __init__(self, seed: int) -> None:
@@ -126,20 +127,21 @@ class _Draw:
 
     # -- what a subclass decides --------------------------------------------------------------------------------
 
+    @abstractmethod
     def kind(self) -> str:
-        raise NotImplementedError
+        """The kind of problem, as the campaign counts it."""
 
+    @abstractmethod
     def weights(self) -> tuple[float, float]:
         """sigma in metres, kappa."""
-        raise NotImplementedError
 
+    @abstractmethod
     def noise(self) -> tuple[str, float]:
         """Where noise is ("B", "A", "AB" or "none"), and how many of the stated standard deviations."""
-        raise NotImplementedError
 
+    @abstractmethod
     def offsets(self) -> tuple[float, float]:
         """Distances of the world's origin on the target carrier's side and on the sensor carrier's, in metres."""
-        raise NotImplementedError
 
     # -- the problem --------------------------------------------------------------------------------------------
 

