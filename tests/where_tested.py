@@ -33,7 +33,7 @@ def modules() -> Iterator[tuple[str, Path]]:
 TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec": {"test_bad_input.py": "errors"},
     "gtsam_rwhec/calibration": {
-        "calibration/test_calibrating.py": "calibrated choices disagreement options",
+        "calibration/test_calibrating.py": "calibrated choices disagreement noise_choice options",
         "calibration/test_cross_validation.py": "folds prediction_errors",
         "calibration/test_misreadings.py": "readings samples trial_fits wrong_units",
     },
@@ -87,6 +87,12 @@ TABLE: dict[str, dict[str, str]] = {
         "methods/test_heller2014.py": "quaternion_moments unit_weights",
         "methods/test_horn2023.py": "dual_quaternion_relaxation",
         "methods/test_registry.py": "applicability certified estimate evaluation method",
+    },
+    "gtsam_rwhec/noise_model": {
+        "noise_model/test_likelihood.py": "drift eliminated_drift gradient measurements",
+        "noise_model/test_refining.py": (
+            "agreement components found mixture modelled options prior_knowledge reml rows typical"
+        ),
     },
     "gtsam_rwhec/pipeline": {
         "pipeline/test_all_stages.py": "image_options",

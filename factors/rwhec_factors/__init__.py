@@ -20,6 +20,7 @@ from rwhec_factors.priors import (
     rotation_prior_factor,
 )
 from rwhec_factors.shifted_pose_prior import shifted_pose_prior_factor
+from rwhec_factors.with_effects import robot_world_hand_eye_effects_factor, robot_world_hand_eye_effects_factors
 
 __all__ = [
     "BatchResiduals",
@@ -37,6 +38,8 @@ __all__ = [
     "position_along_prior_factor",
     "position_prior_factor",
     "robot_world_hand_eye_batch_factor",
+    "robot_world_hand_eye_effects_factor",
+    "robot_world_hand_eye_effects_factors",
     "robot_world_hand_eye_factor",
     "rotation_prior_factor",
     "shifted_pose_prior_factor",

@@ -56,6 +56,19 @@ def checked_twists(twists: ArrayLike, shape: tuple[int, ...]) -> Array:
     return velocity
 
 
+def checked_effect(effect: ArrayLike, key: int, count: int) -> Array:
+    """The residuals' changes (N, 6, m) by the m coefficients of a key, finite."""
+    changes = np.asarray(effect, dtype=np.float64)
+    if changes.ndim != 3 or changes.shape[:2] != (count, 6) or changes.shape[2] == 0:
+        raise ValueError(
+            f"the effect of {name_of(key)} has shape {changes.shape}; give ({count}, 6, m), one 6 x m matrix for each "
+            "measurement"
+        )
+    if not np.isfinite(changes).all():
+        raise ValueError(f"the effect of {name_of(key)} has entries that are NaN or infinite; give numbers")
+    return changes
+
+
 def checked_vector(value: ArrayLike, name: str) -> Array:
     """Three finite numbers."""
     vector = np.asarray(value, dtype=np.float64)

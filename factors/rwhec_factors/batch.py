@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rwhec_factors import se3
-from rwhec_factors.arguments import check_keys, check_time_offset, checked_pairs, checked_twists
+from rwhec_factors.arguments import check_keys, check_time_offset, checked_effect, checked_pairs, checked_twists
 from rwhec_factors.se3 import Array
-from rwhec_factors.values import number_of, pose_of
+from rwhec_factors.values import number_of, pose_of, vector_of
+
+#: Some measurements, and their effects by key.
+Part = tuple[slice, Mapping[int, ArrayLike]]
 
 
 @dataclass(frozen=True)
@@ -127,35 +132,111 @@ def robot_world_hand_eye_batch_factor(
     TypeError, ValueError
         If the arrays' shapes do not agree, a weight is singular or not finite, or two keys are equal.
     """
+    whole: dict[int, Array] = {}
+    (factor,) = factors_of_parts(
+        target_key, sensor_key, A, B, sqrt_information, [(slice(None), whole)], scale_key=scale_key,
+        time_offset_key=time_offset_key, twists=twists,
+    )  # fmt: skip
+    return factor
+
+
+def factors_of_parts(
+    target_key: int,
+    sensor_key: int,
+    A: Array,
+    B: Array,
+    sqrt_information: Array,
+    parts: Sequence[Part],
+    *,
+    scale_key: int | None,
+    time_offset_key: int | None,
+    twists: Array | None,
+) -> list[gtsam.CustomFactor]:
+    """The factors of ``robot_world_hand_eye_effects_factors``; a part may have no effects."""
     A, B = checked_pairs(A, B)
     check_time_offset(time_offset_key, twists)
     batch = BatchResiduals(A, B, None if twists is None else checked_twists(twists, (len(A), 6)))
-    whitening = _whitening(sqrt_information, len(A))
-    ends = [target_key] if target_key == sensor_key else [target_key, sensor_key]
-    keys = ends + [key for key in (time_offset_key, scale_key) if key is not None]
-    check_keys(keys)
+    whole = _Whitened(batch, _whitening(sqrt_information, len(A)), target_key, sensor_key, scale_key, time_offset_key)
+    check_keys(whole.keys)
+    return [_factor_of_part(whole, rows, effects) for rows, effects in parts]
 
-    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Any] | None) -> Array:
-        X = pose_of(values, target_key, "X = T_targetcarrier_target").matrix()
-        Y = pose_of(values, sensor_key, "Y = T_sensorcarrier_sensor").matrix()
-        scale = 1.0 if scale_key is None else number_of(values, scale_key, "the scale")
-        offset = 0.0 if time_offset_key is None else number_of(values, time_offset_key, "the time offset in seconds")
-        if jacobians is None:
-            residual = batch.residuals(X, Y, scale, offset)
-        else:
-            at = batch.linearize(X, Y, scale, offset)
-            residual = at.residual
-            blocks = [at.target + at.sensor] if len(ends) == 1 else [at.target, at.sensor]
-            if time_offset_key is not None:
+
+@dataclass
+class _Whitened:
+    """All measurements of a pair, whitened; the last evaluation is kept for the other factors of the same pair."""
+
+    batch: BatchResiduals
+    whitening: Array
+    target_key: int
+    sensor_key: int
+    scale_key: int | None
+    time_offset_key: int | None
+    _residual: tuple[bytes, Array] = (b"", np.zeros(0))
+    _linear: tuple[bytes, tuple[Array, ...]] = (b"", ())
+
+    @property
+    def keys(self) -> list[int]:
+        ends = [self.target_key] if self.target_key == self.sensor_key else [self.target_key, self.sensor_key]
+        return ends + [key for key in (self.time_offset_key, self.scale_key) if key is not None]
+
+    def at(self, values: gtsam.Values, *, linearized: bool) -> tuple[Array, tuple[Array, ...]]:
+        """Residuals (6 N,) and, if asked for, the Jacobians (6 N, m) by ``keys``."""
+        X = pose_of(values, self.target_key, "X = T_targetcarrier_target").matrix()
+        Y = pose_of(values, self.sensor_key, "Y = T_sensorcarrier_sensor").matrix()
+        scale = 1.0 if self.scale_key is None else number_of(values, self.scale_key, "the scale")
+        offset = 0.0
+        if self.time_offset_key is not None:
+            offset = number_of(values, self.time_offset_key, "the time offset in seconds")
+        here = np.concatenate([X.ravel(), Y.ravel(), [scale, offset]]).tobytes()
+        if linearized and self._linear[0] != here:
+            at = self.batch.linearize(X, Y, scale, offset)
+            blocks = [at.target + at.sensor] if self.target_key == self.sensor_key else [at.target, at.sensor]
+            if self.time_offset_key is not None:
                 blocks.append(at.offset[:, :, None])
-            if scale_key is not None:
+            if self.scale_key is not None:
                 blocks.append(at.scale[:, :, None])
-            for i, block in enumerate(blocks):
-                jacobians[i] = np.asfortranarray((whitening @ block).reshape(residual.size, -1))
-        whitened: Array = np.einsum("nij,nj->ni", whitening, residual).ravel()
+            self._linear = here, tuple(_rows(self.whitening @ block) for block in blocks)
+            self._residual = here, self._whitened(at.residual)
+        elif self._residual[0] != here:
+            self._residual = here, self._whitened(self.batch.residuals(X, Y, scale, offset))
+        return self._residual[1], self._linear[1]
+
+    def _whitened(self, residual: Array) -> Array:
+        whitened: Array = np.einsum("nij,nj->ni", self.whitening, residual).ravel()
         return whitened
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6 * len(A)), keys, error)
+
+def _factor_of_part(whole: _Whitened, rows: slice, effects: Mapping[int, ArrayLike]) -> gtsam.CustomFactor:
+    """One factor of the measurements in a slice."""
+    first, end, _ = rows.indices(len(whole.whitening))
+    if end <= first or rows.step not in (None, 1):
+        raise ValueError(f"{rows} of {len(whole.whitening)} measurements holds none, or has a step; give slice(i, j)")
+    keys, whitening, own = whole.keys, whole.whitening[rows], slice(6 * first, 6 * end)
+    check_keys(keys + list(effects))
+    # Of x_k the residual is a linear function: one constant Jacobian of all, and the same by variable.
+    linear = [-_rows(whitening @ checked_effect(effect, key, end - first)) for key, effect in effects.items()]
+    of_all = np.hstack(linear) if linear else np.zeros((len(whitening), 0))
+    dimensions = {key: block.shape[1] for key, block in zip(effects, linear, strict=True)}
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Any] | None) -> Array:
+        residual, blocks = whole.at(values, linearized=jacobians is not None)
+        if jacobians is not None:
+            for i, block in enumerate(blocks):
+                jacobians[i] = np.asfortranarray(block[own])
+            for i, block in enumerate(linear, len(blocks)):
+                jacobians[i] = block
+        whitened: Array = residual[own]
+        if dimensions:
+            x = [vector_of(values, key, size, "the coefficients of an effect") for key, size in dimensions.items()]
+            whitened = whitened + of_all @ np.concatenate(x)
+        return whitened
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6 * (end - first)), keys + list(effects), error)
+
+
+def _rows(blocks: Array) -> Array:
+    """The rows (6 N, m) of blocks (N, 6, m), as GTSAM stores matrices."""
+    return np.asfortranarray(blocks.reshape(-1, blocks.shape[2]))
 
 
 def _whitening(sqrt_information: object, count: int) -> Array:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gtsam
 
+from rwhec_factors.se3 import Array
+
 
 def pose_of(values: gtsam.Values, key: int, what: str) -> gtsam.Pose3:
     """The Pose3 of a key. Raises KeyError if the key is missing, and TypeError if it holds another type."""
@@ -22,6 +24,17 @@ def number_of(values: gtsam.Values, key: int, what: str) -> float:
     if vector.shape != (1,):
         raise TypeError(f"{name_of(key)} should be {what}, a 1-vector; it is a vector of {len(vector)}")
     return float(vector[0])
+
+
+def vector_of(values: gtsam.Values, key: int, dimension: int, what: str) -> Array:
+    """The vector of a key. Raises KeyError or TypeError like ``pose_of``, and TypeError for another length."""
+    try:
+        vector: Array = values.atVector(key)
+    except RuntimeError as error:
+        raise _explained(values, key, f"{what}, a {dimension}-vector", error) from error
+    if vector.shape != (dimension,):
+        raise TypeError(f"{name_of(key)} should be {what}, a {dimension}-vector; it is a vector of {len(vector)}")
+    return vector
 
 
 def name_of(key: int) -> str:

@@ -29,6 +29,7 @@ from gtsam_rwhec.errors import FrameError, PoseError, UnderdeterminedError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.pose_covariances import relative_jacobian
 from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.unknowns import Unknown
@@ -50,14 +51,23 @@ class NoiseFound:
         Of B, by pair: of the pair's median measurement, root mean square over axes.
     carriers : str
         The noise of A, in words.
+    model : NoiseInData or None
+        All that the data say of their noise, of A's, in time and over the configuration; None where B's alone was
+        estimated, or noise was given.
+    simple : str
+        Why B's alone was estimated; empty with a model.
     """
 
     source: str
     rotation_rad: dict[Pair, float]
     translation_m: dict[Pair, float]
     carriers: str
+    model: NoiseInData | None = None
+    simple: str = ""
 
     def __str__(self) -> str:
+        if self.model is not None:
+            return str(self.model)
         if not self.rotation_rad:
             return f"Noise of B: {self.source}. Noise of A: {self.carriers}."
         degrees = [math.degrees(value) for value in self.rotation_rad.values()]

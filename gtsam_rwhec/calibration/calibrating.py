@@ -28,6 +28,7 @@ from gtsam_rwhec.calibration.clocks import Clock, offsets_worth_estimating
 from gtsam_rwhec.calibration.disagreement import contradicted_frames
 from gtsam_rwhec.calibration.lengths import doubted_lengths, undetectable
 from gtsam_rwhec.calibration.misreadings import Misreading, misreadings
+from gtsam_rwhec.calibration.noise_choice import Inliers, estimated, offsets_of
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.plausibility import Implausible, implausible
 from gtsam_rwhec.calibration.readings import Mistake
@@ -48,7 +49,7 @@ from gtsam_rwhec.errors import (
 )
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.graduated import graduated
@@ -67,7 +68,6 @@ SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, Ou
 #: A time offset of so many standard deviations explains rows that look shifted.
 SURELY = 5.0
 
-Inliers = dict[Pair, np.ndarray]
 NOT_KNOWN = NoiseFound("not known", {}, {}, "not known")
 
 
@@ -111,56 +111,6 @@ def calibrate(
             "and kappa"
         )
     return _Calibrating(problem, options, progress or silent).done()
-
-
-def estimated(
-    problem: Problem, solution: Solution, inliers: Inliers, options: CalibrateOptions, progress: Progress
-) -> tuple[Refined, NoiseFound]:
-    """The refined calibration of the inliers under the noise that is found, and a record of this noise.
-
-    ``inliers`` is empty where every measurement counts; ``solution`` is the certified one of the inliers. The one place
-    that decides by which model the noise is found.
-
-    Raises
-    ------
-    NoiseError, CountError
-        The measurements are too few for the noise.
-    """
-    kept = selected(problem, inliers) if inliers else problem
-    how = RefineOptions(
-        noise="given" if options.noise == "given" else "estimate",
-        noise_groups=options.noise_groups,
-        residual="geodesic" if problem.has_measurements else "chordal",
-        carrier_noise=options.carrier_noise,
-        time_offsets=_offsets(kept, options),
-        carrier_path=options.carrier_path if _offsets(kept, options) else None,
-    )
-    try:
-        refined = refine(kept, solution, how, progress=progress)
-    except NoiseError:
-        if options.noise != "auto" or problem.is_relative:
-            raise
-        refined = refine(kept, solution, replace(how, noise="given"), progress=progress)
-    counts = {pair: (int(mask.sum()), len(mask)) for pair, mask in inliers.items()}
-    return replace(refined, inliers=inliers, inlier_counts=counts), _noise_of(refined, options)
-
-
-def _noise_of(refined: Refined, options: CalibrateOptions) -> NoiseFound:
-    return NoiseFound(
-        source="estimated from the residuals" if refined.noise_source == "estimated" else "as given",
-        rotation_rad={pair: noise.rotation_rad for pair, noise in refined.noise.items()},
-        translation_m={pair: noise.translation_m for pair, noise in refined.noise.items()},
-        carriers="as given" if options.carrier_noise is not None else "none, A counts as exact",
-    )
-
-
-def _offsets(problem: Problem, options: CalibrateOptions) -> bool | tuple[str, ...]:
-    """The sensors whose time offsets are estimated, of those that the problem has."""
-    if options.time_offsets == "auto":
-        return False
-    if isinstance(options.time_offsets, bool):
-        return options.time_offsets
-    return tuple(name for name in options.time_offsets if name in problem.sensors)
 
 
 class _Answer(NamedTuple):
@@ -301,7 +251,7 @@ class _Calibrating:
         options, what = self.options, "time offsets"
         if options.time_offsets != "auto":
             answer = self._answer_as_told(first)
-            asked = _offsets(self.problem, options)
+            asked = offsets_of(self.problem, options)
             self._choose(what, "estimated" if asked else "not estimated", "an option says so")
             return answer
         before = (list(self.choices), list(self.findings))
@@ -332,7 +282,7 @@ class _Calibrating:
 
     def _offsets_for_outliers(self) -> bool | tuple[str, ...]:
         """Clocks that are clearly off make some of what moves an outlier, so they are taken along."""
-        return self._clearly_off or (_offsets(self.problem, self.options) if self._is_told else ())
+        return self._clearly_off or (offsets_of(self.problem, self.options) if self._is_told else ())
 
     @property
     def _is_told(self) -> bool:
@@ -345,9 +295,10 @@ class _Calibrating:
             return _Answer(None, inliers, None, NOT_KNOWN)
         options = self.options
         self.options = options if offsets is None else replace(options, time_offsets=offsets)
-        refined = self._refined(solution, inliers)
+        refined, noise, solution, inliers = self._refined(solution, inliers)
         self.options = options
-        return _Answer(solution, inliers, *refined)
+        self._say_outliers(inliers)
+        return _Answer(solution, inliers, refined, noise)
 
     def _without_outliers(self, first: Solution | None) -> tuple[Solution | None, Inliers]:
         """The certified solution of the measurements that agree, and which these are."""
@@ -383,15 +334,6 @@ class _Calibrating:
                 Finding(Ground.CONTRADICTED, "too few measurements agree with one another to find out which are wrong")
             )
             return first, {}
-        number = sum(int((~mask).sum()) for mask in inliers.values())
-        if number == 0:
-            self._choose(what, "none", "every measurement agrees with the others")
-            return solution, inliers
-        self._choose(
-            what,
-            f"{number} of {problem.number_of_measurements} measurements were left out",
-            f"they are farther off than {100 * options.inlier_confidence:g} % of good measurements are",
-        )
         return solution, inliers
 
     def _inliers_under_the_full_noise(self, first: Solution) -> tuple[Solution, Inliers]:
@@ -410,10 +352,10 @@ class _Calibrating:
         refined = refine(self.problem, first, how, progress=self.tell)
         return refined.solution, refined.inliers
 
-    def _refined(self, solution: Solution, inliers: Inliers) -> tuple[Refined | None, NoiseFound]:
+    def _refined(self, solution: Solution, inliers: Inliers) -> tuple[Refined | None, NoiseFound, Solution, Inliers]:
         self.tell("refining")
         try:
-            refined, noise = estimated(self.problem, solution, inliers, self.options, self.tell)
+            refined, noise, inliers = estimated(self.problem, solution, inliers, self.options, self.tell)
         except (NoiseError, CountError, UnderdeterminedError) as error:
             self._choose(REFINEMENT, "none", f"the noise cannot be found: {error}")
             self.findings.append(
@@ -423,15 +365,54 @@ class _Calibrating:
                     "are known",
                 )
             )
-            return None, NOT_KNOWN
+            return None, NOT_KNOWN, solution, inliers
         if self.options.noise == "given":
             self._choose("noise of B", "as given", "an option says so")
         elif refined.noise_source == "given":
             self._choose("noise of B", "as given", "the residuals are too few to estimate it")
+        elif noise.model is None:
+            self._choose("noise", "that of B alone is estimated", noise.simple)
         else:
-            freedom = refined.degrees_of_freedom
-            self._choose("noise of B", "estimated", f"the residuals have at least {freedom:.0f} degrees of freedom")
-        return refined, noise
+            self._say_noise(noise.model)
+        return refined, noise, refined.solution, inliers
+
+    def _say_noise(self, model: NoiseInData) -> None:
+        """The choices of the noise model, and the finding that errors depend on the configuration."""
+        options = self.options
+        equations = 6 * self.problem.number_of_measurements
+        self._choose("noise of A and B", "each is estimated", f"from {equations} residuals by restricted likelihood")
+        if model.correlation is None:
+            why = "an option says so" if options.drift == "none" else "neighbours in time are no more alike than others"
+            self._choose("drift", "none", why)
+        else:
+            kind = "a random walk" if model.correlation == 1.0 else f"errors correlated by {model.correlation:g} a step"
+            self._choose(
+                "drift",
+                f"{kind}; {model.instants} frames are worth about {model.worth:.0f}",
+                f"2 log likelihood rises by {model.drift_evidence:.0f}",
+            )
+        if not model.arms_assumed:
+            self._choose("systematic errors", "none", "an option says so")
+            return
+        evidence = f"2 log likelihood changes by {model.systematic_evidence:.0f}"
+        if not model.has_systematic:
+            self._choose("systematic errors", "not found; the covariances hold those that may be there", evidence)
+            return
+        self._choose("systematic errors", "found, and in the covariances", evidence)
+        self.findings.append(
+            Finding(Ground.SYSTEMATIC, f"errors vary with the configuration of the carriers: {model.systematic_words}")
+        )
+
+    def _say_outliers(self, inliers: Inliers) -> None:
+        number = sum(int((~mask).sum()) for mask in inliers.values())
+        if inliers and number == 0:
+            self._choose("outliers", "none", "every measurement agrees with the others")
+        elif inliers:
+            self._choose(
+                "outliers",
+                f"{number} of {self.problem.number_of_measurements} measurements were left out",
+                "they are farther off than good measurements are",
+            )
 
     def _sizes(self, inliers: Inliers) -> tuple[TargetSize, ...]:
         """What the motion says about sizes that were said to be known."""

@@ -8,6 +8,8 @@ from typing import Literal, get_args
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.real_numbers import is_one_of, is_real
+from gtsam_rwhec.noise_model.options import Drift
+from gtsam_rwhec.noise_model.rows import Side
 from gtsam_rwhec.refinement.options import CarrierNoise, NoiseGroups
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.trajectories.trajectory import Trajectory
@@ -30,6 +32,13 @@ class CalibrateOptions:
         Which measurements share an estimate of the noise.
     carrier_noise : CarrierNoise, optional
         The noise of A, if you know it.
+    drift : "auto", "walk", "correlated" or "none"
+        Errors of neighbours in time: found out, a random walk (odometry), with a correlation time, or independent.
+    systematic : bool
+        Whether A has errors that vary with the configuration (an arm's kinematics). The constant part, which no
+        residual shows, is assumed to be as large.
+    hand : "targetcarrier", "sensorcarrier" or None
+        The carrier to which errors of A are fixed: an arm's hand. None: found out.
     robust : "auto", "gnc" or "none"
         "auto" and "gnc": measurements that contradict the others are left out, and the rest is certified again. "auto"
         leaves this out where there are too few measurements to tell. "none": every measurement counts.
@@ -55,6 +64,9 @@ class CalibrateOptions:
     noise: NoiseChoice = "auto"
     noise_groups: NoiseGroups = "all"
     carrier_noise: CarrierNoise | None = None
+    drift: Drift = "auto"
+    systematic: bool = True
+    hand: Side | None = None
     robust: RobustChoice = "auto"
     inlier_confidence: float = 0.997
     misreadings: bool = True
@@ -90,6 +102,18 @@ class CalibrateOptions:
             raise OptionError(f"CalibrateOptions.solve is a {type(self.solve).__name__}; give a SolveOptions")
         if self.carrier_path is not None and self.time_offsets is False:
             raise OptionError("CalibrateOptions.carrier_path has no use with time_offsets=False; leave out one of them")
+        if self.hand is not None and not is_one_of(self.hand, get_args(Side)):
+            raise OptionError(
+                f"CalibrateOptions.hand={brief(self.hand)}; give None, or one of {', '.join(map(repr, get_args(Side)))}"
+            )
+        if not isinstance(self.systematic, bool):
+            raise OptionError(f"CalibrateOptions.systematic={brief(self.systematic)}; give True or False")
 
 
-_CHOICES = {"noise": NoiseChoice, "noise_groups": NoiseGroups, "robust": RobustChoice, "sizes": SizesChoice}
+_CHOICES = {
+    "noise": NoiseChoice,
+    "noise_groups": NoiseGroups,
+    "drift": Drift,
+    "robust": RobustChoice,
+    "sizes": SizesChoice,
+}

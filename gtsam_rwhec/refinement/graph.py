@@ -234,6 +234,11 @@ def add_knowledge(
 ) -> None:
     """Priors, and fixed frames as hard constraints."""
     add_priors(graph, variables, problem, residual)
+    add_fixed(graph, variables, problem)
+
+
+def add_fixed(graph: gtsam.NonlinearFactorGraph, variables: Variables, problem: Problem) -> None:
+    """Fixed frames as hard constraints."""
     for name, T in problem.fixed.items():
         graph.add(gtsam.NonlinearEqualityPose3(variables.frames[name], to_pose3(T[:3, :3], T[:3, 3])))
 

@@ -94,7 +94,7 @@ def refine(
     check_inputs(problem, solution, options)
     estimates = options.noise == "estimate" or (options.noise == "auto" and problem.is_relative)
     everything = Variables.of(problem, sensors_with_offset(problem, options))
-    data = _data(problem, everything, options)
+    data = data_of(problem, everything, options)
     inliers: dict[Pair, np.ndarray] = {}
     factors: FactorsByPair = {}
     start, whole, judged = solution, problem, problem
@@ -144,7 +144,7 @@ def refine(
     return Refined(
         X=state.X,
         Y=state.Y,
-        scale=_scale(problem, state),
+        scale=scale_of(problem, state),
         scale_mode=problem.scale,
         time_offsets_s=state.offsets_s,
         graph=settled.graph,
@@ -155,7 +155,7 @@ def refine(
         cost=settled.optimum.cost,
         initial_cost=settled.graph.error(model.values(variables.start(before))),
         iterations=settled.iterations,
-        moved=_moved(before, state),
+        moved=movements(before, state),
         inlier_counts={pair: (int(kept.sum()), len(kept)) for pair, kept in inliers.items()},
         inliers=inliers,
         free_directions=space.directions,
@@ -258,7 +258,7 @@ def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> 
             )
 
 
-def _data(problem: Problem, variables: Variables, options: RefineOptions) -> list[PairData]:
+def data_of(problem: Problem, variables: Variables, options: RefineOptions) -> list[PairData]:
     """The raw data of every pair; empty for the chordal residual, which takes moments."""
     if options.residual == "chordal":
         if problem.has_covariances:
@@ -272,7 +272,8 @@ def _data(problem: Problem, variables: Variables, options: RefineOptions) -> lis
     return [PairData.of(problem, pair, options, paths.get(pair)) for pair in problem.pairs]
 
 
-def _scale(problem: Problem, state: State) -> float | dict[str, float]:
+def scale_of(problem: Problem, state: State) -> float | dict[str, float]:
+    """The scale of a problem at an estimate, as ``Refined.scale`` has it."""
     if problem.scale == "known":
         return 1.0
     found = {unknown.owner: value for unknown, value in state.scales.items()}
@@ -298,7 +299,8 @@ def _noise(model: Model, settled: SettledFit, options: RefineOptions, estimates:
     return result
 
 
-def _moved(start: Solution, state: State) -> dict[str, Movement]:
+def movements(start: Solution, state: State) -> dict[str, Movement]:
+    """How far each frame moved from a certified solution."""
     moved = {}
     for before, after in ((start.X, state.X), (start.Y, state.Y)):
         for name, pose in after.items():

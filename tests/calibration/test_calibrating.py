@@ -32,7 +32,9 @@ def test_a_good_problem_is_to_be_used_and_its_truth_is_inside() -> None:
     for name, truth in (simulated.X | simulated.Y).items():
         assert calibration.contains(name, truth, 0.9999)
     assert choice(calibration, "outliers").chosen == "none"
-    assert choice(calibration, "noise of B").chosen == "estimated"
+    assert choice(calibration, "noise of A and B").chosen == "each is estimated"
+    assert calibration.noise.model is not None
+    assert str(calibration.noise).startswith("Noise of B for each axis: ")
     assert "No outliers among 80 measurements" in str(calibration.outliers)
     assert str(calibration).startswith("Use these poses: ")
 

@@ -142,6 +142,28 @@ def test_an_error_of_a_factor_comes_out_of_the_optimiser_as_it_is() -> None:
             optimiser(graph, empty).optimize()
 
 
+def test_optimisers_copy_the_values_for_each_factor_and_linearize_does_not() -> None:
+    seen: list[gtsam.Values] = []
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        seen.append(values)
+        if jacobians is not None:
+            jacobians[0] = np.eye(1)
+        return values.atVector(0)
+
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    start.insert(0, np.ones(1))
+    for _ in range(2):
+        graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [0], error))
+    graph.linearize(start)
+    assert [values is start for values in seen] == [True, True]
+    seen.clear()
+    gtsam.GaussNewtonOptimizer(graph, start).iterate()
+    one, other = seen[-2:]
+    assert one.atVector(0) == other.atVector(0)
+    assert one is not other
+
+
 def test_the_readme_lists_every_factor() -> None:
     text = (REPOSITORY / "factors" / "README.md").read_text(encoding="utf-8")
     listed = {name for name in rwhec_factors.__all__ if f"`{name}(" in text}

@@ -1,0 +1,69 @@
+"""The gradient of the restricted likelihood by the components: the way back through its elimination.
+
+Fisher's identity for unit effects u scaled by sigma: d(-2 l) / d log sigma = sum 2 (1 - E[u^2]), with the second
+moments given the residuals. The derivative by the products of the columns [u | d | r] is G = y y' + blkdiag(C, 0),
+y = (mean of the systematic errors and the unknowns, 1) and C their covariance; those of the drift and of white noise
+follow. No step divides by a sigma.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.lapack import dtrtri
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.noise_model.components import C
+from gtsam_rwhec.noise_model.eliminated_drift import EliminatedDrift
+from gtsam_rwhec.noise_model.measurements import Reduced
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """What one evaluation of the likelihood leaves for its gradient.
+
+    Attributes
+    ----------
+    measured : Reduced
+        The single measurements.
+    drift : EliminatedDrift or None
+    L : (q + p, q + p) array
+        The Cholesky factor of the precision of the unit systematic errors and the unknowns.
+    half : (q + p,) array
+        L^-1 of their products with the residual.
+    systematic : (6,) array
+        Standard deviations of the systematic errors.
+    features, products : (T, k) and (T, k k) arrays
+        f of each instant, and f f'; k = 0 without systematic errors.
+    """
+
+    measured: Reduced
+    drift: EliminatedDrift | None
+    L: Array
+    half: Array
+    systematic: Array
+    features: Array
+    products: Array
+
+    def gradient(self) -> dict[C, float]:
+        """d(-2 l) / d log sigma of each component."""
+        (T, k), m = self.features.shape, self.measured.of.m
+        q = 6 * k
+        inverse, _ = dtrtri(self.L, lower=1)
+        y = np.append(-inverse.T @ self.half, 1.0)
+        G = y[:, None] * y
+        G[:-1, :-1] += inverse.T @ inverse
+        each = 2.0 * (1.0 - np.diagonal(G)[:q]).reshape(2, 3 * k).sum(axis=1)
+        result = {C.SYSTEMATIC_ROTATION: float(each[0]), C.SYSTEMATIC_TRANSLATION: float(each[1])}
+        by_cross = np.zeros_like(self.measured.cross)
+        if q:
+            mixed = self.features @ G[:q, q:].reshape(6, k, m).transpose(1, 0, 2).reshape(k, 6 * m)
+            by_cross[:, :6, :m] = 2.0 * self.systematic[:, None] * mixed.reshape(T, 6, m)
+            own = G[:q, :q].reshape(6, k, 6, k).transpose(1, 3, 0, 2).reshape(k * k, 36)
+            both = self.systematic[:, None] * self.systematic
+            by_cross[:, :6, m : m + 6] = both * (self.products @ own).reshape(T, 6, 6)
+        if self.drift is not None:
+            by_cross[:, 6:], by_drift = self.drift.gradient(G)
+            result |= by_drift
+        return self.measured.gradient(G[q:, q:], by_cross) | result

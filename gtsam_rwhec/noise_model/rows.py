@@ -1,0 +1,225 @@
+"""All measurements of a problem as rows of one linear model, with the directions in which each kind of noise acts.
+
+About an estimate the residual r = Log(B^-1 S(Y^-1 A X)) of a measurement is
+
+    r + J d = noise of B + E e + G w + sum_k f_k E u_k
+
+d moves the unknowns; e is a twist of A at this instant, on the side of what moves; w is the drift of the sensor's
+track; u_k are the arm's systematic errors, which vary smoothly with its configuration (f_k).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.geodesic import linearized
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.pair_data import PairData
+from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.refinement.variance_components import jacobian_of
+
+#: Which carrier moves through the other's world: the target's (an arm's hand with a board on it) or the sensor's.
+Side = Literal["targetcarrier", "sensorcarrier"]
+#: The lengths by which configurations are compared (an assumption about arms): rad, and m.
+SMOOTH_RAD, SMOOTH_M = 1.5, 0.75
+#: Directions of the configurations with less than this share of their spread are left out.
+SMALLEST_SPREAD = 1e-4
+#: A velocity is taken from neighbours that are no further apart than this, s.
+NEIGHBOURS_S = 0.5
+
+
+@dataclass(frozen=True)
+class Instants:
+    """Measurements grouped by instant: one carrier pose each, in order of time within a track.
+
+    Attributes
+    ----------
+    order : (N,) array
+        The measurements' places in the order of the pairs' data.
+    first : (T,) array
+        The first measurement of each instant, in that order.
+    index : (N,) array
+        The instant of each measurement, in that order.
+    chain : (N,) array
+        The place of each measurement's track in the state of its instant.
+    chains : int
+        The number of tracks in one state.
+    step : (T,) array
+        Time since the instant before, in typical steps; 0 where a track begins.
+    seconds : (T,) array or None
+        Time since the first instant.
+    """
+
+    order: np.ndarray
+    first: np.ndarray
+    index: np.ndarray
+    chain: np.ndarray
+    chains: int
+    step: Array
+    seconds: Array | None
+
+    @property
+    def count(self) -> int:
+        """The number of instants."""
+        return len(self.first)
+
+    @staticmethod
+    def of(data: list[PairData]) -> Instants:
+        """Measurements of one stamp and one A are of one instant; without stamps, those of one A."""
+        pair = np.concatenate([np.full(item.count, i) for i, item in enumerate(data)])
+        has_stamps = all(item.stamps_ns is not None for item in data)
+        within = np.concatenate([np.arange(item.count) for item in data])
+        stamps = np.concatenate([item.stamps_ns for item in data]) if has_stamps else within
+        A = np.concatenate([item.residuals.A for item in data])
+        rounded = np.round(A[:, :3].reshape(len(A), 12), 9)
+        keys = np.column_stack([stamps.astype(np.float64) * has_stamps, rounded])
+        _, same = np.unique(keys, axis=0, return_inverse=True)
+        same = same.ravel()
+        if len(np.unique(same)) == len(same):  # no instant is shared: one track after the other
+            order = np.lexsort((stamps, pair))
+            begins = np.r_[True, np.diff(pair[order]) != 0]
+            index, chain, chains = np.arange(len(order)), np.zeros(len(order), dtype=np.int64), 1
+        else:
+            earliest = np.full(same.max() + 1, np.iinfo(np.int64).max)
+            np.minimum.at(earliest, same, stamps)
+            order = np.lexsort((pair, same, earliest[same]))
+            changes = np.r_[True, np.diff(same[order]) != 0]
+            index, chain, chains = np.cumsum(changes) - 1, pair[order], len(data)
+            begins = np.arange(index[-1] + 1) == 0
+        first = np.flatnonzero(np.r_[True, np.diff(index) != 0])
+        seconds = (stamps[order][first] - stamps.min()) * 1e-9 if has_stamps else None
+        step = np.ones(len(first))
+        if seconds is not None:
+            step[1:] = np.diff(seconds)
+            usual = step[1:][(step[1:] > 0.0) & ~begins[1:]]
+            step = step / np.median(usual) if len(usual) else np.ones(len(first))
+            step = np.clip(step, 1e-3, 1e3)
+        return Instants(order, first, index, chain, chains, np.where(begins, 0.0, step), seconds)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The linear model about one estimate, in the order of its instants.
+
+    Attributes
+    ----------
+    residual : (N, 6) array
+    jacobian : (N, 6, d) array
+        By the unknowns, in the order of ``Variables.unknowns``.
+    given : (N, 6, 6) array
+        B's covariance as stated; without weights 0.5 rad^2 (kappa = 1) and 1 m^2.
+    axis : (N, 3) array
+        The sensor's z axis in the target's frame.
+    twist : dict of side to (N, 6, 6) array
+        E: by a twist of A on either side.
+    configuration : dict of side to (N, 12) array
+        Rotation and translation of the moving carrier, by ``SMOOTH_RAD`` and ``SMOOTH_M``.
+    rate : (N, 6) array
+        The residual's change for a stamp that is one second late; zero where the velocity is not known.
+    predicted : (N, 4, 4) array
+        T_sensor_target, lengths as measured.
+    length : (N, 3) array
+        The residual's change by the logarithm of the track's scale.
+    """
+
+    instants: Instants
+    residual: Array
+    jacobian: Array
+    given: Array
+    axis: Array
+    twist: dict[Side, Array]
+    configuration: dict[Side, Array]
+    rate: Array
+    predicted: Array
+    length: Array
+
+    @staticmethod
+    def of(
+        data: list[PairData], variables: Variables, state: State, layout: JointCovariance, instants: Instants
+    ) -> Rows:
+        """The rows at an estimate; ``layout`` has the places of the unknowns."""
+        at = linearized(data, variables, state)
+        frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
+        size = len(layout.unit)
+        blocks: list[list[Array]] = [[] for _ in range(10)]
+        for item in data:
+            linear = at[item.pair]
+            X, Y = frames[item.pair.target], frames[item.pair.sensor]
+            J, places = jacobian_of(item.pair, linear, variables, layout)
+            whole = np.zeros((item.count, 6, size))
+            whole[:, :, places] = J
+            A, B = item.residuals.A, item.residuals.B
+            inverse = se3.inverse(A)
+            predicted = np.linalg.inv(Y) @ A @ X
+            scale = variables.scale_of_pair.get(item.pair)
+            predicted[:, :3, 3] *= 1.0 if scale is None else state.scales[scale]
+            # A Expmap(e) on the target carrier's side; Expmap(e) A = A Expmap(Ad(A^-1) e) on the sensor carrier's.
+            right = linear.carrier
+            parts = [
+                linear.residual, whole, item.covariance, B[:, 2, :3], right, right @ se3.adjoint(inverse),
+                _configuration(A), _configuration(inverse), predicted, se3.inverse(predicted)[:, :3, 3],
+            ]  # fmt: skip
+            for block, part in zip(blocks, parts, strict=True):
+                block.append(part)
+        stacked = [np.concatenate(block)[instants.order] for block in blocks]
+        residual, jacobian, given, axis, right, left, moving_target, moving_sensor, predicted, length = stacked
+        A = np.concatenate([item.residuals.A for item in data])[instants.order]
+        rate = np.einsum("nij,nj->ni", right, _velocity(A, instants))
+        return Rows(
+            instants, residual, jacobian, given, axis, {"targetcarrier": right, "sensorcarrier": left},
+            {"targetcarrier": moving_target, "sensorcarrier": moving_sensor}, rate, predicted, length,
+        )  # fmt: skip
+
+    def thinned(self, every: int) -> Rows:
+        """The rows of every so-many-th instant of each track."""
+        instants = self.instants
+        track = np.cumsum(instants.step == 0.0) - 1
+        begins = np.flatnonzero(instants.step == 0.0)
+        place = np.arange(instants.count) - begins[track]
+        kept = place % every == 0
+        rows = kept[instants.index]
+        walked = np.cumsum(instants.step)[kept]
+        step = np.where(instants.step[kept] == 0.0, 0.0, np.diff(walked, prepend=0.0))
+        _, index = np.unique(instants.index[rows], return_inverse=True)
+        fewer = Instants(
+            instants.order[rows], np.flatnonzero(np.r_[True, np.diff(index) != 0]), index, instants.chain[rows],
+            instants.chains, step, None if instants.seconds is None else instants.seconds[kept],
+        )  # fmt: skip
+        return Rows(
+            fewer, self.residual[rows], self.jacobian[rows], self.given[rows], self.axis[rows],
+            {side: twist[rows] for side, twist in self.twist.items()},
+            {side: moving[rows] for side, moving in self.configuration.items()},
+            self.rate[rows], self.predicted[rows], self.length[rows],
+        )  # fmt: skip
+
+    def features(self, side: Side) -> Array:
+        """f (N, k): the centred principal components of the configurations."""
+        centred = self.configuration[side] - self.configuration[side].mean(axis=0)
+        _, s, directions = np.linalg.svd(centred, full_matrices=False)
+        kept = s**2 > SMALLEST_SPREAD * max(float((s**2).sum()), 1e-300)
+        found: Array = centred @ directions[kept].T
+        return found
+
+
+def _configuration(moving: Array) -> Array:
+    R, t = moving[:, :3, :3].reshape(len(moving), 9), moving[:, :3, 3]
+    return np.hstack([R / (np.sqrt(2.0) * SMOOTH_RAD), t / SMOOTH_M])
+
+
+def _velocity(A: Array, instants: Instants) -> Array:
+    """The carriers' velocity (N, 6) at each measurement, from the poses before and after; zero where these are far."""
+    velocity = np.zeros((instants.count, 6))
+    if instants.seconds is not None and instants.count >= 3:
+        poses, t = A[instants.first], instants.seconds
+        linked = (instants.step[1:-1] > 0.0) & (instants.step[2:] > 0.0)
+        apart = t[2:] - t[:-2]
+        near = linked & (apart > 0.0) & (apart <= 2.0 * NEIGHBOURS_S)
+        moved = se3.logmap(se3.inverse(poses[:-2]) @ poses[2:])
+        velocity[1:-1] = np.where(near[:, None], moved / np.where(near, apart, 1.0)[:, None], 0.0)
+    found: Array = velocity[instants.index]
+    return found

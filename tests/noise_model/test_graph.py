@@ -1,0 +1,215 @@
+"""The graph has the model's information and optimum, whatever is in the model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import pytest
+from noisy_rows import problem_of, random_poses
+from rwhec_factors import se3
+from settled_models import SIGMA, settled_at, task_of
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import NotUniqueWarning
+from gtsam_rwhec.noise_model import graph as graphs
+from gtsam_rwhec.noise_model.components import Component
+from gtsam_rwhec.noise_model.graph import NoiseGraph, graph_of, optimum_of
+from gtsam_rwhec.noise_model.modelled import Settled, Task
+from gtsam_rwhec.noise_model.refined import disagreement
+from gtsam_rwhec.noise_model.rows import Side
+from gtsam_rwhec.refinement.optimisation import information_of, optimise
+
+C = Component
+
+
+@dataclass(frozen=True)
+class Case:
+    targets: int = 1
+    sensors: int = 1
+    shared: bool = True
+    count: int = 12
+    scale: str = "shared"
+    correlation: float | None = None
+    systematic: bool = False
+    side: Side = "targetcarrier"
+    priors: bool = False
+    fixed: bool = False
+    offset: bool = False
+
+    def settled(self) -> tuple[Task, Settled, rw.Solution]:
+        if self.offset:
+            problem = smooth(self.sensors)
+        else:
+            problem = problem_of(
+                self.targets, self.sensors, self.count, scale=self.scale, shared=self.shared, missing=2
+            )
+        solution = rw.solve(problem)
+        if self.priors:
+            off = gtsam.Pose3.Expmap(np.array([0.01, -0.02, 0.01, 0.003, 0.001, -0.002]))
+            problem.add_prior("tag_0", solution.X["tag_0"].compose(off), sigma=0.005, kappa=1e4)
+            problem.add_prior("cam_0", solution.Y["cam_0"], sigma=0.01)
+        if self.fixed:
+            problem.fix("cam_0", solution.Y["cam_0"])
+        solution = rw.solve(problem)
+        task = task_of(problem, solution, ("cam_0",) if self.offset else ())
+        found = settled_at(task, solution, self.side, self.correlation, systematic=self.systematic)
+        return task, found, solution
+
+
+CASES = {
+    "plain": Case(),
+    "drift": Case(correlation=1.0),
+    "correlated errors": Case(correlation=0.8, side="sensorcarrier"),
+    "systematic": Case(systematic=True),
+    "shared carriers": Case(2, 2),
+    "shared carriers, all effects": Case(2, 2, correlation=1.0, systematic=True, side="sensorcarrier"),
+    "one track after the other": Case(2, 1, shared=False, correlation=1.0, systematic=True),
+    "priors": Case(priors=True, correlation=1.0, systematic=True),
+    "a fixed frame": Case(2, 1, fixed=True, correlation=1.0),
+    "priors and a fixed frame": Case(2, 2, fixed=True, priors=True, systematic=True),
+    "a scale for each target": Case(2, 1, scale="per_target", correlation=1.0, systematic=True),
+    "known scale": Case(scale="known", correlation=1.0),
+    "a time offset": Case(1, 2, offset=True, correlation=0.9),
+}
+
+
+def smooth(sensors: int) -> rw.Problem:
+    """Along a path without jumps, on which a clock's offset can be found: cam_0's is 10 ms."""
+    chance = np.random.default_rng(4)
+    phase, rate = chance.uniform(0.0, 6.0, 6), chance.uniform(0.5, 1.2, 6)
+    t = np.arange(40) * 0.05
+
+    def path(t: np.ndarray) -> np.ndarray:
+        return se3.expmap(0.6 * np.sin(rate * t[:, None] + phase))
+
+    X, *Y = random_poses(chance, 1 + sensors)
+    problem = rw.Problem()
+    for j in range(sensors):
+        B = np.linalg.inv(Y[j]) @ path(t + 0.01 * (j == 0)) @ X @ random_poses(chance, len(t), 0.003, 0.002)
+        problem.add("tag_0", f"cam_{j}", path(t), B, stamps_ns=np.round(t * 1e9).astype(np.int64))
+    return problem
+
+
+def made_of(task: Task, found: Settled) -> NoiseGraph:
+    return graph_of(found.model, SIGMA, task.data, task.variables, found.state, task.problem)
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_information_and_optimum_are_the_models(case: Case) -> None:
+    task, found, _ = case.settled()
+    made = made_of(task, found)
+    assert not task.free_directions
+    information = information_of(made.unfixed, made.values, task.variables)
+    estimate, basis = found.model.evaluate(SIGMA), found.model.basis
+    expected = np.linalg.inv(estimate.covariance)
+    size = np.sqrt(np.diagonal(expected))
+    difference = basis.T @ information @ basis - expected
+    assert np.abs(difference / size[:, None] / size).max() < 1e-6
+
+    optimum = optimum_of(made, task.variables, has_free=False, max_iterations=100)
+    state = task.variables.state(optimum.values)
+    assert disagreement(task, found, SIGMA, state) < 1e-3
+    by_gtsam = optimise(made.graph, made.values, 100)
+    assert optimum.cost == pytest.approx(by_gtsam.cost, rel=1e-7)
+    for name, T in task.problem.fixed.items():
+        np.testing.assert_allclose((state.X | state.Y)[name].matrix(), T, atol=1e-12)
+
+
+def test_effects_have_names() -> None:
+    task, found, _ = Case(2, 1, correlation=1.0, systematic=True).settled()  # two poses have one measurement only
+    made = made_of(task, found)
+    names = {f"drift:{i}" for i in range(12)} | {f"carrier:{i}" for i in range(10)} | {"systematic"}
+    assert set(made.keys) == names
+    effects = set(made.values.keys()) - set(task.variables.keys.values())
+    assert effects == set(made.keys.values())
+    assert made.values.atVector(made.keys["drift:3"]).shape == (14,)
+    assert made.values.atVector(made.keys["systematic"]).shape == (6 * found.model.features.shape[1],)
+
+
+def test_only_the_effects_of_the_model_are_in_the_graph() -> None:
+    task, found, _ = Case(2, 1, systematic=True).settled()
+    quiet = SIGMA | dict.fromkeys((C.CARRIER_ROTATION, C.CARRIER_TRANSLATION), 0.0)
+    made = graph_of(found.model, quiet, task.data, task.variables, found.state, task.problem)
+    assert set(made.keys) == {"systematic"}
+    quiet |= dict.fromkeys((C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION), 0.0)
+    made = graph_of(found.model, quiet, task.data, task.variables, found.state, task.problem)
+    assert made.keys == {}
+    assert made.graph.size() == 2  # one factor for each pair
+
+
+def test_factors_hold_few_instants(monkeypatch: pytest.MonkeyPatch) -> None:
+    task, found, _ = Case(count=25, correlation=1.0).settled()
+
+    def largest() -> int:
+        graph = made_of(task, found).graph
+        factors = [graph.at(i) for i in range(graph.size())]
+        return max(len(factor.keys()) for factor in factors if isinstance(factor, gtsam.CustomFactor))
+
+    assert largest() == 3 + 10  # X, Y, the scale and ten instants
+    monkeypatch.setattr(graphs, "COLUMNS", 3 * 7)
+    assert largest() == 3 + 3
+
+
+def test_the_values_are_the_drift_that_was_put_in() -> None:
+    chance = np.random.default_rng(5)
+    count, phi = 40, 0.8
+    unit = np.repeat([0.02, 0.01], 3)
+    drift = chance.normal(size=(count, 6))
+    for i in range(1, count):
+        drift[i] = phi * drift[i - 1] + np.sqrt(1.0 - phi**2) * drift[i]
+    still = rw.Problem()
+    still.add("tag_0", "cam_0", *drifting(count, drift * unit, chance), stamps_ns=np.arange(count) * 100_000_000)
+    solution = rw.solve(still)
+    task = task_of(still, solution)
+    found = settled_at(task, solution, "targetcarrier", phi, systematic=False)
+    sigma = dict.fromkeys(C, 0.0)
+    sigma |= {C.ROTATION: 1e-3, C.TRANSLATION: 5e-4, C.DRIFT_ROTATION: 0.02, C.DRIFT_TRANSLATION: 0.01}
+    made = graph_of(found.model, sigma, task.data, task.variables, found.state, still)
+    values = optimum_of(made, task.variables, has_free=False, max_iterations=100).values
+    states = np.array([values.atVector(made.keys[f"drift:{i}"])[:6] for i in range(count)])
+    # X and Y take up what is alike at all instants.
+    away = (states - states.mean(axis=0)) - (drift - drift.mean(axis=0))
+    assert np.sqrt((away**2).mean()) < 0.3
+
+
+def drifting(count: int, drift: np.ndarray, chance: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A, and B with errors of a drift (N, 6) that the residual has, and a little noise."""
+    A, XY, noise = random_poses(chance, count), random_poses(chance, 2), random_poses(chance, count, 1e-3, 5e-4)
+    return A, np.linalg.inv(XY[1]) @ A @ XY[0] @ se3.expmap(-drift) @ noise
+
+
+def test_free_directions_stay_where_they_were() -> None:
+    """A robot that turns about one axis only: the heights are free, and the optimum does not run away."""
+    chance = np.random.default_rng(2)
+    turns = np.zeros((15, 6))
+    turns[:, 2] = chance.uniform(-2.0, 2.0, 15)
+    turns[:, 3:5] = chance.normal(size=(15, 2))
+    A = np.array([gtsam.Pose3.Expmap(turn).matrix() for turn in turns])
+    X, Y = (gtsam.Pose3.Expmap(chance.normal(size=6)).matrix() for _ in range(2))
+    noise = np.array([gtsam.Pose3.Expmap(0.003 * chance.normal(size=6)).matrix() for _ in range(15)])
+    problem = rw.Problem()
+    problem.add("tag_0", "cam_0", A, np.linalg.inv(Y) @ A @ X @ noise, stamps_ns=np.arange(15) * 100_000_000)
+    with pytest.warns(NotUniqueWarning):
+        solution = rw.solve(problem)
+    task = task_of(problem, solution)
+    assert task.free_directions
+    found = settled_at(task, solution, "targetcarrier", 1.0, systematic=False)
+    made = made_of(task, found)
+    optimum = optimum_of(made, task.variables, has_free=True, max_iterations=100)
+    state = task.variables.state(optimum.values)
+    assert disagreement(task, found, SIGMA, state) < 1e-3
+    for name, pose in (found.state.X | found.state.Y).items():
+        np.testing.assert_allclose((state.X | state.Y)[name].matrix(), pose.matrix(), atol=1e-5)
+
+
+def test_a_drift_that_only_turns_is_no_singular_graph() -> None:
+    """GTSAM's optimiser fails where the steps of the translation are a thousand times less than the lever's."""
+    task, found, _ = Case(count=30, correlation=1.0).settled()
+    turning = SIGMA | {C.DRIFT_TRANSLATION: 1e-7}
+    made = graph_of(found.model, turning, task.data, task.variables, found.state, task.problem)
+    optimum = optimum_of(made, task.variables, has_free=False, max_iterations=100)
+    assert optimum.iterations < 10
+    # The step of one hundredth of the lever's costs less than a hundredth of a standard deviation.
+    assert disagreement(task, found, turning, task.variables.state(optimum.values)) < 1e-2

@@ -1,0 +1,144 @@
+"""The restricted likelihood, the estimate and its covariance against dense matrices."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from noisy_rows import problem_of, rows_of
+
+from gtsam_rwhec.noise_model.components import Component
+from gtsam_rwhec.noise_model.drift import TRACK, DriftPrior, drift_columns, unit_of
+from gtsam_rwhec.noise_model.likelihood import NoiseModel
+from gtsam_rwhec.noise_model.rows import Side
+
+C = Component
+SIGMA = {
+    C.ROTATION: 0.01, C.TRANSLATION: 0.004, C.DEPTH: 0.007, C.CARRIER_ROTATION: 0.003, C.CARRIER_TRANSLATION: 0.002,
+    C.JITTER: 0.004, C.DRIFT_ROTATION: 0.001, C.DRIFT_TRANSLATION: 0.0007, C.DRIFT_SCALE: 0.002,
+    C.SYSTEMATIC_ROTATION: 0.02, C.SYSTEMATIC_TRANSLATION: 0.01,
+}  # fmt: skip
+
+
+def dense_drift(prior: DriftPrior, sigma: dict[Component, float]) -> np.ndarray:
+    """The covariance of all states, step by step."""
+    T, s = prior.variance.shape
+    unit = np.tile(unit_of(sigma), s // TRACK)
+    whole = np.zeros((T, s, T, s))
+    for k in range(T):
+        own = np.diag(prior.variance[k])
+        if k:
+            F = prior.transport[k - 1] * (unit / unit[:, None])
+            for j in range(k):
+                whole[k, :, j] = F @ whole[k - 1, :, j]
+                whole[j, :, k] = whole[k, :, j].T
+            own = own + F @ whole[k - 1, :, k - 1] @ F.T
+        whole[k, :, k] = own
+    return whole.reshape(T * s, T * s)
+
+
+@pytest.mark.parametrize("side", ["targetcarrier", "sensorcarrier"])
+@pytest.mark.parametrize("correlation", [None, 0.8, 1.0])
+@pytest.mark.parametrize(("targets", "sensors", "shared"), [(1, 1, True), (2, 2, True), (2, 1, False)])
+def test_it_is_that_of_dense_matrices(
+    targets: int, sensors: int, shared: bool, correlation: float | None, side: Side
+) -> None:
+    rows, *_ = rows_of(problem_of(targets, sensors, 8, scale="shared", shared=shared))
+    # without one frame, nothing is free
+    size = rows.jacobian.shape[2]
+    drift = None if correlation is None else DriftPrior.of(rows, correlation)
+    chance = np.random.default_rng(1)
+    root = chance.normal(size=(size, size))
+    prior, gradient = root @ root.T, chance.normal(size=(size,))
+    features = rows.features(side)[:, :3]
+    model = NoiseModel(rows, side, np.eye(size), prior, gradient, drift, features)
+    found = model.evaluate(SIGMA)
+
+    N = len(rows.residual)
+    blocks = np.zeros((N, 6, N, 6))
+    blocks[np.arange(N), :, np.arange(N)] = model.white(SIGMA)
+    E = rows.twist[side] * np.repeat([SIGMA[C.CARRIER_ROTATION], SIGMA[C.CARRIER_TRANSLATION]], 3)
+    same = rows.instants.index[:, None] == rows.instants.index
+    blocks += np.einsum("nij,mkj->nimk", E, E) * same[:, None, :, None]
+    F = rows.twist[side] * np.repeat([SIGMA[C.SYSTEMATIC_ROTATION], SIGMA[C.SYSTEMATIC_TRANSLATION]], 3)
+    blocks += np.einsum("nij,mkj->nimk", F, F) * (features @ features.T)[:, None, :, None]
+    V = blocks.reshape(6 * N, 6 * N)
+    if drift is not None:
+        states = dense_drift(drift, SIGMA).reshape(rows.instants.count, drift.states, rows.instants.count, -1)
+        G, at = drift_columns(rows, SIGMA, drift), rows.instants.index
+        states = states[at][:, :, at]
+        V += np.einsum("nia,namb,mjb->nimj", G, states, G).reshape(6 * N, 6 * N)
+    inverse = np.linalg.inv(V)
+    J, r = rows.jacobian.reshape(6 * N, -1), rows.residual.ravel()
+    information = J.T @ inverse @ J + prior
+    g = J.T @ inverse @ r + gradient
+    expected = np.linalg.slogdet(V)[1] + np.linalg.slogdet(information)[1] + r @ inverse @ r
+    expected -= g @ np.linalg.solve(information, g)
+    assert found.minus_two_log == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found.step, -np.linalg.solve(information, g), rtol=1e-6, atol=1e-9)
+
+
+def model_of(targets: int, sensors: int, shared: bool, correlation: float | None, side: Side) -> NoiseModel:
+    """With covariances stated, full ones, and some measurements of the last instants left out."""
+    problem = problem_of(targets, sensors, 9, scale="shared", shared=shared, missing=2)
+    rows, *_ = rows_of(problem)
+    chance = np.random.default_rng(2)
+    skewed = np.eye(6) + 0.2 * chance.normal(size=rows.given.shape)
+    rows = replace(rows, given=skewed @ skewed.transpose(0, 2, 1))
+    size = rows.jacobian.shape[2]
+    root = chance.normal(size=(size, size))
+    drift = None if correlation is None else DriftPrior.of(rows, correlation)
+    basis = np.linalg.qr(root)[0][:, 1:]
+    prior, gradient = np.eye(size - 1), chance.normal(size=(size - 1,))
+    return NoiseModel(rows, side, basis, prior, gradient, drift, rows.features(side)[:, :3])
+
+
+@pytest.mark.parametrize("side", ["targetcarrier", "sensorcarrier"])
+@pytest.mark.parametrize("correlation", [None, 0.8, 1.0])
+@pytest.mark.parametrize(("targets", "sensors", "shared"), [(1, 1, True), (2, 2, True), (2, 1, False)])
+def test_the_gradient_is_that_of_differences(
+    targets: int, sensors: int, shared: bool, correlation: float | None, side: Side
+) -> None:
+    model = model_of(targets, sensors, shared, correlation, side)
+    active = tuple(c for c in Component if correlation is not None or not c.startswith("drift"))
+    sigma = SIGMA | dict.fromkeys(set(Component) - set(active), 0.0)
+    estimate, gradient = model.value_and_gradient(sigma, active)
+    assert estimate.minus_two_log == model.evaluate(sigma).minus_two_log
+    for component, found in zip(active, gradient, strict=True):
+        h = 1e-4
+        after, before = (model.evaluate(sigma | {component: sigma[component] * np.exp(s)}) for s in (h, -h))
+        expected = (after.minus_two_log - before.minus_two_log) / (2.0 * h)
+        assert found == pytest.approx(expected, rel=1e-5, abs=1e-6), component
+
+
+@pytest.mark.parametrize("correlation", [0.8, 1.0])
+@pytest.mark.parametrize("sensors", [1, 2])
+def test_the_gradient_goes_to_zero_with_a_component(sensors: int, correlation: float) -> None:
+    model = model_of(1, sensors, True, correlation, "targetcarrier")
+    effects = tuple(c for c in Component if c not in (C.ROTATION, C.TRANSLATION))
+    for size, most in ((1e-6, 1e-3), (1e-12, 1e-9)):
+        _, gradient = model.value_and_gradient(SIGMA | dict.fromkeys(effects, size), effects)
+        np.testing.assert_allclose(gradient, 0.0, atol=most)
+
+
+def test_a_drift_of_rotation_alone_is_the_limit() -> None:
+    """The transport makes translations of rotations: a drift of translation of zero must leave these."""
+    model = model_of(1, 1, True, 1.0, "targetcarrier")
+    none = model.value_and_gradient(SIGMA | {C.DRIFT_TRANSLATION: 0.0}, (C.DRIFT_ROTATION,))
+    small = model.value_and_gradient(SIGMA | {C.DRIFT_TRANSLATION: 1e-6}, (C.DRIFT_ROTATION,))
+    assert none[0].minus_two_log == pytest.approx(small[0].minus_two_log, rel=1e-6)
+    np.testing.assert_allclose(none[1], small[1], rtol=1e-5)
+
+
+def test_components_may_go_to_zero() -> None:
+    rows, *_ = rows_of(problem_of(count=20))
+    size = rows.jacobian.shape[2]
+    drift = DriftPrior.of(rows)
+    known = np.eye(size), np.zeros((size, size)), np.zeros(size)
+    with_all = NoiseModel(rows, "targetcarrier", *known, drift, rows.features("targetcarrier"))
+    white = {component: 0.0 for component in Component} | {C.ROTATION: 0.01, C.TRANSLATION: 0.004}
+    tiny = {component: value or 1e-12 for component, value in white.items()}
+    plain = replace(with_all, drift=None).evaluate(white)
+    assert with_all.evaluate(tiny).minus_two_log == pytest.approx(plain.minus_two_log, rel=1e-9)

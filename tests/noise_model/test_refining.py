@@ -1,0 +1,160 @@
+"""From simulated measurements to the noise that they have, and to covariances that hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from noisy_rows import problem_of, random_poses, rows_of
+from rwhec_factors import se3
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.noise_model import Component, NoiseOptions, refine_under_noise
+from gtsam_rwhec.noise_model.components import SMALLEST, Sizes
+from gtsam_rwhec.noise_model.mixture import DRAWS, SAMPLES
+
+C = Component
+X = se3.expmap(np.array([[0.2, -0.3, 0.1, 0.5, 0.4, 0.2]]))[0]
+Y = se3.expmap(np.array([[1.2, 0.4, -0.6, 0.7, -0.4, 0.5]]))[0]
+
+
+def twists(chance: np.random.Generator, count: int, rotation: float, translation: float) -> np.ndarray:
+    size = np.repeat([rotation, translation], 3)
+    found: np.ndarray = se3.expmap(size * chance.normal(size=(count, 6)))
+    return found
+
+
+def simulated(
+    count: int = 80, *, seed: int = 0, of_A: tuple[float, float] = (0.0, 0.0), walk: tuple[float, float] = (0.0, 0.0)
+) -> rw.Problem:
+    """One pair: a board on a hand. B's noise is 2 mrad and 1 mm; A's is a twist of the hand; the sensor may drift."""
+    chance = np.random.default_rng(seed)
+    A = random_poses(chance, count, 0.7, 0.3)
+    exact = np.linalg.inv(Y) @ A @ X
+    drift = np.eye(4)
+    B = np.empty_like(exact)
+    for i, step in enumerate(twists(chance, count, *walk)):
+        if i:
+            motion = exact[i - 1] @ np.linalg.inv(exact[i])  # the sensor's, T_before_after
+            drift = np.linalg.inv(motion) @ drift @ motion @ step
+        B[i] = np.linalg.inv(drift) @ exact[i]
+    B = B @ twists(chance, count, 0.002, 0.001)
+    problem = rw.Problem()
+    problem.add("board", "camera", A @ twists(chance, count, *of_A), B, stamps_ns=np.arange(count) * 10**8)
+    return problem
+
+
+def under_noise(
+    problem: rw.Problem, options: NoiseOptions | None = None
+) -> tuple[rw.Refined, rw.noise_model.NoiseInData]:
+    found = refine_under_noise(problem, rw.solve(problem), options=options)
+    return found.refined, found.noise
+
+
+def test_noise_of_a_and_b_are_told_apart() -> None:
+    refined, noise = under_noise(simulated(of_A=(0.004, 0.0001)))
+    of = noise.deviations
+    assert of[C.ROTATION].low < 0.0025
+    assert of[C.CARRIER_ROTATION].value == pytest.approx(0.004, rel=0.2)
+    assert noise.hand == "targetcarrier"
+    assert noise.correlation is None
+    assert not noise.has_systematic
+    assert refined.contains("board", X, 0.9999)
+    assert refined.contains("camera", Y, 0.9999)
+    words = str(noise)
+    assert words.startswith("Noise of B for each axis: ")
+    assert "Noise of A for each axis: " in words
+    assert "not found, and not excluded" in words
+
+
+def test_a_random_walk_is_found_and_the_frames_are_worth_less() -> None:
+    refined, noise = under_noise(simulated(walk=(0.003, 0.002)))
+    assert noise.correlation == 1.0
+    assert noise.drift_evidence > 50.0
+    assert noise.deviations[C.DRIFT_ROTATION].value == pytest.approx(0.003, rel=0.3)
+    assert noise.deviations[C.DRIFT_TRANSLATION].value == pytest.approx(0.002, rel=0.3)
+    assert noise.worth < 60.0
+    assert "80 frames are worth about" in str(noise)
+    assert refined.keys["drift:79"] in list(refined.values.keys())
+    plain = rw.refine(simulated(walk=(0.003, 0.002)), refined.solution, rw.RefineOptions(noise="estimate"))
+    assert not plain.contains("camera", Y) or plain.covariance("camera").trace() > refined.covariance("camera").trace()
+
+
+def test_options_overrule() -> None:
+    problem = simulated(of_A=(0.004, 0.0001), count=40)
+    stated = {C.CARRIER_ROTATION: 0.004, C.CARRIER_TRANSLATION: 0.0001}
+    _, noise = under_noise(problem, NoiseOptions(stated=stated, side="sensorcarrier", drift="none", systematic=False))
+    assert noise.hand == "sensorcarrier"
+    assert noise.deviations[C.CARRIER_ROTATION].value == pytest.approx(0.004, rel=0.1)
+    assert not noise.arms_assumed
+    _, noise = under_noise(problem, NoiseOptions(carrier=False, drift="walk", systematic=False))
+    assert C.CARRIER_ROTATION not in noise.deviations
+    assert noise.correlation == 1.0
+
+
+def test_noise_of_a_that_is_larger_than_all_residuals_is_no_error() -> None:
+    stated = {C.CARRIER_ROTATION: 0.1, C.CARRIER_TRANSLATION: 0.05}
+    _, noise = under_noise(simulated(40), NoiseOptions(stated=stated))
+    assert noise.deviations[C.CARRIER_ROTATION].value == pytest.approx(0.1, rel=0.2)
+
+
+def test_too_few_measurements_are_refused() -> None:
+    problem = simulated(2)
+    with pytest.raises(rw.errors.CountError, match="12 equations for 12 unknowns leave 0"):
+        refine_under_noise(problem, rw.solve(problem))
+
+
+def test_measurements_that_drift_explains_come_back_and_outliers_do_not() -> None:
+    problem = simulated(walk=(0.003, 0.002))
+    raw = problem.measurements("board", "camera")
+    B = raw.B.copy()
+    B[30:33] = B[30:33] @ twists(np.random.default_rng(3), 3, 0.5, 0.2)
+    whole = rw.Problem()
+    whole.add("board", "camera", raw.A, B, stamps_ns=raw.stamps_ns)
+    first = np.ones(len(B), dtype=bool)
+    first[25:45] = False
+    kept = rw.Problem()
+    kept.add("board", "camera", raw.A[first], B[first], stamps_ns=raw.stamps_ns[first])
+    pair = rw.Pair("board", "camera")
+    found = refine_under_noise(kept, rw.solve(kept), inliers={pair: first}, whole=whole)
+    assert np.flatnonzero(~found.agreeing[pair]).tolist() == [30, 31, 32]
+    assert found.refined.inlier_counts[pair] == (60, 80)
+    again = refine_under_noise(kept, rw.solve(kept), before=found.settled)
+    assert again.noise.correlation == found.noise.correlation
+    assert again.refined.X["board"].equals(found.refined.X["board"], 1e-4)
+
+
+def test_thinned_rows_keep_the_time_between_instants() -> None:
+    rows, *_ = rows_of(problem_of(2, 1, 11, shared=False))
+    fewer = rows.thinned(3)
+    assert fewer.instants.count == 8  # 4 of each track
+    np.testing.assert_allclose(fewer.instants.step, [0.0, 3.0, 3.0, 3.0, 0.0, 3.0, 3.0, 3.0])
+    np.testing.assert_array_equal(fewer.residual[4:], rows.residual[11::3])
+
+
+def test_a_component_is_held_where_it_is_stated_and_free_elsewhere() -> None:
+    sizes = Sizes.of({C.ROTATION: 0.01, C.TRANSLATION: 0.004}, {C.ROTATION: 0.02})
+    assert sizes.penalty(np.log([0.02, 0.3 * 0.004])) == pytest.approx(0.0, abs=1e-12)
+    step = 1e-6
+    at = np.log([0.021, 0.01])
+    by_difference = [(sizes.penalty(at + step * e) - sizes.penalty(at - step * e)) / (2 * step) for e in np.eye(2)]
+    np.testing.assert_allclose(sizes.penalty_gradient(at), by_difference, rtol=1e-6)
+    assert sizes.penalty(np.log([0.03, 0.004])) > 100.0 > sizes.penalty(np.log([0.02, 0.1]))
+    assert np.exp(sizes.bounds[1][0]) == pytest.approx(SMALLEST * 0.004)
+
+
+def test_priors_of_frames_count() -> None:
+    problem = simulated(30)
+    loose = under_noise(problem)[0]
+    problem.add_prior("camera", Y, sigma=1e-5, kappa=1e9)
+    tight = under_noise(problem)[0]
+    assert loose.covariance("camera").trace() > 10.0 * tight.covariance("camera").trace()
+    np.testing.assert_allclose(tight.Y["camera"].matrix(), Y, atol=1e-4)
+
+
+def test_a_mixture_has_weights_and_quantiles() -> None:
+    problem = simulated(15)
+    found = refine_under_noise(problem, rw.solve(problem))
+    for of in found.noise.deviations.values():
+        assert 0.0 < of.low <= of.value <= of.high
+    assert SAMPLES * DRAWS >= 2000
+    assert found.refined.degrees_of_freedom > 3.0
