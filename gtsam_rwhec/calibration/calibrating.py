@@ -68,6 +68,8 @@ SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, Ou
 #: A time offset of so many standard deviations explains rows that look shifted.
 SURELY = 5.0
 
+#: A clock that was taken as right moves poses by millimetres and more if it is off by more than this, s.
+LATE_S = 0.005
 NOT_KNOWN = NoiseFound("not known", {}, {}, "not known")
 
 
@@ -253,6 +255,8 @@ class _Calibrating:
             answer = self._answer_as_told(first)
             asked = offsets_of(self.problem, options)
             self._choose(what, "estimated" if asked else "not estimated", "an option says so")
+            if not asked and answer.refined is not None:
+                self._doubt_stated_clocks(self._clocks(answer.solution, answer.inliers))
             return answer
         before = (list(self.choices), list(self.findings))
         clocks = self._clocks(first, {})
@@ -273,6 +277,14 @@ class _Calibrating:
         chosen = f"estimated for {', '.join(found)}" if found else "not estimated"
         self._choose(what, chosen, "; ".join(f"{clock.sensor}: {clock.evidence}" for clock in after))
         return answer
+
+    def _doubt_stated_clocks(self, clocks: tuple[Clock, ...]) -> None:
+        """Clocks that were taken as right, and that the motion contradicts."""
+        for clock in clocks:
+            if clock.is_clearly_off and clock.offset_s is not None:
+                ground = Ground.LATE_CLOCK if abs(clock.offset_s) > LATE_S else Ground.COVARIANCE_DOUBTED
+                said = f"the clock of {clock.sensor} was taken as right, but {clock.evidence}"
+                self.findings.append(Finding(ground, said))
 
     def _clocks(self, solution: Solution | None, inliers: Inliers) -> tuple[Clock, ...]:
         if solution is None:

@@ -60,6 +60,8 @@ class Ground(StrEnum):
     CONTRADICTED = "contradicted"
     #: A sensor has no measurement in the answer, and so no pose.
     NO_ANSWER = "no_answer"
+    #: The clock of a sensor is late, and was taken as right.
+    LATE_CLOCK = "late_clock"
     #: The stated size of a target was used, but it does not fit the motion.
     SIZE_DOUBTED = "size_doubted"
     #: The measurements are too few to tell how well the poses are known.
@@ -101,6 +103,7 @@ _ADVICE = {
         "check whether the named frame has moved or has another frame's name, and whether its clock is late"
     ),
     Ground.NO_ANSWER: "measure with this sensor, or leave it out of the problem",
+    Ground.LATE_CLOCK: "let its time offset be estimated (in a rig file: time_offset: estimate)",
     Ground.SIZE_DOUBTED: "measure the named target again, or let its size be estimated",
     Ground.NO_COVARIANCE: "take more measurements",
     Ground.TARGET_CONTRADICTED: (

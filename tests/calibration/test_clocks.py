@@ -187,3 +187,11 @@ def test_calibrate_says_why_an_offset_is_not_estimated() -> None:
     told = rw.calibrate(late, rw.CalibrateOptions(time_offsets=False))
     assert why_of(told).evidence == "an option says so"
     assert told.time_offsets_s == {}
+
+
+def test_a_late_clock_that_was_taken_as_right_is_not_passed_over() -> None:
+    options = rw.CalibrateOptions(time_offsets=False, misreadings=False)
+    late = rw.calibrate(moving(0, 0.03)[0], options)
+    assert late.judgement.grounds == (rw.Ground.LATE_CLOCK,)
+    assert "the clock of cam was taken as right, but motion tells it to" in late.verdict_reason
+    assert rw.calibrate(moving(0)[0], options).verdict is rw.Verdict.USE
