@@ -102,7 +102,7 @@ KINDS = (
     Kind("A in millimetres", Mistake.UNIT, "A is in millimetres", in_millimetres),
     Kind("B in millimetres", Mistake.UNIT, "B is in millimetres", of_B=in_millimetres),
     Kind("A in thousands", Mistake.UNIT, "those of A are too small", in_thousands),
-    Kind("size wrong", Mistake.SCALE, "lengths in B are 1.25 times the true ones", of_B=too_large),
+    Kind("size wrong", Mistake.SCALE, "lengths in B are 1.2", of_B=too_large),
     Kind("rows of A late", Mistake.ROWS_SHIFTED, "rows of A come 1 row later", shift=1),
     Kind("rows of B late", Mistake.ROWS_SHIFTED, "rows of B come 3 rows later", shift=-3),
 )
