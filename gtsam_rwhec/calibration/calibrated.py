@@ -25,6 +25,7 @@ from gtsam_rwhec.calibration.task_units import (
     jacobian_of_point,
 )
 from gtsam_rwhec.calibration.verdict import Finding, Judgement, Verdict
+from gtsam_rwhec.calibration.views import SensorView
 from gtsam_rwhec.errors import FrameError, PoseError, UnderdeterminedError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.pose_covariances import relative_jacobian
@@ -122,14 +123,6 @@ class Outliers:
         more = f", and some of {len(out) - NAMED} other pairs" if len(out) > NAMED else ""
         said = f"{self.number} of {total} measurements contradict the others and were left out"
         return f"{said}: {', '.join(named)}{more}."
-
-
-@dataclass(frozen=True)
-class SensorView:
-    """Where a sensor saw its targets: the typical point (3,) in metres, and whether every one was in front of it."""
-
-    point_m: tuple[float, float, float]
-    in_front: bool
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from gtsam_rwhec.calibration.calibrated import (
     Carriers,
     NoiseFound,
     Outliers,
-    SensorView,
 )
 from gtsam_rwhec.calibration.choices import Choice
 from gtsam_rwhec.calibration.clocks import Clock, offsets_worth_estimating
@@ -34,6 +33,7 @@ from gtsam_rwhec.calibration.plausibility import Implausible, implausible
 from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.calibration.sizes import TargetSize, sizes
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
+from gtsam_rwhec.calibration.views import views_of
 from gtsam_rwhec.errors import (
     CountError,
     NoiseError,
@@ -498,30 +498,3 @@ def spare_equations(problem: Problem) -> int:
         scales = len({pair.target for pair in problem.pairs} - set(problem.fixed_scales))
     known = sum(3 * (prior.sigma is not None) + 3 * (prior.kappa is not None) for prior in beliefs)
     return 6 * problem.number_of_measurements + known - 6 * len(free) - scales
-
-
-def views_of(problem: Problem, inliers: Inliers, scale: float | dict[str, float]) -> dict[str, SensorView]:
-    """Where each sensor saw its targets: their median distance, in their mean direction, true metres."""
-    points: dict[str, list[np.ndarray]] = {}
-    if not problem.has_measurements:
-        return {}
-    for pair in problem.pairs:
-        if pair.is_motion:
-            continue
-        seen = problem.measurements(*pair).B[:, :3, 3]
-        if inliers:
-            seen = seen[inliers[pair]]
-        length = scale.get(pair.target) if isinstance(scale, dict) else scale
-        if len(seen) and length is not None:
-            points.setdefault(pair.sensor, []).append(seen / length)
-    return {sensor: _view(np.concatenate(seen)) for sensor, seen in points.items()}
-
-
-def _view(seen: np.ndarray) -> SensorView:
-    distances = np.linalg.norm(seen, axis=1)
-    mean = (seen / np.maximum(distances, 1e-300)[:, None]).mean(axis=0)
-    length = float(np.linalg.norm(mean))
-    # Seen all around, the mean has no direction; then z, which is forward for cameras.
-    direction = mean / length if length > 0.1 else np.array([0.0, 0.0, 1.0])
-    x, y, z = (float(np.median(distances)) * direction).tolist()
-    return SensorView((x, y, z), bool((seen[:, 2] > 0.0).all()))
