@@ -57,6 +57,8 @@ class NoiseFound:
         estimated, or noise was given.
     simple : str
         Why B's alone was estimated; empty with a model.
+    has_failed : bool
+        Whether the model of all noise could not be computed.
     """
 
     source: str
@@ -65,6 +67,7 @@ class NoiseFound:
     carriers: str
     model: NoiseInData | None = None
     simple: str = ""
+    has_failed: bool = False
 
     def __str__(self) -> str:
         if self.model is not None:

@@ -384,6 +384,9 @@ class _Calibrating:
             self._choose("noise of B", "as given", "the residuals are too few to estimate it")
         elif noise.model is None:
             self._choose("noise", "that of B alone is estimated", noise.simple)
+            if noise.has_failed:
+                words = "the noise of A and errors that vary with the configuration could not be computed"
+                self.findings.append(Finding(Ground.COVARIANCE_DOUBTED, words))
         else:
             self._say_noise(noise.model)
         return refined, noise, refined.solution, inliers

@@ -54,13 +54,15 @@ def estimated(
         time_offsets=offsets_of(kept, options),
         carrier_path=options.carrier_path if offsets_of(kept, options) else None,
     )
-    why = "the noise of B alone"
+    why, failed = "a model of all noise was not asked for", False
     is_whole = options.noise != "given" and options.noise_groups == "all" and _is_plain(options.carrier_noise)
     if is_whole and problem.has_measurements:
         try:
             return _by_the_whole_model(problem, solution, how, options, inliers, progress)
         except CountError as error:
-            why = f"the noise of B alone: {error}"
+            why = str(error)
+        except np.linalg.LinAlgError as error:  # noises many orders apart
+            why, failed = f"that of A and B together could not be computed ({error})", True
     try:
         refined = refine(kept, solution, how, progress=progress)
     except NoiseError:
@@ -68,7 +70,8 @@ def estimated(
             raise
         refined = refine(kept, solution, replace(how, noise="given"), progress=progress)
     counts = {pair: (int(mask.sum()), len(mask)) for pair, mask in inliers.items()}
-    return replace(refined, inliers=inliers, inlier_counts=counts), _noise_of(refined, options, None, why), inliers
+    noise = replace(_noise_of(refined, options, None, why), has_failed=failed)
+    return replace(refined, inliers=inliers, inlier_counts=counts), noise, inliers
 
 
 def _by_the_whole_model(
