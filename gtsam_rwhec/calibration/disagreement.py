@@ -8,6 +8,11 @@ from dataclasses import dataclass
 
 from gtsam_rwhec.problem.pairs import Pair
 
+#: Outliers that agree with each other (a planar target's other pose) may be nearly half, and then win by chance.
+NEARLY_HALF = 0.45
+#: From so many measurements on, nearly half is no accident.
+MANY = 10
+
 
 @dataclass(frozen=True)
 class LeftOut:
@@ -22,12 +27,13 @@ class LeftOut:
 
     @property
     def is_majority(self) -> bool:
-        """Whether more than half of the measurements are outliers."""
-        return 2 * self.left_out > self.measurements
+        """Whether more than half of the measurements are outliers; of many measurements, nearly half."""
+        most = NEARLY_HALF if self.measurements >= MANY else 0.5
+        return self.left_out > most * self.measurements
 
 
 def contradicted_frames(counts: Mapping[Pair, tuple[int, int]]) -> tuple[LeftOut, ...]:
-    """The sensors and targets of which more than half of the measurements were left out as outliers.
+    """The sensors and targets of which more than half, or of many nearly half, of the measurements were left out.
 
     ``counts`` has the number that was kept and the number of all, by pair. Where most are outliers the answer is as
     likely to be wrong as they are: a clock, a size or a mounting may have changed. The frame with most outliers comes

@@ -274,10 +274,11 @@ def mixed(task: Task, found: Settled) -> tuple[JointCovariance, Mixture]:
 
 
 def constant_error(task: Task, found: Settled, state: State, mixture: Mixture) -> Array:
-    """The covariance (d, d) of what a constant error of A adds to the frames on the hand.
+    """The covariance (d, d) of what constant errors of A, of the hand and of the base, add to the frames there.
 
-    A Expmap(c) X = A X Expmap(Ad(X^-1) c): no residual shows c, since X takes it up. It is tied to the part that varies
-    with the configuration: the same standard deviations. (An assumption about arms.)
+    A Expmap(c) X = A X Expmap(Ad(X^-1) c), and Expmap(c) A X = Y B the same for Y: no residual shows c, since X or Y
+    takes it up. It is tied to the part that varies with the configuration: the same standard deviations. (An assumption
+    about arms: the first links' errors move with the base, the last links' with the hand.)
     """
     active = found.fit.sizes.active
     size = len(task.layout.unit)
@@ -285,17 +286,17 @@ def constant_error(task: Task, found: Settled, state: State, mixture: Mixture) -
         return np.zeros((size, size))
     places = [active.index(c) for c in (C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION)]
     deviations = np.repeat(np.exp(mixture.logs[:, places]), 3, axis=1)  # (samples, 6)
-    poses = state.X if found.model.side == "targetcarrier" else state.Y
-    shift, shares = np.zeros((size, 6)), [0.0]
-    for name, pose in poses.items():
-        unknown = Unknown(UnknownKind.FRAME, name)
-        if unknown in task.layout.slots:
-            rows = task.layout.slots[unknown]
-            shift[rows] = pose.inverse().AdjointMap()
-            if not task.layout.free[rows].any():
-                shares.append(mixture.share_of(found.model.basis[rows], shift[rows] * deviations[:, None, :]))
-    variance = max(shares) * (mixture.weights @ deviations**2)
-    added: Array = (shift * variance) @ shift.T
+    added = np.zeros((size, size))
+    for poses in (state.X, state.Y):
+        shift, shares = np.zeros((size, 6)), [0.0]
+        for name, pose in poses.items():
+            unknown = Unknown(UnknownKind.FRAME, name)
+            if unknown in task.layout.slots and name not in task.problem.priors:  # a prior is of the true pose
+                rows = task.layout.slots[unknown]
+                shift[rows] = pose.inverse().AdjointMap()
+                if not task.layout.free[rows].any():
+                    shares.append(mixture.share_of(found.model.basis[rows], shift[rows] * deviations[:, None, :]))
+        added += (shift * max(shares) * (mixture.weights @ deviations**2)) @ shift.T
     return added
 
 

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 from refinement_problems import KAPPA, SIGMA_M, copied, rig
+from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.calibrating import spare_equations
@@ -197,3 +198,16 @@ def test_input_that_cannot_be_used_raises() -> None:
         rw.calibrate(relative, rw.CalibrateOptions(noise="given"))
     with pytest.raises(rw.errors.NoiseError, match="give a positive standard deviation"):
         rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(0.0, 0.001))
+
+
+def test_a_target_of_which_half_of_the_measurements_disagree_is_not_to_be_used() -> None:
+    """Outliers that agree with each other, as the other pose of a planar target does, win by chance."""
+    chance = np.random.default_rng(0)
+    A = se3.expmap(np.hstack([0.7 * chance.normal(size=(30, 3)), 0.3 * chance.normal(size=(30, 3))]))
+    X, Y = se3.expmap(np.array([[0.3, 0.1, -0.2, 0.1, 0.0, 0.2], [1.0, 0.3, -0.5, 0.5, 0.4, 0.6]]))
+    turned = X @ se3.expmap(np.array([[0.0, 0.0, np.pi - 0.1, 0.0, 0.0, 0.0]]))[0]
+    B = np.linalg.inv(Y) @ A @ np.where(np.arange(30)[:, None, None] < 15, X, turned)
+    problem = rw.Problem()
+    problem.add("board", "camera", A, B @ se3.expmap(0.002 * chance.normal(size=(30, 6))))
+    calibration = rw.calibrate(problem)
+    assert calibration.verdict is rw.Verdict.DO_NOT_USE

@@ -151,6 +151,15 @@ def test_priors_of_frames_count() -> None:
     np.testing.assert_allclose(tight.Y["camera"].matrix(), Y, atol=1e-4)
 
 
+def test_the_constant_error_of_an_arm_is_in_the_frames_of_both_carriers() -> None:
+    problem = simulated(30)
+    with_it = under_noise(problem)[0]
+    without = under_noise(problem, NoiseOptions(systematic=False))[0]
+    for name in ("board", "camera"):
+        added = with_it.covariance(name) - without.covariance(name)
+        assert np.linalg.eigvalsh(added).max() > 0.05 * np.linalg.eigvalsh(without.covariance(name)).max()
+
+
 def test_a_mixture_has_weights_and_quantiles() -> None:
     problem = simulated(15)
     found = refine_under_noise(problem, rw.solve(problem))
