@@ -60,8 +60,9 @@ from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
-#: Without at least so many equations more than unknowns no measurement can be left out: each one has six.
-SPARE_EQUATIONS = 6
+#: Without at least so many equations more than unknowns a wrong measurement cannot be told from the others: it has six
+#: of its own, and the rest must tell noise from it.
+SPARE_EQUATIONS = 24
 #: The verdict says better what these warn of.
 SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, OutliersWarning)
 
@@ -327,7 +328,7 @@ class _Calibrating:
                 what,
                 "not looked for",
                 f"{problem.number_of_measurements} measurements have {spare} equations more than unknowns, and to "
-                f"leave one out takes {SPARE_EQUATIONS}",
+                f"find a wrong one takes {SPARE_EQUATIONS}",
             )
             return first, {}
         noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
@@ -396,7 +397,11 @@ class _Calibrating:
         options = self.options
         equations = 6 * self.problem.number_of_measurements
         self._choose("noise of A and B", "each is estimated", f"from {equations} residuals by restricted likelihood")
-        if model.correlation is None:
+        if model.is_drift_untried:
+            self._choose("drift", "not modelled", "too many pairs are measured at the same instants")
+            words = "errors of neighbours in time are alike, and the standard deviations do not count with it"
+            self.findings.append(Finding(Ground.CORRELATED, words))
+        elif model.correlation is None:
             why = "an option says so" if options.drift == "none" else "neighbours in time are no more alike than others"
             self._choose("drift", "none", why)
         else:

@@ -46,6 +46,8 @@ class NoiseInData:
         Of a track's errors from one step to the next; 1 is a random walk, None no drift.
     drift_evidence, systematic_evidence : float
         How much twice the log likelihood rose with drift, and with errors that vary with the configuration.
+    is_drift_untried : bool
+        Whether residuals are correlated in time, and there are too many tracks for a model of it.
     arms_assumed : bool
         Whether the covariance has a constant error of A, which no residual shows, as large as the part that varies.
     """
@@ -57,6 +59,7 @@ class NoiseInData:
     correlation: float | None
     drift_evidence: float
     systematic_evidence: float
+    is_drift_untried: bool
     arms_assumed: bool
 
     @property

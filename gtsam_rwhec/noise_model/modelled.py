@@ -19,7 +19,7 @@ from gtsam_rwhec.noise_model.options import NoiseOptions
 from gtsam_rwhec.noise_model.prior_knowledge import prior_terms
 from gtsam_rwhec.noise_model.reml import Fitted, fitted
 from gtsam_rwhec.noise_model.rows import Instants, Rows, Side
-from gtsam_rwhec.noise_model.typical import typical_sizes
+from gtsam_rwhec.noise_model.typical import QUIETEST, typical_sizes
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.pair_data import PairData
@@ -34,6 +34,8 @@ SETTLED = 0.05
 INSTANTS = 300
 #: A dense log has fewer samples of the components, which are known well.
 FEWER_SAMPLES = 12
+#: In fewer rows the unknowns have this share of the information of all rows on top.
+HELD = 1e-3
 #: A track has at least this many instants for a drift.
 SHORTEST_TRACK = 20
 #: Tracks that are seen at the same instants share a state of at most this many tracks.
@@ -46,6 +48,8 @@ MORE_CORRELATIONS = (0.6, 0.97)
 PAYS = 6.0
 #: Residuals are correlated in time when their lag-1 correlation is beyond this many standard deviations.
 CORRELATED = 2.5
+#: Beyond this many, where no model of it can be tried, the verdict says so.
+SURELY_CORRELATED = 8.0
 #: Before the data, the hand is the carrier that is nearer to its frames: this times log of the ratio of distances.
 NEARER = 4.0
 
@@ -140,7 +144,11 @@ def thinned(model: NoiseModel) -> NoiseModel:
     rows = model.rows.thinned(every)
     kept = np.isin(model.rows.instants.order, rows.instants.order)
     drift = None if model.drift is None else DriftPrior.of(rows, model.drift.correlation)
-    return replace(model, rows=rows, drift=drift, features=model.features[kept])
+    # Frames that are not seen in these rows are held by a little of what all rows know of them.
+    size = np.sqrt((model.rows.residual**2).mean(axis=0)) + QUIETEST
+    J = (model.rows.jacobian @ model.basis / size[:, None]).reshape(-1, model.basis.shape[1])
+    held = model.prior_information + HELD * (J.T @ J)
+    return replace(model, rows=rows, drift=drift, features=model.features[kept], prior_information=held)
 
 
 def settled(task: Task, start: State, tell: Progress, before: Settled | None = None) -> Settled:
@@ -201,7 +209,7 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     return walk if options.drift != "auto" or walk.fit.objective < steady.fit.objective - PAYS else steady
 
 
-def is_correlated(found: Settled) -> bool:
+def is_correlated(found: Settled, limit: float = CORRELATED) -> bool:
     """Whether residuals of neighbours in time are alike: the lag-1 correlation of each track's residuals."""
     rows = found.model.rows
     products, squares, count = np.zeros(6), np.zeros(6), 0
@@ -214,7 +222,7 @@ def is_correlated(found: Settled) -> bool:
         squares += (r**2).sum(axis=0)
         count += len(r) - 1
     correlation = products / np.maximum(squares, 1e-300)
-    return bool(correlation.mean() * np.sqrt(6 * max(count, 1)) > CORRELATED)
+    return bool(correlation.mean() * np.sqrt(6 * max(count, 1)) > limit)
 
 
 def moved(state: State, variables: Variables, layout: JointCovariance, d: Array) -> State:
@@ -259,6 +267,7 @@ def noise_in(task: Task, found: Settled, mixture: Mixture) -> NoiseInData:
         correlation=None if found.model.drift is None else found.model.drift.correlation,
         drift_evidence=found.drift_evidence,
         systematic_evidence=found.systematic_evidence,
+        is_drift_untried=task.instants.chains > MOST_TRACKS and is_correlated(found, SURELY_CORRELATED),
         arms_assumed=C.SYSTEMATIC_ROTATION in active,
     )
 
