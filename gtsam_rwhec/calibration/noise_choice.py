@@ -13,7 +13,7 @@ from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.noise_model.components import Component
 from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.noise_model.options import NoiseOptions
-from gtsam_rwhec.noise_model.refining import refine_under_noise
+from gtsam_rwhec.noise_model.refining import under_noise
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -92,18 +92,22 @@ def _by_the_whole_model(
         side = options.carrier_noise.about
     noise = NoiseOptions(stated=stated, drift=options.drift, systematic=options.systematic, side=side)
     how = replace(how, carrier_noise=None)
-    before = None
-    for _ in range(MAX_CHOICES):
+    before, choices = None, 0
+    while True:
         kept = selected(problem, inliers) if inliers else problem
-        found = refine_under_noise(
-            kept, solution, how, noise, inliers=inliers, whole=problem, before=before, progress=progress
-        )
-        before = found.settled
-        if all(np.array_equal(mask, inliers[pair]) for pair, mask in found.agreeing.items()):
+        found = under_noise(kept, solution, how, noise, before=before, progress=progress)
+        choices += 1
+        if not inliers or choices == MAX_CHOICES:
             break
-        inliers = found.agreeing
+        progress("judging outliers again")
+        again = found.agreeing(problem, inliers)
+        if all(np.array_equal(mask, inliers[pair]) for pair, mask in again.items()):
+            break
+        inliers, before = again, found.settled
         solution = solve(selected(problem, inliers), options=options.solve, progress=progress)
-    return found.refined, _noise_of(found.refined, options, found.noise, ""), inliers
+    progress("covariances")
+    refined, noise_found = found.refined(inliers)
+    return refined, _noise_of(refined, options, noise_found, ""), inliers
 
 
 def _is_plain(noise: CarrierNoise | None) -> bool:

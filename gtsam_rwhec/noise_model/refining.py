@@ -35,37 +35,56 @@ SPARE_EQUATIONS = 6
 
 @dataclass(frozen=True)
 class UnderNoise:
-    """The answer under the noise that the data have.
+    """The answer under the noise that the data have, before its covariance is made.
 
     Attributes
     ----------
-    refined : Refined
-        Its joint covariance has the uncertainty of the noise itself, and the constant error of an arm.
-    noise : NoiseInData
-    agreeing : dict of (target, sensor) to (N,) booleans
-        The measurements of the whole problem that agree with it; empty if none were left out.
+    task : Task
     settled : Settled
-        The model, for a refinement of nearly the same measurements.
+        The model at its optimum; for nearly the same measurements it is a start.
+    solution : Solution
+        The certified start.
+    how : RefineOptions
     """
 
-    refined: Refined
-    noise: NoiseInData
-    agreeing: dict[Pair, np.ndarray]
+    task: Task
     settled: Settled
+    solution: Solution
+    how: RefineOptions
+
+    def agreeing(self, whole: Problem, inliers: dict[Pair, np.ndarray]) -> dict[Pair, np.ndarray]:
+        """Which measurements of the whole problem agree, by pair (N,) booleans; ``inliers`` made this answer."""
+        return agreeing(whole, inliers, self.task, self.settled, self.how)
+
+    def refined(self, inliers: dict[Pair, np.ndarray] | None = None) -> tuple[Refined, NoiseInData]:
+        """The answer with its covariance and its graph, and what the data say of their noise.
+
+        The covariance has the uncertainty of the noise itself, and the constant error of an arm. ``inliers`` are for
+        the record.
+        """
+        task, found = self.task, self.settled
+        joint, mixture = mixed(task, found)
+        layout = task.layout
+        frames = [
+            layout.slots[unknown]
+            for unknown in layout.slots
+            if unknown.kind is UnknownKind.FRAME and not layout.free[layout.slots[unknown]].any()
+        ]
+        freedom = min((mixture.degrees_of_freedom(found.model.basis[rows]) for rows in frames), default=float(np.inf))
+        refined = refined_of(task, found, joint, freedom, inliers or {}, self.solution, self.how)
+        return refined, noise_in(task, found, mixture)
 
 
-def refine_under_noise(
+def under_noise(
     problem: Problem,
     solution: Solution,
     how: RefineOptions | None = None,
     options: NoiseOptions | None = None,
     *,
-    inliers: dict[Pair, np.ndarray] | None = None,
-    whole: Problem | None = None,
     before: Settled | None = None,
     progress: Progress | None = None,
 ) -> UnderNoise:
-    """Refine under the noise of B, of A, in time and over the configuration, each estimated from the residuals.
+    """The answer under the noise of B, of A, in time and over the configuration, each estimated from the residuals.
 
     Parameters
     ----------
@@ -76,16 +95,9 @@ def refine_under_noise(
     how : RefineOptions, optional
         Time offsets and the carriers' path.
     options : NoiseOptions, optional
-    inliers : dict of (target, sensor) to (N,) booleans, optional
-        Which measurements were kept of the ``whole`` problem; they are judged again.
-    whole : Problem, optional
     before : Settled, optional
         The model of nearly the same measurements: its side and drift are kept.
     progress : callable, optional
-
-    Returns
-    -------
-    UnderNoise
 
     Raises
     ------
@@ -113,17 +125,16 @@ def refine_under_noise(
     layout = JointCovariance.of(variables.unknowns, np.eye(len(space.unit)), space.basis, space.unit)
     task = Task(problem, data, variables, layout, Instants.of(data), options, space.directions)
     found = settled(task, state, tell, before)
-    tell("covariances")
-    joint, mixture = mixed(task, found)
-    frames = [
-        layout.slots[unknown]
-        for unknown in layout.slots
-        if unknown.kind is UnknownKind.FRAME and not layout.free[layout.slots[unknown]].any()
-    ]
-    freedom = min((mixture.degrees_of_freedom(found.model.basis[rows]) for rows in frames), default=float(np.inf))
-    refined = refined_of(task, found, joint, freedom, inliers or {}, solution, how)
-    again = {}
-    if whole is not None and inliers:
-        tell("judging outliers again")
-        again = agreeing(whole, inliers, task, found, how)
-    return UnderNoise(refined, noise_in(task, found, mixture), again, found)
+    return UnderNoise(task, found, solution, how)
+
+
+def refine_under_noise(
+    problem: Problem,
+    solution: Solution,
+    how: RefineOptions | None = None,
+    options: NoiseOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> tuple[Refined, NoiseInData]:
+    """``under_noise`` and its ``refined``: the refined calibration, and what the data say of their noise."""
+    return under_noise(problem, solution, how, options, progress=progress).refined()

@@ -8,7 +8,7 @@ from noisy_rows import problem_of, random_poses, rows_of
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.noise_model import Component, NoiseOptions, refine_under_noise
+from gtsam_rwhec.noise_model import Component, NoiseOptions, refine_under_noise, under_noise
 from gtsam_rwhec.noise_model.components import SMALLEST, Sizes
 from gtsam_rwhec.noise_model.mixture import DRAWS, SAMPLES
 
@@ -43,15 +43,14 @@ def simulated(
     return problem
 
 
-def under_noise(
+def refined_under(
     problem: rw.Problem, options: NoiseOptions | None = None
 ) -> tuple[rw.Refined, rw.noise_model.NoiseInData]:
-    found = refine_under_noise(problem, rw.solve(problem), options=options)
-    return found.refined, found.noise
+    return refine_under_noise(problem, rw.solve(problem), options=options)
 
 
 def test_noise_of_a_and_b_are_told_apart() -> None:
-    refined, noise = under_noise(simulated(of_A=(0.004, 0.0001)))
+    refined, noise = refined_under(simulated(of_A=(0.004, 0.0001)))
     of = noise.deviations
     assert of[C.ROTATION].low < 0.0025
     assert of[C.CARRIER_ROTATION].value == pytest.approx(0.004, rel=0.2)
@@ -67,7 +66,7 @@ def test_noise_of_a_and_b_are_told_apart() -> None:
 
 
 def test_a_random_walk_is_found_and_the_frames_are_worth_less() -> None:
-    refined, noise = under_noise(simulated(walk=(0.003, 0.002)))
+    refined, noise = refined_under(simulated(walk=(0.003, 0.002)))
     assert noise.correlation == 1.0
     assert noise.drift_evidence > 50.0
     assert noise.deviations[C.DRIFT_ROTATION].value == pytest.approx(0.003, rel=0.3)
@@ -82,18 +81,18 @@ def test_a_random_walk_is_found_and_the_frames_are_worth_less() -> None:
 def test_options_overrule() -> None:
     problem = simulated(of_A=(0.004, 0.0001), count=40)
     stated = {C.CARRIER_ROTATION: 0.004, C.CARRIER_TRANSLATION: 0.0001}
-    _, noise = under_noise(problem, NoiseOptions(stated=stated, side="sensorcarrier", drift="none", systematic=False))
+    _, noise = refined_under(problem, NoiseOptions(stated=stated, side="sensorcarrier", drift="none", systematic=False))
     assert noise.hand == "sensorcarrier"
     assert noise.deviations[C.CARRIER_ROTATION].value == pytest.approx(0.004, rel=0.1)
     assert not noise.arms_assumed
-    _, noise = under_noise(problem, NoiseOptions(carrier=False, drift="walk", systematic=False))
+    _, noise = refined_under(problem, NoiseOptions(carrier=False, drift="walk", systematic=False))
     assert C.CARRIER_ROTATION not in noise.deviations
     assert noise.correlation == 1.0
 
 
 def test_noise_of_a_that_is_larger_than_all_residuals_is_no_error() -> None:
     stated = {C.CARRIER_ROTATION: 0.1, C.CARRIER_TRANSLATION: 0.05}
-    _, noise = under_noise(simulated(40), NoiseOptions(stated=stated))
+    _, noise = refined_under(simulated(40), NoiseOptions(stated=stated))
     assert noise.deviations[C.CARRIER_ROTATION].value == pytest.approx(0.1, rel=0.2)
 
 
@@ -115,12 +114,13 @@ def test_measurements_that_drift_explains_come_back_and_outliers_do_not() -> Non
     kept = rw.Problem()
     kept.add("board", "camera", raw.A[first], B[first], stamps_ns=raw.stamps_ns[first])
     pair = rw.Pair("board", "camera")
-    found = refine_under_noise(kept, rw.solve(kept), inliers={pair: first}, whole=whole)
-    assert np.flatnonzero(~found.agreeing[pair]).tolist() == [30, 31, 32]
-    assert found.refined.inlier_counts[pair] == (60, 80)
-    again = refine_under_noise(kept, rw.solve(kept), before=found.settled)
-    assert again.noise.correlation == found.noise.correlation
-    assert again.refined.X["board"].equals(found.refined.X["board"], 1e-4)
+    found = under_noise(kept, rw.solve(kept))
+    assert np.flatnonzero(~found.agreeing(whole, {pair: first})[pair]).tolist() == [30, 31, 32]
+    refined, noise = found.refined({pair: first})
+    assert refined.inlier_counts[pair] == (60, 80)
+    again, same = under_noise(kept, rw.solve(kept), before=found.settled).refined()
+    assert same.correlation == noise.correlation
+    assert again.X["board"].equals(refined.X["board"], 1e-4)
 
 
 def test_thinned_rows_keep_the_time_between_instants() -> None:
@@ -139,7 +139,7 @@ def test_frames_that_thinned_rows_do_not_see_are_held() -> None:
     for name, rows in (("board", np.arange(620)), ("rare", np.arange(1, 620, 60))):
         B = np.linalg.inv(Y) @ A[rows] @ X @ twists(chance, len(rows), 0.002, 0.001)
         problem.add(name, "camera", A[rows], B, stamps_ns=rows * 10**8)
-    refined, noise = under_noise(problem, NoiseOptions(systematic=False, drift="none"))
+    refined, noise = refined_under(problem, NoiseOptions(systematic=False, drift="none"))
     assert noise.instants == 620
     assert np.isfinite(refined.covariance()).all()
     assert refined.contains("rare", X, 0.9999)
@@ -170,17 +170,17 @@ def test_a_component_is_held_where_it_is_stated_and_free_elsewhere() -> None:
 
 def test_priors_of_frames_count() -> None:
     problem = simulated(30)
-    loose = under_noise(problem)[0]
+    loose = refined_under(problem)[0]
     problem.add_prior("camera", Y, sigma=1e-5, kappa=1e9)
-    tight = under_noise(problem)[0]
+    tight = refined_under(problem)[0]
     assert loose.covariance("camera").trace() > 10.0 * tight.covariance("camera").trace()
     np.testing.assert_allclose(tight.Y["camera"].matrix(), Y, atol=1e-4)
 
 
 def test_the_constant_error_of_an_arm_is_in_the_frames_of_both_carriers() -> None:
     problem = simulated(30)
-    with_it = under_noise(problem)[0]
-    without = under_noise(problem, NoiseOptions(systematic=False))[0]
+    with_it = refined_under(problem)[0]
+    without = refined_under(problem, NoiseOptions(systematic=False))[0]
     for name in ("board", "camera"):
         added = with_it.covariance(name) - without.covariance(name)
         assert np.linalg.eigvalsh(added).max() > 0.05 * np.linalg.eigvalsh(without.covariance(name)).max()
@@ -188,8 +188,8 @@ def test_the_constant_error_of_an_arm_is_in_the_frames_of_both_carriers() -> Non
 
 def test_a_mixture_has_weights_and_quantiles() -> None:
     problem = simulated(15)
-    found = refine_under_noise(problem, rw.solve(problem))
-    for of in found.noise.deviations.values():
+    refined, noise = refined_under(problem)
+    for of in noise.deviations.values():
         assert 0.0 < of.low <= of.value <= of.high
     assert SAMPLES * DRAWS >= 2000
-    assert found.refined.degrees_of_freedom > 3.0
+    assert refined.degrees_of_freedom > 3.0
