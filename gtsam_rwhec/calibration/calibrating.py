@@ -362,7 +362,14 @@ class _Calibrating:
             time_offsets=self._offsets_for_outliers(),
             carrier_path=options.carrier_path if self._offsets_for_outliers() else None,
         )
-        refined = refine(self.problem, first, how, progress=self.tell)
+        try:
+            refined = refine(self.problem, first, how, progress=self.tell)
+        except NoiseError:
+            if options.carrier_noise is None:
+                raise
+            # More noise is stated for A than the residuals hold. They are judged by what they show, and again under
+            # the noise that is found.
+            refined = refine(self.problem, first, replace(how, carrier_noise=None), progress=self.tell)
         return refined.solution, refined.inliers
 
     def _refined(self, solution: Solution, inliers: Inliers) -> tuple[Refined | None, NoiseFound, Solution, Inliers]:

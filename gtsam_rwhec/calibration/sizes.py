@@ -34,6 +34,8 @@ BLOCKS = 10
 #: With so few blocks, the standard deviation itself is uncertain: the ratio of Student's and Gauss's quantiles at the
 #: five standard deviations of the test, for nine degrees of freedom.
 STUDENT = 2.6
+#: Standard deviations of the priors that stand for fixed poses here, in metres and rad.
+FIXED_M, FIXED_RAD = 1e-4, 1e-4
 
 
 def is_size_doubted(scale: float, sigma: float | None) -> bool:
@@ -107,6 +109,7 @@ def sizes(
     (progress or silent)("looking at the targets' sizes")
     free = problem.with_measurements({pair: problem.measurements(*pair) for pair in problem.pairs})
     free.scale = "per_target"
+    _loosen_fixed(free)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RwhecWarning)  # they are about sizes that nobody uses
         try:
@@ -119,6 +122,14 @@ def sizes(
             spread = _jackknife(free)
             found = [replace(size, sigma=_larger(size.sigma, spread.get(size.target))) for size in found]
     return tuple(found)
+
+
+def _loosen_fixed(free: Problem) -> None:
+    """Tight priors in place of fixed poses of what has a size: the certified form cannot hold both as they are."""
+    for name in {pair.target for pair in free.pairs} & set(free.fixed):
+        T = free.fixed.pop(name)
+        free.priors.pop(name, None)
+        free.add_prior(name, T, FIXED_M, 0.5 / FIXED_RAD**2)
 
 
 def _sigma_of(refined: Refined, target: str) -> float | None:

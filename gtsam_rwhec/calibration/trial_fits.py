@@ -103,6 +103,8 @@ def fitted(
 ) -> TrialFit | None:
     """Fit a sample of a problem robustly; ``scale`` overrules the problem's. None where the sample has no answer."""
     mode = scale or problem.scale
+    if not sample:
+        return None  # a shift of rows leaves nothing of pairs with one row each
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # the words of trials are for nobody

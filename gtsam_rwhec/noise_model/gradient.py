@@ -50,7 +50,7 @@ class Eliminated:
         """d(-2 l) / d log sigma of each component."""
         (T, k), m = self.features.shape, self.measured.of.m
         q = 6 * k
-        inverse, _ = dtrtri(self.L, lower=1)
+        inverse = dtrtri(self.L, lower=1)[0] if len(self.L) else self.L  # LAPACK refuses a size of zero
         y = np.append(-inverse.T @ self.half, 1.0)
         G = y[:, None] * y
         G[:-1, :-1] += inverse.T @ inverse

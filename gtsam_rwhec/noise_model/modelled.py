@@ -169,7 +169,8 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
     tell("estimating the noise of A and B")
     tried = {side: task.settle(start, side, None, systematic=False) for side in sides}
     lengths = {"targetcarrier": start.X, "sensorcarrier": start.Y}
-    score = {side: found.fit.objective + NEARER * np.log(_distance(lengths[side])) for side, found in tried.items()}
+    nearer = NEARER if all(lengths.values()) else 0.0  # motions alone have frames on one side only
+    score = {side: found.fit.objective + nearer * np.log(_distance(lengths[side])) for side, found in tried.items()}
     side = min(score, key=lambda each: score[each])
     white = steady = tried[side]
     if options.systematic:
@@ -310,5 +311,5 @@ def constant_error(task: Task, found: Settled, state: State, mixture: Mixture) -
 
 
 def _distance(poses: dict[str, gtsam.Pose3]) -> float:
-    """The typical distance of frames from their carrier, m."""
-    return max(float(np.median([np.linalg.norm(pose.translation()) for pose in poses.values()])), 1e-6)
+    """The typical distance of frames from their carrier, m; without frames, the smallest."""
+    return max(float(np.median([float(np.linalg.norm(pose.translation())) for pose in poses.values()] or [0.0])), 1e-6)

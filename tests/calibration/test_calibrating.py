@@ -211,3 +211,55 @@ def test_a_target_of_which_half_of_the_measurements_disagree_is_not_to_be_used()
     problem.add("board", "camera", A, B @ se3.expmap(0.002 * chance.normal(size=(30, 6))))
     calibration = rw.calibrate(problem)
     assert calibration.verdict is rw.Verdict.DO_NOT_USE
+
+
+def exact_and_truth(count: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A, B with 1 mm and 1 mrad of noise, X and Y of one sensor and one target."""
+    chance = np.random.default_rng(3)
+    A = se3.expmap(np.hstack([0.6 * chance.normal(size=(count, 3)), 0.3 * chance.normal(size=(count, 3))]))
+    X, Y = se3.expmap(np.array([[0.3, 0.1, -0.2, 0.1, 0.0, 0.2], [1.0, 0.3, -0.5, 0.5, 0.4, 0.6]]))
+    return A, np.linalg.inv(Y) @ A @ X @ se3.expmap(1e-3 * chance.normal(size=(count, 6))), X, Y
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_a_fixed_target_whose_size_is_known_is_calibrated(both: bool, capfd: pytest.CaptureFixture[str]) -> None:
+    A, B, X, Y = exact_and_truth()
+    problem = rw.Problem()
+    problem.add("board", "camera", A, B)
+    problem.fix("board", X)
+    if both:
+        problem.fix("camera", Y)
+    calibration = rw.calibrate(problem)
+    assert calibration.verdict is rw.Verdict.USE
+    assert calibration.sizes[0].scale == pytest.approx(1.0, abs=0.01)
+    assert calibration.sizes[0].sigma is not None
+    assert not capfd.readouterr().out  # LAPACK writes there
+
+
+def test_a_wrong_size_of_a_fixed_target_is_doubted() -> None:
+    A, B, X, _ = exact_and_truth()
+    B[:, :3, 3] *= 1.05
+    problem = rw.Problem()
+    problem.add("board", "camera", A, B)
+    problem.fix("board", X)
+    assert rw.Ground.SIZE_DOUBTED in rw.calibrate(problem).judgement.grounds
+
+
+def test_more_noise_stated_for_A_than_the_residuals_have_is_no_contradiction() -> None:
+    A, B, X, _ = exact_and_truth()
+    problem = rw.Problem()
+    problem.add("board", "camera", A, B)
+    calibration = rw.calibrate(problem, rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(0.01, 0.01)))
+    assert calibration.verdict is rw.Verdict.USE
+    assert calibration.contains("board", X)
+
+
+def test_motions_alone_say_nothing_of_an_empty_mean() -> None:
+    A, _, _, Y = exact_and_truth()
+    problem = rw.Problem()
+    noise = 1e-3 * np.random.default_rng(4).normal(size=(len(A), 6))
+    problem.add_motion("camera", A, np.linalg.inv(Y) @ A @ Y @ se3.expmap(noise))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        calibration = rw.calibrate(problem)
+    assert calibration.contains("camera", Y, 0.9999)

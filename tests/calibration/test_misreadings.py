@@ -11,7 +11,9 @@ from rwhec_factors.se3 import expmap
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.misreadings import misreadings
-from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.calibration.readings import Mistake, shifted
+from gtsam_rwhec.calibration.samples import Sampled
+from gtsam_rwhec.calibration.trial_fits import fitted
 from gtsam_rwhec.errors import OptionError, RwhecError
 from gtsam_rwhec.simulate import Noise, general, perturb
 from gtsam_rwhec.simulate.transforms import random_poses
@@ -84,6 +86,14 @@ def test_rows_of_a_slow_path_with_stamps_are_a_matter_of_the_clock() -> None:
         problem.add("tag", "cam", A, B, 1e-3, 1e5, stamps_ns=stamps_ns)
         found.append([one.mistake for one in misreadings(problem, solved(problem))])
     assert found == [[], [Mistake.ROWS_SHIFTED]]
+
+
+def test_a_shift_of_rows_leaves_nothing_of_pairs_that_are_seen_once() -> None:
+    problem = general(3, 3, seed=1, noise=NOISE, number_of_measurements=1).problem
+    sampled = Sampled.of(problem)
+    assert sampled is not None
+    assert sampled.by(shifted(1)) == {}
+    assert fitted(problem, sampled.by(shifted(1))) is None
 
 
 def test_a_wrong_progress_is_refused() -> None:
