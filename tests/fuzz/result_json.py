@@ -9,8 +9,9 @@ from pathlib import Path
 from harness import Harness, scratch
 from mutations import json_tree
 
+from gtsam_rwhec.calibration.calibrating import calibrate
 from gtsam_rwhec.refinement import refined, refining
-from gtsam_rwhec.results import result_file, verdict
+from gtsam_rwhec.results import result_file
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solving import certified_solution
 
@@ -23,11 +24,14 @@ def read(data: bytes) -> None:
     str(result.solution.certificate)
     for direction in result.solution.identifiability.free_directions:
         str(direction)
-    verdict.judge(result.solution, result.refined, result.log)
+    str(result.judgement)
+    if result.calibration is not None:
+        for said in (*result.calibration.choices, *result.calibration.points, *result.calibration.findings):
+            str(said)
 
 
 def seeds() -> Iterable[bytes]:
-    """Certified, with a free direction, with scales, and refined; and the files of earlier versions."""
+    """Certified, with a free direction, with scales, refined, and of one call; and the files of earlier versions."""
     folder = scratch()
     noise = Noise(0.005, 6000.0)
     problems = [
@@ -44,9 +48,12 @@ def seeds() -> Iterable[bytes]:
             result_file.write_solution(solution, folder / "a.json")
             yield (folder / "a.json").read_bytes()
         better: refined.Refined = refining.refine(problems[0], certified_solution.solve(problems[0]))
+        calibrations = [calibrate(problem) for problem in problems[:2]]
     result_file.write_refined(better, folder / "b.json")
     yield (folder / "b.json").read_bytes()
-    for version in (1, 2, 3):
+    for calibration in calibrations:
+        yield result_file.calibration_json(calibration)
+    for version in (1, 2, 3, 4, 5):
         yield (GOLDEN / f"result_version_{version}.json").read_bytes()
 
 
