@@ -32,6 +32,7 @@ from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.plausibility import Implausible, implausible
 from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.calibration.sizes import TargetSize, sizes
+from gtsam_rwhec.calibration.stated_poses import contradicted_poses, stated_poses
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.calibration.views import views_of
 from gtsam_rwhec.errors import (
@@ -42,6 +43,7 @@ from gtsam_rwhec.errors import (
     OptionError,
     OutlierError,
     OutliersWarning,
+    RwhecError,
     RwhecWarning,
     ScaleError,
     UnderdeterminedError,
@@ -169,6 +171,8 @@ class _Calibrating:
                     misread, (solution, inliers, refined, noise) = (), late
             elif not (misread or odd):
                 solution, inliers, refined, noise = self._answer(solution)
+            if refined is not None:
+                self._doubt_stated_poses(refined, inliers)
             found_sizes = self._sizes(inliers) if refined is not None else ()
         if solution is None:
             self.findings.append(Finding(Ground.NO_SCALE, why))
@@ -440,6 +444,29 @@ class _Calibrating:
                 f"{number} of {self.problem.number_of_measurements} measurements were left out",
                 "they are farther off than good measurements are",
             )
+
+    def _doubt_stated_poses(self, refined: Refined, inliers: Inliers) -> None:
+        """Priors and fixed poses that the measurements contradict."""
+        problem = self.problem
+        if not problem.has_measurements or not stated_poses(problem):
+            return
+        self.tell("comparing the stated poses with the measurements")
+        options = replace(self.options, time_offsets=tuple(refined.time_offsets_s))
+        with_outliers = any(not mask.all() for mask in inliers.values())
+
+        def answer(without: Problem) -> Refined | None:
+            try:
+                agree = graduated(without, noise_scale="estimate").inliers if with_outliers else {}
+                kept = selected(without, agree) if agree else without
+                return estimated(without, solve(kept, options=options.solve), agree, options, silent)[0]
+            except (RwhecError, np.linalg.LinAlgError):
+                return None  # without what was stated there is no answer to compare with
+
+        found = contradicted_poses(problem, answer)
+        for one in found:
+            self.findings.append(Finding(Ground.COVARIANCE_DOUBTED if one.is_small else Ground.CONTRADICTED, str(one)))
+        said = "contradicted by the measurements" if found else "not contradicted by the measurements"
+        self._choose("stated poses", "as stated", said)
 
     def _sizes(self, inliers: Inliers) -> tuple[TargetSize, ...]:
         """What the motion says about sizes that were said to be known."""

@@ -61,7 +61,7 @@ def estimated(
             return _by_the_whole_model(problem, solution, how, options, inliers, progress)
         except CountError as error:
             why = str(error)
-        except np.linalg.LinAlgError as error:  # noises many orders apart
+        except (np.linalg.LinAlgError, RuntimeError) as error:  # noises many orders apart, in LAPACK or in GTSAM
             why, failed = f"that of A and B together could not be computed ({error})", True
     try:
         refined = refine(kept, solution, how, progress=progress)

@@ -100,7 +100,8 @@ _ADVICE = {
     Ground.NOT_CERTIFIED: "measure with more and larger rotations, then calibrate again",
     Ground.NOT_UNIQUE: "turn the carriers about at least two different axes and measure again, or fix what you know",
     Ground.CONTRADICTED: (
-        "check whether the named frame has moved or has another frame's name, and whether its clock is late"
+        "check whether the named frame has moved, has another frame's name or was stated at a wrong pose, and whether "
+        "its clock is late"
     ),
     Ground.NO_ANSWER: "measure with this sensor, or leave it out of the problem",
     Ground.LATE_CLOCK: "let its time offset be estimated (in a rig file: time_offset: estimate)",

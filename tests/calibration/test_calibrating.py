@@ -263,3 +263,19 @@ def test_motions_alone_say_nothing_of_an_empty_mean() -> None:
         warnings.simplefilter("error", RuntimeWarning)
         calibration = rw.calibrate(problem)
     assert calibration.contains("camera", Y, 0.9999)
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.UnitsWarning")
+def test_a_noise_model_that_cannot_be_computed_is_said_and_b_alone_is_estimated() -> None:
+    """A map whose origin is 100,000 km away: the whole model has no Cholesky factor in double precision."""
+    A, _, X, Y = exact_and_truth()
+    A[:, 0, 3] += 1e8
+    noise = 1e-3 * np.random.default_rng(4).normal(size=(len(A), 6))
+    problem = rw.Problem()
+    problem.add("board", "camera", A, np.linalg.inv(Y) @ A @ X @ se3.expmap(noise))
+    calibration = rw.calibrate(problem, rw.CalibrateOptions(misreadings=False))
+    assert calibration.noise.has_failed
+    assert calibration.noise.model is None
+    assert "could not be computed" in choice(calibration, "noise").evidence
+    assert rw.Ground.COVARIANCE_DOUBTED in calibration.judgement.grounds
+    assert calibration.verdict is not rw.Verdict.USE

@@ -1,0 +1,62 @@
+"""Stated poses that the measurements contradict are found, and true ones are not accused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rwhec_factors import se3
+
+import gtsam_rwhec as rw
+
+X, Y = se3.expmap(np.array([[0.3, 0.1, -0.2, 0.1, 0.0, 0.2], [1.0, 0.3, -0.5, 0.5, 0.4, 0.6]]))
+
+
+def problem_of(seed: int = 3, planar: bool = False) -> rw.Problem:
+    """Twenty measurements of a board by a camera, 1 mm and 1 mrad."""
+    chance = np.random.default_rng(seed)
+    xi = np.hstack([0.6 * chance.normal(size=(20, 3)), 0.3 * chance.normal(size=(20, 3))])
+    A = se3.expmap(xi * [0, 0, 1, 1, 1, 0] if planar else xi)
+    problem = rw.Problem()
+    problem.add("board", "camera", A, np.linalg.inv(Y) @ A @ X @ se3.expmap(1e-3 * chance.normal(size=(20, 6))))
+    return problem
+
+
+def off(T: np.ndarray, degrees: float, metres: float) -> np.ndarray:
+    return T @ se3.expmap(np.array([[np.radians(degrees), 0.0, 0.0, metres, 0.0, 0.0]]))[0]
+
+
+@pytest.mark.parametrize(("degrees", "metres"), [(29.0, 0.5), (3.0, 0.05), (0.6, 0.01)])
+def test_a_prior_far_from_what_the_measurements_say_is_not_to_be_used(degrees: float, metres: float) -> None:
+    problem = problem_of()
+    problem.add_prior("board", off(X, degrees, metres), 1e-3, 5e5)
+    calibration = rw.calibrate(problem)
+    assert calibration.verdict is rw.Verdict.DO_NOT_USE
+    assert calibration.judgement.grounds[0] in (rw.Ground.CONTRADICTED, rw.Ground.IMPLAUSIBLE)
+    if degrees < 10.0:
+        assert "the stated pose of board is" in calibration.judgement.reason
+
+
+def test_wrong_fixed_poses_are_not_to_be_used() -> None:
+    problem = problem_of()
+    problem.fix("board", off(X, 5.7, 0.2))
+    problem.fix("camera", Y)
+    calibration = rw.calibrate(problem)
+    assert calibration.verdict is rw.Verdict.DO_NOT_USE
+    assert rw.Ground.CONTRADICTED in calibration.judgement.grounds
+    assert "camera" not in calibration.judgement.reason.split(";")[0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_true_stated_poses_are_not_accused(seed: int) -> None:
+    problem = problem_of(seed)
+    problem.add_prior("board", off(X, 0.05, 0.001), 1e-3, 5e5)
+    problem.fix("camera", Y)
+    assert rw.calibrate(problem).verdict is rw.Verdict.USE
+
+
+def test_what_the_motion_leaves_free_contradicts_nothing() -> None:
+    """A planar robot cannot tell the height of the board; the rest of a stated pose is tested."""
+    for metres, verdict in ((0.0, rw.Verdict.USE), (0.1, rw.Verdict.DO_NOT_USE)):
+        problem = problem_of(planar=True)
+        problem.fix("board", off(X, 0.0, metres))
+        assert rw.calibrate(problem).verdict is verdict
