@@ -95,7 +95,7 @@ def test_certified_start_then_refinement_is_short_and_goes_on(tmp_path: Path) ->
 
 def test_no_example_is_left_out() -> None:
     scripts = {path.stem for path in EXAMPLES.glob("*.py")} - {"figures"}
-    assert scripts == set(RUNS) | {"figure_8_grid", "certified_init_then_refine"}
+    assert scripts == set(RUNS) | {"figure_8_grid", "certified_init_then_refine", "one_call"}
 
 
 def test_committed_pictures_are_small_and_made_by_an_example() -> None:

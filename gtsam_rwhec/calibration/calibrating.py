@@ -179,7 +179,9 @@ class _Calibrating:
         elif lengths := doubted_lengths(problem, solution):
             self.findings.append(Finding(Ground.MISREAD, str(lengths)))
         outliers = self._outliers(inliers)
-        judgement = Judgement.of([*findings_of(solution, refined), *self.findings], proof_of(refined))
+        # What a misreading leaves undetermined says nothing of the motion.
+        of_answer = [one for one in findings_of(solution, refined) if not (misread and one.ground is Ground.NOT_UNIQUE)]
+        judgement = Judgement.of([*of_answer, *self.findings], proof_of(refined))
         best = solution if refined is None else refined
         return Calibration(
             X={} if best is None else best.X,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from gtsam_rwhec.problem.pairs import Pair
 
 #: Outliers that agree with each other (a planar target's other pose) may be nearly half, and then win by chance.
-NEARLY_HALF = 0.45
+NEARLY_HALF = 0.42
 #: From so many measurements on, nearly half is no accident.
 MANY = 10
 

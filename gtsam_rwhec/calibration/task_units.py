@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from rwhec_factors import se3
-from scipy.optimize import brentq
 from scipy.special import chdtr, chdtri, fdtr, fdtri
 
 from gtsam_rwhec.errors import OptionError, PoseError
@@ -166,4 +165,6 @@ def ball_radius(variances: Array, level: float, degrees_of_freedom: float = np.i
     end = 1.0
     while lacking(end) < 0.0:
         end *= 4.0
+    from scipy.optimize import brentq  # here, since its import takes as long as a calibration of few poses
+
     return float(np.sqrt(largest * brentq(lacking, 0.0, end, xtol=1e-12)))

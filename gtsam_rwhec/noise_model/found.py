@@ -86,6 +86,7 @@ class NoiseInData:
                 f"Noise of A for each axis: {self._words(C.CARRIER_ROTATION)} and "
                 f"{self._words(C.CARRIER_TRANSLATION)}"
                 + (f"; jitter of stamps: {self._words(C.JITTER)}." if C.JITTER in self.deviations else ".")
+                + " Only lever arms tell A's noise from B's: their sum is known better than either."
             )
         if self.correlation is not None:
             steps = [self._words(component) for component in DRIFT if component in self.deviations]

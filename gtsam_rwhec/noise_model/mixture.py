@@ -11,9 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import chdtri, fdtri
-from scipy.stats import qmc
+from scipy.special import chdtri, fdtri, ndtri
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import PRIOR
@@ -30,6 +28,8 @@ HEAVIEST = 8.0
 CONFIDENCE, FEWEST = 0.95, 3.0
 #: A share is found by so many bisections.
 BISECTIONS = 12
+#: A root is found by so many steps, each of which halves its error at least.
+ROOT_STEPS = 60
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,12 @@ class Mixture:
             return float(np.inf)
         if found >= m * fdtri(m, FEWEST, CONFIDENCE):
             return FEWEST
-        return float(brentq(lambda nu: m * fdtri(m, nu, CONFIDENCE) - found, FEWEST, 1e6))
+        low, high = np.log(FEWEST), np.log(1e6)
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            is_large = m * fdtri(m, np.exp(middle), CONFIDENCE) > found
+            low, high = (middle, high) if is_large else (low, middle)
+        return float(np.exp(low))
 
     def share_of(self, rows: Array, added: Array) -> float:
         """The share of the mean of ``added`` with which the ellipsoid holds as much of the samples as it says.
@@ -112,6 +117,19 @@ def _quantile(samples: Array, weights: Array, covariance: Array) -> float:
     return float(np.interp(CONFIDENCE, np.cumsum(weights[order]), squares[order]))
 
 
+def normal_points(count: int, dimension: int) -> Array:
+    """Points (n, k) that are spread as a normal distribution is, the first at its mean: an additive recurrence.
+
+    (Its step is the powers of 1 / g, g^(k + 1) = g + 1: Roberts 2018, the R_d sequence.)
+    """
+    g = 1.5
+    for _ in range(ROOT_STEPS):
+        g = (1.0 + g) ** (1.0 / (dimension + 1.0))
+    step = g ** -np.arange(1.0, dimension + 1.0)
+    points: Array = ndtri((0.5 + np.arange(count)[:, None] * step) % 1.0)
+    return points
+
+
 def mixture_of(model: NoiseModel, fit: Fitted, whole: NoiseModel, samples: int = SAMPLES) -> Mixture:
     """The mixture about the most probable components; the unknowns are those of the ``whole`` model."""
     k = len(fit.logs)
@@ -119,8 +137,7 @@ def mixture_of(model: NoiseModel, fit: Fitted, whole: NoiseModel, samples: int =
     H = 0.5 * curvature(lambda logs: value_and_gradient(model, fit.sizes, logs)[1], fit.logs, low, high)
     values, vectors = np.linalg.eigh(H)
     spread = vectors / np.sqrt(np.maximum(values, 0.5 / PRIOR**2))
-    drawn = qmc.MultivariateNormalQMC(np.zeros(k), rng=np.random.default_rng(0)).random(samples)
-    drawn[0] = 0.0
+    drawn = normal_points(samples, k)
     logs = np.clip(fit.logs + drawn @ spread.T, low, high)
     estimates = [model.evaluate(fit.sizes.values(at)) for at in logs]
     heights = np.array([e.minus_two_log for e in estimates]) + np.array([fit.sizes.penalty(at) for at in logs])

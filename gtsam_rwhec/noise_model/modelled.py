@@ -33,7 +33,7 @@ SETTLED = 0.05
 #: Components are estimated from at most about this many instants; the unknowns, from all.
 INSTANTS = 300
 #: A dense log has fewer samples of the components, which are known well.
-FEWER_SAMPLES = 12
+FEWER_SAMPLES = 16
 #: In fewer rows the unknowns have this share of the information of all rows on top.
 HELD = 1e-3
 #: A track has at least this many instants for a drift.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.noise_model.agreement import agreeing
 from gtsam_rwhec.noise_model.found import NoiseInData
+from gtsam_rwhec.noise_model.mixture import FEWEST
 from gtsam_rwhec.noise_model.modelled import Settled, Task, mixed, noise_in, settled
 from gtsam_rwhec.noise_model.options import NoiseOptions
 from gtsam_rwhec.noise_model.refined import refined_of
@@ -71,8 +72,12 @@ class UnderNoise:
             if unknown.kind is UnknownKind.FRAME and not layout.free[layout.slots[unknown]].any()
         ]
         freedom = min((mixture.degrees_of_freedom(found.model.basis[rows]) for rows in frames), default=float(np.inf))
+        # Two kinds of noise at least share what equations there are to spare.
+        spare = 6 * task.problem.number_of_measurements - len(layout.unit)
+        freedom = min(freedom, max(0.5 * spare, FEWEST))
         refined = refined_of(task, found, joint, freedom, inliers or {}, self.solution, self.how)
-        return refined, noise_in(task, found, mixture)
+        noise = noise_in(task, found, mixture)
+        return replace(refined, noise_sentences=noise.sentences), noise
 
 
 def under_noise(

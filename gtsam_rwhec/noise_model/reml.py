@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import fmin_l_bfgs_b
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import Sizes
@@ -50,6 +49,8 @@ def fitted(model: NoiseModel, sizes: Sizes, start: Array) -> Fitted:
     """The maximum of the posterior density of the components, from a start."""
     bounds = sizes.bounds
     low, high = np.array(bounds).T
+    from scipy.optimize import fmin_l_bfgs_b  # here, since its import takes as long as a calibration of few poses
+
     logs, value, _ = fmin_l_bfgs_b(
         lambda logs: value_and_gradient(model, sizes, logs), np.clip(start, low, high), bounds=bounds,
         maxfun=MOST, factr=1e7, pgtol=SETTLED,

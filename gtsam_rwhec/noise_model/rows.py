@@ -29,13 +29,15 @@ Side = Literal["targetcarrier", "sensorcarrier"]
 SMOOTH_RAD, SMOOTH_M = 1.5, 0.75
 #: Directions of the configurations with less than this share of their spread are left out.
 SMALLEST_SPREAD = 1e-4
+#: A carrier stands still while no entry of its pose (1, m) changes by more than this.
+STILL = 5e-5
 #: A velocity is taken from neighbours that are no further apart than this, s.
 NEIGHBOURS_S = 0.5
 
 
 @dataclass(frozen=True)
 class Instants:
-    """Measurements grouped by instant: one carrier pose each, in order of time within a track.
+    """Measurements grouped by instant: one carrier pose each, or one standstill, in order of time within a track.
 
     Attributes
     ----------
@@ -70,16 +72,18 @@ class Instants:
 
     @staticmethod
     def of(data: list[PairData]) -> Instants:
-        """Measurements of one stamp and one A are of one instant; without stamps, those of one A."""
+        """Measurements of one standstill (of one stamp and A at least) are one instant; without stamps, of one A."""
         pair = np.concatenate([np.full(item.count, i) for i, item in enumerate(data)])
         has_stamps = all(item.stamps_ns is not None for item in data)
         within = np.concatenate([np.arange(item.count) for item in data])
         stamps = np.concatenate([item.stamps_ns for item in data]) if has_stamps else within
         A = np.concatenate([item.residuals.A for item in data])
         rounded = np.round(A[:, :3].reshape(len(A), 12), 9)
-        keys = np.column_stack([stamps.astype(np.float64) * has_stamps, rounded])
-        _, same = np.unique(keys, axis=0, return_inverse=True)
+        keys = np.column_stack([(stamps - stamps.min()).astype(np.float64) * has_stamps, rounded])
+        first_of, same = np.unique(keys, axis=0, return_index=True, return_inverse=True)[1:]
         same = same.ravel()
+        if has_stamps:
+            same = standstills(A[first_of, :3].reshape(-1, 12), stamps[first_of])[same]
         if len(np.unique(same)) == len(same):  # no instant is shared: one track after the other
             order = np.lexsort((stamps, pair))
             begins = np.r_[True, np.diff(pair[order]) != 0]
@@ -100,6 +104,18 @@ class Instants:
             step = step / np.median(usual) if len(usual) else np.ones(len(first))
             step = np.clip(step, 1e-3, 1e3)
         return Instants(order, first, index, chain, chains, np.where(begins, 0.0, step), seconds)
+
+
+def standstills(A: Array, stamps: np.ndarray) -> np.ndarray:
+    """The standstill (N,) of each instant: poses (N, 12) that stay within ``STILL`` of its first have one error."""
+    order = np.lexsort((A[:, 0], stamps))
+    place = np.empty(len(A), dtype=np.int64)
+    count, first, last = -1, np.full(12, np.inf), -1
+    for i in order.tolist():
+        if stamps[i] == last or not (np.abs(A[i] - first) < STILL).all():
+            count, first = count + 1, A[i]
+        place[i], last = count, stamps[i]
+    return place
 
 
 @dataclass(frozen=True)

@@ -258,6 +258,8 @@ class Refined(RefinedPoses):
     solution : Solution
         The certified solution that was refined; with robust="gnc" it is the inliers' solution.
     options : RefineOptions
+    noise_sentences : tuple of str
+        What was found of the noise of A and B, in time and over the configuration; empty where only B's was estimated.
     """
 
     graph: gtsam.NonlinearFactorGraph
@@ -266,6 +268,7 @@ class Refined(RefinedPoses):
     inliers: dict[Pair, np.ndarray]
     solution: Solution
     options: RefineOptions
+    noise_sentences: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return (

@@ -91,7 +91,8 @@ def print_refined_body(console: Console, refined: Refined, log: LogFields | None
 def legend(refined: Refined) -> str:
     """What the columns mean, and what the refinement's model has that the certified one lacks."""
     has_offsets = any(unknown.kind is UnknownKind.TIME_OFFSET for unknown in refined.unknowns)
-    added = ["clock offsets"] * has_offsets + ["the noise of A"] * (refined.options.carrier_noise is not None)
+    has_carrier_noise = refined.options.carrier_noise is not None or bool(refined.noise_sentences)
+    added = ["clock offsets"] * has_offsets + ["the noise of A"] * has_carrier_noise
     return f"{LEGEND}; it adds {' and '.join(added)}." if added else f"{LEGEND}."
 
 
@@ -125,7 +126,8 @@ def scale_and_offset_sentences(refined: Refined) -> list[str]:
 
 def refined_sentences(refined: Refined) -> list[str]:
     """The noise, the cost and the outliers, which decide the standard deviations."""
-    sentences = [_noise_sentence(refined), NOISE_LEGEND, _carrier_noise_sentence(refined)]
+    sentences = [_noise_sentence(refined), NOISE_LEGEND]
+    sentences += refined.noise_sentences or (_carrier_noise_sentence(refined),)
     loss = "" if refined.options.robust in ("none", "gnc") else f", {refined.options.robust} loss"
     steps = f"{refined.iterations} iteration{'' if refined.iterations == 1 else 's'}"
     sentences.append(

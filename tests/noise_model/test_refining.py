@@ -123,6 +123,22 @@ def test_measurements_that_drift_explains_come_back_and_outliers_do_not() -> Non
     assert again.X["board"].equals(refined.X["board"], 1e-4)
 
 
+def test_measurements_of_one_standstill_share_an_instant() -> None:
+    """An encoder's jitter does not make ten errors of A out of one."""
+    chance = np.random.default_rng(0)
+    stations = random_poses(chance, 12, 0.7, 0.3)
+    wrong = stations @ twists(chance, 12, 0.003, 0.003)  # A's error, once a station
+    A = np.repeat(wrong, 10, axis=0) @ twists(chance, 120, 1e-6, 3e-6)
+    B = np.linalg.inv(Y) @ np.repeat(stations, 10, axis=0) @ X @ twists(chance, 120, 0.002, 0.001)
+    problem = rw.Problem()
+    problem.add("board", "camera", A, B, stamps_ns=np.arange(120) * 10**8)
+    refined, noise = refined_under(problem)
+    assert noise.instants == 12
+    assert noise.deviations[C.CARRIER_TRANSLATION].value == pytest.approx(0.003, rel=0.4)
+    assert not noise.has_systematic
+    assert refined.contains("board", X, 0.999)
+
+
 def test_thinned_rows_keep_the_time_between_instants() -> None:
     rows, *_ = rows_of(problem_of(2, 1, 11, shared=False))
     fewer = rows.thinned(3)
