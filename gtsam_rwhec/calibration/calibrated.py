@@ -58,7 +58,7 @@ class NoiseFound:
     simple : str
         Why B's alone was estimated; empty with a model.
     has_failed : bool
-        Whether the model of all noise could not be computed.
+        Whether the model of all noise could not be computed, or the noise that was stated for A not used.
     """
 
     source: str

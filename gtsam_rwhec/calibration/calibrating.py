@@ -399,7 +399,7 @@ class _Calibrating:
         elif noise.model is None:
             self._choose("noise", "that of B alone is estimated", noise.simple)
             if noise.has_failed:
-                words = "the noise of A and errors that vary with the configuration could not be computed"
+                words = "the standard deviations lack the noise of A and errors that vary with the configuration"
                 self.findings.append(Finding(Ground.COVARIANCE_DOUBTED, words))
         else:
             self._say_noise(noise.model)

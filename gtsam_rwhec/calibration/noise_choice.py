@@ -65,10 +65,15 @@ def estimated(
             why, failed = f"that of A and B together could not be computed ({error})", True
     try:
         refined = refine(kept, solution, how, progress=progress)
-    except NoiseError:
-        if options.noise != "auto" or problem.is_relative:
+    except NoiseError as error:
+        if options.noise == "auto" and not problem.is_relative:
+            refined = refine(kept, solution, replace(how, noise="given"), progress=progress)
+        elif options.noise != "given" and options.carrier_noise is not None:  # it is more than the residuals hold
+            why, failed = f"the noise that was stated for A was not used: {error}", True
+            options = replace(options, carrier_noise=None)
+            refined = refine(kept, solution, replace(how, carrier_noise=None), progress=progress)
+        else:
             raise
-        refined = refine(kept, solution, replace(how, noise="given"), progress=progress)
     counts = {pair: (int(mask.sum()), len(mask)) for pair, mask in inliers.items()}
     noise = replace(_noise_of(refined, options, None, why), has_failed=failed)
     return replace(refined, inliers=inliers, inlier_counts=counts), noise, inliers

@@ -252,6 +252,11 @@ def test_more_noise_stated_for_A_than_the_residuals_have_is_no_contradiction() -
     calibration = rw.calibrate(problem, rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(0.01, 0.01)))
     assert calibration.verdict is rw.Verdict.USE
     assert calibration.contains("board", X)
+    covariances = {problem.pairs[0]: np.tile(1e-4 * np.eye(6), (len(A), 1, 1))}
+    calibration = rw.calibrate(problem, rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(covariances=covariances)))
+    assert calibration.verdict is rw.Verdict.CARE
+    assert "stated for A was not used" in choice(calibration, "noise").evidence
+    assert calibration.contains("board", X)
 
 
 def test_motions_alone_say_nothing_of_an_empty_mean() -> None:
