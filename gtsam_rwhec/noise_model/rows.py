@@ -82,7 +82,7 @@ class Instants:
         keys = np.column_stack([(stamps - stamps.min()).astype(np.float64) * has_stamps, rounded])
         first_of, same = np.unique(keys, axis=0, return_index=True, return_inverse=True)[1:]
         same = same.ravel()
-        if has_stamps:
+        if has_stamps or len(data) == 1:  # the rows of one pair are in order of time
             same = standstills(A[first_of, :3].reshape(-1, 12), stamps[first_of])[same]
         if len(np.unique(same)) == len(same):  # no instant is shared: one track after the other
             order = np.lexsort((stamps, pair))

@@ -284,3 +284,14 @@ def test_a_noise_model_that_cannot_be_computed_is_said_and_b_alone_is_estimated(
     assert "could not be computed" in choice(calibration, "noise").evidence
     assert rw.Ground.COVARIANCE_DOUBTED in calibration.judgement.grounds
     assert calibration.verdict is not rw.Verdict.USE
+
+
+def test_three_stations_are_too_few_for_a_covariance_that_is_relied_on() -> None:
+    chance = np.random.default_rng(0)
+    A = se3.expmap(np.hstack([0.7 * chance.normal(size=(3, 3)), 0.3 * chance.normal(size=(3, 3))]))
+    X, Y = se3.expmap(np.array([[0.3, 0.1, -0.2, 0.1, 0.0, 0.2], [1.0, 0.3, -0.5, 0.5, 0.4, 0.6]]))
+    problem = rw.Problem()
+    problem.add("board", "camera", A, np.linalg.inv(Y) @ A @ X @ se3.expmap(0.001 * chance.normal(size=(3, 6))))
+    calibration = rw.calibrate(problem)
+    assert calibration.verdict is not rw.Verdict.USE
+    assert "3 measurements are too few to tell how large their noise is" in calibration.verdict_reason
