@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from gtsam_rwhec.problem.pairs import Pair
 
+HALF = 0.5
 #: Outliers that agree with each other (a planar target's other pose) may be nearly half, and then win by chance.
 NEARLY_HALF = 0.42
 #: From so many measurements on, nearly half is no accident.
@@ -25,30 +26,32 @@ class LeftOut:
     def __str__(self) -> str:
         return f"{self.left_out} of {self.measurements} measurements of {self.frame} contradict the answer"
 
-    @property
-    def is_majority(self) -> bool:
-        """Whether more than half of the measurements are outliers; of many measurements, nearly half."""
-        most = NEARLY_HALF if self.measurements >= MANY else 0.5
-        return self.left_out > most * self.measurements
+    def is_beyond(self, share: float) -> bool:
+        """Whether more than this share of the measurements are outliers; of few measurements, more than half."""
+        return self.left_out > (share if self.measurements >= MANY else HALF) * self.measurements
 
 
-def contradicted_frames(counts: Mapping[Pair, tuple[int, int]]) -> tuple[LeftOut, ...]:
+def contradicted_frames(
+    counts: Mapping[Pair, tuple[int, int]], nearly_half: float = NEARLY_HALF
+) -> tuple[LeftOut, ...]:
     """The sensors and targets of which more than half, or of many nearly half, of the measurements were left out.
 
     ``counts`` has the number that was kept and the number of all, by pair. Where most are outliers the answer is as
     likely to be wrong as they are: a clock, a size or a mounting may have changed. The frame with most outliers comes
     first. Its outliers then count for no other frame: the targets are not to blame for a camera that contradicts all of
-    them.
+    them. So frames with more than half come before those with nearly half: of two cameras that see one target, the
+    one that contradicts everything makes half of the target's measurements outliers.
     """
     rest = counts
     everything = _by_frame(counts)
     names: list[str] = []
-    while majorities := [frame for frame in _by_frame(rest).values() if frame.is_majority]:
-        names.append(max(majorities, key=lambda frame: frame.left_out).frame)
-        rest = {pair: count for pair, count in rest.items() if names[-1] not in pair}
+    for share in (HALF, nearly_half):
+        while beyond := [frame for frame in _by_frame(rest).values() if frame.is_beyond(share)]:
+            names.append(max(beyond, key=lambda frame: frame.left_out).frame)
+            rest = {pair: count for pair, count in rest.items() if names[-1] not in pair}
     # A frame that was seen only together with contradicted frames rests on them.
     known = {*names, *_by_frame(rest)}
-    names += [name for name, frame in everything.items() if name not in known and frame.is_majority]
+    names += [name for name, frame in everything.items() if name not in known and frame.is_beyond(nearly_half)]
     return tuple(everything[name] for name in names)
 
 

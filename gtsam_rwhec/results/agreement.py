@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
+from gtsam_rwhec.calibration.disagreement import HALF, NEARLY_HALF
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
 from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.refinement.refined import RefinedPoses
@@ -163,8 +164,11 @@ def check_verdict(stated: Verdict, grounds: tuple[Ground, ...], found: Judgement
         )
 
 
-def check_log(log: LogFields) -> None:
-    """The frames that most measurements contradict are those of the counts, and each count is there once."""
+def check_log(log: LogFields, version: int) -> None:
+    """The frames that most measurements contradict are those of the counts, and each count is there once.
+
+    Up to version 5 these were frames of which more than half of the measurements were left out.
+    """
     for name, rows in (
         ("outliers", [str(row.pair) for row in log.outliers]),
         ("sizes", [row.target for row in log.sizes]),
@@ -175,7 +179,7 @@ def check_log(log: LogFields) -> None:
         twice = [each for each, number in Counter(rows).items() if number > 1]
         if twice:
             raise ValueError(f"$.log.{name}: {brief(twice[0])} is there twice; keep one")
-    found = contradictions(log.outliers)
+    found = contradictions(log.outliers, HALF if version <= LAST_WITH_CARE else NEARLY_HALF)
     if log.contradicted != found:
         frames = [", ".join(shown(row.frame) for row in each) or "none" for each in (log.contradicted, found)]
         raise ValueError(f"$.log.contradicted: must be {frames[1]}, by $.log.outliers (found {frames[0]})")

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
 
+from gtsam_rwhec.calibration.disagreement import HALF
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind
 from gtsam_rwhec.results.json_tree import from_json, in_words
 from gtsam_rwhec.results.log_history import OutlierCount, contradictions
@@ -198,7 +199,7 @@ def _log(log: dict[str, Any]) -> dict[str, Any]:
         OutlierCount(**_only(row, "target", "sensor", "used"), left_out=sum(row["removed"].values()))
         for row in log["outliers"]
     ]
-    contradicted = contradictions(outliers)
+    contradicted = contradictions(outliers, HALF)
     named = log.get("contradicted")  # the first files of version 3 name none
     if named is not None and set(named) != {counts.frame for counts in contradicted}:
         frames = ", ".join(counts.frame for counts in contradicted) or "none"

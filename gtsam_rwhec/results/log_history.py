@@ -10,7 +10,7 @@ from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from gtsam_rwhec.calibration.disagreement import contradicted_frames
+from gtsam_rwhec.calibration.disagreement import NEARLY_HALF, contradicted_frames
 from gtsam_rwhec.calibration.sizes import is_size_doubted
 from gtsam_rwhec.problem.pairs import Pair
 
@@ -144,7 +144,7 @@ class LogFields(_Record):
     )
 
 
-def contradictions(outliers: Iterable[OutlierCount]) -> tuple[FrameOutliers, ...]:
-    """The sensors and targets of which more than half of the measurements were left out as outliers."""
+def contradictions(outliers: Iterable[OutlierCount], nearly_half: float = NEARLY_HALF) -> tuple[FrameOutliers, ...]:
+    """The sensors and targets of which more than half, or of many nearly half, of the measurements were left out."""
     counts = {count.pair: (count.used, count.used + count.left_out) for count in outliers}
-    return tuple(FrameOutliers(**vars(frame)) for frame in contradicted_frames(counts))
+    return tuple(FrameOutliers(**vars(frame)) for frame in contradicted_frames(counts, nearly_half))

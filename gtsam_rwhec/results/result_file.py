@@ -224,7 +224,7 @@ def parse_result(content: bytes, path: str | Path) -> Result:
             raw = as_version_4(raw)
         if number >= FIRST_WITH_REGION:
             check_says_what_it_is_about(raw)
-        file = _checked({**raw, "format_version": FORMAT_VERSION})  # version 4 lacks fields that have defaults
+        file = _checked({**raw, "format_version": FORMAT_VERSION}, number)  # version 4 lacks fields that have defaults
         result = _result_of(file)
         if number >= FIRST_WITH_VERDICT:
             check_verdict(file.verdict, file.verdict_grounds, result.judgement, number)
@@ -276,7 +276,7 @@ def _content(
         }
         content = json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         encoded = content.encode("utf-8")  # a name may have half a character
-        _checked(json.loads(content))
+        _checked(json.loads(content), FORMAT_VERSION)
     except ValueError as error:
         raise FileFormatError(f"{path} was not written, because the result is not valid: {in_words(error)}") from error
     return encoded
@@ -322,8 +322,11 @@ def _refined_fields(refined: Refined) -> RefinedFields:
     return RefinedFields(**kept, residual=refined.options.residual, robust=refined.options.robust, frames=frames)
 
 
-def _checked(tree: dict[str, Any]) -> ResultFile:
-    """Check a file's fields and make records of them; `POSED` at the top belong to the refined answer, if any."""
+def _checked(tree: dict[str, Any], version: int) -> ResultFile:
+    """Check the fields of a file of this version and make records of them.
+
+    `POSED` at the top belong to the refined answer, if any.
+    """
     posed = {name: tree[name] for name in POSED if name in tree}
     rest = {name: value for name, value in tree.items() if name not in posed}
     if isinstance(tree.get("refined"), dict):
@@ -333,7 +336,7 @@ def _checked(tree: dict[str, Any]) -> ResultFile:
     check_scale(file.certified, "$.certified.scale")
     check_sizes(file.certified, file.refined)
     if file.log is not None:
-        check_log(file.log)
+        check_log(file.log, version)
     if file.refined is None:
         check_top(tree)
     else:

@@ -13,7 +13,7 @@ import pytest
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.verdict import Finding, Judgement
 from gtsam_rwhec.report import certificate_sentence
-from gtsam_rwhec.results.agreement import check_verdict
+from gtsam_rwhec.results.agreement import check_log, check_verdict
 from gtsam_rwhec.results.result_file import read_result
 from gtsam_rwhec.solver.cause import Cause
 from gtsam_rwhec.solver.certificate import Basis
@@ -138,6 +138,19 @@ def test_the_first_files_of_version_3_did_not_name_contradicted_frames(tmp_path:
     log = read_result(tmp_path / "result.json").log
     assert log is not None
     assert [counts.frame for counts in log.contradicted] == ["cam_side"]
+
+
+def test_up_to_version_5_nearly_half_was_not_enough(tmp_path: Path) -> None:
+    _, raw = stored(3)
+    for row in raw["log"]["outliers"]:
+        row["removed"] = {"outlier (robust estimation)": row["used"] - 1}
+    (tmp_path / "result.json").write_text(json.dumps(raw), encoding="utf-8")
+    log = read_result(tmp_path / "result.json").log
+    assert log is not None
+    assert log.contradicted == ()
+    check_log(log, 5)
+    with pytest.raises(ValueError, match=r"must be tag_7, cam_front, cam_side, by .* \(found none\)"):
+        check_log(log, 6)
 
 
 def test_the_bound_of_version_4_was_of_the_reduced_form() -> None:

@@ -32,6 +32,17 @@ def test_targets_are_not_to_blame_for_a_camera() -> None:
     assert names() == []
 
 
+def test_nearly_half_of_many_measurements_is_enough() -> None:
+    def board(used: int, left_out: int) -> OutlierCount:
+        return OutlierCount(target="board", sensor="camera", used=used, left_out=left_out)
+
+    assert names(board(16, 14)) == ["board", "camera"]
+    assert names(board(20, 10)) == []
+    assert names(board(4, 4)) == []  # of few measurements half may be chance
+    half_of_the_board = OutlierCount(target="board", sensor="late", used=25, left_out=50)
+    assert names(board(25, 0), half_of_the_board) == ["late"]
+
+
 def test_unknown_fields_are_refused() -> None:
     with pytest.raises(ValidationError):
         TrackCount.model_validate({"target": "t", "sensor": "s", "used": 1, "lost": 2})
