@@ -179,12 +179,10 @@ class _Calibrating:
         elif lengths := doubted_lengths(problem, solution):
             self.findings.append(Finding(Ground.MISREAD, str(lengths)))
         outliers = self._outliers(inliers)
-        # What a misreading leaves undetermined says nothing of the motion.
         if refined is not None and not refined.free_directions and spare_equations(problem) < SPARE_EQUATIONS:
             words = f"{problem.number_of_measurements} measurements are too few to tell how large their noise is"
             self.findings.append(Finding(Ground.COVARIANCE_DOUBTED, words))
-        of_answer = [one for one in findings_of(solution, refined) if not (misread and one.ground is Ground.NOT_UNIQUE)]
-        judgement = Judgement.of([*of_answer, *self.findings], proof_of(refined))
+        judgement = Judgement.of([*findings_of(solution, refined), *self.findings], proof_of(refined))
         best = solution if refined is None else refined
         return Calibration(
             X={} if best is None else best.X,

@@ -147,7 +147,12 @@ class Judgement:
 
     @staticmethod
     def of(findings: list[Finding], praise: str) -> Judgement:
-        """The judgement that some findings lead to; without any, ``praise`` is why the poses are to be used."""
+        """The judgement that some findings lead to; without any, ``praise`` is why the poses are to be used.
+
+        What a misreading leaves undetermined says nothing of the motion, so it is no ground beside a misreading.
+        """
+        if any(finding.ground is Ground.MISREAD for finding in findings):
+            findings = [finding for finding in findings if finding.ground is not Ground.NOT_UNIQUE]
         if not findings:
             return Judgement(Verdict.USE, (), praise)
         by_ground: dict[Ground, list[str]] = {}

@@ -41,6 +41,13 @@ def test_the_most_serious_ground_comes_first_and_decides() -> None:
     assert judgement.reason == f"{facts}. What to do: {Ground.MISREAD.advice}"
 
 
+def test_what_a_misreading_leaves_free_is_not_blamed_on_the_motion() -> None:
+    free = Finding(Ground.NOT_UNIQUE, "the measurements do not determine all poses")
+    misread = Finding(Ground.MISREAD, "A is inverted")
+    assert Judgement.of([free, misread], "praise") == Judgement.of([misread], "praise")
+    assert Judgement.of([free], "praise").grounds == (Ground.NOT_UNIQUE,)
+
+
 def test_without_findings_the_poses_are_to_be_used() -> None:
     judgement = Judgement.of([], "all is well")
     assert (judgement.verdict, judgement.grounds, str(judgement)) == (Verdict.USE, (), "Use these poses: all is well.")
