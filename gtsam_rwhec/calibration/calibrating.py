@@ -451,7 +451,7 @@ class _Calibrating:
     def _doubt_stated_poses(self, refined: Refined, inliers: Inliers) -> None:
         """Priors and fixed poses that the measurements contradict."""
         problem = self.problem
-        if not problem.has_measurements or not stated_poses(problem):
+        if not stated_poses(problem):
             return
         self.tell("comparing the stated poses with the measurements")
         options = replace(self.options, time_offsets=tuple(refined.time_offsets_s))

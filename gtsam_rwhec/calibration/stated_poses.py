@@ -6,6 +6,7 @@ without what was stated; what they say is compared with it under both covariance
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -98,7 +99,7 @@ def stated_poses(problem: Problem) -> dict[str, list[Prior]]:
 def _without(problem: Problem, loose: set[str]) -> Problem:
     """The problem without what was stated of frames; those of ``loose`` keep the pose with a large noise."""
     stated = stated_poses(problem)
-    without = problem.with_measurements({pair: problem.measurements(*pair) for pair in problem.pairs})
+    without = copy.copy(problem)  # the measurements are shared, what was stated is not
     without.fixed, without.priors = {}, {}
     for name in loose:
         without.add_prior(name, stated[name][0].transform, LOOSE_M, 0.5 / LOOSE_RAD**2)

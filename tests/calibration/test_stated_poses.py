@@ -46,6 +46,18 @@ def test_wrong_fixed_poses_are_not_to_be_used() -> None:
     assert "camera" not in calibration.judgement.reason.split(";")[0]
 
 
+def test_measurements_that_were_not_kept_contradict_a_wrong_prior_too() -> None:
+    raw = problem_of().measurements("board", "camera")
+    problem = rw.Problem(keep_measurements=False)
+    problem.add("board", "camera", raw.A, raw.B)
+    problem.add_prior("board", off(X, 5.0, 0.1), 1e-3, 5e5)
+    before = problem.priors["board"]
+    calibration = rw.calibrate(problem)
+    assert "the stated pose of board is" in calibration.judgement.reason
+    assert problem.priors["board"] is before
+    assert rw.Ground.CONTRADICTED in calibration.judgement.grounds
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_true_stated_poses_are_not_accused(seed: int) -> None:
     problem = problem_of(seed)
