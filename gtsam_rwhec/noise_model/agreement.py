@@ -53,15 +53,15 @@ def agreeing(
         for item in data_of(judged, variables, how)
     ]
     everything = replace(task, problem=judged, data=data, variables=variables, instants=Instants.of(data))
-    correlation = None if found.model.drift is None else found.model.drift.correlation
+    walk = None if found.model.drift is None else found.model.drift.walk
     sigma = found.fit.sizes.values(found.fit.logs)
     is_systematic = found.model.features.shape[1] > 0
-    model = everything.model(found.state, found.model.side, correlation, systematic=is_systematic)
+    model = everything.model(found.state, found.model.side, walk, systematic=is_systematic)
     made = graph_of(model, sigma, data, variables, found.state, judged)
     has_free = bool(task.layout.free.shape[1])
     optimum = optimum_of(made, variables, has_free=has_free, max_iterations=how.max_iterations)
     state = variables.state(optimum.values)
-    there = everything.model(state, found.model.side, correlation, systematic=is_systematic)
+    there = everything.model(state, found.model.side, walk, systematic=is_systematic)
     rows = there.rows
     left = rows.residual - effects_at(model, sigma, optimum.values)
     keep = np.concatenate([inliers[item.pair] for item in data])[rows.instants.order]

@@ -1,13 +1,14 @@
-"""The drift of a sensor's track: a random walk of its pose in its own frame, and of the logarithm of its scale.
+"""The drift of a track: a walk of its pose in the frame of the sensor or of the target, and of its scale's logarithm.
 
-T_target_sensor as measured is the true one times Expmap(w), w_k = Ad(motion^-1) w_{k-1} + xi_k: what odometry does,
-whose error of a step is made where the sensor is. A correlation time makes it w_k = phi w_{k-1} + xi_k in the frame of
-the residual, as errors of a detector are that vary slowly with the view.
+T_target_sensor as measured is the true one times Expmap(w) (in the sensor's frame), or T_sensor_target is (in the
+target's). A random walk is w_k = Ad(motion^-1) w_{k-1} + xi_k: what odometry does, whose error of a step is made where
+the frame is. With a correlation time it is w_k = phi w_{k-1} + xi_k, as errors of a detector are that vary slowly.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from rwhec_factors import se3
@@ -23,6 +24,17 @@ TRACK = 7
 SMALLEST, SMALLEST_SHARE = 1e-12, 1e-4
 
 
+#: Whose frame an error is made in; "detection": rotations in the target's axes, translations along the sensor's.
+Frame = Literal["sensor", "target", "detection"]
+
+
+class Walk(NamedTuple):
+    """A kind of drift: the correlation of errors from step to step (1: a random walk), and whose frame they are in."""
+
+    correlation: float
+    frame: Frame
+
+
 @dataclass(frozen=True)
 class DriftPrior:
     """The walk of all tracks' states from instant to instant.
@@ -35,12 +47,18 @@ class DriftPrior:
         Of the steps, in those of a typical step.
     linked : (T - 1,) array
         Whether an instant continues the one before.
+    walk : Walk
     """
 
     transport: Array
     variance: Array
     linked: np.ndarray
-    correlation: float
+    walk: Walk
+
+    @property
+    def correlation(self) -> float:
+        """Of errors from one step to the next; 1 is a random walk."""
+        return self.walk.correlation
 
     @property
     def states(self) -> int:
@@ -48,9 +66,9 @@ class DriftPrior:
         return int(self.transport.shape[1])
 
     @staticmethod
-    def of(rows: Rows, correlation: float = 1.0) -> DriftPrior:
-        """A random walk (correlation 1), or a stationary walk with this correlation from step to step."""
-        instants = rows.instants
+    def of(rows: Rows, walk: Walk) -> DriftPrior:
+        """A random walk from the first instant on (correlation 1), or a stationary one."""
+        instants, correlation = rows.instants, walk.correlation
         T, s = instants.count, TRACK * instants.chains
         linked = instants.step[1:] > 0.0
         step = np.where(instants.step > 0.0, instants.step, 1.0)
@@ -63,15 +81,18 @@ class DriftPrior:
             variance[np.r_[True, ~linked]] = 1.0
         else:
             transport[:] = np.eye(s)
+        if correlation == 1.0 and walk.frame != "detection":
             for chain in range(instants.chains):
                 own = np.flatnonzero(instants.chain == chain)
-                at = instants.index[own]
-                poses = rows.predicted[own]
+                at, first_of = np.unique(instants.index[own], return_index=True)
+                poses = rows.predicted[own[first_of]]
+                if walk.frame == "target":
+                    poses = se3.inverse(poses)
                 motion = se3.adjoint(poses[1:] @ se3.inverse(poses[:-1]))  # Ad(motion^-1), motion = T_before_after
                 first = TRACK * chain
                 transport[at[1:] - 1, first : first + 6, first : first + 6] = motion
         transport[~linked] = 0.0
-        return DriftPrior(transport, variance, linked, correlation)
+        return DriftPrior(transport, variance, linked, walk)
 
     def factor(self, added: Array, sigma: dict[C, float]) -> tuple[ChainFactor, float]:
         """Of the unit states' precision, with the measurements' (T, s, s) ``added``; log|precision| - log|prior|."""
@@ -127,7 +148,12 @@ def drift_directions(rows: Rows, prior: DriftPrior) -> Array:
     """The same by states in rad, m and logarithms of the scale."""
     N = len(rows.residual)
     own = np.zeros((N, 6, TRACK))
-    own[:, :, :6] = se3.adjoint(se3.inverse(rows.predicted)) if prior.correlation == 1.0 else np.eye(6)
+    back = se3.inverse(rows.predicted)
+    if prior.walk.frame == "sensor":
+        own[:, :, :6] = se3.adjoint(back)
+    else:
+        own[:, :3, :3] = np.eye(3)
+        own[:, 3:, 3:6] = np.eye(3) if prior.walk.frame == "target" else back[:, :3, :3]
     own[:, 3:, 6] = rows.length
     if rows.instants.chains == 1:
         return own

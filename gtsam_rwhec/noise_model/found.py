@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from gtsam_rwhec.noise_model.components import CARRIER, DRIFT, SYSTEMATIC, Component
+from gtsam_rwhec.noise_model.drift import Frame
 from gtsam_rwhec.noise_model.rows import Side
 
 C = Component
@@ -44,6 +45,8 @@ class NoiseInData:
         The carrier to which errors of A are fixed.
     correlation : float or None
         Of a track's errors from one step to the next; 1 is a random walk, None no drift.
+    frame : "sensor", "target", "detection" or None
+        In whose frame these errors are; "detection": rotations in the target's axes, translations along the sensor's.
     drift_evidence, systematic_evidence : float
         How much twice the log likelihood rose with drift, and with errors that vary with the configuration.
     is_drift_untried : bool
@@ -57,6 +60,7 @@ class NoiseInData:
     worth: float
     hand: Side
     correlation: float | None
+    frame: Frame | None
     drift_evidence: float
     systematic_evidence: float
     is_drift_untried: bool
@@ -91,6 +95,7 @@ class NoiseInData:
         if self.correlation is not None:
             steps = [self._words(component) for component in DRIFT if component in self.deviations]
             kind = "Drift in a step" if self.correlation == 1.0 else f"Correlated errors ({self.correlation:g} a step)"
+            kind += " of detections" if self.frame == "detection" else f" in the {self.frame}'s frame"
             said.append(
                 f"{kind}: {', '.join(steps)} (2 log likelihood {self.drift_evidence:+.0f}). "
                 f"{self.instants} frames are worth about {self.worth:.0f}."

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import gtsam
 import numpy as np
@@ -11,11 +13,11 @@ from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.noise_model.components import Component, Sizes
-from gtsam_rwhec.noise_model.drift import DriftPrior
+from gtsam_rwhec.noise_model.drift import DriftPrior, Frame, Walk
 from gtsam_rwhec.noise_model.found import Deviation, NoiseInData
 from gtsam_rwhec.noise_model.likelihood import NoiseModel
 from gtsam_rwhec.noise_model.mixture import SAMPLES, Mixture, mixture_of
-from gtsam_rwhec.noise_model.options import NoiseOptions
+from gtsam_rwhec.noise_model.options import Drift, NoiseOptions
 from gtsam_rwhec.noise_model.prior_knowledge import prior_terms
 from gtsam_rwhec.noise_model.reml import Fitted, fitted
 from gtsam_rwhec.noise_model.rows import Instants, Rows, Side
@@ -40,10 +42,15 @@ HELD = 1e-3
 SHORTEST_TRACK = 20
 #: Tracks that are seen at the same instants share a state of at most this many tracks.
 MOST_TRACKS = 6
-#: Correlations from step to step that are tried; 1 is a random walk.
-FIRST_CORRELATIONS = {"auto": (1.0, 0.9), "walk": (1.0,), "correlated": (0.9,), "none": ()}
-#: These are tried where the walk is not a random one.
-MORE_CORRELATIONS = (0.6, 0.97)
+#: Kinds of drift that are tried.
+FIRST_WALKS: dict[Drift, tuple[Walk, ...]] = {
+    "auto": tuple(Walk(each, frame) for each in (1.0, 0.9) for frame in get_args(Frame)),
+    "walk": tuple(Walk(1.0, frame) for frame in get_args(Frame)),
+    "correlated": tuple(Walk(0.9, frame) for frame in get_args(Frame)),
+    "none": (),
+}
+#: These correlations are tried where the walk is not a random one.
+MORE_CORRELATIONS = (0.6, 0.97, 0.99)
 #: A drift is in the model when it lowers -2 log of the density by more than this.
 PAYS = 6.0
 #: Residuals are correlated in time when their lag-1 correlation is beyond this many standard deviations.
@@ -100,10 +107,10 @@ class Task:
         rest: Array = unit[:, None] * np.linalg.svd(free, full_matrices=True)[0][:, free.shape[1] :]
         return rest
 
-    def model(self, state: State, side: Side, correlation: float | None, *, systematic: bool) -> NoiseModel:
+    def model(self, state: State, side: Side, walk: Walk | None, *, systematic: bool) -> NoiseModel:
         """The model about an estimate, from all measurements."""
         rows = Rows.of(self.data, self.variables, state, self.layout, self.instants)
-        drift = None if correlation is None else DriftPrior.of(rows, correlation)
+        drift = None if walk is None else DriftPrior.of(rows, walk)
         features = rows.features(side) if systematic else np.zeros((len(rows.residual), 0))
         information, gradient = prior_terms(self.problem, self.variables, state, self.layout, self.basis)
         return NoiseModel(rows, side, self.basis, information, gradient, drift, features)
@@ -117,12 +124,12 @@ class Task:
         return Sizes.of(typical, {c: s for c, s in self.options.stated.items() if c in typical})
 
     def settle(
-        self, start: State, side: Side, correlation: float | None, *, systematic: bool, near: Fitted | None = None
+        self, start: State, side: Side, walk: Walk | None, *, systematic: bool, near: Fitted | None = None
     ) -> Settled:
         """Components and unknowns in turn; ``near`` has components of a similar model."""
         state, sizes, logs = start, None, None
         for _ in range(ROUNDS):
-            model = self.model(state, side, correlation, systematic=systematic)
+            model = self.model(state, side, walk, systematic=systematic)
             sizes = self.sizes(model, systematic=systematic) if sizes is None else sizes
             if logs is None:
                 known = {} if near is None else dict(zip(near.sizes.active, near.logs, strict=True))
@@ -133,7 +140,7 @@ class Task:
             state = moved(state, self.variables, self.layout, model.basis @ whole.step)
             if (np.abs(whole.step) < SETTLED * np.sqrt(np.diagonal(whole.covariance))).all():
                 break
-        return Settled(state, self.model(state, side, correlation, systematic=systematic), fit)
+        return Settled(state, self.model(state, side, walk, systematic=systematic), fit)
 
 
 def thinned(model: NoiseModel) -> NoiseModel:
@@ -143,7 +150,7 @@ def thinned(model: NoiseModel) -> NoiseModel:
         return model
     rows = model.rows.thinned(every)
     kept = np.isin(model.rows.instants.order, rows.instants.order)
-    drift = None if model.drift is None else DriftPrior.of(rows, model.drift.correlation)
+    drift = None if model.drift is None else DriftPrior.of(rows, model.drift.walk)
     # Frames that are not seen in these rows are held by a little of what all rows know of them.
     size = np.sqrt((model.rows.residual**2).mean(axis=0)) + QUIETEST
     J = (model.rows.jacobian @ model.basis / size[:, None]).reshape(-1, model.basis.shape[1])
@@ -161,7 +168,7 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
         tell("estimating the noise again")
         drift = before.model.drift
         again = task.settle(
-            start, before.model.side, None if drift is None else drift.correlation, systematic=options.systematic,
+            start, before.model.side, None if drift is None else drift.walk, systematic=options.systematic,
             near=before.fit,
         )  # fmt: skip
         return replace(before, state=again.state, model=again.model, fit=again.fit)
@@ -180,8 +187,8 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
     if options.systematic:
         systematic_evidence = white.fit.objective - steady.fit.objective
         if best is not steady and systematic_evidence > 0.0:  # drift may explain the same
-            correlation = None if best.model.drift is None else best.model.drift.correlation
-            without = task.settle(best.state, side, correlation, systematic=False, near=best.fit)
+            kind = None if best.model.drift is None else best.model.drift.walk
+            without = task.settle(best.state, side, kind, systematic=False, near=best.fit)
             systematic_evidence = without.fit.objective - best.fit.objective
     return replace(best, white=white, drift_evidence=drift_evidence, systematic_evidence=systematic_evidence)
 
@@ -194,20 +201,27 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
         return steady
     tell("estimating drift")
 
-    def best_of(correlations: tuple[float, ...], near: Settled) -> Settled:
+    def best_of(kinds: Sequence[Walk], near: Settled) -> Settled:
         return min(
             (
-                task.settle(near.state, steady.model.side, each, systematic=options.systematic, near=near.fit)
-                for each in correlations
+                task.settle(near.state, steady.model.side, kind, systematic=options.systematic, near=near.fit)
+                for kind in kinds
             ),
-            key=lambda each: each.fit.objective,
+            key=_height,
         )
 
-    walk = best_of(FIRST_CORRELATIONS[options.drift], steady)
+    walk = best_of(FIRST_WALKS[options.drift], steady)
     assert walk.model.drift is not None
     if walk.model.drift.correlation < 1.0:
-        walk = min(walk, best_of(MORE_CORRELATIONS, walk), key=lambda each: each.fit.objective)
+        frame = walk.model.drift.walk.frame
+        walk = min(walk, best_of([Walk(each, frame) for each in MORE_CORRELATIONS], walk), key=_height)
     return walk if options.drift != "auto" or walk.fit.objective < steady.fit.objective - PAYS else steady
+
+
+def _height(found: Settled) -> float:
+    """-2 log of the density; more for a random walk, which says that the first instant has no error."""
+    assert found.model.drift is not None
+    return found.fit.objective + (PAYS if found.model.drift.correlation == 1.0 else 0.0)
 
 
 def is_correlated(found: Settled, limit: float = CORRELATED) -> bool:
@@ -265,7 +279,8 @@ def noise_in(task: Task, found: Settled, mixture: Mixture) -> NoiseInData:
         instants=task.instants.count,
         worth=task.instants.count * float(np.exp(min(ratios))),
         hand=found.model.side,
-        correlation=None if found.model.drift is None else found.model.drift.correlation,
+        correlation=None if found.model.drift is None else found.model.drift.walk.correlation,
+        frame=None if found.model.drift is None else found.model.drift.walk.frame,
         drift_evidence=found.drift_evidence,
         systematic_evidence=found.systematic_evidence,
         is_drift_untried=task.instants.chains > MOST_TRACKS and is_correlated(found, SURELY_CORRELATED),

@@ -6,6 +6,7 @@ import numpy as np
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.noise_model.components import Component, Sizes
+from gtsam_rwhec.noise_model.drift import Walk
 from gtsam_rwhec.noise_model.modelled import Settled, Task, moved
 from gtsam_rwhec.noise_model.options import NoiseOptions
 from gtsam_rwhec.noise_model.reml import Fitted
@@ -34,15 +35,13 @@ def task_of(problem: rw.Problem, solution: rw.Solution, offsets: tuple[str, ...]
     return Task(problem, data, variables, layout, Instants.of(data), NoiseOptions(), space.directions)
 
 
-def settled_at(
-    task: Task, solution: rw.Solution, side: Side, correlation: float | None, *, systematic: bool
-) -> Settled:
+def settled_at(task: Task, solution: rw.Solution, side: Side, walk: Walk | None, *, systematic: bool) -> Settled:
     """The optimum at ``SIGMA``, as ``Task.settle`` leaves it at the components that it finds."""
     sizes = Sizes.of(SIGMA, {})
     state = task.variables.start(solution)
     for _ in range(3):
-        model = task.model(state, side, correlation, systematic=systematic)
+        model = task.model(state, side, walk, systematic=systematic)
         estimate = model.evaluate(SIGMA)
         state = moved(state, task.variables, task.layout, model.basis @ estimate.step)
     fit = Fitted(sizes, np.log(list(SIGMA.values())), estimate.minus_two_log, estimate)
-    return Settled(state, task.model(state, side, correlation, systematic=systematic), fit)
+    return Settled(state, task.model(state, side, walk, systematic=systematic), fit)

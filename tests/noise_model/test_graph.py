@@ -15,6 +15,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotUniqueWarning
 from gtsam_rwhec.noise_model import graph as graphs
 from gtsam_rwhec.noise_model.components import Component
+from gtsam_rwhec.noise_model.drift import Walk
 from gtsam_rwhec.noise_model.graph import NoiseGraph, graph_of, optimum_of
 from gtsam_rwhec.noise_model.modelled import Settled, Task
 from gtsam_rwhec.noise_model.refined import disagreement
@@ -31,7 +32,7 @@ class Case:
     shared: bool = True
     count: int = 12
     scale: str = "shared"
-    correlation: float | None = None
+    walk: Walk | None = None
     systematic: bool = False
     side: Side = "targetcarrier"
     priors: bool = False
@@ -54,24 +55,24 @@ class Case:
             problem.fix("cam_0", solution.Y["cam_0"])
         solution = rw.solve(problem)
         task = task_of(problem, solution, ("cam_0",) if self.offset else ())
-        found = settled_at(task, solution, self.side, self.correlation, systematic=self.systematic)
+        found = settled_at(task, solution, self.side, self.walk, systematic=self.systematic)
         return task, found, solution
 
 
 CASES = {
     "plain": Case(),
-    "drift": Case(correlation=1.0),
-    "correlated errors": Case(correlation=0.8, side="sensorcarrier"),
+    "drift": Case(walk=Walk(1.0, "sensor")),
+    "correlated errors": Case(walk=Walk(0.8, "target"), side="sensorcarrier"),
     "systematic": Case(systematic=True),
     "shared carriers": Case(2, 2),
-    "shared carriers, all effects": Case(2, 2, correlation=1.0, systematic=True, side="sensorcarrier"),
-    "one track after the other": Case(2, 1, shared=False, correlation=1.0, systematic=True),
-    "priors": Case(priors=True, correlation=1.0, systematic=True),
-    "a fixed frame": Case(2, 1, fixed=True, correlation=1.0),
+    "shared carriers, all effects": Case(2, 2, walk=Walk(1.0, "sensor"), systematic=True, side="sensorcarrier"),
+    "one track after the other": Case(2, 1, shared=False, walk=Walk(1.0, "sensor"), systematic=True),
+    "priors": Case(priors=True, walk=Walk(1.0, "sensor"), systematic=True),
+    "a fixed frame": Case(2, 1, fixed=True, walk=Walk(1.0, "sensor")),
     "priors and a fixed frame": Case(2, 2, fixed=True, priors=True, systematic=True),
-    "a scale for each target": Case(2, 1, scale="per_target", correlation=1.0, systematic=True),
-    "known scale": Case(scale="known", correlation=1.0),
-    "a time offset": Case(1, 2, offset=True, correlation=0.9),
+    "a scale for each target": Case(2, 1, scale="per_target", walk=Walk(1.0, "sensor"), systematic=True),
+    "known scale": Case(scale="known", walk=Walk(1.0, "target")),
+    "a time offset": Case(1, 2, offset=True, walk=Walk(0.9, "sensor")),
 }
 
 
@@ -118,7 +119,9 @@ def test_information_and_optimum_are_the_models(case: Case) -> None:
 
 
 def test_effects_have_names() -> None:
-    task, found, _ = Case(2, 1, correlation=1.0, systematic=True).settled()  # two poses have one measurement only
+    task, found, _ = Case(
+        2, 1, walk=Walk(1.0, "sensor"), systematic=True
+    ).settled()  # two poses have one measurement only
     made = made_of(task, found)
     names = {f"drift:{i}" for i in range(12)} | {f"carrier:{i}" for i in range(10)} | {"systematic"}
     assert set(made.keys) == names
@@ -140,7 +143,7 @@ def test_only_the_effects_of_the_model_are_in_the_graph() -> None:
 
 
 def test_factors_hold_few_instants(monkeypatch: pytest.MonkeyPatch) -> None:
-    task, found, _ = Case(count=25, correlation=1.0).settled()
+    task, found, _ = Case(count=25, walk=Walk(1.0, "sensor")).settled()
 
     def largest() -> int:
         graph = made_of(task, found).graph
@@ -163,7 +166,7 @@ def test_the_values_are_the_drift_that_was_put_in() -> None:
     still.add("tag_0", "cam_0", *drifting(count, drift * unit, chance), stamps_ns=np.arange(count) * 100_000_000)
     solution = rw.solve(still)
     task = task_of(still, solution)
-    found = settled_at(task, solution, "targetcarrier", phi, systematic=False)
+    found = settled_at(task, solution, "targetcarrier", Walk(phi, "target"), systematic=False)
     sigma = dict.fromkeys(C, 0.0)
     sigma |= {C.ROTATION: 1e-3, C.TRANSLATION: 5e-4, C.DRIFT_ROTATION: 0.02, C.DRIFT_TRANSLATION: 0.01}
     made = graph_of(found.model, sigma, task.data, task.variables, found.state, still)
@@ -195,7 +198,7 @@ def test_free_directions_stay_where_they_were() -> None:
         solution = rw.solve(problem)
     task = task_of(problem, solution)
     assert task.free_directions
-    found = settled_at(task, solution, "targetcarrier", 1.0, systematic=False)
+    found = settled_at(task, solution, "targetcarrier", Walk(1.0, "sensor"), systematic=False)
     made = made_of(task, found)
     optimum = optimum_of(made, task.variables, has_free=True, max_iterations=100)
     state = task.variables.state(optimum.values)
@@ -206,7 +209,7 @@ def test_free_directions_stay_where_they_were() -> None:
 
 def test_a_drift_that_only_turns_is_no_singular_graph() -> None:
     """GTSAM's optimiser fails where the steps of the translation are a thousand times less than the lever's."""
-    task, found, _ = Case(count=30, correlation=1.0).settled()
+    task, found, _ = Case(count=30, walk=Walk(1.0, "sensor")).settled()
     turning = SIGMA | {C.DRIFT_TRANSLATION: 1e-7}
     made = graph_of(found.model, turning, task.data, task.variables, found.state, task.problem)
     optimum = optimum_of(made, task.variables, has_free=False, max_iterations=100)

@@ -9,7 +9,7 @@ import pytest
 from noisy_rows import problem_of, rows_of
 
 from gtsam_rwhec.noise_model.components import Component
-from gtsam_rwhec.noise_model.drift import TRACK, DriftPrior, drift_columns, unit_of
+from gtsam_rwhec.noise_model.drift import TRACK, DriftPrior, Walk, drift_columns, unit_of
 from gtsam_rwhec.noise_model.likelihood import NoiseModel
 from gtsam_rwhec.noise_model.rows import Side
 
@@ -47,7 +47,11 @@ def test_it_is_that_of_dense_matrices(
     rows, *_ = rows_of(problem_of(targets, sensors, 8, scale="shared", shared=shared))
     # without one frame, nothing is free
     size = rows.jacobian.shape[2]
-    drift = None if correlation is None else DriftPrior.of(rows, correlation)
+    drift = (
+        None
+        if correlation is None
+        else DriftPrior.of(rows, Walk(correlation, "sensor" if side == "targetcarrier" else "target"))
+    )
     chance = np.random.default_rng(1)
     root = chance.normal(size=(size, size))
     prior, gradient = root @ root.T, chance.normal(size=(size,))
@@ -89,7 +93,11 @@ def model_of(targets: int, sensors: int, shared: bool, correlation: float | None
     rows = replace(rows, given=skewed @ skewed.transpose(0, 2, 1))
     size = rows.jacobian.shape[2]
     root = chance.normal(size=(size, size))
-    drift = None if correlation is None else DriftPrior.of(rows, correlation)
+    drift = (
+        None
+        if correlation is None
+        else DriftPrior.of(rows, Walk(correlation, "sensor" if side == "targetcarrier" else "target"))
+    )
     basis = np.linalg.qr(root)[0][:, 1:]
     prior, gradient = np.eye(size - 1), chance.normal(size=(size - 1,))
     return NoiseModel(rows, side, basis, prior, gradient, drift, rows.features(side)[:, :3])
@@ -135,7 +143,7 @@ def test_a_drift_of_rotation_alone_is_the_limit() -> None:
 def test_components_may_go_to_zero() -> None:
     rows, *_ = rows_of(problem_of(count=20))
     size = rows.jacobian.shape[2]
-    drift = DriftPrior.of(rows)
+    drift = DriftPrior.of(rows, Walk(1.0, "sensor"))
     known = np.eye(size), np.zeros((size, size)), np.zeros(size)
     with_all = NoiseModel(rows, "targetcarrier", *known, drift, rows.features("targetcarrier"))
     white = {component: 0.0 for component in Component} | {C.ROTATION: 0.01, C.TRANSLATION: 0.004}

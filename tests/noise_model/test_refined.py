@@ -14,6 +14,7 @@ from settled_models import SIGMA, settled_at, task_of
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotConvergedWarning
 from gtsam_rwhec.noise_model.components import Component
+from gtsam_rwhec.noise_model.drift import Walk
 from gtsam_rwhec.noise_model.modelled import Settled, Task, moved
 from gtsam_rwhec.noise_model.refined import change_between, refined_of
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
@@ -27,7 +28,7 @@ def settled(scale: str = "per_target") -> tuple[Task, Settled, rw.Solution]:
     problem = problem_of(2, 1, 20, scale=scale)
     solution = rw.solve(problem)
     task = task_of(problem, solution)
-    return task, settled_at(task, solution, "targetcarrier", 1.0, systematic=True), solution
+    return task, settled_at(task, solution, "targetcarrier", Walk(1.0, "sensor"), systematic=True), solution
 
 
 def refined(task: Task, found: Settled, solution: rw.Solution, options: RefineOptions | None = None) -> Refined:

@@ -67,7 +67,7 @@ def test_noise_of_a_and_b_are_told_apart() -> None:
 
 def test_a_random_walk_is_found_and_the_frames_are_worth_less() -> None:
     refined, noise = refined_under(simulated(walk=(0.003, 0.002)))
-    assert noise.correlation == 1.0
+    assert (noise.correlation, noise.frame) == (1.0, "sensor")
     assert noise.drift_evidence > 50.0
     assert noise.deviations[C.DRIFT_ROTATION].value == pytest.approx(0.003, rel=0.3)
     assert noise.deviations[C.DRIFT_TRANSLATION].value == pytest.approx(0.002, rel=0.3)
@@ -76,6 +76,31 @@ def test_a_random_walk_is_found_and_the_frames_are_worth_less() -> None:
     assert refined.keys["drift:79"] in list(refined.values.keys())
     plain = rw.refine(simulated(walk=(0.003, 0.002)), refined.solution, rw.RefineOptions(noise="estimate"))
     assert not plain.contains("camera", Y) or plain.covariance("camera").trace() > refined.covariance("camera").trace()
+
+
+@pytest.mark.parametrize("frame", ["sensor", "target", "detection"])
+def test_errors_that_fade_are_found_in_their_frame(frame: str) -> None:
+    """The target's or the sensor's pose is off by errors of which 0.9 are left after each step."""
+    chance = np.random.default_rng(5)
+    A = random_poses(chance, 80, 0.7, 0.3)
+    xi = np.zeros((80, 6))
+    for i in range(80):
+        xi[i] = (0.9 * xi[i - 1] if i else 0.0) + (1.0 if i == 0 else np.sqrt(0.19)) * chance.normal(size=6)
+    fading = se3.expmap(xi * np.repeat([0.01, 0.005], 3))
+    exact = np.linalg.inv(Y) @ A @ X
+    B = fading @ exact if frame == "sensor" else exact @ fading
+    if frame == "detection":
+        B[:, :3, 3] = exact[:, :3, 3] + fading[:, :3, 3]
+    B = B @ twists(chance, 80, 0.002, 0.001)
+    problem = rw.Problem()
+    problem.add("board", "camera", A, B, stamps_ns=np.arange(80) * 10**8)
+    refined, noise = refined_under(problem)
+    assert noise.frame == frame
+    assert noise.correlation is not None
+    assert 0.6 <= noise.correlation < 1.0
+    assert ("of detections" if frame == "detection" else f"in the {frame}'s frame") in str(noise)
+    assert refined.contains("board", X, 0.9999)
+    assert refined.contains("camera", Y, 0.9999)
 
 
 def test_options_overrule() -> None:
