@@ -39,6 +39,7 @@ from .calibration import calibrate as calibrate
 # Refine it: covariances, outliers, time offsets; and predict measurements that it has not seen.
 from .calibration import CrossValidation as CrossValidation
 from .calibration import cross_validate as cross_validate
+from .calibration import reading_of as reading_of
 from .geometry import pose_covariances as pose_covariances
 from .refinement import CarrierNoise as CarrierNoise
 from .refinement import RefineOptions as RefineOptions

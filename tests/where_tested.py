@@ -35,7 +35,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/calibration": {
         "calibration/test_calibrating.py": "calibrated choices disagreement noise_choice options",
         "calibration/test_cross_validation.py": "folds prediction_errors",
-        "calibration/test_misreadings.py": "readings samples trial_fits wrong_units",
+        "calibration/test_misreadings.py": "reading readings samples trial_fits wrong_units",
     },
     "gtsam_rwhec/cleaning": {
         "cleaning/test_pair_consensus.py": "removed",

@@ -16,3 +16,5 @@ from .verdict import Verdict as Verdict
 from .misreadings import Misreading as Misreading
 from .plausibility import Implausible as Implausible
 from .readings import Mistake as Mistake
+from .reading import Reading as Reading
+from .reading import reading_of as reading_of

@@ -26,10 +26,11 @@ from gtsam_rwhec.calibration.choices import Choice
 from gtsam_rwhec.calibration.clocks import Clock, offsets_worth_estimating
 from gtsam_rwhec.calibration.disagreement import contradicted_frames
 from gtsam_rwhec.calibration.lengths import doubted_lengths, undetectable
-from gtsam_rwhec.calibration.misreadings import Misreading, misreadings
+from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.noise_choice import Inliers, estimated, offsets_of
 from gtsam_rwhec.calibration.options import CalibrateOptions
-from gtsam_rwhec.calibration.plausibility import Implausible, implausible
+from gtsam_rwhec.calibration.plausibility import Implausible
+from gtsam_rwhec.calibration.reading import reading_of
 from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.calibration.sizes import TargetSize, sizes
 from gtsam_rwhec.calibration.stated_poses import contradicted_poses, stated_poses
@@ -231,13 +232,13 @@ class _Calibrating:
         if not self.options.misreadings:
             self._choose(what, "as given", "an option says so")
             return (), None
-        found = misreadings(self.problem, solution, progress=self.tell)
-        odd = None if found else implausible(self.problem, solution)
+        reading = reading_of(self.problem, solution, self.tell)
+        found, odd = reading.misreadings, reading.implausible
+        if reading.finding is not None:
+            self.findings.append(reading.finding)
         if found:
-            self.findings.append(Finding(Ground.MISREAD, " (or: ".join(map(str, found)) + ")" * (len(found) - 1)))
             self._choose(what, "nothing else is computed", "another reading of the poses fits far better")
         elif odd is not None:
-            self.findings.append(Finding(Ground.IMPLAUSIBLE, str(odd)))
             self._choose(what, "nothing else is computed", "the residuals are those of no sensor")
         else:
             self._choose(what, "as given", "no likely mistake of reading explains the measurements far better")

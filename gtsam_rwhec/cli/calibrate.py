@@ -161,8 +161,13 @@ def calibrate(
             earlier = None if initial is None else rw.read_solution(initial)
             start = None if earlier is None else (earlier.X, earlier.Y, earlier.scale)
             solution = rw.solve(problem, method=method, initial=start, progress=stage)
-            write, report = partial(rw.write_solution, solution), partial(rw.report.print_solution, solution)
-            judgement = rw.judge(solution)
+            # Residuals of an answer that is not the optimum tell nothing of the reading.
+            is_optimal = solution.certificate.is_optimal
+            of_reading = rw.reading_of(problem, solution, stage).finding if is_optimal else None
+            findings = () if of_reading is None else (of_reading,)
+            write = partial(rw.write_solution, solution)
+            report = partial(rw.report.print_solution, solution, findings=findings)
+            judgement = rw.judge(solution, findings=findings)
         else:
             options = rw.CalibrateOptions(noise=noise, robust=robust, carrier_noise=carriers, misreadings=not as_read)
             calibration = rw.calibrate(problem, options, progress=stage)

@@ -124,11 +124,18 @@ class Task:
         return Sizes.of(typical, {c: s for c, s in self.options.stated.items() if c in typical})
 
     def settle(
-        self, start: State, side: Side, walk: Walk | None, *, systematic: bool, near: Fitted | None = None
+        self,
+        start: State,
+        side: Side,
+        walk: Walk | None,
+        *,
+        systematic: bool,
+        near: Fitted | None = None,
+        rounds: int = ROUNDS,
     ) -> Settled:
         """Components and unknowns in turn; ``near`` has components of a similar model."""
         state, sizes, logs = start, None, None
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             model = self.model(state, side, walk, systematic=systematic)
             sizes = self.sizes(model, systematic=systematic) if sizes is None else sizes
             if logs is None:
@@ -201,27 +208,27 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
         return steady
     tell("estimating drift")
 
-    def best_of(kinds: Sequence[Walk], near: Settled) -> Settled:
-        return min(
-            (
-                task.settle(near.state, steady.model.side, kind, systematic=options.systematic, near=near.fit)
-                for kind in kinds
-            ),
-            key=_height,
-        )
+    def best_of(kinds: Sequence[Walk], near: Settled) -> tuple[Walk, Settled]:
+        tried = [
+            (kind, task.settle(near.state, steady.model.side, kind, systematic=systematic, near=near.fit, rounds=1))
+            for kind in kinds
+        ]
+        return min(tried, key=_height)
 
-    walk = best_of(FIRST_WALKS[options.drift], steady)
-    assert walk.model.drift is not None
-    if walk.model.drift.correlation < 1.0:
-        frame = walk.model.drift.walk.frame
-        walk = min(walk, best_of([Walk(each, frame) for each in MORE_CORRELATIONS], walk), key=_height)
-    return walk if options.drift != "auto" or walk.fit.objective < steady.fit.objective - PAYS else steady
+    systematic = options.systematic
+    kind, walk = best_of(FIRST_WALKS[options.drift], steady)
+    if kind.correlation < 1.0:
+        more = best_of([Walk(each, kind.frame) for each in MORE_CORRELATIONS], walk)
+        kind, walk = min((kind, walk), more, key=_height)
+    if options.drift == "auto" and walk.fit.objective > steady.fit.objective - PAYS:
+        return steady
+    return task.settle(walk.state, steady.model.side, kind, systematic=systematic, near=walk.fit)
 
 
-def _height(found: Settled) -> float:
+def _height(tried: tuple[Walk, Settled]) -> float:
     """-2 log of the density; more for a random walk, which says that the first instant has no error."""
-    assert found.model.drift is not None
-    return found.fit.objective + (PAYS if found.model.drift.correlation == 1.0 else 0.0)
+    kind, found = tried
+    return found.fit.objective + (PAYS if kind.correlation == 1.0 else 0.0)
 
 
 def is_correlated(found: Settled, limit: float = CORRELATED) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rich.console import Console
 
-from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.calibration.verdict import Finding, Verdict
 from gtsam_rwhec.report.advice import print_advice
 from gtsam_rwhec.report.pair_grid import PairGrid
 from gtsam_rwhec.report.pose_table import POSE_LEGEND, sensor_table, target_table
@@ -27,7 +29,7 @@ from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.solving.solution import Solution
 
 
-def print_solution(solution: Solution, console: Console | None = None) -> None:
+def print_solution(solution: Solution, console: Console | None = None, *, findings: Sequence[Finding] = ()) -> None:
     """Print the verdict, what to do, the poses, and the details.
 
     Parameters
@@ -36,9 +38,11 @@ def print_solution(solution: Solution, console: Console | None = None) -> None:
         The result of `gtsam_rwhec.solve`.
     console : rich.console.Console, optional
         Where to print; standard output by default.
+    findings : sequence of Finding, optional
+        What else is known against the poses: how A and B were read.
     """
     console = report_console() if console is None else console
-    print_verdict(console, judge(solution), solution)
+    print_verdict(console, judge(solution, findings=findings), solution)
     print_advice(console, solution.identifiability.free_directions)
     print_solution_body(console, solution)
 

@@ -118,6 +118,18 @@ def test_scale_and_method(utias_folder: Path) -> None:
     assert "Scale: 1.025" in done.stdout
 
 
+def test_a_misread_folder_is_named_without_refinement_too(tmp_path: Path) -> None:
+    """B's quaternions are x, y, z, w, and are read as w first."""
+    for path in DEMO.glob("*_cam_*.csv"):
+        rows = np.loadtxt(path, delimiter=",")
+        if path.stem.endswith("_B"):
+            rows = rows[:, [1, 2, 3, 0, 4, 5, 6]]
+        np.savetxt(tmp_path / path.name, rows, delimiter=",")
+    done = run("calibrate", tmp_path, "--certified-only")
+    assert done.returncode == 6, done.stderr
+    assert done.stdout.startswith("Do not use these poses: the quaternions of B are xyzw, and were read as wxyz")
+
+
 def test_local_from_an_earlier_result(tmp_path: Path) -> None:
     assert run("calibrate", DEMO, "-o", tmp_path / "first.json").returncode == 0
     done = run("calibrate", DEMO, "--certified-only", "--method", "local", "--initial", tmp_path / "first.json")
