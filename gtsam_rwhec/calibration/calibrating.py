@@ -414,7 +414,7 @@ class _Calibrating:
         self._choose("noise of A and B", "each is estimated", f"from {equations} residuals by restricted likelihood")
         if model.is_drift_untried:
             self._choose("drift", "not modelled", "too many pairs are measured at the same instants")
-            words = "errors of neighbours in time are alike, and the standard deviations do not count with it"
+            words = "errors of neighbours in time are alike, so the standard deviations may be too small"
             self.findings.append(Finding(Ground.CORRELATED, words))
         elif model.correlation is None:
             why = "an option says so" if options.drift == "none" else "neighbours in time are no more alike than others"

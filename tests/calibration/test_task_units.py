@@ -11,7 +11,7 @@ from refinement_problems import rig
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.calibrated import Carriers
-from gtsam_rwhec.calibration.task_units import ball_radius, ellipsoid
+from gtsam_rwhec.calibration.task_units import ball_radius, ellipsoid, point_sentence
 
 POINT = np.array([0.1, -0.2, 0.8])
 
@@ -127,3 +127,10 @@ def test_a_fixed_frame_has_no_error() -> None:
     found = rw.calibrate(simulated.problem).uncertainty_at(POINT, "sensor0")
     assert found.radius_mm == 0.0
     assert isinstance(simulated.Y["sensor0"], np.ndarray | gtsam.Pose3)
+
+
+def test_a_sentence_has_no_exponents() -> None:
+    assert point_sentence("cam", "hand", 2.5, 0.95, 104.0, 4520.0) == (
+        "A point 2.50 m from cam, expressed in hand, is within 100 mm of its true place with 95 % probability; the "
+        "noise of one new measurement adds up to 4500 mm."
+    )
