@@ -33,8 +33,12 @@ def modules() -> Iterator[tuple[str, Path]]:
 TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec": {"test_bad_input.py": "errors"},
     "gtsam_rwhec/calibration": {
-        "calibration/test_calibrating.py": "calibrated choices disagreement noise_choice options",
+        "calibration/test_calibrating.py": (
+            "calibrated choices clock_stage disagreement noise_choice noise_found noise_stage options outlier_stage "
+            "outliers run statement_stage"
+        ),
         "calibration/test_cross_validation.py": "folds prediction_errors",
+        "calibration/test_task_units.py": "point_uncertainty",
         "calibration/test_misreadings.py": "reading readings samples trial_fits wrong_units",
     },
     "gtsam_rwhec/cleaning": {

@@ -1,6 +1,6 @@
 from .calibrated import Calibration as Calibration
-from .calibrated import NoiseFound as NoiseFound
-from .calibrated import Outliers as Outliers
+from .noise_found import NoiseFound as NoiseFound
+from .outliers import Outliers as Outliers
 from .calibrating import calibrate as calibrate
 from .choices import Choice as Choice
 from .clocks import Clock as Clock

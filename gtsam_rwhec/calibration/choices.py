@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+#: What is chosen where the choice says why there is no refined calibration.
+REFINEMENT = "covariances"
+
 
 @dataclass(frozen=True)
 class Choice:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrated import NoiseFound
+from gtsam_rwhec.calibration.noise_found import NoiseFound
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.errors import CountError, NoiseError
 from gtsam_rwhec.files.progress import Progress

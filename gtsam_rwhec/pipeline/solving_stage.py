@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gtsam_rwhec.calibration.calibrated import Calibration, Outliers
+from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.choices import Choice
+from gtsam_rwhec.calibration.outliers import Outliers
 from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import LogError

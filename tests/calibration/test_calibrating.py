@@ -10,7 +10,7 @@ from refinement_problems import KAPPA, SIGMA_M, copied, rig
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.calibrating import spare_equations
+from gtsam_rwhec.calibration.outlier_stage import spare_equations
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.simulate import Noise

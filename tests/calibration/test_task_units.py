@@ -10,7 +10,7 @@ import pytest
 from refinement_problems import rig
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.calibrated import Carriers
+from gtsam_rwhec.calibration.point_uncertainty import Carriers
 from gtsam_rwhec.calibration.task_units import ball_radius, ellipsoid, point_sentence
 
 POINT = np.array([0.1, -0.2, 0.8])

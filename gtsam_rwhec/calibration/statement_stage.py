@@ -1,0 +1,70 @@
+"""The stage that asks the measurements about what the user stated: poses and sizes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from gtsam_rwhec.calibration.noise_choice import Inliers, estimated
+from gtsam_rwhec.calibration.run import Run
+from gtsam_rwhec.calibration.sizes import TargetSize, sizes
+from gtsam_rwhec.calibration.stated_poses import contradicted_poses, stated_poses
+from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.refinement.graduated import graduated
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.solving.certified_solution import solve
+
+
+def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
+    """Priors and fixed poses that the measurements contradict are found."""
+    if not stated_poses(run.problem):
+        return
+    run.tell("comparing the stated poses with the measurements")
+    options = replace(run.options, time_offsets=tuple(refined.time_offsets_s))
+    with_outliers = any(not mask.all() for mask in inliers.values())
+
+    def answer(without: Problem) -> Refined | None:
+        try:
+            agree = graduated(without, noise_scale="estimate").inliers if with_outliers else {}
+            kept = selected(without, agree) if agree else without
+            return estimated(without, solve(kept, options=options.solve), agree, options, silent)[0]
+        except (RwhecError, np.linalg.LinAlgError):
+            return None  # without what was stated there is no answer to compare with
+
+    found = contradicted_poses(run.problem, answer)
+    for one in found:
+        run.record.find(Ground.COVARIANCE_DOUBTED if one.is_small else Ground.CONTRADICTED, str(one))
+    said = "contradicted by the measurements" if found else "not contradicted by the measurements"
+    run.record.choose("stated poses", "as stated", said)
+
+
+def doubt_stated_sizes(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:
+    """What the motion says about sizes that were said to be known; those that it contradicts are found."""
+    problem, options, record, what = run.problem, run.options, run.record, "sizes of targets"
+    if problem.scale != "known":
+        return ()
+    if options.sizes == "known":
+        record.choose(what, "as stated", "an option says so")
+        return ()
+    noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
+    how = RefineOptions(noise=noise, noise_groups=options.noise_groups, carrier_noise=options.carrier_noise)
+    # A target of a wrong size contradicts the others: then all of its measurements are asked, not those that agree.
+    kept = {pair: mask if 2 * mask.sum() > len(mask) else np.ones(len(mask), bool) for pair, mask in inliers.items()}
+    found = sizes(selected(problem, kept) if kept else problem, how, progress=run.tell)
+    doubted = [size for size in found if size.is_doubted]
+    for size in doubted:
+        record.find(Ground.SIZE_DOUBTED, str(size))
+    if doubted:
+        record.choose(what, "as stated, and doubted", "the motion contradicts them")
+    elif any(size.sigma is not None for size in found):
+        record.choose(what, "as stated", "the motion does not contradict them")
+    else:
+        record.choose(what, "as stated", "the motion does not tell them, so a wrong size would not show")
+    return found
