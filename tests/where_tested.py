@@ -95,7 +95,8 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/noise_model": {
         "noise_model/test_likelihood.py": "drift eliminated_drift gradient measurements",
         "noise_model/test_refining.py": (
-            "agreement components found mixture modelled options prior_knowledge reml rows typical"
+            "agreement components drift_choice found mixture modelled options prior_knowledge reml rows settling "
+            "typical"
         ),
     },
     "gtsam_rwhec/pipeline": {

@@ -16,8 +16,8 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import C
 from gtsam_rwhec.noise_model.drift import drift_columns
 from gtsam_rwhec.noise_model.graph import effects_at, graph_of, optimum_of
-from gtsam_rwhec.noise_model.modelled import Settled, Task
 from gtsam_rwhec.noise_model.rows import Instants
+from gtsam_rwhec.noise_model.settling import Settled, Task
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import RefineOptions

@@ -12,7 +12,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import C
 from gtsam_rwhec.noise_model.graph import graph_of, optimum_of
 from gtsam_rwhec.noise_model.likelihood import NoiseModel
-from gtsam_rwhec.noise_model.modelled import Settled, Task
+from gtsam_rwhec.noise_model.settling import Settled, Task
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
@@ -132,7 +132,7 @@ def disagreement(task: Task, settled: Settled, sigma: dict[C, float], state: Sta
 
 
 def change_between(task: Task, before: State, after: State) -> Array:
-    """The change (d,) of the unknowns that ``modelled.moved`` makes of one estimate the other."""
+    """The change (d,) of the unknowns that ``settling.moved`` makes of one estimate the other."""
     change = np.zeros(len(task.layout.unit))
     poses, moved = before.X | before.Y, after.X | after.Y
     for unknown, place in task.layout.slots.items():

@@ -11,10 +11,11 @@ from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.noise_model.agreement import agreeing
 from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.noise_model.mixture import FEWEST
-from gtsam_rwhec.noise_model.modelled import Settled, Task, mixed, noise_in, settled
+from gtsam_rwhec.noise_model.modelled import mixed, noise_in, settled
 from gtsam_rwhec.noise_model.options import NoiseOptions
 from gtsam_rwhec.noise_model.refined import refined_of
 from gtsam_rwhec.noise_model.rows import Instants
+from gtsam_rwhec.noise_model.settling import Settled, Task
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.free_space import free_space_of

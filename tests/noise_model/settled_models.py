@@ -7,10 +7,10 @@ import numpy as np
 import gtsam_rwhec as rw
 from gtsam_rwhec.noise_model.components import Component, Sizes
 from gtsam_rwhec.noise_model.drift import Walk
-from gtsam_rwhec.noise_model.modelled import Settled, Task, moved
 from gtsam_rwhec.noise_model.options import NoiseOptions
 from gtsam_rwhec.noise_model.reml import Fitted
 from gtsam_rwhec.noise_model.rows import Instants, Side
+from gtsam_rwhec.noise_model.settling import Settled, Task, moved
 from gtsam_rwhec.refinement.free_space import free_space_of
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions

@@ -17,9 +17,9 @@ from gtsam_rwhec.noise_model import graph as graphs
 from gtsam_rwhec.noise_model.components import Component
 from gtsam_rwhec.noise_model.drift import Walk
 from gtsam_rwhec.noise_model.graph import NoiseGraph, graph_of, optimum_of
-from gtsam_rwhec.noise_model.modelled import Settled, Task
 from gtsam_rwhec.noise_model.refined import disagreement
 from gtsam_rwhec.noise_model.rows import Side
+from gtsam_rwhec.noise_model.settling import Settled, Task
 from gtsam_rwhec.refinement.optimisation import information_of, optimise
 
 C = Component

@@ -15,8 +15,8 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotConvergedWarning
 from gtsam_rwhec.noise_model.components import Component
 from gtsam_rwhec.noise_model.drift import Walk
-from gtsam_rwhec.noise_model.modelled import Settled, Task, moved
 from gtsam_rwhec.noise_model.refined import change_between, refined_of
+from gtsam_rwhec.noise_model.settling import Settled, Task, moved
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refined import Refined

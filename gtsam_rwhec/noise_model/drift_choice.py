@@ -1,0 +1,78 @@
+"""Which drift the residuals show: the kind that fits best, where it pays to have one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import get_args
+
+import numpy as np
+
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.noise_model.drift import Frame, Walk
+from gtsam_rwhec.noise_model.options import Drift
+from gtsam_rwhec.noise_model.settling import Settled, Task
+
+#: A track has at least this many instants for a drift.
+SHORTEST_TRACK = 20
+#: Tracks that are seen at the same instants share a state of at most this many tracks.
+MOST_TRACKS = 6
+#: Kinds of drift that are tried.
+FIRST_WALKS: dict[Drift, tuple[Walk, ...]] = {
+    "auto": tuple(Walk(each, frame) for each in (1.0, 0.9) for frame in get_args(Frame)),
+    "walk": tuple(Walk(1.0, frame) for frame in get_args(Frame)),
+    "correlated": tuple(Walk(0.9, frame) for frame in get_args(Frame)),
+    "none": (),
+}
+#: These correlations are tried where the walk is not a random one.
+MORE_CORRELATIONS = (0.6, 0.97, 0.99)
+#: A drift is in the model when it lowers -2 log of the density by more than this.
+PAYS = 6.0
+#: Residuals are correlated in time when their lag-1 correlation is beyond this many standard deviations.
+CORRELATED = 2.5
+
+
+def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
+    """The best model with drift, where that pays; else the one without."""
+    options, instants = task.options, task.instants
+    is_long = instants.count >= SHORTEST_TRACK * len(task.data) / instants.chains and instants.chains <= MOST_TRACKS
+    if options.drift == "none" or not is_long or (options.drift == "auto" and not is_correlated(steady)):
+        return steady
+    tell("estimating drift")
+
+    def best_of(kinds: Sequence[Walk], near: Settled) -> tuple[Walk, Settled]:
+        tried = [
+            (kind, task.settle(near.state, steady.model.side, kind, systematic=systematic, near=near.fit, rounds=1))
+            for kind in kinds
+        ]
+        return min(tried, key=_height)
+
+    systematic = options.systematic
+    kind, walk = best_of(FIRST_WALKS[options.drift], steady)
+    if kind.correlation < 1.0:
+        more = best_of([Walk(each, kind.frame) for each in MORE_CORRELATIONS], walk)
+        kind, walk = min((kind, walk), more, key=_height)
+    if options.drift == "auto" and walk.fit.objective > steady.fit.objective - PAYS:
+        return steady
+    return task.settle(walk.state, steady.model.side, kind, systematic=systematic, near=walk.fit)
+
+
+def _height(tried: tuple[Walk, Settled]) -> float:
+    """-2 log of the density; more for a random walk, which says that the first instant has no error."""
+    kind, found = tried
+    return found.fit.objective + (PAYS if kind.correlation == 1.0 else 0.0)
+
+
+def is_correlated(found: Settled, limit: float = CORRELATED) -> bool:
+    """Whether residuals of neighbours in time are alike: the lag-1 correlation of each track's residuals."""
+    rows = found.model.rows
+    products, squares, count = np.zeros(6), np.zeros(6), 0
+    tracks = np.cumsum(rows.instants.step[rows.instants.index] == 0.0) if rows.instants.chains == 1 else None
+    groups = rows.instants.chain if tracks is None else tracks
+    for group in np.unique(groups):
+        r = rows.residual[groups == group]
+        r = r - r.mean(axis=0)
+        products += (r[1:] * r[:-1]).sum(axis=0)
+        squares += (r**2).sum(axis=0)
+        count += len(r) - 1
+    correlation = products / np.maximum(squares, 1e-300)
+    return bool(correlation.mean() * np.sqrt(6 * max(count, 1)) > limit)
