@@ -1,8 +1,9 @@
 """Sizes of targets that were said to be known: what the motion says about them.
 
 The sizes are estimated with everything else, and compared with 1. Standard deviations of a refinement are too small
-where errors of neighbouring measurements are alike. So, where one would doubt a size, blocks of rows are left out in
-turn as well (jackknife), and the larger standard deviation counts.
+where errors of neighbouring measurements are alike, or depend on the arm's pose. So, where one would doubt a size, it
+is estimated again under the whole model of the noise; where there is none, blocks of rows are left out in turn
+(jackknife), and the larger standard deviation counts.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError, RwhecWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.noise_model.refining import refine_under_noise
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.options import RefineOptions
@@ -27,6 +29,8 @@ from gtsam_rwhec.solving.certified_solution import solve
 
 #: Standard deviations by which a stated size must differ from the measured size before it is doubted.
 SIZE_SIGMAS = 5.0
+#: By so many it is uncertain: the poses are to be used with care.
+UNCERTAIN_SIGMAS = 3.5
 #: A size is doubted only if it also differs by this share: printers, calipers and intrinsics are seldom more exact.
 SIZE_SHARE = 0.004
 #: So many blocks of each pair's rows are left out in turn.
@@ -43,8 +47,17 @@ def is_size_doubted(scale: float, sigma: float | None) -> bool:
 
     ``scale`` is the stated over the true length; ``sigma`` its standard deviation, None where it is not determined.
     """
+    return _is_off(scale, sigma, SIZE_SIGMAS)
+
+
+def is_size_uncertain(scale: float, sigma: float | None) -> bool:
+    """Whether measurements speak against a stated size, though not clearly."""
+    return _is_off(scale, sigma, UNCERTAIN_SIGMAS) and not is_size_doubted(scale, sigma)
+
+
+def _is_off(scale: float, sigma: float | None, sigmas: float) -> bool:
     off = abs(scale - 1.0)
-    return sigma is not None and off > SIZE_SHARE and off > SIZE_SIGMAS * sigma
+    return sigma is not None and off > SIZE_SHARE and off > sigmas * sigma
 
 
 @dataclass(frozen=True)
@@ -69,6 +82,11 @@ class TargetSize:
     def is_doubted(self) -> bool:
         """Whether the measurements contradict the stated size clearly, and by a share that matters."""
         return is_size_doubted(self.scale, self.sigma)
+
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether the measurements speak against the stated size, though not clearly."""
+        return is_size_uncertain(self.scale, self.sigma)
 
     def __str__(self) -> str:
         if self.sigma is None:
@@ -118,10 +136,26 @@ def sizes(
             return ()
         assert isinstance(refined.scale, Mapping)
         found = [TargetSize(target, scale, _sigma_of(refined, target)) for target, scale in refined.scale.items()]
-        if any(size.is_doubted for size in found):
-            spread = _jackknife(free)
-            found = [replace(size, sigma=_larger(size.sigma, spread.get(size.target))) for size in found]
+        if any(size.is_doubted or size.is_uncertain for size in found):
+            found = _under_all_noise(free, options, progress or silent) or _with_jackknife(free, found)
     return tuple(found)
+
+
+def _under_all_noise(free: Problem, options: RefineOptions | None, progress: Progress) -> list[TargetSize]:
+    """The sizes under the noise that the data have; none where that cannot be modelled, or is given."""
+    if options is not None and (options.noise != "estimate" or options.carrier_noise is not None):
+        return []
+    try:
+        refined, _ = refine_under_noise(free, solve(free), options, progress=progress)
+    except (CountError, np.linalg.LinAlgError, RuntimeError):
+        return []
+    assert isinstance(refined.scale, Mapping)
+    return [TargetSize(target, scale, _sigma_of(refined, target)) for target, scale in refined.scale.items()]
+
+
+def _with_jackknife(free: Problem, found: list[TargetSize]) -> list[TargetSize]:
+    spread = _jackknife(free)
+    return [replace(size, sigma=_larger(size.sigma, spread.get(size.target))) for size in found]
 
 
 def _loosen_fixed(free: Problem) -> None:

@@ -45,7 +45,7 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
     run.record.choose("stated poses", "as stated", said)
 
 
-def doubt_stated_sizes(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:
+def doubt_stated_sizes(run: Run, refined: Refined, inliers: Inliers) -> tuple[TargetSize, ...]:
     """What the motion says about sizes that were said to be known; those that it contradicts are found."""
     problem, options, record, what = run.problem, run.options, run.record, "sizes of targets"
     if problem.scale != "known":
@@ -54,14 +54,24 @@ def doubt_stated_sizes(run: Run, inliers: Inliers) -> tuple[TargetSize, ...]:
         record.choose(what, "as stated", "an option says so")
         return ()
     noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
-    how = RefineOptions(noise=noise, noise_groups=options.noise_groups, carrier_noise=options.carrier_noise)
+    late = tuple(refined.time_offsets_s)
+    how = RefineOptions(
+        noise=noise,
+        noise_groups=options.noise_groups,
+        carrier_noise=options.carrier_noise,
+        time_offsets=late,
+        carrier_path=options.carrier_path if late else None,
+    )
     # A target of a wrong size contradicts the others: then all of its measurements are asked, not those that agree.
     kept = {pair: mask if 2 * mask.sum() > len(mask) else np.ones(len(mask), bool) for pair, mask in inliers.items()}
     found = sizes(selected(problem, kept) if kept else problem, how, progress=run.tell)
     doubted = [size for size in found if size.is_doubted]
     for size in doubted:
         record.find(Ground.SIZE_DOUBTED, str(size))
-    if doubted:
+    uncertain = [size for size in found if size.is_uncertain]
+    for size in uncertain:
+        record.find(Ground.SIZE_UNCERTAIN, str(size))
+    if doubted or uncertain:
         record.choose(what, "as stated, and doubted", "the motion contradicts them")
     elif any(size.sigma is not None for size in found):
         record.choose(what, "as stated", "the motion does not contradict them")

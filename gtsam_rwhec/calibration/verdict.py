@@ -68,6 +68,8 @@ class Ground(StrEnum):
     NO_COVARIANCE = "no_covariance"
     #: Most measurements of a target were left out as outliers; the sensors' poses rest on other targets.
     TARGET_CONTRADICTED = "target_contradicted"
+    #: The stated size of a target fits the motion badly.
+    SIZE_UNCERTAIN = "size_uncertain"
     #: Errors of neighbouring measurements are alike, beyond what the model of the noise holds.
     CORRELATED = "correlated"
     #: Errors depend on the configuration: an arm's kinematics, intrinsics, a board that is not flat.
@@ -86,7 +88,13 @@ class Ground(StrEnum):
         return _ADVICE[self]
 
 
-_CARE = (Ground.TARGET_CONTRADICTED, Ground.CORRELATED, Ground.SYSTEMATIC, Ground.COVARIANCE_DOUBTED)
+_CARE = (
+    Ground.TARGET_CONTRADICTED,
+    Ground.SIZE_UNCERTAIN,
+    Ground.CORRELATED,
+    Ground.SYSTEMATIC,
+    Ground.COVARIANCE_DOUBTED,
+)
 _ADVICE = {
     Ground.MISREAD: "correct how the file is read, and calibrate again",
     Ground.IMPLAUSIBLE: (
@@ -110,6 +118,7 @@ _ADVICE = {
     Ground.TARGET_CONTRADICTED: (
         "do not use the pose of the named target; check whether it has moved, and measure it again"
     ),
+    Ground.SIZE_UNCERTAIN: "measure the named target with a caliper, or let its size be estimated",
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
     Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",
     Ground.COVARIANCE_DOUBTED: "use the poses, but do not rely on their standard deviations",

@@ -49,4 +49,9 @@ def judge(
         if doubted:
             words = f"the stated size of {', '.join(doubted)} does not fit the motion"
             found.append(Finding(Ground.SIZE_DOUBTED, words))
+        found += [
+            Finding(Ground.SIZE_UNCERTAIN, f"the stated size of {size.target} fits the motion badly")
+            for size in log.sizes
+            if size.is_uncertain and not size.is_free
+        ]
     return Judgement.of(found, proof_of(refined))

@@ -11,7 +11,7 @@ from typing import Annotated, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from gtsam_rwhec.calibration.disagreement import NEARLY_HALF, contradicted_frames
-from gtsam_rwhec.calibration.sizes import is_size_doubted
+from gtsam_rwhec.calibration.sizes import is_size_doubted, is_size_uncertain
 from gtsam_rwhec.problem.pairs import Pair
 
 #: Seconds whose nanoseconds fit 64 bits; rig files have the same limit.
@@ -117,6 +117,11 @@ class SizeFields(_Record):
     def is_doubted(self) -> bool:
         """Whether the measurements contradict the stated size clearly, and by a share that matters."""
         return is_size_doubted(self.scale, self.sigma)
+
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether the measurements speak against the stated size, though not clearly."""
+        return is_size_uncertain(self.scale, self.sigma)
 
 
 class TimeOffsetFields(_Record):

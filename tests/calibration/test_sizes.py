@@ -14,9 +14,9 @@ from gtsam_rwhec.simulate import Noise, general
 NOISE = Noise(0.003, 0.5 / np.radians(0.3) ** 2)
 
 
-def with_wrong_size(factor: float) -> rw.Problem:
+def with_wrong_size(factor: float, number_of_measurements: int = 40) -> rw.Problem:
     """Two targets, of which the first was stated too large by a factor."""
-    exact = general(2, 1, seed=4, noise=NOISE, number_of_measurements=40).problem
+    exact = general(2, 1, seed=4, noise=NOISE, number_of_measurements=number_of_measurements).problem
     problem = rw.Problem()
     for pair in exact.pairs:
         raw = exact.measurements(*pair)
@@ -54,3 +54,30 @@ def test_sizes_that_are_not_said_to_be_known_are_not_looked_at() -> None:
 def test_what_is_no_problem_is_refused() -> None:
     with pytest.raises(OptionError, match=r"give a gtsam_rwhec\.Problem"):
         sizes("folder")  # type: ignore[arg-type]
+
+
+def test_a_size_that_is_off_by_one_percent_is_doubted() -> None:
+    """80 measurements of each with 3 mm tell a size to 0.2 %; leaving out blocks of rows told it to 0.4 % only."""
+    wrong, right = sizes(with_wrong_size(1.012, number_of_measurements=80))
+    assert wrong.sigma is not None
+    assert wrong.sigma < 0.0025
+    assert wrong.is_doubted or wrong.is_uncertain
+    assert not right.is_doubted
+    assert not right.is_uncertain
+
+
+def test_a_size_between_the_limits_is_uncertain() -> None:
+    uncertain = TargetSize("tag", 1.01, 0.01 / 4.0)
+    assert uncertain.is_uncertain
+    assert not uncertain.is_doubted
+    assert not TargetSize("tag", 1.01, 0.01 / 3.0).is_uncertain
+    assert not TargetSize("tag", 1.01, 0.01 / 6.0).is_uncertain
+    assert not TargetSize("tag", 1.0 + 0.9 * SIZE_SHARE, 1e-4).is_uncertain
+
+
+def test_an_uncertain_size_asks_for_care(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gtsam_rwhec.calibration.sizes.SIZE_SIGMAS", 1e6)
+    calibration = rw.calibrate(with_wrong_size(1.03))
+    assert calibration.verdict is rw.Verdict.CARE
+    assert rw.Ground.SIZE_UNCERTAIN in calibration.judgement.grounds
+    assert "target0 is 3" in calibration.verdict_reason
