@@ -120,6 +120,16 @@ class DriftPrior:
             C.DRIFT_SCALE: float(by_state[6]),
         }
 
+    def walked(self, states: Array, kinds: Array, sigma: dict[C, float]) -> Array:
+        """The part (T, s, k) of the unit states (T, s) that the steps of some kinds (s, k) make."""
+        F = self.unit_transport(sigma)
+        steps = states.copy()
+        steps[1:] -= (F @ states[:-1, :, None])[:, :, 0]
+        result: Array = steps[:, :, None] * kinds
+        for before, after, here in zip(result[:-1], result[1:], F, strict=True):
+            after += here @ before
+        return result
+
     def unit_transport(self, sigma: dict[C, float]) -> Array:
         """``transport`` between states in the units of their own steps' standard deviations."""
         unit = np.tile(unit_of(sigma), self.states // TRACK)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
 
 from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.noise_model.drift import Frame, Walk
+from gtsam_rwhec.noise_model.drift import DriftPrior, Frame, Walk
 from gtsam_rwhec.noise_model.options import Drift
-from gtsam_rwhec.noise_model.settling import Settled, Task
+from gtsam_rwhec.noise_model.reml import ENOUGH, Fitted, fitted
+from gtsam_rwhec.noise_model.settling import Settled, Task, start_at, thinned
 
 #: A track has at least this many instants for a drift.
 SHORTEST_TRACK = 20
@@ -27,6 +29,9 @@ FIRST_WALKS: dict[Drift, tuple[Walk, ...]] = {
 MORE_CORRELATIONS = (0.6, 0.97, 0.99)
 #: A drift is in the model when it lowers -2 log of the density by more than this.
 PAYS = 6.0
+#: A kind's first fit ends where -2 log of the density would fall by less than this; kinds up to so far above the best
+#: are fitted to the end.
+ROUGH, NEAR = 1.0, 10.0
 #: Residuals are correlated in time when their lag-1 correlation is beyond this many standard deviations.
 CORRELATED = 2.5
 
@@ -38,28 +43,33 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     if options.drift == "none" or not is_long or (options.drift == "auto" and not is_correlated(steady)):
         return steady
     tell("estimating drift")
+    thin, systematic = thinned(steady.model), options.systematic
 
-    def best_of(kinds: Sequence[Walk], near: Settled) -> tuple[Walk, Settled]:
-        tried = [
-            (kind, task.settle(near.state, steady.model.side, kind, systematic=systematic, near=near.fit, rounds=1))
-            for kind in kinds
-        ]
-        return min(tried, key=_height)
+    def best_of(kinds: Sequence[Walk], near: Fitted) -> tuple[Walk, Fitted]:
+        """A rough fit of each kind, and a whole one of those that are near the best."""
 
-    systematic = options.systematic
-    kind, walk = best_of(FIRST_WALKS[options.drift], steady)
+        def fit(kind: Walk, near: Fitted, enough: float) -> Fitted:
+            model, whole = (replace(each, drift=DriftPrior.of(each.rows, kind)) for each in (thin, steady.model))
+            sizes = task.sizes(whole, systematic=systematic)
+            return fitted(model, sizes, start_at(sizes, near), enough=enough)
+
+        rough = [(kind, fit(kind, near, ROUGH)) for kind in kinds]
+        most = min(map(_height, rough)) + NEAR
+        return min(((kind, fit(kind, one, ENOUGH)) for kind, one in rough if _height((kind, one)) <= most), key=_height)
+
+    kind, walk = best_of(FIRST_WALKS[options.drift], steady.fit)
     if kind.correlation < 1.0:
         more = best_of([Walk(each, kind.frame) for each in MORE_CORRELATIONS], walk)
         kind, walk = min((kind, walk), more, key=_height)
-    if options.drift == "auto" and walk.fit.objective > steady.fit.objective - PAYS:
+    if options.drift == "auto" and walk.objective > steady.fit.objective - PAYS:
         return steady
-    return task.settle(walk.state, steady.model.side, kind, systematic=systematic, near=walk.fit)
+    return task.settle(steady.state, steady.model.side, kind, systematic=systematic, near=walk)
 
 
-def _height(tried: tuple[Walk, Settled]) -> float:
+def _height(tried: tuple[Walk, Fitted]) -> float:
     """-2 log of the density; more for a random walk, which says that the first instant has no error."""
-    kind, found = tried
-    return found.fit.objective + (PAYS if kind.correlation == 1.0 else 0.0)
+    kind, fit = tried
+    return fit.objective + (PAYS if kind.correlation == 1.0 else 0.0)
 
 
 def is_correlated(found: Settled, limit: float = CORRELATED) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -64,6 +65,11 @@ class EliminatedDrift:
         found: Array = flat.T @ flat
         return found
 
+    @cached_property
+    def whole(self) -> Array:
+        """The states (T, s, q + m) that go with each column, but for their sign."""
+        return self.factor.whole(self.half)
+
     def gradient(self, G: Array) -> tuple[Array, dict[C, float]]:
         """The derivative by the products (T, s, m + 6 + s) of each instant, and d / d log sigma of the drift's own.
 
@@ -73,7 +79,7 @@ class EliminatedDrift:
         n = self.half.shape[2]
         q = 6 * k
         m = n - q
-        whole = self.factor.whole(self.half)
+        whole = self.whole
         weighted = (whole.reshape(T * s, n) @ G).reshape(T, s, n)
         own, below = self.factor.inverse_blocks()
         own += weighted @ whole.transpose(0, 2, 1)

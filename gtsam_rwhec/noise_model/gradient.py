@@ -9,6 +9,7 @@ follow. No step divides by a sigma.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dtrtri
@@ -46,14 +47,30 @@ class Eliminated:
     features: Array
     products: Array
 
+    @cached_property
+    def inverse(self) -> Array:
+        """L^-1 (q + p, q + p)."""
+        found: Array = dtrtri(self.L, lower=1)[0] if len(self.L) else self.L  # LAPACK refuses a size of zero
+        return found
+
+    @cached_property
+    def mean(self) -> Array:
+        """The unit systematic errors and the unknowns (q + p,)."""
+        found: Array = -self.inverse.T @ self.half
+        return found
+
+    def gradient_by(self, active: tuple[C, ...]) -> Array:
+        """d(-2 l) / d log sigma (k,) of the active components."""
+        gradient = self.gradient()
+        return np.array([gradient[component] for component in active])
+
     def gradient(self) -> dict[C, float]:
         """d(-2 l) / d log sigma of each component."""
         (T, k), m = self.features.shape, self.measured.of.m
         q = 6 * k
-        inverse = dtrtri(self.L, lower=1)[0] if len(self.L) else self.L  # LAPACK refuses a size of zero
-        y = np.append(-inverse.T @ self.half, 1.0)
+        y = np.append(self.mean, 1.0)
         G = y[:, None] * y
-        G[:-1, :-1] += inverse.T @ inverse
+        G[:-1, :-1] += self.inverse.T @ self.inverse
         each = 2.0 * (1.0 - np.diagonal(G)[:q]).reshape(2, 3 * k).sum(axis=1)
         result = {C.SYSTEMATIC_ROTATION: float(each[0]), C.SYSTEMATIC_TRANSLATION: float(each[1])}
         by_cross = np.zeros_like(self.measured.cross)

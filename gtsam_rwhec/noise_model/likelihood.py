@@ -68,13 +68,12 @@ class NoiseModel:
 
     def evaluate(self, sigma: dict[C, float]) -> Estimate:
         """The restricted likelihood at standard deviations, with the estimate and its covariance."""
-        return self._eliminated(sigma)[0]
+        return self.eliminated(sigma)[0]
 
     def value_and_gradient(self, sigma: dict[C, float], active: tuple[C, ...]) -> tuple[Estimate, Array]:
         """The same, and d(-2 l) / d log sigma (k,) of the active components."""
-        estimate, eliminated = self._eliminated(sigma)
-        gradient = eliminated.gradient()
-        return estimate, np.array([gradient[component] for component in active])
+        estimate, eliminated = self.eliminated(sigma)
+        return estimate, eliminated.gradient_by(active)
 
     def white(self, sigma: dict[C, float]) -> Array:
         """D (N, 6, 6): the noise of single measurements, of B and of stamps."""
@@ -95,7 +94,8 @@ class NoiseModel:
         f = self.features[self.rows.instants.first]
         return f, (f[:, :, None] * f[:, None, :]).reshape(len(f), -1)
 
-    def _eliminated(self, sigma: dict[C, float]) -> tuple[Estimate, Eliminated]:
+    def eliminated(self, sigma: dict[C, float]) -> tuple[Estimate, Eliminated]:
+        """The same, and what is left of the elimination for derivatives."""
         measured = self._measurements.reduced(sigma)
         systematic = np.repeat([sigma[C.SYSTEMATIC_ROTATION], sigma[C.SYSTEMATIC_TRANSLATION]], 3)
         f, ff = self._features

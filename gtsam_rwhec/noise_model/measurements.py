@@ -70,10 +70,10 @@ class Measurements:
         Z = root @ self.columns
         flat = Z[:, :, :m].reshape(-1, m)
         total = flat.T @ flat
-        cross = self._by_instant(Z[:, :, m:], Z)
+        cross = self.by_instant(Z[:, :, m:], Z)
         if self.single:
             return Reduced(self, sigma, root, Z, None, total, cross, log_det)
-        carrier = np.repeat([sigma[C.CARRIER_ROTATION], sigma[C.CARRIER_TRANSLATION]], 3)
+        carrier = carrier_of(sigma)
         K = np.eye(6) + cross[:, :6, m : m + 6] * carrier[:, None] * carrier
         L_K = np.linalg.cholesky(K)
         log_det += 2.0 * float(np.log(np.diagonal(L_K, axis1=1, axis2=2)).sum())
@@ -84,7 +84,7 @@ class Measurements:
         cross -= lost[:, :, m:].transpose(0, 2, 1) @ lost
         return Reduced(self, sigma, root, Z, (root_K, lost), total, cross, log_det)
 
-    def _by_instant(self, left: Array, right: Array) -> Array:
+    def by_instant(self, left: Array, right: Array) -> Array:
         """Sums (T, a, b) of the products of (N, 6, a) and (N, 6, b)."""
         T, n = self.instants.count, len(left)
         if T * (n // T) == n and np.array_equal(self.instants.first, np.arange(T) * (n // T)):
@@ -127,6 +127,11 @@ class Reduced:
     cross: Array
     log_det: float
 
+    @property
+    def carrier(self) -> Array:
+        """The standard deviations (6,) of a twist of A."""
+        return carrier_of(self.sigma)
+
     def gradient(self, by_total: Array, by_cross: Array) -> dict[C, float]:
         """d / d log sigma of log|V| and of a function of ``total`` and ``cross``, from that by their entries."""
         measurements, root, Z = self.of, self.root, self.Z
@@ -134,7 +139,7 @@ class Reduced:
         inner = np.eye(6)
         if self.carriers is not None:
             root_K, lost = self.carriers
-            carrier = np.repeat([self.sigma[C.CARRIER_ROTATION], self.sigma[C.CARRIER_TRANSLATION]], 3)
+            carrier = self.carrier
             twists = self.cross[:, :6] * carrier[:, None]
             explained = _weighted(twists, by_total, by_cross, measurements.m) * twists
             each = 2.0 * (1.0 - (root_K**2).sum(axis=1) - explained.sum(axis=2)).sum(axis=0)
@@ -152,6 +157,12 @@ class Reduced:
             result[a] += change
             result[b] += change
         return result
+
+
+def carrier_of(sigma: dict[C, float]) -> Array:
+    """The standard deviations (6,) of a twist of A."""
+    found: Array = np.repeat([sigma[C.CARRIER_ROTATION], sigma[C.CARRIER_TRANSLATION]], 3)
+    return found
 
 
 def white_terms(rows: Rows) -> dict[tuple[C, C], Array]:

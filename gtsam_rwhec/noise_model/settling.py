@@ -108,9 +108,7 @@ class Task:
         for _ in range(rounds):
             model = self.model(state, side, walk, systematic=systematic)
             sizes = self.sizes(model, systematic=systematic) if sizes is None else sizes
-            if logs is None:
-                known = {} if near is None else dict(zip(near.sizes.active, near.logs, strict=True))
-                logs = np.array([known.get(c, e) for c, e in zip(sizes.active, sizes.expected, strict=True)])
+            logs = start_at(sizes, near) if logs is None else logs
             fit = fitted(thinned(model), sizes, logs)
             logs = fit.logs
             whole = model.evaluate(sizes.values(logs))
@@ -118,6 +116,12 @@ class Task:
             if (np.abs(whole.step) < SETTLED * np.sqrt(np.diagonal(whole.covariance))).all():
                 break
         return Settled(state, self.model(state, side, walk, systematic=systematic), fit)
+
+
+def start_at(sizes: Sizes, near: Fitted | None) -> Array:
+    """Logarithms (k,) from which components are fitted: those of a similar model, others as expected."""
+    known = {} if near is None else dict(zip(near.sizes.active, near.logs, strict=True))
+    return np.array([known.get(c, e) for c, e in zip(sizes.active, sizes.expected, strict=True)])
 
 
 def thinned(model: NoiseModel) -> NoiseModel:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from noisy_rows import problem_of, rows_of
 
+from gtsam_rwhec.noise_model.average_information import average_information
 from gtsam_rwhec.noise_model.components import Component
 from gtsam_rwhec.noise_model.drift import TRACK, DriftPrior, Walk, drift_columns, unit_of
 from gtsam_rwhec.noise_model.likelihood import NoiseModel
@@ -38,6 +39,26 @@ def dense_drift(prior: DriftPrior, sigma: dict[Component, float]) -> np.ndarray:
     return whole.reshape(T * s, T * s)
 
 
+def dense_variance(model: NoiseModel, sigma: dict[Component, float]) -> np.ndarray:
+    """V of all rows."""
+    rows, side, drift, features = model.rows, model.side, model.drift, model.features
+    N = len(rows.residual)
+    blocks = np.zeros((N, 6, N, 6))
+    blocks[np.arange(N), :, np.arange(N)] = model.white(sigma)
+    E = rows.twist[side] * np.repeat([sigma[C.CARRIER_ROTATION], sigma[C.CARRIER_TRANSLATION]], 3)
+    same = rows.instants.index[:, None] == rows.instants.index
+    blocks += np.einsum("nij,mkj->nimk", E, E) * same[:, None, :, None]
+    F = rows.twist[side] * np.repeat([sigma[C.SYSTEMATIC_ROTATION], sigma[C.SYSTEMATIC_TRANSLATION]], 3)
+    blocks += np.einsum("nij,mkj->nimk", F, F) * (features @ features.T)[:, None, :, None]
+    V = blocks.reshape(6 * N, 6 * N)
+    if drift is not None:
+        states = dense_drift(drift, sigma).reshape(rows.instants.count, drift.states, rows.instants.count, -1)
+        G, at = drift_columns(rows, sigma, drift), rows.instants.index
+        states = states[at][:, :, at]
+        V = V + np.einsum("nia,namb,mjb->nimj", G, states, G).reshape(6 * N, 6 * N)
+    return V
+
+
 @pytest.mark.parametrize("side", ["targetcarrier", "sensorcarrier"])
 @pytest.mark.parametrize("correlation", [None, 0.8, 1.0])
 @pytest.mark.parametrize(("targets", "sensors", "shared"), [(1, 1, True), (2, 2, True), (2, 1, False)])
@@ -59,22 +80,9 @@ def test_it_is_that_of_dense_matrices(
     model = NoiseModel(rows, side, np.eye(size), prior, gradient, drift, features)
     found = model.evaluate(SIGMA)
 
-    N = len(rows.residual)
-    blocks = np.zeros((N, 6, N, 6))
-    blocks[np.arange(N), :, np.arange(N)] = model.white(SIGMA)
-    E = rows.twist[side] * np.repeat([SIGMA[C.CARRIER_ROTATION], SIGMA[C.CARRIER_TRANSLATION]], 3)
-    same = rows.instants.index[:, None] == rows.instants.index
-    blocks += np.einsum("nij,mkj->nimk", E, E) * same[:, None, :, None]
-    F = rows.twist[side] * np.repeat([SIGMA[C.SYSTEMATIC_ROTATION], SIGMA[C.SYSTEMATIC_TRANSLATION]], 3)
-    blocks += np.einsum("nij,mkj->nimk", F, F) * (features @ features.T)[:, None, :, None]
-    V = blocks.reshape(6 * N, 6 * N)
-    if drift is not None:
-        states = dense_drift(drift, SIGMA).reshape(rows.instants.count, drift.states, rows.instants.count, -1)
-        G, at = drift_columns(rows, SIGMA, drift), rows.instants.index
-        states = states[at][:, :, at]
-        V += np.einsum("nia,namb,mjb->nimj", G, states, G).reshape(6 * N, 6 * N)
+    V = dense_variance(model, SIGMA)
     inverse = np.linalg.inv(V)
-    J, r = rows.jacobian.reshape(6 * N, -1), rows.residual.ravel()
+    J, r = rows.jacobian.reshape(len(V), -1), rows.residual.ravel()
     information = J.T @ inverse @ J + prior
     g = J.T @ inverse @ r + gradient
     expected = np.linalg.slogdet(V)[1] + np.linalg.slogdet(information)[1] + r @ inverse @ r
@@ -119,6 +127,32 @@ def test_the_gradient_is_that_of_differences(
         after, before = (model.evaluate(sigma | {component: sigma[component] * np.exp(s)}) for s in (h, -h))
         expected = (after.minus_two_log - before.minus_two_log) / (2.0 * h)
         assert found == pytest.approx(expected, rel=1e-5, abs=1e-6), component
+
+
+@pytest.mark.parametrize("side", ["targetcarrier", "sensorcarrier"])
+@pytest.mark.parametrize("correlation", [None, 0.8, 1.0])
+@pytest.mark.parametrize(("targets", "sensors", "shared"), [(1, 1, True), (2, 2, True), (2, 1, False)])
+def test_the_average_information_is_that_of_dense_matrices(
+    targets: int, sensors: int, shared: bool, correlation: float | None, side: Side
+) -> None:
+    model = model_of(targets, sensors, shared, correlation, side)
+    active = tuple(c for c in Component if correlation is not None or not c.startswith("drift"))
+    sigma = SIGMA | dict.fromkeys(set(Component) - set(active), 0.0)
+    found = average_information(model.eliminated(sigma)[1], active)
+    inverse = np.linalg.inv(dense_variance(model, sigma))
+    J = model.rows.jacobian.reshape(len(inverse), -1) @ model.basis
+    r = model.rows.residual.ravel()
+    information = J.T @ inverse @ J + model.prior_information
+    step = -np.linalg.solve(information, J.T @ inverse @ r + model.prior_gradient)
+    P = inverse - inverse @ J @ np.linalg.solve(information, J.T @ inverse)
+    columns = []
+    for component in active:
+        h = 1e-5
+        after, before = (dense_variance(model, sigma | {component: sigma[component] * np.exp(s)}) for s in (h, -h))
+        columns.append((after - before) / (2.0 * h) @ inverse @ (r + J @ step))
+    expected = np.array(columns) @ P @ np.transpose(columns)
+    size = np.sqrt(np.diagonal(expected))
+    np.testing.assert_allclose(found / size[:, None] / size, expected / size[:, None] / size, atol=1e-6)
 
 
 @pytest.mark.parametrize("correlation", [0.8, 1.0])

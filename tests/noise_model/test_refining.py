@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from noisy_rows import problem_of, random_poses, rows_of
 from rwhec_factors import se3
+from settled_models import task_of
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.noise_model import Component, NoiseOptions, refine_under_noise, under_noise
 from gtsam_rwhec.noise_model.components import SMALLEST, Sizes
+from gtsam_rwhec.noise_model.drift import Walk
 from gtsam_rwhec.noise_model.mixture import DRAWS, SAMPLES
+from gtsam_rwhec.noise_model.reml import fitted, value_and_gradient
 
 C = Component
 X = se3.expmap(np.array([[0.2, -0.3, 0.1, 0.5, 0.4, 0.2]]))[0]
@@ -207,6 +210,23 @@ def test_a_component_is_held_where_it_is_stated_and_free_elsewhere() -> None:
     np.testing.assert_allclose(sizes.penalty_gradient(at), by_difference, rtol=1e-6)
     assert sizes.penalty(np.log([0.03, 0.004])) > 100.0 > sizes.penalty(np.log([0.02, 0.1]))
     assert np.exp(sizes.bounds[1][0]) == pytest.approx(SMALLEST * 0.004)
+
+
+@pytest.mark.parametrize("walk", [None, Walk(1.0, "sensor"), Walk(0.9, "target")])
+def test_a_fit_ends_where_the_gradient_is_nothing_or_points_out_of_the_bounds(walk: Walk | None) -> None:
+    problem = simulated(walk=(0.003, 0.002), of_A=(0.002, 0.001))
+    task = task_of(problem, rw.solve(problem))
+    model = task.model(task.variables.start(rw.solve(problem)), "targetcarrier", walk, systematic=True)
+    sizes = task.sizes(model, systematic=True)
+    fit = fitted(model, sizes, sizes.expected, enough=1e-9)
+    value, gradient = value_and_gradient(model, sizes, fit.logs)
+    assert value == pytest.approx(fit.objective, rel=1e-12)
+    low, high = np.array(sizes.bounds).T
+    inside = (fit.logs > low) & (fit.logs < high)
+    np.testing.assert_allclose(gradient[inside], 0.0, atol=1e-3)
+    assert (gradient[fit.logs == low] > 0.0).all()
+    for start in (sizes.expected - 2.0, sizes.expected + 2.0):
+        assert fitted(model, sizes, start).objective == pytest.approx(fit.objective, abs=0.02)
 
 
 def test_priors_of_frames_count() -> None:
