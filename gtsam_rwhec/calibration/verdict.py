@@ -70,6 +70,8 @@ class Ground(StrEnum):
     TARGET_CONTRADICTED = "target_contradicted"
     #: The stated size of a target fits the motion badly.
     SIZE_UNCERTAIN = "size_uncertain"
+    #: The stated size of a target does not fit the motion, while others do; it was estimated in its place.
+    SIZE_ESTIMATED = "size_estimated"
     #: Errors of neighbouring measurements are alike, beyond what the model of the noise holds.
     CORRELATED = "correlated"
     #: Errors depend on the configuration: an arm's kinematics, intrinsics, a board that is not flat.
@@ -91,6 +93,7 @@ class Ground(StrEnum):
 _CARE = (
     Ground.TARGET_CONTRADICTED,
     Ground.SIZE_UNCERTAIN,
+    Ground.SIZE_ESTIMATED,
     Ground.CORRELATED,
     Ground.SYSTEMATIC,
     Ground.COVARIANCE_DOUBTED,
@@ -119,6 +122,7 @@ _ADVICE = {
         "do not use the pose of the named target; check whether it has moved, and measure it again"
     ),
     Ground.SIZE_UNCERTAIN: "measure the named target with a caliper, or let its size be estimated",
+    Ground.SIZE_ESTIMATED: "measure the named target again, and correct its size",
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
     Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",
     Ground.COVARIANCE_DOUBTED: "use the poses, but do not rely on their standard deviations",

@@ -12,7 +12,7 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
-from gtsam_rwhec.cli.failures import check_folder_of, said_in_the_report
+from gtsam_rwhec.cli.failures import check_output, said_in_the_report
 from gtsam_rwhec.cli.options import (
     CHOICES_PANEL,
     CSV_PANEL,
@@ -149,7 +149,7 @@ def calibrate(
         raise typer.BadParameter("--carrier-noise-deg and --carrier-noise-mm go together: give both, or neither")
     if noise == "given" and (sigma is None or kappa is None):
         raise typer.BadParameter("--noise given needs --sigma and --kappa: give both, or use --noise estimate")
-    check_folder_of(output)
+    check_output(output)
     carriers = None
     if carrier_noise_deg is not None and carrier_noise_mm is not None:
         carriers = rw.CarrierNoise(math.radians(carrier_noise_deg), 1e-3 * carrier_noise_mm)

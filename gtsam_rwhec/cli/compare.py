@@ -10,7 +10,7 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
-from gtsam_rwhec.cli.failures import check_folder_of
+from gtsam_rwhec.cli.failures import check_output
 from gtsam_rwhec.cli.options import FOLDER_OF_CSV, KappaOption, ScaleOption, SensorsOption, SigmaOption, TargetsOption
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import say, shown_path
@@ -39,7 +39,7 @@ def compare(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File for all results (JSON).")] = None,
 ) -> ExitStatus:
     """Solve with every published method that applies; print the cost, gap, residuals and time of each."""
-    check_folder_of(output)
+    check_output(output)
     with StageDisplay() as stage, warnings.catch_warnings():
         stage(f"reading {folder}")
         problem = rw.read_csv(folder, scale, sigma, kappa, targets, sensors)

@@ -19,6 +19,7 @@ from gtsam_rwhec.errors import (
     RwhecError,
     RwhecWarning,
 )
+from gtsam_rwhec.files.atomic_write import why_not_writable
 from gtsam_rwhec.files.terminal_text import printable
 
 
@@ -82,7 +83,8 @@ def said_in_the_report() -> Iterator[None]:
         yield
 
 
-def check_folder_of(output: Path | None) -> None:
-    """Check before a long calculation that the folder of its result exists; raise FileFormatError if not."""
-    if output is not None and not output.absolute().parent.is_dir():
-        raise FileFormatError(f"{output} cannot be written: the folder {output.parent} does not exist.")
+def check_output(output: Path | None) -> None:
+    """Check before a long calculation that its result can be written; raise FileFormatError if not."""
+    why = "" if output is None else why_not_writable(output)
+    if why:
+        raise FileFormatError(f"{output} cannot be written: {why}.")

@@ -26,6 +26,30 @@ def write_atomically(path: str | Path, content: bytes) -> None:
         raise FileFormatError(f"{path} cannot be written: {error.strerror or error}.") from error
 
 
+def why_not_writable(path: str | Path) -> str:
+    """Why `write_atomically` could not write a file now, in words; empty where it could. Nothing is left behind.
+
+    For checks before a long calculation: rights, read-only disks and names that folders have show only by trying.
+    """
+    path = Path(path).absolute()
+    if not path.parent.is_dir():
+        return f"there is no folder {path.parent}"
+    if path.is_dir():
+        return "it is a folder; give the name of a file"
+    if path.exists() and not path.is_file():
+        return ""  # a pipe or a device: to open it is to begin
+    trial = Path(os.path.realpath(path)).with_name(f".{path.name}.{os.getpid()}.trial")
+    try:
+        with open(trial, "xb"):
+            pass
+        trial.unlink()
+    except PermissionError:
+        return f"no right to write into {trial.parent}"
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
 @contextmanager
 def atomic_stream(path: str | Path) -> Iterator[BinaryIO]:
     """A stream to a temporary file beside `path`. It takes the name `path` when the block ends without an error.

@@ -106,6 +106,10 @@ class TfBuffer:
         down = up_from_child[: up_from_child.index(common)]
         return (*up_from_parent[: up_from_parent.index(common) + 1], *reversed(down))
 
+    def is_above(self, frame: str, other: str) -> bool:
+        """Whether `frame` is on the way from `other` up to its root; errors as in `chain`."""
+        return frame in self._up(other)
+
     def stamps(self, parent: str, child: str) -> Stamps:
         """Every stamp at which a moving link of the chain has a transform, (N,) increasing; errors as in `chain`."""
         moving = [link.by_stamp()[0] for link, _ in self._links_of(parent, child) if not link.is_static]

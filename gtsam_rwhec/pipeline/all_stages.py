@@ -25,7 +25,7 @@ from gtsam_rwhec.pipeline.log_contract import (
     is_from_stage,
 )
 from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig
-from gtsam_rwhec.pipeline.output_paths import check_is_not_read, made_folder
+from gtsam_rwhec.pipeline.output_paths import check_is_not_read, made_folder, made_output_folder
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solution_plots import plot_all
 from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
@@ -90,7 +90,7 @@ def calibrate_log(
         is_cleaned = CLEANING_METADATA in log.metadata() and (
             rig is None or not changes(read_embedded_rig(log), rig).cleaning
         )
-    out = made_folder(out)
+    out = made_output_folder(out)
     if is_raw:
         assert rig is not None
         detect_log(log_path, rig, detected, images=images, workers=workers, progress=progress)
@@ -129,7 +129,7 @@ def solve_into(
     RwhecError
         As `solve_log` does.
     """
-    out = made_folder(out)
+    out = made_output_folder(out)
     calibrated = solve_log(clean_path, rig, progress=progress)
     write_calibration(calibrated.calibration, out / RESULT_FILE, calibrated.log)
     write_solved(clean_path, calibrated, out / CLEAN_LOG, images=images)

@@ -44,8 +44,8 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     source, noise = rig.carriers.poses, rig.carriers.noise
     parent, child = source.frames
     if source.topic is None:
+        parent, child, stamps, T = _from_tf(log, parent, child, rig.carriers.sensors)
         where = f"tf {parent} to {child}"
-        stamps, T = _from_tf(log, parent, child)
     else:
         where = f"topic {source.topic}"
         stamps, T = _from_topic(log, source.topic)
@@ -59,7 +59,11 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     return CarrierMotion(Trajectory.of(stamps, T, where), carrier_noise)
 
 
-def _from_tf(log: Log, parent: str, child: str) -> tuple[np.ndarray, Array]:
+def _from_tf(log: Log, parent: str, child: str, of_sensors: str) -> tuple[str, str, np.ndarray, Array]:
+    """The frames, the upper one in tf first, whatever the order in which they were named; stamps and poses.
+
+    Of frames on two branches of the tree, the carrier of the sensors is the child.
+    """
     where = f"{log.files[0].path}, tf {parent} to {child}"
     topics = [topic for topic in log.topics() if topic.is_tf]
     readable = [t.name for t in topics if not t.unreadable]
@@ -67,6 +71,8 @@ def _from_tf(log: Log, parent: str, child: str) -> tuple[np.ndarray, Array]:
         buffer = TfBuffer(log.records(readable)) if readable else TfBuffer()
         if not buffer.frames():
             raise LogError(f"{where}: {_no_transforms(log, topics)}")
+        if not buffer.is_above(parent, child) and (buffer.is_above(child, parent) or child != of_sensors):
+            parent, child = child, parent
         chain = " -> ".join(buffer.chain(parent, child))
         for link, in_order in buffer.stamps_as_logged(parent, child).items():
             check_order(in_order, f"{where}, transforms of {link}")
@@ -80,7 +86,7 @@ def _from_tf(log: Log, parent: str, child: str) -> tuple[np.ndarray, Array]:
     known = np.isfinite(gap_s)  # nothing is known before the first and after the last transform of a link
     if not known.any():
         raise TransformError(f"{where}: the links of the chain have no time in common: {chain}")
-    return stamps[known], T[known]
+    return parent, child, stamps[known], T[known]
 
 
 def _no_transforms(log: Log, topics: list[Topic]) -> str:

@@ -10,7 +10,6 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.cleaning import (
     ConsensusOptions,
-    estimate_time_offset,
     find_consensus,
     synchronise,
     thin,
@@ -24,6 +23,7 @@ from gtsam_rwhec.logs import LogWriter, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_cleaning
+from gtsam_rwhec.pipeline.clocks_by_turning import offset_of_either_direction
 from gtsam_rwhec.pipeline.log_contract import topics_up_to_detection
 from gtsam_rwhec.pipeline.log_metadata import read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, write_pairs
@@ -163,7 +163,7 @@ def _time_offset(rig: Rig, sensor: str, path: Trajectory, tracks: list[Track]) -
             f"{sensor}: no target was seen twice, and without this the time offset cannot be estimated; state "
             "time_offset in the rig file"
         )
-    found = estimate_time_offset(path, usable, max_gap_s=rig.carriers.max_gap_s, where=sensor)
+    found = offset_of_either_direction(path, usable, rig.carriers.max_gap_s, sensor)
     return found.offset_s, found.sigma_s
 
 

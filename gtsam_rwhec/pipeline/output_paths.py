@@ -6,20 +6,17 @@ import os
 from pathlib import Path
 
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.export.files import FILES
+from gtsam_rwhec.files.atomic_write import why_not_writable
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG
+from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, PLOTS_FOLDER, RESULT_FILE
 
 
 def check_writable(path: str | Path) -> None:
     """Raise `LogError` if a file cannot be written: its folder is missing or not writable, or a folder has its name."""
-    path = Path(path)
-    folder = path.absolute().parent
-    if not folder.is_dir():
-        raise LogError(f"{path} cannot be written: there is no folder {folder}.")
-    if path.is_dir():
-        raise LogError(f"{path} cannot be written: it is a folder; give the name of a file.")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise LogError(f"{path} cannot be written: no right to write into {folder}.")
+    why = why_not_writable(path)
+    if why:
+        raise LogError(f"{path} cannot be written: {why}.")
 
 
 def check_is_not_read(log: Log, path: str | Path) -> None:
@@ -36,4 +33,17 @@ def made_folder(path: str | Path) -> Path:
     except OSError as error:
         raise LogError(f"{path} cannot be made a folder: {error.strerror}.") from error
     check_writable(path / CLEAN_LOG)
+    return path
+
+
+def made_output_folder(path: str | Path) -> Path:
+    """As `made_folder`, for all files of a calibration: whatever could not be replaced at its end is told before it."""
+    path = made_folder(path)
+    for name in (DETECTED_LOG, RESULT_FILE, *FILES):
+        check_writable(path / name)
+    plots = path / PLOTS_FOLDER
+    if plots.is_dir():
+        check_writable(plots / CLEAN_LOG)
+    elif os.path.lexists(plots):
+        raise LogError(f"{plots} cannot be made a folder: it is a file.")
     return path

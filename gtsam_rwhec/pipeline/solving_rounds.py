@@ -12,7 +12,9 @@ import numpy as np
 
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.calibrating import calibrate
+from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.options import CalibrateOptions
+from gtsam_rwhec.calibration.reading import reading_of
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import RwhecError, RwhecWarning, ScaleError
 from gtsam_rwhec.files.progress import Progress
@@ -28,8 +30,8 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.certified_solution import solve
 
 Pairs = dict[Pair, MeasuredPairs]
-#: A solution serves to find outliers, to estimate time offsets, or as the answer.
-Purpose = Literal["outliers", "time offsets", "answer"]
+#: A solution serves to find outliers, to estimate time offsets, as the answer, or for plots of what was misread.
+Purpose = Literal["outliers", "time offsets", "answer", "plots"]
 #: At most this many rounds estimate outliers and time offsets, and compute A again at the new time offsets.
 ROUNDS = 6
 #: Seconds. If no time offset changes by more than this, the rounds end.
@@ -83,6 +85,16 @@ class SolvingRounds:
                 break
         return marked
 
+    def misreadings(self, given: SynchronisedPairs) -> tuple[Misreading, ...]:
+        """Likely misreadings of the poses of all measurements, before any is left out."""
+        problem = problem_of(given.pairs, self.rig, given.offsets_s)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)
+            try:
+                return reading_of(problem, solve(problem, progress=self.progress), self.progress).misreadings
+            except ScaleError:
+                return ()
+
     def at(self, pairs: Pairs, offsets_s: Mapping[str, float]) -> SynchronisedPairs:
         """The pairs with A at new time offsets. Pairs of sensors with a stated offset stay as they are."""
         path = self.motion.trajectory
@@ -102,7 +114,7 @@ class SolvingRounds:
         robust = self.rig.cleaning.robust
         if robust == "gnc" and purpose != "outliers":
             robust = "none"  # the outliers are marked already
-        estimated = self.estimated if purpose != "outliers" else ()
+        estimated = self.estimated if purpose in ("time offsets", "answer") else ()
         options = RefineOptions(
             noise="estimate" if self.rig.noise == "estimate" else "given",
             robust=robust,
@@ -117,8 +129,13 @@ class SolvingRounds:
             solution = solve(problem, progress=self.progress)
             return refine(problem, solution, options, progress=self.progress)
 
-    def calibrated(self, given: SynchronisedPairs, free_sizes: Collection[str]) -> Calibration:
-        """The answer from the measurements that are left, with everything that ``calibrate`` finds and judges."""
+    def calibrated(
+        self, given: SynchronisedPairs, free_sizes: Collection[str], *, is_late: bool = False
+    ) -> Calibration:
+        """The answer from the measurements that are left, with everything that ``calibrate`` finds and judges.
+
+        Where a clock was late, drift and systematic errors are not looked for: they would take its place.
+        """
         problem = problem_of(given.pairs, self.rig, given.offsets_s, free_sizes)
         problem.sensor_carrier, problem.target_carrier = self.rig.carriers.sensors, self.rig.carriers.targets
         options = CalibrateOptions(
@@ -126,6 +143,8 @@ class SolvingRounds:
             robust="none",  # the outliers are marked already
             sizes="known",  # the rounds have looked at them
             carrier_noise=self.motion.noise,
+            drift="none" if is_late else "auto",
+            systematic=not is_late,
             time_offsets=self.estimated or False,
             carrier_path=self.motion.trajectory if self.estimated else None,
         )

@@ -16,7 +16,9 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
+from gtsam_rwhec.pipeline.clocks_by_turning import late_clocks
 from gtsam_rwhec.pipeline.log_contract import CLEANING_METADATA
+from gtsam_rwhec.pipeline.log_findings import estimated_sizes, in_rig_file, is_of_the_poses, not_of_late_clocks, with_cures
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, sigma_of, without_outlier_marks
@@ -109,23 +111,30 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         raise LogError(f"{clean_path}, metadata {CLEANING_METADATA}: no time offset of {', '.join(missing)}")
     rounds = SolvingRounds(rig, motion, estimated, progress or silent)
     given = rounds.at(without_outlier_marks(pairs), cleaning.time_offsets_s)
+    stated = [name for name in rig.sensors if name in used_sensors and name not in estimated]
+    stated_s = {name: given.offsets_s.get(name, 0.0) for name in stated}
+    late = late_clocks(given.pairs, motion.trajectory, rig, stated_s)
     sizes: tuple[SizeFields, ...] = ()
-    if rig.sizes != "known":
-        sizes, given = rounds.sizes(given)
     free: set[str] = set()
-    if any(size.is_free for size in sizes):
-        free = set(rig.targets) - {size.target for size in sizes if not size.is_free}
-    settled = rounds.settled(given, free)
-    if rig.sizes == "known":
-        sizes = rounds.sizes_as_seen(settled)
-    calibration = rounds.calibrated(settled, free)
+    is_misread = is_of_the_poses(rounds.misreadings(given))
+    if is_misread or late:
+        settled = given  # outliers and sizes mean nothing where poses were misread, or are of another time
+    else:
+        if rig.sizes != "known":
+            sizes, given = rounds.sizes(given)
+        if any(size.is_free for size in sizes):
+            free = set(rig.targets) - {size.target for size in sizes if not size.is_free}
+        settled = rounds.settled(given, free)
+        if rig.sizes == "known":
+            sizes = rounds.sizes_as_seen(settled)
+    calibration = rounds.calibrated(settled, free, is_late=bool(late))
     # Without a refined calibration (the measurements look misread) the poses are refined all the same, for the plots.
-    refined = calibration.refined or rounds.refined(settled, free, "answer")
+    refined = calibration.refined or rounds.refined(settled, free, "plots" if is_misread or late else "answer")
     offsets = settled.offsets_s | {n: settled.offsets_s[n] + value for n, value in refined.time_offsets_s.items()}
     outliers = tuple(_outlier_count(measured) for measured in settled.pairs.values())
     refined = replace(
         refined,
-        time_offsets_s={name: offsets[name] for name in estimated},
+        time_offsets_s={name: offsets[name] for name in refined.time_offsets_s},
         inlier_counts={
             count.pair: (count.used, count.used + count.left_out)
             for count in outliers
@@ -143,16 +152,24 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
             TimeOffsetFields(
                 sensor=name,
                 offset_s=offsets[name],
-                sigma_s=sigma_of(refined, Unknown(UnknownKind.TIME_OFFSET, name)) if name in estimated else None,
+                sigma_s=sigma_of(refined, Unknown(UnknownKind.TIME_OFFSET, name))
+                if name in refined.time_offsets_s
+                else None,
             )
             for name in rig.sensors
             if name in offsets
         ),
         contradicted=contradictions(outliers),
     )
-    judgement = judge(refined.solution, refined, fields, calibration.findings)
+    findings = with_cures(calibration.findings, calibration.misreadings, rig)
+    if late:
+        findings = not_of_late_clocks(findings, calibration.misreadings)
+    findings = (*findings, *late, *estimated_sizes(fields.sizes, rig))
+    judgement = judge(refined.solution, refined, fields, findings)
     calibration = replace(
         calibration,
+        findings=findings,
+        misreadings=in_rig_file(calibration.misreadings, rig),
         refined=refined,
         time_offsets_s=refined.time_offsets_s,
         judgement=judgement,

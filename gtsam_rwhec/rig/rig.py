@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +12,7 @@ from pydantic import Discriminator, Field, ValidationError, model_validator
 from pydantic import Tag as UnionTag
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from gtsam_rwhec.files.yaml_lines import KeyPath, dotted
 from gtsam_rwhec.rig.contradictions import contradictions
 from gtsam_rwhec.rig.field_types import Name
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Section, Sensor
@@ -63,7 +66,37 @@ class RigFile(Section):
         return self
 
 
+@dataclass(frozen=True)
+class Lines:
+    """Where the values of a rig file stand, for messages; rig files of equal content are equal wherever they stand.
+
+    Attributes
+    ----------
+    where : str
+        The file; empty for a rig that was made in Python.
+    lines : mapping of key path to int
+        The line of each value.
+    """
+
+    where: str = field(default="", compare=False)
+    lines: Mapping[KeyPath, int] = field(default_factory=dict, compare=False)
+
+    def place(self, *paths: KeyPath) -> str:
+        """``FILE, lines N and M: a.b and a.c``, as far as known; of a value that is not written, its section's line."""
+        names = " and ".join(map(dotted, paths))
+        numbers = list(dict.fromkeys(filter(None, map(self._line, paths))))
+        if not self.where or not numbers:
+            return names
+        return f"{self.where}, line{'s' * (len(numbers) > 1)} {' and '.join(map(str, numbers))}: {names}"
+
+    def _line(self, path: KeyPath) -> int | None:
+        while path and path not in self.lines:
+            path = path[:-1]
+        return self.lines.get(path)
+
+
 class Rig(RigFile):
-    """A rig file that was read: its content, and the folder that its relative paths start from."""
+    """A rig file that was read: its content, the folder that its relative paths start from, and its lines."""
 
     folder: Path = Path()
+    source: Lines = Lines()

@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 from gtsam_rwhec.errors import FileFormatError, RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
 from gtsam_rwhec.rig import sections, target_sections
-from gtsam_rwhec.rig.rig import Rig, RigFile
+from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
 
 #: A message names at most this many faults.
 MOST_FAULTS = 20
@@ -93,7 +93,8 @@ def parse_rig(text: str, where: str, folder: Path = Path()) -> Rig:
         said = RigFile.model_validate(file.data)
     except ValidationError as error:
         raise RigError(_in_words(error, file)) from error
-    return Rig(**{name: getattr(said, name) for name in RigFile.model_fields}, folder=folder)
+    content = {name: getattr(said, name) for name in RigFile.model_fields}
+    return Rig(**content, folder=folder, source=Lines(where, file.lines))
 
 
 def _in_words(error: ValidationError, file: YamlFile) -> str:

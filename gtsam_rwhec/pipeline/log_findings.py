@@ -1,0 +1,99 @@
+"""What is found against a log beside what ``calibrate`` finds, and the lines of the rig file to change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from gtsam_rwhec.calibration.misreadings import Misreading
+from gtsam_rwhec.calibration.reading import Reading
+from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.results.log_history import SizeFields
+from gtsam_rwhec.rig import Rig
+
+#: Other sizes that are estimated, or other clocks, may look like these.
+NOT_OF_DIRECTIONS = (Mistake.UNIT, Mistake.SCALE, Mistake.ROWS_SHIFTED)
+
+
+def is_of_the_poses(misreadings: Sequence[Misreading]) -> bool:
+    """Whether poses were misread in a way that neither sizes nor clocks explain: then no round helps."""
+    return bool(misreadings) and all(one.mistake not in NOT_OF_DIRECTIONS for one in misreadings)
+
+
+def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading, ...]:
+    """The misreadings with the cure for a log: the line of the rig file to change, or the messages that are wrong."""
+    return tuple(replace(one, cure=_cure(one, rig)) for one in misreadings)
+
+
+def with_cures(findings: Sequence[Finding], before: tuple[Misreading, ...], rig: Rig) -> tuple[Finding, ...]:
+    """The findings, with the cures for a log in that of the misreadings."""
+    said, now = Reading(before).finding, Reading(in_rig_file(before, rig)).finding
+    return tuple(now if now is not None and finding == said else finding for finding in findings)
+
+
+def not_of_late_clocks(findings: Sequence[Finding], misreadings: Sequence[Misreading]) -> tuple[Finding, ...]:
+    """The findings without those that late clocks make, which rotations tell better: large residuals, shifted rows."""
+    made = {Ground.IMPLAUSIBLE, Ground.COVARIANCE_DOUBTED, Ground.LATE_CLOCK}
+    if all(one.mistake is Mistake.ROWS_SHIFTED for one in misreadings):
+        made.add(Ground.MISREAD)
+    return tuple(finding for finding in findings if finding.ground not in made)
+
+
+def _cure(misreading: Misreading, rig: Rig) -> str:
+    carriers, place = rig.carriers, rig.source.place
+    of_A = "A is inverted" in misreading.likely
+    if misreading.mistake is Mistake.INVERTED and of_A:
+        parent, child = carriers.poses.frames
+        exchange = (
+            f"if {carriers.targets} carries the sensors, exchange the two names in "
+            f"{place(('carriers', 'sensors'), ('carriers', 'targets'))}"
+        )
+        if carriers.poses.topic is not None:
+            return (
+                f"{exchange}; if it does not, topic {carriers.poses.topic} has poses of {parent} in {child}: exchange "
+                f"parent and child in {place(('carriers', 'poses', 'parent'))}"
+            )
+        return f"{exchange}; if it does not, what publishes tf writes the inverse of T_{parent}_{child}"
+    if misreading.mistake is Mistake.INVERTED:
+        topics = ", ".join(sensor.detections for sensor in rig.sensors.values() if sensor.detections is not None)
+        return f"let the driver publish the target's pose in the sensor's frame (topics {topics})" if topics else (
+            misreading.cure
+        )  # fmt: skip
+    if misreading.mistake is Mistake.ROWS_SHIFTED:
+        lines = place(*(("sensors", name, "time_offset") for name in rig.sensors))
+        return f"write time_offset: estimate ({lines})"
+    if misreading.mistake is Mistake.SCALE:
+        return (
+            f"measure the targets again ({place(('targets',))}), or write sizes: estimate; or the carriers' unit of "
+            "length or the focal lengths are wrong"
+        )
+    if misreading.mistake is Mistake.QUATERNION_ORDER:
+        return "ROS and Foxglove messages have quaternions as x, y, z, w: correct what publishes these poses"
+    return misreading.cure
+
+
+def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig) -> list[Finding]:
+    """Stated sizes that were to be checked, that the motion contradicts, and that were estimated in their place.
+
+    Where another stated size fits the motion, the carriers' unit and the focal lengths are right, and the poses rest
+    on it. Where none does, any of the three may be wrong.
+    """
+    if rig.sizes != "check":
+        return []
+    told = [size for size in sizes if size.sigma is not None]
+    doubted = [size for size in told if size.is_doubted and size.is_free]
+    if not doubted:
+        return []
+    words = ", ".join(
+        f"{size.target} is {abs(size.percent_too_large):.2g} % too {'large' if size.scale > 1.0 else 'small'} "
+        f"({rig.source.place(('targets', size.target))}: the motion says {1e3 * size.stated_m / size.scale:.2f} mm)"
+        for size in doubted
+    )
+    if len(doubted) == len(told):
+        said = "the stated size of" if len(doubted) == 1 else "no stated size fits the motion:"
+        why = "the poses use the sizes that the motion gives, and nothing tells whether the sizes are wrong or the "
+        return [
+            Finding(Ground.SIZE_DOUBTED, f"{said} {words}; {why}carriers' unit of length or the focal lengths")
+        ]  # fmt: skip
+    return [Finding(Ground.SIZE_ESTIMATED, f"the stated size of {words}; the poses use the size that the motion gives")]

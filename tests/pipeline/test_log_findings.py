@@ -1,0 +1,137 @@
+"""What a log's calibration says is wrong, with the line of the rig file to change: one process, as people run it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic_logs as made
+
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.pipeline.all_stages import calibrate_log
+from gtsam_rwhec.pipeline.clocks_by_turning import offset_of_either_direction
+from gtsam_rwhec.rig import parse_rig
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+
+EXCHANGED = made.RIG.replace("sensors: hand", "sensors: base").replace("targets: base", "targets: hand")
+ESTIMATED = "detections: /cam_{0}/tags\n    time_offset: estimate"
+
+
+def calibrated(
+    folder: Path, messages: Iterable[made.Message], text: str
+) -> tuple[subprocess.CompletedProcess[str], str]:
+    """The command's end, and the first paragraph of its report, without line breaks."""
+    log = made.write(folder / "raw.mcap", messages)
+    (folder / "rig.yaml").write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "gtsam_rwhec", "calibrate", "raw.mcap", "--rig", "rig.yaml", "-o", "out"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=log.parent)
+    return done, " ".join(done.stdout.split("\n\n")[0].split())
+
+
+def test_exchanged_carriers_are_named_with_their_lines_though_clocks_are_estimated(tmp_path: Path) -> None:
+    text = EXCHANGED
+    for number in range(2):
+        text = text.replace(f"detections: /cam_{number}/tags", ESTIMATED.format(number))
+    done, said = calibrated(tmp_path, made.recording(6.0), text.replace("sizes: known", "sizes: check"))
+    assert done.returncode == 6, done.stdout + done.stderr
+    assert said.startswith("Do not use these poses: A is inverted (the poses of the base and the hand are exchanged)")
+    assert "deg and" in said.split("the median residual is ")[1].split(" as read, and ")[0]
+    assert "if hand carries the sensors, exchange the two names in rig.yaml, lines 2 and 3: carriers.sensors" in said
+    assert "contradict" not in said
+    grounds = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))["verdict_grounds"]
+    assert grounds == ["misread"]
+
+
+def test_poses_of_a_topic_that_are_the_inverse_of_what_the_rig_file_says(tmp_path: Path) -> None:
+    messages = []
+    for message in made.recording(6.0):
+        if message.topic != "/tf":
+            messages.append(message)
+            continue
+        (part,) = message.content["transforms"]
+        place = {"position": part["translation"], "orientation": part["rotation"]}
+        content = {"timestamp": part["timestamp"], "frame_id": "base", "pose": place}
+        messages.append(made.Message("/robot", "foxglove.PoseInFrame", content, message.logged_ns))
+    text = made.rig_text(poses="{topic: /robot, parent: hand, child: base}")
+    done, said = calibrated(tmp_path, messages, text)
+    assert done.returncode == 6, done.stdout + done.stderr
+    assert "exchange parent and child in rig.yaml, line 4: carriers.poses.parent" in said
+
+
+def test_the_order_of_the_frames_of_tf_changes_nothing(tmp_path: Path) -> None:
+    log = made.write(tmp_path / "raw.mcap", made.recording(2.5))
+    found = []
+    for number, order in enumerate(("[base, hand]", "[hand, base]")):
+        text = made.rig_text(poses=f"{{tf: {order}}}\n  noise: {{rotation_deg: 0.5, translation_mm: 0.1}}")
+        found.append(calibrate_log(log, parse_rig(text, "rig.yaml"), tmp_path / f"out_{number}").refined)
+    for name, T in found[0].Y.items():
+        np.testing.assert_array_equal(found[1].Y[name].matrix(), T.matrix())
+        np.testing.assert_array_equal(found[1].covariance(name), found[0].covariance(name))
+
+
+def test_sizes_of_which_none_fits_the_motion_are_no_success(tmp_path: Path) -> None:
+    """Where nothing tells the sizes from the carriers' unit of length, one judgement, as in Python."""
+    log = made.recording(6.0, true_size=dict.fromkeys(made.TAGS, 1 / 1.17))
+    done, said = calibrated(tmp_path, log, made.rig_text(sizes="sizes: check"))
+    assert done.returncode == 6, done.stdout + done.stderr
+    assert "carriers' unit of length or the focal lengths" in said
+    assert "rig.yaml, line 1" in said
+
+
+def test_a_size_that_was_corrected_by_the_others_asks_for_care(tmp_path: Path) -> None:
+    log = made.recording(6.0, true_size={"tag_1": 1 / 1.17})
+    done, said = calibrated(tmp_path, log, made.rig_text(sizes="sizes: check"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert said.startswith("Use these poses with care: the stated size of tag_1 is 17 % too large (rig.yaml, line 13")
+    assert "the motion says 102." in said
+
+
+def test_two_clocks_that_are_both_late_are_named(tmp_path: Path) -> None:
+    log = made.recording(8.0, offsets_s=dict.fromkeys(made.CAMERAS, 0.3))
+    done, said = calibrated(tmp_path, log, made.rig_text(sizes="sizes: check"))
+    assert done.returncode == 6, done.stdout + done.stderr
+    assert said.startswith("Do not use these poses: the time offset of cam_0 is 0 s in the rig file")
+    offset_s = float(said.split("carriers' at ")[1].split(" s, to +-")[0])
+    assert abs(offset_s - 0.3) < 2e-3
+    assert "rig.yaml, line 7: sensors.cam_0.time_offset: write time_offset: estimate" in said
+    assert "the time offset of cam_1 is 0 s" in said
+    assert "rows of A" not in said
+
+
+def test_an_offset_along_the_inverse_path_is_taken_only_where_it_fits_far_better() -> None:
+    """A path that is right gives its own offset, also where detections are so noisy that the other one is tried."""
+    generator = np.random.default_rng(3)
+    t = np.arange(0.0, 12.0, 0.02)
+    stamps = made.BEGIN_NS + np.round(1e9 * t).astype(np.int64)
+    path = Trajectory.of(stamps, np.linalg.inv([made.hand(each) for each in t]))
+    own = np.arange(0.5, 11.0, 0.1)
+    for noise_deg in (0.1, 3.0):
+        B = np.array([np.linalg.inv(made.hand(each + 0.1) @ made.Y["cam_0"]) @ made.X["tag_0"] for each in own])
+        turned = np.array([made.pose(each, (0, 0, 0)) for each in noise_deg * generator.normal(size=(len(own), 3))])
+        tracks = [(made.BEGIN_NS + np.round(1e9 * own).astype(np.int64), B @ turned)]
+        found = offset_of_either_direction(path, tracks, 0.2, "cam_0")
+        assert abs(found.offset_s - 0.1) < max(5.0 * found.sigma_s, 1e-3)
+
+
+def test_what_cannot_be_written_is_told_before_anything_is_computed(tmp_path: Path) -> None:
+    log = made.write(tmp_path / "raw.mcap", made.recording(1.0))
+    (tmp_path / "rig.yaml").write_text(made.RIG, encoding="utf-8")
+    for number, name in enumerate(("result.json", "clean.mcap", "tf.yaml", "plots")):
+        out = tmp_path / f"out_{number}"
+        out.mkdir()
+        if name == "plots":
+            (out / name).write_text("a file")
+        else:
+            (out / name).mkdir()
+        with pytest.raises(LogError, match=name):
+            calibrate_log(log, parse_rig(made.RIG, "rig.yaml"), out, progress=_nothing_is_done)
+        assert [path.name for path in out.iterdir()] == [name]
+
+
+def _nothing_is_done(stage: str) -> None:
+    raise AssertionError(stage)
