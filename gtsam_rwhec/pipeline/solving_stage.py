@@ -18,7 +18,13 @@ from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
 from gtsam_rwhec.pipeline.clocks_by_turning import late_clocks
 from gtsam_rwhec.pipeline.log_contract import CLEANING_METADATA
-from gtsam_rwhec.pipeline.log_findings import estimated_sizes, in_rig_file, is_of_the_poses, not_of_late_clocks, with_cures
+from gtsam_rwhec.pipeline.log_findings import (
+    estimated_sizes,
+    in_rig_file,
+    is_of_the_poses,
+    not_of_late_clocks,
+    with_cures,
+)
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, sigma_of, without_outlier_marks
