@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.calibration.calibrating import LATE_S, SURELY
+from gtsam_rwhec.calibration.clock_stage import LATE_S, SURELY
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.cleaning import TimeOffset, estimate_time_offset
 from gtsam_rwhec.errors import StampError
