@@ -1,4 +1,4 @@
-"""What a log's calibration says is wrong, with the line of the rig file to change: one process, as people run it."""
+"""What a log's calibration says is wrong, with the line of the rig file to change."""
 
 from __future__ import annotations
 
@@ -12,14 +12,25 @@ import numpy as np
 import pytest
 import synthetic_logs as made
 
+import gtsam_rwhec as rw
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.pipeline.all_stages import calibrate_log
-from gtsam_rwhec.pipeline.clocks_by_turning import offset_of_either_direction
-from gtsam_rwhec.rig import parse_rig
-from gtsam_rwhec.trajectories.trajectory import Trajectory
+from gtsam_rwhec.pipeline.cleaning_stage import clean_log
+from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.solving_stage import solve_log
+from gtsam_rwhec.rig import parse_rig, read_rig
 
 EXCHANGED = made.RIG.replace("sensors: hand", "sensors: base").replace("targets: base", "targets: hand")
 ESTIMATED = "detections: /cam_{0}/tags\n    time_offset: estimate"
+
+
+def judged(folder: Path, messages: Iterable[made.Message], text: str) -> rw.Judgement:
+    """The judgement of the stages, without exports and plots."""
+    (folder / "rig.yaml").write_text(text, encoding="utf-8")
+    detected, rig = folder / "detected.mcap", read_rig(folder / "rig.yaml")
+    detect_log(made.write(folder / "raw.mcap", messages), rig, detected)
+    clean_log(detected, detected, rig)
+    return solve_log(detected, rig).judgement
 
 
 def calibrated(
@@ -58,9 +69,10 @@ def test_poses_of_a_topic_that_are_the_inverse_of_what_the_rig_file_says(tmp_pat
         content = {"timestamp": part["timestamp"], "frame_id": "base", "pose": place}
         messages.append(made.Message("/robot", "foxglove.PoseInFrame", content, message.logged_ns))
     text = made.rig_text(poses="{topic: /robot, parent: hand, child: base}")
-    done, said = calibrated(tmp_path, messages, text)
-    assert done.returncode == 6, done.stdout + done.stderr
-    assert "exchange parent and child in rig.yaml, line 4: carriers.poses.parent" in said
+    judgement = judged(tmp_path, messages, text)
+    assert judgement.verdict is rw.Verdict.DO_NOT_USE
+    said = str(judgement)
+    assert "rig.yaml, line 4: carriers.poses.parent" in said
 
 
 def test_the_order_of_the_frames_of_tf_changes_nothing(tmp_path: Path) -> None:
@@ -77,45 +89,33 @@ def test_the_order_of_the_frames_of_tf_changes_nothing(tmp_path: Path) -> None:
 def test_sizes_of_which_none_fits_the_motion_are_no_success(tmp_path: Path) -> None:
     """Where nothing tells the sizes from the carriers' unit of length, one judgement, as in Python."""
     log = made.recording(6.0, true_size=dict.fromkeys(made.TAGS, 1 / 1.17))
-    done, said = calibrated(tmp_path, log, made.rig_text(sizes="sizes: check"))
-    assert done.returncode == 6, done.stdout + done.stderr
+    judgement = judged(tmp_path, log, made.rig_text(sizes="sizes: check"))
+    assert judgement.verdict is rw.Verdict.DO_NOT_USE
+    said = str(judgement)
     assert "carriers' unit of length or the focal lengths" in said
     assert "rig.yaml, line 1" in said
 
 
 def test_a_size_that_was_corrected_by_the_others_asks_for_care(tmp_path: Path) -> None:
     log = made.recording(6.0, true_size={"tag_1": 1 / 1.17})
-    done, said = calibrated(tmp_path, log, made.rig_text(sizes="sizes: check"))
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert said.startswith("Use these poses with care: the stated size of tag_1 is 17 % too large (rig.yaml, line 13")
-    assert "the motion says 102." in said
+    judgement = judged(tmp_path, log, made.rig_text(sizes="sizes: check"))
+    assert judgement.verdict is rw.Verdict.CARE
+    said = str(judgement)
+    assert said.startswith("Use these poses with care: the stated size of tag_1 is 17 % too large (")
+    assert "rig.yaml, line 13: targets.tag_1: the motion says 102." in said
 
 
 def test_two_clocks_that_are_both_late_are_named(tmp_path: Path) -> None:
     log = made.recording(8.0, offsets_s=dict.fromkeys(made.CAMERAS, 0.3))
-    done, said = calibrated(tmp_path, log, made.rig_text(sizes="sizes: check"))
-    assert done.returncode == 6, done.stdout + done.stderr
+    judgement = judged(tmp_path, log, made.rig_text(sizes="sizes: check"))
+    assert judgement.verdict is rw.Verdict.DO_NOT_USE
+    said = str(judgement)
     assert said.startswith("Do not use these poses: the time offset of cam_0 is 0 s in the rig file")
     offset_s = float(said.split("carriers' at ")[1].split(" s, to +-")[0])
     assert abs(offset_s - 0.3) < 2e-3
     assert "rig.yaml, line 7: sensors.cam_0.time_offset: write time_offset: estimate" in said
     assert "the time offset of cam_1 is 0 s" in said
     assert "rows of A" not in said
-
-
-def test_an_offset_along_the_inverse_path_is_taken_only_where_it_fits_far_better() -> None:
-    """A path that is right gives its own offset, also where detections are so noisy that the other one is tried."""
-    generator = np.random.default_rng(3)
-    t = np.arange(0.0, 12.0, 0.02)
-    stamps = made.BEGIN_NS + np.round(1e9 * t).astype(np.int64)
-    path = Trajectory.of(stamps, np.linalg.inv([made.hand(each) for each in t]))
-    own = np.arange(0.5, 11.0, 0.1)
-    for noise_deg in (0.1, 3.0):
-        B = np.array([np.linalg.inv(made.hand(each + 0.1) @ made.Y["cam_0"]) @ made.X["tag_0"] for each in own])
-        turned = np.array([made.pose(each, (0, 0, 0)) for each in noise_deg * generator.normal(size=(len(own), 3))])
-        tracks = [(made.BEGIN_NS + np.round(1e9 * own).astype(np.int64), B @ turned)]
-        found = offset_of_either_direction(path, tracks, 0.2, "cam_0")
-        assert abs(found.offset_s - 0.1) < max(5.0 * found.sigma_s, 1e-3)
 
 
 def test_what_cannot_be_written_is_told_before_anything_is_computed(tmp_path: Path) -> None:
