@@ -8,6 +8,7 @@ import gtsam
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.calibration.choices import REFINEMENT, Choice
+from gtsam_rwhec.calibration.disagreement import contradicted_frames
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.noise_found import NoiseFound
 from gtsam_rwhec.calibration.options import CalibrateOptions
@@ -100,6 +101,11 @@ class Calibration:
         """Why, and what to do about it."""
         return self.judgement.reason
 
+    @property
+    def contradicted(self) -> tuple[str, ...]:
+        """Sensors and targets whose own measurements contradict the answer, for the most part: not to be used."""
+        return tuple(one.frame for one in contradicted_frames(self.outliers.counts))
+
     def __str__(self) -> str:
         lines = [str(self.judgement), *map(str, self.points.values()), *map(str, self.choices)]
         return "\n".join(lines)
@@ -107,7 +113,11 @@ class Calibration:
     # -- covariances --------------------------------------------------------------------------------------------
 
     def covariance(self, *names: str | Unknown) -> Array:
-        """As ``Refined.covariance``; an UnderdeterminedError where there is no refined calibration."""
+        """As ``Refined.covariance``; an UnderdeterminedError where there is no refined calibration.
+
+        Where the noise was estimated, the ellipsoid of a probability is that of an F quantile, which is wider than the
+        chi-square quantile: xi' covariance^-1 xi <= ``squared_radius(dimension, confidence)``.
+        """
         return self._known().covariance(*names)
 
     def standard_deviations(self, name: str) -> tuple[Array, Array]:
@@ -119,7 +129,10 @@ class Calibration:
         return self._known().relative(first, second)
 
     def squared_radius(self, dimension: int = 6, confidence: float = 0.95) -> float:
-        """As ``Refined.squared_radius``."""
+        """As ``Refined.squared_radius``: a chi-square quantile, or dimension times an F quantile.
+
+        The F quantile is that of ``refined.degrees_of_freedom``, where the noise was estimated.
+        """
         return self._known().squared_radius(dimension, confidence)
 
     def contains(self, name: str, T_carrier_frame: PoseLike, confidence: float = 0.95) -> bool:

@@ -86,7 +86,7 @@ def _calibrated(run: Run) -> Calibration:
     solution, inliers, refined = found.solution, found.inliers, found.refined
     if solution is None:
         record.find(Ground.NO_SCALE, why)
-    elif lengths := doubted_lengths(problem, solution):
+    elif not reading.misreadings and (lengths := doubted_lengths(problem, solution)):
         record.find(Ground.MISREAD, str(lengths))
     outliers = outliers_of(run, inliers)
     if refined is not None and not refined.free_directions and spare_equations(problem) < SPARE_EQUATIONS:

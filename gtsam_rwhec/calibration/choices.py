@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 #: What is chosen where the choice says why there is no refined calibration.
 REFINEMENT = "covariances"
+#: What is chosen of outliers.
+OUTLIERS = "outliers"
 
 
 @dataclass(frozen=True)

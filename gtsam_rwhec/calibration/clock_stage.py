@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gtsam_rwhec.calibration.clocks import Clock, offsets_worth_estimating
+from gtsam_rwhec.calibration.clocks import NO_STAMPS, Clock, offsets_worth_estimating
 from gtsam_rwhec.calibration.noise_choice import Inliers, offsets_of
 from gtsam_rwhec.calibration.noise_found import NOT_KNOWN, NoiseFound
 from gtsam_rwhec.calibration.noise_stage import refined_under_its_noise
@@ -105,7 +105,7 @@ def _by_the_data(run: Run, first: Solution | None) -> Answer:
     run.record.take(attempt.record)
     names = ", ".join(found.time_offsets_s)
     chosen = f"estimated for {names}" if names else "not estimated"
-    run.record.choose(WHAT, chosen, "; ".join(f"{clock.sensor}: {clock.evidence}" for clock in after))
+    run.record.choose(WHAT, chosen, _evidence(after))
     return found
 
 
@@ -128,6 +128,16 @@ def _clocks(run: Run, solution: Solution | None, inliers: Inliers) -> tuple[Cloc
         return ()
     kept = selected(run.problem, inliers) if inliers else run.problem
     return offsets_worth_estimating(kept, solution, run.options.carrier_path)
+
+
+def _evidence(clocks: tuple[Clock, ...]) -> str:
+    """The evidence of all clocks; what is true of several is said once."""
+    sensors: dict[str, list[str]] = {}
+    for clock in clocks:
+        sensors.setdefault(clock.evidence, []).append(clock.sensor)
+    if set(sensors) == {NO_STAMPS}:
+        return "the measurements have no stamps"
+    return "; ".join(f"{', '.join(names)}: {evidence}" for evidence, names in sensors.items())
 
 
 def _doubt_stated_clocks(run: Run, clocks: tuple[Clock, ...]) -> None:

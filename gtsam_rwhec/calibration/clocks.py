@@ -124,14 +124,11 @@ def _clock_of(sensor: str, problem: Problem, solution: Solution, carrier_path: T
     data = [PairData.of(problem, pair, options, paths[pair]) for pair in pairs]
     unknown = _unknown_share(paths)
     if unknown > LARGEST_UNKNOWN_SHARE:
-        noise = (
-            f"{100 * min(unknown, 1.0):.0f} % of the carriers' squared velocity at its stamps, {apart_s:.2g} s apart"
-        )
+        help_ = "" if carrier_path is not None else " (a path that was logged faster would tell: carrier_path)"
         return Clock(
             sensor,
             False,
-            f"{noise}, is noise or a guess between poses: they stood still, or what lies between the poses is not known"
-            + ("" if carrier_path is not None else ". A path of the carriers that was logged faster would tell"),
+            f"the carriers stood still, or how they moved between stamps {apart_s:.2g} s apart is not known{help_}",
         )
     offset_s, sigma_s = _one_step(_Rows.of(data, solution, frozenset(problem.fixed_scales)))
     # What is wrong in the velocities stretches the offset.

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 from gtsam_rwhec.calibration.choices import REFINEMENT
 from gtsam_rwhec.calibration.noise_choice import Inliers, estimated
 from gtsam_rwhec.calibration.noise_found import NOT_KNOWN, NoiseFound
+from gtsam_rwhec.calibration.outlier_stage import spare_equations
 from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
-from gtsam_rwhec.noise_model.found import NoiseInData
+from gtsam_rwhec.noise_model.found import MOST_BY_CHANCE, NoiseInData, ratio_words
+from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.solving.weights import contradicted_by
 
 
 def refined_under_its_noise(
@@ -32,6 +37,7 @@ def refined_under_its_noise(
         return None, NOT_KNOWN, solution, inliers
     if run.options.noise == "given":
         record.choose("noise of B", "as given", "an option says so")
+        _doubt_stated_noise(run, refined, inliers)
     elif refined.noise_source == "given":
         record.choose("noise of B", "as given", "the residuals are too few to estimate it")
     elif noise.model is None:
@@ -40,30 +46,53 @@ def refined_under_its_noise(
             words = "the standard deviations lack the noise of A and errors that vary with the configuration"
             record.find(Ground.COVARIANCE_DOUBTED, words)
     else:
-        equations = 6 * run.problem.number_of_measurements
-        record.choose("noise of A and B", "each is estimated", f"from {equations} residuals by restricted likelihood")
+        _say_sizes(run, noise.model, inliers)
         _say_drift(run, noise.model)
         _say_systematic(run, noise.model)
     return refined, noise, refined.solution, inliers
+
+
+def _doubt_stated_noise(run: Run, refined: Refined, inliers: Inliers) -> None:
+    """Noise that was stated, and is larger: then the standard deviations are too small by as much."""
+    if refined.options.robust not in ("none", "gnc"):
+        return  # the cost of another loss is no chi-square
+    kept = selected(run.problem, inliers) if inliers else run.problem
+    ratio = contradicted_by(refined.cost, spare_equations(kept))
+    if ratio is not None:
+        words = f"the residuals are {math.sqrt(ratio):.2g} times as large as the stated noise allows"
+        run.record.find(Ground.NOISE_UNDERSTATED, words)
+
+
+def _say_sizes(run: Run, model: NoiseInData, inliers: Inliers) -> None:
+    """How large the noise is, in one line; ``model`` says the rest."""
+    number = sum(int(mask.sum()) for mask in inliers.values()) or run.problem.number_of_measurements
+    chosen = f"estimated, for each axis {model.size_words}"
+    run.record.choose("noise of A and B", chosen, f"that is what the residuals of {number} measurements show")
 
 
 def _say_drift(run: Run, model: NoiseInData) -> None:
     """Whether errors of neighbours in time are alike."""
     what, record = "drift", run.record
     if model.is_drift_untried:
-        record.choose(what, "not modelled", "too many pairs are measured at the same instants")
+        evidence = "more pairs are measured at the same instants than its model can hold"
+        record.choose(what, "seen, and not modelled", evidence)
         words = "errors of neighbours in time are alike, so the standard deviations may be too small"
         record.find(Ground.CORRELATED, words)
     elif model.correlation is None:
-        is_told = run.options.drift == "none"
-        why = "an option says so" if is_told else "neighbours in time are no more alike than others"
-        record.choose(what, "none", why)
+        if run.options.drift == "none":
+            record.choose(what, "none", "an option says so")
+        elif model.drift_not_sought:
+            record.choose(what, "not looked for", model.drift_not_sought)
+        else:
+            order = "" if model.has_stamps else " (rows are taken to be in order of time, since they have no stamps)"
+            record.choose(what, "none", f"errors of neighbours in time are no more alike than others{order}")
     else:
         kind = "a random walk" if model.correlation == 1.0 else f"errors correlated by {model.correlation:g} a step"
         record.choose(
             what,
             f"{kind}; {model.instants} frames are worth about {model.worth:.0f}",
-            f"2 log likelihood rises by {model.drift_evidence:.0f}",
+            f"a model in which neighbours in time share errors explains the residuals far better "
+            f"({ratio_words(model.drift_evidence)})",
         )
 
 
@@ -73,10 +102,16 @@ def _say_systematic(run: Run, model: NoiseInData) -> None:
     if not model.arms_assumed:
         record.choose(what, "none", "an option says so")
         return
-    evidence = f"2 log likelihood changes by {model.systematic_evidence:.0f}"
+    tried = "a model with errors that vary with the carriers' configuration explains the residuals"
     if not model.has_systematic:
-        record.choose(what, "not found; the covariances hold those that may be there", evidence)
+        how = "hardly" if model.systematic_evidence > 1.0 else "no"
+        record.choose(
+            what,
+            "none found; the covariances hold as much as could hide",
+            f"{tried} {how} better ({ratio_words(model.systematic_evidence)}; {MOST_BY_CHANCE:g} would count)",
+        )
         return
+    evidence = f"{tried} far better ({ratio_words(model.systematic_evidence)})"
     record.choose(what, "found, and in the covariances", evidence)
     words = f"errors vary with the configuration of the carriers: {model.systematic_words}"
     record.find(Ground.SYSTEMATIC, words)

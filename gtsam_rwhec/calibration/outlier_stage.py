@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
+
+from gtsam_rwhec.calibration.choices import OUTLIERS
 from gtsam_rwhec.calibration.disagreement import contradicted_frames
+from gtsam_rwhec.calibration.gross_errors import gross_errors
 from gtsam_rwhec.calibration.noise_choice import Inliers, offsets_of
 from gtsam_rwhec.calibration.outliers import Outliers
 from gtsam_rwhec.calibration.run import Run
@@ -20,7 +24,8 @@ from gtsam_rwhec.solving.solution import Solution
 #: Without at least so many equations more than unknowns a wrong measurement cannot be told from the others: it has six
 #: of its own, and the rest must tell noise from it.
 SPARE_EQUATIONS = 24
-WHAT = "outliers"
+#: The share of the measurements that agree where the noise is about right.
+HALF = 0.5
 
 
 def without_outliers(
@@ -39,41 +44,78 @@ def without_outliers(
     problem, options, record = run.problem, run.options, run.record
     spare = spare_equations(problem)
     if options.robust == "none":
-        record.choose(WHAT, "every measurement counts", "an option says so")
+        record.choose(OUTLIERS, "every measurement counts", "an option says so")
+        if gross := gross_errors(problem):
+            record.find(Ground.OUTLIERS_KEPT, str(gross))
         return first, {}
     if not problem.has_measurements:
-        record.choose(WHAT, "every measurement counts", "the raw measurements were not kept")
+        record.choose(OUTLIERS, "every measurement counts", "the raw measurements were not kept")
         return first, {}
     if options.robust == "auto" and spare < SPARE_EQUATIONS:
         record.choose(
-            WHAT,
+            OUTLIERS,
             "not looked for",
-            f"{problem.number_of_measurements} measurements have {spare} equations more than unknowns, and to "
-            f"find a wrong one takes {SPARE_EQUATIONS}",
+            f"{problem.number_of_measurements} measurements are too few to tell a wrong one from the others; "
+            f"{-((spare - SPARE_EQUATIONS) // 6)} more would do",
         )
         return first, {}
     offsets = clearly_off or offsets_of(problem, options)
-    has_more = problem.has_covariances or options.carrier_noise is not None or bool(offsets)
-    noise: Literal["given", "estimate"] = "given" if options.noise == "given" else "estimate"
     try:
-        if first is not None and has_more:
-            return _inliers_under_the_full_noise(run, first, offsets)
-        found = graduated(problem, confidence=options.inlier_confidence, noise_scale=noise, progress=run.tell)
+        return _agreeing(run, first, offsets)
     except (OutlierError, NoiseError, ScaleError) as error:
-        record.choose(WHAT, "not left out", f"it is not possible: {error}")
+        record.choose(OUTLIERS, "not left out", f"it is not possible: {error}")
         words = "too few measurements agree with one another to find out which are wrong"
         record.find(Ground.CONTRADICTED, words)
         return first, {}
+
+
+def _agreeing(run: Run, first: Solution | None, offsets: bool | tuple[str, ...]) -> tuple[Solution, Inliers]:
+    """The certified solution of the measurements that agree, and which these are.
+
+    Under a stated noise that is far too small nearly nothing agrees. Where most agree under the noise that the
+    residuals show, that noise decides; the stage of the noise says then that the stated one is too small.
+    """
+    if run.options.noise != "given":
+        return _agreeing_under(run, first, offsets, "estimate")
+    try:
+        found = _agreeing_under(run, first, offsets, "given")
+        if _share_kept(found[1]) > HALF:
+            return found
+    except (OutlierError, NoiseError, ScaleError) as error:
+        found, why = None, error
+    try:
+        other = _agreeing_under(run, first, offsets, "estimate")
+    except (OutlierError, NoiseError, ScaleError):
+        other = None
+    if other is not None and _share_kept(other[1]) > HALF:
+        return other
+    if found is None:
+        raise why
+    return found
+
+
+def _share_kept(inliers: Inliers) -> float:
+    return float(np.concatenate(list(inliers.values())).mean())
+
+
+def _agreeing_under(
+    run: Run, first: Solution | None, offsets: bool | tuple[str, ...], noise: Literal["given", "estimate"]
+) -> tuple[Solution, Inliers]:
+    problem, options = run.problem, run.options
+    has_more = problem.has_covariances or options.carrier_noise is not None or bool(offsets)
+    if first is not None and has_more:
+        return _inliers_under_the_full_noise(run, first, offsets, noise)
+    found = graduated(problem, confidence=options.inlier_confidence, noise_scale=noise, progress=run.tell)
     return found.solution, found.inliers
 
 
 def _inliers_under_the_full_noise(
-    run: Run, first: Solution, offsets: bool | tuple[str, ...]
+    run: Run, first: Solution, offsets: bool | tuple[str, ...], noise: Literal["given", "estimate"]
 ) -> tuple[Solution, Inliers]:
     """Inliers where sigma and kappa do not hold the whole noise: ``refine`` chooses them again under it."""
     options = run.options
     how = RefineOptions(
-        noise="given" if options.noise == "given" else "estimate",
+        noise=noise,
         noise_groups=options.noise_groups,
         robust="gnc",
         inlier_confidence=options.inlier_confidence,
@@ -95,34 +137,22 @@ def _inliers_under_the_full_noise(
 
 def say_outliers(run: Run, inliers: Inliers) -> None:
     """The choice of outliers, where they were looked for."""
-    number = sum(int((~mask).sum()) for mask in inliers.values())
-    if inliers and number == 0:
-        run.record.choose(WHAT, "none", "every measurement agrees with the others")
-    elif inliers:
-        run.record.choose(
-            WHAT,
-            f"{number} of {run.problem.number_of_measurements} measurements were left out",
-            "they are farther off than good measurements are",
-        )
+    if inliers:
+        outliers = Outliers.of(run.problem, inliers)
+        run.record.choices.append(outliers.choice("they are farther off than the noise of the others explains"))
 
 
 def outliers_of(run: Run, inliers: Inliers) -> Outliers:
     """The outliers as a record; what they say against frames is found."""
-    problem = run.problem
-    counts = {
-        pair: (int(inliers[pair].sum()) if inliers else problem.moments(*pair).count, problem.moments(*pair).count)
-        for pair in problem.pairs
-    }
-    for frame in contradicted_frames(counts):
-        is_sensor = frame.frame in problem.sensors
-        run.record.find(Ground.CONTRADICTED if is_sensor else Ground.TARGET_CONTRADICTED, str(frame))
-    left = {name for pair, (kept, _) in counts.items() if kept for name in pair}
-    left_out = tuple(name for name in (*problem.sensors, *problem.targets) if name not in left)
-    for name in left_out:
-        if name in problem.sensors:
+    outliers = Outliers.of(run.problem, inliers)
+    sensors = run.problem.sensors
+    for frame in contradicted_frames(outliers.counts):
+        run.record.find(Ground.CONTRADICTED if frame.frame in sensors else Ground.TARGET_CONTRADICTED, str(frame))
+    for name in outliers.left_out:
+        if name in sensors:
             words = f"{name} has no pose, because no measurement of it is in the answer"
             run.record.find(Ground.NO_ANSWER, words)
-    return Outliers(inliers, counts, left_out, looked_for=bool(inliers))
+    return outliers
 
 
 def spare_equations(problem: Problem) -> int:

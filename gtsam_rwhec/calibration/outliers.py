@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.calibration.choices import OUTLIERS, Choice
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
 
 #: A sentence about outliers names at most this many pairs.
 NAMED = 5
@@ -33,6 +35,15 @@ class Outliers:
     left_out: tuple[str, ...]
     looked_for: bool
 
+    @staticmethod
+    def of(problem: Problem, inliers: dict[Pair, np.ndarray]) -> Outliers:
+        """The outliers of a problem; without ``inliers`` they were not looked for, and every measurement counts."""
+        totals = {pair: problem.moments(*pair).count for pair in problem.pairs}
+        counts = {pair: (int(inliers[pair].sum()) if inliers else total, total) for pair, total in totals.items()}
+        left = {name for pair, (kept, _) in counts.items() if kept for name in pair}
+        left_out = tuple(name for name in (*problem.sensors, *problem.targets) if name not in left)
+        return Outliers(inliers, counts, left_out, looked_for=bool(inliers))
+
     @property
     def number(self) -> int:
         """How many measurements were left out."""
@@ -42,11 +53,22 @@ class Outliers:
         total = sum(number for _, number in self.counts.values())
         if not self.looked_for:
             return f"Outliers were not looked for among {total} measurements."
-        out = {pair: (number - kept, number) for pair, (kept, number) in self.counts.items() if kept < number}
-        if not out:
+        if not self.number:
             return f"No outliers among {total} measurements."
+        return f"{self.number} of {total} measurements contradict the others and were left out: {self.by_pair}."
+
+    @property
+    def by_pair(self) -> str:
+        """How many of which pair were left out, the most first."""
+        out = {pair: (number - kept, number) for pair, (kept, number) in self.counts.items() if kept < number}
         most = sorted(out.items(), key=lambda item: -item[1][0])[:NAMED]
         named = [f"{number} of {of} of {pair}" for pair, (number, of) in most]
         more = f", and some of {len(out) - NAMED} other pairs" if len(out) > NAMED else ""
-        said = f"{self.number} of {total} measurements contradict the others and were left out"
-        return f"{said}: {', '.join(named)}{more}."
+        return f"{', '.join(named)}{more}"
+
+    def choice(self, evidence: str) -> Choice:
+        """What was chosen where outliers were looked for; ``evidence`` is why some were left out."""
+        if not self.number:
+            return Choice(OUTLIERS, "none", "every measurement agrees with the others")
+        total = sum(number for _, number in self.counts.values())
+        return Choice(OUTLIERS, f"{self.number} of {total} measurements were left out ({self.by_pair})", evidence)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,8 @@ from gtsam_rwhec.solving.certified_solution import solve
 SIZE_SIGMAS = 5.0
 #: By so many it is uncertain: the poses are to be used with care.
 UNCERTAIN_SIGMAS = 3.5
+#: By so many it speaks for a factor that others share.
+SPEAKING_SIGMAS = 2.0
 #: A size is doubted only if it also differs by this share: printers, calipers and intrinsics are seldom more exact.
 SIZE_SHARE = 0.004
 #: So many blocks of each pair's rows are left out in turn.
@@ -91,12 +93,54 @@ class TargetSize:
     def __str__(self) -> str:
         if self.sigma is None:
             return f"the motion does not tell the size of {self.target}"
-        percent = 100.0 * (self.scale - 1.0)
-        larger = "larger" if percent > 0.0 else "smaller"
         return (
-            f"the stated size of {self.target} is {abs(percent):.2g} % {larger} than the motion says "
+            f"the stated size of {self.target} is {_off(self.scale)} than the motion says "
             f"(standard deviation {100.0 * self.sigma:.2g} %)"
         )
+
+
+@dataclass(frozen=True)
+class CommonFactor:
+    """One factor by which all stated sizes are wrong; ``str()`` is one sentence.
+
+    Attributes
+    ----------
+    targets : int
+        How many targets' sizes the motion tells.
+    scale, sigma : float
+        As of a ``TargetSize``.
+    """
+
+    targets: int
+    scale: float
+    sigma: float
+
+    def __str__(self) -> str:
+        return (
+            f"the stated sizes of all {self.targets} targets are {_off(self.scale)} than the motion says (standard "
+            f"deviation {100.0 * self.sigma:.2g} %), by one factor: the unit of lengths in A, or the focal length, may "
+            "be wrong as well"
+        )
+
+
+def common_factor(found: Sequence[TargetSize]) -> CommonFactor | None:
+    """The factor that all sizes which the motion tells are wrong by; None where they are right, or differ."""
+    told = [(size.scale, size.sigma) for size in found if size.sigma is not None]
+    if len(told) < 2:
+        return None
+    scales, sigmas = np.array(told).T
+    weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
+    scale, sigma = float(weights @ scales / weights.sum()), float(sigmas.min())  # their errors may be alike
+    alike = np.abs(scales - scale) <= np.maximum(UNCERTAIN_SIGMAS * sigmas, SIZE_SHARE)
+    speaks = (scales - 1.0) * np.sign(scale - 1.0) > SPEAKING_SIGMAS * sigmas
+    if not alike.all() or speaks.sum() < 2 or not is_size_doubted(scale, sigma):
+        return None
+    return CommonFactor(len(told), scale, sigma)
+
+
+def _off(scale: float) -> str:
+    percent = 100.0 * (scale - 1.0)
+    return f"{abs(percent):.2g} % {'larger' if percent > 0.0 else 'smaller'}"
 
 
 @one_blas_thread()

@@ -9,7 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.calibration.noise_choice import Inliers, estimated
 from gtsam_rwhec.calibration.run import Run
-from gtsam_rwhec.calibration.sizes import TargetSize, sizes
+from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
 from gtsam_rwhec.calibration.stated_poses import contradicted_poses, stated_poses
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
@@ -41,8 +41,8 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
     found = contradicted_poses(run.problem, answer)
     for one in found:
         run.record.find(Ground.COVARIANCE_DOUBTED if one.is_small else Ground.CONTRADICTED, str(one))
-    said = "contradicted by the measurements" if found else "not contradicted by the measurements"
-    run.record.choose("stated poses", "as stated", said)
+    chosen, do = ("as stated, and doubted", "") if found else ("as stated", "do not ")
+    run.record.choose("stated poses", chosen, f"the measurements {do}contradict them")
 
 
 def doubt_stated_sizes(run: Run, refined: Refined, inliers: Inliers) -> tuple[TargetSize, ...]:
@@ -66,12 +66,16 @@ def doubt_stated_sizes(run: Run, refined: Refined, inliers: Inliers) -> tuple[Ta
     kept = {pair: mask if 2 * mask.sum() > len(mask) else np.ones(len(mask), bool) for pair, mask in inliers.items()}
     found = sizes(selected(problem, kept) if kept else problem, how, progress=run.tell)
     doubted = [size for size in found if size.is_doubted]
-    for size in doubted:
-        record.find(Ground.SIZE_DOUBTED, str(size))
+    together = common_factor(found)
     uncertain = [size for size in found if size.is_uncertain]
-    for size in uncertain:
-        record.find(Ground.SIZE_UNCERTAIN, str(size))
-    if doubted or uncertain:
+    if together is not None:
+        record.find(Ground.SIZE_DOUBTED, str(together))
+    else:
+        for size in doubted:
+            record.find(Ground.SIZE_DOUBTED, str(size))
+        for size in uncertain:
+            record.find(Ground.SIZE_UNCERTAIN, str(size))
+    if doubted or uncertain or together is not None:
         record.choose(what, "as stated, and doubted", "the motion contradicts them")
     elif any(size.sigma is not None for size in found):
         record.choose(what, "as stated", "the motion does not contradict them")

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+from gtsam_rwhec.identifiability.free_directions import FEW
 from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.solver.cause import Status
 from gtsam_rwhec.solving.solution import Solution
@@ -76,6 +77,10 @@ class Ground(StrEnum):
     CORRELATED = "correlated"
     #: Errors depend on the configuration: an arm's kinematics, intrinsics, a board that is not flat.
     SYSTEMATIC = "systematic"
+    #: Every measurement counts, as an option says, and some of them look wrong.
+    OUTLIERS_KEPT = "outliers_kept"
+    #: The residuals are larger than the noise that was stated allows.
+    NOISE_UNDERSTATED = "noise_understated"
     #: Another reason for which the standard deviations may be too small.
     COVARIANCE_DOUBTED = "covariance_doubted"
 
@@ -96,6 +101,8 @@ _CARE = (
     Ground.SIZE_ESTIMATED,
     Ground.CORRELATED,
     Ground.SYSTEMATIC,
+    Ground.OUTLIERS_KEPT,
+    Ground.NOISE_UNDERSTATED,
     Ground.COVARIANCE_DOUBTED,
 )
 _ADVICE = {
@@ -115,16 +122,32 @@ _ADVICE = {
         "its clock is late"
     ),
     Ground.NO_ANSWER: "measure with this sensor, or leave it out of the problem",
-    Ground.LATE_CLOCK: "let its time offset be estimated (in a rig file: time_offset: estimate)",
-    Ground.SIZE_DOUBTED: "measure the named target again, or let its size be estimated",
+    Ground.LATE_CLOCK: (
+        'let its time offset be estimated: CalibrateOptions(time_offsets="auto"), in a rig file time_offset: estimate'
+    ),
+    Ground.SIZE_DOUBTED: (
+        "measure the named targets again and state the right sizes, or let the motion tell them: rw.Problem(scale="
+        '"per_target") or --scale per_target (in a rig file: sizes: estimate), and scale="shared" or --scale shared '
+        "where all sizes are off by one factor"
+    ),
     Ground.NO_COVARIANCE: "take more measurements",
     Ground.TARGET_CONTRADICTED: (
         "do not use the pose of the named target; check whether it has moved, and measure it again"
     ),
-    Ground.SIZE_UNCERTAIN: "measure the named target with a caliper, or let its size be estimated",
+    Ground.SIZE_UNCERTAIN: (
+        'measure the named target with a caliper, or let its size be estimated: rw.Problem(scale="per_target") or '
+        "--scale per_target (in a rig file: sizes: estimate)"
+    ),
     Ground.SIZE_ESTIMATED: "measure the named target again, and correct its size",
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
     Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",
+    Ground.OUTLIERS_KEPT: (
+        'let them be found and left out: CalibrateOptions(robust="auto") or --robust auto (in a rig file: robust: gnc)'
+    ),
+    Ground.NOISE_UNDERSTATED: (
+        'let the noise be estimated: CalibrateOptions(noise="auto") or --noise auto (in a rig file: noise: estimate), '
+        "or state it as large as it is"
+    ),
     Ground.COVARIANCE_DOUBTED: "use the poses, but do not rely on their standard deviations",
 }
 
@@ -181,12 +204,10 @@ class Judgement:
 
 def proof_of(refined: RefinedPoses | None) -> str:
     """Why poses without any finding against them are to be used."""
-    first = (
-        "the answer is proven optimal, and"
-        if refined is None
-        else "the first answer is proven optimal, the refinement started from it, and"
+    nothing_against = (
+        "no other poses fit them better" if refined is None else "nothing that was looked for speaks against them"
     )
-    return f"{first} the measurements determine every pose"
+    return f"the measurements determine every pose, and {nothing_against}"
 
 
 def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) -> list[Finding]:
@@ -215,10 +236,12 @@ def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) 
     found = [certificate[status]] if status in certificate else []
     is_unique = solution.identifiability.is_unique and status is not Status.CERTIFIED_NOT_UNIQUE
     if not is_unique or (refined is not None and refined.free_directions):
-        found.append(
-            Finding(
-                Ground.NOT_UNIQUE,
-                "the measurements do not determine all poses; other poses fit them equally well",
+        most = max((residual.number_of_measurements for residual in solution.residuals.values()), default=0)
+        words = "the measurements do not determine all poses; other poses fit them equally well"
+        if most <= FEW:
+            words = (
+                f"the measurements are too few ({most} of a pair at most, which is not more than one motion about one "
+                "axis); other poses fit them equally well"
             )
-        )
+        found.append(Finding(Ground.NOT_UNIQUE, words))
     return found

@@ -19,6 +19,8 @@ NAMED = 4
 AXIS_COSINE = np.cos(np.radians(8.0))
 #: A motion that turns by more than this (root mean square) really turned, even if its residuals are as large.
 TURNED_RAD = np.radians(3.0)
+#: So many measurements of a pair are one motion, which has one axis.
+FEW = 2
 
 Twist = tuple[float, float, float, float, float, float]
 
@@ -50,6 +52,7 @@ class FreeReason(StrEnum):
         "the rotation residuals are as large as the motion: check whether A or B is inverted and the order of the "
         "quaternions",
     )
+    FEW = "few", "no pair of these frames has more than two measurements, which are one motion"
     NO_ROTATION = "no_rotation", "the motion did not turn"
     ONE_AXIS = "one_axis", "the motion turned about one axis only"
     #: The motion turned enough, and still the information is no more than noise alone would create.
@@ -134,14 +137,16 @@ class FreeDirection:
                 yield f"{name} along {_axis(v)}"
 
 
-def reason_for(axes: int, turned_rad: float, residual_rad: float) -> FreeReason:
+def reason_for(axes: int, turned_rad: float, residual_rad: float, measurements: int) -> FreeReason:
     """Why a direction of a pair is free.
 
-    ``axes`` says about how many axes the pair's motion turned beyond the noise: 0, 1, or 2 for two and more. The others
-    are root mean squares: one of its turning, noise included, and one of its rotation residuals.
+    ``axes`` says about how many axes the pair's motion turned beyond the noise: 0, 1, or 2 for two and more. The next
+    two are root mean squares: one of its turning, noise included, and one of its rotation residuals.
     """
     if axes < 2 and turned_rad > TURNED_RAD and residual_rad > 0.5 * turned_rad:
         return FreeReason.CONTRADICTION
+    if measurements <= FEW:
+        return FreeReason.FEW
     return (FreeReason.NO_ROTATION, FreeReason.ONE_AXIS, FreeReason.NOISE)[axes]
 
 

@@ -94,7 +94,8 @@ def identify_with_basis(part: Part, poses: PairPoses, J_t: Array, J_R: Array) ->
     length = typical_length(part)
     axes, turned = _rotation_axes(part, singular_values, noise)
     residual = np.sqrt(J_R / part.moments.kappa)  # J_R is sum kappa theta^2
-    reasons = [reason_for(*of_pair) for of_pair in zip(axes, turned, residual, strict=True)]
+    count = part.moments.count.tolist()
+    reasons = [reason_for(*of_pair) for of_pair in zip(axes, turned, residual, count, strict=True)]
     weak = _weakest_of_part(part, pairs, noise)
     # A frame has the reason of its pair that turned about most axes; of several such pairs, of the last one.
     of_frame = {

@@ -38,9 +38,8 @@ CORRELATED = 2.5
 
 def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     """The best model with drift, where that pays; else the one without."""
-    options, instants = task.options, task.instants
-    is_long = instants.count >= SHORTEST_TRACK * len(task.data) / instants.chains and instants.chains <= MOST_TRACKS
-    if options.drift == "none" or not is_long or (options.drift == "auto" and not is_correlated(steady)):
+    options = task.options
+    if options.drift == "none" or why_no_drift(task) or (options.drift == "auto" and not is_correlated(steady)):
         return steady
     tell("estimating drift")
     thin, systematic = thinned(steady.model), options.systematic
@@ -64,6 +63,16 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     if options.drift == "auto" and walk.objective > steady.fit.objective - PAYS:
         return steady
     return task.settle(steady.state, steady.model.side, kind, systematic=systematic, near=walk)
+
+
+def why_no_drift(task: Task) -> str:
+    """Why no drift can be looked for; empty where it can."""
+    instants = task.instants
+    if instants.chains > MOST_TRACKS:
+        return f"{instants.chains} pairs are measured at the same instants, and its model holds {MOST_TRACKS} at most"
+    if instants.count < SHORTEST_TRACK * len(task.data) / instants.chains:
+        return f"it takes {SHORTEST_TRACK} instants of each pair, one after the other"
+    return ""
 
 
 def _height(tried: tuple[Walk, Fitted]) -> float:

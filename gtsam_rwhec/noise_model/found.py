@@ -12,6 +12,8 @@ from gtsam_rwhec.noise_model.rows import Side
 C = Component
 #: A kind of noise is found where it raises twice the log likelihood by more than this, a parameter.
 EVIDENCE = 5.0
+#: Twice the log likelihood's rise that systematic errors of rotation and of translation must exceed.
+MOST_BY_CHANCE = EVIDENCE * len(SYSTEMATIC)
 _UNITS = {
     C.JITTER: ("ms", 1e3), C.DRIFT_SCALE: ("%", 1e2),
     **dict.fromkeys((C.ROTATION, C.CARRIER_ROTATION, C.DRIFT_ROTATION, C.SYSTEMATIC_ROTATION), ("°", 180.0 / math.pi)),
@@ -19,6 +21,17 @@ _UNITS = {
         (C.TRANSLATION, C.DEPTH, C.CARRIER_TRANSLATION, C.DRIFT_TRANSLATION, C.SYSTEMATIC_TRANSLATION), ("mm", 1e3)
     ),
 }  # fmt: skip
+
+
+def two_digits(value: float) -> str:
+    """A number with two digits, and without an exponent up to a million."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def ratio_words(evidence: float) -> str:
+    """A likelihood ratio: how much twice the log likelihood rose; a fall, which rounding and priors make, is none."""
+    rise = max(evidence, 0.0)
+    return f"likelihood ratio 2 ln L = {two_digits(rise) if rise < 10.0 else f'{rise:.0f}'}"
 
 
 @dataclass(frozen=True)
@@ -49,6 +62,10 @@ class NoiseInData:
         In whose frame these errors are; "detection": rotations in the target's axes, translations along the sensor's.
     drift_evidence, systematic_evidence : float
         How much twice the log likelihood rose with drift, and with errors that vary with the configuration.
+    drift_not_sought : str
+        Why no drift was looked for; empty where it was, or an option says that there is none.
+    has_stamps : bool
+        Whether the order in time is known; without stamps it is that of rows.
     is_drift_untried : bool
         Whether residuals are correlated in time, and there are too many tracks for a model of it.
     arms_assumed : bool
@@ -63,13 +80,24 @@ class NoiseInData:
     frame: Frame | None
     drift_evidence: float
     systematic_evidence: float
+    drift_not_sought: str
+    has_stamps: bool
     is_drift_untried: bool
     arms_assumed: bool
 
     @property
     def has_systematic(self) -> bool:
         """Whether the data show errors that vary with the configuration."""
-        return self.systematic_evidence > EVIDENCE * len(SYSTEMATIC)
+        return self.systematic_evidence > MOST_BY_CHANCE
+
+    @property
+    def size_words(self) -> str:
+        """How large the noise of B and of A is, in short."""
+        of_B, of_A = (C.ROTATION, C.TRANSLATION), (C.CARRIER_ROTATION, C.CARRIER_TRANSLATION)
+        said = f"{' and '.join(self._size(each) for each in of_B)} for B"
+        if not any(each in self.deviations for each in of_A):
+            return f"{said}; A counts as exact"
+        return f"{said}, {' and '.join(self._size(each) for each in of_A)} for A"
 
     @property
     def systematic_words(self) -> str:
@@ -97,7 +125,7 @@ class NoiseInData:
             kind = "Drift in a step" if self.correlation == 1.0 else f"Correlated errors ({self.correlation:g} a step)"
             kind += " of detections" if self.frame == "detection" else f" in the {self.frame}'s frame"
             said.append(
-                f"{kind}: {', '.join(steps)} (2 log likelihood {self.drift_evidence:+.0f}). "
+                f"{kind}: {', '.join(steps)} ({ratio_words(self.drift_evidence)}). "
                 f"{self.instants} frames are worth about {self.worth:.0f}."
             )
         elif self.worth < 0.8 * self.instants:
@@ -106,7 +134,7 @@ class NoiseInData:
             found = "found" if self.has_systematic else "not found, and not excluded"
             said.append(
                 f"Errors of A that vary with the configuration: {self.systematic_words}, {found} "
-                f"(2 log likelihood {self.systematic_evidence:+.0f}). The constant part, which residuals do not show, "
+                f"({ratio_words(self.systematic_evidence)}). The constant part, which residuals do not show, "
                 "is assumed to be as large."
             )
         return tuple(said)
@@ -114,8 +142,12 @@ class NoiseInData:
     def __str__(self) -> str:
         return " ".join(self.sentences)
 
-    def _words(self, component: Component) -> str:
+    def _size(self, component: Component) -> str:
         unit, factor = _UNITS[component]
-        of = self.deviations[component]
         separator = "" if unit == "°" else " "
-        return f"{of.value * factor:.2g}{separator}{unit} ({of.low * factor:.2g} to {of.high * factor:.2g})"
+        return f"{two_digits(self.deviations[component].value * factor)}{separator}{unit}"
+
+    def _words(self, component: Component) -> str:
+        _, factor = _UNITS[component]
+        of = self.deviations[component]
+        return f"{self._size(component)} ({two_digits(of.low * factor)} to {two_digits(of.high * factor)})"

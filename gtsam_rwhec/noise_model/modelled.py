@@ -10,7 +10,7 @@ import numpy as np
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import Component
-from gtsam_rwhec.noise_model.drift_choice import MOST_TRACKS, is_correlated, with_drift
+from gtsam_rwhec.noise_model.drift_choice import MOST_TRACKS, is_correlated, why_no_drift, with_drift
 from gtsam_rwhec.noise_model.found import Deviation, NoiseInData
 from gtsam_rwhec.noise_model.mixture import SAMPLES, Mixture, mixture_of
 from gtsam_rwhec.noise_model.rows import Side
@@ -90,6 +90,8 @@ def noise_in(task: Task, found: Settled, mixture: Mixture) -> NoiseInData:
         frame=None if found.model.drift is None else found.model.drift.walk.frame,
         drift_evidence=found.drift_evidence,
         systematic_evidence=found.systematic_evidence,
+        drift_not_sought=why_no_drift(task),
+        has_stamps=task.instants.seconds is not None,
         is_drift_untried=task.instants.chains > MOST_TRACKS and is_correlated(found, SURELY_CORRELATED),
         arms_assumed=C.SYSTEMATIC_ROTATION in active,
     )

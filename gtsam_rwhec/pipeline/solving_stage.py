@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gtsam_rwhec.calibration.calibrated import Calibration
-from gtsam_rwhec.calibration.choices import Choice
+from gtsam_rwhec.calibration.choices import OUTLIERS, Choice
 from gtsam_rwhec.calibration.outliers import Outliers
 from gtsam_rwhec.calibration.verdict import Judgement
 from gtsam_rwhec.cleaning.removed import RemovalReason
@@ -172,6 +172,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         findings = not_of_late_clocks(findings, calibration.misreadings)
     findings = (*findings, *late, *estimated_sizes(fields.sizes, rig))
     judgement = judge(refined.solution, refined, fields, findings)
+    left_out = _outliers(outliers, looked_for=rig.cleaning.robust == "gnc")
     calibration = replace(
         calibration,
         findings=findings,
@@ -179,8 +180,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         refined=refined,
         time_offsets_s=refined.time_offsets_s,
         judgement=judgement,
-        outliers=_outliers(outliers, looked_for=rig.cleaning.robust == "gnc"),
-        choices=(*_choices_before(rig, estimated, outliers), *_made_in_the_answer(calibration.choices)),
+        outliers=left_out,
+        choices=(*_choices_before(rig, estimated, left_out), *_made_in_the_answer(calibration.choices)),
     )
     solution, cameras = refined.solution, dict(metadata.cameras)
     return Calibrated(refined, solution, settled.pairs, fields, cameras, rig, judgement, calibration)
@@ -197,15 +198,13 @@ def _outliers(counts: tuple[OutlierCount, ...], *, looked_for: bool) -> Outliers
     )
 
 
-def _choices_before(rig: Rig, estimated: tuple[str, ...], counts: tuple[OutlierCount, ...]) -> tuple[Choice, ...]:
+def _choices_before(rig: Rig, estimated: tuple[str, ...], outliers: Outliers) -> tuple[Choice, ...]:
     """What was chosen in the rounds before the answer."""
-    number, left_out = sum(count.used + count.left_out for count in counts), sum(count.left_out for count in counts)
     choices = []
-    if rig.cleaning.robust == "gnc":
-        chosen = f"{left_out} of {number} measurements were left out" if left_out else "none"
-        choices.append(Choice("outliers", chosen, "the others agree with one another at the estimated time offsets"))
+    if outliers.looked_for:
+        choices.append(outliers.choice("they are farther off than the noise of the others explains"))
     else:
-        choices.append(Choice("outliers", "every measurement counts", "the rig file says so"))
+        choices.append(Choice(OUTLIERS, "every measurement counts", "the rig file says so"))
     if estimated:
         choices.append(
             Choice("time offsets", f"estimated for {', '.join(estimated)}", "the rig file states none for them")
@@ -214,7 +213,7 @@ def _choices_before(rig: Rig, estimated: tuple[str, ...], counts: tuple[OutlierC
 
 
 def _made_in_the_answer(choices: tuple[Choice, ...]) -> tuple[Choice, ...]:
-    return tuple(choice for choice in choices if choice.what not in ("outliers", "sizes of targets", "time offsets"))
+    return tuple(choice for choice in choices if choice.what not in (OUTLIERS, "sizes of targets", "time offsets"))
 
 
 def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:

@@ -42,12 +42,12 @@ def warn_of_millimetres(found: Sequence[LongTranslations], stacklevel: int) -> N
     if not long:
         return
     sides = sorted({name for each in long for name in each.sizes})
-    sizes = [f"{np.median([each.sizes[name] for each in long if name in each.sizes]):.4g} of {name}" for name in sides]
+    sizes = [f"{np.median([each.sizes[name] for each in long if name in each.sizes]):.4g}" for name in sides]
     named = ", ".join(each.where for each in long[:MOST_NAMED])
     more = f" and {len(long) - MOST_NAMED} more" if len(long) > MOST_NAMED else ""
     warnings.warn(
         f"{named}{more}: translations of {' and '.join(sides)} have a median size of {' and '.join(sizes)}; this looks "
-        "like millimetres. Give metres: divide by 1000",
+        "like millimetres. Give metres: divide by 1000. (This is said once for all pairs of a problem)",
         UnitsWarning,
         stacklevel=stacklevel + 1,
     )

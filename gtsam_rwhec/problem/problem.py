@@ -60,6 +60,7 @@ class Problem(Knowledge):
         self._kind: dict[str, Literal["target", "sensor"]] = {}
         self._kept: dict[Pair, KeptMeasurements] = {}
         self._accumulator = Accumulator()
+        self._long: frozenset[str] = frozenset()  # of "A" and "B", those whose millimetres were warned of
 
     # -- contents -----------------------------------------------------------------------------------------------
 
@@ -236,12 +237,13 @@ class Problem(Knowledge):
             )
             raw = raw.projected(where)
         translations = LongTranslations.of(raw.A, raw.B, accumulator.gauge, pair.is_motion, where)
-        if long is None:
-            warn_of_millimetres([translations], stacklevel=3)
-        else:
+        if long is not None:
             long.append(translations)
+        elif not translations.sizes.keys() <= self._long:
+            warn_of_millimetres([translations], stacklevel=3)
         # The problem changes only after all checks and warnings: a warning may be raised as an error.
         self._accumulator = accumulator
+        self._long |= translations.sizes.keys()
         self.is_relative = self.is_relative or not given.has_noise
         self._kind |= {pair.target: "target", pair.sensor: "sensor"}  # a motion's one name is its sensor's
         kept = raw.kept() if self.keep_measurements else KeptMeasurements((), raw.covariances is not None)

@@ -96,7 +96,9 @@ class RefinedPoses:
     def covariance(self, *names: str | Unknown) -> Array:
         """The joint covariance (m, m) of frames, scales and time offsets, in the order given.
 
-        It is zero for fixed frames, and infinite in the rows that a free direction changes.
+        It is zero for fixed frames, and infinite in the rows that a free direction changes. Where the noise was
+        estimated, it has `degrees_of_freedom`: take ``squared_radius`` for ellipsoids, which is an F quantile then, and
+        no chi-square quantile.
 
         Parameters
         ----------

@@ -45,13 +45,11 @@ def print_calibration(
         print_sentence(console, POINTS, "dim")
     print_heading(console, "What was chosen, and why")
     print_list(console, map(str, calibration.choices))
-    if calibration.outliers.looked_for:
-        print_list(console, [str(calibration.outliers)])
     print_list(console, calibration.notes, "yellow")
     if calibration.cannot_tell:
         print_list(console, [f"Not checked, as no residual shows it: {_facts(calibration)}."], "dim")
     if refined is not None:
-        print_refined_body(console, refined, log)
+        print_refined_body(console, refined, log, outliers_are_said=True)
     elif solution is not None:
         print_solution_body(console, solution)
 

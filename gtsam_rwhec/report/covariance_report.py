@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 from rich.console import Console
@@ -20,10 +20,12 @@ from gtsam_rwhec.report.log_report import print_log
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, RESIDUAL_LEGEND, FrameTable, pose_cells, residual_table
 from gtsam_rwhec.report.printing import print_heading, print_sentence, print_tables, print_verdict, report_console
 from gtsam_rwhec.report.solution_report import print_solution_details
-from gtsam_rwhec.results.judging import judge
+from gtsam_rwhec.results.judging import contradicted_names, judge
 from gtsam_rwhec.results.log_history import LogFields
 
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
+#: Beside the name of a frame whose pose is not to be used.
+MARK = "(!)"
 #: The carrier that has the noise of A.
 CARRIERS: dict[About, str] = {"targetcarrier": "target carrier", "sensorcarrier": "sensor carrier"}
 #: What the numbers of the noise are, beside the residuals.
@@ -57,29 +59,37 @@ def print_refined(refined: Refined, console: Console | None = None, *, log: LogF
     print_refined_body(console, refined, log)
 
 
-def print_refined_body(console: Console, refined: Refined, log: LogFields | None = None) -> None:
+def print_refined_body(
+    console: Console, refined: Refined, log: LogFields | None = None, *, outliers_are_said: bool = False
+) -> None:
     """Print the refined poses with their standard deviations, and the details."""
     solution = refined.solution
+    wrong = contradicted_names(refined, log)
     print_heading(console, "Poses")
     sensor_frame, target_frame = (
         ("of their carrier", "of their carrier") if log is None else (log.sensor_carrier, log.target_carrier)
     )
     tables = (
-        _frame_table(f"Sensors in the frame {sensor_frame}", "sensor", refined.Y, refined),
-        _frame_table(f"Targets in the frame {target_frame}", "target", refined.X, refined),
+        _frame_table(f"Sensors in the frame {sensor_frame}", "sensor", refined.Y, refined, wrong),
+        _frame_table(f"Targets in the frame {target_frame}", "target", refined.X, refined, wrong),
     )
     print_tables(console, tables, legend(refined))
+    if wrong:
+        print_sentence(console, f"{MARK}: do not use this pose; most measurements of it contradict the answer.", "bold")
     for sentence in scale_and_offset_sentences(refined):
         print_sentence(console, sentence)
     print_heading(console, "Details")
     if log is not None:
         print_log(log, console)
-    relative = [_relative_table(kind, poses, refined) for kind, poses in (("sensor", refined.Y), ("target", refined.X))]
+    sides = (("sensor", refined.Y), ("target", refined.X))
+    relative = [_relative_table(kind, poses, refined, wrong) for kind, poses in sides]
     print_tables(console, [*relative, residual_table(solution)], RESIDUAL_LEGEND)
     console.print()
     noise = noise_table(refined)
     if len(noise.rows) > 1:
         console.print(noise)
+    if refined.inlier_counts and not outliers_are_said:
+        print_sentence(console, outlier_sentence(refined.inlier_counts))
     for sentence in refined_sentences(refined):
         print_sentence(console, sentence)
     console.print()
@@ -125,7 +135,7 @@ def scale_and_offset_sentences(refined: Refined) -> list[str]:
 
 
 def refined_sentences(refined: Refined) -> list[str]:
-    """The noise, the cost and the outliers, which decide the standard deviations."""
+    """The noise and the cost, which decide the standard deviations."""
     sentences = [_noise_sentence(refined), NOISE_LEGEND]
     sentences += refined.noise_sentences or (_carrier_noise_sentence(refined),)
     loss = "" if refined.options.robust in ("none", "gnc") else f", {refined.options.robust} loss"
@@ -135,8 +145,6 @@ def refined_sentences(refined: Refined) -> list[str]:
         f"({refined.options.residual} residual{loss}). Do not compare it with the certified cost, which has other "
         "weights."
     )
-    if refined.inlier_counts:
-        sentences.append(_outlier_sentence(refined.inlier_counts))
     return sentences
 
 
@@ -166,7 +174,7 @@ def _carrier_noise_sentence(refined: Refined) -> str:
     )
 
 
-def _outlier_sentence(counts: Mapping[Pair, tuple[int, int]]) -> str:
+def outlier_sentence(counts: Mapping[Pair, tuple[int, int]]) -> str:
     """How many measurements of which pairs were left out."""
     total = sum(number for _, number in counts.values())
     out = {pair: number - kept for pair, (kept, number) in counts.items() if kept < number}
@@ -204,11 +212,13 @@ def _noise_cells(noise: PairNoise) -> tuple[str, ...]:
     return size + tuple(f"{number:.0f}" for number in noise.degrees_of_freedom if np.isfinite(number))
 
 
-def _frame_table(title: str, kind: str, poses: Mapping[str, object], refined: Refined) -> FrameTable:
+def _frame_table(
+    title: str, kind: str, poses: Mapping[str, object], refined: Refined, wrong: Collection[str]
+) -> FrameTable:
     rows = {}
     for name in sorted(poses, key=natural_key):
         moved = refined.moved[name]
-        rows[name] = (
+        rows[_label(name, wrong)] = (
             *pose_cells(refined.X[name] if name in refined.X else refined.Y[name]),
             *(deviation_cells(refined.covariance(name)) if name in refined.names else ("fixed",) * 6),
             f"{moved.translation_mm:.2f}",
@@ -217,13 +227,17 @@ def _frame_table(title: str, kind: str, poses: Mapping[str, object], refined: Re
     return FrameTable(title, kind, (*POSE_HEADINGS, *DEVIATION_HEADINGS, "moved mm", "moved°"), rows)
 
 
-def _relative_table(kind: str, poses: Mapping[str, object], refined: Refined) -> FrameTable:
+def _label(name: str, wrong: Collection[str]) -> str:
+    return f"{name} {MARK}" if name in wrong else name
+
+
+def _relative_table(kind: str, poses: Mapping[str, object], refined: Refined, wrong: Collection[str]) -> FrameTable:
     """The pose of each frame in the first frame of the same carrier."""
     names = sorted(poses, key=natural_key)
     rows = {}
     for name in names[1:]:
         pose, covariance = refined.relative(names[0], name)
-        rows[name] = (*pose_cells(pose), *deviation_cells(covariance))
+        rows[_label(name, wrong)] = (*pose_cells(pose), *deviation_cells(covariance))
     title = f"Other {kind}s in the frame of {names[0]}" if names else ""
     return FrameTable(title, kind, (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows)
 

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from gtsam_rwhec.calibration.disagreement import contradicted_frames
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.solving.solution import Solution
+
+
+def contradicted_names(refined: RefinedPoses | None, log: LogFields | None = None) -> frozenset[str]:
+    """The sensors and targets whose own measurements contradict the answer, for the most part: poses not to be used."""
+    if log is not None:
+        return frozenset(one.frame for one in log.contradicted)
+    counts = {} if refined is None else refined.inlier_counts
+    return frozenset(one.frame for one in contradicted_frames(counts))
 
 
 def judge(

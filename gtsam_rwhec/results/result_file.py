@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -37,7 +37,7 @@ from gtsam_rwhec.results.covariance_agreement import check_frames, check_joint
 from gtsam_rwhec.results.earlier_versions import FIRST_VERSION, FIRST_WITH_REGION, FIRST_WITH_VERDICT, as_version_4
 from gtsam_rwhec.results.json_text import MOST_BYTES, parse_json
 from gtsam_rwhec.results.json_tree import POSED, from_json, in_words, to_json
-from gtsam_rwhec.results.judging import judge
+from gtsam_rwhec.results.judging import contradicted_names, judge
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.schema import (
     CONVENTIONS,
@@ -258,11 +258,12 @@ def _content(
     if log is not None:
         carriers = {"X": log.target_carrier, "Y": log.sensor_carrier}
     try:
-        certified = _posed(to_json(solution, "$.certified"), solution, carriers)
+        wrong = contradicted_names(refined, log)
+        certified = _posed(to_json(solution, "$.certified"), solution, carriers, wrong)
         parts: dict[str, Any] = {"certified": certified}
         poses = {name: certified[name] for name in POSED}
         if refined is not None:
-            parts["refined"] = _posed(to_json(_refined_fields(refined), "$.refined"), refined, carriers)
+            parts["refined"] = _posed(to_json(_refined_fields(refined), "$.refined"), refined, carriers, wrong)
             poses = {name: parts["refined"].pop(name) for name in POSED}
         if calibration is not None:
             parts["calibration"] = to_json(calibration, "$.calibration")
@@ -306,9 +307,14 @@ def _heading(judgement: Judgement) -> dict[str, Any]:
     }
 
 
-def _posed(tree: dict[str, Any], answer: Solution | RefinedPoses, carriers: Mapping[str, str]) -> dict[str, Any]:
+def _posed(
+    tree: dict[str, Any], answer: Solution | RefinedPoses, carriers: Mapping[str, str], contradicted: Collection[str]
+) -> dict[str, Any]:
     """Put the poses into a record's JSON, under the names that files have for them."""
-    poses = {"targets": pose_rows(carriers["X"], answer.X), "sensors": pose_rows(carriers["Y"], answer.Y)}
+    poses = {
+        "targets": pose_rows(carriers["X"], answer.X, contradicted),
+        "sensors": pose_rows(carriers["Y"], answer.Y, contradicted),
+    }
     return {**poses, **{name: value for name, value in tree.items() if name not in ("X", "Y")}}
 
 

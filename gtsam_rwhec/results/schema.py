@@ -8,7 +8,7 @@ bases describe the fields. Lengths are in metres, angles in radians, times in se
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal
 
@@ -83,6 +83,12 @@ class Pose(BaseModel):
         description="the same rotation, row by row. Only the matrix is read back: a quaternion loses the last bit"
     )
 
+    contradicted: bool = Field(
+        default=False,
+        description="whether the frame's own measurements contradict the answer, for the most part: do not use this "
+        "pose; not read back",
+    )
+
     @model_validator(mode="after")
     def _is_a_rotation(self) -> Pose:
         R = np.array(self.rotation_matrix)
@@ -99,8 +105,13 @@ class Pose(BaseModel):
         return self
 
 
-def pose_rows(parent: str, poses: Mapping[str, gtsam.Pose3]) -> list[dict[str, Any]]:
-    """The poses of the frames on one carrier as JSON: rows with the fields of `Pose`."""
+def pose_rows(
+    parent: str, poses: Mapping[str, gtsam.Pose3], contradicted: Collection[str] | None = None
+) -> list[dict[str, Any]]:
+    """The poses of the frames on one carrier as JSON: rows with the fields of `Pose`.
+
+    Without ``contradicted``, the frames whose poses are not to be used, rows do not say whether they are.
+    """
     rows = []
     for name, pose in poses.items():
         q: Any = pose.rotation().toQuaternion()  # Eigen's quaternion, which gtsam's stubs do not type
@@ -111,6 +122,7 @@ def pose_rows(parent: str, poses: Mapping[str, gtsam.Pose3]) -> list[dict[str, A
                 "translation_m": pose.translation().tolist(),
                 "quaternion_wxyz": [q.w(), q.x(), q.y(), q.z()],
                 "rotation_matrix": pose.rotation().matrix().tolist(),
+                **({} if contradicted is None else {"contradicted": name in contradicted}),
             }
         )
     return rows

@@ -11,6 +11,7 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.outlier_stage import spare_equations
+from gtsam_rwhec.identifiability.free_directions import FreeReason
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.simulate import Noise
@@ -33,11 +34,16 @@ def test_a_good_problem_is_to_be_used_and_its_truth_is_inside() -> None:
     for name, truth in (simulated.X | simulated.Y).items():
         assert calibration.contains(name, truth, 0.9999)
     assert choice(calibration, "outliers").chosen == "none"
-    assert choice(calibration, "noise of A and B").chosen == "each is estimated"
+    said = choice(calibration, "noise of A and B")
+    assert said.chosen.startswith("estimated, for each axis 0.49° and 4.6 mm for B, ")
+    assert said.evidence == "that is what the residuals of 80 measurements show"
+    said = choice(calibration, "systematic errors")
+    assert said.chosen == "none found; the covariances hold as much as could hide"
+    assert "explains the residuals hardly better (likelihood ratio 2 ln L = " in said.evidence
     assert calibration.noise.model is not None
     assert str(calibration.noise).startswith("Noise of B for each axis: ")
     assert "No outliers among 80 measurements" in str(calibration.outliers)
-    assert str(calibration).startswith("Use these poses: ")
+    assert str(calibration).startswith("Use these poses: the measurements determine every pose, and nothing ")
 
 
 def with_outliers(problem: rw.Problem, share: float, of: tuple[str, ...] = ()) -> rw.Problem:
@@ -59,12 +65,29 @@ def test_outliers_are_left_out_and_the_rest_is_certified_again() -> None:
     assert calibration.verdict is rw.Verdict.USE
     assert calibration.outliers.number == 16
     assert calibration.solution.counts.endswith("64 measurements")
-    assert "16 of 80 measurements were left out" in str(choice(calibration, "outliers"))
+    assert "16 of 80 measurements were left out (4 of 20 of target0-sensor0, " in str(choice(calibration, "outliers"))
     for name, truth in (simulated.X | simulated.Y).items():
         assert calibration.contains(name, truth, 0.9999)
     everything = rw.calibrate(with_outliers(simulated.problem, 0.2), rw.CalibrateOptions(robust="none"))
     assert everything.outliers.number == 0
     assert choice(everything, "outliers").evidence == "an option says so"
+    assert everything.judgement.grounds == (rw.Ground.OUTLIERS_KEPT,)
+    assert everything.verdict_reason.startswith("16 of 80 measurements look wrong ")
+    assert 'CalibrateOptions(robust="auto") or --robust auto' in everything.verdict_reason
+    good = rw.calibrate(simulated.problem, rw.CalibrateOptions(robust="none"))
+    assert good.verdict is rw.Verdict.USE
+
+
+@pytest.mark.parametrize("robust", ["auto", "none"])
+def test_noise_that_is_stated_too_small_is_said_with_its_factor(robust: str) -> None:
+    """Nothing agrees under it; that is no sign of a frame that has moved."""
+    problem = copied(rig().problem, sigma=lambda pair, raw: raw.sigma / 30.0, kappa=lambda pair, raw: 900.0 * raw.kappa)
+    calibration = rw.calibrate(problem, rw.CalibrateOptions(noise="given", robust=robust))  # type: ignore[arg-type]
+    assert calibration.judgement.grounds == (rw.Ground.NOISE_UNDERSTATED,)
+    assert calibration.verdict_reason.startswith("the residuals are 30 times as large as the stated noise allows")
+    assert "--noise auto" in calibration.verdict_reason
+    assert calibration.outliers.number == 0
+    assert rw.calibrate(rig().problem, rw.CalibrateOptions(noise="given", robust=robust)).judgement.grounds == ()  # type: ignore[arg-type]
 
 
 def test_a_sensor_whose_measurements_disagree_is_not_to_be_used() -> None:
@@ -84,6 +107,8 @@ def test_a_size_that_the_motion_contradicts_is_found() -> None:
     calibration = rw.calibrate(problem)
     assert calibration.judgement.grounds[0] is rw.Ground.SIZE_DOUBTED
     assert [size.target for size in calibration.sizes if size.is_doubted] == ["target1"]
+    assert calibration.contradicted == ("target1",)
+    assert 'rw.Problem(scale="per_target") or --scale per_target' in calibration.verdict_reason
     assert "the stated size of target1 is 3 % larger than the motion says" in calibration.verdict_reason
     told = rw.calibrate(problem, rw.CalibrateOptions(sizes="known"))
     assert rw.Ground.SIZE_DOUBTED not in told.judgement.grounds
@@ -143,8 +168,42 @@ def test_two_measurements_are_too_few_to_leave_one_out() -> None:
     assert spare_equations(few) == 0
     calibration = rw.calibrate(few)
     assert calibration.judgement.grounds == (rw.Ground.NOT_UNIQUE,)
+    assert calibration.verdict_reason.startswith("the measurements are too few (2 of a pair at most, ")
+    assert {direction.reason for direction in calibration.refined.free_directions} == {FreeReason.FEW}
     assert choice(calibration, "outliers").chosen == "not looked for"
-    assert "2 measurements have 0 equations more than unknowns" in choice(calibration, "outliers").evidence
+    assert "2 measurements are too few to tell a wrong one from the others; 4 more" in str(calibration)
+    assert choice(calibration, "time offsets").evidence == "the measurements have no stamps"
+
+
+def test_drift_that_cannot_be_looked_for_says_why() -> None:
+    """Rows of one pair are taken to be in order of time, and 15 are too few."""
+    raw = rig(1, 1).problem.measurements("target0", "sensor0")
+    said = []
+    for count in (15, 20):
+        problem = rw.Problem()
+        problem.add("target0", "sensor0", raw.A[:count], raw.B[:count])
+        said.append(choice(rw.calibrate(problem), "drift"))
+    assert (said[0].chosen, said[0].evidence) == (
+        "not looked for",
+        "it takes 20 instants of each pair, one after the other",
+    )
+    assert said[1].chosen == "none"
+    assert "since they have no stamps" in said[1].evidence
+
+
+def test_millimetres_in_A_are_said_once() -> None:
+    def thousandfold(pair: Pair, raw: Measurements) -> np.ndarray:
+        A = raw.A.copy()
+        A[:, :3, 3] *= 1e3
+        return A
+
+    with pytest.warns(rw.errors.UnitsWarning) as caught:
+        problem = copied(rig().problem, A=thousandfold)
+    (warning,) = caught  # of four pairs
+    assert "translations of A have a median size of 823.7; this looks like millimetres" in str(warning.message)
+    calibration = rw.calibrate(problem)
+    assert calibration.verdict_reason.count("millimetres") == 1
+    assert "A and B" not in calibration.verdict_reason
 
 
 def test_stated_noise_serves_where_the_residuals_are_too_few() -> None:

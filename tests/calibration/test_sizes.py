@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.sizes import SIZE_SHARE, TargetSize, is_size_doubted, sizes
+from gtsam_rwhec.calibration.sizes import SIZE_SHARE, TargetSize, common_factor, is_size_doubted, sizes
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.results.log_history import SizeFields
 from gtsam_rwhec.simulate import Noise, general
@@ -81,3 +81,14 @@ def test_an_uncertain_size_asks_for_care(monkeypatch: pytest.MonkeyPatch) -> Non
     assert calibration.verdict is rw.Verdict.CARE
     assert rw.Ground.SIZE_UNCERTAIN in calibration.judgement.grounds
     assert "target0 is 3" in calibration.verdict_reason
+
+
+def test_sizes_that_are_off_by_one_factor_are_said_together() -> None:
+    """Some of them may be known too little to be doubted alone."""
+    common = common_factor([TargetSize("a", 1.05, 0.002), TargetSize("b", 1.047, 0.02), TargetSize("c", 1.0, None)])
+    assert common is not None
+    assert str(common).startswith("the stated sizes of all 2 targets are 5 % larger than the motion says ")
+    assert common_factor([TargetSize("a", 1.05, 0.002), TargetSize("b", 1.0, 0.002)]) is None
+    assert common_factor([TargetSize("a", 1.001, 0.0001), TargetSize("b", 1.001, 0.0001)]) is None
+    assert common_factor([TargetSize("a", 1.05, 0.002)]) is None
+    assert common_factor([TargetSize("a", 1.05, 0.002), TargetSize("b", 1.0, 0.05)]) is None  # b says nothing

@@ -176,7 +176,7 @@ def test_words_of_an_old_file_are_kept() -> None:
     ],
 )
 def test_reasons(axes: int, turned_deg: float, residual_deg: float, said: FreeReason) -> None:
-    assert reason_for(axes, np.radians(turned_deg), np.radians(residual_deg)) is said
+    assert reason_for(axes, np.radians(turned_deg), np.radians(residual_deg), 3) is said
 
 
 # -- from motion to words ---------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from gtsam_rwhec.report.covariance_report import (
     deviation_cells,
     legend,
     noise_table,
+    outlier_sentence,
     refined_sentences,
     scale_and_offset_sentences,
 )
@@ -210,12 +211,21 @@ def test_it_says_whether_the_carriers_are_taken_for_exact(rig: rw.Refined) -> No
 
 def test_outliers_are_counted(rig: rw.Refined) -> None:
     counts = dict.fromkeys(rig.noise, (20, 20))
-    assert "Outliers: none of 120 measurements." in refined_sentences(dataclasses.replace(rig, inlier_counts=counts))
+    assert outlier_sentence(counts) == "Outliers: none of 120 measurements."
     counts |= {Pair("target1", "sensor0"): (18, 20), Pair("target2", "sensor1"): (19, 20)}
-    assert (
-        "Outliers: 3 of 120 measurements left out: target1-sensor0 2 of 20, target2-sensor1 1 of 20."
-    ) in refined_sentences(dataclasses.replace(rig, inlier_counts=counts))
-    assert not any("Outliers" in sentence for sentence in refined_sentences(rig))
+    said = "Outliers: 3 of 120 measurements left out: target1-sensor0 2 of 20, target2-sensor1 1 of 20."
+    assert outlier_sentence(counts) == said
+    assert said in printed(dataclasses.replace(rig, inlier_counts=counts))
+    assert "Outliers: " not in printed(rig)
+
+
+def test_a_frame_that_its_measurements_contradict_is_marked_in_every_table(rig: rw.Refined) -> None:
+    counts = dict.fromkeys(rig.noise, (20, 20)) | {pair: (3, 20) for pair in rig.noise if pair.target == "target2"}
+    text = printed(dataclasses.replace(rig, inlier_counts=counts))
+    assert text.count("target2 (!)") == 2
+    assert "target1 (!)" not in text
+    assert "(!): do not use this pose; most measurements of it contradict the answer." in text
+    assert "(!)" not in printed(rig)
 
 
 def test_cost_names_residual_and_loss(rig: rw.Refined) -> None:

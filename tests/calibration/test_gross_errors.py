@@ -1,0 +1,53 @@
+"""Measurements that look wrong where every measurement counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from refinement_problems import copied, rig
+from rwhec_factors import se3
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.gross_errors import GrossErrors, gross_errors
+from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.problem.pairs import Pair
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_they_are_counted(share: float) -> None:
+    """Least squares hides a third of outliers: all of its residuals are large then."""
+    chance = np.random.default_rng(0)
+
+    def spoilt(pair: Pair, raw: Measurements) -> np.ndarray:
+        bad = chance.permutation(len(raw.B))[: round(share * len(raw.B))]
+        B = raw.B.copy()
+        B[bad] = B[bad] @ se3.expmap(np.hstack([np.zeros((len(bad), 3)), chance.uniform(0.5, 2.0, (len(bad), 3))]))
+        return B
+
+    problem = copied(rig(number_of_measurements=40).problem, B=spoilt)
+    assert gross_errors(problem) == GrossErrors(round(share * 160), 160)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_there_are_none_among_good_ones(seed: int) -> None:
+    assert gross_errors(rig(seed=seed).problem) is None
+
+
+def test_a_pair_with_more_noise_than_others_is_not_wrong() -> None:
+    noisy = Pair("target0", "sensor0")
+
+    def spoilt(pair: Pair, raw: Measurements) -> np.ndarray:
+        extra = 0.05 * np.random.default_rng(1).normal(size=(len(raw.B), 6))
+        return np.asarray(raw.B @ se3.expmap(extra)) if pair == noisy else raw.B
+
+    assert gross_errors(copied(rig().problem, B=spoilt)) is None
+
+
+def test_without_measurements_none_can_be_told() -> None:
+    raw = rig(1, 1).problem.measurements("target0", "sensor0")
+    kept = rw.Problem(keep_measurements=False)
+    kept.add("target0", "sensor0", raw.A, raw.B)
+    assert gross_errors(kept) is None
+    few = rw.Problem()
+    few.add("target0", "sensor0", raw.A[:5], raw.B[:5])
+    assert gross_errors(few) is None
