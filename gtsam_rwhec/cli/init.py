@@ -28,8 +28,16 @@ def init(
         with rw.logs.open_log(log) as opened:
             text, notes = rw.first_rig.propose_rig(opened, output)
     write_atomically(output, text.encode())
-    say(f"Written to {shown_path(output)}. Complete the lines marked TODO.")
-    say(f"Next: gtsam-rwhec calibrate {shown_path(log)} --rig {shown_path(output)} -o out\n")
+    call = f" gtsam-rwhec calibrate {shown_path(log)} --rig {shown_path(output)} -o out"
     for note in notes:
         say(note)
+    say(f"\nWritten to {shown_path(output)}.")
+    lines = rw.rig.todo_lines(text)
+    if lines:
+        say("Complete these lines, and take the mark TODO away:")
+        for line in lines:
+            say(f"  {line}")
+        say("Then:" + call)
+    else:
+        say("Next:" + call)
     return ExitStatus.DONE

@@ -33,7 +33,7 @@ def why_not_writable(path: str | Path) -> str:
     """
     path = Path(path).absolute()
     if not path.parent.is_dir():
-        return f"there is no folder {path.parent}"
+        return f"the folder {path.parent} does not exist"
     if path.is_dir():
         return "it is a folder; give the name of a file"
     if path.exists() and not path.is_file():

@@ -27,7 +27,7 @@ _COMMON = frozenset({
 #: Comment on a sensor's time offset.
 _TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs rotation that speeds up and slows down)"
 #: Comment on the noise of the carriers' poses.
-_NOISE = "TODO errors of these poses, here a guess; without them, standard deviations are too small"
+_NOISE = "TODO errors of these poses, here a guess; leave the line out if you do not know them: residuals tell too"
 #: Good robot arms have this noise; motion capture and SLAM have more.
 _GUESSED_NOISE = PoseNoise(rotation_deg=0.03, translation_mm=0.2)
 

@@ -71,6 +71,7 @@ def _from_tf(log: Log, parent: str, child: str, of_sensors: str) -> tuple[str, s
         buffer = TfBuffer(log.records(readable)) if readable else TfBuffer()
         if not buffer.frames():
             raise LogError(f"{where}: {_no_transforms(log, topics)}")
+        buffer.chain(parent, child)
         if not buffer.is_above(parent, child) and (buffer.is_above(child, parent) or child != of_sensors):
             parent, child = child, parent
         chain = " -> ".join(buffer.chain(parent, child))

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from gtsam_rwhec.errors import FileFormatError, RigError
+from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
 from gtsam_rwhec.rig import sections, target_sections
 from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
+from gtsam_rwhec.rig.todo_lines import todo_lines
 
 #: A message names at most this many faults.
 MOST_FAULTS = 20
@@ -59,12 +61,27 @@ def read_rig(path: str | Path) -> Rig:
     ------
     RigError
         The file cannot be read, is not YAML, or has faults: the message names every fault with its line.
+
+    Warns
+    -----
+    UnfinishedRigWarning
+        Lines are still marked TODO.
     """
     try:
         text = read_text(path)
     except FileFormatError as error:
         raise RigError(str(error)) from error
-    return parse_rig(text, str(path), Path(path).parent)
+    rig = parse_rig(text, str(path), Path(path).parent)
+    lines = todo_lines(text)
+    if lines:
+        said = "\n".join(map(str, lines[:MOST_FAULTS]))
+        warnings.warn(
+            f"{path} has lines that are marked TODO, whose values are guesses. State them, and take the mark away:\n"
+            f"{said}",
+            UnfinishedRigWarning,
+            stacklevel=2,
+        )
+    return rig
 
 
 def parse_rig(text: str, where: str, folder: Path = Path()) -> Rig:
