@@ -5,8 +5,8 @@ from .calibrated_frames import RigFrames as RigFrames
 from .rig import Rig as Rig
 from .rig_file import parse_rig as parse_rig
 from .rig_file import read_rig as read_rig
-from .todo_lines import TodoLine as TodoLine
-from .todo_lines import todo_lines as todo_lines
+from .unfinished import TodoLine as TodoLine
+from .unfinished import todo_lines as todo_lines
 
 # The sections of a rig file.
 from .sections import Carriers as Carriers

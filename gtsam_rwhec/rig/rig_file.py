@@ -13,7 +13,7 @@ from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
 from gtsam_rwhec.rig import sections, target_sections
 from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
-from gtsam_rwhec.rig.todo_lines import todo_lines
+from gtsam_rwhec.rig.unfinished import todo_lines
 
 #: A message names at most this many faults.
 MOST_FAULTS = 20
