@@ -93,7 +93,9 @@ TABLE: dict[str, dict[str, str]] = {
         "methods/test_registry.py": "applicability certified estimate evaluation method",
     },
     "gtsam_rwhec/noise_model": {
-        "noise_model/test_likelihood.py": "average_information drift eliminated_drift gradient measurements",
+        "noise_model/test_likelihood.py": (
+            "average_information drift eliminated_drift gradient measurements sparse_columns"
+        ),
         "noise_model/test_refining.py": (
             "agreement components drift_choice found mixture modelled options prior_knowledge reml rows settling "
             "typical"

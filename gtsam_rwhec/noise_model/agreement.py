@@ -68,10 +68,12 @@ def agreeing(
     honest = replace(there, rows=replace(rows, given=rows.given * np.where(keep, 1.0, WEIGHTLESS)[:, None, None]))
     E = rows.twist[found.model.side] * np.repeat([sigma[C.CARRIER_ROTATION], sigma[C.CARRIER_TRANSLATION]], 3)
     estimate = found.model.evaluate(sigma)
-    J = rows.jacobian @ found.model.basis
+    J = rows.by_unknowns
     covariance = honest.white(sigma) + E @ E.transpose(0, 2, 1)
     # A measurement that is left out also has the unknowns' error.
-    covariance += np.where(keep, 0.0, 1.0)[:, None, None] * (J @ estimate.covariance @ J.transpose(0, 2, 1))
+    of_unknowns = found.model.basis @ estimate.covariance @ found.model.basis.T
+    blocks = of_unknowns[J.places[:, :, None], J.places[:, None]]
+    covariance += np.where(keep, 0.0, 1.0)[:, None, None] * (J.values @ blocks @ J.values.transpose(0, 2, 1))
     if there.drift is not None:  # the drift is not known where nothing was measured
         # A rotation's error on the way moves the sensor by the way's length.
         way = 2.0 * float(rows.length.var(axis=0).sum()) if there.drift.correlation == 1.0 else 0.0
@@ -82,7 +84,7 @@ def agreeing(
             away = 1.0 - there.drift.correlation ** (2.0 * away)
         covariance += away.reshape(-1, 1, 1) * (G @ G.transpose(0, 2, 1))
     squares = np.einsum("ni,ni->n", left, np.linalg.solve(covariance, left[:, :, None])[:, :, 0])
-    freedom = max(6 * int(keep.sum()) - J.shape[2], 1)
+    freedom = max(6 * int(keep.sum()) - found.model.basis.shape[1], 1)
     agrees = squares <= 6.0 * fdtri(6, freedom, 1.0 - FALSE_ALARM / len(squares))
     in_order = np.empty(len(agrees), dtype=bool)
     in_order[rows.instants.order] = agrees

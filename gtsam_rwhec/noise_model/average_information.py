@@ -26,16 +26,16 @@ def average_information(eliminated: Eliminated, active: tuple[C, ...]) -> Array:
     m, q = measured.of.m, 6 * e.features.shape[1]
     V = _working_columns(e, active)
     k = V.shape[2]
-    flat, columns = V.reshape(-1, k), measured.Z[:, :, :m].reshape(-1, m)
-    own, mixed = flat.T @ flat, flat.T @ columns
-    cross = measured.of.by_instant(measured.Z[:, :, m:], V)
+    flat = V.reshape(-1, k)
+    own, mixed = flat.T @ flat, measured.of.with_unknowns(V, measured.Z)
+    cross = measured.of.by_instant(measured.Z, V)
     if measured.carriers is not None:
-        root, lost = measured.carriers
-        lost_V = (root * measured.carrier) @ cross[:, :6]
-        flat, columns = lost_V.reshape(-1, k), lost[:, :, :m].reshape(-1, m)
+        shared, (root, lost) = measured.of.shared, measured.carriers
+        lost_V = (root * measured.carrier) @ cross[shared, :6]
+        flat = lost_V.reshape(-1, k)
         own -= flat.T @ flat
-        mixed -= flat.T @ columns
-        cross -= lost[:, :, m:].transpose(0, 2, 1) @ lost_V
+        mixed -= flat.T @ lost[:, :, :m].reshape(-1, m)
+        cross[shared] -= lost[:, :, m:].transpose(0, 2, 1) @ lost_V
     gram = np.empty((k, q + m - 1))
     gram[:, q:] = mixed[:, :-1]
     if q:
@@ -63,12 +63,13 @@ def _working_columns(e: Eliminated, active: tuple[C, ...]) -> Array:
         states = -(e.drift.whole @ y)
         effects.append(states * e.drift.unit)
     effect = np.hstack(effects)
-    left = Z[:, :, :m] @ y[q:] + (Z[:, :, m:] @ of.of_instants(effect)[:, :, None])[:, :, 0]
-    twists = Z[:, :, m : m + 6]
+    left = of.along(Z, y[q:], effect)
+    twists = Z[:, :, of.own : of.own + 6]
     if measured.carriers is not None:
         root, lost = measured.carriers
-        seen = lost[:, :, :m] @ y[q:] + (lost[:, :, m:] @ effect[:, :, None])[:, :, 0]
-        carrier = -(root.transpose(0, 2, 1) @ seen[:, :, None])[:, :, 0] * measured.carrier
+        seen = lost[:, :, :m] @ y[q:] + (lost[:, :, m:] @ effect[of.shared, :, None])[:, :, 0]
+        carrier = np.zeros((len(effect), 6))
+        carrier[of.shared] = -(root.transpose(0, 2, 1) @ seen[:, :, None])[:, :, 0] * measured.carrier
         left += (twists @ of.of_instants(carrier)[:, :, None])[:, :, 0]
         parts = _split(twists, of.of_instants(carrier[:, :, None] * TWIST))
         added |= dict(zip((C.CARRIER_ROTATION, C.CARRIER_TRANSLATION), parts, strict=True))
@@ -78,7 +79,7 @@ def _working_columns(e: Eliminated, active: tuple[C, ...]) -> Array:
     if e.drift is not None:
         kinds = np.tile(STATE, (len(e.drift.unit) // TRACK, 1))
         walks = e.drift.prior.walked(states, kinds, e.drift.sigma) * e.drift.unit[:, None]
-        parts = _split(Z[:, :, m + 6 :], of.of_instants(walks))
+        parts = _split(Z[:, :, of.own + 6 :], of.of_own_track(walks))
         added |= dict(zip((C.DRIFT_ROTATION, C.DRIFT_TRANSLATION, C.DRIFT_SCALE), parts, strict=True))
     weighted = measured.root.transpose(0, 2, 1) @ left[:, :, None]
     for (a, b), term in zip(of.pairs, of.terms, strict=True):

@@ -156,6 +156,16 @@ def drift_columns(rows: Rows, sigma: dict[C, float], prior: DriftPrior) -> Array
 
 def drift_directions(rows: Rows, prior: DriftPrior) -> Array:
     """The same by states in rad, m and logarithms of the scale."""
+    own, N = own_directions(rows, prior), len(rows.residual)
+    if rows.instants.chains == 1:
+        return own
+    result = np.zeros((N, 6, rows.instants.chains, TRACK))
+    result[np.arange(N), :, rows.instants.chain] = own
+    return result.reshape(N, 6, -1)
+
+
+def own_directions(rows: Rows, prior: DriftPrior) -> Array:
+    """The same (N, 6, 7) by the states of each measurement's own track."""
     N = len(rows.residual)
     own = np.zeros((N, 6, TRACK))
     back = se3.inverse(rows.predicted)
@@ -165,8 +175,4 @@ def drift_directions(rows: Rows, prior: DriftPrior) -> Array:
         own[:, :3, :3] = np.eye(3)
         own[:, 3:, 3:6] = np.eye(3) if prior.walk.frame == "target" else back[:, :3, :3]
     own[:, 3:, 6] = rows.length
-    if rows.instants.chains == 1:
-        return own
-    result = np.zeros((N, 6, rows.instants.chains, TRACK))
-    result[np.arange(N), :, rows.instants.chain] = own
-    return result.reshape(N, 6, -1)
+    return own

@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import C
-from gtsam_rwhec.noise_model.drift import DriftPrior, drift_directions
+from gtsam_rwhec.noise_model.drift import DriftPrior, own_directions
 from gtsam_rwhec.noise_model.eliminated_drift import EliminatedDrift
 from gtsam_rwhec.noise_model.gradient import Eliminated
 from gtsam_rwhec.noise_model.measurements import Measurements, Reduced, white_terms
@@ -85,7 +85,7 @@ class NoiseModel:
 
     @cached_property
     def _measurements(self) -> Measurements:
-        directions = None if self.drift is None else drift_directions(self.rows, self.drift)
+        directions = None if self.drift is None else own_directions(self.rows, self.drift)
         return Measurements.of(self.rows, self.side, self.basis, directions)
 
     @cached_property

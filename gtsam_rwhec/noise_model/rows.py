@@ -17,6 +17,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.noise_model.sparse_columns import SparseColumns
 from gtsam_rwhec.refinement.geodesic import linearized
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.pair_data import PairData
@@ -125,8 +126,8 @@ class Rows:
     Attributes
     ----------
     residual : (N, 6) array
-    jacobian : (N, 6, d) array
-        By the unknowns, in the order of ``Variables.unknowns``.
+    by_unknowns : SparseColumns
+        Its derivative by the d unknowns, in the order of ``Variables.unknowns``.
     given : (N, 6, 6) array
         B's covariance as stated; without weights 0.5 rad^2 (kappa = 1) and 1 m^2.
     axis : (N, 3) array
@@ -145,7 +146,7 @@ class Rows:
 
     instants: Instants
     residual: Array
-    jacobian: Array
+    by_unknowns: SparseColumns
     given: Array
     axis: Array
     twist: dict[Side, Array]
@@ -161,14 +162,12 @@ class Rows:
         """The rows at an estimate; ``layout`` has the places of the unknowns."""
         at = linearized(data, variables, state)
         frames = {name: pose.matrix() for name, pose in (state.X | state.Y).items()}
-        size = len(layout.unit)
-        blocks: list[list[Array]] = [[] for _ in range(10)]
+        jacobians = []
+        blocks: list[list[Array]] = [[] for _ in range(9)]
         for item in data:
             linear = at[item.pair]
             X, Y = frames[item.pair.target], frames[item.pair.sensor]
-            J, places = jacobian_of(item.pair, linear, variables, layout)
-            whole = np.zeros((item.count, 6, size))
-            whole[:, :, places] = J
+            jacobians.append(jacobian_of(item.pair, linear, variables, layout))
             A, B = item.residuals.A, item.residuals.B
             inverse = se3.inverse(A)
             predicted = np.linalg.inv(Y) @ A @ X
@@ -177,19 +176,25 @@ class Rows:
             # A Expmap(e) on the target carrier's side; Expmap(e) A = A Expmap(Ad(A^-1) e) on the sensor carrier's.
             right = linear.carrier
             parts = [
-                linear.residual, whole, item.covariance, B[:, 2, :3], right, right @ se3.adjoint(inverse),
+                linear.residual, item.covariance, B[:, 2, :3], right, right @ se3.adjoint(inverse),
                 _configuration(A), _configuration(inverse), predicted, se3.inverse(predicted)[:, :3, 3],
             ]  # fmt: skip
             for block, part in zip(blocks, parts, strict=True):
                 block.append(part)
         stacked = [np.concatenate(block)[instants.order] for block in blocks]
-        residual, jacobian, given, axis, right, left, moving_target, moving_sensor, predicted, length = stacked
+        residual, given, axis, right, left, moving_target, moving_sensor, predicted, length = stacked
+        by_unknowns = SparseColumns.of(jacobians, len(layout.unit)).of_rows(instants.order)
         A = np.concatenate([item.residuals.A for item in data])[instants.order]
         rate = np.einsum("nij,nj->ni", right, _velocity(A, instants))
         return Rows(
-            instants, residual, jacobian, given, axis, {"targetcarrier": right, "sensorcarrier": left},
+            instants, residual, by_unknowns, given, axis, {"targetcarrier": right, "sensorcarrier": left},
             {"targetcarrier": moving_target, "sensorcarrier": moving_sensor}, rate, predicted, length,
         )  # fmt: skip
+
+    @property
+    def jacobian(self) -> Array:
+        """The derivative (N, 6, d) by all unknowns."""
+        return self.by_unknowns.whole
 
     def thinned(self, every: int) -> Rows:
         """The rows of every so-many-th instant of each track."""
@@ -207,7 +212,7 @@ class Rows:
             instants.chains, step, None if instants.seconds is None else instants.seconds[kept],
         )  # fmt: skip
         return Rows(
-            fewer, self.residual[rows], self.jacobian[rows], self.given[rows], self.axis[rows],
+            fewer, self.residual[rows], self.by_unknowns.of_rows(rows), self.given[rows], self.axis[rows],
             {side: twist[rows] for side, twist in self.twist.items()},
             {side: moving[rows] for side, moving in self.configuration.items()},
             self.rate[rows], self.predicted[rows], self.length[rows],

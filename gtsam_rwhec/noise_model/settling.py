@@ -134,8 +134,7 @@ def thinned(model: NoiseModel) -> NoiseModel:
     drift = None if model.drift is None else DriftPrior.of(rows, model.drift.walk)
     # Frames that are not seen in these rows are held by a little of what all rows know of them.
     size = np.sqrt((model.rows.residual**2).mean(axis=0)) + QUIETEST
-    J = (model.rows.jacobian @ model.basis / size[:, None]).reshape(-1, model.basis.shape[1])
-    held = model.prior_information + HELD * (J.T @ J)
+    held = model.prior_information + HELD * (model.basis.T @ model.rows.by_unknowns.gram(size) @ model.basis)
     return replace(model, rows=rows, drift=drift, features=model.features[kept], prior_information=held)
 
 
