@@ -38,7 +38,7 @@ TABLE: dict[str, dict[str, str]] = {
             "outliers run statement_stage"
         ),
         "calibration/test_cross_validation.py": "folds prediction_errors",
-        "calibration/test_task_units.py": "point_uncertainty",
+        "calibration/test_task_units.py": "point_uncertainty seen_from",
         "calibration/test_misreadings.py": "reading readings samples trial_fits wrong_units",
     },
     "gtsam_rwhec/cleaning": {

@@ -14,13 +14,16 @@ from gtsam_rwhec.calibration.noise_found import NoiseFound
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.outliers import Outliers
 from gtsam_rwhec.calibration.plausibility import Implausible
-from gtsam_rwhec.calibration.point_uncertainty import Carriers, point_uncertainty
+from gtsam_rwhec.calibration.point_uncertainty import point_uncertainty
+from gtsam_rwhec.calibration.seen_from import Carriers
 from gtsam_rwhec.calibration.sizes import TargetSize
 from gtsam_rwhec.calibration.task_units import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Judgement, Verdict
 from gtsam_rwhec.calibration.views import SensorView
 from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.unknowns import Unknown
 from gtsam_rwhec.solving.solution import Solution
@@ -153,13 +156,19 @@ class Calibration:
         if self.refined is None:
             return {}
         return {
-            name: self.uncertainty_at(view.point_m, name, level=self.options.level)
-            for name, view in self.views.items()
+            name: self.uncertainty_at(self.views[name].point_m, name, level=self.options.level)
+            for name in sorted(self.views, key=natural_key)
             if name in self.Y
         }
 
     def uncertainty_at(
-        self, point: ArrayLike, frame: str, seen_from: str | None = None, level: float = 0.95
+        self,
+        point: ArrayLike,
+        frame: str,
+        seen_from: str | None = None,
+        level: float = 0.95,
+        *,
+        A: PoseLike | None = None,
     ) -> PointUncertainty:
         """How far off a point is that is seen in one frame and expressed in another.
 
@@ -171,22 +180,46 @@ class Calibration:
             A sensor or a target.
         seen_from : str, optional
             Where the point is expressed: the carrier of ``frame`` (the default), or another sensor or target on the
-            same carrier. The carrier has the name that the problem states. Where it states none, "sensorcarrier",
-            "hand", "base" and "rig" mean the carrier of the sensors, and "targetcarrier", "base", "hand" and "world"
-            the carrier of the targets: always the one that carries ``frame``.
+            same carrier; with ``A`` the other carrier (the default then), or a frame on it. A carrier has the name that
+            the problem states. Where it states none, "sensorcarrier", "hand", "base" and "rig" mean the carrier of the
+            sensors, and "targetcarrier", "base", "hand" and "world" the carrier of the targets: without ``A`` the one
+            that carries ``frame``, and with it the other one.
         level : float
             Probability of the ellipsoid and of the ball.
+        A : (4, 4) array or gtsam.Pose3, optional
+            T_sensorcarrier_targetcarrier at the moment of the measurement: what a camera on a hand sees, in the base's
+            frame. Its own noise is part of ``measurement_mm``, where it is known; ``radius_mm`` takes it as exact.
 
         Raises
         ------
         FrameError
-            There is no such frame, or the two are not on one carrier; the message lists what there is.
+            There is no such frame, or the two are not on one carrier and there is no ``A``; the message lists what
+            there is.
+        OptionError
+            ``A`` is given for two frames on one carrier.
         PoseError
-            The point is not three numbers, or it is behind a sensor that saw every target in front of it.
+            The point is not three numbers, or it is behind a sensor that saw every target in front of it; ``A`` is no
+            pose.
         UnderdeterminedError
             There is no refined calibration, and so no covariance.
         """
         noise = {pair: sigma for pair, sigma in self.noise.translation_m.items() if not pair.is_motion}
         return point_uncertainty(
-            self._known(), self.views, noise, self.carriers, point, frame=frame, seen_from=seen_from, level=level
+            self._known(),
+            self.views,
+            noise,
+            self._noise_of_A,
+            self.carriers,
+            point,
+            frame=frame,
+            seen_from=seen_from,
+            level=level,
+            A=A,
         )
+
+    @property
+    def _noise_of_A(self) -> CarrierNoise | None:
+        """The noise of A that was found, or stated as standard deviations."""
+        found = None if self.noise.model is None else self.noise.model.carrier_noise
+        stated = self.options.carrier_noise
+        return found or (stated if stated is not None and stated.covariances is None else None)

@@ -13,10 +13,10 @@ from gtsam_rwhec.calibration.clock_stage import Answer, answer, check_offsets, l
 from gtsam_rwhec.calibration.lengths import doubted_lengths, undetectable
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.outlier_stage import SPARE_EQUATIONS, outliers_of, spare_equations
-from gtsam_rwhec.calibration.point_uncertainty import Carriers
 from gtsam_rwhec.calibration.reading import Reading, reading_of
 from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.calibration.run import Run
+from gtsam_rwhec.calibration.seen_from import Carriers
 from gtsam_rwhec.calibration.sizes import TargetSize
 from gtsam_rwhec.calibration.statement_stage import doubt_stated_poses, doubt_stated_sizes
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, findings_of, proof_of
@@ -68,9 +68,19 @@ def calibrate(
             "noise='given', but some measurements were added without sigma or kappa; take noise='auto', or add sigma "
             "and kappa"
         )
+    _check_what_needs_measurements(problem, options)
     run = Run(problem, options, progress or silent)
     check_offsets(run)
     return _calibrated(run)
+
+
+def _check_what_needs_measurements(problem: Problem, options: CalibrateOptions) -> None:
+    """A MeasurementsNotKeptError for noise and offsets that moments do not hold."""
+    if problem.has_covariances:
+        problem.require_raw_measurements("a problem whose measurements have covariances (not sigma and kappa)")
+    for name in ("carrier_noise", "carrier_path", "time_offsets"):
+        if getattr(options, name) not in (None, "auto", False, ()):
+            problem.require_raw_measurements(f"CalibrateOptions.{name}")
 
 
 def _calibrated(run: Run) -> Calibration:

@@ -55,6 +55,8 @@ def estimated(
         carrier_path=options.carrier_path if offsets_of(kept, options) else None,
     )
     why, failed = "a model of all noise was not asked for", False
+    if not problem.has_measurements:
+        why = "the raw measurements were not kept"
     is_whole = options.noise != "given" and options.noise_groups == "all" and _is_plain(options.carrier_noise)
     if is_whole and problem.has_measurements:
         try:

@@ -89,7 +89,9 @@ class CalibrateOptions:
                 raise OptionError(f"CalibrateOptions.{name}={brief(value)}; give one between {least:g} and 1")
         if not isinstance(self.misreadings, bool):
             raise OptionError(f"CalibrateOptions.misreadings={brief(self.misreadings)}; give True or False")
-        if self.time_offsets != "auto" and not isinstance(self.time_offsets, (bool, tuple)):
+        offsets = self.time_offsets
+        is_word = isinstance(offsets, bool) or (isinstance(offsets, str) and offsets == "auto")
+        if not is_word and not (isinstance(offsets, tuple) and all(isinstance(name, str) for name in offsets)):
             raise OptionError(
                 f"CalibrateOptions.time_offsets={brief(self.time_offsets)}; give 'auto', True, False, or a tuple of "
                 "sensors' names: ('cam_0',)"

@@ -3,7 +3,7 @@
 A point p in the frame f, seen from a carrier or from another frame g on the same carrier, is q = T_g_f p. To first
 order an error xi = [omega, v] of T_g_f Expmap(xi) moves it by R_g_f (omega x p + v), so its covariance is J Sigma J'
 with J = R_g_f [-[p]x, I]. With one scale for all lengths, the point is taken as measured (true = measured / scale), and
-an error of the scale moves it by -p d(scale) / scale.
+an error of the scale moves it by -p d(scale) / scale. On the other carrier, T_g_f has the pose A of the moment.
 
 The noise of one new measurement comes on top, and is told apart: it averages out over measurements, and the
 calibration's error does not.
@@ -27,11 +27,6 @@ from gtsam_rwhec.noise_model.found import two_digits
 #: Nodes of the quadrature over directions, in cos(polar angle) and in azimuth. With these the probability of a ball is
 #: right to 1e-6 for axes of any ratio that changes the radius.
 NODES = (48, 24)
-#: The words for a carrier that a problem does not name.
-CARRIER_WORDS = {
-    "sensor": ("sensorcarrier", "hand", "base", "rig"),
-    "target": ("targetcarrier", "base", "hand", "world"),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +53,9 @@ class PointUncertainty:
     radius_mm : float
         The true point is within this distance of the centre with probability ``level``, millimetres.
     measurement_mm : float or None
-        The same radius for the noise of one new measurement of the point alone, which is not in ``radius_mm``; None for
-        a target's frame, which measures nothing, and where the noise is not known.
+        The same radius for the noise of one new measurement alone, which is not in ``radius_mm``: of the sensor, and of
+        A where the point is expressed on the other carrier. None where nothing is measured, and where the noise is not
+        known.
     """
 
     point_m: Array

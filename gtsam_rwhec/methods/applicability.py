@@ -70,9 +70,10 @@ def _check_frames(method: Method[Any], problem: Problem) -> None:
         "Xs and Ys": (True, ""),
     }[method.properties.multiple]
     if not can:
+        pairs = len(problem.pairs)
         raise FrameError(
             f"this method solves for {what}; the problem has {targets} target{'s' * (targets != 1)}, {sensors} "
-            f"sensor{'s' * (sensors != 1)} and the pairs {', '.join(map(str, problem.pairs))}"
+            f"sensor{'s' * (sensors != 1)} and {pairs} pair{'s' * (pairs != 1)}"
         )
     if targets == sensors == 1 and Takes.PRIORS not in method.takes and problem.number_of_measurements < FEWEST:
         raise CountError(

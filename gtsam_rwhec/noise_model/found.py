@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from gtsam_rwhec.noise_model.components import CARRIER, DRIFT, SYSTEMATIC, Component
 from gtsam_rwhec.noise_model.drift import Frame
 from gtsam_rwhec.noise_model.rows import Side
+from gtsam_rwhec.refinement.options import CarrierNoise
 
 C = Component
 #: A kind of noise is found where it raises twice the log likelihood by more than this, a parameter.
@@ -89,6 +90,14 @@ class NoiseInData:
     def has_systematic(self) -> bool:
         """Whether the data show errors that vary with the configuration."""
         return self.systematic_evidence > MOST_BY_CHANCE
+
+    @property
+    def carrier_noise(self) -> CarrierNoise | None:
+        """The noise of A, independent from measurement to measurement; None where A counts as exact."""
+        if not all(component in self.deviations for component in (C.CARRIER_ROTATION, C.CARRIER_TRANSLATION)):
+            return None
+        rotation, translation = (self.deviations[c].value for c in (C.CARRIER_ROTATION, C.CARRIER_TRANSLATION))
+        return CarrierNoise(rotation, translation, about=self.hand)
 
     @property
     def size_words(self) -> str:

@@ -227,6 +227,13 @@ def test_moments_alone_are_calibrated_without_outliers() -> None:
     calibration = rw.calibrate(kept)
     assert calibration.verdict is rw.Verdict.USE
     assert choice(calibration, "outliers").evidence == "the raw measurements were not kept"
+    assert choice(calibration, "noise").evidence == "the raw measurements were not kept"
+    for name, value in (("carrier_noise", rw.CarrierNoise(0.001, 0.001)), ("time_offsets", True)):
+        with pytest.raises(rw.errors.MeasurementsNotKeptError, match=f"^CalibrateOptions.{name} needs the raw "):
+            rw.calibrate(kept, rw.CalibrateOptions(**{name: value}))  # type: ignore[arg-type]
+    kept.add("target0", "sensor0", raw.A, raw.B, covariances=np.tile(1e-4 * np.eye(6), (len(raw.A), 1, 1)))
+    with pytest.raises(rw.errors.MeasurementsNotKeptError, match="whose measurements have covariances"):
+        rw.calibrate(kept)
 
 
 @pytest.mark.parametrize(
@@ -236,6 +243,8 @@ def test_moments_alone_are_calibrated_without_outliers() -> None:
         ({"robust": "huber"}, "robust='huber' is not one of"),
         ({"level": 1.0}, "level=1.0; give one between 0 and 1"),
         ({"time_offsets": "always"}, "time_offsets='always'"),
+        ({"time_offsets": np.array(["sensor0"])}, "give 'auto', True, False, or a tuple of sensors' names"),
+        ({"time_offsets": (3,)}, "give 'auto', True, False, or a tuple of sensors' names"),
         ({"carrier_noise": 0.1}, "carrier_noise is a float; give a CarrierNoise"),
     ],
 )

@@ -10,8 +10,9 @@ import pytest
 from refinement_problems import rig
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.point_uncertainty import Carriers
+from gtsam_rwhec.calibration.seen_from import Carriers
 from gtsam_rwhec.calibration.task_units import ball_radius, ellipsoid, point_sentence
+from gtsam_rwhec.simulate import Noise
 
 POINT = np.array([0.1, -0.2, 0.8])
 
@@ -50,6 +51,64 @@ def test_another_sensor_sees_it_with_the_relative_covariance(calibration: rw.Cal
     np.testing.assert_allclose(found.covariance_m2, J @ covariance @ J.T, rtol=1e-9, atol=1e-15)
 
 
+A = gtsam.Pose3.Expmap(np.array([0.4, -0.3, 0.8, 0.5, -0.2, 0.9]))
+
+
+@pytest.mark.parametrize(
+    ("frame", "seen_from"),
+    [("sensor0", "base"), ("sensor0", "target1"), ("target0", "hand"), ("target0", "sensor1"), ("sensor0", None)],
+)
+def test_with_A_it_is_expressed_on_the_other_carrier(
+    calibration: rw.Calibration, frame: str, seen_from: str | None
+) -> None:
+    """Against samples of both poses from their joint covariance."""
+    rng = np.random.default_rng(0)
+    names = [frame, *([seen_from] if seen_from in calibration.X | calibration.Y else [])]
+    poses = [(calibration.X | calibration.Y)[name] for name in names]
+    twists = rng.multivariate_normal(np.zeros(6 * len(names)), calibration.covariance(*names), 20_000)
+
+    def expressed(*at: gtsam.Pose3) -> np.ndarray:
+        across = (A.inverse() if frame.startswith("sensor") else A).compose(at[0])
+        return np.asarray((across if len(at) == 1 else at[1].between(across)).transformFrom(POINT))
+
+    moved = [
+        expressed(*(pose.retract(xi) for pose, xi in zip(poses, np.split(row, len(poses)), strict=True)))
+        for row in twists
+    ]
+    found = calibration.uncertainty_at(POINT, frame, seen_from, A=A)
+    np.testing.assert_allclose(found.centre_m, expressed(*poses), atol=1e-12)
+    np.testing.assert_allclose(
+        found.covariance_m2, np.cov(np.array(moved).T), atol=0.03 * np.trace(found.covariance_m2)
+    )
+    assert found.seen_from == (
+        seen_from if len(names) == 2 else f"the frame that carries the {'target' if frame == 'sensor0' else 'sensor'}s"
+    )
+
+
+@pytest.mark.parametrize("about", ["targetcarrier", "sensorcarrier"])
+def test_the_noise_of_one_new_A_is_apart(about: str) -> None:
+    """Noise of A that is stated by the measurement is in the noise of one new measurement: by samples."""
+    noise = rw.CarrierNoise(0.01, 0.002, about=about)  # type: ignore[arg-type]
+    problem = rig(2, 1, noise=Noise(1e-3, 0.5 / 1e-3**2)).problem
+    calibration = rw.calibrate(problem, rw.CalibrateOptions(noise="given", carrier_noise=noise, misreadings=False))
+    found = calibration.uncertainty_at(POINT, "sensor0", A=A)
+    rng = np.random.default_rng(0)
+    here = calibration.Y["sensor0"].transformFrom(POINT)
+    there = A.inverse().transformFrom(here)
+    moved = []
+    for xi in rng.normal(size=(20_000, 6)) * np.repeat([0.01, 0.002], 3):
+        E = gtsam.Pose3.Expmap(xi)
+        new = A.compose(E) if about == "targetcarrier" else E.compose(A)
+        moved.append(new.inverse().transformFrom(here) - there)
+    error = np.linalg.norm(np.array(moved) + 1e-3 * rng.normal(size=(20_000, 3)), axis=1)
+    assert found.measurement_mm == pytest.approx(1e3 * np.quantile(error, 0.95), rel=0.03)
+    alone = calibration.uncertainty_at(POINT, "sensor0").measurement_mm
+    assert alone is not None
+    assert alone < 0.3 * found.measurement_mm
+    assert calibration.uncertainty_at(POINT, "target0").measurement_mm is None
+    assert calibration.uncertainty_at(POINT, "target0", A=A).measurement_mm is not None
+
+
 def test_axes_and_half_lengths_are_of_the_ellipsoid(calibration: rw.Calibration) -> None:
     found = calibration.uncertainty_at(POINT, "target0", level=0.9)
     assert calibration.refined is not None
@@ -77,15 +136,26 @@ def test_carriers_have_the_names_that_the_problem_states(calibration: rw.Calibra
     named = replace(calibration, carriers=Carriers("arm/flange", "floor"))
     assert named.uncertainty_at(POINT, "sensor0", "arm/flange").seen_from == "arm/flange"
     assert named.uncertainty_at(POINT, "target0", "targetcarrier").seen_from == "floor"
-    with pytest.raises(rw.errors.FrameError, match=r"'hand' is no frame .* \(arm/flange, sensorcarrier\) and sensor1"):
+    with pytest.raises(
+        rw.errors.FrameError, match=r"'hand' is no frame .* \(arm/flange, sensorcarrier\) and sensor1, "
+    ):
         named.uncertainty_at(POINT, "sensor0", "hand")
 
 
 def test_what_cannot_be_asked_is_refused(calibration: rw.Calibration) -> None:
     with pytest.raises(rw.errors.FrameError, match="there is no frame 'cam_9'; there are the sensors sensor0, sensor1"):
         calibration.uncertainty_at(POINT, "cam_9")
-    with pytest.raises(rw.errors.FrameError, match="'target0' is no frame in which a point of sensor0"):
+    with pytest.raises(rw.errors.FrameError, match=r"target0 is on the carrier of the targets, .*; give the pose .*A="):
         calibration.uncertainty_at(POINT, "sensor0", "target0")
+    with pytest.raises(rw.errors.OptionError, match="A has no use: sensor1 and sensor0 are on one carrier"):
+        calibration.uncertainty_at(POINT, "sensor0", "sensor1", A=np.eye(4))
+    with pytest.raises(rw.errors.PoseError, match="A"):
+        calibration.uncertainty_at(POINT, "sensor0", A=np.ones((4, 4)))
+    for nothing in ([], {}, 3):
+        with pytest.raises(rw.errors.FrameError, match="is no frame in which a point of sensor0"):
+            calibration.uncertainty_at(POINT, "sensor0", nothing)  # type: ignore[arg-type]
+        with pytest.raises(rw.errors.FrameError, match="there is no frame"):
+            calibration.uncertainty_at(POINT, nothing)  # type: ignore[arg-type]
     with pytest.raises(rw.errors.PoseError, match="give three"):
         calibration.uncertainty_at([0.0, 0.8], "sensor0")
     with pytest.raises(rw.errors.OptionError, match=r"level=1.5; give one between 0 and 1"):
