@@ -36,7 +36,7 @@ class CalibrateOptions:
         Errors of neighbours in time: found out, a random walk (odometry), with a correlation time, or independent.
     systematic : bool
         Whether A has errors that vary with the configuration (an arm's kinematics). The constant part, which no
-        residual shows, is assumed to be as large.
+        residual shows, is assumed to be twice as large, as probably as the data say.
     hand : "targetcarrier", "sensorcarrier" or None
         The carrier to which errors of A are fixed: an arm's hand. None: found out.
     robust : "auto", "gnc" or "none"

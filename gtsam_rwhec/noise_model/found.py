@@ -70,7 +70,9 @@ class NoiseInData:
     is_drift_untried : bool
         Whether residuals are correlated in time, and there are too many tracks for a model of it.
     arms_assumed : bool
-        Whether the covariance has a constant error of A, which no residual shows, as large as the part that varies.
+        Whether the covariance has a constant error of A, which no residual shows, tied to the part that varies.
+    systematic_probability : float
+        That such errors are there: the covariance averages over both.
     """
 
     deviations: dict[Component, Deviation]
@@ -85,6 +87,7 @@ class NoiseInData:
     has_stamps: bool
     is_drift_untried: bool
     arms_assumed: bool
+    systematic_probability: float
 
     @property
     def has_systematic(self) -> bool:
@@ -143,8 +146,8 @@ class NoiseInData:
             found = "found" if self.has_systematic else "not found, and not excluded"
             said.append(
                 f"Errors of A that vary with the configuration: {self.systematic_words}, {found} "
-                f"({ratio_words(self.systematic_evidence)}). The constant part, which residuals do not show, "
-                "is assumed to be as large."
+                f"({ratio_words(self.systematic_evidence)}): {100.0 * self.systematic_probability:.0f} % probable. "
+                "Their constant part, which residuals do not show, is assumed to be twice as large."
             )
         return tuple(said)
 

@@ -91,13 +91,17 @@ class Mixture:
             low, high = (middle, high) if is_large else (low, middle)
         return float(np.exp(low))
 
-    def share_of(self, rows: Array, added: Array) -> float:
+    def share_of(self, rows: Array, added: Array, probability: float = 1.0) -> float:
         """The share of the mean of ``added`` with which the ellipsoid holds as much of the samples as it says.
 
         The posterior of a standard deviation that the data hardly show has a long tail. Its mean square would make the
-        ellipsoid far too large, its mode too small.
+        ellipsoid far too large, its mode too small. ``probability`` is that of ``added`` being there at all.
         """
         samples, weights = self.draws(rows, added)
+        if probability < 1.0:
+            without, as_often = self.draws(rows)
+            samples = np.concatenate([samples, without])
+            weights = np.concatenate([probability * weights, (1.0 - probability) * as_often])
         plain = rows @ self.covariance @ rows.T
         mean = np.einsum("n,nij,nkj->ik", self.weights, added, added)
         wanted = chdtri(len(rows), 1.0 - CONFIDENCE)

@@ -12,7 +12,8 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.noise_model import Component, NoiseOptions, refine_under_noise, under_noise
 from gtsam_rwhec.noise_model.components import SMALLEST, Sizes
 from gtsam_rwhec.noise_model.drift import Walk
-from gtsam_rwhec.noise_model.mixture import DRAWS, SAMPLES
+from gtsam_rwhec.noise_model.likelihood import Estimate
+from gtsam_rwhec.noise_model.mixture import DRAWS, SAMPLES, Mixture
 from gtsam_rwhec.noise_model.reml import fitted, value_and_gradient
 
 C = Component
@@ -254,3 +255,16 @@ def test_a_mixture_has_weights_and_quantiles() -> None:
         assert 0.0 < of.low <= of.value <= of.high
     assert SAMPLES * DRAWS >= 2000
     assert refined.degrees_of_freedom > 3.0
+
+
+def test_the_ellipsoid_is_the_average_of_models_with_and_without_an_arms_errors() -> None:
+    """The share of the constant error falls with the probability that it is there, down to nothing."""
+    chance = np.random.default_rng(5)
+    root = np.diag(chance.uniform(0.5, 2.0, 3))
+    estimates = tuple(Estimate(0.0, np.zeros(3), root @ root.T) for _ in range(8))
+    mixture = Mixture(np.zeros(3), root @ root.T, np.zeros((8, 1)), np.full(8, 0.125), estimates)
+    added = np.broadcast_to(3.0 * root, (8, 3, 3))
+    shares = [mixture.share_of(np.eye(3), added, probability) for probability in (1.0, 0.5, 0.12, 0.0)]
+    assert shares[0] == pytest.approx(1.0, abs=0.15)
+    assert shares[0] > shares[1] > shares[2] > shares[3]
+    assert shares[3] < 0.02
