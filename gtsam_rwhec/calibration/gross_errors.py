@@ -1,7 +1,7 @@
 """Measurements that look wrong where every measurement counts: gross errors beside a robust fit.
 
 Least squares of all measurements hides them: its residuals are all large. So a robust fit of a sample is asked how far
-each measurement is from its prediction, in medians of its own pair.
+each measurement is from its prediction, in medians of its own pair, after the ratios of the noise that was stated.
 """
 
 from __future__ import annotations
@@ -48,10 +48,18 @@ def gross_errors(problem: Problem) -> GrossErrors | None:
     if fit is None:
         return None
     ends = np.cumsum([len(rows) for rows in sampled.rows.values()])[:-1]
-    medians = np.median(fit.errors, axis=1, keepdims=True)
-    ratios = [_in_medians(errors, medians) for errors in np.split(fit.errors, ends, axis=1)]
+    errors = fit.errors / _stated(sampled)
+    medians = np.median(errors, axis=1, keepdims=True)
+    ratios = [_in_medians(of_pair, medians) for of_pair in np.split(errors, ends, axis=1)]
     number = int((np.concatenate(ratios) > GROSS).sum())
     return GrossErrors(number, sampled.count) if number else None
+
+
+def _stated(sampled: Sampled) -> Array:
+    """The noise that was stated for each measurement (2, N), rad and m: only its ratios count."""
+    rows = [(sampled.whole[pair], chosen) for pair, chosen in sampled.rows.items()]
+    rotation = np.concatenate([np.sqrt(0.5 / raw.kappa[chosen]) for raw, chosen in rows])
+    return np.stack([rotation, np.concatenate([raw.sigma[chosen] for raw, chosen in rows])])
 
 
 def _in_medians(errors: Array, medians: Array) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
@@ -36,9 +37,9 @@ class DoubtedLengths:
     def __str__(self) -> str:
         found = []
         if self.distance_m > FAR_M:
-            found.append(f"targets are seen from {self.distance_m:.4g} m")
+            found.append(f"targets are seen from {rounded(self.distance_m, 4)} m")
         if self.arm_m > LONG_ARM_M:
-            found.append(f"targets and sensors are {self.arm_m:.4g} m from their carriers")
+            found.append(f"targets and sensors are {rounded(self.arm_m, 4)} m from their carriers")
         return (
             f"{' and '.join(found)}: this looks like millimetres in A and B, which no residual shows; give metres: "
             "divide both by 1000"

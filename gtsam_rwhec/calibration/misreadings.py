@@ -21,6 +21,7 @@ from gtsam_rwhec.calibration.samples import Sampled
 from gtsam_rwhec.calibration.trial_fits import Spread, TrialFit, fitted, residual_of, signal_of
 from gtsam_rwhec.calibration.wrong_units import WrongUnit, wrong_unit
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.problem import Problem
@@ -83,7 +84,8 @@ class Misreading:
 
     def __str__(self) -> str:
         before, after = (
-            f"{deg:.3g} deg and {mm:.3g} mm" for deg, mm in zip(self.rotation_deg, self.translation_mm, strict=True)
+            f"{rounded(deg, 3)} deg and {rounded(mm, 3)} mm"
+            for deg, mm in zip(self.rotation_deg, self.translation_mm, strict=True)
         )
         return f"{self.likely}: the median residual is {before} as read, and {after} otherwise; {self.cure}"
 

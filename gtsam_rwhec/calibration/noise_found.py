@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from gtsam_rwhec.noise_model.found import NoiseInData, two_digits
+from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.problem.pairs import Pair
 
 
@@ -53,7 +54,7 @@ class NoiseFound:
 
 
 def _span(values: list[float]) -> str:
-    low, high = two_digits(min(values)), two_digits(max(values))
+    low, high = rounded(min(values)), rounded(max(values))
     return low if low == high else f"{low} to {high}"
 
 

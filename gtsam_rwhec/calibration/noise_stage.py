@@ -11,6 +11,7 @@ from gtsam_rwhec.calibration.outlier_stage import spare_equations
 from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import CountError, NoiseError, UnderdeterminedError
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.noise_model.found import MOST_BY_CHANCE, NoiseInData, ratio_words
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.refined import Refined
@@ -59,7 +60,7 @@ def _doubt_stated_noise(run: Run, refined: Refined, inliers: Inliers) -> None:
     kept = selected(run.problem, inliers) if inliers else run.problem
     ratio = contradicted_by(refined.cost, spare_equations(kept))
     if ratio is not None:
-        words = f"the residuals are {math.sqrt(ratio):.2g} times as large as the stated noise allows"
+        words = f"the residuals are {rounded(math.sqrt(ratio))} times as large as the stated noise allows"
         run.record.find(Ground.NOISE_UNDERSTATED, words)
 
 
@@ -82,7 +83,7 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
         if run.options.drift == "none":
             record.choose(what, "none", "an option says so")
         elif model.drift_not_sought:
-            record.choose(what, "not looked for", model.drift_not_sought)
+            record.choose(what, "no model of it was tried", model.drift_not_sought)
         else:
             order = "" if model.has_stamps else " (rows are taken to be in order of time, since they have no stamps)"
             record.choose(what, "none", f"errors of neighbours in time are no more alike than others{order}")

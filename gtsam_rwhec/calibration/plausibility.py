@@ -10,6 +10,7 @@ import numpy as np
 
 from gtsam_rwhec.calibration.samples import Sampled
 from gtsam_rwhec.calibration.trial_fits import Spread, fitted, median_distance, residual_of, signal_of
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.solution import Solution
 
@@ -54,13 +55,13 @@ class Implausible:
     varies_mm: float
 
     def __str__(self) -> str:
+        deg, mm = rounded(self.rotation_deg, 3), rounded(self.translation_mm, 3)
         found = {
-            Unlikely.ROTATION: f"half of the measurements are off by {self.rotation_deg:.3g} deg or more "
-            f"({self.translation_mm:.3g} mm)",
-            Unlikely.ROTATION_UNEXPLAINED: f"the median residual of rotations, {self.rotation_deg:.3g} deg, is about "
-            f"as large as what B varies by ({self.varies_deg:.3g} deg)",
-            Unlikely.TRANSLATION_UNEXPLAINED: f"the median residual of translations, {self.translation_mm:.3g} mm, is "
-            f"about as large as what B varies by ({self.varies_mm:.3g} mm)",
+            Unlikely.ROTATION: f"half of the measurements are off by {deg} deg or more ({mm} mm)",
+            Unlikely.ROTATION_UNEXPLAINED: f"the median residual of rotations, {deg} deg, is about "
+            f"as large as what B varies by ({rounded(self.varies_deg, 3)} deg)",
+            Unlikely.TRANSLATION_UNEXPLAINED: f"the median residual of translations, {mm} mm, is "
+            f"about as large as what B varies by ({rounded(self.varies_mm, 3)} mm)",
         }[self.why]
         return f"{found}: no sensor measures like that, so A and B do not belong together as given"
 

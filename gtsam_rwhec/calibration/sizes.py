@@ -17,6 +17,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import CountError, NoiseError, OptionError, RwhecWarning, ScaleError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.noise_model.refining import refine_under_noise
 from gtsam_rwhec.problem.problem import Problem
@@ -95,7 +96,7 @@ class TargetSize:
             return f"the motion does not tell the size of {self.target}"
         return (
             f"the stated size of {self.target} is {_off(self.scale)} than the motion says "
-            f"(standard deviation {100.0 * self.sigma:.2g} %)"
+            f"(standard deviation {rounded(100.0 * self.sigma)} %)"
         )
 
 
@@ -118,8 +119,8 @@ class CommonFactor:
     def __str__(self) -> str:
         return (
             f"the stated sizes of all {self.targets} targets are {_off(self.scale)} than the motion says (standard "
-            f"deviation {100.0 * self.sigma:.2g} %), by one factor: the unit of lengths in A, or the focal length, may "
-            "be wrong as well"
+            f"deviation {rounded(100.0 * self.sigma)} %), by one factor: the unit of lengths in A, or the focal "
+            "length, may be wrong as well"
         )
 
 
@@ -140,7 +141,7 @@ def common_factor(found: Sequence[TargetSize]) -> CommonFactor | None:
 
 def _off(scale: float) -> str:
     percent = 100.0 * (scale - 1.0)
-    return f"{abs(percent):.2g} % {'larger' if percent > 0.0 else 'smaller'}"
+    return f"{rounded(abs(percent))} % {'larger' if percent > 0.0 else 'smaller'}"
 
 
 @one_blas_thread()

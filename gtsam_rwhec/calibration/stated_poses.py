@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import CONTRADICTION_SIGMAS, Prior
 from gtsam_rwhec.problem.problem import Problem
@@ -51,9 +52,10 @@ class StatedPose:
         return self.rotation_deg < SMALL_DEG and self.translation_m < SMALL_M
 
     def __str__(self) -> str:
+        off = f"{rounded(self.rotation_deg)} deg and {rounded(1e3 * self.translation_m, 3)} mm"
         return (
-            f"the stated pose of {self.frame} is {self.rotation_deg:.2g} deg and {1e3 * self.translation_m:.3g} mm "
-            f"from the pose that the measurements give ({self.sigmas:.2g} standard deviations)"
+            f"the stated pose of {self.frame} is {off} from the pose that the measurements give "
+            f"({rounded(self.sigmas)} standard deviations)"
         )
 
 

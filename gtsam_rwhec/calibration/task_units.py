@@ -19,10 +19,10 @@ from rwhec_factors import se3
 from scipy.special import chdtr, chdtri, fdtr, fdtri
 
 from gtsam_rwhec.errors import OptionError, PoseError
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
-from gtsam_rwhec.noise_model.found import two_digits
 
 #: Nodes of the quadrature over directions, in cos(polar angle) and in azimuth. With these the probability of a ball is
 #: right to 1e-6 for axes of any ratio that changes the radius.
@@ -81,10 +81,10 @@ def point_sentence(
     what = f"A point {distance_m:.2f} m from {frame}, expressed in {seen_from},"
     if not np.isfinite(radius_mm):
         return f"{what} is not determined: the measurements leave a direction free that moves it."
-    said = f"{what} is within {two_digits(radius_mm)} mm of its true place with {100 * level:g} % probability"
+    said = f"{what} is within {rounded(radius_mm)} mm of its true place with {100 * level:g} % probability"
     if measurement_mm is None:
         return f"{said}."
-    return f"{said}; the noise of one new measurement adds up to {two_digits(measurement_mm)} mm."
+    return f"{said}; the noise of one new measurement adds up to {rounded(measurement_mm)} mm."
 
 
 def checked_point(point: ArrayLike) -> Array:

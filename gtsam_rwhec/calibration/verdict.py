@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.identifiability.free_directions import FEW
 from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.solver.cause import Status
@@ -229,7 +230,7 @@ def findings_of(solution: Solution | None, refined: RefinedPoses | None = None) 
         Status.GAP: Finding(
             Ground.NOT_CERTIFIED,
             "a better answer may exist; its cost would be lower by at most "
-            f"{100.0 * solution.certificate.relative_gap:.2g} %",
+            f"{rounded(100.0 * solution.certificate.relative_gap)} %",
         ),
     }
     status = solution.certificate.status

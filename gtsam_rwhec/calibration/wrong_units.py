@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.files.rounded_numbers import rounded
 
 #: The number of each unit in a metre.
 UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 1.0 / 0.0254, "feet": 1.0 / 0.3048}
@@ -38,17 +39,17 @@ def wrong_unit(scale: float, median_A: float, median_B: float) -> WrongUnit | No
     for unit, number in UNITS.items():
         if abs(ratio / number - 1.0) > UNIT_SHARE:
             continue
-        lengths = f"lengths in {longer} are {ratio:.4g} times those in {shorter}"
+        lengths = f"lengths in {longer} are {rounded(ratio, 4)} times those in {shorter}"
         if (median_B if longer == "B" else median_A) > LONG_M or number < 1000.0:
             of_B = number if longer == "B" else 1.0
-            cure = f"give metres: divide the translations of {longer} by {number:.4g}"
+            cure = f"give metres: divide the translations of {longer} by {rounded(number, 4)}"
             return WrongUnit(Mistake.UNIT, f"{lengths}: {longer} is in {unit}", cure, of_B)
         of_B = 1.0 / number if shorter == "B" else 1.0
-        cure = f"give metres: multiply the translations of {shorter} by {number:.4g}"
+        cure = f"give metres: multiply the translations of {shorter} by {rounded(number, 4)}"
         return WrongUnit(Mistake.UNIT, f"{lengths}: those of {shorter} are too small", cure, of_B)
     return WrongUnit(
         Mistake.SCALE,
-        f"lengths in B are {scale:.4g} times the true ones, and were said to be true (scale='known')",
+        f"lengths in B are {rounded(scale, 4)} times the true ones, and were said to be true (scale='known')",
         "measure the targets again and state their true sizes, or let the scale be estimated (scale='shared')",
         scale,
     )

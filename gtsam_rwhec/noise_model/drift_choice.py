@@ -69,7 +69,10 @@ def why_no_drift(task: Task) -> str:
     """Why no drift can be looked for; empty where it can."""
     instants = task.instants
     if instants.chains > MOST_TRACKS:
-        return f"{instants.chains} pairs are measured at the same instants, and its model holds {MOST_TRACKS} at most"
+        return (
+            f"{instants.chains} pairs are measured at the same instants, of which a model holds {MOST_TRACKS}, and "
+            "neighbours in time are not clearly alike"
+        )
     if instants.count < SHORTEST_TRACK * len(task.data) / instants.chains:
         return f"it takes {SHORTEST_TRACK} instants of each pair, one after the other"
     return ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.noise_model.components import CARRIER, DRIFT, SYSTEMATIC, Component
 from gtsam_rwhec.noise_model.drift import Frame
 from gtsam_rwhec.noise_model.rows import Side
@@ -24,15 +25,10 @@ _UNITS = {
 }  # fmt: skip
 
 
-def two_digits(value: float) -> str:
-    """A number with two digits, and without an exponent up to a million."""
-    return f"{float(f'{value:.2g}'):g}"
-
-
 def ratio_words(evidence: float) -> str:
     """A likelihood ratio: how much twice the log likelihood rose; a fall, which rounding and priors make, is none."""
     rise = max(evidence, 0.0)
-    return f"likelihood ratio 2 ln L = {two_digits(rise) if rise < 10.0 else f'{rise:.0f}'}"
+    return f"likelihood ratio 2 ln L = {rounded(rise) if rise < 10.0 else f'{rise:.0f}'}"
 
 
 @dataclass(frozen=True)
@@ -157,9 +153,9 @@ class NoiseInData:
     def _size(self, component: Component) -> str:
         unit, factor = _UNITS[component]
         separator = "" if unit == "°" else " "
-        return f"{two_digits(self.deviations[component].value * factor)}{separator}{unit}"
+        return f"{rounded(self.deviations[component].value * factor)}{separator}{unit}"
 
     def _words(self, component: Component) -> str:
         _, factor = _UNITS[component]
         of = self.deviations[component]
-        return f"{self._size(component)} ({two_digits(of.low * factor)} to {two_digits(of.high * factor)})"
+        return f"{self._size(component)} ({rounded(of.low * factor)} to {rounded(of.high * factor)})"

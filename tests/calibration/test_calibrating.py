@@ -184,7 +184,7 @@ def test_drift_that_cannot_be_looked_for_says_why() -> None:
         problem.add("target0", "sensor0", raw.A[:count], raw.B[:count])
         said.append(choice(rw.calibrate(problem), "drift"))
     assert (said[0].chosen, said[0].evidence) == (
-        "not looked for",
+        "no model of it was tried",
         "it takes 20 instants of each pair, one after the other",
     )
     assert said[1].chosen == "none"

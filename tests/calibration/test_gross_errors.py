@@ -43,6 +43,28 @@ def test_a_pair_with_more_noise_than_others_is_not_wrong() -> None:
     assert gross_errors(copied(rig().problem, B=spoilt)) is None
 
 
+def test_measurements_that_were_said_to_be_noisy_are_not_wrong() -> None:
+    """Of a tag that is seen from far away, say."""
+    chance = np.random.default_rng(2)
+
+    def often(pair: Pair, raw: Measurements) -> np.ndarray:
+        return np.where(np.arange(len(raw.B)) % 5 == 0, 20.0, 1.0)
+
+    def spoilt(pair: Pair, raw: Measurements) -> np.ndarray:
+        return np.asarray(raw.B @ se3.expmap(often(pair, raw)[:, None] * 0.005 * chance.normal(size=(len(raw.B), 6))))
+
+    noisy = copied(rig().problem, B=spoilt)
+    assert gross_errors(noisy) is not None
+    chance = np.random.default_rng(2)
+    said = copied(
+        rig().problem,
+        B=spoilt,
+        sigma=lambda pair, raw: 0.005 * often(pair, raw),
+        kappa=lambda pair, raw: 2e4 / often(pair, raw) ** 2,
+    )
+    assert gross_errors(said) is None
+
+
 def test_without_measurements_none_can_be_told() -> None:
     raw = rig(1, 1).problem.measurements("target0", "sensor0")
     kept = rw.Problem(keep_measurements=False)
