@@ -41,6 +41,7 @@ def refined_under_its_noise(
         _doubt_stated_noise(run, refined, inliers)
     elif refined.noise_source == "given":
         record.choose("noise of B", "as given", "the residuals are too few to estimate it")
+        _doubt_stated_noise(run, refined, inliers)
     elif noise.model is None:
         record.choose("noise", "that of B alone is estimated", noise.simple)
         if noise.has_failed:

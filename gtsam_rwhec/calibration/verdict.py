@@ -172,7 +172,7 @@ class Judgement:
     grounds : tuple of Ground
         Reasons not to use the poses, the most serious first; empty for ``Verdict.USE``.
     reason : str
-        The grounds in words, and what to do about the first.
+        The grounds in words, and what to do about the first; where all of them ask for care only, about each.
     """
 
     verdict: Verdict
@@ -200,7 +200,10 @@ class Judgement:
         grounds = tuple(by_ground)
         worst = max((ground.verdict for ground in grounds), key=list(Verdict).index)
         facts = "; ".join(words for group in by_ground.values() for words in group)
-        return Judgement(worst, grounds, f"{facts}. What to do: {grounds[0].advice}")
+        # What makes poses useless comes first, and the rest may go with it.
+        advice = [grounds[0].advice] if worst is Verdict.DO_NOT_USE else list(dict.fromkeys(g.advice for g in grounds))
+        numbered = advice if len(advice) == 1 else [f"({i}) {each}" for i, each in enumerate(advice, start=1)]
+        return Judgement(worst, grounds, f"{facts}. What to do: {'; '.join(numbered)}")
 
 
 def proof_of(refined: RefinedPoses | None) -> str:

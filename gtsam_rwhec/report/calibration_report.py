@@ -12,8 +12,8 @@ from gtsam_rwhec.report.solution_report import print_solution_body
 from gtsam_rwhec.results.log_history import LogFields
 
 POINTS = (
-    "This is the error of the calibration alone, where the sensor typically saw its targets; "
-    "Calibration.uncertainty_at tells of any other point."
+    "This is the error of the calibration alone, where the sensor typically saw its targets; in Python, "
+    "calibration.uncertainty_at(point, frame) tells of any other point."
 )
 
 

@@ -41,6 +41,18 @@ def test_the_most_serious_ground_comes_first_and_decides() -> None:
     assert judgement.reason == f"{facts}. What to do: {Ground.MISREAD.advice}"
 
 
+def test_where_all_grounds_ask_for_care_each_says_what_to_do() -> None:
+    findings = [
+        Finding(Ground.SYSTEMATIC, "errors vary"),
+        Finding(Ground.CORRELATED, "neighbours are alike"),
+        Finding(Ground.COVARIANCE_DOUBTED, "few measurements"),
+    ]
+    judgement = Judgement.of(findings, "praise")
+    assert Ground.CORRELATED.advice == Ground.COVARIANCE_DOUBTED.advice  # is said once
+    to_do = f"(1) {Ground.CORRELATED.advice}; (2) {Ground.SYSTEMATIC.advice}"
+    assert judgement.reason == f"neighbours are alike; errors vary; few measurements. What to do: {to_do}"
+
+
 def test_what_a_misreading_leaves_free_is_not_blamed_on_the_motion() -> None:
     free = Finding(Ground.NOT_UNIQUE, "the measurements do not determine all poses")
     misread = Finding(Ground.MISREAD, "A is inverted")
