@@ -21,7 +21,7 @@ from scipy.special import chdtr, chdtri, fdtr, fdtri
 from gtsam_rwhec.errors import OptionError, PoseError
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.poses import LARGEST_M, Array
 from gtsam_rwhec.geometry.real_numbers import is_real
 
 #: Nodes of the quadrature over directions, in cos(polar angle) and in azimuth. With these the probability of a ball is
@@ -93,8 +93,8 @@ def checked_point(point: ArrayLike) -> Array:
         result = np.asarray(point, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise PoseError(f"the point is {brief(point)}; give three numbers, metres") from error
-    if result.shape != (3,) or not np.isfinite(result).all():
-        raise PoseError(f"the point is {brief(point)}; give three finite numbers, metres")
+    if result.shape != (3,) or not (np.abs(result) <= LARGEST_M).all():
+        raise PoseError(f"the point is {brief(point)}; give three finite numbers, metres, up to {LARGEST_M:g}")
     return result
 
 

@@ -126,10 +126,21 @@ def _check_covariance(given: Array, expected: Array, place: str) -> None:
     finite = np.isfinite(expected)
     if not np.array_equal(finite, np.isfinite(given)):
         raise ValueError(f"{place}: null must stand where the joint covariance is infinite, and nowhere else")
-    variances = np.diagonal(np.where(finite, expected, 0.0))
-    off = np.where(finite, given, 0.0) - np.where(finite, expected, 0.0)
-    for i, j in np.argwhere(np.abs(off) > TWICE * np.sqrt(np.outer(variances, variances)))[:1]:
+    known = np.where(finite, expected, 0.0)
+    deviations = _deviations(known)
+    off = np.where(finite, given, 0.0) - known
+    for i, j in np.argwhere(np.abs(off) > TWICE * np.maximum(np.outer(deviations, deviations), np.abs(known)))[:1]:
         raise ValueError(f"{place}[{i}][{j}]: must be {expected[i, j]}, by $.refined.joint (found {given[i, j]})")
+
+
+def _deviations(known: Array) -> Array:
+    """The size of each row of a covariance (m, m) with 0 for infinities: its deviation, or what its covariances imply.
+
+    A row whose own variance is infinite may have finite covariances with others.
+    """
+    deviations = np.sqrt(np.maximum(np.diagonal(known), 0.0))
+    implied = np.abs(known) / np.where(deviations > 0.0, deviations, np.inf)
+    return np.where(deviations > 0.0, deviations, implied.max(axis=1, initial=0.0))
 
 
 def _matrix(frame: FrameFields, place: str) -> Array:

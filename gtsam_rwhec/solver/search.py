@@ -35,6 +35,8 @@ NOTHING_YET = Bound()
 REGION_SHARE = 1e-4
 #: With unit weights and exact data, costs below this part of the form's magnitude are the rounding of the measurements.
 OF_MEASUREMENTS = 1e-30
+#: The same part of what a far origin adds: poses about it are rounded to 1.1e-16 of their distance.
+OF_ORIGIN = 1e-31
 #: The same where only moments are known, whose sums are rounded.
 OF_MOMENTS = 1e-13
 #: Moments whose rounding may change the cost by more than this part of it prove nothing.
@@ -102,14 +104,23 @@ class Search:
         """The absolute gap that counts as zero (design fact 10).
 
         With unit weights a cost of 1 has no meaning, and with exact data the cost is zero but for the rounding of the
-        measurements. Of moments alone, no more than the rounding of the form's entries is known.
+        measurements and of the answer, which grows with the distance of the world's origin. Of moments alone, no more
+        than the rounding of the form's entries is known.
         """
         if not self.part.is_relative:
             return self.options.relative_tolerance * max(cost, 1.0)
         zero = OF_MOMENTS if self.part.given is None else OF_MEASUREMENTS
         # At rest a motion's equation cancels in the form, and its terms are of the size of kappa.
         magnitude = max(self.form.magnitude, float(self.part.moments.kappa.sum()))
-        return max(self.options.relative_tolerance * cost, zero * self.form.size * magnitude + 1e-250)
+        floor = zero * self.form.size * magnitude + OF_ORIGIN * self._of_origin + 1e-250
+        return max(self.options.relative_tolerance * cost, floor)
+
+    @property
+    def _of_origin(self) -> float:
+        """The part of the form that the gauge took off, sum (|a|^2 + |c|^2) / sigma^2, in which poses are rounded."""
+        gauge = self.part.gauge
+        squares = float((gauge.sensor_carrier**2).sum() + (gauge.target_carrier**2).sum())
+        return float(self.part.moments.weight.sum()) * squares
 
     @property
     def rounding(self) -> float:

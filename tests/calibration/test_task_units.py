@@ -158,6 +158,8 @@ def test_what_cannot_be_asked_is_refused(calibration: rw.Calibration) -> None:
             calibration.uncertainty_at(POINT, nothing)  # type: ignore[arg-type]
     with pytest.raises(rw.errors.PoseError, match="give three"):
         calibration.uncertainty_at([0.0, 0.8], "sensor0")
+    with pytest.raises(rw.errors.PoseError, match=r"give three finite numbers, metres, up to 1e\+15"):
+        calibration.uncertainty_at([0.0, 0.0, 1e160], "sensor0")
     with pytest.raises(rw.errors.OptionError, match=r"level=1.5; give one between 0 and 1"):
         calibration.uncertainty_at(POINT, "sensor0", level=1.5)
 

@@ -8,11 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from places import DEMO
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.results.covariance_agreement import _check_covariance
 from gtsam_rwhec.results.result_file import read_result
 from gtsam_rwhec.simulate import Noise, general
 
@@ -351,3 +353,15 @@ def test_what_solves_certifies_and_writes_agrees(tmp_path: Path) -> None:
         problem = rw.read_csv(DEMO, scale=scale, sigma=0.005, kappa=6565.0)
         rw.write_refined(rw.refine(problem, rw.solve(problem)), tmp_path / "result.json")
         assert read_result(tmp_path / "result.json").refined is not None
+
+
+def test_a_rows_last_digits_may_differ_where_its_variance_is_infinite_and_lengths_are_tiny() -> None:
+    expected = np.diag([np.inf, 1e-22, 4e-22])
+    expected[0, 1] = expected[1, 0] = 1.1178833517395231e-11
+    expected[1, 2] = expected[2, 1] = 1e-22
+    given = np.where(np.isfinite(expected), expected, np.nan)
+    given[0, 1] = np.nextafter(given[0, 1], 0.0)
+    _check_covariance(given, expected, "$.here")
+    given[0, 1] *= 1.001
+    with pytest.raises(ValueError, match=r"\$\.here\[0\]\[1\]: must be 1\.1178833517395231e-11, by"):
+        _check_covariance(given, expected, "$.here")

@@ -388,3 +388,20 @@ def test_a_solution_prints_as_a_few_lines() -> None:
     assert scale == "scale (known): 1"
     *_, scale = str(rw.solve(simulated("per_target").problem)).splitlines()
     assert all(name in scale for name in solution.X)
+
+
+@pytest.mark.parametrize("distance_m", [0.0, 1e3, 1e6])
+def test_exact_data_are_certified_wherever_the_origin_of_the_world_is(distance_m: float) -> None:
+    """What is left of the cost is the rounding of the poses, which is 1e-10 m where the origin is 1,000 km away."""
+    near = general(2, 2, seed=1).problem
+    problem = rw.Problem()
+    away = np.eye(4)
+    away[:3, 3] = distance_m * np.array([0.6, 0.8, 0.1])
+    for pair in near.pairs:
+        for batch in near.batches(*pair):
+            problem.add(*pair, batch.A @ away, batch.B)
+    solution = rw.solve(problem)
+    assert solution.certificate.status is rw.Status.CERTIFIED
+    # Another answer is refused: 1e-6 m is ten thousand times the rounding.
+    moved = {name: pose.retract(np.array([0, 0, 0, 1e-6, 0, 0])) for name, pose in solution.X.items()}
+    assert not rw.certify(problem, moved, solution.Y).is_certified
