@@ -90,11 +90,12 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
             record.choose(what, "none", f"errors of neighbours in time are no more alike than others{order}")
     else:
         kind = "a random walk" if model.correlation == 1.0 else f"errors correlated by {model.correlation:g} a step"
+        clock = "" if model.has_stamps else "; a late clock looks like this too, and there are no stamps to tell"
         record.choose(
             what,
             f"{kind}; {model.instants} frames are worth about {model.worth:.0f}",
             f"a model in which neighbours in time share errors explains the residuals far better "
-            f"({ratio_words(model.drift_evidence)})",
+            f"({ratio_words(model.drift_evidence)}){clock}",
         )
 
 
@@ -116,4 +117,9 @@ def _say_systematic(run: Run, model: NoiseInData) -> None:
     evidence = f"{tried} far better ({ratio_words(model.systematic_evidence)})"
     record.choose(what, "found, and in the covariances", evidence)
     words = f"errors vary with the configuration of the carriers: {model.systematic_words}"
+    if not model.has_stamps:
+        words += (
+            "; it may also be a late clock, which looks like this where there are no stamps: give stamps, or stand "
+            "still at each pose"
+        )
     record.find(Ground.SYSTEMATIC, words)

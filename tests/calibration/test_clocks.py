@@ -189,6 +189,20 @@ def test_calibrate_says_why_an_offset_is_not_estimated() -> None:
     assert told.time_offsets_s == {}
 
 
+def test_without_stamps_the_words_say_that_it_may_be_a_clock() -> None:
+    """Its errors vary with the motion, as those of an arm do, or fade as drift does."""
+    g, t = np.random.default_rng(0), np.arange(120) * STEP_S
+    B = perturb(np.linalg.inv(Y) @ road(t + 0.04) @ X, NOISE, g)
+    unstamped, stamped = rw.Problem(), rw.Problem()
+    unstamped.add("tag", "cam", road(t), B)
+    stamped.add("tag", "cam", road(t), B, stamps_ns=np.round(t * 1e9).astype(np.int64))
+    found = rw.calibrate(unstamped)
+    assert rw.Ground.SYSTEMATIC in found.judgement.grounds
+    assert "it may also be a late clock" in found.verdict_reason
+    told = rw.calibrate(stamped, rw.CalibrateOptions(time_offsets=False, misreadings=False))
+    assert "it may also be a late clock" not in told.verdict_reason
+
+
 def test_a_late_clock_that_was_taken_as_right_is_not_passed_over() -> None:
     options = rw.CalibrateOptions(time_offsets=False, misreadings=False)
     late = rw.calibrate(moving(0, 0.03)[0], options)
