@@ -27,9 +27,11 @@ def stacked(poses: Any) -> Array:
 
 def hat(v: Array) -> Array:
     """The matrices (N, 3, 3) with hat(v) w = v x w."""
-    x, y, z = np.moveaxis(v, -1, 0)
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape[:-1], 3, 3)
+    result = np.zeros((*v.shape, 3), dtype=v.dtype)
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -z, y, -x
+    result[..., 1, 0], result[..., 2, 0], result[..., 2, 1] = z, -y, x
+    return result
 
 
 #: hat(e_1), hat(e_2), hat(e_3): hat(omega) e_i = -hat(e_i) omega, so d (R e_i) = -R hat(e_i) omega.

@@ -8,7 +8,6 @@ likelihood is its elimination of one more column for each component. It is never
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import C
@@ -45,8 +44,7 @@ def average_information(eliminated: Eliminated, active: tuple[C, ...]) -> Array:
         half = e.drift.factor.half((e.drift.factor.inverse * e.drift.unit) @ cross[:, 6:]).reshape(-1, k)
         own -= half.T @ half
         gram -= half.T @ e.drift.half.reshape(len(half), -1)[:, :-1]
-    explained = solve_triangular(e.L, gram.T, lower=True, check_finite=False)
-    found: Array = own - explained.T @ explained
+    found: Array = own - gram @ e.covariance @ gram.T
     return found
 
 

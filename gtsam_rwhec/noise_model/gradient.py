@@ -9,10 +9,8 @@ follow. No step divides by a sigma.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from scipy.linalg.lapack import dtrtri
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import C
@@ -29,10 +27,10 @@ class Eliminated:
     measured : Reduced
         The single measurements.
     drift : EliminatedDrift or None
-    L : (q + p, q + p) array
-        The Cholesky factor of the precision of the unit systematic errors and the unknowns.
-    half : (q + p,) array
-        L^-1 of their products with the residual.
+    covariance : (q + p, q + p) array
+        Of the unit systematic errors and the unknowns.
+    mean : (q + p,) array
+        Theirs.
     systematic : (6,) array
         Standard deviations of the systematic errors.
     features, products : (T, k) and (T, k k) arrays
@@ -41,23 +39,11 @@ class Eliminated:
 
     measured: Reduced
     drift: EliminatedDrift | None
-    L: Array
-    half: Array
+    covariance: Array
+    mean: Array
     systematic: Array
     features: Array
     products: Array
-
-    @cached_property
-    def inverse(self) -> Array:
-        """L^-1 (q + p, q + p)."""
-        found: Array = dtrtri(self.L, lower=1)[0] if len(self.L) else self.L  # LAPACK refuses a size of zero
-        return found
-
-    @cached_property
-    def mean(self) -> Array:
-        """The unit systematic errors and the unknowns (q + p,)."""
-        found: Array = -self.inverse.T @ self.half
-        return found
 
     def gradient_by(self, active: tuple[C, ...]) -> Array:
         """d(-2 l) / d log sigma (k,) of the active components."""
@@ -70,7 +56,7 @@ class Eliminated:
         q = 6 * k
         y = np.append(self.mean, 1.0)
         G = y[:, None] * y
-        G[:-1, :-1] += self.inverse.T @ self.inverse
+        G[:-1, :-1] += self.covariance
         each = 2.0 * (1.0 - np.diagonal(G)[:q]).reshape(2, 3 * k).sum(axis=1)
         result = {C.SYSTEMATIC_ROTATION: float(each[0]), C.SYSTEMATIC_TRANSLATION: float(each[1])}
         by_cross = np.zeros_like(self.measured.cross)

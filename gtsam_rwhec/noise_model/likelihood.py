@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import C
@@ -24,6 +23,7 @@ from gtsam_rwhec.noise_model.eliminated_drift import EliminatedDrift
 from gtsam_rwhec.noise_model.gradient import Eliminated
 from gtsam_rwhec.noise_model.measurements import Measurements, Reduced, white_terms
 from gtsam_rwhec.noise_model.rows import Rows, Side
+from gtsam_rwhec.refinement.definite_inverse import EliminationOrder
 
 
 @dataclass(frozen=True)
@@ -94,6 +94,11 @@ class NoiseModel:
         f = self.features[self.rows.instants.first]
         return f, (f[:, :, None] * f[:, None, :]).reshape(len(f), -1)
 
+    @cached_property
+    def _orders(self) -> dict[int, EliminationOrder]:
+        """The order of elimination of the systematic errors and the unknowns, by their number."""
+        return {}
+
     def eliminated(self, sigma: dict[C, float]) -> tuple[Estimate, Eliminated]:
         """The same, and what is left of the elimination for derivatives."""
         measured = self._measurements.reduced(sigma)
@@ -112,13 +117,14 @@ class NoiseModel:
         precision[np.arange(q), np.arange(q)] += 1.0
         precision[q:, q:] += self.prior_information
         b[q:] += self.prior_gradient
-        L = np.linalg.cholesky(precision)
-        log_det += 2.0 * float(np.log(np.diagonal(L)).sum())
-        half = solve_triangular(L, b, lower=True, check_finite=False)
-        inverse = np.linalg.inv(L[q:, q:])
-        value = log_det + float(gram[-1, -1] - half @ half)
-        estimate = Estimate(value, -inverse.T @ half[q:], inverse.T @ inverse)
-        return estimate, Eliminated(measured, drift, L, half, systematic, f, ff)
+        if len(precision) not in self._orders:
+            self._orders[len(precision)] = EliminationOrder.of(precision)
+        covariance, more = self._orders[len(precision)].inverse(precision)
+        mean = -covariance @ b
+        mean -= covariance @ (precision @ mean + b)  # what rounding has left
+        value = log_det + more + float(gram[-1, -1] + b @ mean)
+        estimate = Estimate(value, mean[q:], np.ascontiguousarray(covariance[q:, q:]))
+        return estimate, Eliminated(measured, drift, covariance, mean, systematic, f, ff)
 
 
 def _products(measured: Reduced, systematic: Array, f: Array, ff: Array) -> Array:

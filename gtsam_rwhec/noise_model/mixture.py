@@ -68,8 +68,10 @@ class Mixture:
         """
         chance = np.random.default_rng(0)
         drawn = []
+        used = np.flatnonzero(rows.any(axis=0))  # few of many unknowns
+        of_used = rows[:, used]
         for i, estimate in enumerate(self.estimates):
-            root = np.linalg.cholesky(rows @ estimate.covariance @ rows.T)
+            root = np.linalg.cholesky(of_used @ estimate.covariance[used[:, None], used] @ of_used.T)
             sample = rows @ (estimate.step - self.step) + chance.normal(size=(DRAWS, len(rows))) @ root.T
             if added is not None:
                 sample = sample + chance.normal(size=(DRAWS, added.shape[2])) @ added[i].T

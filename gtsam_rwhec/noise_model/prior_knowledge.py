@@ -17,6 +17,8 @@ def prior_terms(
 ) -> tuple[Array, Array]:
     """Information (p, p) and gradient (p,) of 2 kappa_0 theta^2 + |t - t_0|^2 / sigma_0^2 over two, by the basis."""
     size = len(layout.unit)
+    if not problem.priors:
+        return np.zeros((basis.shape[1], basis.shape[1])), np.zeros(basis.shape[1])
     information, gradient = np.zeros((size, size)), np.zeros(size)
     for name, priors in problem.priors.items():
         unknown = Unknown(UnknownKind.FRAME, name)

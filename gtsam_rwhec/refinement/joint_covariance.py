@@ -19,6 +19,7 @@ from scipy.linalg import block_diag
 
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.definite_inverse import SMALL, EliminationOrder
 from gtsam_rwhec.refinement.unknowns import Unknown, rows_of, slots_of
 
 #: A linear function is determined when its share along the free directions is below this. (A free direction's sentence
@@ -60,11 +61,18 @@ class JointCovariance:
         scaled = information * unit[:, None] * unit
         scaled = 0.5 * (scaled + scaled.T)
         basis = _orthonormal(free / unit[:, None])
-        Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if basis.shape[1] else np.eye(len(unit))
-        inside = Q.T @ scaled @ Q
+        has_free = bool(basis.shape[1])
+        Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if has_free else np.eye(len(unit))
+        inside = Q.T @ scaled @ Q if has_free else scaled
         # Equilibrated, so that each parameter's own information is the scale of its rounding.
         size = np.sqrt(np.maximum(np.diagonal(inside), 1e-300))
-        values, vectors = np.linalg.eigh(inside / size[:, None] / size)
+        inside = inside / size[:, None] / size
+        if not has_free and len(unit) > SMALL:
+            inverse = _surely_definite_inverse(inside)
+            if inverse is not None:
+                share = unit / size
+                return JointCovariance(slots_of(unknowns), inverse * share[:, None] * share, basis, unit)
+        values, vectors = np.linalg.eigh(inside)
         lost = values <= ROUNDING * values.max(initial=0.0)
         if lost.any():  # no measurement depends on these directions
             more = Q @ (vectors[:, lost] / size[:, None])
@@ -83,7 +91,9 @@ class JointCovariance:
 
     def selector(self, unknowns: tuple[Unknown, ...]) -> Array:
         """The matrix (m, d) that selects the rows of some unknowns."""
-        selected: Array = np.eye(len(self.unit))[self.rows(unknowns)]
+        rows = self.rows(unknowns)
+        selected: Array = np.zeros((len(rows), len(self.unit)))
+        selected[np.arange(len(rows)), rows] = 1.0
         return selected
 
     def reach(self, G: Array) -> Array:
@@ -107,7 +117,9 @@ class JointCovariance:
         length = np.linalg.norm(G * self.unit, axis=1)
         shares = moved / np.where(length > 0.0, length, 1.0)[:, None]
         touched = np.linalg.norm(shares, axis=1) > SHARE
-        covariance: Array = G @ self.finite @ G.T + DISPLACED**2 * moved @ moved.T
+        used = np.flatnonzero(G.any(axis=0))  # few of many unknowns
+        of_used = G[:, used]
+        covariance: Array = of_used @ self.finite[used[:, None], used] @ of_used.T + DISPLACED**2 * moved @ moved.T
         along = shares @ shares.T
         reached = touched[:, None] & touched & (np.abs(along) > SHARE**2 * 1e-3)
         covariance[reached] = np.inf * np.sign(along[reached])
@@ -142,6 +154,16 @@ class JointCovariance:
                 across = se3.hat(f)
                 result[3:, 3:] += across @ self.finite[np.ix_(rows[:3], rows[:3])] @ across.T
         return result
+
+
+def _surely_definite_inverse(information: Array) -> Array | None:
+    """The inverse, without eigenvalues; None where one of these may be rounding error."""
+    try:
+        inverse, _ = EliminationOrder.of(information).inverse(information)
+    except np.linalg.LinAlgError:
+        return None
+    largest, smallest = (np.abs(each).sum(axis=0).max() for each in (information, inverse))  # at least, and its inverse
+    return inverse if ROUNDING * largest * smallest < 1.0 else None
 
 
 def _orthonormal(basis: Array) -> Array:

@@ -1,0 +1,77 @@
+"""The inverse of matrices of many frames against that of dense ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gtsam_rwhec.refinement.definite_inverse import SMALL, EliminationOrder
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+
+
+def information(targets: int, sensors: int, scales: bool, chance: np.random.Generator) -> np.ndarray:
+    """Every sensor sees every target; each target may have a scale of its own."""
+    width = 7 if scales else 6
+    size = width * targets + 6 * sensors
+    found = np.zeros((size, size))
+    for i in range(targets):
+        for j in range(sensors):
+            own = np.r_[width * i : width * (i + 1), width * targets + 6 * j : width * targets + 6 * (j + 1)]
+            J = chance.normal(size=(20, len(own)))
+            found[np.ix_(own, own)] += J.T @ J
+    return found
+
+
+@pytest.mark.parametrize(
+    ("targets", "sensors", "scales"), [(40, 1, False), (30, 2, True), (3, 40, False), (2, 2, True)]
+)
+def test_it_is_that_of_the_dense_matrix(targets: int, sensors: int, scales: bool) -> None:
+    matrix = information(targets, sensors, scales, np.random.default_rng(0))
+    order = EliminationOrder.of(matrix)
+    inverse, log_det = order.inverse(matrix)
+    np.testing.assert_allclose(inverse, np.linalg.inv(matrix), atol=1e-12 * np.abs(inverse).max())
+    assert log_det == pytest.approx(np.linalg.slogdet(matrix)[1], rel=1e-12)
+    assert [level.shape for level in order.levels] == (
+        [] if len(matrix) <= SMALL else [(max(targets, sensors), 7 if scales else 6)]
+    )
+
+
+def test_frames_in_a_chain_are_eliminated_in_turns() -> None:
+    """Each is tied to the next: every second is independent, then every second of the rest."""
+    chance, frames = np.random.default_rng(1), 64
+    matrix = np.zeros((6 * frames, 6 * frames))
+    for k in range(frames - 1):
+        own = slice(6 * k, 6 * k + 12)
+        J = chance.normal(size=(20, 12))
+        matrix[own, own] += J.T @ J
+    order = EliminationOrder.of(matrix)
+    assert [len(level) for level in order.levels] == [32, 16]
+    np.testing.assert_allclose(order.inverse(matrix)[0] @ matrix, np.eye(len(matrix)), atol=1e-8)
+
+
+def test_a_dense_matrix_is_inverted_as_a_whole_and_an_indefinite_one_refused() -> None:
+    J = np.random.default_rng(2).normal(size=(200, 150))
+    order = EliminationOrder.of(J.T @ J)
+    assert order.levels == ()
+    np.testing.assert_allclose(order.inverse(J.T @ J)[0], np.linalg.inv(J.T @ J), atol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):
+        order.inverse(J.T @ J - 100.0 * np.eye(150))
+    star = information(40, 1, False, np.random.default_rng(0))
+    order = EliminationOrder.of(star)
+    star[5, 5] = -1.0
+    with pytest.raises(np.linalg.LinAlgError):
+        order.inverse(star)
+
+
+def test_the_joint_covariance_of_many_frames_is_the_inverse_and_finds_what_nothing_determines() -> None:
+    unknowns = tuple(Unknown(UnknownKind.FRAME, f"frame_{k}") for k in range(41))
+    matrix = information(40, 1, False, np.random.default_rng(3))
+    unit = np.linspace(0.5, 2.0, len(matrix))
+    none = np.zeros((len(matrix), 0))
+    found = JointCovariance.of(unknowns, matrix, none, unit)
+    assert found.free.shape[1] == 0
+    np.testing.assert_allclose(found.finite, np.linalg.inv(matrix), atol=1e-12 * np.abs(found.finite).max())
+    np.testing.assert_allclose(found.covariance_of(found.selector(unknowns[3:5])), found.finite[18:30, 18:30])
+    matrix[60], matrix[:, 60] = 0.0, 0.0
+    assert JointCovariance.of(unknowns, matrix, none, unit).free.shape[1] == 1
