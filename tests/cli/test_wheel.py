@@ -76,7 +76,7 @@ def test_the_demo_runs_from_it_and_meets_the_truth(unpacked_wheel: Path, tmp_pat
     assert "Warning" not in done.stderr
     log = unpacked_wheel / "gtsam_rwhec" / "demo_data" / "robot_cell.mcap"
     assert f"This is the same as: gtsam-rwhec calibrate {log} --rig {log.parent / 'rig.yaml'} -o " in done.stderr
-    assert done.stdout.startswith("Use these poses: ")
+    assert done.stdout.startswith("Use these poses with care: the stated size of board is 2.5 % too large ")
     for words in (
         "Certified globally optimal",
         "Outliers: ",
