@@ -119,8 +119,9 @@ def misreadings(
     is_late = solution is not None and _rows_are_late(sampled, solution)
     if given is not None and is_plain(given, signal) and not is_late:
         return ()
-    (progress or silent)("trying other readings of the poses")
-    trial = _Trial.of(problem, sampled, signal)
+    tell = progress or silent
+    tell("trying other readings of the poses")
+    trial = _Trial.of(problem, sampled, signal, tell)
     if trial is None or (is_plain(trial.base.residual, signal) and not is_late):
         return ()
     angles = list(readings_of_angles(*sampled.all_poses))
@@ -191,9 +192,10 @@ class _Trial:
     signal: Spread
     base: TrialFit
     on_screen: TrialFit
+    tell: Progress
 
     @staticmethod
-    def of(problem: Problem, sampled: Sampled, signal: Spread) -> _Trial | None:
+    def of(problem: Problem, sampled: Sampled, signal: Spread, tell: Progress) -> _Trial | None:
         """The poses as they were read, fitted; None where they have no answer with these scales."""
         screen = Sampled.of(problem, SCREENING_PAIRS, SCREENING_MEASUREMENTS)
         assert screen is not None
@@ -201,7 +203,7 @@ class _Trial:
         on_screen = fitted(problem, screen.as_read(), rounds=SCREENING_ROUNDS)
         if base is None or on_screen is None:
             return None
-        return _Trial(problem, sampled, screen, signal, base, on_screen)
+        return _Trial(problem, sampled, screen, signal, base, on_screen, tell)
 
     def found(self, readings: Iterable[Reading], mode: ScaleMode | None = None) -> tuple[Misreading, ...]:
         """The readings that fit best, if they fit far better than the given one."""
@@ -233,6 +235,7 @@ class _Trial:
 
     def is_promising(self, reading: Reading, mode: ScaleMode | None) -> bool:
         """Whether a reading does better on few measurements in few rounds."""
+        self.tell(f"trying other readings of the poses: {reading.likely or 'another unit'}")
         fit = fitted(self.problem, self.screen.by(reading), mode, rounds=SCREENING_ROUNDS)
         return fit is not None and self._log_product(fit) < self._log_product(self.on_screen) + math.log(PROMISING)
 

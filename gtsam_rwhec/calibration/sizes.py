@@ -191,9 +191,11 @@ def _under_all_noise(free: Problem, options: RefineOptions | None, progress: Pro
     if options is not None and (options.noise != "estimate" or options.carrier_noise is not None):
         return []
     try:
-        refined, _ = refine_under_noise(free, solve(free), options, progress=progress)
+        refined, noise = refine_under_noise(free, solve(free), options, progress=progress)
     except (CountError, np.linalg.LinAlgError, RuntimeError):
         return []
+    if noise.is_drift_untried:
+        return []  # errors of neighbours in time are alike, and the deviations do not know it
     assert isinstance(refined.scale, Mapping)
     return [TargetSize(target, scale, _sigma_of(refined, target)) for target, scale in refined.scale.items()]
 

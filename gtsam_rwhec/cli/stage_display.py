@@ -15,6 +15,8 @@ from gtsam_rwhec.files.terminal_text import shown
 
 #: Seconds before anything is shown, and between lines in a log.
 INTERVAL_S = 1.0
+#: Seconds after which a log says that a stage goes on.
+SILENCE_S = 10.0
 #: A stage is shown with at most this many characters.
 LONGEST_STAGE = 200
 
@@ -61,10 +63,12 @@ class StageDisplay:
         self._progress.update(self._task, description=self._stage)
 
     def _tick(self) -> None:
-        said = ""
+        said, said_s = "", self._begun_s
         while not self._finished.wait(INTERVAL_S):
+            now_s = time.monotonic()
             if self._console.is_interactive:
                 self._progress.start()  # does nothing when it runs already
-            elif self._stage != said:
-                said = self._stage
-                self._console.print(f"[{time.monotonic() - self._begun_s:.0f} s] {said}", markup=False, soft_wrap=True)
+            elif self._stage != said or now_s - said_s > SILENCE_S:
+                still = "still " if self._stage == said else ""
+                said, said_s = self._stage, now_s
+                self._console.print(f"[{now_s - self._begun_s:.0f} s] {still}{said}", markup=False, soft_wrap=True)

@@ -48,6 +48,8 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
         """A rough fit of each kind, and a whole one of those that are near the best."""
 
         def fit(kind: Walk, near: Fitted, enough: float) -> Fitted:
+            name = "a random walk" if kind.correlation == 1.0 else f"correlation {kind.correlation:g}"
+            tell(f"estimating drift: {name}")
             model, whole = (replace(each, drift=DriftPrior.of(each.rows, kind)) for each in (thin, steady.model))
             sizes = task.sizes(whole, systematic=systematic)
             return fitted(model, sizes, start_at(sizes, near), enough=enough)

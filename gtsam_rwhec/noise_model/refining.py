@@ -65,6 +65,7 @@ class UnderNoise:
         the record.
         """
         task, found = self.task, self.settled
+        task.tell("covariances: with the uncertainty of the noise itself")
         joint, mixture = mixed(task, found)
         layout = task.layout
         frames = [
@@ -76,6 +77,7 @@ class UnderNoise:
         # Two kinds of noise at least share what equations there are to spare.
         spare = 6 * task.problem.number_of_measurements - len(layout.unit)
         freedom = min(freedom, max(0.5 * spare, FEWEST))
+        task.tell("covariances: the graph of the answer")
         refined = refined_of(task, found, joint, freedom, inliers or {}, self.solution, self.how)
         noise = noise_in(task, found, mixture)
         return replace(refined, noise_sentences=noise.sentences), noise
@@ -129,7 +131,7 @@ def under_noise(
     state = variables.start(solution)
     space = free_space_of(parts_of(problem), variables, state, data)
     layout = JointCovariance.of(variables.unknowns, np.eye(len(space.unit)), space.basis, space.unit)
-    task = Task(problem, data, variables, layout, Instants.of(data), options, space.directions)
+    task = Task(problem, data, variables, layout, Instants.of(data), options, space.directions, tell)
     found = settled(task, state, tell, before)
     return UnderNoise(task, found, solution, how)
 

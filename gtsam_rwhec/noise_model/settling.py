@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import FreeDirection
 from gtsam_rwhec.noise_model.components import Sizes
@@ -67,6 +68,8 @@ class Task:
     instants: Instants
     options: NoiseOptions
     free_directions: tuple[FreeDirection, ...] = ()
+    #: Is told each round, so that a long model is seen to move.
+    tell: Progress = silent
 
     @property
     def basis(self) -> Array:
@@ -105,7 +108,10 @@ class Task:
     ) -> Settled:
         """Components and unknowns in turn; ``near`` has components of a similar model."""
         state, sizes, logs = start, None, None
-        for _ in range(rounds):
+        what = "errors of the configuration" if systematic else "noise of A and B"
+        what = what if walk is None else f"drift, {what}"
+        for number in range(1, rounds + 1):
+            self.tell(f"estimating {what}: round {number} of at most {rounds}")
             model = self.model(state, side, walk, systematic=systematic)
             sizes = self.sizes(model, systematic=systematic) if sizes is None else sizes
             logs = start_at(sizes, near) if logs is None else logs

@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import time
 
+import pytest
 from rich.console import Console
 
+from gtsam_rwhec.cli import stage_display
 from gtsam_rwhec.cli.stage_display import INTERVAL_S, StageDisplay
 
 
@@ -35,6 +37,15 @@ def test_a_log_has_a_line_for_each_stage_that_lasts() -> None:
         stage("solving")
         time.sleep(1.2 * INTERVAL_S)
     assert stream.getvalue().splitlines() == ["[1 s] reading [1]", "[3 s] solving"]
+
+
+def test_a_log_says_that_a_long_stage_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage_display, "SILENCE_S", 1.5 * INTERVAL_S)
+    stages, stream = display(terminal=False)
+    with stages as stage:
+        stage("solving")
+        time.sleep(3.5 * INTERVAL_S)
+    assert stream.getvalue().splitlines() == ["[1 s] solving", "[3 s] still solving"]
 
 
 def test_a_terminal_has_a_spinner_that_goes_away() -> None:
