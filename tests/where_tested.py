@@ -96,9 +96,9 @@ TABLE: dict[str, dict[str, str]] = {
         "noise_model/test_likelihood.py": (
             "average_information drift eliminated_drift gradient measurements sparse_columns"
         ),
+        "noise_model/test_stations.py": "rows",
         "noise_model/test_refining.py": (
-            "agreement components drift_choice found mixture modelled options prior_knowledge reml rows settling "
-            "typical"
+            "agreement components drift_choice found mixture modelled options prior_knowledge reml settling typical"
         ),
     },
     "gtsam_rwhec/pipeline": {

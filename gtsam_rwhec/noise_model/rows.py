@@ -15,6 +15,9 @@ from typing import Literal
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.sparse_columns import SparseColumns
@@ -32,6 +35,11 @@ SMOOTH_RAD, SMOOTH_M = 1.5, 0.75
 SMALLEST_SPREAD = 1e-4
 #: A carrier stands still while no entry of its pose (1, m) changes by more than this.
 STILL = 5e-5
+#: Poses of an arm that comes back to a station differ by less than this (1, m); those of other stations, by more than
+#: ``APART`` times as much.
+REVISITED, APART = 1e-3, 10.0
+#: More pairs of near poses than this, an instant, are not those of visits to stations.
+MOST_LINKS = 50
 #: A velocity is taken from neighbours that are no further apart than this, s.
 NEIGHBOURS_S = 0.5
 
@@ -84,7 +92,9 @@ class Instants:
         first_of, same = np.unique(keys, axis=0, return_index=True, return_inverse=True)[1:]
         same = same.ravel()
         if has_stamps or len(data) == 1:  # the rows of one pair are in order of time
-            same = standstills(A[first_of, :3].reshape(-1, 12), stamps[first_of])[same]
+            still = standstills(A[first_of, :3].reshape(-1, 12), stamps[first_of])
+            one = np.unique(still, return_index=True)[1]
+            same = stations(A[first_of, :3].reshape(-1, 12)[one])[still][same]
         if len(np.unique(same)) == len(same):  # no instant is shared: one track after the other
             order = np.lexsort((stamps, pair))
             begins = np.r_[True, np.diff(pair[order]) != 0]
@@ -117,6 +127,26 @@ def standstills(A: Array, stamps: np.ndarray) -> np.ndarray:
             count, first = count + 1, A[i]
         place[i], last = count, stamps[i]
     return place
+
+
+def stations(A: Array) -> np.ndarray:
+    """The station (N,) of each instant: where an arm comes back to few poses (N, 12), its error there is the same.
+
+    Poses within ``REVISITED`` of one another are one station, if they are far from all others and if each is visited
+    twice and more on average. Elsewhere each instant is a station of its own.
+    """
+    alone = np.arange(len(A))
+    tree = cKDTree(A)
+    number = (tree.count_neighbors(tree, APART * REVISITED) - len(A)) // 2
+    if number < len(A) // 2 or number > MOST_LINKS * len(A):
+        return alone
+    links = tree.query_pairs(APART * REVISITED, output_type="ndarray")
+    is_close = np.linalg.norm(A[links[:, 0]] - A[links[:, 1]], axis=1) < REVISITED
+    if not is_close.all():
+        return alone
+    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(A), len(A)))
+    count, station = connected_components(graph, directed=False)
+    return station if 2 * count <= len(A) else alone
 
 
 @dataclass(frozen=True)
