@@ -20,6 +20,8 @@ from gtsam_rwhec.problem.problem import Problem
 GROSS = 8.0
 #: A pair with fewer rows has no median of its own; that of all pairs counts.
 FEWEST_ROWS = 10
+#: At most so many pairs and measurements are looked at.
+MOST_PAIRS, MOST_MEASUREMENTS = 200, 10_000
 #: With fewer measurements in all, one cannot be told from the others.
 FEWEST_MEASUREMENTS = 8
 
@@ -41,7 +43,7 @@ class GrossErrors:
 
 def gross_errors(problem: Problem) -> GrossErrors | None:
     """Measurements of a problem, or of a sample of it, that look wrong; None where none does, or none can be told."""
-    sampled = Sampled.of(problem)
+    sampled = Sampled.of(problem, MOST_PAIRS, MOST_MEASUREMENTS)
     if sampled is None or sampled.count < FEWEST_MEASUREMENTS:
         return None
     fit = fitted(problem, sampled.as_read())

@@ -40,6 +40,11 @@ def not_of_late_clocks(findings: Sequence[Finding], misreadings: Sequence[Misrea
     return tuple(finding for finding in findings if finding.ground not in made)
 
 
+def not_of_marked_outliers(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """The findings without measurements that look wrong: outliers were looked for, under each detection's own noise."""
+    return tuple(finding for finding in findings if finding.ground is not Ground.OUTLIERS_KEPT)
+
+
 def _cure(misreading: Misreading, rig: Rig) -> str:
     carriers, place = rig.carriers, rig.source.place
     of_A = "A is inverted" in misreading.likely

@@ -23,6 +23,7 @@ from gtsam_rwhec.pipeline.log_findings import (
     in_rig_file,
     is_of_the_poses,
     not_of_late_clocks,
+    not_of_marked_outliers,
     with_cures,
 )
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
@@ -167,12 +168,14 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         ),
         contradicted=contradictions(outliers),
     )
+    left_out = _outliers(outliers, looked_for=rig.cleaning.robust == "gnc")
     findings = with_cures(calibration.findings, calibration.misreadings, rig)
+    if left_out.looked_for:
+        findings = not_of_marked_outliers(findings)
     if late:
         findings = not_of_late_clocks(findings, calibration.misreadings)
     findings = (*findings, *late, *estimated_sizes(fields.sizes, rig))
     judgement = judge(refined.solution, refined, fields, findings)
-    left_out = _outliers(outliers, looked_for=rig.cleaning.robust == "gnc")
     calibration = replace(
         calibration,
         findings=findings,

@@ -13,10 +13,12 @@ import pytest
 import synthetic_logs as made
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.pipeline.all_stages import calibrate_log
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.log_findings import not_of_marked_outliers
 from gtsam_rwhec.pipeline.solving_stage import solve_log
 from gtsam_rwhec.rig import parse_rig, read_rig
 
@@ -135,3 +137,10 @@ def test_what_cannot_be_written_is_told_before_anything_is_computed(tmp_path: Pa
 
 def _nothing_is_done(stage: str) -> None:
     raise AssertionError(stage)
+
+
+def test_measurements_that_look_wrong_are_no_finding_where_outliers_were_looked_for() -> None:
+    """Under each detection's own noise: the advice would be to look for them."""
+    kept = Finding(Ground.OUTLIERS_KEPT, "4 of 200 measurements look wrong")
+    size = Finding(Ground.SIZE_DOUBTED, "the stated size of tag_0 is 3 % larger than the motion says")
+    assert not_of_marked_outliers((kept, size)) == (size,)
