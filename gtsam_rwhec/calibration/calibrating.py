@@ -91,7 +91,7 @@ def _calibrated(run: Run) -> Calibration:
         reading, found = _read_and_answered(run, first)
         if found.refined is not None:
             doubt_stated_poses(run, found.refined, found.inliers)
-            found_sizes = doubt_stated_sizes(run, found.refined, found.inliers)
+            found_sizes = doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
     problem, record = run.problem, run.record
     solution, inliers, refined = found.solution, found.inliers, found.refined
     if solution is None:

@@ -19,6 +19,9 @@ from gtsam_rwhec.errors import CountError, NoiseError, OptionError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.noise_model.drift import Walk
+from gtsam_rwhec.noise_model.found import NoiseInData
+from gtsam_rwhec.noise_model.options import NoiseOptions
 from gtsam_rwhec.noise_model.refining import refine_under_noise
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -146,7 +149,11 @@ def _off(scale: float) -> str:
 
 @one_blas_thread()
 def sizes(
-    problem: Problem, options: RefineOptions | None = None, *, progress: Progress | None = None
+    problem: Problem,
+    options: RefineOptions | None = None,
+    *,
+    like: NoiseInData | None = None,
+    progress: Progress | None = None,
 ) -> tuple[TargetSize, ...]:
     """Estimate the sizes of all targets of a problem whose scale is said to be known.
 
@@ -156,6 +163,8 @@ def sizes(
         With scale="known" and its raw measurements, without outliers.
     options : RefineOptions, optional
         How the noise is taken; by default it is estimated from the residuals.
+    like : NoiseInData, optional
+        The noise that was found with the sizes as stated: whose errors those of A are, and which drift there is, stay.
     progress : callable, optional
 
     Returns
@@ -182,16 +191,24 @@ def sizes(
         assert isinstance(refined.scale, Mapping)
         found = [TargetSize(target, scale, _sigma_of(refined, target)) for target, scale in refined.scale.items()]
         if any(size.is_doubted or size.is_uncertain for size in found):
-            found = _under_all_noise(free, options, progress or silent) or _with_jackknife(free, found)
+            found = _under_all_noise(free, options, like, progress or silent) or _with_jackknife(free, found)
     return tuple(found)
 
 
-def _under_all_noise(free: Problem, options: RefineOptions | None, progress: Progress) -> list[TargetSize]:
+def _under_all_noise(
+    free: Problem, options: RefineOptions | None, like: NoiseInData | None, progress: Progress
+) -> list[TargetSize]:
     """The sizes under the noise that the data have; none where that cannot be modelled, or is given."""
     if options is not None and (options.noise != "estimate" or options.carrier_noise is not None):
         return []
+    kinds = NoiseOptions()
+    if like is not None:
+        if like.is_drift_untried:
+            return []
+        walk = None if like.correlation is None or like.frame is None else Walk(like.correlation, like.frame)
+        kinds = NoiseOptions(drift=walk or "none", side=like.hand, systematic=like.arms_assumed)
     try:
-        refined, noise = refine_under_noise(free, solve(free), options, progress=progress)
+        refined, noise = refine_under_noise(free, solve(free), options, kinds, progress=progress)
     except (CountError, np.linalg.LinAlgError, RuntimeError):
         return []
     if noise.is_drift_untried:

@@ -14,6 +14,7 @@ from gtsam_rwhec.calibration.stated_poses import contradicted_poses, stated_pose
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.graduated import graduated
@@ -45,7 +46,9 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
     run.record.choose("stated poses", chosen, f"the measurements {do}contradict them")
 
 
-def doubt_stated_sizes(run: Run, refined: Refined, inliers: Inliers) -> tuple[TargetSize, ...]:
+def doubt_stated_sizes(
+    run: Run, refined: Refined, inliers: Inliers, like: NoiseInData | None
+) -> tuple[TargetSize, ...]:
     """What the motion says about sizes that were said to be known; those that it contradicts are found."""
     problem, options, record, what = run.problem, run.options, run.record, "sizes of targets"
     if problem.scale != "known":
@@ -64,7 +67,7 @@ def doubt_stated_sizes(run: Run, refined: Refined, inliers: Inliers) -> tuple[Ta
     )
     # A target of a wrong size contradicts the others: then all of its measurements are asked, not those that agree.
     kept = {pair: mask if 2 * mask.sum() > len(mask) else np.ones(len(mask), bool) for pair, mask in inliers.items()}
-    found = sizes(selected(problem, kept) if kept else problem, how, progress=run.tell)
+    found = sizes(selected(problem, kept) if kept else problem, how, like=like, progress=run.tell)
     doubted = [size for size in found if size.is_doubted]
     together = common_factor(found)
     uncertain = [size for size in found if size.is_uncertain]

@@ -42,6 +42,10 @@ def with_drift(task: Task, steady: Settled, tell: Progress) -> Settled:
     if options.drift == "none" or why_no_drift(task) or (options.drift == "auto" and not is_correlated(steady)):
         return steady
     tell("estimating drift")
+    if isinstance(options.drift, Walk):
+        return task.settle(
+            steady.state, steady.model.side, options.drift, systematic=options.systematic, near=steady.fit
+        )
     thin, systematic = thinned(steady.model), options.systematic
 
     def best_of(kinds: Sequence[Walk], near: Fitted) -> tuple[Walk, Fitted]:

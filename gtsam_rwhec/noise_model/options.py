@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from gtsam_rwhec.noise_model.components import Component
+from gtsam_rwhec.noise_model.drift import Walk
 from gtsam_rwhec.noise_model.rows import Side
 
 #: Whether a track drifts: found out, a random walk, errors with a correlation time, or neither.
@@ -24,8 +25,8 @@ class NoiseOptions:
         Whether A has noise.
     systematic : bool
         Whether A has errors that vary smoothly with the configuration.
-    drift : "auto", "walk", "correlated" or "none"
-        "auto": as the residuals' correlation in time shows.
+    drift : "auto", "walk", "correlated", "none" or Walk
+        "auto": as the residuals' correlation in time shows. A ``Walk``: this kind, which was found before.
     side : "targetcarrier", "sensorcarrier" or None
         Which carrier the errors of A are fixed to: an arm's hand. None: as the data show.
     """
@@ -33,5 +34,5 @@ class NoiseOptions:
     stated: dict[Component, float] = field(default_factory=dict)
     carrier: bool = True
     systematic: bool = True
-    drift: Drift = "auto"
+    drift: Drift | Walk = "auto"
     side: Side | None = None

@@ -16,7 +16,7 @@ from gtsam_rwhec.noise_model.likelihood import Estimate, NoiseModel
 #: The step of differences of gradients, in logarithms.
 STEP = 0.05
 #: A fit ends where -2 log of the density would fall by less than this.
-ENOUGH = 1e-4
+ENOUGH = 1e-3
 #: At most this many evaluations are for one fit; the first of them have the average information as curvature.
 MOST, AVERAGED = 60, 6
 #: No step of the logarithms is longer than this.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -30,6 +30,8 @@ ROUNDS = 4
 SETTLED = 0.05
 #: Components are estimated from at most about this many instants; the unknowns, from all.
 INSTANTS = 300
+#: The rows at so many estimates are kept.
+KEPT = 3
 #: In fewer rows the unknowns have this share of the information of all rows on top.
 HELD = 1e-3
 
@@ -70,6 +72,7 @@ class Task:
     free_directions: tuple[FreeDirection, ...] = ()
     #: Is told each round, so that a long model is seen to move.
     tell: Progress = silent
+    _known: list[tuple[State, Rows]] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def basis(self) -> Array:
@@ -82,11 +85,20 @@ class Task:
 
     def model(self, state: State, side: Side, walk: Walk | None, *, systematic: bool) -> NoiseModel:
         """The model about an estimate, from all measurements."""
-        rows = Rows.of(self.data, self.variables, state, self.layout, self.instants)
+        rows = self._rows(state)
         drift = None if walk is None else DriftPrior.of(rows, walk)
         features = rows.features(side) if systematic else np.zeros((len(rows.residual), 0))
         information, gradient = prior_terms(self.problem, self.variables, state, self.layout, self.basis)
         return NoiseModel(rows, side, self.basis, information, gradient, drift, features)
+
+    def _rows(self, state: State) -> Rows:
+        """The rows at an estimate; those at the last ones are kept, since several models begin where one ended."""
+        for known, rows in self._known:
+            if known is state:
+                return rows
+        self._known.append((state, Rows.of(self.data, self.variables, state, self.layout, self.instants)))
+        del self._known[:-KEPT]
+        return self._known[-1][1]
 
     def sizes(self, model: NoiseModel, *, systematic: bool) -> Sizes:
         """The components' ranges, by the residuals at the start."""
