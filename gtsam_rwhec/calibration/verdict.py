@@ -120,7 +120,7 @@ _ADVICE = {
     Ground.NOT_UNIQUE: "turn the carriers about at least two different axes and measure again, or fix what you know",
     Ground.CONTRADICTED: (
         "check whether the named frame has moved, has another frame's name or was stated at a wrong pose, and whether "
-        "its clock is late"
+        "its intrinsics are right and its clock is not late"
     ),
     Ground.NO_ANSWER: "measure with this sensor, or leave it out of the problem",
     Ground.LATE_CLOCK: (

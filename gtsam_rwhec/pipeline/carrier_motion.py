@@ -44,7 +44,10 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     source, noise = rig.carriers.poses, rig.carriers.noise
     parent, child = source.frames
     if source.topic is None:
-        parent, child, stamps, T = _from_tf(log, parent, child, rig.carriers.sensors)
+        try:
+            parent, child, stamps, T = _from_tf(log, parent, child, rig.carriers.sensors)
+        except TransformError as error:
+            raise TransformError(f"{error} ({rig.source.place(('carriers', 'poses'))})") from error
         where = f"tf {parent} to {child}"
     else:
         where = f"topic {source.topic}"

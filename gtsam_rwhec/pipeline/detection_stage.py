@@ -22,6 +22,7 @@ from gtsam_rwhec.pipeline.log_metadata import LogMetadata
 from gtsam_rwhec.pipeline.no_detections import no_detections
 from gtsam_rwhec.pipeline.output_paths import check_is_not_read, check_writable
 from gtsam_rwhec.pipeline.sensor_detections import detection_report
+from gtsam_rwhec.pipeline.topics_of_rig import check_topics
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
 
@@ -67,6 +68,7 @@ def detect_log(
     with open_log(log_path) as log:
         check_is_not_read(log, out_path)
         check_image_options(log, rig, images=images, workers=workers)
+        check_topics(log, rig)
         cameras = read_intrinsics(log, rig)
         tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
         motion = read_carrier_motion(log, rig)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.reading import Reading
 from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.calibration.task_units import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.results.log_history import SizeFields
 from gtsam_rwhec.rig import Rig
 
+#: A point that is known to this share of its distance only (with 95 %) is known to nothing.
+LARGEST_SHARE = 0.25
 #: Other sizes that are estimated, or other clocks, may look like these.
 NOT_OF_DIRECTIONS = (Mistake.UNIT, Mistake.SCALE, Mistake.ROWS_SHIFTED)
 
@@ -102,3 +107,21 @@ def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig) -> list[Finding]:
             Finding(Ground.SIZE_DOUBTED, f"{said} {words}; {why}carriers' unit of length or the focal lengths")
         ]  # fmt: skip
     return [Finding(Ground.SIZE_ESTIMATED, f"the stated size of {words}; the poses use the size that the motion gives")]
+
+
+def known_to_nothing(points: Iterable[PointUncertainty], rig: Rig) -> list[Finding]:
+    """Points that are known no better than by a part of their distance: what was stated does not fit together.
+
+    Noise that is as large as this is no camera's. Wrong intrinsics of all cameras look like it.
+    """
+    findings = []
+    for point in points:
+        distance_mm = 1e3 * float(np.linalg.norm(point.point_m))
+        if np.isfinite(point.radius_mm) and point.radius_mm > LARGEST_SHARE * distance_mm:
+            place = rig.source.place(("sensors", point.frame, "intrinsics"))
+            words = (
+                f"a point {1e-3 * distance_mm:.2f} m from {point.frame} is known to {point.radius_mm:.0f} mm only, and "
+                f"that is no noise of a camera: intrinsics ({place}), sizes and the carriers' poses do not fit together"
+            )
+            findings.append(Finding(Ground.IMPLAUSIBLE, words))
+    return findings

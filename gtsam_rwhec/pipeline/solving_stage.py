@@ -8,7 +8,7 @@ from pathlib import Path
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.choices import OUTLIERS, Choice
 from gtsam_rwhec.calibration.outliers import Outliers
-from gtsam_rwhec.calibration.verdict import Judgement
+from gtsam_rwhec.calibration.verdict import Judgement, Verdict
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Progress, silent
@@ -22,6 +22,7 @@ from gtsam_rwhec.pipeline.log_findings import (
     estimated_sizes,
     in_rig_file,
     is_of_the_poses,
+    known_to_nothing,
     not_of_late_clocks,
     not_of_marked_outliers,
     with_cures,
@@ -175,6 +176,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     if late:
         findings = not_of_late_clocks(findings, calibration.misreadings)
     findings = (*findings, *late, *estimated_sizes(fields.sizes, rig))
+    if calibration.judgement.verdict is not Verdict.DO_NOT_USE:
+        findings = (*findings, *known_to_nothing(calibration.points.values(), rig))
     judgement = judge(refined.solution, refined, fields, findings)
     calibration = replace(
         calibration,

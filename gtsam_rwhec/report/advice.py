@@ -45,7 +45,7 @@ def log_advice(log: LogFields) -> list[str]:
     if given:
         advice.append(
             f"The time offset of {', '.join(given)} was not estimated. If the clock may be late, write time_offset: "
-            "estimate in the rig file."
+            "estimate in the rig file. Wrong intrinsics show like this, too."
         )
     advice += _sizes(log)
     if log.detection.strangers:

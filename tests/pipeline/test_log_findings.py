@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,13 @@ import pytest
 import synthetic_logs as made
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.task_units import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.pipeline.all_stages import calibrate_log
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
-from gtsam_rwhec.pipeline.log_findings import not_of_marked_outliers
+from gtsam_rwhec.pipeline.log_findings import known_to_nothing, not_of_marked_outliers
 from gtsam_rwhec.pipeline.solving_stage import solve_log
 from gtsam_rwhec.rig import parse_rig, read_rig
 
@@ -144,3 +146,16 @@ def test_measurements_that_look_wrong_are_no_finding_where_outliers_were_looked_
     kept = Finding(Ground.OUTLIERS_KEPT, "4 of 200 measurements look wrong")
     size = Finding(Ground.SIZE_DOUBTED, "the stated size of tag_0 is 3 % larger than the motion says")
     assert not_of_marked_outliers((kept, size)) == (size,)
+
+
+def test_points_that_are_known_to_nothing_are_no_success_and_others_are() -> None:
+    rig = parse_rig(made.RIG, "rig.yaml")
+    point = PointUncertainty(
+        point_m=np.array([0.0, 0.0, 1.5]), frame="cam_1", seen_from="hand", level=0.95, centre_m=np.zeros(3),
+        covariance_m2=np.eye(3), axes=np.eye(3), half_lengths_mm=np.full(3, 800.0), radius_mm=870.0,
+        measurement_mm=None,
+    )  # fmt: skip
+    (found,) = known_to_nothing([point, replace(point, radius_mm=20.0), replace(point, radius_mm=np.inf)], rig)
+    assert found.ground.verdict is rw.Verdict.DO_NOT_USE
+    assert found.words.startswith("a point 1.50 m from cam_1 is known to 870 mm only")
+    assert "(rig.yaml, line 9: sensors.cam_1.intrinsics)" in found.words

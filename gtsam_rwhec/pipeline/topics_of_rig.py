@@ -1,0 +1,56 @@
+"""Whether the topics that a rig file names are in the log, and whether their messages are of the sensors named."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+
+from gtsam_rwhec.errors import LogError, LogWarning
+from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log
+from gtsam_rwhec.rig import Rig
+
+
+def check_topics(log: Log, rig: Rig) -> None:
+    """Check the topics that a rig file names, before anything is read.
+
+    Raises `LogError` for a topic that is not in the log, with the line that names it. Warns (`LogWarning`) of topics
+    whose messages are of the frame of another sensor of the rig file: then two topics were exchanged.
+    """
+    there = {topic.name for topic in log.topics()}
+    for path, topic in _named(rig):
+        if topic not in there and path[-1] != "topic":  # the reader of intrinsics says what else there is
+            raise LogError(
+                f"{rig.source.place(path)}: {log.files[0].path} has no topic {topic}; it has: {log.topics_in_words()}."
+            )
+    owners = {frame: name for name in rig.sensors for frame in (name, rig.frame_of(name))}
+    for path, topic in _named(rig):
+        frame, sensor = _frame_of(log, topic) if topic in there else "", str(path[1])
+        if owners.get(frame, sensor) != sensor:
+            warnings.warn(
+                f"{rig.source.place(path)}: the messages on {topic} are of frame {frame}, which is that of sensor "
+                f"{owners[frame]} and not of {sensor}. Are the topics of the two exchanged?",
+                LogWarning,
+                stacklevel=2,
+            )
+
+
+def _named(rig: Rig) -> Iterator[tuple[KeyPath, str]]:
+    """The topics of sensors and where the rig file names them."""
+    for name, sensor in rig.sensors.items():
+        for key, topic in (("images", sensor.images), ("detections", sensor.detections)):
+            if topic is not None:
+                yield ("sensors", name, key), topic
+        if sensor.intrinsics is not None and sensor.intrinsics.topic is not None:
+            yield ("sensors", name, "intrinsics", "topic"), sensor.intrinsics.topic
+
+
+def _frame_of(log: Log, topic: str) -> str:
+    """The frame of the first message of a topic; empty where it has none, or cannot be read."""
+    if any(each.name == topic and each.unreadable for each in log.topics()):
+        return ""
+    kinds = (ImageRecord, IntrinsicsRecord, DetectionRecord)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LogWarning)  # those who read all of the topic say it
+        first = next((record for record in log.records([topic]) if isinstance(record, kinds)), None)
+    return "" if first is None else first.frame
