@@ -18,7 +18,7 @@ from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.seen_from import Carriers
 from gtsam_rwhec.calibration.sizes import TargetSize
-from gtsam_rwhec.calibration.statement_stage import doubt_stated_poses, doubt_stated_sizes
+from gtsam_rwhec.calibration.statement_stage import doubt_one_pose, doubt_stated_poses, doubt_stated_sizes
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.calibration.views import views_of
 from gtsam_rwhec.errors import OptionError, ScaleError
@@ -91,6 +91,7 @@ def _calibrated(run: Run) -> Calibration:
         reading, found = _read_and_answered(run, first)
         if found.refined is not None:
             doubt_stated_poses(run, found.refined, found.inliers)
+            doubt_one_pose(run, found.refined, found.inliers)
             found_sizes = doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
     problem, record = run.problem, run.record
     solution, inliers, refined = found.solution, found.inliers, found.refined

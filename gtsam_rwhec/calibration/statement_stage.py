@@ -1,4 +1,4 @@
-"""The stage that asks the measurements about what the user stated: poses and sizes."""
+"""The stage that asks the measurements about what the user stated: poses, sizes, and that each frame has one pose."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from gtsam_rwhec.calibration.noise_choice import Inliers, estimated
 from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
 from gtsam_rwhec.calibration.stated_poses import contradicted_poses, stated_poses
+from gtsam_rwhec.calibration.two_poses import two_poses
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import silent
@@ -44,6 +45,12 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
         run.record.find(Ground.COVARIANCE_DOUBTED if one.is_small else Ground.CONTRADICTED, str(one))
     chosen, do = ("as stated, and doubted", "") if found else ("as stated", "do not ")
     run.record.choose("stated poses", chosen, f"the measurements {do}contradict them")
+
+
+def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
+    """Frames that were at two poses are found."""
+    for one in two_poses(run.problem, refined, inliers):
+        run.record.find(Ground.CONTRADICTED, str(one))
 
 
 def doubt_stated_sizes(

@@ -1,0 +1,64 @@
+"""A target or a sensor that moved half way is named, with how far; data without such a move are not accused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rwhec_factors import se3
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.two_poses import two_poses
+
+COUNT = 60
+MOVED = se3.expmap(np.array([[0.03, 0.0, 0.04, 0.03, 0.0, 0.02]]))[0]
+
+
+def poses(chance: np.random.Generator, count: int, angle: float, length: float) -> np.ndarray:
+    return se3.expmap(np.hstack([angle * chance.normal(size=(count, 3)), length * chance.normal(size=(count, 3))]))
+
+
+def problem_of(seed: int, is_moved: np.ndarray, frame: str = "board", noise: float = 1e-3) -> rw.Problem:
+    chance = np.random.default_rng(seed)
+    X, Y = poses(chance, 2, 1.0, 0.5)
+    A = poses(chance, COUNT, 0.5, 0.3)
+    B = np.linalg.inv(Y) @ A @ X
+    B[is_moved] = B[is_moved] @ MOVED if frame == "board" else MOVED @ B[is_moved]
+    problem = rw.Problem()
+    problem.add("board", "camera", A, B @ poses(chance, COUNT, noise, noise))
+    return problem
+
+
+@pytest.mark.parametrize("frame", ["board", "camera"])
+def test_a_frame_that_moved_half_way_is_named(frame: str) -> None:
+    """Least squares and outlier rejection alike put the answer between the two poses, and said USE."""
+    calibration = rw.calibrate(problem_of(1, np.arange(COUNT) >= COUNT // 2, frame))
+    assert calibration.verdict is rw.Verdict.DO_NOT_USE
+    assert calibration.judgement.grounds[0] is rw.Ground.CONTRADICTED
+
+
+def test_the_sentence_says_how_far_and_from_when() -> None:
+    problem = problem_of(2, np.arange(COUNT) >= 31)
+    refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
+    (found,) = two_poses(problem, refined, {})
+    assert (found.frame, found.first, found.second, found.from_row) == ("board", 31, 29, 32)
+    assert found.angle_rad == pytest.approx(0.05, rel=0.05)
+    assert found.distance_m == pytest.approx(float(np.hypot(0.03, 0.02)), rel=0.1)
+    assert "board was at two poses from measurement 32 on" in str(found)
+    assert "groups of 31 and 29, 2.8 degrees and 34.7 mm apart" in str(found)
+
+
+def test_two_poses_that_alternate_have_no_first_row() -> None:
+    problem = problem_of(3, np.arange(COUNT) % 2 == 1)
+    refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
+    (found,) = two_poses(problem, refined, {})
+    assert found.from_row is None
+    assert "board was at two poses: its" in str(found)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_pose_is_not_accused(seed: int) -> None:
+    problem = problem_of(seed, np.zeros(COUNT, dtype=bool), noise=3e-3)
+    refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
+    assert two_poses(problem, refined, {}) == ()
+    few = {pair: np.arange(COUNT) < 12 for pair in problem.pairs}
+    assert two_poses(problem, refined, few) == ()
