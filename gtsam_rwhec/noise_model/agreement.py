@@ -15,9 +15,8 @@ from scipy.special import fdtri
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.components import C
 from gtsam_rwhec.noise_model.drift import drift_columns
-from gtsam_rwhec.noise_model.graph import effects_at, graph_of, optimum_of
 from gtsam_rwhec.noise_model.rows import Instants
-from gtsam_rwhec.noise_model.settling import Settled, Task
+from gtsam_rwhec.noise_model.settling import SETTLED, Settled, Task, moved
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import RefineOptions
@@ -28,6 +27,8 @@ from gtsam_rwhec.refinement.variables import Variables
 FALSE_ALARM = 0.05
 #: A measurement that is left out keeps this part of its weight.
 WEIGHTLESS = 1e-8
+#: The unknowns are settled in at most so many steps, with the measurements that are left out.
+STEPS = 4
 #: A track without any kept measurement is this many steps from one.
 LONGEST = 1e6
 
@@ -56,14 +57,15 @@ def agreeing(
     walk = None if found.model.drift is None else found.model.drift.walk
     sigma = found.fit.sizes.values(found.fit.logs)
     is_systematic = found.model.features.shape[1] > 0
-    model = everything.model(found.state, found.model.side, walk, systematic=is_systematic)
-    made = graph_of(model, sigma, data, variables, found.state, judged)
-    has_free = bool(task.layout.free.shape[1])
-    optimum = optimum_of(made, variables, has_free=has_free, max_iterations=how.max_iterations)
-    state = variables.state(optimum.values)
-    there = everything.model(state, found.model.side, walk, systematic=is_systematic)
+    state = found.state
+    for _ in range(STEPS):
+        there = everything.model(state, found.model.side, walk, systematic=is_systematic)
+        optimum, eliminated = there.eliminated(sigma)
+        if (np.abs(optimum.step) < SETTLED * np.sqrt(np.diagonal(optimum.covariance))).all():
+            break
+        state = moved(state, variables, task.layout, there.basis @ optimum.step)
     rows = there.rows
-    left = rows.residual - effects_at(model, sigma, optimum.values)
+    left = eliminated.left(eliminated.measured.of.columns)
     keep = np.concatenate([inliers[item.pair] for item in data])[rows.instants.order]
     honest = replace(there, rows=replace(rows, given=rows.given * np.where(keep, 1.0, WEIGHTLESS)[:, None, None]))
     E = rows.twist[found.model.side] * np.repeat([sigma[C.CARRIER_ROTATION], sigma[C.CARRIER_TRANSLATION]], 3)

@@ -51,32 +51,19 @@ def average_information(eliminated: Eliminated, active: tuple[C, ...]) -> Array:
 def _working_columns(e: Eliminated, active: tuple[C, ...]) -> Array:
     """V_i P r (N, 6, k), by L^-1 of B's and the stamps' noise."""
     measured, of = e.measured, e.measured.of
-    m, q = of.m, 6 * e.features.shape[1]
     Z = measured.Z
     added: dict[C, Array] = {}
-    y = np.append(e.mean, 1.0)
-    varying = (y[:q].reshape(6, -1) * e.systematic[:, None]) @ e.features.T  # (6, T)
-    effects = [varying.T]
-    if e.drift is not None:
-        states = -(e.drift.whole @ y)
-        effects.append(states * e.drift.unit)
-    effect = np.hstack(effects)
-    left = of.along(Z, y[q:], effect)
-    twists = Z[:, :, of.own : of.own + 6]
+    effects, carrier = e.effects
+    left, twists = e.left(Z), Z[:, :, of.own : of.own + 6]
     if measured.carriers is not None:
-        root, lost = measured.carriers
-        seen = lost[:, :, :m] @ y[q:] + (lost[:, :, m:] @ effect[of.shared, :, None])[:, :, 0]
-        carrier = np.zeros((len(effect), 6))
-        carrier[of.shared] = -(root.transpose(0, 2, 1) @ seen[:, :, None])[:, :, 0] * measured.carrier
-        left += (twists @ of.of_instants(carrier)[:, :, None])[:, :, 0]
         parts = _split(twists, of.of_instants(carrier[:, :, None] * TWIST))
         added |= dict(zip((C.CARRIER_ROTATION, C.CARRIER_TRANSLATION), parts, strict=True))
-    if q:
-        parts = _split(twists, of.of_instants(varying.T[:, :, None] * TWIST))
+    if e.features.shape[1]:
+        parts = _split(twists, of.of_instants(effects[:, :6, None] * TWIST))
         added |= dict(zip((C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION), parts, strict=True))
     if e.drift is not None:
         kinds = np.tile(STATE, (len(e.drift.unit) // TRACK, 1))
-        walks = e.drift.prior.walked(states, kinds, e.drift.sigma) * e.drift.unit[:, None]
+        walks = e.drift.prior.walked(e.states, kinds, e.drift.sigma) * e.drift.unit[:, None]
         parts = _split(Z[:, :, of.own + 6 :], of.of_own_track(walks))
         added |= dict(zip((C.DRIFT_ROTATION, C.DRIFT_TRANSLATION, C.DRIFT_SCALE), parts, strict=True))
     weighted = measured.root.transpose(0, 2, 1) @ left[:, :, None]

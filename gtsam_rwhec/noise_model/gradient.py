@@ -9,6 +9,7 @@ follow. No step divides by a sigma.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -44,6 +45,38 @@ class Eliminated:
     systematic: Array
     features: Array
     products: Array
+
+    @cached_property
+    def states(self) -> Array:
+        """The drift's unit states (T, s); of no drift, (T, 0)."""
+        if self.drift is None:
+            return np.zeros((len(self.features), 0))
+        found: Array = -(self.drift.whole @ np.append(self.mean, 1.0))
+        return found
+
+    @cached_property
+    def effects(self) -> tuple[Array, Array]:
+        """Twists of the systematic errors and the drift's states (T, 6 + s), and shared twists of A (T, 6); rad, m."""
+        measured, of, q = self.measured, self.measured.of, 6 * self.features.shape[1]
+        varying = self.features @ (self.mean[:q].reshape(6, -1) * self.systematic[:, None]).T
+        drift = self.states * (1.0 if self.drift is None else self.drift.unit)
+        found = np.hstack([varying, drift])
+        carrier = np.zeros((len(found), 6))
+        if measured.carriers is not None:
+            root, lost = measured.carriers
+            seen = lost[:, :, : of.m] @ np.append(self.mean[q:], 1.0)
+            seen += (lost[:, :, of.m :] @ found[of.shared, :, None])[:, :, 0]
+            carrier[of.shared] = -(root.transpose(0, 2, 1) @ seen[:, :, None])[:, :, 0] * measured.carrier
+        return found, carrier
+
+    def left(self, columns: Array) -> Array:
+        """What is left (N, 6) of the residuals; ``columns`` are those of the rows, or whitened: ``Reduced.Z``."""
+        of, (effects, carrier) = self.measured.of, self.effects
+        found = of.along(columns, np.append(self.mean[6 * self.features.shape[1] :], 1.0), effects)
+        if self.measured.carriers is not None:
+            twists = columns[:, :, of.own : of.own + 6]
+            found += (twists @ of.of_instants(carrier)[:, :, None])[:, :, 0]
+        return found
 
     def gradient_by(self, active: tuple[C, ...]) -> Array:
         """d(-2 l) / d log sigma (k,) of the active components."""

@@ -212,25 +212,6 @@ def _walk(prior: DriftPrior, sigma: dict[C, float], values: gtsam.Values) -> gts
     return gtsam.LinearContainerFactor.ConvertLinearGraph(linear, values)
 
 
-def effects_at(model: NoiseModel, sigma: dict[C, float], values: gtsam.Values) -> Array:
-    """The part (N, 6) of the residuals that drift, systematic errors and shared twists of A explain, in rows' order."""
-    if model.drift is not None:
-        sigma = _with_smallest_step(sigma, model.drift)
-    effects, index = _Effects.of(model, sigma), model.rows.instants.index
-    explained = np.zeros_like(model.rows.residual)
-    if effects.systematic is not None:
-        explained += effects.systematic @ values.atVector(SYSTEMATIC_KEY)
-    if effects.drift is not None:
-        states = np.array([values.atVector(drift_key(i)) for i in range(model.rows.instants.count)])
-        explained += np.einsum("nij,nj->ni", effects.drift, states[index])
-    if effects.twist is not None:
-        twists = np.zeros((model.rows.instants.count, 6))
-        for i in np.flatnonzero(effects.shared).tolist():
-            twists[i] = values.atVector(twist_key(i))
-        explained += np.einsum("nij,nj->ni", effects.twist, twists[index])
-    return explained
-
-
 def _with_smallest_step(sigma: dict[C, float], prior: DriftPrior) -> dict[C, float]:
     """A drift's translation that is almost nothing beside the rotation's lever is one hundredth of that.
 
