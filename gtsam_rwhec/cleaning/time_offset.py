@@ -105,7 +105,9 @@ def estimate_time_offset(
         )
     problem = RotationProblem.of(carrier, smooth, tracks, max_gap_s, MOST)
     fits = [problem.fit(float(grid[i]), found[i][1]) for i in _minima(costs)]
-    fits = [fit for fit in fits if np.isfinite(fit.sigma_s) and np.isfinite(fit.squares).sum() >= 10]
+    fits = [
+        fit for fit in fits if np.isfinite([fit.sigma_s, fit.rms_rad]).all() and np.isfinite(fit.squares).sum() >= 10
+    ]
     if not fits:
         raise StampError(f"{where}: its rotations agree with the carrier's at no offset; is it the right carrier?")
     cut = (GROSS * min(fit.rms_rad for fit in fits)) ** 2 * 3.0

@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.calibration.clock_stage import LATE_S, SURELY
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.cleaning import TimeOffset, estimate_time_offset
 from gtsam_rwhec.errors import StampError
@@ -27,6 +26,9 @@ from gtsam_rwhec.trajectories.trajectory import Trajectory
 Detections = tuple[np.ndarray, Array]
 #: Rotations that agree to this, rad, about each axis are those of a sensor: another direction need not be tried.
 PLAIN_RAD = np.radians(2.0)
+#: From this offset on, s, and from so many standard deviations on, rotations contradict a stated one. Smaller ones are
+#: the calibration's to find, which knows the noise better.
+LATE_S, SURELY = 0.03, 8.0
 #: The other direction of the carriers' path must fit better by this factor.
 FAR_BETTER = 2.0
 
@@ -77,7 +79,7 @@ def late_clocks(
         if abs(off) > LATE_S and abs(off) > SURELY * found.sigma_s:
             words = (
                 f"the time offset of {sensor} is {stated:g} s in the rig file, but its rotations agree with the "
-                f"carriers' at {found.offset_s:+.4g} s, to +-{1e3 * found.sigma_s:.1g} ms "
+                f"carriers' at {1e3 * found.offset_s:+.1f} ms, to +-{1e3 * found.sigma_s:.1f} ms "
                 f"({rig.source.place(('sensors', sensor, 'time_offset'))}: write time_offset: estimate)"
             )
             findings.append(Finding(Ground.LATE_CLOCK, words))
