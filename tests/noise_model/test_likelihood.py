@@ -55,7 +55,7 @@ def dense_variance(model: NoiseModel, sigma: dict[Component, float]) -> np.ndarr
         states = dense_drift(drift, sigma).reshape(rows.instants.count, drift.states, rows.instants.count, -1)
         G, at = drift_columns(rows, sigma, drift), rows.instants.index
         states = states[at][:, :, at]
-        V = V + np.einsum("nia,namb,mjb->nimj", G, states, G).reshape(6 * N, 6 * N)
+        V = V + np.einsum("nia,namb,mjb->nimj", G, states, G, optimize=True).reshape(6 * N, 6 * N)
     return V
 
 
