@@ -135,7 +135,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/results": {
         "results/test_agreement.py": "covariance_agreement",
-        "results/test_result_file.py": "json_tree schema",
+        "results/test_result_file.py": "json_tree schema written_result",
     },
     "gtsam_rwhec/rig": {
         "rig/test_rig_faults.py": "contradictions",

@@ -30,7 +30,7 @@ from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solution_plots import plot_all
 from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
-from gtsam_rwhec.results.result_file import write_calibration
+from gtsam_rwhec.results.written_result import write_calibration
 from gtsam_rwhec.rig import Rig
 
 #: Names of all that `calibrate_log` leaves in its folder.

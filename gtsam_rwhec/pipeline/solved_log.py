@@ -17,7 +17,8 @@ from gtsam_rwhec.pipeline.log_contract import (
 from gtsam_rwhec.pipeline.log_metadata import LogMetadata, read_cameras, read_embedded_rig
 from gtsam_rwhec.pipeline.measured_pairs import read_pairs, write_pairs
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
-from gtsam_rwhec.results.result_file import calibration_json, parse_result
+from gtsam_rwhec.results.result_file import parse_result
+from gtsam_rwhec.results.written_result import calibration_json
 
 #: A calibrated frame's name gets this ending if the raw log has transforms of a frame with the same name.
 CALIBRATED = "_calibrated"

@@ -7,56 +7,12 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 from harness import Harness, scratch
+from intrinsics_samples import CAMCHAIN, OPENCV, ROS
 from mutations import words_and_lines
 
 from gtsam_rwhec.vision import camera, intrinsics_files
 
 FOLDER = scratch()
-KALIBR = b"""\
-cam0:
-  cam_overlaps: [1]
-  camera_model: pinhole
-  distortion_coeffs: [-0.28, 0.07, 0.0002, 1.8e-05]
-  distortion_model: radtan
-  intrinsics: [458.6, 457.3, 367.2, 248.4]
-  resolution: [752, 480]
-cam1:
-  T_cn_cnm1:
-  - [1.0, 0.0, 0.0, -0.11]
-  camera_model: pinhole
-  distortion_coeffs: [0.01, -0.02, 0.003, -0.0004]
-  distortion_model: equidistant
-  intrinsics: [300, 301, 320, 240]
-  resolution: [640, 480]
-"""
-ROS = b"""\
-image_width: 640
-image_height: 480
-camera_name: narrow_stereo
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [430.2, 0, 306.7, 0, 430.5, 227.2, 0, 0, 1]
-distortion_model: plumb_bob
-distortion_coefficients: {rows: 1, cols: 5, data: [-0.34, 0.18, 1e-3, -2.e-4, 0]}
-"""
-OPENCV = b"""\
-%YAML:1.0
----
-image_width: 640
-image_height: 480
-fisheye_model: 0
-camera_matrix: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 430.2, 0., 306.7, 0., 430.5, 227.2, 0., 0., 1. ]
-distortion_coefficients: !!opencv-matrix
-   rows: 5
-   cols: 1
-   dt: d
-   data: [ -0.34, 0.18, 1e-3, -2.e-4, 0. ]
-"""
 
 
 def read(data: bytes) -> None:
@@ -79,12 +35,11 @@ def mutate(data: bytes, chance: random.Random, plain: Callable[[bytes], bytes]) 
 
 def seeds() -> Iterable[bytes]:
     """One file of each program."""
-    yield b"K" + KALIBR
-    yield b"R" + ROS
-    yield b"R" + OPENCV
-    yield b"R" + ROS.replace(b"plumb_bob", b"rational_polynomial").replace(b"cols: 5", b"cols: 8").replace(
-        b"-2.e-4, 0]", b"-2.e-4, 0, 0, 0, 0]"
-    )
+    eight_coefficients = ROS.replace("plumb_bob", "rational_polynomial").replace("cols: 5", "cols: 8")
+    yield b"K" + CAMCHAIN.encode()
+    yield b"R" + ROS.encode()
+    yield b"R" + OPENCV.encode()
+    yield b"R" + eight_coefficients.replace("-2.e-4, 0]", "-2.e-4, 0, 0, 0, 0]").encode()
 
 
 HARNESS = Harness(read, seeds, mutate)

@@ -11,7 +11,7 @@ from mutations import json_tree
 
 from gtsam_rwhec.calibration.calibrating import calibrate
 from gtsam_rwhec.refinement import refined, refining
-from gtsam_rwhec.results import result_file
+from gtsam_rwhec.results import result_file, written_result
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.solving import certified_solution
 
@@ -45,14 +45,14 @@ def seeds() -> Iterable[bytes]:
         warnings.simplefilter("ignore")
         for problem in problems:
             solution = certified_solution.solve(problem)
-            result_file.write_solution(solution, folder / "a.json")
+            written_result.write_solution(solution, folder / "a.json")
             yield (folder / "a.json").read_bytes()
         better: refined.Refined = refining.refine(problems[0], certified_solution.solve(problems[0]))
         calibrations = [calibrate(problem) for problem in problems[:2]]
-    result_file.write_refined(better, folder / "b.json")
+    written_result.write_refined(better, folder / "b.json")
     yield (folder / "b.json").read_bytes()
     for calibration in calibrations:
-        yield result_file.calibration_json(calibration)
+        yield written_result.calibration_json(calibration)
     for version in (1, 2, 3, 4, 5):
         yield (GOLDEN / f"result_version_{version}.json").read_bytes()
 
