@@ -77,8 +77,11 @@ def _say_drift(run: Run, model: NoiseInData) -> None:
     what, record = "drift", run.record
     if model.is_drift_untried:
         evidence = "more pairs are measured at the same instants than its model can hold"
-        record.choose(what, "seen, and not modelled", evidence)
-        words = "errors of neighbours in time are alike, so the standard deviations may be too small"
+        record.choose(what, "seen, and not modelled; blocks of time widen the standard deviations", evidence)
+        words = (
+            "errors of neighbours in time are alike, and no model holds them; the standard deviations were widened as "
+            "blocks of time show, and may still be too small"
+        )
         record.find(Ground.CORRELATED, words)
     elif model.correlation is None:
         if run.options.drift == "none":

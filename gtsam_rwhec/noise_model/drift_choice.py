@@ -17,7 +17,7 @@ from gtsam_rwhec.noise_model.settling import Settled, Task, start_at, thinned
 #: A track has at least this many instants for a drift.
 SHORTEST_TRACK = 20
 #: Tracks that are seen at the same instants share a state of at most this many tracks.
-MOST_TRACKS = 6
+MOST_TRACKS = 9
 #: Kinds of drift that are tried.
 FIRST_WALKS: dict[Drift, tuple[Walk, ...]] = {
     "auto": tuple(Walk(each, frame) for each in (1.0, 0.9) for frame in get_args(Frame)),

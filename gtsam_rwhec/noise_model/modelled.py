@@ -10,6 +10,7 @@ from scipy.special import expit
 
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.noise_model.blocks import widening
 from gtsam_rwhec.noise_model.components import SYSTEMATIC, Component
 from gtsam_rwhec.noise_model.drift_choice import MOST_TRACKS, is_correlated, why_no_drift, with_drift
 from gtsam_rwhec.noise_model.found import Deviation, NoiseInData
@@ -98,7 +99,7 @@ def noise_in(task: Task, found: Settled, mixture: Mixture) -> NoiseInData:
         systematic_evidence=found.systematic_evidence,
         drift_not_sought=why_no_drift(task),
         has_stamps=task.instants.seconds is not None,
-        is_drift_untried=task.instants.chains > MOST_TRACKS and is_correlated(found, SURELY_CORRELATED),
+        is_drift_untried=is_drift_untried(task, found),
         arms_assumed=C.SYSTEMATIC_ROTATION in active,
         systematic_probability=_probability(task, found),
     )
@@ -111,7 +112,15 @@ def mixed(task: Task, found: Settled) -> tuple[JointCovariance, Mixture]:
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
     finite = basis @ mixture.covariance @ basis.T + constant_error(task, found, state, mixture)
+    if is_drift_untried(task, found):
+        wider = widening(task, found)
+        finite = finite * wider[:, None] * wider
     return replace(task.layout, finite=finite), mixture
+
+
+def is_drift_untried(task: Task, found: Settled) -> bool:
+    """Whether errors of neighbours are alike, and there are too many tracks for a model of that."""
+    return task.instants.chains > MOST_TRACKS and is_correlated(found, SURELY_CORRELATED)
 
 
 def constant_error(task: Task, found: Settled, state: State, mixture: Mixture) -> Array:

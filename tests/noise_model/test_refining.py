@@ -190,18 +190,6 @@ def test_frames_that_thinned_rows_do_not_see_are_held() -> None:
     assert refined.contains("rare", X, 0.9999)
 
 
-def test_correlated_errors_of_many_tracks_are_said() -> None:
-    chance = np.random.default_rng(1)
-    A = random_poses(chance, 40, 0.7, 0.3)
-    problem = rw.Problem()
-    for i in range(7):
-        slow = se3.expmap(0.003 * np.cumsum(chance.normal(size=(40, 6)), axis=0))
-        problem.add(f"tag_{i}", "camera", A, np.linalg.inv(Y) @ A @ X @ slow, stamps_ns=np.arange(40) * 10**8)
-    calibration = rw.calibrate(problem, rw.CalibrateOptions(systematic=False, time_offsets=False, robust="none"))
-    assert rw.Ground.CORRELATED in calibration.judgement.grounds
-    assert calibration.verdict is rw.Verdict.CARE
-
-
 def test_a_component_is_held_where_it_is_stated_and_free_elsewhere() -> None:
     sizes = Sizes.of({C.ROTATION: 0.01, C.TRANSLATION: 0.004}, {C.ROTATION: 0.02})
     assert sizes.penalty(np.log([0.02, 0.3 * 0.004])) == pytest.approx(0.0, abs=1e-12)
