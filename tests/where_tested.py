@@ -80,7 +80,8 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/logs": {
         "logs/test_hostile_bags.py": "bag_definitions ros1_checks ros2_checks",
         "logs/test_hostile_logs.py": "mcap_chunks mcap_index mcap_records",
-        "logs/test_mcap_reader.py": "checked_poses decoders mcap_blocks message_kinds records ros2_schemas",
+        "logs/test_mcap_reader.py": "mcap_blocks",
+        "logs/test_message_kinds.py": "checked_poses decoders records ros2_schemas",
         "logs/test_mcap_writer.py": "foxglove_schemas written_schemas",
         "logs/test_ros_bags.py": "ros_bag_process",
     },
@@ -103,7 +104,9 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/pipeline": {
         "pipeline/test_all_stages.py": "image_options",
-        "pipeline/test_bad_logs.py": "intrinsics no_detections output_paths",
+        "pipeline/test_bad_images.py": "intrinsics",
+        "pipeline/test_bad_logs.py": "no_detections",
+        "pipeline/test_log_findings.py": "output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",
         "pipeline/test_same_log.py": "changed_rig log_metadata",
         "pipeline/test_synthetic_calibration.py": (
@@ -151,10 +154,11 @@ TABLE: dict[str, dict[str, str]] = {
         "solver/test_bound.py": "curvature null_vectors part_form polish region stored_form weakest_rotation",
         "solver/test_measured_form.py": "exact_residuals given measured_priors point",
         "solver/test_reduced_form.py": "full_form variables",
-        "solver/test_search.py": "options stages",
+        "solver/test_search.py": "stages",
+        "solver/test_search_methods.py": "options",
     },
     "gtsam_rwhec/solving": {
-        "solving/test_certified_solution.py": "part_solution solution",
+        "solving/test_certified_solution.py": "part_solution",
     },
     "gtsam_rwhec/trajectories": {"trajectories/test_trajectory.py": "local_paths"},
     "gtsam_rwhec/vision": {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from seeded_problems import Case
+from seeded_case import Case
 from stated_cost import Rows
 
 import gtsam_rwhec as rw

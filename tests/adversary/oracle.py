@@ -17,7 +17,7 @@ import numpy as np
 from exact_cost import RationalPoses, exact_cost
 from global_search import minima, weighted_matrix
 from pair_descent import Answers, PairDescent, Region
-from seeded_problems import Case
+from seeded_case import Case
 from stated_cost import Enclosure, Poses, Rows, StatedCost
 
 import gtsam_rwhec as rw

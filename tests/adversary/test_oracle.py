@@ -17,7 +17,8 @@ from given_rows import given_rows
 from naive_cost import naive_cost
 from oracle import centres, judged
 from pair_descent import PairDescent, Region
-from seeded_problems import KINDS, Case, seeded
+from seeded_case import Case
+from seeded_problems import KINDS, seeded
 from stated_cost import Poses, Rows, StatedCost
 
 import gtsam_rwhec as rw

@@ -1,51 +1,19 @@
-"""What the motion determines: alone, along the graph, together; without noise and statistically with it."""
+"""What the motion determines: alone, along the graph, together; without noise and with it."""
 
 from __future__ import annotations
 
-import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from places import GOLDEN
+from identified_problems import FRAMES, MOCAP, NOISE, identify, of_motions
 from rwhec_factors.se3 import inverse, pose
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import NotUniqueWarning, RwhecWarning, ScaleError
+from gtsam_rwhec.errors import NotUniqueWarning
 from gtsam_rwhec.identifiability import FreeKind, FreeReason
-from gtsam_rwhec.simulate import Motion, Noise, carrier_poses, general, perturb, sphere
+from gtsam_rwhec.simulate import Motion, general, perturb, sphere
 from gtsam_rwhec.simulate.transforms import random_poses
-
-GOLDEN_FIGURE_8 = GOLDEN / "utias_figure_8.txt"
-NOISE = Noise(0.01, 1250.0)  # 1 cm, 0.02 rad
-MOCAP = Noise(0.001, 2e4)  # 1 mm, 0.005 rad
-FRAMES = random_poses(8, 1.0, np.random.default_rng(12))
-
-
-def identify(problem: rw.Problem) -> rw.Identifiability:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RwhecWarning)
-        return rw.solve(problem).identifiability
-
-
-def of_motions(
-    motions: dict[tuple[int, int], tuple[Motion, int]],
-    noise: Noise | None,
-    noise_in_A: Noise | None = None,
-    seed: int = 0,
-) -> rw.Problem:
-    """Pairs (target, sensor), each seen on a motion of its own, so many times."""
-    problem = rw.Problem()
-    generator = np.random.default_rng(seed)
-    for (j, k), (motion, count) in motions.items():
-        X, Y = FRAMES[j], FRAMES[4 + k]
-        A = inverse(carrier_poses(motion, count, generator))
-        B = perturb(inverse(Y) @ A @ X, noise, generator)
-        weights = {} if noise is None else {"sigma": noise.sigma_m, "kappa": noise.kappa}
-        problem.add(f"tag{j}", f"cam{k}", perturb(A, noise_in_A, generator), B, **weights)
-    return problem
-
 
 # -- one pair: Corollaries 2 and 4 ------------------------------------------------------------------
 
@@ -292,200 +260,6 @@ def test_with_every_frame_known_the_scale_is_still_determined() -> None:
     solution = rw.solve(problem)
     assert solution.identifiability.is_unique
     assert solution.scale == pytest.approx(1.0, abs=0.05)
-
-
-# -- statistics -------------------------------------------------------------------------------------
-
-RUNS = 60
-
-
-def verdicts(
-    motion: Any, count: int, scale: str, noise_in_A: Noise | None, turned_at: str = "world"
-) -> tuple[list[bool], list[bool]]:
-    """is_unique of many simulated wholes and of their pairs."""
-    wholes, pairs = [], []
-    for seed in range(RUNS):
-        simulation = general(
-            2,
-            1,
-            seed=seed,
-            motion=motion,
-            number_of_measurements=count,
-            noise=NOISE,
-            scale=scale,
-            noise_in_A=noise_in_A,
-        )
-        problem = simulation.problem
-        if turned_at == "rig":  # motion capture's noise acts where the rig is, not at the world's origin
-            generator = np.random.default_rng(seed)
-            at_rig = rw.Problem(problem.scale)
-            for target, sensor in problem.pairs:
-                data = problem.measurements(target, sensor)
-                A = inverse(perturb(inverse(data.A), MOCAP, generator))
-                at_rig.add(target, sensor, A, data.B, data.sigma, data.kappa)
-            problem = at_rig
-        try:
-            known = identify(problem)
-        except ScaleError:  # a mirror image fits motion about one axis as well: refused, and not called determined
-            assert scale != "known"
-            continue
-        wholes.append(known.is_unique)
-        pairs += [pair.is_unique for pair in known.pairs.values()]
-    return wholes, pairs
-
-
-@pytest.mark.parametrize(
-    ("motion", "count", "scale", "noise_in_A", "turned_at"),
-    [
-        ("planar", 4, "known", NOISE, "world"),
-        ("planar", 30, "known", NOISE, "world"),
-        ("planar", 30, "known", MOCAP, "world"),
-        ("planar", 10, "known", None, "rig"),
-        ("planar", 10, "shared", NOISE, "world"),
-        ("planar", 10, "per_target", NOISE, "world"),
-        ("single_axis", 10, "known", NOISE, "world"),
-        ("single_axis", 10, "shared", MOCAP, "world"),
-        ("none", 10, "known", NOISE, "world"),
-        ("none", 10, "known", None, "rig"),
-    ],
-)
-def test_a_free_direction_is_practically_never_called_determined(
-    motion: Any, count: int, scale: str, noise_in_A: Any, turned_at: str
-) -> None:
-    """At a significance of 1e-3, two among up to 180 verdicts is a chance of 1 in 100 that the test forgives."""
-    wholes, pairs = verdicts(motion, count, scale, noise_in_A, turned_at)
-    assert len(wholes) > RUNS // 4
-    assert sum(wholes) <= 1
-    assert sum(pairs) <= 2
-
-
-def few(kind: Any, seed: int, count: int, noise_in_A: Noise | None, scale: Any = "known") -> rw.Problem:
-    """A precise sensor, and a carrier whose rotations are off about the rig, or about the world's origin."""
-    of_B = Noise(1e-4, 2e6)  # 0.1 mm, 0.03 degrees
-    motion = Motion(kind, max_angle_rad=0.3 if kind != "general" else 1.0)
-    problem = general(1, 1, seed=seed, motion=motion, noise=of_B, number_of_measurements=count, scale=scale).problem
-    data = problem.measurements("target0", "sensor0")
-    A = perturb(data.A, noise_in_A, seed) if seed % 2 else inverse(perturb(inverse(data.A), noise_in_A, seed))
-    noisy = rw.Problem(scale)
-    noisy.add("target0", "sensor0", A, data.B, data.sigma, data.kappa)
-    return noisy
-
-
-@pytest.mark.parametrize("scale", ["known", "shared"])
-@pytest.mark.parametrize("kind", ["single_axis", "planar"])
-@pytest.mark.parametrize("count", [3, 4])
-def test_few_equations_to_spare_do_not_make_the_test_brave(kind: Any, count: int, scale: Any) -> None:
-    """The fit puts the target where A's noise takes up residuals, by metres; the noise must not seem small."""
-    wholes = []
-    for seed in range(RUNS // 3):
-        try:
-            known = identify(few(kind, seed, count, Noise(1e-4, 2e4), scale))  # 0.3 degrees
-        except ScaleError:
-            continue
-        (pair,) = known.pairs.values()
-        assert pair.is_unique is known.is_unique
-        wholes.append(known.is_unique)
-    assert len(wholes) > RUNS // 12
-    assert not any(wholes)
-
-
-def test_three_rich_measurements_are_enough() -> None:
-    """Turns of up to 60 degrees, with noise of 0.06 and 0.03 degrees: three determine the pair."""
-    verdicts = [identify(few("general", seed, 3, Noise(1e-4, 5e5))).is_unique for seed in range(RUNS // 2)]
-    assert sum(verdicts) >= RUNS // 2 - 1
-
-
-@pytest.mark.parametrize("count", [10, 40])
-@pytest.mark.parametrize(
-    ("of_B", "of_A"), [(Noise(0.001, 5e5), Noise(0.005, 2500.0)), (Noise(0.002, 1e5), Noise(0.007, 1800.0))]
-)
-def test_weights_too_modest_for_the_sensor_do_not_excuse_the_carrier(of_B: Noise, of_A: Noise, count: int) -> None:
-    """The residuals are about what sigma and kappa say, but it is A that is off: nothing shows which of the two."""
-    verdicts = []
-    for seed in range(RUNS // 2):
-        simulation = general(
-            1, 1, seed=seed, motion="planar", noise=of_B, noise_in_A=of_A, number_of_measurements=count
-        )
-        data = simulation.problem.measurements("target0", "sensor0")
-        problem = rw.Problem()
-        problem.add("tag", "cam", data.A, data.B, NOISE.sigma_m, NOISE.kappa)
-        verdicts.append(identify(problem).is_unique)
-    assert sum(verdicts) <= 1
-
-
-@pytest.mark.parametrize(
-    ("count", "scale", "noise_in_A"),
-    [(5, "known", None), (5, "known", MOCAP), (10, "shared", MOCAP), (10, "per_target", MOCAP), (30, "known", NOISE)],
-)
-def test_a_determined_problem_is_never_called_free(count: int, scale: str, noise_in_A: Any) -> None:
-    wholes, pairs = verdicts("general", count, scale, noise_in_A)
-    assert wholes == [True] * RUNS
-    assert pairs == [True] * (2 * RUNS)
-
-
-@pytest.mark.parametrize(("wobble_rad", "unique"), [(0.0, False), (0.2, True)])
-def test_a_wobble_beyond_the_noise_determines(wobble_rad: float, unique: bool) -> None:
-    """Planar motion with the carrier tilting by ten times what the sensor's rotations are off by."""
-    motion = Motion("planar", wobble_rad=wobble_rad)
-    wholes, _ = verdicts(motion, 20, "known", MOCAP)
-    assert wholes == [unique] * RUNS
-
-
-# -- the real dataset -------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def real(utias_folder: Path) -> rw.Solution:
-    return rw.solve(rw.read_csv(utias_folder, sigma=1.0, kappa=1.0))
-
-
-def figure_8(known: rw.Identifiability, targets: list[str], sensors: list[str]) -> list[str]:
-    """A row for each sensor, a column for each target: B blue, unique alone; r red, not; . white, not observed."""
-    rows = []
-    for sensor in sensors:
-        pairs = [known.pairs.get((target, sensor)) for target in targets]
-        rows.append(sensor + " " + "".join("." if p is None else "B" if p.is_unique else "r" for p in pairs))
-    return rows
-
-
-def test_the_real_dataset_is_unique(real: rw.Solution) -> None:
-    known = real.identifiability
-    assert real.certificate.status == "certified"
-    assert known.is_unique
-    assert known.free_directions == ()
-    assert known.weakest > 10.0 * known.threshold
-    assert len(known.parts) == 1
-
-
-def test_figure_8_of_the_real_dataset(real: rw.Solution) -> None:
-    targets = sorted(real.X, key=lambda name: int(name[4:]))
-    grid = figure_8(real.identifiability, targets, sorted(real.Y))
-    assert grid == GOLDEN_FIGURE_8.read_text().splitlines()
-    joined = "".join(row.split()[1] for row in grid)
-    assert (len(joined) - joined.count(".")) == 73
-
-
-def test_red_squares_are_motions_in_the_plane(real: rw.Solution, utias_folder: Path) -> None:
-    """Read from A itself, without any residual: how far each pair's rotations leave one common axis, in degrees."""
-    problem = rw.read_csv(utias_folder, sigma=1.0, kappa=1.0)
-    for pair, value in real.identifiability.pairs.items():
-        R = problem.measurements(*pair).A[:, :3, :3]
-        # The direction that the rotations keep best, and the mean angle by which they tilt it.
-        _, s, _ = np.linalg.svd(R.mean(axis=0))
-        tilt_deg = np.degrees(np.arccos(min(1.0, s[0])))
-        if tilt_deg < 0.2:
-            assert not value.is_unique, pair
-            assert value.rotation_axes < 2, pair
-        if tilt_deg > 3.0 and len(R) >= 10:
-            assert value.is_unique, pair
-            assert value.rotation_axes == 2, pair
-
-
-def test_nothing_that_was_not_seen_is_in_the_grid(real: rw.Solution) -> None:
-    assert set(real.identifiability.pairs) == set(real.residuals)
-    for pair, value in real.identifiability.pairs.items():
-        assert value.number_of_measurements == real.residuals[pair].number_of_measurements
-        assert value.is_unique is (value.free_directions == ())
 
 
 def test_pose_of_the_far_frames_is_not_needed_for_the_verdict() -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.simulate import Noise, Simulation, general
 from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.descent import Descent, descend, homogeneous
@@ -25,6 +27,7 @@ from gtsam_rwhec.solver.start import spectral_start
 SMALL_NOISE = Noise(0.01, 6500.0)
 #: Sixty degrees about each axis, and half a metre.
 GROSS_NOISE = Noise(0.5, 0.4)
+SCALES: tuple[ScaleMode, ...] = ("known", "shared", "per_target")
 
 
 def simulated(targets: int = 2, sensors: int = 1, seed: int = 0, **options: Any) -> Simulation:
@@ -46,6 +49,13 @@ def reduced(problem: rw.Problem) -> ReducedForm:
 def searched(problem: rw.Problem, **options: Any) -> Search:
     """A search that has not run."""
     return Search.of(part_of(problem), SolveOptions(**options))
+
+
+def solved(problem: rw.Problem, method: str = "auto", **options: object) -> rw.Solution:
+    """Solve without warnings: tests read the certificate."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rw.errors.RwhecWarning)
+        return rw.solve(problem, method, options=SolveOptions(**options))
 
 
 def optimum(problem: rw.Problem) -> Descent:
