@@ -23,7 +23,10 @@ from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs.written_schemas import json_schema
-from gtsam_rwhec.rig import Rig, parse_rig
+from gtsam_rwhec.pipeline.cleaning_stage import clean_log
+from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
+from gtsam_rwhec.rig import Rig, parse_rig, read_rig
 
 BEGIN_NS = 1_700_000_000_000_000_000
 SIZE_M = 0.12
@@ -253,3 +256,12 @@ def _pose(T: Array) -> dict[str, dict[str, float]]:
         "position": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
         "orientation": dict(zip("xyzw", quaternion, strict=True)),
     }
+
+
+def solved(folder: Path, messages: Iterable[Message], text: str) -> Calibrated:
+    """The answer of the stages to a log and a rig file, without the files for others and the plots, which take long."""
+    (folder / "rig.yaml").write_text(text, encoding="utf-8")
+    detected, rig = folder / "detected.mcap", read_rig(folder / "rig.yaml")
+    detect_log(write(folder / "raw.mcap", messages), rig, detected)
+    clean_log(detected, detected, rig)
+    return solve_log(detected, rig)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import synthetic_logs as made
-from bad_logs import MOVING, RECORDED, SEEN, WITH_IMAGES, calibrate, images, linked, picture, refused
+from bad_logs import MOVING, RECORDED, SEEN, WITH_IMAGES, images, linked, picture, refused
 from synthetic_logs import BEGIN_NS
 
 from gtsam_rwhec.errors import LogError, LogWarning, TransformError
@@ -125,7 +125,8 @@ def test_nothing_is_seen(tmp_path: Path) -> None:
 
 
 def test_a_size_that_is_wrong_is_said_although_it_counts_as_known(tmp_path: Path) -> None:
-    sizes = {s.target: s for s in calibrate(tmp_path, made.recording(5.0, true_size={"tag_1": 0.95})).log.sizes}
+    messages = made.recording(5.0, true_size={"tag_1": 0.95})
+    sizes = {s.target: s for s in made.solved(tmp_path, messages, made.rig_text()).log.sizes}
     assert [name for name, size in sizes.items() if size.is_doubted] == ["tag_1"]
     assert not sizes["tag_1"].is_free
     assert sizes["tag_1"].scale > 1.02

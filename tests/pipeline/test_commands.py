@@ -15,7 +15,7 @@ from ros2_twin import CELL, write_twins
 import gtsam_rwhec as rw
 from gtsam_rwhec.logs import ImageRecord, open_log
 
-IMAGES = 8
+IMAGES = 5
 #: `init` looks for the tags of every family in each image.
 IMAGES_OF_INIT = 1
 

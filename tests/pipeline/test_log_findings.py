@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +15,8 @@ from gtsam_rwhec.calibration.task_units import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.pipeline.all_stages import calibrate_log
-from gtsam_rwhec.pipeline.cleaning_stage import clean_log
-from gtsam_rwhec.pipeline.detection_stage import detect_log
 from gtsam_rwhec.pipeline.log_findings import known_to_nothing, not_of_marked_outliers
-from gtsam_rwhec.pipeline.solving_stage import solve_log
-from gtsam_rwhec.rig import parse_rig, read_rig
+from gtsam_rwhec.rig import parse_rig
 
 EXCHANGED = made.RIG.replace("sensors: hand", "sensors: base").replace("targets: base", "targets: hand")
 ESTIMATED = "detections: /cam_{0}/tags\n    time_offset: estimate"
@@ -30,36 +24,22 @@ ESTIMATED = "detections: /cam_{0}/tags\n    time_offset: estimate"
 
 def judged(folder: Path, messages: Iterable[made.Message], text: str) -> rw.Judgement:
     """The judgement of the stages, without exports and plots."""
-    (folder / "rig.yaml").write_text(text, encoding="utf-8")
-    detected, rig = folder / "detected.mcap", read_rig(folder / "rig.yaml")
-    detect_log(made.write(folder / "raw.mcap", messages), rig, detected)
-    clean_log(detected, detected, rig)
-    return solve_log(detected, rig).judgement
-
-
-def calibrated(
-    folder: Path, messages: Iterable[made.Message], text: str
-) -> tuple[subprocess.CompletedProcess[str], str]:
-    """The command's end, and the first paragraph of its report, without line breaks."""
-    log = made.write(folder / "raw.mcap", messages)
-    (folder / "rig.yaml").write_text(text, encoding="utf-8")
-    command = [sys.executable, "-m", "gtsam_rwhec", "calibrate", "raw.mcap", "--rig", "rig.yaml", "-o", "out"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=log.parent)
-    return done, " ".join(done.stdout.split("\n\n")[0].split())
+    return made.solved(folder, messages, text).judgement
 
 
 def test_exchanged_carriers_are_named_with_their_lines_though_clocks_are_estimated(tmp_path: Path) -> None:
     text = EXCHANGED
     for number in range(2):
         text = text.replace(f"detections: /cam_{number}/tags", ESTIMATED.format(number))
-    done, said = calibrated(tmp_path, made.recording(6.0), text.replace("sizes: known", "sizes: check"))
-    assert done.returncode == 6, done.stdout + done.stderr
+    judgement = judged(tmp_path, made.recording(6.0), text.replace("sizes: known", "sizes: check"))
+    assert judgement.verdict is rw.Verdict.DO_NOT_USE
+    said = str(judgement)
     assert said.startswith("Do not use these poses: A is inverted (the poses of the base and the hand are exchanged)")
     assert "deg and" in said.split("the median residual is ")[1].split(" as read, and ")[0]
-    assert "if hand carries the sensors, exchange the two names in rig.yaml, lines 2 and 3: carriers.sensors" in said
+    rig = tmp_path / "rig.yaml"
+    assert f"if hand carries the sensors, exchange the two names in {rig}, lines 2 and 3: carriers.sensors" in said
     assert "contradict" not in said
-    grounds = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))["verdict_grounds"]
-    assert grounds == ["misread"]
+    assert judgement.grounds == (Ground.MISREAD,)
 
 
 def test_poses_of_a_topic_that_are_the_inverse_of_what_the_rig_file_says(tmp_path: Path) -> None:
@@ -80,11 +60,10 @@ def test_poses_of_a_topic_that_are_the_inverse_of_what_the_rig_file_says(tmp_pat
 
 
 def test_the_order_of_the_frames_of_tf_changes_nothing(tmp_path: Path) -> None:
-    log = made.write(tmp_path / "raw.mcap", made.recording(2.5))
-    found = []
-    for number, order in enumerate(("[base, hand]", "[hand, base]")):
+    messages, found = made.recording(2.5), []
+    for order in ("[base, hand]", "[hand, base]"):
         text = made.rig_text(poses=f"{{tf: {order}}}\n  noise: {{rotation_deg: 0.5, translation_mm: 0.1}}")
-        found.append(calibrate_log(log, parse_rig(text, "rig.yaml"), tmp_path / f"out_{number}").refined)
+        found.append(made.solved(tmp_path, messages, text).refined)
     for name, T in found[0].Y.items():
         np.testing.assert_array_equal(found[1].Y[name].matrix(), T.matrix())
         np.testing.assert_array_equal(found[1].covariance(name), found[0].covariance(name))
