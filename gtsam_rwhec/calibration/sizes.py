@@ -39,6 +39,8 @@ UNCERTAIN_SIGMAS = 3.5
 SPEAKING_SIGMAS = 2.0
 #: A size is doubted only if it also differs by this share: printers, calipers and intrinsics are seldom more exact.
 SIZE_SHARE = 0.004
+#: A size that is off by more than this factor is none that the motion tells.
+LARGEST = 1e4
 #: So many blocks of each pair's rows are left out in turn.
 BLOCKS = 10
 #: With so few blocks, the standard deviation itself is uncertain: the ratio of Student's and Gauss's quantiles at the
@@ -185,7 +187,11 @@ def sizes(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RwhecWarning)  # they are about sizes that nobody uses
         try:
-            refined = refine(free, solve(free), options or RefineOptions(noise="estimate"))
+            start = solve(free)
+            assert isinstance(start.scale, dict)
+            if not all(1.0 / LARGEST < scale < LARGEST for scale in start.scale.values()):
+                return ()  # the lengths of B tell nothing, or they are those of another unit: that is a misreading
+            refined = refine(free, start, options or RefineOptions(noise="estimate"))
         except (ScaleError, CountError, NoiseError, UnderdeterminedError):
             return ()
         assert isinstance(refined.scale, Mapping)

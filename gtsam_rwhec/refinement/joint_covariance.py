@@ -65,7 +65,10 @@ class JointCovariance:
         Q = np.linalg.svd(basis, full_matrices=True)[0][:, basis.shape[1] :] if has_free else np.eye(len(unit))
         inside = Q.T @ scaled @ Q if has_free else scaled
         # Equilibrated, so that each parameter's own information is the scale of its rounding.
-        size = np.sqrt(np.maximum(np.diagonal(inside), 1e-300))
+        # What is below the rounding of the largest, once directions are mixed, is nothing.
+        diagonal = np.diagonal(inside)
+        least = ROUNDING**2 * diagonal.max(initial=0.0) if has_free else 0.0
+        size = np.sqrt(np.maximum(diagonal, max(least, 1e-300)))
         inside = inside / size[:, None] / size
         if not has_free and len(unit) > SMALL:
             inverse = _surely_definite_inverse(inside)
@@ -76,6 +79,7 @@ class JointCovariance:
         lost = values <= ROUNDING * values.max(initial=0.0)
         if lost.any():  # no measurement depends on these directions
             more = Q @ (vectors[:, lost] / size[:, None])
+            more /= np.abs(more).max(axis=0)  # a parameter without information has a size of 1e-150
             return JointCovariance.of(unknowns, information, np.hstack([free, more * unit[:, None]]), unit)
         root = Q @ (vectors / np.sqrt(values) / size[:, None])
         finite = (root @ root.T) * np.outer(unit, unit)

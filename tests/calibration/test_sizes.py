@@ -92,3 +92,8 @@ def test_sizes_that_are_off_by_one_factor_are_said_together() -> None:
     assert common_factor([TargetSize("a", 1.001, 0.0001), TargetSize("b", 1.001, 0.0001)]) is None
     assert common_factor([TargetSize("a", 1.05, 0.002)]) is None
     assert common_factor([TargetSize("a", 1.05, 0.002), TargetSize("b", 1.0, 0.05)]) is None  # b says nothing
+
+
+def test_lengths_that_run_away_are_no_sizes() -> None:
+    """Where motion tells no size the scale may run to 1e14, which ended in a LinAlgError of LAPACK."""
+    assert sizes(with_wrong_size(1e6)) == ()
