@@ -9,7 +9,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.dictionaries import dictionary
 from gtsam_rwhec.vision.images import Gray
-from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard
+from gtsam_rwhec.vision.targets import AprilGrid, Charuco
 
 #: cornerSubPix ends after 30 rounds, or with a step of at most 1e-3 pixels.
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
@@ -26,12 +26,8 @@ MEASURE = 0.13
 MEASURE_GAP = 0.55
 #: A corner further than this (pixels) from the place that the other corners predict is not used.
 ASTRAY_PX = 1.5
-#: The half window at a checkerboard's corner is this share of a square's side.
-OF_SQUARE = 0.4
 #: Blur and the gradient's window carry a marker's edge outwards by this many pixels.
 GRADIENT_PX = 0.5
-#: A checkerboard's outermost squares need at least this share of the contrast of its inner squares.
-LEAST_CONTRAST = 0.3
 
 
 def charuco_detector(board: Charuco) -> cv2.aruco.CharucoDetector:
@@ -111,52 +107,6 @@ def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndar
     focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
     H, agrees = cv2.findHomography(corners_m[:, :2], x * focal, cv2.RANSAC, ASTRAY_PX)
     return everyone if H is None else agrees.ravel().astype(bool)
-
-
-def checkerboard_corners(gray: Gray, board: Checkerboard) -> Array:
-    """Inner corners (columns rows, 2), left to right from the top; (0, 2) where the board is not whole in the image.
-
-    The top is where the first corner's outer square is black. If the board is turned by half a turn, that square is
-    white.
-    """
-    # OpenCV sometimes takes an outer edge for inner corners: the contrast shows it, and other options can avoid it.
-    for flags in (cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY, 0):
-        found, corners = cv2.findChessboardCornersSB(gray, (board.columns, board.rows), flags=flags)
-        if not found:
-            return np.zeros((0, 2))
-        grid = np.reshape(corners, (board.rows, board.columns, 2)).astype(float)
-        right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-        if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: a board is not seen from behind
-            grid = grid[::-1]
-        contrast = _contrast(gray, grid)
-        if contrast < 0.0:
-            grid, contrast = grid[::-1, ::-1], -contrast
-        if contrast > 0.0:
-            steps = (np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
-            return refined_corners(gray, grid.reshape(-1, 2), int(np.clip(OF_SQUARE * min(steps), 2, 9)))
-    return np.zeros((0, 2))
-
-
-def _contrast(gray: Gray, grid: Array) -> float:
-    """How much lighter the white squares are if the first corner's outer square is black; negative if it is white.
-
-    It is 0 if the outermost squares in the image do not alternate, since an outer edge was taken for inner corners.
-    """
-    beyond = np.pad(grid, ((1, 1), (1, 1), (0, 0)), mode="reflect", reflect_type="odd")
-    middles = 0.25 * (beyond[1:, 1:] + beyond[1:, :-1] + beyond[:-1, 1:] + beyond[:-1, :-1])
-    x, y = np.moveaxis(np.rint(middles).astype(int), 2, 0)
-    seen = (x >= 0) & (y >= 0) & (x < gray.shape[1]) & (y < gray.shape[0])
-    values = cv2.blur(gray, (3, 3))[np.where(seen, y, 0), np.where(seen, x, 0)].astype(float)
-    white = np.indices(values.shape).sum(axis=0) % 2 == 1
-
-    def difference(part: tuple[slice | int, slice | int]) -> float:
-        light, dark = values[part][seen[part] & white[part]], values[part][seen[part] & ~white[part]]
-        return float(light.mean() - dark.mean()) if len(light) and len(dark) else np.nan
-
-    whole = np.s_[:]
-    inner = difference((slice(1, -1), slice(1, -1)))
-    edges = [difference(part) for part in ((0, whole), (-1, whole), (whole, 0), (whole, -1))]
-    return 0.0 if any(edge / inner < LEAST_CONTRAST for edge in edges) else inner
 
 
 def refined_corners(gray: Gray, corners: Array, half: int) -> Array:

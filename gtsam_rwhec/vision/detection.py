@@ -12,6 +12,7 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision import boards
 from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.checkerboards import find_checkerboard
 from gtsam_rwhec.vision.codes import identified, quadrangles, unlike
 from gtsam_rwhec.vision.dictionaries import detector_of, modules
 from gtsam_rwhec.vision.edges import refine_corners
@@ -131,9 +132,10 @@ class Detector:
                 sightings[k].append(sighting)
         for checkerboard in self._checkerboards:
             for of_image, gray in zip(sightings, images, strict=True):
-                seen_px = boards.checkerboard_corners(gray, checkerboard)
-                if len(seen_px):
-                    of_image.append(_Sighting(checkerboard, np.arange(len(seen_px)), seen_px))
+                seen = find_checkerboard(gray, checkerboard, self.camera)
+                if seen is not None:
+                    indices = np.arange(len(seen.corners_px))
+                    of_image.append(_Sighting(checkerboard, indices, seen.corners_px, rejection=seen.rejection))
         judged = iter(self._judged([sighting for of_image in sightings for sighting in of_image]))
         return [
             ImageDetections(tuple(next(judged) for _ in of_image), strangers)

@@ -29,6 +29,8 @@ from gtsam_rwhec.vision.images import Gray, decode_gray
 BATCH = 32
 #: The threads take this number of images before processes take over the others.
 FEW = 320
+#: Errors of OpenCV's or of our arithmetic on the pixels of one image. They cost this image, and no other.
+OF_ONE_IMAGE = (cv2.error, ArithmeticError, LookupError, ValueError)
 #: With this environment, linear algebra uses one thread in each process, since each core has its process.
 _ONE_THREAD = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
@@ -142,13 +144,31 @@ def _look(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> li
         detectors[topic] = make_detector()
     camera = detectors[topic].camera
     decoded = [_decoded(image, camera) for image in batch]
-    found = iter(detectors[topic]([gray for gray in decoded if not isinstance(gray, str)]))
+    whole = [(image, gray) for image, gray in zip(batch, decoded, strict=True) if not isinstance(gray, str)]
+    found = iter(_detected(detectors[topic], whole))
     return [
-        DetectedImage(topic, image.stamp_ns, None, gray)
-        if isinstance(gray, str)
-        else DetectedImage(topic, image.stamp_ns, next(found))
+        _with_result(image, gray if isinstance(gray, str) else next(found))
         for image, gray in zip(batch, decoded, strict=True)
     ]
+
+
+def _with_result(image: ImageRecord, result: ImageDetections | str) -> DetectedImage:
+    """An image with its detections or its fault."""
+    if isinstance(result, str):
+        return DetectedImage(image.topic, image.stamp_ns, None, result)
+    return DetectedImage(image.topic, image.stamp_ns, result)
+
+
+def _detected(detector: Detector, images: list[tuple[ImageRecord, Gray]]) -> list[ImageDetections | str]:
+    """The detections in each image, or the fault of an image on which the detection fails; the others lose nothing."""
+    try:
+        return list(detector([gray for _, gray in images]))
+    except OF_ONE_IMAGE as error:
+        if len(images) > 1:
+            return [result for one in images for result in _detected(detector, [one])]
+        where = f"topic {images[0][0].topic}, image at {images[0][0].stamp_ns} ns"
+        message = " ".join(str(error).split())
+        return [f"{where}: the detection failed ({type(error).__name__}: {message})"]
 
 
 def _decoded(image: ImageRecord, camera: Camera) -> Gray | str:

@@ -20,3 +20,7 @@ class Rejection(StrEnum):
     NO_POSE = "no pose"
     REPROJECTION = "reprojection error"
     AMBIGUOUS = "ambiguous"
+    NOT_A_GRID = "corners not on one plane's grid"
+    NOT_WHOLE = "board not whole in the image"
+    SQUARES = "squares do not alternate as printed"
+    OTHER_SIZE = "board goes on: other columns or rows"

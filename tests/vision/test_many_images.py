@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -15,7 +15,8 @@ import pytest
 from rendered import BARREL, PINHOLE, pose, printed, render
 
 from gtsam_rwhec.logs.records import ImageRecord
-from gtsam_rwhec.vision.detection import Detector
+from gtsam_rwhec.vision.detection import Detector, ImageDetections
+from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.many_images import BATCH, DetectedImage, detect_in_images, measured_corner_px
 from gtsam_rwhec.vision.targets import Tag
 
@@ -101,6 +102,26 @@ def test_each_thread_makes_its_detectors_once(images: list[ImageRecord]) -> None
 
     list(detect_in_images(images, {topic: maker(topic) for topic in MAKERS}, workers=2))
     assert len(made) == len(set(made)) <= 4
+
+
+class FailsOnDark(Detector):
+    """Fails as NumPy and OpenCV do, on each image that begins with a black pixel."""
+
+    def __call__(self, images: Sequence[Gray]) -> list[ImageDetections]:
+        for gray in images:
+            if gray[0, 0] == 0:
+                cv2.resize(gray[:0], (0, 0))  # raises cv2.error
+        return super().__call__(images)
+
+
+def test_an_image_on_which_the_detection_fails_costs_itself_only(images: list[ImageRecord]) -> None:
+    bad = [record("/left", stamp, png(np.zeros((240, 320), np.uint8))) for stamp in (5, 7)]
+    makers = {topic: (lambda camera=camera: FailsOnDark(camera, [TAG])) for topic, camera in CAMERAS.items()}
+    found = by_image(detect_in_images([*images[:10], *bad, *images[10:20]], makers, workers=1))
+    faults = {key: found.pop(key).fault for key in (("/left", 5), ("/left", 7))}
+    assert "topic /left, image at 7 ns: the detection failed (error: OpenCV" in faults["/left", 7]
+    assert faults["/left", 5].startswith("topic /left, image at 5 ns: the detection failed")
+    assert_same(found, by_image(detect_in_images(images[:20], MAKERS, workers=1)))
 
 
 def test_faults_are_reported_and_the_other_images_are_used(images: list[ImageRecord]) -> None:

@@ -13,12 +13,7 @@ import pytest
 from gtsam_rwhec.files.yaml_lines import read_yaml
 from gtsam_rwhec.logs import ImageRecord, PoseRecord, open_log
 from gtsam_rwhec.logs.image_folder import write_image_folder
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.detection import Detector
-from gtsam_rwhec.vision.targets import Checkerboard
 
-#: Images of the checkerboard that the detector reads right; it takes a second or more for each.
-READ_RIGHT = ("0052", "0073")
 #: Of the circles: views that differ; the camera's intrinsics are nominal ones, so that turns agree to a few degrees.
 CIRCLES = (0, 6, 8)
 
@@ -33,23 +28,6 @@ def assert_turns_agree(seen: list[np.ndarray], hand: list[np.ndarray], tolerance
         turned_deg = angle_deg(hand[i][:3, :3] @ hand[j][:3, :3].T)
         assert turned_deg > 3.0
         assert angle_deg(seen[i][:3, :3] @ seen[j][:3, :3].T) == pytest.approx(turned_deg, abs=tolerance_deg)
-
-
-def test_a_checkerboard_on_a_hand(workcell_camera2: Path) -> None:
-    fields = read_yaml(workcell_camera2 / "intrinsic_pars_file.yaml").data
-    K = np.array([[fields["fx"], 0.0, fields["cx"]], [0.0, fields["fy"], fields["cy"]], [0.0, 0.0, 1.0]])
-    camera = Camera.of(fields["img_width"], fields["img_height"], "none", K, np.zeros(0), "camera2")
-    detector = Detector(camera, [Checkerboard("board", columns=3, rows=4, square_m=0.05)])
-    seen, hand = [], []
-    for name in READ_RIGHT:
-        image = cv2.imread(str(workcell_camera2 / "image" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
-        assert image is not None
-        ((detection,),) = (frame.detections for frame in detector([image]))
-        assert detection.rejection is None
-        assert len(detection.indices) == 12
-        seen.append(detection.T[0])
-        hand.append(np.loadtxt(workcell_camera2 / "pose" / f"{name}.csv"))
-    assert_turns_agree(seen, hand, tolerance_deg=0.2)
 
 
 def test_a_grid_of_circles_before_a_wrist(circle_grid_10x10: Path, tmp_path: Path) -> None:

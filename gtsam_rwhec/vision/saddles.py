@@ -1,0 +1,96 @@
+"""Where an image may show a checkerboard: points that look like two dark squares meeting, in groups.
+
+A checkerboard's inner corner is a saddle of the gray values, and on a ring around it dark and light alternate twice.
+Few images without a checkerboard have a dozen such points close together, so that most of them need no detector.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.vision.images import Gray
+
+#: Gray values are blurred by this standard deviation (pixels of the level) before they are differentiated.
+SIGMA_PX = 1.0
+#: A saddle's curvature along its two axes (gray values a pixel^2) is at least this. Noise of 4 of 255 stays below.
+LEAST_CURVATURE = 1.5
+#: The ring around a saddle has this radius (pixels of the level) and this number of samples, a multiple of 4.
+RING_PX, RING = 3.0, 16
+#: Opposite samples of a ring may differ by at most this share of what quarters differ by.
+UNLIKE = 0.6
+#: A level has at most this number of saddles, the strongest.
+MOST = 600
+#: Two saddles are of one group if they are closer than this many times the distance to their third nearest neighbour.
+NEAR = 1.8
+#: A group may be a board if it has at least this share of the board's corners.
+SHARE = 0.6
+#: A region reaches beyond its group by this share of the group's size, and by `BEYOND_PX` pixels of the level.
+BEYOND, BEYOND_PX = 0.45, 12.0
+
+
+def regions(gray: Gray, corners: int, level: int) -> list[tuple[slice, slice]]:
+    """Regions (rows, columns) of an image that may show a board of this number of corners, the fullest first.
+
+    The image is halved `level` times first: this is fast, and finds blurred corners too.
+    """
+    small = np.asarray(gray)
+    if min(small.shape) < 4 * RING_PX * 2**level:
+        return []
+    for _ in range(level):
+        small = np.asarray(cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    places = saddles(small)
+    boxes = []
+    for members in _groups(places):
+        if len(members) >= SHARE * corners:
+            low, high = places[members].min(axis=0), places[members].max(axis=0)
+            more = BEYOND * float((high - low).max()) + BEYOND_PX
+            boxes.append((len(members), low - more, high + more))
+    boxes.sort(key=lambda box: -box[0])
+    found = []
+    for _, low, high in boxes:
+        (left, top), (right, bottom) = (np.rint(side * 2**level).astype(int) for side in (low, high))
+        found.append((slice(max(top, 0), max(bottom, 0)), slice(max(left, 0), max(right, 0))))
+    return found
+
+
+def saddles(gray: Gray) -> Array:
+    """Places (n, 2), to a pixel, of an image's saddles with rings that alternate; the strongest first."""
+    smooth = cv2.GaussianBlur(gray, (0, 0), SIGMA_PX).astype(np.float32)
+    xx = cv2.filter2D(smooth, -1, np.array([[1.0, -2.0, 1.0]], np.float32))
+    yy = cv2.filter2D(smooth, -1, np.array([[1.0], [-2.0], [1.0]], np.float32))
+    xy = cv2.filter2D(smooth, -1, 0.25 * np.array([[1.0, 0.0, -1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 1.0]], np.float32))
+    strength = xy * xy - xx * yy
+    peak = (strength >= LEAST_CURVATURE**2) & (strength >= cv2.dilate(strength, np.ones((5, 5), np.uint8)))
+    edge = int(np.ceil(RING_PX)) + 1
+    rows, columns = np.nonzero(peak[edge:-edge, edge:-edge])
+    rows, columns = rows + edge, columns + edge
+    order = np.argsort(-strength[rows, columns], kind="stable")[: 4 * MOST]
+    rows, columns = rows[order], columns[order]
+    angle = 2.0 * np.pi * np.arange(RING) / RING
+    dx, dy = (np.rint(RING_PX * turned(angle)).astype(int) for turned in (np.cos, np.sin))
+    ring = smooth[rows[:, None] + dy, columns[:, None] + dx]
+    ring -= ring.mean(axis=1, keepdims=True)
+    changes = (np.sign(ring) != np.sign(np.roll(ring, 1, axis=1))).sum(axis=1)
+    opposite = np.abs(ring - np.roll(ring, RING // 2, axis=1)).mean(axis=1)
+    quarter = np.abs(ring - np.roll(ring, RING // 4, axis=1)).mean(axis=1)
+    good = (changes == 4) & (opposite < UNLIKE * quarter)
+    places: Array = np.stack([columns[good], rows[good]], axis=1)[:MOST].astype(float)
+    return places
+
+
+def _groups(places: Array) -> list[np.ndarray]:
+    """Indices of the members of each group of places (n, 2) that are as near to each other as their neighbours are."""
+    if len(places) < 4:
+        return []
+    apart = np.linalg.norm(places[:, None] - places, axis=2)
+    third = np.sort(apart, axis=1)[:, 3]
+    linked = apart <= NEAR * np.minimum(third[:, None], third)
+    group = np.arange(len(places))
+    while True:  # each takes the smallest number of its neighbours, until nothing changes
+        smallest = np.where(linked, group, len(places)).min(axis=1)
+        smallest = smallest[smallest]
+        if np.array_equal(smallest, group):
+            return [np.flatnonzero(group == number) for number in np.unique(group)]
+        group = smallest
