@@ -3,15 +3,34 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import pytest
 from places import REPOSITORY
 
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+
 #: Beside calls that OpenCV 5 lacks; with it these run where tests/vision/test_other_opencv.py brings OpenCV 4.
 BESIDE_OPENCV_4 = ["compat/test_beside_opencv4.py", "methods/test_opencv4.py"]
 collect_ignore = [] if hasattr(cv2, "calibrateRobotWorldHandEye") else BESIDE_OPENCV_4
+
+#: Packages whose functions users reach only through calls that hold the limit of one BLAS thread.
+BELOW_THE_LIMIT = ("noise_model", "solver")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread_below_the_limit(request: pytest.FixtureRequest) -> Iterator[None]:
+    """One BLAS thread for tests of inner functions, as their callers in the library hold it.
+
+    Without it the threads of two workers wait for each other: minutes in place of seconds where cores are busy.
+    """
+    if request.path.parent.name in BELOW_THE_LIMIT:
+        with one_blas_thread():
+            yield
+    else:
+        yield
 
 
 @pytest.fixture(scope="session")
