@@ -32,22 +32,13 @@ def robot_world_hand_eye_effects_factor(
 
     Parameters
     ----------
-    target_key, sensor_key : int
-        Keys of X = T_targetcarrier_target and Y = T_sensorcarrier_sensor, Pose3. One key for both makes every
-        measurement A Y = Y B (AX = XB), A and B both T_before_after.
-    A, B : (N, 4, 4) arrays or lists of gtsam.Pose3
-        T_sensorcarrier_targetcarrier and T_sensor_target; metres.
+    target_key, sensor_key, A, B, scale_key, time_offset_key, twists
+        As in ``robot_world_hand_eye_batch_factor``.
     sqrt_information : (6, 6) or (N, 6, 6) array
         W: W' W is the information of what is left of the residual, rotation first.
     effects : dict of int to (N, 6, m) array
         By the key of each x_k, an m-vector: the residual's derivative by it, with zeros for measurements that it does
         not change. [rotation (rad), translation (m)] by the unit of x_k.
-    scale_key : int, optional
-        Key of a 1-vector: t_B = scale * (true length).
-    time_offset_key : int, optional
-        Key of a 1-vector, in seconds: B's stamp t is the carriers' t + offset. Needs ``twists``.
-    twists : (N, 6) array, optional
-        The carriers' velocity at each stamp: A(t + d) = A Expmap(d twist), [omega rad/s, v m/s].
 
     Returns
     -------
