@@ -59,7 +59,9 @@ NOT_CERTIFIED_ONLY = NOT_FOR_A_FOLDER | {
 
 def calibrate(
     context: typer.Context,
-    source: Annotated[Path, typer.Argument(help=f"MCAP log, or {FOLDER_OF_CSV}.")],
+    source: Annotated[
+        Path, typer.Argument(help=f"MCAP log, folder of images with poses beside them (--rig), or {FOLDER_OF_CSV}.")
+    ],
     rig: RigOption = None,
     scale: ScaleOption = "known",
     sigma: SigmaOption = None,

@@ -23,12 +23,21 @@ NOT_FOR_A_BAG = {
         {"columns", "parent", "child", "camera"}
     )
 }
+NOT_WITH_A_RIG = {
+    "not with --rig, whose file states it. Leave one of them out.": frozenset(
+        {"poses", "columns", "parent", "child", "camera"}
+    )
+}
 
 
 def convert(
     context: typer.Context,
     source: Annotated[Path, typer.Argument(help="ROS 1 bag, folder of a ROS 2 db3 bag, or folder of images.")],
     output: McapOption,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="For folders of images: rig file that names them, their poses and their cameras."),
+    ] = None,
     poses: Annotated[
         Path | None,
         typer.Option(
@@ -45,6 +54,20 @@ def convert(
     """Make an MCAP log of a ROS bag, or of a folder of images and a file of poses."""
     with StageDisplay() as stage:
         stage(f"converting {source}")
+        if rig is not None:
+            refuse(context, NOT_WITH_A_RIG)
+            described = rw.rig.read_rig(rig)
+            if not rw.pipeline.is_folder_of_images(source, described):
+                raise LogError(
+                    f"{source}: --rig is for a folder of images with poses beside them, and a rig file with "
+                    "carriers.poses: {frames: [parent, child]}. Leave --rig out for a bag"
+                )
+            images, number = rw.pipeline.write_folder_log(source, described, output, progress=stage)
+            say(
+                f"Written to {shown_path(output)}: {images} images and {number} poses.\n"
+                f"Next: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out"
+            )
+            return ExitStatus.DONE
         if poses is not None:
             images, number = rw.logs.write_image_folder(
                 source, poses, output, columns=columns, parent=parent, child=child, camera=camera
@@ -54,7 +77,8 @@ def convert(
             refuse(context, NOT_FOR_A_BAG)
             if rw.logs.is_image_folder(source):
                 raise LogError(
-                    f"{source} is a folder of images. Name the file with the robot's poses as well: --poses FILE"
+                    f"{source} is a folder of images. Name the file with the robot's poses as well: --poses FILE; or "
+                    "describe the folder in a rig file: --rig FILE"
                 )
             said = f"{rw.logs.convert_ros_bag(source, output)} messages"
     say(f"Written to {shown_path(output)}: {said}.\nNext: gtsam-rwhec init {shown_path(output)} -o rig.yaml")

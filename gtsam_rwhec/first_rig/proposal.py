@@ -127,7 +127,7 @@ def _text(log: Log, carriers: Carriers, carrier_remark: str, cameras: list[_Came
 
 
 def _carriers(pair: MovingPair) -> tuple[Carriers, str]:
-    parent, child = pair.source.frames
+    parent, child = pair.source.parent_and_child
     if pair.on_parent > pair.on_child:
         remark = f"{parent} carries the sensors, as tf has it"
         return Carriers(sensors=parent, targets=child, poses=pair.source, noise=_GUESSED_NOISE), remark
@@ -222,7 +222,7 @@ def _free(name: str, taken: set[str]) -> str:
 
 
 def _pair_words(pair: MovingPair) -> str:
-    parent, child = pair.source.frames
+    parent, child = pair.source.parent_and_child
     return f"{child} in {parent} ({pair.words})"
 
 

@@ -83,10 +83,10 @@ def _of_family(family: str, ids: dict[int, int], looked_at: int) -> Iterator[Gue
     if family.startswith("aruco") and len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
         columns, rows = _squares(order[-1] - order[0] + 1)
         board = CharucoTarget(
-            type="charuco", family=family, columns=columns, rows=rows, square_m=SQUARE_M, marker_m=MARKER_M,
+            type="charuco", family=family, squares=(columns, rows), square_m=SQUARE_M, marker_m=MARKER_M,
             first_id=order[0],
         )  # fmt: skip
-        remark = f"TODO count columns and rows, measure: a guess from markers {_listed(order)}"
+        remark = f"TODO count the squares, measure: a guess from markers {_listed(order)}"
         yield Guess(f"board_{family.removeprefix('aruco_')}", board, remark)
         return
     for i in order:
@@ -100,9 +100,9 @@ def _aprilgrid(family: str, ids: list[int]) -> Guess:
     columns = side if side * side == last - first + 1 else side + 1
     rows = math.ceil((last - first + 1) / columns)
     section = AprilGridTarget(
-        type="aprilgrid", family=family, columns=columns, rows=rows, tag_m=TAG_M, spacing=SPACING, first_id=first
+        type="aprilgrid", family=family, tags=(columns, rows), tag_m=TAG_M, spacing=SPACING, first_id=first
     )
-    return Guess(f"grid_{family}", section, f"TODO count columns and rows, measure: a guess from tags {_listed(ids)}")
+    return Guess(f"grid_{family}", section, f"TODO count the tags, measure: a guess from tags {_listed(ids)}")
 
 
 def _of_drivers(drivers: Iterable[DriverTopic], already: Iterable[Guess]) -> Iterator[Guess]:

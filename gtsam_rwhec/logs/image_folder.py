@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
@@ -27,6 +26,7 @@ from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.logs.checked_poses import transforms
 from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.records import Array
+from gtsam_rwhec.logs.stamp_text import as_ns
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
 #: Foxglove gives the formats of images these names; the keys are the files' endings.
@@ -35,8 +35,6 @@ FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
 MOST_LINES, LONGEST_LINE = 500_000, 10_000
 #: Bytes of the largest file that is taken as an image. A log keeps images as they are.
 LARGEST_IMAGE = MESSAGE
-#: A stamp in nanoseconds has at least this many digits.
-NANOSECOND_DIGITS = 16
 
 
 def is_image_folder(path: str | Path) -> bool:
@@ -154,10 +152,10 @@ def _stamps(files: Sequence[Path], names: Sequence[str], poses: Path) -> tuple[l
     if all(name in known for name in names):
         if len(set(names)) < len(names):
             raise LogError(f"{poses}: an image has two poses: {Counter(names).most_common(1)[0][0]}.")
-        if all(_as_ns(file.stem) is None for file in files):
+        if all(as_ns(file.stem) is None for file in files):
             return [(i + 1) * 10**9 for i in range(len(files))], [(known[name] + 1) * 10**9 for name in names]
-    image_stamps = [_as_ns(file.stem) for file in files]
-    pose_stamps = [_as_ns(name.removesuffix(Path(name).suffix) if name in known else name) for name in names]
+    image_stamps = [as_ns(file.stem) for file in files]
+    pose_stamps = [as_ns(name.removesuffix(Path(name).suffix) if name in known else name) for name in names]
     for stamps, what in ((pose_stamps, names), (image_stamps, [file.name for file in files])):
         if None in stamps:
             raise LogError(
@@ -165,14 +163,3 @@ def _stamps(files: Sequence[Path], names: Sequence[str], poses: Path) -> tuple[l
                 f"nanoseconds; the first image is {files[0].name}, the first pose's name {names[0]!r}."
             )
     return [s for s in image_stamps if s is not None], [s for s in pose_stamps if s is not None]
-
-
-def _as_ns(text: str) -> int | None:
-    """Exact nanoseconds of a stamp in seconds (with a decimal point) or in nanoseconds; None for any other name."""
-    if re.fullmatch(rf"\d{{{NANOSECOND_DIGITS},19}}", text, flags=re.ASCII):
-        stamp = int(text)
-    elif re.fullmatch(r"\d{1,10}\.\d{1,15}", text, flags=re.ASCII):
-        stamp = int((Decimal(text) * 10**9).to_integral_value())
-    else:
-        return None
-    return stamp if stamp < 1 << 63 else None

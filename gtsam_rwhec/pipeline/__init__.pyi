@@ -8,6 +8,8 @@ from .all_stages import solve_into as solve_into
 from .cleaning_stage import clean_log as clean_log
 from .detection_stage import detect_log as detect_log
 from .detections_in_images import draw_log as draw_log
+from .folder_log import is_folder_of_images as is_folder_of_images
+from .folder_log import write_folder_log as write_folder_log
 
 # What comes out, and what a log that a stage wrote holds.
 from .earlier_output import replacing_output as replacing_output

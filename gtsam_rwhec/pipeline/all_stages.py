@@ -15,12 +15,14 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.changed_rig import changes
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.folder_log import is_folder_of_images, write_folder_log
 from gtsam_rwhec.pipeline.image_options import check_image_options
 from gtsam_rwhec.pipeline.log_contract import (
     CLEAN_LOG,
     CLEANING_METADATA,
     DETECTED_LOG,
     PLOTS_FOLDER,
+    RECORDED_LOG,
     RESULT_FILE,
     is_from_stage,
 )
@@ -57,7 +59,8 @@ def calibrate_log(
     Parameters
     ----------
     log_path
-        As for ``open_log``.
+        As for ``open_log``; or a folder of images, for a rig file with poses in files (``carriers.poses.frames``),
+        whose paths then start from this folder.
     rig : Rig or None
         None: the rig file embedded in a log that a stage wrote.
     out
@@ -76,6 +79,14 @@ def calibrate_log(
         As each stage does.
     """
     detected, clean = Path(out) / DETECTED_LOG, Path(out) / CLEAN_LOG
+    if rig is not None and is_folder_of_images(log_path, rig):
+        recorded = made_output_folder(out) / RECORDED_LOG
+        rig = rig.model_copy(update={"folder": Path(str(log_path))})
+        write_folder_log(str(log_path), rig, recorded, progress=progress)
+        try:
+            return calibrate_log(recorded, rig, out, images=images, workers=workers, progress=progress)
+        finally:
+            recorded.unlink(missing_ok=True)
     with open_log(log_path) as log:
         source = log.files[0].path
         is_raw = not is_from_stage(log)

@@ -37,12 +37,14 @@ class CarrierMotion:
 def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     """Read the carriers' motion from the tf frames or the topic that the rig file names.
 
+    Frames of poses in files (``frames``) are in tf of the log that was made of the files.
+
     Raises `LogError` if the topic is missing or has no poses of these frames, or if the log has no transforms;
     `TransformError` if no chain of transforms joins the frames, or if they never move relative to each other;
     `StampError` if all stamps are the same, or if a clock was set back during the recording.
     """
     source, noise = rig.carriers.poses, rig.carriers.noise
-    parent, child = source.frames
+    parent, child = source.parent_and_child
     if source.topic is None:
         try:
             parent, child, stamps, T = _from_tf(log, parent, child, rig.carriers.sensors)

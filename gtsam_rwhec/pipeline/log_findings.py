@@ -54,7 +54,7 @@ def _cure(misreading: Misreading, rig: Rig) -> str:
     carriers, place = rig.carriers, rig.source.place
     of_A = "A is inverted" in misreading.likely
     if misreading.mistake is Mistake.INVERTED and of_A:
-        parent, child = carriers.poses.frames
+        parent, child = carriers.poses.parent_and_child
         exchange = (
             f"if {carriers.targets} carries the sensors, exchange the two names in "
             f"{place(('carriers', 'sensors'), ('carriers', 'targets'))}"

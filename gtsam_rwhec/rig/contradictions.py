@@ -25,6 +25,7 @@ def contradictions(
     """Yield every fault of a rig file's sections, as the path of the value and what is wrong with it."""
     yield from _carriers(carriers)
     yield from _sensors(sensors)
+    yield from _poses(carriers, sensors)
     printed = []
     if not targets:
         yield ("targets",), "none; give at least one target"
@@ -41,9 +42,10 @@ def contradictions(
 def _carriers(carriers: Carriers) -> Iterator[Fault]:
     if carriers.sensors == carriers.targets:
         yield ("carriers", "targets"), f"{carriers.targets!r} also carries the sensors; name two different frames"
-    elif set(carriers.poses.frames) != {carriers.sensors, carriers.targets}:
-        key = "tf" if carriers.poses.tf is not None else "parent"
-        parent, child = carriers.poses.frames
+    elif set(carriers.poses.parent_and_child) != {carriers.sensors, carriers.targets}:
+        poses = carriers.poses
+        key = "tf" if poses.tf is not None else "frames" if poses.frames is not None else "parent"
+        parent, child = carriers.poses.parent_and_child
         yield (
             ("carriers", "poses", key),
             f"poses of {child} in {parent} are not poses of the carriers; name {carriers.sensors} and "
@@ -59,8 +61,19 @@ def _sensors(sensors: Mapping[str, Sensor]) -> Iterator[Fault]:
         for name, sensor in sensors.items():
             topic = getattr(sensor, key)
             if topic is not None and first.setdefault(topic, name) != name:
-                words = f"{topic} is also the topic of sensor {first[topic]}; each sensor needs its own topic"
+                words = f"{topic} is also the topic or path of sensor {first[topic]}; each sensor needs its own"
                 yield ("sensors", name, key), words
+
+
+def _poses(carriers: Carriers, sensors: Mapping[str, Sensor]) -> Iterator[Fault]:
+    """Poses in files are those of a folder, and need the frames."""
+    for name, sensor in sensors.items():
+        if sensor.poses is not None and carriers.poses.frames is None:
+            yield (
+                ("sensors", name, "poses"),
+                "poses in files beside images, and carriers.poses is of a log; write carriers.poses: "
+                "{frames: [parent, child]} for these files",
+            )
 
 
 def _names(carriers: Carriers, sensors: Mapping[str, Sensor], targets: Mapping[str, TargetSection]) -> Iterator[Fault]:

@@ -72,6 +72,15 @@ def list_of(count: int, words: str) -> BeforeValidator:
     return BeforeValidator(check)
 
 
+def _axes(text: str) -> str:
+    if not re.fullmatch(r"rotation_vector|[xyz]{3}|[XYZ]{3}", text) or text[0] == text[1] or text[1] == text[2:3]:
+        raise ValueError(
+            f"{shown(text)}; give three axes in the order of the turns, capitals for turning axes and small letters "
+            "for fixed ones (ZYX: yaw, pitch, roll; xyz: roll, pitch, yaw about fixed axes), or rotation_vector"
+        )
+    return text
+
+
 def _offset(given: Any) -> Any:
     number = isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) <= LARGEST_OFFSET_S
     if given != "estimate" and not number:
@@ -81,6 +90,8 @@ def _offset(given: Any) -> Any:
 
 Name: TypeAlias = Annotated[str, AfterValidator(_name)]
 Text: TypeAlias = Annotated[str, AfterValidator(_text)]
+FramePair: TypeAlias = Annotated[tuple[Name, Name], list_of(2, "two frames, [parent, child]")]
+EulerAxes: TypeAlias = Annotated[str, AfterValidator(_axes)]
 Positive: TypeAlias = Annotated[float, AfterValidator(_positive)]
 Length: TypeAlias = Annotated[float, AfterValidator(_length)]
 TimeOffset: TypeAlias = Annotated[float | Literal["estimate"], BeforeValidator(_offset)]

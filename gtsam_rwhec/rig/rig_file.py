@@ -24,6 +24,7 @@ _TARGETS: dict[str, type[BaseModel]] = {
     "charuco": target_sections.CharucoTarget,
     "aprilgrid": target_sections.AprilGridTarget,
     "checkerboard": target_sections.CheckerboardTarget,
+    "circle_grid": target_sections.CircleGridTarget,
 }
 #: Each place has this section; * stands for any name.
 _SECTIONS: dict[KeyPath, type[BaseModel]] = {
@@ -152,6 +153,9 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
         return f"is missing{about}"
     if kind == "extra_forbidden":
         model = _section(path[:-1], file.data)
+        counted = getattr(model, "counted", "")
+        if counted and path[-1] in ("columns", "rows"):
+            return f"not a key any more; {_counts_before(file.data['targets'][path[1]], counted)}"
         return suggestion(str(path[-1]), list(model.model_fields) if model else [])
     if kind == "literal_error":
         section = " or a section" if path == ("noise",) else ""
@@ -167,6 +171,14 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
     if kind in _KINDS:
         return f"{shown(given)}; {_KINDS[kind]}"
     return str(context.get("error", fault["msg"]))
+
+
+def _counts_before(target: dict[str, Any], counted: str) -> str:
+    """What replaces columns and rows of rig files of before."""
+    across, down = (target.get(key) for key in ("columns", "rows"))
+    if isinstance(across, int) and isinstance(down, int):
+        return f"columns: {across}, rows: {down} is now {counted}: [{across}, {down}]"
+    return f"columns and rows are now {counted}: [across, down]"
 
 
 def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:

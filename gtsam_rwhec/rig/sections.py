@@ -5,11 +5,11 @@ No value is converted, and an unknown key is an error.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from gtsam_rwhec.rig.field_types import Name, Positive, Text, TimeOffset, list_of
+from gtsam_rwhec.rig.field_types import EulerAxes, FramePair, Name, Positive, Text, TimeOffset, list_of
 from gtsam_rwhec.vision.camera import Camera
 
 
@@ -31,26 +31,41 @@ class PoseNoise(Section):
 
 
 class PoseSource(Section):
-    """Where the carriers' poses are: in tf (two frames), or on a topic whose poses are T_parent_child."""
+    """Where the carriers' poses are: in tf (two frames), on a topic, or in files beside the images (frames).
 
-    tf: Annotated[tuple[Name, Name], list_of(2, "two frames, [parent, child]")] | None = None
+    Poses are T_parent_child. How the numbers of files are meant is stated here where the files do not say it.
+    """
+
+    tf: FramePair | None = None
     topic: Text | None = None
     parent: Name | None = None
     child: Name | None = None
+    frames: FramePair | None = None
+    quaternion: Literal["xyzw", "wxyz"] | None = None
+    euler: EulerAxes | None = None
+    angles: Literal["degrees", "radians"] | None = None
+    length: Literal["m", "mm"] | None = None
+    one_instant: bool | None = None
 
     @property
-    def frames(self) -> tuple[str, str]:
+    def parent_and_child(self) -> tuple[str, str]:
         """The parent and the child frame of the poses."""
-        return self.tf if self.tf is not None else (self.parent or "", self.child or "")
+        return self.tf or self.frames or (self.parent or "", self.child or "")
 
     @model_validator(mode="after")
     def _is_one(self) -> PoseSource:
-        if len(self._given("tf", "topic")) != 1:
-            raise ValueError("give one of tf: [parent, child] and topic: ... (with parent and child)")
-        if self.tf is not None and self._given("parent", "child"):
-            raise ValueError("tf names both frames already; leave parent and child out")
+        if len(self._given("tf", "topic", "frames")) != 1:
+            raise ValueError(
+                "give one of tf: [parent, child], topic: ... (with parent and child), and, for poses in files beside "
+                "images, frames: [parent, child]"
+            )
+        if self.topic is None and self._given("parent", "child"):
+            raise ValueError(f"{self._given('tf', 'frames')[0]} names both frames already; leave parent and child out")
         if self.topic is not None and len(self._given("parent", "child")) < 2:
             raise ValueError(f"name the frames of the poses of {self.topic}: parent: ..., child: ...")
+        of_files = self._given("quaternion", "euler", "angles", "length", "one_instant")
+        if of_files and self.frames is None:
+            raise ValueError(f"{', '.join(of_files)}: only for poses in files, with frames: [parent, child]")
         return self
 
 
@@ -59,13 +74,15 @@ class Carriers(Section):
 
     sensors: Name = Field(description="the frame that carries the sensors, such as hand")
     targets: Name = Field(description="the frame that carries the targets, such as base")
-    poses: PoseSource = Field(description="where their poses are: {tf: [parent, child]} or {topic, parent, child}")
+    poses: PoseSource = Field(
+        description="where their poses are: {tf: [parent, child]}, {topic, parent, child} or {frames: [parent, child]}"
+    )
     max_gap_s: Positive = 0.2
     noise: PoseNoise | None = None
 
 
 class Intrinsics(Section):
-    """Where a camera's intrinsics are: a topic, a Kalibr camchain, another YAML file, or numbers in this section."""
+    """Where a camera's intrinsics are: a topic, a Kalibr camchain, another file, or numbers in this section."""
 
     topic: Text | None = None
     kalibr: Text | None = None
@@ -74,17 +91,18 @@ class Intrinsics(Section):
     model: str | None = None
     width: int | None = None
     height: int | None = None
+    size: Annotated[tuple[int, int], list_of(2, "[width, height] in pixels")] | None = None
     K: Annotated[tuple[float, float, float, float], list_of(4, "[fx, fy, cx, cy] in pixels")] | None = None
     D: tuple[float, ...] | None = None
 
     @model_validator(mode="after")
     def _is_one(self) -> Intrinsics:
-        numbers = self._given("model", "width", "height", "K", "D")
+        numbers = self._given("model", "width", "height", "size", "K", "D")
         sources = self._given("topic", "kalibr", "file") + (["numbers"] if numbers else [])
         if len(sources) != 1:
             raise ValueError(
                 f"{' and '.join(sources) or 'nothing'} given; give one of topic, kalibr (with camera), file, or "
-                "numbers (model, width, height, K, D)"
+                "numbers (K, size, and model and D with distortion)"
             )
         if (self.kalibr is None) != (self.camera is None):
             raise ValueError("kalibr and camera go together: {kalibr: camchain.yaml, camera: cam0}")
@@ -93,21 +111,32 @@ class Intrinsics(Section):
         return self
 
     def camera_of_numbers(self, where: str) -> Camera:
-        """The camera of model, width, height, K and D; `ValueError` if a number is missing or absurd."""
-        if self.width is None or self.height is None or self.K is None or self.model is None:
-            missing = [name for name in ("model", "width", "height", "K") if getattr(self, name) is None]
-            raise ValueError(f"{' and '.join(missing)} missing")
+        """The camera of size, K, model and D; `ValueError` if a number is missing or absurd."""
+        if self.size is not None and self._given("width", "height"):
+            raise ValueError("size has the width and the height already; leave width and height out")
+        width, height = self.size or (self.width, self.height)
+        if width is None or height is None or self.K is None:
+            given = {"size: [width, height]": width is not None and height is not None, "K": self.K is not None}
+            raise ValueError(f"{' and '.join(name for name, there in given.items() if not there)} missing")
+        if self.model is None and self.D and any(self.D):
+            raise ValueError("D without model; say which coefficients these are: model: radtan or equidistant")
         fx, fy, cx, cy = self.K
         K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-        return Camera.of(self.width, self.height, self.model, K, self.D or (), where)
+        return Camera.of(width, height, self.model or "pinhole", K, self.D or (), where)
+
+
+def _file_or_section(given: Any) -> Any:
+    """A section of intrinsics; text alone is a file."""
+    return {"file": given} if isinstance(given, str) else given
 
 
 class Sensor(Section):
     """A camera with images, or with the detections of a driver."""
 
-    images: Text | None = Field(default=None, description="topic of the camera's images")
+    images: Text | None = Field(default=None, description="topic of the camera's images; in a folder, their path")
+    poses: Text | None = Field(default=None, description="in a folder: path of the carriers' poses, a file or a folder")
     detections: Text | None = Field(default=None, description="topic of a driver's detections")
-    intrinsics: Intrinsics | None = None
+    intrinsics: Annotated[Intrinsics, BeforeValidator(_file_or_section)] | None = None
     time_offset: TimeOffset = 0.0
     frame: Name | None = None
 
@@ -116,11 +145,15 @@ class Sensor(Section):
         given = self._given("images", "detections")
         if len(given) != 1:
             raise ValueError(
-                f"{' and '.join(given) or 'nothing'} given; give one of images and detections, which are topics"
+                f"{' and '.join(given) or 'nothing'} given; give one of images (a topic of a log, or a path in a "
+                "folder) and detections (a topic)"
             )
+        if self.poses is not None and self.images is None:
+            raise ValueError("poses go with images in a folder; poses of detections are in the log")
         if self.images is not None and self.intrinsics is None:
             raise ValueError(
-                "images without intrinsics; give {topic: ...}, {kalibr: ..., camera: ...}, {file: ...} or numbers"
+                "images without intrinsics; give FILE, {topic: ...}, {kalibr: ..., camera: ...} or numbers, "
+                "{K: [fx, fy, cx, cy], size: [width, height]}"
             )
         return self
 

@@ -22,7 +22,7 @@ from gtsam_rwhec.vision.camera import MODELS, Camera
 KALIBR_DISTORTIONS = ("none", "radtan", "equidistant")
 _KALIBR_CAMERA = re.compile(r"cam\d+")
 #: ROS, OpenCV's samples and people write these keys of intrinsics; here they have lower case and no underscores.
-_WIDTH, _HEIGHT = ("imagewidth", "width"), ("imageheight", "height")
+_WIDTH, _HEIGHT = ("imagewidth", "width", "imgwidth"), ("imageheight", "height", "imgheight")
 _MATRIX = ("cameramatrix", "k")
 _COEFFICIENTS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "d")
 _MODEL = ("distortionmodel", "cameramodel")
@@ -91,7 +91,8 @@ def read_calibration_yaml(path: str | Path) -> Camera:
     Parameters
     ----------
     path
-        Has image_width, image_height, camera_matrix, distortion_coefficients, and distortion_model. Without a
+        Has image_width, image_height, camera_matrix, distortion_coefficients, and distortion_model; or the plain
+        numbers fx, fy, cx, cy with the size, and coefficients k1, k2, p1, p2, k3 by name. Without a
         distortion_model, fisheye_model (of OpenCV's sample) tells the model; five coefficients or more are radtan.
 
     Raises
@@ -108,11 +109,40 @@ def read_calibration_yaml(path: str | Path) -> Camera:
     fields = file.data if isinstance(file.data, dict) else {}
     if any(_KALIBR_CAMERA.fullmatch(name) for name in fields):
         _refuse(file, (), "a Kalibr camchain; give it in the rig file as {kalibr: FILE, camera: cam0}")
+    if _found(fields, _MATRIX) is None and _found(fields, ("fx",)) is not None:
+        return _of_plain_numbers(file)
     width, height = (_pixels(file, (key,), fields[key]) for key in (_key(file, _WIDTH), _key(file, _HEIGHT)))
     key = _key(file, _MATRIX)
     K = _matrix(file, key, 9).reshape(3, 3)
     D = _matrix(file, _key(file, _COEFFICIENTS), None)
     return Camera.of(width, height, _model(file, D), K, D, file.place((key,)))
+
+
+def _of_plain_numbers(file: YamlFile) -> Camera:
+    """A camera of numbers with names: fx, fy, cx, cy, and k1, k2, p1, p2, k3 to k6 of OpenCV's model.
+
+    Files of multi-camera hand-eye tools count the coefficients from zero, dist_k0 to dist_k5 with dist_px and dist_py.
+    """
+    fields = file.data
+    width, height = (_pixels(file, (key,), fields[key]) for key in (_key(file, _WIDTH), _key(file, _HEIGHT)))
+
+    def number(names: tuple[str, ...]) -> float:
+        key = _found(fields, names)
+        if key is None:
+            _refuse(file, (), f"no {names[0]}; plain intrinsics have fx, fy, cx and cy")
+        return float(_numbers(file, (key,), (fields[key],), 1)[0])
+
+    fx, fy, cx, cy = (number((name,)) for name in ("fx", "fy", "cx", "cy"))
+    from_zero = _found(fields, ("distk0", "k0")) is not None
+    names = ("0", "1", "px", "py", "2", "3", "4", "5") if from_zero else ("1", "2", "p1", "p2", "3", "4", "5", "6")
+    wanted = [(f"dist{name}", name) if name[0] == "p" else (f"distk{name}", f"k{name}") for name in names]
+    D = [number(each) if _found(fields, each) is not None else 0.0 for each in wanted]
+    has = _found(fields, ("hasdistcoeff",))
+    if has is not None and not fields[has]:
+        D = []
+    model = _model(file, np.array([])) if _found(fields, _MODEL) is not None else "radtan" if any(D) else "pinhole"
+    K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    return Camera.of(width, height, model, K, D, file.place(()))
 
 
 def _model(file: YamlFile, D: Array) -> str:

@@ -142,7 +142,7 @@ def test_fixed_cameras_and_a_tag_on_the_hand(scene: Scene) -> None:
     scene.moving("base", "hand").static("base", "cam").images("/cam/image", "cam", TAGS).calibration("/cam/info", "cam")
     rig, text, _ = scene.first()
     assert (rig.carriers.sensors, rig.carriers.targets) == ("base", "hand")
-    assert rig.carriers.poses.frames == ("base", "hand")
+    assert rig.carriers.poses.parent_and_child == ("base", "hand")
     assert "base carries the sensors, as tf has it" in text
     assert list(rig.sensors) == ["cam"]
 
@@ -180,7 +180,7 @@ def test_poses_of_a_topic(scene: Scene) -> None:
     scene.stamped_poses("/robot/pose", "map").images("/cam/image", "cam", TAGS)
     rig, text, _ = scene.first()
     assert rig.carriers.poses.topic == "/robot/pose"
-    assert rig.carriers.poses.frames == ("map", "robot_pose")
+    assert rig.carriers.poses.parent_and_child == ("map", "robot_pose")
     assert rig.carriers.sensors == "robot_pose"
     assert "check the frames' names" in text.replace("\n  #", "")
 
@@ -306,9 +306,9 @@ def test_markers_in_a_row_are_a_board(family: str, ids: range, columns: int, row
     (guess,), remarks = targets_seen(look({family: Tags(counts(ids))}), [])
     board = guess.section
     assert isinstance(board, CharucoTarget)
-    assert (board.columns, board.rows, board.family, board.first_id) == (columns, rows, named, ids[0])
+    assert (*board.squares, board.family, board.first_id) == (columns, rows, named, ids[0])
     assert board.target("board").ids == tuple(ids)
-    assert "TODO count columns and rows, measure" in guess.remark
+    assert "TODO count the squares, measure" in guess.remark
     assert remarks == []
 
 
@@ -322,7 +322,7 @@ def test_double_borders_are_an_aprilgrid() -> None:
     guesses, _ = targets_seen(look({"tag36h11": tags}), [])
     grid = guesses[0].section
     assert isinstance(grid, AprilGridTarget)
-    assert (grid.columns, grid.rows, grid.first_id) == (6, 6, 4)
+    assert (*grid.tags, grid.first_id) == (6, 6, 4)
     assert [guess.name for guess in guesses[1:]] == [f"tag36h11_{i}" for i in (0, 1, 2, 3, 50)]
 
 

@@ -26,9 +26,9 @@ sensors:
     detections: /tag_detections
 targets:
   tag_0: {type: tag, family: tag36h11, id: 0, size_m: 0.12}
-  board: {type: charuco, family: aruco_5x5_100, columns: 7, rows: 5, square_m: 0.041, marker_m: 0.03075, first_id: 0}
-  grid: {type: aprilgrid, family: tag36h11, columns: 6, rows: 6, tag_m: 0.088, spacing: 0.3, first_id: 10}
-  chess: {type: checkerboard, columns: 9, rows: 6, square_m: 0.03}
+  board: {type: charuco, family: aruco_5x5_100, squares: [7, 5], square_m: 0.041, marker_m: 0.03075, first_id: 0}
+  grid: {type: aprilgrid, family: tag36h11, tags: [6, 6], tag_m: 0.088, spacing: 0.3, first_id: 10}
+  chess: {type: checkerboard, inner_corners: [9, 6], square_m: 0.03}
 sizes: check
 noise: estimate
 detection: {min_side_px: 18, max_reprojection_px: 2.0}

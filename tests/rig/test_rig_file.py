@@ -100,8 +100,11 @@ def test_poses_of_a_topic_in_either_direction() -> None:
         text = FULL.replace("{tf: [base, hand]}", f"{{topic: /pose, parent: {parent}, child: {child}}}")
         source = parse_rig(text, "rig.yaml").carriers.poses
         assert source == PoseSource(topic="/pose", parent=parent, child=child)
-        assert source.frames == (parent, child)
-    assert parse_rig(FULL.replace("[base, hand]", "[hand, base]"), "f").carriers.poses.frames == ("hand", "base")
+        assert source.parent_and_child == (parent, child)
+    assert parse_rig(FULL.replace("[base, hand]", "[hand, base]"), "f").carriers.poses.parent_and_child == (
+        "hand",
+        "base",
+    )
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
@@ -164,12 +167,12 @@ def rigs(draw: st.DrawFn) -> Rig:
     targets = {
         next(names): TagTarget(type="tag", family="tag36h11", id=draw(st.integers(0, 99)), size_m=draw(LENGTHS)),
         next(names): CharucoTarget(
-            type="charuco", family="aruco_5x5_100", columns=5, rows=3, square_m=1.0, marker_m=draw(st.floats(0.1, 0.9))
+            type="charuco", family="aruco_5x5_100", squares=(5, 3), square_m=1.0, marker_m=draw(st.floats(0.1, 0.9))
         ),
         next(names): AprilGridTarget(
-            type="aprilgrid", family="tag36h11", columns=3, rows=2, tag_m=draw(LENGTHS), spacing=0.3, first_id=100
+            type="aprilgrid", family="tag36h11", tags=(3, 2), tag_m=draw(LENGTHS), spacing=0.3, first_id=100
         ),
-        next(names): CheckerboardTarget(type="checkerboard", columns=5, rows=4, square_m=draw(LENGTHS)),
+        next(names): CheckerboardTarget(type="checkerboard", inner_corners=(5, 4), square_m=draw(LENGTHS)),
     }  # fmt: skip
     some = draw(st.sets(st.sampled_from(sorted(targets)), min_size=1))
     return Rig(

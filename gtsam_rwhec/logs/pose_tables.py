@@ -1,0 +1,224 @@
+"""Tables of poses in text: CSV, TUM, KITTI, one 4 x 4 matrix or many, with names of columns or without.
+
+Fields are parted by commas, semicolons or blanks. A line of column names, if there is one, says what each column is,
+and may have units, ``x [mm]``. Without it, a line is
+
+- 7 numbers (a position, then a quaternion), 8 fields (a name or a stamp first: TUM), or 6 and 7 with three angles;
+- 12 or 16 numbers of a matrix, row by row (KITTI), or 13 and 17 fields with a name first;
+- 4 numbers: four lines, or three, are a matrix.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from gtsam_rwhec.errors import FileFormatError, LogError
+from gtsam_rwhec.files.budgets import POSES_TEXT
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.logs.pose_rows import Kind, PoseRow
+
+#: A table has at most this many lines, and a line at most this many characters.
+MOST_LINES, LONGEST_LINE = 500_000, 10_000
+#: The last row of a transform.
+_LAST = (0.0, 0.0, 0.0, 1.0)
+_UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+#: Columns of names, the best first.
+_NAMES = ("image", "image_name", "imagename", "filename", "file", "img", "frame", "name")
+_STAMPS = ("timestamp", "stamp", "time", "t", "secs", "sec", "time_s", "timestamp_s", "timestamp_ns", "index", "id")
+
+Line = tuple[int, list[str]]
+
+
+def read_pose_table(path: str, text: str, *, has_angles: bool) -> list[PoseRow]:
+    """The poses of a text; `has_angles` says that rotations are three angles.
+
+    Raises
+    ------
+    LogError
+        A line is no pose; the message has the line and what was expected.
+    """
+    header, lines = _lines(path, text)
+    if not lines:
+        raise LogError(f"{path} has no poses.")
+    if header is not None and (columns := _columns(header)):
+        return _by_columns(path, columns, header, lines)
+    counts = {len(fields) for _, fields in lines}
+    if counts == {4} and not _name_first(lines, 4):
+        return _stacked(path, lines)
+    return [_row(path, line, lines, has_angles) for line in lines]
+
+
+def pose_text(path: object) -> str:
+    """The text of a file of poses, UTF-8; a LogError if it is too large or no text."""
+    try:
+        content = read_whole(str(path), POSES_TEXT, "A table of poses was")
+        number_of_lines = content.count(b"\n") + content.count(b"\r")
+        if number_of_lines > MOST_LINES:
+            raise LogError(f"{path} has {number_of_lines} lines; at most {MOST_LINES} are read.")
+        return content.decode("utf-8-sig")
+    except FileFormatError as error:
+        raise LogError(str(error)) from error
+    except UnicodeDecodeError as error:
+        raise LogError(f"{path} is not text in UTF-8 (byte {error.start}); give lines of poses.") from error
+
+
+def _lines(path: str, text: str) -> tuple[list[str] | None, list[Line]]:
+    """The names of columns, None without; the lines that have fields, with their numbers."""
+    header: list[str] | None = None
+    lines: list[Line] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        bare = line.strip()
+        if len(bare) > LONGEST_LINE:
+            raise LogError(f"{path}, line {number}: longer than {LONGEST_LINE} characters; is it a table of poses?")
+        is_comment = bare.startswith(("#", "%"))
+        if not bare or (is_comment and (lines or header)):
+            continue
+        fields = _fields(bare.lstrip("#% ") if is_comment else bare)
+        if not lines and _is_header(fields):
+            if not is_comment or _columns(fields):
+                header = fields
+        elif not is_comment:
+            lines.append((number, fields))
+    return header, lines
+
+
+def _fields(line: str) -> list[str]:
+    separator = next((mark for mark in (",", ";", "\t") if mark in line), None)
+    line = re.sub(r"\s*[\[(]\s*([A-Za-z]*)\s*[\])]", r"_[\1]", line)  # units stay with their column
+    fields = re.split(rf"\s*{separator}\s*", line) if separator else line.split()
+    while fields and not fields[-1]:
+        fields.pop()
+    return fields
+
+
+def _is_header(fields: Sequence[str]) -> bool:
+    return sum(_number(field) is None for field in fields) > max(1, len(fields) // 2)
+
+
+def _columns(header: Sequence[str]) -> dict[str, int]:
+    """The places of tx ty tz, with qx qy qz qw, rx ry rz or m00 to m23; empty if the names do not say them."""
+    found: dict[str, int] = {}
+    for i, word in enumerate(header):
+        found.setdefault(_role(word), i)
+    if "m11" in found and "m00" not in found and "m01" not in found:  # counted from one
+        found |= {
+            f"m{r}{c}": found[f"m{r + 1}{c + 1}"] for r in range(3) for c in range(4) if f"m{r + 1}{c + 1}" in found
+        }
+    if all(f"m{r}{c}" in found for r in range(3) for c in range(4)):
+        return found
+    is_whole = all(f"t{axis}" in found for axis in "xyz") and (
+        all(f"q{axis}" in found for axis in "xyzw")
+        or all(f"r{axis}" in found for axis in "xyz")
+        or all(f"m{r}{c}" in found for r in range(3) for c in range(3))
+    )
+    return found if is_whole else {}
+
+
+def _role(word: str) -> str:
+    """What a column is by its name: tx, qw, rz, m01, or the name itself."""
+    bare = re.sub(r"_?\[.*\]$", "", word.strip("\"' ").lower())
+    bare = re.sub(r"_(mm|cm|m|deg|rad|degrees|radians)$", "", bare)
+    turned = {"roll": "rx", "pitch": "ry", "yaw": "rz"}.get(re.split(r"[._/ ]", bare)[-1])
+    if turned:
+        return turned
+    if match := re.fullmatch(r"(?:m|t|r|rot|mat)?_?([0-3])_?([0-3])", bare):
+        return f"m{match[1]}{match[2]}"
+    match = re.fullmatch(r"(?P<of>.*?)[._/ ]?(?P<axis>[xyzw])", bare)
+    if match is None:
+        return bare
+    of, axis = match["of"], match["axis"]
+    if re.search(r"(^|[._/ ])(q|quat\w*|orient\w*|rot|rotation)($|[._/ ])", of) or re.search(r"(^|[._/ ])q_", of):
+        return f"q{axis}"
+    if axis == "w" and not of:
+        return "qw"
+    if axis != "w" and re.fullmatch(r"r|rv|rotvec|euler|angle", of):
+        return f"r{axis}"
+    if axis != "w" and (not of or re.search(r"(^|[._/ ])(t|p|pos\w*|trans\w*|loc\w*)($|[._/ ])", of)):
+        return f"t{axis}"
+    return bare
+
+
+def _by_columns(path: str, columns: dict[str, int], header: Sequence[str], lines: list[Line]) -> list[PoseRow]:
+    named = next((columns[name] for name in _NAMES if name in columns), None)
+    if named is None:
+        named = next((columns[name] for name in _STAMPS if name in columns), None)
+    if named is None:
+        named = next((i for i, word in enumerate(header) if "stamp" in word.lower() or "time" in word.lower()), None)
+    keys, kind = _wanted(columns)
+    unit_m = _unit_m(header[columns["tx"]]) if "tx" in columns else None
+    rows = []
+    for number, fields in lines:
+        if len(fields) != len(header):
+            raise LogError(f"{path}, line {number}: {len(fields)} fields, and {len(header)} names of columns.")
+        numbers = _numbers(path, number, [fields[columns[key]] for key in keys])
+        if kind == "matrix":
+            numbers = (*numbers, *_LAST)
+        name = "" if named is None else fields[named].strip("\"'")
+        rows.append(PoseRow(name, f"{path}, line {number}", kind, numbers, kind == "angles", unit_m))
+    return rows
+
+
+def _wanted(columns: dict[str, int]) -> tuple[list[str], Kind]:
+    position = [f"t{axis}" for axis in "xyz"]
+    if all(f"q{axis}" in columns for axis in "xyzw"):
+        return position + [f"q{axis}" for axis in "xyzw"], "quaternion"
+    if all(f"r{axis}" in columns for axis in "xyz"):
+        return position + [f"r{axis}" for axis in "xyz"], "angles"
+    has_fourth = all(f"m{r}3" in columns for r in range(3))
+    return [f"m{r}{c}" if c < 3 or has_fourth else position[r] for r in range(3) for c in range(4)], "matrix"
+
+
+def _unit_m(word: str) -> float | None:
+    match = re.search(r"[\[(_](mm|cm|m)[\])]?$", word.strip("\"' ").lower())
+    return _UNITS_M[match[1]] if match else None
+
+
+def _stacked(path: str, lines: list[Line]) -> list[PoseRow]:
+    """Matrices of four lines each, or one of three."""
+    table = [_numbers(path, number, fields) for number, fields in lines]
+    if len(table) == 3:
+        table.append(_LAST)
+        lines = [*lines, lines[-1]]
+    if len(table) % 4:
+        raise LogError(f"{path}: {len(table)} lines of four numbers; a 4 x 4 matrix has four lines.")
+    places = [f"{path}, line {lines[i][0]}" if len(table) > 4 else path for i in range(0, len(table), 4)]
+    return [PoseRow("", place, "matrix", sum(table[4 * i : 4 * i + 4], ())) for i, place in enumerate(places)]
+
+
+def _row(path: str, line: Line, lines: list[Line], has_angles: bool) -> PoseRow:
+    number, fields = line
+    kinds: dict[int, Kind] = {6: "angles"} if has_angles else {7: "quaternion_of_any_order"}
+    kinds |= {12: "matrix", 16: "matrix"}
+    count = len(fields)
+    has_name = count not in kinds
+    if count - has_name not in kinds:
+        raise LogError(
+            f"{path}, line {number}: {count} fields, {brief(' '.join(fields))}. Give a position and a quaternion (7 "
+            "numbers), a matrix (12 or 16 numbers), or a position and three angles with euler: stated; a name or a "
+            "stamp may come first."
+        )
+    numbers = _numbers(path, number, fields[has_name:])
+    if len(numbers) == 12:
+        numbers = (*numbers, *_LAST)
+    place = f"{path}, line {number}" if len(lines) > 1 else path
+    return PoseRow(fields[0].strip("\"'") if has_name else "", place, kinds[count - has_name], numbers)
+
+
+def _name_first(lines: list[Line], count: int) -> bool:
+    return any(len(fields) == count and _number(fields[0]) is None for _, fields in lines)
+
+
+def _numbers(path: str, line: int, fields: Sequence[str]) -> tuple[float, ...]:
+    numbers = [_number(field) for field in fields]
+    if None in numbers:
+        raise LogError(f"{path}, line {line}: {brief(fields[numbers.index(None)])} is not a number.")
+    return tuple(number for number in numbers if number is not None)
+
+
+def _number(field: str) -> float | None:
+    try:
+        return float(field)
+    except ValueError:
+        return None

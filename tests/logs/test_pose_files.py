@@ -1,0 +1,152 @@
+"""Files of poses as many tools write them: each gives the same transforms, and what is not said is asked for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.logs.pose_files import read_poses
+from gtsam_rwhec.logs.pose_rows import PoseStatement
+
+RNG = np.random.default_rng(3)
+TURNS = Rotation.random(4, rng=RNG)
+T = np.tile(np.eye(4), (4, 1, 1))
+T[:, :3, :3], T[:, :3, 3] = TURNS.as_matrix(), RNG.uniform(-1.0, 1.0, (4, 3))
+Q = TURNS.as_quat()
+NAMES = [f"im_{i}.png" for i in range(4)]
+
+
+def line(*numbers: object, mark: str = " ") -> str:
+    return mark.join(repr(float(x)) if not isinstance(x, str) else x for x in np.ravel(numbers).tolist())
+
+
+def lines(header: str, *columns: object, mark: str = ",") -> str:
+    rows = [mark.join(str(x) for part in row for x in np.ravel(part).tolist()) for row in zip(*columns, strict=True)]
+    return "\n".join([header, *rows] if header else rows) + "\n"
+
+
+P, WXYZ, DEGREES = T[:, :3, 3], Q[:, [3, 0, 1, 2]], TURNS.as_euler("ZYX", degrees=True)
+ABOUT_XYZ = DEGREES[:, ::-1]  # yaw, pitch, roll: about x, y, z
+TEXTS = {
+    "tum.txt": (lines("# timestamp tx ty tz qx qy qz qw", range(4), P, Q, mark=" "), {}),
+    "plain.csv": (lines("", P, Q), {}),
+    "wxyz.csv": (lines("", P, WXYZ), {"quaternion": "wxyz"}),
+    "named.csv": (lines("image,qw,qx,qy,qz,x,y,z", NAMES, WXYZ, P), {}),
+    "euroc.csv": (
+        lines(
+            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []",
+            [17 * 10**17 + i for i in range(4)], P, WXYZ,
+        ),
+        {},
+    ),
+    "rostopic.csv": (
+        lines(
+            "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.pose.position.x,"
+            "field.pose.position.y,field.pose.position.z,field.pose.orientation.x,field.pose.orientation.y,"
+            "field.pose.orientation.z,field.pose.orientation.w",
+            range(4), range(4), [17 * 10**17] * 4, ["base"] * 4, P, Q,
+        ),
+        {},
+    ),
+    "millimetres.csv": (lines("name;x [mm];y [mm];z [mm];q_x;q_y;q_z;q_w", NAMES, 1e3 * P, Q, mark=";"), {}),
+    "stated_millimetres.csv": (lines("", NAMES, 1e3 * P, Q), {"length": "mm"}),
+    "euler.csv": (lines("", NAMES, P, DEGREES), {"euler": "ZYX", "angles": "degrees"}),
+    "roll_pitch_yaw.csv": (lines("x,y,z,roll,pitch,yaw", P, ABOUT_XYZ), {"euler": "ZYX", "angles": "degrees"}),
+    "rotvec.txt": (lines("", P, TURNS.as_rotvec(), mark=" "), {"euler": "rotation_vector", "angles": "radians"}),
+    "kitti.txt": (lines("", T[:, :3].reshape(4, 12), mark=" "), {}),
+    "flat.csv": (lines("", NAMES, T.reshape(4, 16)), {}),
+    "stacked.txt": (lines("", T.reshape(16, 4), mark=" "), {}),
+    "entries.csv": (
+        lines("r11,r12,r13,r21,r22,r23,r31,r32,r33,tx,ty,tz", T[:, :3, :3].reshape(4, 9), P), {},
+    ),
+    "matrices.json": (json.dumps({name: t.tolist() for name, t in zip(NAMES, T, strict=True)}), {}),
+    "nerf.json": (
+        json.dumps(
+            {"frames": [{"file_path": n, "transform_matrix": t.tolist()} for n, t in zip(NAMES, T, strict=True)]}
+        ),
+        {},
+    ),
+    "ros.yaml": (
+        json.dumps([
+            {
+                "header": {"stamp": {"sec": i, "nanosec": 5}},
+                "pose": {
+                    "position": dict(zip("xyz", P[i].tolist(), strict=True)),
+                    "orientation": dict(zip("xyzw", Q[i].tolist(), strict=True)),
+                },
+            }
+            for i in range(4)
+        ]),
+        {},
+    ),
+    "lists.yaml": (
+        "poses:\n"
+        + "".join(f"  - {{image: {NAMES[i]}, t: {P[i].tolist()}, q: {WXYZ[i].tolist()}}}\n" for i in range(4)),
+        {"quaternion": "wxyz"},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(TEXTS))
+def test_each_form_gives_the_same_poses(tmp_path: Path, name: str) -> None:
+    text, stated = TEXTS[name]
+    (tmp_path / name).write_text(text)
+    found = read_poses(tmp_path / name, PoseStatement(**stated))
+    np.testing.assert_allclose(found.T, T, atol=1e-9)
+    if "im_0" in text:
+        assert list(found.names) == NAMES
+
+
+def test_names_of_matrices_and_stamps(tmp_path: Path) -> None:
+    for name in ("ros.yaml", "euroc.csv", "tum.txt"):
+        (tmp_path / name).write_text(TEXTS[name][0])
+    assert read_poses(tmp_path / "ros.yaml").names[:2] == ("5", "1000000005")
+    assert read_poses(tmp_path / "euroc.csv").names[1] == "1700000000000000001"
+    assert read_poses(tmp_path / "tum.txt").places[1] == f"{tmp_path / 'tum.txt'}, line 3"
+
+
+def test_a_file_an_image_and_an_index(tmp_path: Path) -> None:
+    folder = tmp_path / "poses"
+    folder.mkdir()
+    for i, t in enumerate(T):
+        keys = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), [*t[:3, 3].tolist(), *Q[i].tolist()], strict=True))
+        (folder / f"{i}.yaml").write_text("".join(f"{key}: {value}\n" for key, value in keys.items()))
+    index = tmp_path / "cal_data.yaml"
+    index.write_text("data:\n" + "".join(f"  - pose: poses/{i}.yaml\n    image: images/{i}.png\n" for i in (3, 1)))
+    found = read_poses(folder)
+    assert found.names == ("0.yaml", "1.yaml", "2.yaml", "3.yaml")
+    np.testing.assert_allclose(found.T, T, atol=1e-12)
+    of_index = read_poses(index)
+    assert of_index.names == ("images/3.png", "images/1.png")
+    np.testing.assert_allclose(of_index.T, T[[3, 1]], atol=1e-12)
+    index.write_text("data:\n  - {pose: poses/9.yaml, image: images/9.png}\n")
+    with pytest.raises(LogError, match=r"line 2: data\[0\]: there is no file .*9\.yaml"):
+        read_poses(index)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "stated", "words"),
+    [
+        ("a.csv", lines("", NAMES, 1e3 * P, Q), {}, "millimetres. Write length: mm"),
+        ("a.csv", lines("x,y,z,roll,pitch,yaw", P, ABOUT_XYZ), {}, "convention is not stated. .* euler: ZYX"),
+        ("a.csv", lines("", P, DEGREES), {"euler": "ZYX"}, "angles without a unit"),
+        ("a.csv", lines("", P, DEGREES), {"euler": "ZYX", "angles": "radians"}, "Are they degrees. Write angles"),
+        ("a.csv", lines("", P, 2 * Q), {}, "line 1: quaternion .* norm 2"),
+        ("a.csv", lines("", P, Q) + "1,2,3\n", {}, "line 5: 3 fields"),
+        ("a.csv", lines("x,y,z,qx,qy,qz,qw", P, Q) + "1,2,x,4,5,6,7\n", {}, "line 6: 'x' is not a number"),
+        ("a.csv", lines("", T.swapaxes(1, 2).reshape(4, 16)), {}, "line 1: .* is no transform.* transpose it"),
+        ("a.csv", "", {}, "has no poses"),
+        ("a.yaml", "a: {b: 3}", {}, "has no poses. A pose is"),
+        ("a.yaml", "a: [", {}, "not YAML"),
+    ],
+)
+def test_what_cannot_be_meant(tmp_path: Path, name: str, text: str, stated: dict[str, str], words: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(LogError, match=words) as caught:
+        read_poses(tmp_path / name, PoseStatement(**stated))
+    assert name in str(caught.value)
