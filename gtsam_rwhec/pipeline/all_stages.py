@@ -59,7 +59,7 @@ def calibrate_log(
     Parameters
     ----------
     log_path
-        As for ``open_log``; or a folder of images, for a rig file with poses in files (``carriers.poses.frames``),
+        As for ``open_log``; or a folder of images, for a rig file with poses in files (``frames``),
         whose paths then start from this folder.
     rig : Rig or None
         None: the rig file embedded in a log that a stage wrote.
