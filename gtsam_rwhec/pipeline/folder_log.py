@@ -65,7 +65,7 @@ def write_folder_log(
     folder
         Where the paths of the rig file start.
     rig : Rig
-        Its ``carriers.poses`` has frames, and its sensors have images and poses.
+        The poses of its carriers are ``frames``, and its sensors have images and poses.
     path
         The MCAP file to write.
     progress : callable, optional
