@@ -10,17 +10,19 @@ import numpy as np
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion, check_order
 from gtsam_rwhec.pipeline.log_contract import detections_topic
 from gtsam_rwhec.pipeline.sensor_detections import SensorDetections
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.ambiguity import choose_over_time
+from gtsam_rwhec.vision.board_turns import Turns, choose_turns, turn_between, turned_detection
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.detection import Detection, Detector
 from gtsam_rwhec.vision.many_images import DetectedImage, detect_in_images, measured_corner_px
 from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import Target
+from gtsam_rwhec.vision.targets import Checkerboard, Target
 
 #: A camera's stamps are checked after these numbers of images, so that nobody waits long for a log of no use.
 CHECKED_AFTER = (10, 100, 1000, 10_000)
@@ -43,8 +45,9 @@ def detect_in_log(
     images: dict[str, list[DetectedImage]] = {topic: [] for topic in sensor_of}
     for image in _detected(log, rig, cameras, sensor_of, workers=workers, progress=progress):
         images[image.topic].append(image)
+    upright: dict[str, Turns] = {}
     return {
-        sensor: _of_sensor(log, rig, sensor, sorted(images[topic], key=lambda image: image.stamp_ns), motion)
+        sensor: _of_sensor(log, rig, sensor, sorted(images[topic], key=lambda image: image.stamp_ns), motion, upright)
         for topic, sensor in sensor_of.items()
     }
 
@@ -85,7 +88,14 @@ def _detected(
         check_order(np.array(stamps[topic], dtype=np.int64), f"topic {topic}")
 
 
-def _of_sensor(log: Log, rig: Rig, sensor: str, images: list[DetectedImage], motion: CarrierMotion) -> SensorDetections:
+def _of_sensor(
+    log: Log,
+    rig: Rig,
+    sensor: str,
+    images: list[DetectedImage],
+    motion: CarrierMotion,
+    upright: dict[str, Turns],
+) -> SensorDetections:
     faults = tuple(image.fault for image in images if image.found is None)
     if len(faults) == len(images):
         topic = rig.sensors[sensor].images
@@ -104,7 +114,7 @@ def _of_sensor(log: Log, rig: Rig, sensor: str, images: list[DetectedImage], mot
     records: list[DetectionRecord] = []
     corner_px: dict[str, float] = {}
     for target in rig.target_list:
-        of_target, measured_px = _of_track(tracks[target.name], target, sensor, rig, motion)
+        of_target, measured_px = _of_track(tracks[target.name], target, sensor, rig, motion, upright)
         records += of_target
         if measured_px is not None:
             corner_px[f"{target.name}/{sensor}"] = measured_px
@@ -112,9 +122,17 @@ def _of_sensor(log: Log, rig: Rig, sensor: str, images: list[DetectedImage], mot
 
 
 def _of_track(
-    track: list[tuple[int, Detection]], target: Target, sensor: str, rig: Rig, motion: CarrierMotion
+    track: list[tuple[int, Detection]],
+    target: Target,
+    sensor: str,
+    rig: Rig,
+    motion: CarrierMotion,
+    upright: dict[str, Turns],
 ) -> tuple[list[DetectionRecord], float | None]:
-    """Each stamped detection of a target, with the pose that the whole track supports, and the corners' noise."""
+    """Each stamped detection of a target, with the pose that the whole track supports, and the corners' noise.
+
+    `upright` has the first track of each board that looks the same turned, and gets this one if there is none.
+    """
     options = rig.detection_options
     chosen = [0] * len(track)
     rejections = [detection.rejection for _, detection in track]
@@ -128,15 +146,23 @@ def _of_track(
         )
         factor = (corner_px / options.corner_px) ** 2
         stamps = np.array([track[i][0] for i in good], dtype=np.int64)
+        carrier = motion.A_where_known(stamps, rig.carriers.max_gap_s)
+        sure_of_turn = np.full(len(good), np.inf)
+        if isinstance(target, Checkerboard) and target.ways > 1:
+            detections, sure_of_turn = _turned(detections, target, carrier, corner_px, factor, upright)
+            track = track.copy()
+            for i, detection in zip(good, detections, strict=True):
+                track[i] = (track[i][0], detection)
         choice = choose_over_time(
             stamps,
             np.array([detection.T for detection in detections]),
             squared,
             factor * np.array([detection.covariance for detection in detections]),
             corner_px,
-            motion.A_where_known(stamps, rig.carriers.max_gap_s),
+            carrier,
         )
-        for i, which, margin in zip(good, choice.which.tolist(), choice.margin.tolist(), strict=True):
+        surest = np.minimum(choice.margin, sure_of_turn)
+        for i, which, margin in zip(good, choice.which.tolist(), surest.tolist(), strict=True):
             chosen[i] = which
             rejections[i] = Rejection.AMBIGUOUS if margin < options.ambiguity_margin else None
     records = []
@@ -160,6 +186,36 @@ def _of_track(
             )
         )
     return records, corner_px
+
+
+def _turned(
+    detections: list[Detection],
+    board: Checkerboard,
+    carrier: Array,
+    corner_px: float,
+    factor: float,
+    upright: dict[str, Turns],
+) -> tuple[list[Detection], Array]:
+    """Detections of a board that looks the same turned, each the same way up in its frame, and how sure that is (n,).
+
+    The first sensor's first image says which way is up.
+    """
+    turns = choose_turns(
+        np.array([detection.T for detection in detections]),
+        factor * np.array([detection.covariance for detection in detections]),
+        np.array([detection.squared_px for detection in detections]),
+        corner_px,
+        carrier,
+        board.ways,
+    )
+    more, margin = 0, np.inf
+    if board.name in upright:
+        more, margin = turn_between(upright[board.name], turns, board.ways)
+    elif len(turns.R_A):
+        upright[board.name] = turns
+    which = (turns.which + more) % board.ways
+    turned = [turned_detection(*pair) for pair in zip(detections, [board] * len(which), which.tolist(), strict=True)]
+    return turned, np.minimum(turns.margin, margin)
 
 
 def message_count(log: Log, topic: str | None) -> int:

@@ -97,8 +97,8 @@ def _starts(track: _Track) -> list[np.ndarray]:
     found: list[tuple[float, np.ndarray]] = []
     for picked in itertools.product((0, 1), repeat=len(few)):
         R_B = track.R_B[few, np.array(picked)]
-        first = _first_rotation(track.R_A[few], R_B)
-        R_X, R_Y = _rotations(track.R_A[few], R_B, np.ones(len(few)), np.eye(3), first)
+        first = first_rotation(track.R_A[few], R_B)
+        R_X, R_Y = extrinsic_rotations(track.R_A[few], R_B, np.ones(len(few)), np.eye(3), first)
         cost = track.image + _disagreement(track, R_X, R_Y)
         found.append((float(cost.min(axis=1).sum()), np.argmin(cost, axis=1)))
     return [which for _, which in sorted(found, key=lambda item: item[0])[:BEST]]
@@ -117,7 +117,7 @@ def _apart(R: Array) -> np.ndarray:
 
 def _disagreement(track: _Track, R_X: Array, R_Y: Array) -> Array:
     """Costs (n, 2) of the candidates' rotations, for given rotations of the extrinsics."""
-    off = _off(track.R_A, track.R_B, R_X, R_Y)
+    off = rotations_off(track.R_A, track.R_B, R_X, R_Y)
     cost: Array = np.minimum(0.5 * np.einsum("nci,ncij,ncj->nc", off, track.information, off), track.most)
     return cost
 
@@ -127,9 +127,9 @@ def _settled(track: _Track, which: np.ndarray) -> _Answer:
     each = np.arange(n)
     weight: Array = np.ones(n)
     R_X: Array = np.eye(3)
-    R_Y, cost = _first_rotation(track.R_A, track.R_B[each, which]), track.image
+    R_Y, cost = first_rotation(track.R_A, track.R_B[each, which]), track.image
     for _ in range(ROUNDS):
-        R_X, R_Y = _rotations(track.R_A, track.R_B[each, which], weight, R_X, R_Y)
+        R_X, R_Y = extrinsic_rotations(track.R_A, track.R_B[each, which], weight, R_X, R_Y)
         disagreement = _disagreement(track, R_X, R_Y)
         cost = track.image + disagreement
         before, which = which, np.argmin(cost, axis=1)
@@ -143,21 +143,21 @@ def _settled(track: _Track, which: np.ndarray) -> _Answer:
     return _Answer(which, cost, float(cost[each, which].sum()) + _translations(track, R_Y, which))
 
 
-def _off(R_A: Array, R_B: Array, R_X: Array, R_Y: Array) -> Array:
+def rotations_off(R_A: Array, R_B: Array, R_X: Array, R_Y: Array) -> Array:
     """The rotation vectors (n, c, 3) from the predicted R_Y' R_A R_X to R_B (n, c, 3, 3), in the target's frame."""
     predicted = R_Y.T @ R_A @ R_X
     return se3.so3_logmap((predicted[:, None].swapaxes(-1, -2) @ R_B).reshape(-1, 3, 3)).reshape(*R_B.shape[:2], 3)
 
 
-def _rotations(R_A: Array, R_B: Array, weight: Array, R_X: Array, R_Y: Array) -> tuple[Array, Array]:
+def extrinsic_rotations(R_A: Array, R_B: Array, weight: Array, R_X: Array, R_Y: Array) -> tuple[Array, Array]:
     """Solve R_A R_X = R_Y R_B for R_X and R_Y, by weighted least squares from a first R_Y."""
     w = weight[:, None, None]
     for _ in range(TURNS):
-        R_X = _rotation((w * (R_A.swapaxes(1, 2) @ R_Y @ R_B)).sum(axis=0))
-        R_Y = _rotation((w * (R_A @ R_X @ R_B.swapaxes(1, 2))).sum(axis=0))
+        R_X = nearest_rotation((w * (R_A.swapaxes(1, 2) @ R_Y @ R_B)).sum(axis=0))
+        R_Y = nearest_rotation((w * (R_A @ R_X @ R_B.swapaxes(1, 2))).sum(axis=0))
     root = np.sqrt(weight)
     for _ in range(STEPS):
-        off = _off(R_A, R_B[:, None], R_X, R_Y)[:, 0]
+        off = rotations_off(R_A, R_B[:, None], R_X, R_Y)[:, 0]
         # R_X Exp(x), R_Y Exp(y): the prediction P turns by x - P' y. Turns about a single axis leave x and y partly
         # free: lstsq takes the step of minimum norm.
         P = R_Y.T @ R_A @ R_X
@@ -170,7 +170,7 @@ def _rotations(R_A: Array, R_B: Array, weight: Array, R_X: Array, R_Y: Array) ->
     return R_X, R_Y
 
 
-def _first_rotation(R_A: Array, R_B: Array) -> Array:
+def first_rotation(R_A: Array, R_B: Array) -> Array:
     """R_Y that turns the axes of the target's motions onto the carriers': R_A R_A' = R_Y R_B R_B' R_Y'."""
     M = np.zeros((3, 3))
     for lag in LAGS:
@@ -178,7 +178,7 @@ def _first_rotation(R_A: Array, R_B: Array) -> Array:
             a, b = (se3.so3_logmap(R[:-lag] @ R[lag:].swapaxes(1, 2)) for R in (R_A, R_B))
             alike = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1)) < ALIKE_RAD
             M += a[alike].T @ b[alike]
-    return _rotation(M)
+    return nearest_rotation(M)
 
 
 def _translations(track: _Track, R_Y: Array, which: np.ndarray) -> float:
@@ -197,7 +197,7 @@ def _translations(track: _Track, R_Y: Array, which: np.ndarray) -> float:
     return float(cost.sum())
 
 
-def _rotation(M: Array) -> Array:
+def nearest_rotation(M: Array) -> Array:
     """The rotation nearest to a matrix (3, 3)."""
     U, _, Vt = np.linalg.svd(M)
     R: Array = U @ np.diag([1.0, 1.0, float(np.linalg.det(U @ Vt))]) @ Vt

@@ -169,7 +169,8 @@ class AprilGrid:
 class Checkerboard:
     """A checkerboard of columns x rows inner corners, numbered left to right, from the top.
 
-    One of columns and rows must be even and the other odd: any other board looks the same after half a turn.
+    If columns and rows are both even or both odd, the board looks the same turned by half a turn (or by quarters, see
+    `ways`): which way up it is in each image only the motion tells.
 
     Attributes
     ----------
@@ -190,12 +191,16 @@ class Checkerboard:
     def __post_init__(self) -> None:
         _check_grid(self.name, self.columns, self.rows, 3)
         _check(self.name, None, (), {"square_m": self.square_m})
-        if (self.columns + self.rows) % 2 == 0:
-            raise TargetError(
-                f"a checkerboard of {self.columns} x {self.rows} inner corners looks the same "
-                "after half a turn; take one with an odd and an even number, or a ChArUco board",
-                self.name,
-            )
+
+    @property
+    def ways(self) -> int:
+        """In how many ways the board looks the same: turned by half a turn 2, by quarters 4, else 1.
+
+        With columns and rows both even, the four outermost squares have one colour; both odd, opposite ones have.
+        """
+        if (self.columns + self.rows) % 2 == 1:
+            return 1
+        return 4 if self.columns == self.rows and self.columns % 2 == 0 else 2
 
     @property
     def length_m(self) -> float:
