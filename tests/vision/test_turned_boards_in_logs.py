@@ -23,12 +23,12 @@ BOARD = Checkerboard("board", 5, 3, 0.03)
 IMAGES = 8
 CAMERA = "{images: /IMAGES, intrinsics: {model: pinhole, width: 320, height: 240, K: [300, 302, 157, 121.5]}}"
 RIG = f"""
-carriers: {{sensors: base, targets: hand, poses: {{tf: [base, hand]}}}}
+carriers: {{sensors: base, targets: hand, poses: {{frames: [base, hand]}}}}
 sensors:
   left: {CAMERA.replace("IMAGES", "left")}
   right: {CAMERA.replace("IMAGES", "right")}
 targets:
-  board: {{type: checkerboard, columns: 5, rows: 3, square_m: 0.03}}
+  board: {{type: checkerboard, inner_corners: [5, 3], square_m: 0.03}}
 """
 
 
