@@ -84,6 +84,10 @@ class TfBuffer:
             link.T.append(record.T)
             link.sorted = None
 
+    def moving_links(self) -> dict[str, tuple[Stamps, Array]]:
+        """The stamps (N,), increasing, and transforms (N, 4, 4) of each moving link, by its child."""
+        return {child: link.by_stamp() for child, link in self._links.items() if not link.is_static}
+
     def frames(self) -> tuple[str, ...]:
         """Every frame, by name."""
         return tuple(sorted(set(self._links) | {link.parent for link in self._links.values()}))

@@ -80,7 +80,7 @@ def calibrate_log(
     """
     detected, clean = Path(out) / DETECTED_LOG, Path(out) / CLEAN_LOG
     if rig is not None and is_folder_of_images(log_path, rig):
-        recorded = made_output_folder(out) / RECORDED_LOG
+        recorded = made_output_folder(out) / f"{Path(str(log_path)).resolve().name}{RECORDED_LOG}"
         rig = rig.model_copy(update={"folder": Path(str(log_path))})
         write_folder_log(str(log_path), rig, recorded, progress=progress)
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,8 @@ from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: Seconds. If stamps go back by more than this in the order of the log, a clock was set during the recording.
 BACKWARDS_S = 1.0
+#: Two files have the same pose at a stamp if their matrices differ by at most this.
+SAME_POSE = 1e-6
 #: Nanoseconds. Stamps must be below this (the year 2116), so that differences and time offsets fit into 64 bits.
 LATEST_NS = 1 << 62
 
@@ -41,7 +44,8 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
 
     Raises `LogError` if the topic is missing or has no poses of these frames, or if the log has no transforms;
     `TransformError` if no chain of transforms joins the frames, or if they never move relative to each other;
-    `StampError` if all stamps are the same, or if a clock was set back during the recording.
+    `StampError` if all stamps are the same, or if a clock was set back during the recording. Of several files, none may
+    have other poses at a stamp than another one: that is a `LogError` with both.
     """
     source, noise = rig.carriers.poses, rig.carriers.noise
     parent, child = source.parent_and_child
@@ -54,6 +58,8 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     else:
         where = f"topic {source.topic}"
         stamps, T = _from_topic(log, source.topic)
+    if len(log.files) > 1:
+        _check_one_pose_a_stamp(log, source.topic)
     # The pose of a child frame is noisy about and along the child's own axes.
     about: Literal["sensorcarrier", "targetcarrier"] = "targetcarrier"
     if child == rig.carriers.sensors:  # the log has T_targetcarrier_sensorcarrier
@@ -113,6 +119,34 @@ def _from_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
     # Of several poses with the same stamp, the last one counts, as in tf.
     last = np.append(np.diff(series.stamps_ns) != 0, True)
     return series.stamps_ns[last], series.T[last]
+
+
+def _check_one_pose_a_stamp(log: Log, topic: str | None) -> None:
+    """Refuse files with different poses of one frame at one stamp: folders that were converted apart, most often."""
+    before: list[tuple[Path, dict[str, tuple[np.ndarray, Array]]]] = []
+    for file in log.files:
+        alone = Log([file])
+        names = [t.name for t in alone.topics() if not t.unreadable and (t.is_tf if topic is None else t.name == topic)]
+        if not names:
+            continue
+        if topic is None:
+            links = TfBuffer(alone.records(names)).moving_links()
+        else:
+            stamps, T = _from_topic(alone, topic)
+            links = {topic: (stamps, T)}
+        for other, theirs in before:
+            for name in links.keys() & theirs.keys():
+                (stamps, T), (their_stamps, their_T) = links[name], theirs[name]
+                _, here, there = np.intersect1d(stamps, their_stamps, return_indices=True)
+                apart = np.abs(T[here] - their_T[there]).max(axis=(1, 2), initial=0.0) > SAME_POSE
+                if apart.any():
+                    i = int(np.argmax(apart))
+                    raise LogError(
+                        f"{other} and {file.path} have two poses of {name} at one stamp, {stamps[here[i]]} ns: "
+                        f"{their_T[there[i]][:3, 3].tolist()} and {T[here[i]][:3, 3].tolist()} m. Were they made of "
+                        "folders without stamps? Name these as sensors of one rig file, and give the folder above"
+                    )
+        before.append((file.path, links))
 
 
 def check_order(stamps_ns: np.ndarray, where: str) -> None:

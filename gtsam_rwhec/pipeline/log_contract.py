@@ -34,8 +34,8 @@ CLEANING_METADATA = "gtsam_rwhec.cleaning"
 #: This metadata holds the certificate, for people who look at the log.
 CERTIFICATE_METADATA = "gtsam_rwhec.certificate"
 
-#: A folder of images becomes this log in the output folder. It is removed at the end.
-RECORDED_LOG = "recorded.mcap"
+#: A folder of images becomes a log in the output folder, with its name and this ending. It is removed at the end.
+RECORDED_LOG = ".images.mcap"
 #: Detection writes this file in the output folder. It is removed at the end.
 DETECTED_LOG = "detected.mcap"
 #: Cleaning writes this file in the output folder. Solving adds its solution to it.

@@ -53,6 +53,8 @@ def not_of_marked_outliers(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 def _cure(misreading: Misreading, rig: Rig) -> str:
     carriers, place = rig.carriers, rig.source.place
     of_A = "A is inverted" in misreading.likely
+    if carriers.poses.frames is not None and (cure := _cure_of_files(misreading.mistake, of_A, rig)):
+        return cure
     if misreading.mistake is Mistake.INVERTED and of_A:
         parent, child = carriers.poses.parent_and_child
         exchange = (
@@ -81,6 +83,29 @@ def _cure(misreading: Misreading, rig: Rig) -> str:
     if misreading.mistake is Mistake.QUATERNION_ORDER:
         return "ROS and Foxglove messages have quaternions as x, y, z, w: correct what publishes these poses"
     return misreading.cure
+
+
+def _cure_of_files(mistake: Mistake, of_A: bool, rig: Rig) -> str:
+    """The cure where the carriers' poses are in files beside images; empty where it is the same as for a log."""
+    carriers, place = rig.carriers, rig.source.place
+    poses, key = carriers.poses, place(("carriers", "poses"))
+    if mistake is Mistake.QUATERNION_ORDER:
+        other = "xyzw" if poses.quaternion == "wxyz" else "wxyz"
+        return f"write quaternion: {other} beside the frames ({key}); where the files name their columns, rename those"
+    if mistake is Mistake.INVERTED and of_A:
+        parent, child = poses.parent_and_child
+        return (
+            f"if {carriers.targets} carries the sensors, exchange the two names in "
+            f"{place(('carriers', 'sensors'), ('carriers', 'targets'))}; if it does not, the files have "
+            f"T_{child}_{parent}: write frames: [{child}, {parent}] ({key})"
+        )
+    if mistake is Mistake.ROWS_SHIFTED and all(sensor.time_offset == 0.0 for sensor in rig.sensors.values()):
+        paths = ", ".join(f"{sensor.images} with {sensor.poses}" for sensor in rig.sensors.values())
+        return (
+            f"poses belong to other images than those of their names or order ({paths}): compare both, first and last; "
+            "where the names are stamps, write time_offset: estimate"
+        )
+    return ""
 
 
 def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig) -> list[Finding]:

@@ -7,12 +7,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.misreadings import Misreading
+from gtsam_rwhec.calibration.readings import Mistake
+from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import LogError, LogWarning, RigError
 from gtsam_rwhec.logs import ImageRecord, PoseRecord, open_log
+from gtsam_rwhec.logs.pose_files import read_poses
+from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.folder_log import is_folder_of_images, write_folder_log
 from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
+from gtsam_rwhec.pipeline.log_contract import RECORDED_LOG
+from gtsam_rwhec.pipeline.log_findings import in_rig_file
 from gtsam_rwhec.rig.rig_file import parse_rig
 
 _, PNG = cv2.imencode(".png", np.zeros((4, 6), dtype=np.uint8))
@@ -66,6 +74,17 @@ def test_one_instant_only_where_it_is_said(tmp_path: Path) -> None:
         write_folder_log(tmp_path, rig("a", "b", one_instant="true"), tmp_path / "log.mcap")
     (tmp_path / "b" / "pose" / "1.csv").write_text((tmp_path / "a" / "pose" / "1.csv").read_text())
     assert write_folder_log(tmp_path, rig("a", "b", one_instant="true"), tmp_path / "log.mcap") == (4, 2)
+
+
+def test_folders_converted_apart_are_no_one_log(tmp_path: Path) -> None:
+    for camera, last in (("a", 2.0), ("b", 2.5)):
+        add(tmp_path, camera, ["0.png", "1.png"], {"0.csv": 1.0, "1.csv": last})
+        write_folder_log(tmp_path, rig(camera), tmp_path / f"{camera}.mcap")
+    words = r"a\.mcap and .*b\.mcap have two poses of hand at one stamp, 2000000000 ns: \[2\.0, .* and \[2\.5"
+    with open_log([tmp_path / "a.mcap", tmp_path / "b.mcap"]) as log, pytest.raises(LogError, match=words):
+        read_carrier_motion(log, rig("a", "b"))
+    with open_log([tmp_path / "a.mcap", tmp_path / "a.mcap"]) as log:
+        assert len(read_carrier_motion(log, rig("a", "b")).trajectory.T) == 2
 
 
 def test_the_rest_is_counted_and_said(tmp_path: Path) -> None:
@@ -158,3 +177,41 @@ def test_the_two_folders_of_other_people(workcell_camera2: Path, circle_grid_10x
     of_index = parse_rig(CIRCLES.replace("poses: poses,", "poses: cal_data.yaml,"), "rig.yaml")
     assert write_folder_log(circle_grid_10x10, of_index, tmp_path / "index.mcap") == (15, 15)
     assert read(tmp_path / "index.mcap") == read(tmp_path / "log.mcap")
+
+
+def part_of(folder: Path, workcell: Path) -> Path:
+    """A folder with some of the workcell's images."""
+    (folder / "image").mkdir(parents=True)
+    for number in (1, 43, 61, 94, 112, 121, 208, 221, 233, 242):
+        (folder / "image" / f"{number:04d}.png").symlink_to(workcell / "image" / f"{number:04d}.png")
+    (folder / "intrinsic_pars_file.yaml").symlink_to(workcell / "intrinsic_pars_file.yaml")
+    return folder
+
+
+def test_from_a_folder_to_a_result(workcell_camera2: Path, tmp_path: Path) -> None:
+    folder, out = part_of(tmp_path / "cell", workcell_camera2), tmp_path / "out"
+    poses = read_poses(workcell_camera2 / "pose")
+    rows = np.hstack([poses.T[:, :3, 3], Rotation.from_matrix(poses.T[:, :3, :3]).as_quat(scalar_first=True)])
+    lines = [f"{name} {' '.join(map(repr, row))}" for name, row in zip(poses.names, rows.tolist(), strict=True)]
+    (folder / "poses.txt").write_text("\n".join(lines))
+    text = WORKCELL.replace("poses: pose,", "poses: poses.txt,").replace("hand]}", "hand], quaternion: wxyz}")
+    with pytest.warns(LogWarning, match="29 of 39 poses have no image"):
+        calibrated = rw.pipeline.calibrate_log(folder, parse_rig(text, "rig.yaml"), out)
+    assert not list(out.glob(f"*{RECORDED_LOG}"))
+    assert calibrated.judgement.verdict is not Verdict.DO_NOT_USE
+    assert calibrated.log.detection.sources == ("cell.images.mcap",)
+    # All 34 boards together have the camera here, to a millimetre.
+    np.testing.assert_allclose(calibrated.refined.Y["camera2"].translation(), [1.7666, 2.0622, 1.1559], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "likely", "words"),
+    [
+        (Mistake.QUATERNION_ORDER, "", "write quaternion: wxyz beside the frames (rig.yaml, line 1: carriers.poses)"),
+        (Mistake.INVERTED, "A is inverted", "the files have T_hand_base: write frames: [hand, base] (rig.yaml, line 1"),
+        (Mistake.ROWS_SHIFTED, "", "poses belong to other images than those of their names or order (a/image with"),
+    ],
+)  # fmt: skip
+def test_the_cures_of_files(mistake: Mistake, likely: str, words: str) -> None:
+    (found,) = in_rig_file((Misreading(mistake, likely, "", (9.0, 1.0), (9.0, 1.0)),), rig("a"))
+    assert words in found.cure
