@@ -129,11 +129,11 @@ def _check_one_pose_a_stamp(log: Log, topic: str | None) -> None:
         names = [t.name for t in alone.topics() if not t.unreadable and (t.is_tf if topic is None else t.name == topic)]
         if not names:
             continue
+        links: dict[str, tuple[np.ndarray, Array]] = {}
         if topic is None:
-            links = TfBuffer(alone.records(names)).moving_links()
+            links.update(TfBuffer(alone.records(names)).moving_links())
         else:
-            stamps, T = _from_topic(alone, topic)
-            links = {topic: (stamps, T)}
+            links[topic] = _from_topic(alone, topic)
         for other, theirs in before:
             for name in links.keys() & theirs.keys():
                 (stamps, T), (their_stamps, their_T) = links[name], theirs[name]
