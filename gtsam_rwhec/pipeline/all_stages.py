@@ -15,7 +15,7 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.changed_rig import changes
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
-from gtsam_rwhec.pipeline.folder_log import is_folder_of_images, write_folder_log
+from gtsam_rwhec.pipeline.folder_log import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.pipeline.image_options import check_image_options
 from gtsam_rwhec.pipeline.log_contract import (
     CLEAN_LOG,
@@ -79,14 +79,9 @@ def calibrate_log(
         As each stage does.
     """
     detected, clean = Path(out) / DETECTED_LOG, Path(out) / CLEAN_LOG
+    check_is_no_other_folder(log_path, rig)
     if rig is not None and is_folder_of_images(log_path, rig):
-        recorded = made_output_folder(out) / f"{Path(str(log_path)).resolve().name}{RECORDED_LOG}"
-        rig = rig.model_copy(update={"folder": Path(str(log_path))})
-        write_folder_log(str(log_path), rig, recorded, progress=progress)
-        try:
-            return calibrate_log(recorded, rig, out, images=images, workers=workers, progress=progress)
-        finally:
-            recorded.unlink(missing_ok=True)
+        return _calibrate_folder(Path(str(log_path)), rig, out, images=images, workers=workers, progress=progress)
     with open_log(log_path) as log:
         source = log.files[0].path
         is_raw = not is_from_stage(log)
@@ -114,6 +109,22 @@ def calibrate_log(
     if is_raw:
         detected.unlink(missing_ok=True)  # clean.mcap has all that was in it
     return calibrated
+
+
+def _calibrate_folder(
+    folder: Path, rig: Rig, out: str | Path, *, images: Images, workers: int | None, progress: Progress | None
+) -> Calibrated:
+    """As `calibrate_log`, by way of a log of the folder's images, which is removed at the end."""
+    rig = rig.model_copy(update={"folder": folder})
+    made = made_output_folder(out)
+    recorded = made / f"{folder.resolve().name}{RECORDED_LOG}"
+    try:
+        write_folder_log(folder, rig, recorded, progress=progress)
+        return calibrate_log(recorded, rig, made, images=images, workers=workers, progress=progress)
+    finally:
+        recorded.unlink(missing_ok=True)
+        if not any(made.iterdir()):
+            made.rmdir()
 
 
 def _check_is_alone(log: Log) -> None:

@@ -55,6 +55,19 @@ def is_folder_of_images(path: object, rig: Rig | None) -> bool:
     return rig.carriers.poses.frames is not None and not any(Path(path).glob("*.mcap"))
 
 
+def check_is_no_other_folder(path: object, rig: Rig | None) -> None:
+    """Refuse a folder that has no log, with a rig file of a log; a `LogError` says what to write."""
+    if rig is None or not isinstance(path, str | Path) or not Path(path).is_dir() or is_folder_of_images(path, rig):
+        return
+    if not any(Path(path).glob("*.mcap")):
+        parent, child = rig.carriers.poses.parent_and_child
+        raise LogError(
+            f"{path} is a folder without MCAP files, and {rig.source.place(('carriers', 'poses'))} is of a log. For "
+            f"images with poses beside them write poses: {{frames: [{parent}, {child}]}}, and for each sensor "
+            "images: PATH and poses: PATH, which start from the folder"
+        )
+
+
 def write_folder_log(
     folder: str | Path, rig: Rig, path: str | Path, *, progress: Progress | None = None
 ) -> tuple[int, int]:

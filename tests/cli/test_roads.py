@@ -34,6 +34,7 @@ VALUES = {
     "carrier_noise_mm": "1",
     "images": None,
     "workers": "2",
+    "poses": "poses.csv",
 }
 
 # What is typed, what the way refuses, and what it takes.
@@ -45,7 +46,8 @@ ROADS = {
         calibrate.NOT_CERTIFIED_ONLY,
         calibrate.OF_FOLDER | calibrate.OF_SOLVE,
     ),
-    "bag": (BAG, convert.NOT_FOR_A_BAG, {"source", "output", "poses"}),
+    "bag": (BAG, convert.NOT_FOR_A_BAG, {"source", "output", "poses", "rig"}),
+    "described": ((*BAG, "--rig", "rig.yaml"), convert.NOT_WITH_A_RIG, {"source", "output", "rig"}),
 }
 # These choose the way, and so are never passed over.
 CHOOSING = {"folder": {"rig"}, "certified": {"rig"}}

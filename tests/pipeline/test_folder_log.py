@@ -131,6 +131,12 @@ def test_what_does_not_fit(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="nothing: there is no such file or folder of poses"):
         write_folder_log(tmp_path, rig("a", poses="nothing"), out)
     assert not out.exists()
+    with pytest.raises(LogError, match="no such folder of images"):
+        rw.pipeline.calibrate_log(tmp_path, rig("b"), tmp_path / "results")
+    assert not (tmp_path / "results").exists()
+    of_a_log = parse_rig(WORKCELL.replace("frames", "tf").replace("poses: pose, ", ""), "rig.yaml")
+    with pytest.raises(LogError, match=r"is of a log.* write poses: {frames: \[base, hand\]}"):
+        rw.pipeline.calibrate_log(tmp_path, of_a_log, tmp_path / "results")
 
 
 def test_the_rig_file_of_a_folder() -> None:
