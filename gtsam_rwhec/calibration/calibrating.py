@@ -28,6 +28,9 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
+#: From fewer poses of the carriers their noise is not known, however often each was measured.
+FEWEST_POSES = 6
+
 
 @one_blas_thread()
 def calibrate(
@@ -102,6 +105,10 @@ def _calibrated(run: Run) -> Calibration:
     outliers = outliers_of(run, inliers)
     if refined is not None and not refined.free_directions and spare_equations(problem) < SPARE_EQUATIONS:
         words = f"{problem.number_of_measurements} measurements are too few to tell how large their noise is"
+        record.find(Ground.COVARIANCE_DOUBTED, words)
+    elif refined is not None and found.noise.model is not None and found.noise.model.instants < FEWEST_POSES:
+        number = found.noise.model.instants
+        words = f"all measurements come from {number} poses of the carriers, and each pose has one error"
         record.find(Ground.COVARIANCE_DOUBTED, words)
     best = solution if refined is None else refined
     return Calibration(

@@ -7,11 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from gtsam_rwhec.calibration.moved_frames import are_alike, moved_frame
 from gtsam_rwhec.calibration.noise_choice import Inliers, estimated
 from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
 from gtsam_rwhec.calibration.stated_poses import contradicted_poses, stated_poses
-from gtsam_rwhec.calibration.two_poses import two_poses
+from gtsam_rwhec.calibration.two_poses import by_station, means_of, residual_twists, two_poses
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import silent
@@ -49,7 +50,18 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
 
 def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
     """Frames that were at two poses are found."""
-    for one in two_poses(run.problem, refined, inliers):
+    found = two_poses(run.problem, refined, inliers)
+    if not found and run.problem.has_measurements:
+        problem = selected(run.problem, inliers) if inliers else run.problem
+        raw = {pair: problem.measurements(*pair) for pair in problem.pairs}
+        twists = [
+            means_of(residual_twists(refined, pair, of.A, of.B)[0], by_station(of.A)[0]) for pair, of in raw.items()
+        ]
+        if are_alike(twists):
+            run.tell("looking for a frame that moved")
+            moved = moved_frame(run.problem, {pair: (of.A, of.B) for pair, of in raw.items()})
+            found = () if moved is None else (moved,)
+    for one in found:
         run.record.find(Ground.CONTRADICTED, str(one))
 
 

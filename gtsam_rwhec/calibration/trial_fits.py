@@ -69,11 +69,14 @@ class TrialFit:
         Lengths in B over true lengths; negative where A and B are of different handedness.
     errors : (2, N) array
         Of each measurement, pair after pair: angle (rad) and distance (in B's unit).
+    frames : dict of str to (4, 4) array
+        The poses of targets and sensors.
     """
 
     residual: Spread
     scale: float | dict[str, float]
     errors: Array
+    frames: dict[str, Array]
 
     @property
     def log_likelihoods(self) -> Array:
@@ -132,7 +135,7 @@ def _fitted(problem: Problem, sample: Sample, mode: ScaleMode, rounds: int) -> T
         if kept:
             scales = {pair.target: answer.scales[pair.target] for pair in sample}
             own = scales if mode == "per_target" else next(iter(scales.values()))
-            best = TrialFit(spread, own, joined)
+            best = TrialFit(spread, own, joined, answer.frames)
         s_R = max(spread.rotation_rad, SMALLEST_SHARE) / MEDIAN_OF_CHI
         s_t = max(spread.translation_m, SMALLEST_SHARE * distance) / MEDIAN_OF_CHI
         kappa, sigma = 0.5 / s_R**2, s_t

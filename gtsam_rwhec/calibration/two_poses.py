@@ -12,8 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from rwhec_factors import se3
+from scipy.spatial import cKDTree
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.noise_model.rows import stations
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.refined import Refined
@@ -21,6 +23,8 @@ from gtsam_rwhec.refinement.refined import Refined
 #: Two groups lie apart by this many times their own spread. (2,000 simulations each of white noise, random walks, walks
 #: with noise, Student's t with 2 degrees of freedom and smooth errors, 20 to 160 measurements: 1 of 30,000 was.)
 APART = 8.0
+#: Neighbours among the carriers' poses are in the same group with this share, where the groups come with the poses.
+SAME_GROUP = 0.9
 #: Each group has at least this share of the measurements, and there are so many.
 SMALLEST_GROUP, FEWEST = 0.25, 20
 
@@ -52,7 +56,7 @@ class TwoPoses:
         apart = f"{np.degrees(self.angle_rad):.2g} degrees and {1e3 * self.distance_m:.3g} mm apart"
         return (
             f"{self.frame} was at two poses{when}: its measurements fall into groups of {self.first} and "
-            f"{self.second}, {apart}, and each group agrees with itself"
+            f"{self.second}, {apart}, and each group agrees with itself (it was moved, or it was seen in two ways)"
         )
 
 
@@ -67,33 +71,56 @@ def two_poses(problem: Problem, refined: Refined, inliers: Mapping[Pair, np.ndar
     """
     if not problem.has_measurements:
         return ()
-    in_frame: dict[str, list[Array]] = {}
+    in_frame: dict[str, list[tuple[Array, Array]]] = {}
     for pair in problem.pairs:
         raw = problem.measurements(*pair)
         kept = inliers.get(pair, np.ones(len(raw.A), dtype=bool))
-        of_target, of_sensor = _twists(refined, pair, raw.A[kept], raw.B[kept])
-        in_frame.setdefault(pair.target, []).append(of_target)
-        in_frame.setdefault(pair.sensor, []).append(of_sensor)
-    found = [(*_groups(name, np.concatenate(twists)), name) for name, twists in in_frame.items()]
+        station, A = by_station(raw.A[kept])
+        of_target, of_sensor = residual_twists(refined, pair, raw.A[kept], raw.B[kept])
+        in_frame.setdefault(pair.target, []).append((means_of(of_target, station), A))
+        in_frame.setdefault(pair.sensor, []).append((means_of(of_sensor, station), A))
+    found = [
+        (*_groups(name, *(np.concatenate(each) for each in zip(*parts, strict=True))), name)
+        for name, parts in in_frame.items()
+    ]
     found = sorted((one for one in found if one[0] > APART), key=lambda one: -one[0])
     # What moved makes two groups of whatever it is seen with; so a frame counts alone.
     return tuple(groups for _, groups, _ in found[:1] if groups is not None)
 
 
-def _twists(refined: Refined, pair: Pair, A: Array, B: Array) -> tuple[Array, Array]:
+def residual_twists(refined: Refined, pair: Pair, A: Array, B: Array) -> tuple[Array, Array]:
     """Residuals (N, 6) of some measurements, in the target's axes and in the sensor's; lengths are true ones."""
-    scale = refined.scale[pair.target] if isinstance(refined.scale, Mapping) else refined.scale
     X, Y = refined.X.get(pair.target), refined.Y.get(pair.sensor)
     if X is None or Y is None or not len(A):
         return np.zeros((0, 6)), np.zeros((0, 6))
+    scale = refined.scale[pair.target] if isinstance(refined.scale, Mapping) else refined.scale
     measured = B.copy()
     measured[:, :3, 3] /= scale
     predicted = se3.inverse(Y.matrix()) @ A @ X.matrix()
     return se3.logmap(se3.inverse(measured) @ predicted), se3.logmap(measured @ se3.inverse(predicted))
 
 
-def _groups(name: str, twists: Array) -> tuple[float, TwoPoses | None]:
-    """How far apart the best two groups of some residuals (N, 6) are, in their own spread, and the groups."""
+def by_station(A: Array) -> tuple[np.ndarray, Array]:
+    """The station (N,) of each pose, and a pose (S, 12) of each station: many visits of one are one error of an arm."""
+    rows = A[:, :3].reshape(-1, 12)
+    station = stations(rows) if len(rows) else np.zeros(0, dtype=np.int64)
+    return station, rows[np.unique(station, return_index=True)[1]]
+
+
+def means_of(twists: Array, station: np.ndarray) -> Array:
+    """The mean residual (S, 6) at each station."""
+    if not len(twists):
+        return twists
+    visits = np.bincount(station)
+    return np.stack([np.bincount(station, column) / visits for column in twists.T], axis=1)
+
+
+def _groups(name: str, twists: Array, A: Array) -> tuple[float, TwoPoses | None]:
+    """How far apart the best two groups of some residuals (N, 6) are, in their own spread, and the groups.
+
+    Groups that come with the carriers' poses A (N, 12), and not one after the other in time, are an arm's error, or
+    views of a board.
+    """
     n = len(twists)
     if n < FEWEST:
         return 0.0, None
@@ -115,6 +142,8 @@ def _groups(name: str, twists: Array) -> tuple[float, TwoPoses | None]:
         is_high = ~is_high  # the first group is that of the first measurement
     step = twists[is_high].mean(axis=0) - twists[~is_high].mean(axis=0)
     changes = np.flatnonzero(np.diff(is_high))
+    if len(changes) > 1 and (is_high[np.asarray(cKDTree(A).query(A, k=2)[1])[:, 1]] == is_high).mean() > SAME_GROUP:
+        return 0.0, None
     groups = TwoPoses(
         frame=name,
         first=int((~is_high).sum()),

@@ -35,9 +35,9 @@ SMOOTH_RAD, SMOOTH_M = 1.5, 0.75
 SMALLEST_SPREAD = 1e-4
 #: A carrier stands still while no entry of its pose (1, m) changes by more than this.
 STILL = 5e-5
-#: Poses of an arm that comes back to a station differ by less than this (1, m); those of other stations, by more than
-#: ``APART`` times as much.
-REVISITED, APART = 1e-3, 10.0
+#: Poses of an arm that comes back to a station are so near to their mean (1, and lengths by the motion's spread over
+#: ``SPREAD_M``): the first of these that fits. Those of other stations are ``APART`` times as far at least.
+REVISITED, APART, SPREAD_M = (1e-3, 6e-3), 10.0, 0.3
 #: More pairs of near poses than this, an instant, are not those of visits to stations.
 MOST_LINKS = 50
 #: A velocity is taken from neighbours that are no further apart than this, s.
@@ -91,10 +91,11 @@ class Instants:
         keys = np.column_stack([(stamps - stamps.min()).astype(np.float64) * has_stamps, rounded])
         first_of, same = np.unique(keys, axis=0, return_index=True, return_inverse=True)[1:]
         same = same.ravel()
+        poses = A[first_of, :3].reshape(-1, 12)
         if has_stamps or len(data) == 1:  # the rows of one pair are in order of time
-            still = standstills(A[first_of, :3].reshape(-1, 12), stamps[first_of])
-            one = np.unique(still, return_index=True)[1]
-            same = stations(A[first_of, :3].reshape(-1, 12)[one])[still][same]
+            still = standstills(poses, stamps[first_of])
+            poses, same = poses[np.unique(still, return_index=True)[1]], still[same]
+        same = stations(poses)[same]
         if len(np.unique(same)) == len(same):  # no instant is shared: one track after the other
             order = np.lexsort((stamps, pair))
             begins = np.r_[True, np.diff(pair[order]) != 0]
@@ -132,21 +133,28 @@ def standstills(A: Array, stamps: np.ndarray) -> np.ndarray:
 def stations(A: Array) -> np.ndarray:
     """The station (N,) of each instant: where an arm comes back to few poses (N, 12), its error there is the same.
 
-    Poses within ``REVISITED`` of one another are one station, if they are far from all others and if each is visited
-    twice and more on average. Elsewhere each instant is a station of its own.
+    Poses near one another are one station, if all are far from those of other stations and if each is visited twice and
+    more on average. Elsewhere each instant is a station of its own. Lengths count in units of the motion's spread.
     """
     alone = np.arange(len(A))
-    tree = cKDTree(A)
-    number = (tree.count_neighbors(tree, APART * REVISITED) - len(A)) // 2
-    if number < len(A) // 2 or number > MOST_LINKS * len(A):
-        return alone
-    links = tree.query_pairs(APART * REVISITED, output_type="ndarray")
-    is_close = np.linalg.norm(A[links[:, 0]] - A[links[:, 1]], axis=1) < REVISITED
-    if not is_close.all():
-        return alone
-    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(A), len(A)))
-    count, station = connected_components(graph, directed=False)
-    return station if 2 * count <= len(A) else alone
+    spread = float(np.sqrt((A[:, 3::4].var(axis=0)).mean()))
+    poses = A.copy()
+    poses[:, 3::4] *= SPREAD_M / max(spread, SMALLEST_SPREAD)
+    tree = cKDTree(poses)
+    for near in REVISITED:
+        number = (tree.count_neighbors(tree, APART * near) - len(A)) // 2
+        if number > MOST_LINKS * len(A):
+            return alone
+        if number < len(A) // 2:
+            continue
+        links = tree.query_pairs(APART * near, output_type="ndarray")
+        graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(A), len(A)))
+        count, station = connected_components(graph, directed=False)
+        visits = np.bincount(station, minlength=count)
+        middle = np.stack([np.bincount(station, column, count) / visits for column in poses.T], axis=1)
+        if 2 * count <= len(A) and (np.linalg.norm(poses - middle[station], axis=1) < near).all():
+            return np.asarray(station)
+    return alone
 
 
 @dataclass(frozen=True)
@@ -251,6 +259,9 @@ class Rows:
     def features(self, side: Side) -> Array:
         """f (N, k): the centred principal components of the configurations."""
         centred = self.configuration[side] - self.configuration[side].mean(axis=0)
+        # Of a motion that is wider than an arm's, the spread is the length.
+        spread = SMOOTH_M * float(np.sqrt((centred[:, 9:] ** 2).mean()))
+        centred[:, 9:] *= min(1.0, SPREAD_M / max(spread, SMALLEST_SPREAD))
         _, s, directions = np.linalg.svd(centred, full_matrices=False)
         kept = s**2 > SMALLEST_SPREAD * max(float((s**2).sum()), 1e-300)
         found: Array = centred @ directions[kept].T

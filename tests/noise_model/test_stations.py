@@ -37,7 +37,7 @@ def test_poses_that_are_not_apart_are_instants_of_their_own() -> None:
     along = np.linspace(0.0, 1.0, 200)[:, None] * chance.normal(size=12)
     alone = chance.normal(size=(60, 12))
     few = np.concatenate([alone, alone[:10]])
-    slow = np.concatenate([alone, alone + 3e-3])
+    slow = np.concatenate([alone, alone + 0.02])
     for poses in (along, alone, few, slow, alone[:1]):
         np.testing.assert_array_equal(stations(poses), np.arange(len(poses)))
 
