@@ -17,9 +17,11 @@ from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.rejection import Rejection
 
-#: A corner is off its place in the plane by at most this (pixels), or by `MOST_OFF` of the smallest square's side.
+#: A corner is off its place in the plane by at most this (pixels), or by `MOST_OFF` of the distance between lines.
 MOST_OFF_PX = 0.5
-MOST_OFF = 0.04
+MOST_OFF = 0.02
+#: At least this share of the corners must be at their places; those that are not do not count.
+LEAST_KEPT = 0.75
 #: Two neighbouring squares have at least this share of the median contrast of all neighbours.
 LEAST_CONTRAST = 0.3
 #: Two neighbouring squares differ by at least this, in gray values.
@@ -38,11 +40,14 @@ class Evidence:
     ----------
     rejection : Rejection or None
         Why the corners are not the board's; None if they are.
+    kept : (rows, columns) array of bool
+        Which corners are at their places in the plane; a shadow's edge or dirt moves a few.
     first_is_dark : bool
         Whether the first corner's outer square is dark.
     """
 
     rejection: Rejection | None
+    kept: np.ndarray
     first_is_dark: bool = True
 
 
@@ -53,13 +58,20 @@ def evidence(gray: Gray, grid: Array, camera: Camera | None) -> Evidence:
     seen = grid.reshape(-1, 2)
     focal = 1.0 if camera is None else 0.5 * float(camera.K[0, 0] + camera.K[1, 1])
     flat = seen if camera is None else camera.undistort(seen) * focal
-    fitted = cv2.findHomography(plane, flat)[0] if np.isfinite(flat).all() else None
-    if fitted is None or not np.isfinite(fitted).all():
-        return Evidence(Rejection.NOT_A_GRID)
-    H: Array = np.asarray(fitted, dtype=float)
-    off = np.linalg.norm(_pixels(plane, H, focal, camera) - seen, axis=1).max()
-    if not off <= max(MOST_OFF_PX, MOST_OFF * smallest_step(grid)):
-        return Evidence(Rejection.NOT_A_GRID)
+    most_px = max(MOST_OFF_PX, MOST_OFF * smallest_step(grid))
+    none_left_out = np.ones((rows, columns), dtype=bool)
+    H: Array = np.eye(3)
+    off: Array = np.full(len(seen), np.inf)
+    for method in (0, cv2.LMEDS):  # least squares of all; where some are off, the median's homography finds which
+        fitted = _homography(plane, flat, method)
+        if fitted is None:
+            return Evidence(Rejection.NOT_A_GRID, none_left_out)
+        H, off = fitted, np.linalg.norm(_pixels(plane, fitted, focal, camera) - seen, axis=1)
+        if (off <= most_px).all():
+            break
+    kept = (off <= most_px).reshape(rows, columns)
+    if not kept.mean() >= LEAST_KEPT:
+        return Evidence(Rejection.NOT_A_GRID, none_left_out)
     values = _values(gray, H, focal, camera, rows, columns)
     white = np.indices(values.shape).sum(axis=0) % 2 == 1
     inner = np.s_[2:-2, 2:-2]
@@ -68,16 +80,22 @@ def evidence(gray: Gray, grid: Array, camera: Camera | None) -> Evidence:
     across, down = (_contrasts(values, light, axis) for axis in (1, 0))
     on_board = np.concatenate([across[1:-1, 1:-1].ravel(), down[1:-1, 1:-1].ravel()])
     if np.isnan(on_board).any():
-        return Evidence(Rejection.NOT_WHOLE)
+        return Evidence(Rejection.NOT_WHOLE, kept)
     usual = float(np.median(on_board))
     if not (on_board >= LEAST_CONTRAST * usual).all() or usual <= 0.0:
-        return Evidence(Rejection.SQUARES)
+        return Evidence(Rejection.SQUARES, kept)
     # Beyond the board, where all of a row or column of squares alternates on and against the outermost squares.
     beyond = ((across[k, 1:-1], down[k, 1:-1]) for k in (0, -1))
     beside = ((down[1:-1, k], across[1:-1, k]) for k in (0, -1))
     if any((np.concatenate(pair) >= GOES_ON * usual).all() for pair in (*beyond, *beside)):
-        return Evidence(Rejection.OTHER_SIZE)
-    return Evidence(None, first_is_dark)
+        return Evidence(Rejection.OTHER_SIZE, kept)
+    return Evidence(None, kept, first_is_dark)
+
+
+def _homography(plane: Array, flat: Array, method: int) -> Array | None:
+    """The homography (3, 3) from the board to pixels without distortion; None where there is none."""
+    H = cv2.findHomography(plane, flat, method)[0] if np.isfinite(flat).all() else None
+    return None if H is None or not np.isfinite(H).all() else np.asarray(H, dtype=float)
 
 
 def smallest_step(grid: Array) -> float:

@@ -7,15 +7,14 @@ reads all 34 boards at a tenth of the second's time; the second reads more where
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import cv2
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.board_evidence import evidence, smallest_step
+from gtsam_rwhec.vision.board_evidence import Evidence, evidence, smallest_step
 from gtsam_rwhec.vision.boards import refined_corners
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.images import Gray
@@ -24,21 +23,24 @@ from gtsam_rwhec.vision.saddles import regions
 from gtsam_rwhec.vision.targets import Checkerboard
 
 #: The half window at a corner is this share of the distance between neighbouring lines of corners, at most 9 pixels.
-OF_SQUARE = 0.4
+#: The second is tried where corners are not on a grid.
+OF_SQUARE = (0.4, 0.25)
 #: Images are halved this often before saddles are looked for: sharp corners first, blurred ones in what is smaller.
 LEVELS = (1, 2)
 #: At most this number of regions of an image are searched.
 MOST_REGIONS = 3
-
-#: Asks for corners (rows, columns, 2) in a region, or None.
-_Finder: TypeAlias = Callable[[Gray, Checkerboard], "Array | None"]
+#: A region of at most this many pixels is searched at twice its size too: narrow squares of oblique boards need that.
+LARGEST_ENLARGED = 250_000
+#: A region is not searched if at least this share of it has been searched.
+SEARCHED = 0.95
 
 
 @dataclass(frozen=True, eq=False)
 class FoundCheckerboard:
-    """Corners of a checkerboard (columns rows, 2), left to right from the top, and why they are not used, if so."""
+    """Corners (n, 2) of a checkerboard, their indices (n,) in its rows from the top, and why they are not used."""
 
     corners_px: Array
+    indices: np.ndarray
     rejection: Rejection | None
 
 
@@ -59,14 +61,31 @@ def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = N
 
 def _candidates(gray: Gray, board: Checkerboard) -> Iterator[Array]:
     """Grids of corners (rows, columns, 2) that OpenCV finds, in the order in which they are asked for."""
+    searched: list[tuple[slice, slice]] = []
     for level in LEVELS:
         for region in regions(gray, board.columns * board.rows, level)[:MOST_REGIONS]:
+            if any(_share_inside(region, before) > SEARCHED for before in searched):
+                continue
+            searched.append(region)
             part = np.ascontiguousarray(gray[region])
             corner = np.array([region[1].start, region[0].start], dtype=float)
-            for finder in (_classic, _sector_based):
-                grid = finder(part, board)
-                if grid is not None:
-                    yield grid + corner
+            enlarged: Gray | None = None
+            if part.size <= LARGEST_ENLARGED:
+                enlarged = np.asarray(cv2.resize(part, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
+            for picture in (part, enlarged):
+                for finder in (_classic, _sector_based):
+                    grid = None if picture is None else finder(picture, board)
+                    if grid is not None:
+                        # Pixel centres are at whole numbers: the first of the enlarged ones is at -1/4.
+                        yield corner + (grid if picture is part else 0.5 * grid - 0.25)
+
+
+def _share_inside(region: tuple[slice, slice], other: tuple[slice, slice]) -> float:
+    """The share of a region (rows, columns) that lies in another one."""
+    share = 1.0
+    for side, of_other in zip(region, other, strict=True):
+        share *= max(0, min(side.stop, of_other.stop) - max(side.start, of_other.start)) / (side.stop - side.start)
+    return share
 
 
 def _classic(gray: Gray, board: Checkerboard) -> Array | None:
@@ -84,16 +103,22 @@ def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundCheckerboard
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: a board is not seen from behind
         grid = grid[::-1]
-    half = int(np.clip(OF_SQUARE * smallest_step(grid), 2, 9))
-    grid = refined_corners(gray, grid.reshape(-1, 2), half).reshape(grid.shape)
-    seen = evidence(gray, grid, camera)
+    tried: list[tuple[Array, Evidence]] = []
+    for share in OF_SQUARE:  # a smaller window where something else is in the larger one, as a shadow's edge
+        half = int(np.clip(share * smallest_step(grid), 2, 9))
+        refined = refined_corners(gray, grid.reshape(-1, 2), half).reshape(grid.shape)
+        tried.append((refined, evidence(gray, refined, camera)))
+        if tried[-1][1].rejection is not Rejection.NOT_A_GRID and tried[-1][1].kept.all():
+            break
+    refined, seen = max(tried, key=lambda one: (one[1].rejection is None, int(one[1].kept.sum())))
+    kept = seen.kept
     if not seen.first_is_dark:
-        grid = _other_colour(grid)
-    return FoundCheckerboard(grid.reshape(-1, 2), seen.rejection)
+        refined, kept = _other_colour(refined), _other_colour(kept)
+    return FoundCheckerboard(refined[kept], np.flatnonzero(kept), seen.rejection)
 
 
-def _other_colour(grid: Array) -> Array:
-    """The grid turned so that its first corner is at a square of the other colour, where a turn does so."""
+def _other_colour(grid: np.ndarray) -> np.ndarray:
+    """A grid (rows, columns, ...) turned so that its first corner is at a square of the other colour, if a turn can."""
     rows, columns = grid.shape[:2]
     if (rows + columns) % 2 == 1:
         return grid[::-1, ::-1]

@@ -134,8 +134,7 @@ class Detector:
             for of_image, gray in zip(sightings, images, strict=True):
                 seen = find_checkerboard(gray, checkerboard, self.camera)
                 if seen is not None:
-                    indices = np.arange(len(seen.corners_px))
-                    of_image.append(_Sighting(checkerboard, indices, seen.corners_px, rejection=seen.rejection))
+                    of_image.append(_Sighting(checkerboard, seen.indices, seen.corners_px, rejection=seen.rejection))
         judged = iter(self._judged([sighting for of_image in sightings for sighting in of_image]))
         return [
             ImageDetections(tuple(next(judged) for _ in of_image), strangers)

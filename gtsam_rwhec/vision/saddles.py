@@ -31,7 +31,9 @@ BEYOND, BEYOND_PX = 0.45, 12.0
 
 
 def regions(gray: Gray, corners: int, level: int) -> list[tuple[slice, slice]]:
-    """Regions (rows, columns) of an image that may show a board of this number of corners, the fullest first.
+    """Regions (rows, columns) of an image that may show a board of this number of corners, the likeliest first.
+
+    A group of about as many saddles as the board has corners is likelier than a larger one, which may be any clutter.
 
     The image is halved `level` times first: this is fast, and finds blurred corners too.
     """
@@ -46,12 +48,13 @@ def regions(gray: Gray, corners: int, level: int) -> list[tuple[slice, slice]]:
         if len(members) >= SHARE * corners:
             low, high = places[members].min(axis=0), places[members].max(axis=0)
             more = BEYOND * float((high - low).max()) + BEYOND_PX
-            boxes.append((len(members), low - more, high + more))
-    boxes.sort(key=lambda box: -box[0])
+            boxes.append((abs(float(np.log(len(members) / corners))), low - more, high + more))
+    boxes.sort(key=lambda box: box[0])
     found = []
     for _, low, high in boxes:
         (left, top), (right, bottom) = (np.rint(side * 2**level).astype(int) for side in (low, high))
-        found.append((slice(max(top, 0), max(bottom, 0)), slice(max(left, 0), max(right, 0))))
+        height, width = gray.shape
+        found.append((slice(max(top, 0), min(bottom, height)), slice(max(left, 0), min(right, width))))
     return found
 
 

@@ -56,9 +56,14 @@ def test_a_part_of_a_larger_board_is_rejected() -> None:
     assert evidence(image, grid_of(PINHOLE), PINHOLE).rejection is Rejection.OTHER_SIZE
 
 
-def test_one_wrong_corner_is_enough() -> None:
+def test_wrong_corners_do_not_count_and_many_are_no_grid() -> None:
     image, grid = render(PINHOLE, [(printed(CHESS), T)]), grid_of(PINHOLE)
-    grid[1, 2] += [2.0, 0.0]
+    grid[1, 2] += [1.0, 0.0]
+    grid[3, 0] += [0.0, -2.0]
+    seen = evidence(image, grid, PINHOLE)
+    assert seen.rejection is None
+    assert np.argwhere(~seen.kept).tolist() == [[1, 2], [3, 0]]
+    grid[:2, :3] += [3.0, 0.0]
     assert evidence(image, grid, PINHOLE).rejection is Rejection.NOT_A_GRID
     grid[:] = 7.0
     assert evidence(image, grid, PINHOLE).rejection is Rejection.NOT_A_GRID
