@@ -106,7 +106,7 @@ def match(files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:
 def _number(name: str) -> str:
     """The last number in a name, without zeros before it; empty without a number."""
     numbers = re.findall(r"\d+", stem_of(name))
-    return str(int(numbers[-1])) if numbers else ""
+    return numbers[-1].lstrip("0") or "0" if numbers else ""
 
 
 def _enough(matched: Matched, files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:

@@ -173,7 +173,8 @@ def _of_angles(rows: list[PoseRow], stated: PoseStatement) -> Array:
 def _check_workspace(T: Array, rows: Sequence[PoseRow]) -> None:
     """Refuse positions that are spread as millimetres are."""
     t = T[:, :3, 3]
-    extent = float(np.ptp(t, axis=0).max())
+    with np.errstate(over="ignore"):
+        extent = float(np.ptp(t, axis=0).max())
     if len(rows) > 1 and extent > WORKSPACE_M:
         far = int(np.argmax(np.abs(t - np.median(t, axis=0)).max(axis=1)))
         raise LogError(

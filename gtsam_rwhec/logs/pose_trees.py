@@ -129,9 +129,10 @@ def _name(fields: dict[str, Any]) -> str:
     for key in _NAME:
         value = fields.get(key, header.get(key))
         of_stamp = _fields(value)
-        if "sec" in of_stamp or "secs" in of_stamp:  # ROS
-            nanoseconds = of_stamp.get("nanosec", of_stamp.get("nsec", of_stamp.get("nsecs", 0)))
-            return str(int(of_stamp.get("sec", of_stamp.get("secs", 0))) * 10**9 + int(nanoseconds))
+        seconds = of_stamp.get("sec", of_stamp.get("secs"))
+        nanoseconds = of_stamp.get("nanosec", of_stamp.get("nsec", of_stamp.get("nsecs", 0)))
+        if isinstance(seconds, int) and isinstance(nanoseconds, int):  # ROS
+            return str(seconds * 10**9 + nanoseconds)
         if isinstance(value, str) or _is_number(value):
             return str(value)
     return ""

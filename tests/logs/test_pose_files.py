@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from strategies import damaged, tables
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs.pose_files import read_poses
@@ -19,10 +23,6 @@ T = np.tile(np.eye(4), (4, 1, 1))
 T[:, :3, :3], T[:, :3, 3] = TURNS.as_matrix(), RNG.uniform(-1.0, 1.0, (4, 3))
 Q = TURNS.as_quat()
 NAMES = [f"im_{i}.png" for i in range(4)]
-
-
-def line(*numbers: object, mark: str = " ") -> str:
-    return mark.join(repr(float(x)) if not isinstance(x, str) else x for x in np.ravel(numbers).tolist())
 
 
 def lines(header: str, *columns: object, mark: str = ",") -> str:
@@ -150,3 +150,26 @@ def test_what_cannot_be_meant(tmp_path: Path, name: str, text: str, stated: dict
     with pytest.raises(LogError, match=words) as caught:
         read_poses(tmp_path / name, PoseStatement(**stated))
     assert name in str(caught.value)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    ending=st.sampled_from([".csv", ".yaml", ".json"]),
+    content=tables(8, "a 1 2 3 0 0 0.6 0.8", " ").map(lambda text: text.encode(errors="surrogatepass"))
+    | damaged([text.encode() for text, _ in TEXTS.values()]),
+    stated=st.sampled_from([stated for _, stated in TEXTS.values()]),
+)
+def test_any_file_gives_poses_or_an_error_of_ours(
+    tmp_path_factory: pytest.TempPathFactory, ending: str, content: bytes, stated: dict[str, Any]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / f"any{ending}"
+    path.write_bytes(content)
+    try:
+        found = read_poses(path, PoseStatement(**stated))
+    except LogError as error:
+        assert path.name in str(error)  # noqa: PT017
+        assert len(str(error)) < 2000  # noqa: PT017
+    else:
+        R = found.T[:, :3, :3]
+        assert np.isfinite(found.T).all()
+        np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-9)
