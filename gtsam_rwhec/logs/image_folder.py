@@ -1,7 +1,6 @@
 """Logs made of a folder of images and a text file of poses, the form in which older tools take data.
 
-Each line of the file is one pose: a name or a stamp, then seven numbers, with commas or blanks between. A line of
-column names and lines that begin with # are passed over. The first field is
+The file is any that `read_poses` reads; names of columns, if it has them, go before the stated order. A pose's name is
 
 - the file name of an image, with or without its ending: the image was taken at this pose. Images get stamps 1 s apart;
 - or a stamp, in seconds (``1700000000.25``) or integer nanoseconds (16 digits or more). Then the images' file names are
@@ -10,29 +9,24 @@ column names and lines that begin with # are passed over. The first field is
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from gtsam_rwhec.errors import FileFormatError, LogError
-from gtsam_rwhec.files.budgets import MESSAGE, POSES_TEXT
+from gtsam_rwhec.files.budgets import MESSAGE
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.whole_files import read_whole
-from gtsam_rwhec.logs.checked_poses import transforms
 from gtsam_rwhec.logs.mcap_writer import LogWriter
-from gtsam_rwhec.logs.records import Array
+from gtsam_rwhec.logs.pose_files import read_poses
+from gtsam_rwhec.logs.pose_rows import PoseStatement
 from gtsam_rwhec.logs.stamp_text import as_ns
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
 #: Foxglove gives the formats of images these names; the keys are the files' endings.
 FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
-#: A table of poses has at most this many lines, and a line at most this many characters.
-MOST_LINES, LONGEST_LINE = 500_000, 10_000
 #: Bytes of the largest file that is taken as an image. A log keeps images as they are.
 LARGEST_IMAGE = MESSAGE
 
@@ -63,11 +57,11 @@ def write_image_folder(
     images
         The folder; files with other endings than `FORMATS` are passed over.
     poses
-        The text file, T_parent_child in metres and unit quaternions.
+        The file or folder of T_parent_child, in metres.
     path
         The MCAP file to write.
     columns
-        The order of the seven numbers.
+        The order of the seven numbers, where the file does not name them.
     parent, child, camera
         Names of the frames.
 
@@ -86,7 +80,8 @@ def write_image_folder(
     files = sorted((f for f in images.glob("*") if f.suffix.lower() in FORMATS), key=lambda f: natural_key(f.name))
     if not files:
         raise LogError(f"{images} has no images ({', '.join(FORMATS)}).")
-    names, T = _read_poses(poses, columns)
+    found = read_poses(poses, PoseStatement(length="m", columns=columns))
+    names, T = list(found.names), found.T
     image_stamps, pose_stamps = _stamps(files, names, poses)
     entries = [(stamp, True, i) for i, stamp in enumerate(image_stamps)]
     entries += [(stamp, False, i) for i, stamp in enumerate(pose_stamps)]
@@ -101,49 +96,6 @@ def write_image_folder(
                 raise LogError(str(error)) from error
             out.compressed_image(f"/{camera}/image", stamp, camera, FORMATS[files[i].suffix.lower()], data)
     return len(files), len(T)
-
-
-def _read_poses(path: Path, columns: Columns) -> tuple[list[str], Array]:
-    try:
-        content = read_whole(path, POSES_TEXT, "A table of poses was")
-    except FileFormatError as error:
-        raise LogError(str(error)) from error
-    number_of_lines = content.count(b"\n") + content.count(b"\r")
-    if number_of_lines > MOST_LINES:
-        raise LogError(f"{path} has {number_of_lines} lines; at most {MOST_LINES} are read.")
-    try:
-        lines = content.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise LogError(f"{path} is not text in UTF-8 (byte {error.start}); give lines of poses.") from error
-    found: list[tuple[int, str, list[float]]] = []
-    has_header = False
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        if len(line) > LONGEST_LINE:
-            raise LogError(
-                f"{path}, line {number}: longer than {LONGEST_LINE} characters. Give a name or stamp, {columns}."
-            )
-        fields = re.split(r"\s*,\s*|\s+", line.strip())
-        try:
-            row = [float(field) for field in fields[1:]]
-        except ValueError:
-            row = []
-        if len(row) != 7:
-            if not found and not has_header and re.search(r"[A-Za-z]", "".join(fields[1:])):
-                has_header = True
-                continue
-            raise LogError(f"{path}, line {number}: not a name or stamp and {columns}: {line[:80]!r}.")
-        found.append((number, fields[0], row))
-    if not found:
-        raise LogError(f"{path} has no poses; each line is a name or stamp, then {columns}.")
-    numbers, names, rows = zip(*found, strict=True)
-    column = columns.split().index
-    table = np.array(rows)
-    T, faults = transforms(table[:, [column(f"t{a}") for a in "xyz"]], table[:, [column(f"q{a}") for a in "xyzw"]])
-    for i, fault in faults.items():
-        raise LogError(f"{path}, line {numbers[i]}: {fault}. Are the columns {columns}?")
-    return list(names), T
 
 
 def _stamps(files: Sequence[Path], names: Sequence[str], poses: Path) -> tuple[list[int], list[int]]:

@@ -32,19 +32,16 @@ def read_poses(path: str | Path, stated: PoseStatement | None = None) -> NamedPo
         There are no poses, or one cannot be read; the message has the file and the line.
     """
     path, stated = checked_path(path), stated or PoseStatement()
-    has_angles = stated.euler is not None
     if not path.is_dir():
-        if not path.exists():
-            raise LogError(f"{path}: there is no such file or folder of poses")
-        return poses_of(_file(path, has_angles), stated)
+        return poses_of(_file(path, stated), stated)
     files = sorted((f for f in path.iterdir() if f.suffix.lower() in TREES + TABLES), key=lambda f: natural_key(f.name))
     if not files:
         raise LogError(f"{path} has no files of poses ({', '.join(TREES + TABLES)})")
     if len(files) == 1:
-        return poses_of(_file(files[0], has_angles), stated)
+        return poses_of(_file(files[0], stated), stated)
     rows = []
     for file in files:
-        of_file = _file(file, has_angles)
+        of_file = _file(file, stated)
         if len(of_file) > 1:
             raise LogError(
                 f"{file} has {len(of_file)} poses, and the folder {path} has {len(files)} files: give one pose a file, "
@@ -54,17 +51,17 @@ def read_poses(path: str | Path, stated: PoseStatement | None = None) -> NamedPo
     return poses_of(rows, stated)
 
 
-def _file(path: Path, has_angles: bool) -> list[PoseRow]:
+def _file(path: Path, stated: PoseStatement) -> list[PoseRow]:
     """The rows of one file."""
     if path.suffix.lower() not in TREES:
-        return read_pose_table(str(path), pose_text(path), has_angles=has_angles)
+        return read_pose_table(str(path), pose_text(path), stated=stated)
     entries = read_pose_tree(str(path), pose_text(path))
-    referred = [_referred(path, entry) for entry in entries if isinstance(entry, PoseReference)]
+    referred = [_referred(path, entry, stated) for entry in entries if isinstance(entry, PoseReference)]
     # Other poses of an index are first guesses of the calibration.
     return referred or [entry for entry in entries if isinstance(entry, PoseRow)]
 
 
-def _referred(index: Path, entry: PoseReference) -> PoseRow:
+def _referred(index: Path, entry: PoseReference, stated: PoseStatement) -> PoseRow:
     """The pose in the file that an index names for an image."""
     file = checked_path(index.parent / entry.file)
     if not file.is_file():
@@ -72,7 +69,7 @@ def _referred(index: Path, entry: PoseReference) -> PoseRow:
     if file.suffix.lower() in TREES:
         found = [row for row in read_pose_tree(str(file), pose_text(file)) if isinstance(row, PoseRow)]
     else:
-        found = read_pose_table(str(file), pose_text(file), has_angles=False)
+        found = read_pose_table(str(file), pose_text(file), stated=stated)
     if len(found) != 1:
         raise LogError(f"{file} has {len(found)} poses in place of one ({entry.place} names it)")
     return replace(found[0], name=entry.name)

@@ -66,12 +66,15 @@ class PoseStatement:
         ``"degrees"`` or ``"radians"``.
     length : str or None
         ``"m"`` or ``"mm"``.
+    columns : str or None
+        The order of a line's seven numbers, as ``"qw qx qy qz tx ty tz"``, in tables without names of columns.
     """
 
     quaternion: Literal["xyzw", "wxyz"] | None = None
     euler: str | None = None
     angles: Literal["degrees", "radians"] | None = None
     length: Literal["m", "mm"] | None = None
+    columns: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

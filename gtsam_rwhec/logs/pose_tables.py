@@ -17,7 +17,7 @@ from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.files.budgets import POSES_TEXT
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.files.whole_files import read_whole
-from gtsam_rwhec.logs.pose_rows import Kind, PoseRow
+from gtsam_rwhec.logs.pose_rows import Kind, PoseRow, PoseStatement
 
 #: A table has at most this many lines, and a line at most this many characters.
 MOST_LINES, LONGEST_LINE = 500_000, 10_000
@@ -31,8 +31,8 @@ _STAMPS = ("timestamp", "stamp", "time", "t", "secs", "sec", "time_s", "timestam
 Line = tuple[int, list[str]]
 
 
-def read_pose_table(path: str, text: str, *, has_angles: bool) -> list[PoseRow]:
-    """The poses of a text; `has_angles` says that rotations are three angles.
+def read_pose_table(path: str, text: str, *, stated: PoseStatement) -> list[PoseRow]:
+    """The poses of a text; `stated` says what lines without names of columns have.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def read_pose_table(path: str, text: str, *, has_angles: bool) -> list[PoseRow]:
     counts = {len(fields) for _, fields in lines}
     if counts == {4} and not _name_first(lines, 4):
         return _stacked(path, lines)
-    return [_row(path, line, lines, has_angles) for line in lines]
+    return [_row(path, line, stated) for line in lines]
 
 
 def pose_text(path: object) -> str:
@@ -76,7 +76,7 @@ def _lines(path: str, text: str) -> tuple[list[str] | None, list[Line]]:
         if not bare or (is_comment and (lines or header)):
             continue
         fields = _fields(bare.lstrip("#% ") if is_comment else bare)
-        if not lines and _is_header(fields):
+        if not lines and header is None and _is_header(fields):
             if not is_comment or _columns(fields):
                 header = fields
         elif not is_comment:
@@ -187,9 +187,9 @@ def _stacked(path: str, lines: list[Line]) -> list[PoseRow]:
     return [PoseRow("", place, "matrix", sum(table[4 * i : 4 * i + 4], ())) for i, place in enumerate(places)]
 
 
-def _row(path: str, line: Line, lines: list[Line], has_angles: bool) -> PoseRow:
+def _row(path: str, line: Line, stated: PoseStatement) -> PoseRow:
     number, fields = line
-    kinds: dict[int, Kind] = {6: "angles"} if has_angles else {7: "quaternion_of_any_order"}
+    kinds: dict[int, Kind] = {6: "angles"} if stated.euler is not None else {7: "quaternion_of_any_order"}
     kinds |= {12: "matrix", 16: "matrix"}
     count = len(fields)
     has_name = count not in kinds
@@ -202,8 +202,12 @@ def _row(path: str, line: Line, lines: list[Line], has_angles: bool) -> PoseRow:
     numbers = _numbers(path, number, fields[has_name:])
     if len(numbers) == 12:
         numbers = (*numbers, *_LAST)
-    place = f"{path}, line {number}" if len(lines) > 1 else path
-    return PoseRow(fields[0].strip("\"'") if has_name else "", place, kinds[count - has_name], numbers)
+    place = f"{path}, line {number}"
+    kind = kinds[count - has_name]
+    if kind == "quaternion_of_any_order" and stated.columns is not None:
+        at = stated.columns.split().index
+        kind, numbers = "quaternion", tuple(numbers[at(name)] for name in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
+    return PoseRow(fields[0].strip("\"'") if has_name else "", place, kind, numbers)
 
 
 def _name_first(lines: list[Line], count: int) -> bool:
