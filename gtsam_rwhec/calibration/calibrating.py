@@ -12,7 +12,13 @@ from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.clock_stage import Answer, answer, check_offsets, late_in_place_of_shifted
 from gtsam_rwhec.calibration.lengths import doubted_lengths, undetectable
 from gtsam_rwhec.calibration.options import CalibrateOptions
-from gtsam_rwhec.calibration.outlier_stage import SPARE_EQUATIONS, outliers_of, spare_equations
+from gtsam_rwhec.calibration.outlier_stage import (
+    SPARE_EQUATIONS,
+    outliers_of,
+    share_that_agrees_plausibly,
+    spare_equations,
+)
+from gtsam_rwhec.calibration.plausibility import implausible
 from gtsam_rwhec.calibration.reading import Reading, reading_of
 from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.calibration.run import Run
@@ -102,7 +108,7 @@ def _calibrated(run: Run) -> Calibration:
         record.find(Ground.NO_SCALE, why)
     elif not reading.misreadings and (lengths := doubted_lengths(problem, solution)):
         record.find(Ground.MISREAD, str(lengths))
-    outliers = outliers_of(run, inliers)
+    outliers = outliers_of(run, inliers, is_answered=refined is not None and not refined.free_directions)
     if refined is not None and not refined.free_directions and spare_equations(problem) < SPARE_EQUATIONS:
         words = f"{problem.number_of_measurements} measurements are too few to tell how large their noise is"
         record.find(Ground.COVARIANCE_DOUBTED, words)
@@ -143,19 +149,26 @@ def _solved(run: Run) -> tuple[Solution | None, str]:
 
 
 def _read_and_answered(run: Run, first: Solution | None) -> tuple[Reading, Answer]:
-    """How the poses were read, and the answer. Of poses that were misread it is the first solution, and no more."""
-    reading, what = Reading(), "reading of A and B"
-    if not run.options.misreadings:
-        run.record.choose(what, "as given", "an option says so")
-        return reading, answer(run, first)
-    reading = reading_of(run.problem, first, run.tell)
-    if reading.finding is None:
-        run.record.choose(what, "as given", "no likely mistake of reading explains the measurements far better")
-        return reading, answer(run, first)
+    """How the poses were read, and the answer. Of poses that were misread it is the first solution, and no more.
+
+    Residuals of no sensor in the fit of all measurements may come from outliers alone: then those that agree decide.
+    """
+    what, tries = "reading of A and B", run.options.misreadings
+    reading = (
+        reading_of(run.problem, first, run.tell) if tries else Reading(implausible=implausible(run.problem, first))
+    )
     if reading.misreadings and all(one.mistake is Mistake.ROWS_SHIFTED for one in reading.misreadings):
         late = late_in_place_of_shifted(run, first)
         if late is not None:
             return Reading(), late
+    if reading.finding is None:
+        why = "no likely mistake of reading explains the measurements far better" if tries else "an option says so"
+        run.record.choose(what, "as given", why)
+        return reading, answer(run, first)
+    if reading.implausible is not None and (share := share_that_agrees_plausibly(run, first)) is not None:
+        why = f"{100.0 * share:.0f} % of the measurements agree with one another, with residuals that a sensor may have"
+        run.record.choose(what, "as given", why)
+        return Reading(), answer(run, first)
     why = (
         "another reading of the poses fits far better"
         if reading.misreadings

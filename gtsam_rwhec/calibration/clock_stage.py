@@ -24,6 +24,8 @@ from gtsam_rwhec.solving.solution import Solution
 SURELY = 5.0
 #: A clock that was taken as right moves poses by millimetres and more if it is off by more than this, s.
 LATE_S = 0.005
+#: Where more than this share of a sensor's measurements are outliers, its clock may have made them.
+MANY_LEFT_OUT = 0.25
 WHAT = "time offsets"
 
 
@@ -80,8 +82,8 @@ def _by_option(run: Run, first: Solution | None) -> Answer:
     found = _with_offsets(run, first)
     asked = offsets_of(run.problem, run.options)
     run.record.choose(WHAT, "estimated" if asked else "not estimated", "an option says so")
-    if not asked and found.refined is not None:
-        _doubt_stated_clocks(run, _clocks(run, found.solution, found.inliers))
+    if found.refined is not None:
+        _doubt_stated_clocks(run, _stated_clocks(run, found))
     return found
 
 
@@ -138,6 +140,26 @@ def _evidence(clocks: tuple[Clock, ...]) -> str:
     if set(sensors) == {NO_STAMPS}:
         return "the measurements have no stamps"
     return "; ".join(f"{', '.join(names)}: {evidence}" for evidence, names in sensors.items())
+
+
+def _stated_clocks(run: Run, found: Answer) -> tuple[Clock, ...]:
+    """The clocks that were taken as right, by the measurements that agree.
+
+    A late clock makes outliers of what moves. So where many of a sensor's were left out, all of them are asked too.
+    """
+    stated = [name for name in run.problem.sensors if name not in found.time_offsets_s]
+    if not stated:
+        return ()
+    clocks = {clock.sensor: clock for clock in _clocks(run, found.solution, found.inliers)}
+    of_sensor = {
+        name: np.concatenate([mask for pair, mask in found.inliers.items() if pair.sensor == name])
+        for name in stated
+        if found.inliers
+    }
+    many = [name for name, kept in of_sensor.items() if np.mean(~kept) > MANY_LEFT_OUT]
+    if many:
+        clocks |= {clock.sensor: clock for clock in _clocks(run, found.solution, {}) if clock.sensor in many}
+    return tuple(clocks[name] for name in stated if name in clocks)
 
 
 def _doubt_stated_clocks(run: Run, clocks: tuple[Clock, ...]) -> None:

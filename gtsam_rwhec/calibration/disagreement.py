@@ -27,14 +27,20 @@ class LeftOut:
         return f"{self.left_out} of {self.measurements} measurements of {self.frame} contradict the answer"
 
     def is_beyond(self, share: float) -> bool:
-        """Whether more than this share of the measurements are outliers; of few measurements, more than half."""
-        return self.left_out > (share if self.measurements >= MANY else HALF) * self.measurements
+        """Whether more than this share of the measurements are outliers.
+
+        Of few measurements, more than half; where nearly half is asked, half: which half is right was then chance.
+        """
+        if self.measurements >= MANY:
+            return self.left_out > share * self.measurements
+        twice = 2 * self.left_out
+        return twice > self.measurements or (share < HALF and twice == self.measurements > 0)
 
 
 def contradicted_frames(
     counts: Mapping[Pair, tuple[int, int]], nearly_half: float = NEARLY_HALF
 ) -> tuple[LeftOut, ...]:
-    """The sensors and targets of which more than half, or of many nearly half, of the measurements were left out.
+    """The sensors and targets of which most measurements were left out: more than half, of few half, of many near it.
 
     ``counts`` has the number that was kept and the number of all, by pair. Where most are outliers the answer is as
     likely to be wrong as they are: a clock, a size or a mounting may have changed. The frame with most outliers comes

@@ -45,8 +45,8 @@ class CalibrateOptions:
     inlier_confidence : float
         Probability that a good measurement is kept.
     misreadings : bool
-        Look for likely mistakes in the reading of A and B, and for residuals that no sensor has. Where there are any,
-        nothing else is done.
+        Look for likely mistakes in the reading of A and B. Where there are any, or residuals that no sensor has (these
+        are looked for whatever this says), nothing else is done.
     sizes : "check" or "known"
         "check": where the sizes of targets are said to be known (``scale="known"``), a size that the motion contradicts
         is found. "known": it is not looked for.

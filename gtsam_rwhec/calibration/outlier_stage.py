@@ -11,11 +11,14 @@ from gtsam_rwhec.calibration.choices import OUTLIERS
 from gtsam_rwhec.calibration.disagreement import contradicted_frames
 from gtsam_rwhec.calibration.gross_errors import gross_errors
 from gtsam_rwhec.calibration.noise_choice import Inliers, offsets_of
-from gtsam_rwhec.calibration.outliers import Outliers
+from gtsam_rwhec.calibration.outliers import Outliers, few_words
+from gtsam_rwhec.calibration.plausibility import implausible
 from gtsam_rwhec.calibration.run import Run
+from gtsam_rwhec.calibration.stated_poses import stated_poses
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.graduated import graduated
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refining import refine
@@ -26,6 +29,11 @@ from gtsam_rwhec.solving.solution import Solution
 SPARE_EQUATIONS = 24
 #: The share of the measurements that agree where the noise is about right.
 HALF = 0.5
+#: Of fewer measurements than this, more than this share of outliers under the stated noise may be a noise stated too
+#: small: so it is where under the noise that the residuals show none is left out.
+FEW, MANY_OF_FEW = 20, 0.25
+#: So many that agree, with residuals of a sensor, are right, and the others are outliers.
+MAJORITY = 0.6
 
 
 def without_outliers(
@@ -79,15 +87,17 @@ def _agreeing(run: Run, first: Solution | None, offsets: bool | tuple[str, ...])
         return _agreeing_under(run, first, offsets, "estimate")
     try:
         found = _agreeing_under(run, first, offsets, "given")
-        if _share_kept(found[1]) > HALF:
+        share = _share_kept(found[1])
+        is_doubtful = run.problem.number_of_measurements < FEW and share < 1.0 - MANY_OF_FEW
+        if share > HALF and not is_doubtful:
             return found
     except (OutlierError, NoiseError, ScaleError) as error:
-        found, why = None, error
+        found, share, why = None, 0.0, error
     try:
         other = _agreeing_under(run, first, offsets, "estimate")
     except (OutlierError, NoiseError, ScaleError):
         other = None
-    if other is not None and _share_kept(other[1]) > HALF:
+    if other is not None and (_share_kept(other[1]) == 1.0 or (_share_kept(other[1]) > HALF >= share)):
         return other
     if found is None:
         raise why
@@ -135,6 +145,18 @@ def _inliers_under_the_full_noise(
     return refined.solution, refined.inliers
 
 
+def share_that_agrees_plausibly(run: Run, first: Solution | None) -> float | None:
+    """The share of the measurements that agree with one another, with residuals that a sensor may have.
+
+    None where fewer than ``MAJORITY`` do: then outliers do not explain what is wrong with the others.
+    """
+    attempt = run.attempt()
+    solution, inliers = without_outliers(attempt, first)
+    if solution is None or not inliers or _share_kept(inliers) < MAJORITY:
+        return None
+    return None if implausible(selected(run.problem, inliers), solution) else _share_kept(inliers)
+
+
 def say_outliers(run: Run, inliers: Inliers) -> None:
     """The choice of outliers, where they were looked for."""
     if inliers:
@@ -142,16 +164,22 @@ def say_outliers(run: Run, inliers: Inliers) -> None:
         run.record.choices.append(outliers.choice("they are farther off than the noise of the others explains"))
 
 
-def outliers_of(run: Run, inliers: Inliers) -> Outliers:
-    """The outliers as a record; what they say against frames is found."""
+def outliers_of(run: Run, inliers: Inliers, *, is_answered: bool) -> Outliers:
+    """The outliers as a record; what they say against frames is found, and what they leave too little of."""
     outliers = Outliers.of(run.problem, inliers)
     sensors = run.problem.sensors
-    for frame in contradicted_frames(outliers.counts):
+    contradicted = contradicted_frames(outliers.counts)
+    for frame in contradicted:
         run.record.find(Ground.CONTRADICTED if frame.frame in sensors else Ground.TARGET_CONTRADICTED, str(frame))
     for name in outliers.left_out:
         if name in sensors:
             words = f"{name} has no pose, because no measurement of it is in the answer"
             run.record.find(Ground.NO_ANSWER, words)
+    if is_answered:
+        known = {frame.frame for frame in contradicted} | set(stated_poses(run.problem))
+        for name, number in outliers.resting_on_few.items():
+            if name not in known:
+                run.record.find(Ground.FEW_MEASUREMENTS, few_words(name, number))
     return outliers
 
 

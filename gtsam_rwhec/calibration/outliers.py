@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,8 @@ from gtsam_rwhec.problem.problem import Problem
 
 #: A sentence about outliers names at most this many pairs.
 NAMED = 5
+#: Of fewer measurements of one frame, a wrong one cannot be told.
+FEWEST_OF_A_FRAME = 3
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,15 @@ class Outliers:
         return Outliers(inliers, counts, left_out, looked_for=bool(inliers))
 
     @property
+    def resting_on_few(self) -> dict[str, int]:
+        """The sensors and targets that rest on fewer than three measurements in all, and on how many."""
+        kept = Counter[str]()
+        for pair, (number, _) in self.counts.items():
+            for name in pair.frames:
+                kept[name] += number
+        return {name: number for name, number in kept.items() if 0 < number < FEWEST_OF_A_FRAME}
+
+    @property
     def number(self) -> int:
         """How many measurements were left out."""
         return sum(total - kept for kept, total in self.counts.values())
@@ -72,3 +84,10 @@ class Outliers:
             return Choice(OUTLIERS, "none", "every measurement agrees with the others")
         total = sum(number for _, number in self.counts.values())
         return Choice(OUTLIERS, f"{self.number} of {total} measurements were left out ({self.by_pair})", evidence)
+
+
+def few_words(frame: str, number: int) -> str:
+    """What is said of a frame that rests on so few measurements."""
+    if number == 1:
+        return f"{frame} rests on 1 measurement: a wrong one would not show"
+    return f"{frame} rests on {number} measurements: a wrong one could not be told from the other"

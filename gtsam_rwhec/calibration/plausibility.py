@@ -69,6 +69,8 @@ class Implausible:
 def implausible(problem: Problem, solution: Solution | None) -> Implausible | None:
     """Find residuals that are no measurement noise, with weights or without.
 
+    ``calibrate`` asks again of the measurements that agree: wrong ones may pull the fit of all of them to these.
+
     Medians decide, of the solution or of a robust fit of a sample, whichever are smaller: outliers change nothing as
     long as they are fewer than half. Without raw measurements the solution's root mean squares decide.
 

@@ -22,6 +22,8 @@ from gtsam_rwhec.refinement.refined import Refined
 
 #: Chance that a true stated pose is contradicted.
 CHANCE = 1e-6
+#: From this chance on it is doubted: that of 3.5 standard deviations of one number, as for sizes.
+DOUBTFUL_CHANCE = 4.65e-4
 #: A stated pose that is off by less is no mistake, but its standard deviation was too small: degrees, m.
 SMALL_DEG, SMALL_M = 0.5, 0.005
 #: Standard deviations of the prior that holds what the motion leaves free, m and rad.
@@ -39,12 +41,15 @@ class StatedPose:
         How far the pose that the measurements give is from it; 0 for a part that was not stated.
     sigmas : float
         The same in standard deviations of their difference.
+    is_surely_off : bool
+        Whether the measurements contradict it beyond chance; otherwise it fits them badly.
     """
 
     frame: str
     rotation_deg: float
     translation_m: float
     sigmas: float
+    is_surely_off: bool = True
 
     @property
     def is_small(self) -> bool:
@@ -60,7 +65,7 @@ class StatedPose:
 
 
 def contradicted_poses(problem: Problem, answer: Callable[[Problem], Refined | None]) -> tuple[StatedPose, ...]:
-    """Stated poses of a problem that its measurements contradict.
+    """Stated poses of a problem that its measurements contradict, or that fit them badly.
 
     Parameters
     ----------
@@ -119,8 +124,10 @@ def _compared(name: str, prior: Prior, refined: Refined) -> StatedPose | None:
     both = (refined.covariance(name) + np.diag(variance))[np.ix_(told, told)]
     squared = float(difference[told] @ np.linalg.lstsq(both, difference[told], rcond=None)[0])
     limit = refined.squared_radius(int(told.sum()), 1.0 - CHANCE)
-    if squared < max(limit, CONTRADICTION_SIGMAS**2):
+    if squared < refined.squared_radius(int(told.sum()), 1.0 - DOUBTFUL_CHANCE):
         return None
     turned_rad = 0.0 if prior.kappa is None else float(np.linalg.norm(difference[:3]))
     moved_m = 0.0 if prior.sigma is None else float(np.linalg.norm(pose.translation() - prior.transform[:3, 3]))
-    return StatedPose(name, math.degrees(turned_rad), moved_m, math.sqrt(squared))
+    return StatedPose(
+        name, math.degrees(turned_rad), moved_m, math.sqrt(squared), squared >= max(limit, CONTRADICTION_SIGMAS**2)
+    )

@@ -72,6 +72,10 @@ class Ground(StrEnum):
     TARGET_CONTRADICTED = "target_contradicted"
     #: The stated size of a target fits the motion badly.
     SIZE_UNCERTAIN = "size_uncertain"
+    #: A stated pose fits the measurements badly.
+    POSE_UNCERTAIN = "pose_uncertain"
+    #: A frame rests on so few measurements that a wrong one would not show.
+    FEW_MEASUREMENTS = "few_measurements"
     #: The stated size of a target does not fit the motion, while others do; it was estimated in its place.
     SIZE_ESTIMATED = "size_estimated"
     #: Errors of neighbouring measurements are alike, beyond what the model of the noise holds.
@@ -99,6 +103,8 @@ class Ground(StrEnum):
 _CARE = (
     Ground.TARGET_CONTRADICTED,
     Ground.SIZE_UNCERTAIN,
+    Ground.POSE_UNCERTAIN,
+    Ground.FEW_MEASUREMENTS,
     Ground.SIZE_ESTIMATED,
     Ground.CORRELATED,
     Ground.SYSTEMATIC,
@@ -139,6 +145,10 @@ _ADVICE = {
         'measure the named target with a caliper, or let its size be estimated: rw.Problem(scale="per_target") or '
         "--scale per_target (in a rig file: sizes: estimate)"
     ),
+    Ground.POSE_UNCERTAIN: (
+        "measure the stated pose again, or state it as uncertain as it is: Problem.add_prior in place of Problem.fix"
+    ),
+    Ground.FEW_MEASUREMENTS: "measure each named frame at three poses or more, or do not use its pose",
     Ground.SIZE_ESTIMATED: "measure the named target again, and correct its size",
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
     Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",

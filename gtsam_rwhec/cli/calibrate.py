@@ -99,7 +99,7 @@ def calibrate(
         typer.Option(
             "--as-read",
             rich_help_panel=CHOICES_PANEL,
-            help="Do not look for likely mistakes in the reading of A and B.",
+            help="Do not try other readings of A and B. Residuals that no sensor has are still refused.",
         ),
     ] = False,
     certified_only: Annotated[

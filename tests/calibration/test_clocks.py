@@ -209,3 +209,17 @@ def test_a_late_clock_that_was_taken_as_right_is_not_passed_over() -> None:
     assert late.judgement.grounds == (rw.Ground.LATE_CLOCK,)
     assert "the clock of cam was taken as right, but motion tells it to" in late.verdict_reason
     assert rw.calibrate(moving(0)[0], options).verdict is rw.Verdict.USE
+
+
+def test_the_clock_of_a_sensor_that_the_option_leaves_out_is_not_passed_over() -> None:
+    """A tuple names the sensors whose offsets are estimated; the others count as right, and are asked too."""
+    problem = rw.Problem()
+    for sensor, late_s in (("cam", 0.0), ("late", 0.03)):
+        raw = moving(0, late_s, count=60)[0].measurements("tag", "cam")
+        problem.add("tag", sensor, raw.A, raw.B, stamps_ns=raw.stamps_ns)
+    found = rw.calibrate(problem, rw.CalibrateOptions(time_offsets=("cam",), misreadings=False))
+    assert rw.Ground.LATE_CLOCK in found.judgement.grounds
+    assert "the clock of late was taken as right, but motion tells it to" in found.verdict_reason
+    assert "the clock of cam" not in found.verdict_reason
+    assert list(found.time_offsets_s) == ["cam"]
+    assert rw.Ground.LATE_CLOCK not in rw.calibrate(problem, rw.CalibrateOptions(time_offsets=True)).judgement.grounds

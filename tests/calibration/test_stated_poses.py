@@ -72,3 +72,20 @@ def test_what_the_motion_leaves_free_contradicts_nothing() -> None:
         problem = problem_of(planar=True)
         problem.fix("board", off(X, 0.0, metres))
         assert rw.calibrate(problem).verdict is verdict
+
+
+@pytest.mark.parametrize(("sigmas", "ground"), [(5.7, rw.Ground.POSE_UNCERTAIN), (9.0, rw.Ground.CONTRADICTED)])
+def test_a_fixed_pose_that_fits_badly_asks_for_care(sigmas: float, ground: rw.Ground) -> None:
+    """Between chance and contradiction: as with sizes, there is no sharp step from use to refusal."""
+    problem = problem_of()
+    free = rw.calibrate(problem)
+    along = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    size = sigmas / np.sqrt(along @ np.linalg.solve(free.covariance("board"), along))
+    problem.fix("board", free.X["board"].matrix() @ se3.expmap(-size * along[None])[0])
+    calibration = rw.calibrate(problem)
+    assert "the stated pose of board is" in calibration.verdict_reason
+    if ground is rw.Ground.POSE_UNCERTAIN:
+        assert calibration.judgement.grounds == (ground,)
+        assert calibration.verdict is rw.Verdict.CARE
+    else:
+        assert calibration.judgement.grounds[0] in (ground, rw.Ground.COVARIANCE_DOUBTED)
