@@ -20,8 +20,9 @@ from gtsam_rwhec.vision.rejection import Rejection
 #: A corner is off its place in the plane by at most this (pixels), or by `MOST_OFF` of the distance between lines.
 MOST_OFF_PX = 0.5
 MOST_OFF = 0.02
-#: At least this share of the corners must be at their places; those that are not do not count.
-LEAST_KEPT = 0.75
+#: At least this share of the corners must be at their places; those that are not do not count. Of each row and column
+#: more than half must be: a row that is not on the board is nowhere at its places.
+LEAST_KEPT = 0.8
 #: Two neighbouring squares have at least this share of the median contrast of all neighbours.
 LEAST_CONTRAST = 0.3
 #: Two neighbouring squares differ by at least this, in gray values.
@@ -70,7 +71,7 @@ def evidence(gray: Gray, grid: Array, camera: Camera | None) -> Evidence:
         if (off <= most_px).all():
             break
     kept = (off <= most_px).reshape(rows, columns)
-    if not kept.mean() >= LEAST_KEPT:
+    if not (kept.mean() >= LEAST_KEPT and all((kept.mean(axis=axis) > 0.5).all() for axis in (0, 1))):
         return Evidence(Rejection.NOT_A_GRID, none_left_out)
     values = _values(gray, H, focal, camera, rows, columns)
     white = np.indices(values.shape).sum(axis=0) % 2 == 1

@@ -63,6 +63,9 @@ def test_wrong_corners_do_not_count_and_many_are_no_grid() -> None:
     seen = evidence(image, grid, PINHOLE)
     assert seen.rejection is None
     assert np.argwhere(~seen.kept).tolist() == [[1, 2], [3, 0]]
+    off_board = grid_of(PINHOLE)
+    off_board[0] -= [0.0, 3.0]
+    assert evidence(image, off_board, PINHOLE).rejection is Rejection.NOT_A_GRID
     grid[:2, :3] += [3.0, 0.0]
     assert evidence(image, grid, PINHOLE).rejection is Rejection.NOT_A_GRID
     grid[:] = 7.0

@@ -58,6 +58,18 @@ def test_all_boards_of_a_workcell_are_read_right(workcell_camera2: Path, workcel
     assert off.max() < 1.0
 
 
+@pytest.mark.parametrize(("columns", "rows"), [(3, 3), (4, 4), (3, 5)])
+def test_a_workcells_board_is_not_read_as_one_of_another_size(
+    workcell_camera2: Path, workcell_camera: Camera, columns: int, rows: int
+) -> None:
+    # In 0224 OpenCV continues the board into what is behind it, which alternates as a row of squares would.
+    for name in ("0224", "0115"):
+        image = cv2.imread(str(workcell_camera2 / "image" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        found = find_checkerboard(image, Checkerboard("board", columns, rows, 0.05), workcell_camera)
+        assert found is None or found.rejection is not None
+
+
 def reprojected(camera: Camera, B: np.ndarray, A: np.ndarray) -> np.ndarray:
     """Corners (n, 12, 2) that the joint solution of Y B = A X predicts (Shah 2013, by the Kronecker product)."""
     n = len(A)
