@@ -28,6 +28,7 @@ from gtsam_rwhec.logs.mcap_writer import LogWriter
 from gtsam_rwhec.logs.pose_files import read_poses
 from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseStatement, stem_of
 from gtsam_rwhec.logs.records import Array
+from gtsam_rwhec.pipeline.log_contract import IMAGES_METADATA, image_key
 from gtsam_rwhec.rig import Rig
 
 #: Images that were taken at rest have stamps this far apart, nanoseconds: further than poses are interpolated.
@@ -108,6 +109,11 @@ def write_folder_log(
         (stamp, each.sensor, file) for each in stamped for stamp, file in zip(each.image_ns, each.files, strict=True)
     )
     with LogWriter(path) as out:
+        names = {
+            image_key(str(rig.sensors[sensor].images), stamp): f"{rig.sensors[sensor].images}/{file.name}"
+            for stamp, sensor, file in images
+        }
+        out.metadata(IMAGES_METADATA, names)
         for stamp, T in sorted(poses.items()):
             out.transforms("/tf", stamp, [(parent, child, T)])
         for done, (stamp, sensor, file) in enumerate(images, start=1):

@@ -13,7 +13,7 @@ from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion, check_order
-from gtsam_rwhec.pipeline.log_contract import detections_topic
+from gtsam_rwhec.pipeline.log_contract import IMAGES_METADATA, detections_topic, image_key
 from gtsam_rwhec.pipeline.sensor_detections import SensorDetections
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.ambiguity import choose_over_time
@@ -96,7 +96,7 @@ def _of_sensor(
     motion: CarrierMotion,
     upright: dict[str, Turns],
 ) -> SensorDetections:
-    faults = tuple(image.fault for image in images if image.found is None)
+    faults = _faults(log, images)
     if len(faults) == len(images):
         topic = rig.sensors[sensor].images
         why = f"the first: {faults[0]}" if faults else "none can be read as its schema says"
@@ -119,6 +119,16 @@ def _of_sensor(
         if measured_px is not None:
             corner_px[f"{target.name}/{sensor}"] = measured_px
     return SensorDetections(records, len(images), strangers, faults, corner_px)
+
+
+def _faults(log: Log, images: list[DetectedImage]) -> tuple[str, ...]:
+    """What is wrong with images; an image that was a file of a folder has its name in place of a stamp."""
+    names = log.metadata().get(IMAGES_METADATA, {})
+    faulty = [image for image in images if image.found is None]
+    stamped = [(image, f"topic {image.topic}, image at {image.stamp_ns} ns") for image in faulty]
+    return tuple(
+        image.fault.replace(words, names.get(image_key(image.topic, image.stamp_ns), words)) for image, words in stamped
+    )
 
 
 def _of_track(

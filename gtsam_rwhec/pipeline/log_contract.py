@@ -36,6 +36,8 @@ CERTIFICATE_METADATA = "gtsam_rwhec.certificate"
 
 #: A folder of images becomes a log in the output folder, with its name and this ending. It is removed at the end.
 RECORDED_LOG = ".images.mcap"
+#: This metadata has the names of the files that a folder's images were, by topic and stamp (`image_key`).
+IMAGES_METADATA = "gtsam_rwhec.images"
 #: Detection writes this file in the output folder. It is removed at the end.
 DETECTED_LOG = "detected.mcap"
 #: Cleaning writes this file in the output folder. Solving adds its solution to it.
@@ -44,6 +46,11 @@ CLEAN_LOG = "clean.mcap"
 RESULT_FILE = "result.json"
 #: The pictures are in this folder of the output folder.
 PLOTS_FOLDER = "plots"
+
+
+def image_key(topic: str, stamp_ns: int) -> str:
+    """The key of an image in `IMAGES_METADATA`."""
+    return f"{topic} {stamp_ns}"
 
 
 def detections_topic(sensor: str) -> str:

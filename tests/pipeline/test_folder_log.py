@@ -200,12 +200,15 @@ def test_from_a_folder_to_a_result(workcell_camera2: Path, tmp_path: Path) -> No
     rows = np.hstack([poses.T[:, :3, 3], Rotation.from_matrix(poses.T[:, :3, :3]).as_quat(scalar_first=True)])
     lines = [f"{name} {' '.join(map(repr, row))}" for name, row in zip(poses.names, rows.tolist(), strict=True)]
     (folder / "poses.txt").write_text("\n".join(lines))
+    (folder / "image" / "0100.png").write_bytes(b"no picture")
     text = WORKCELL.replace("poses: pose,", "poses: poses.txt,").replace("hand]}", "hand], quaternion: wxyz}")
-    with pytest.warns(LogWarning, match="29 of 39 poses have no image"):
+    with pytest.warns(LogWarning, match="28 of 39 poses have no image"):
         calibrated = rw.pipeline.calibrate_log(folder, parse_rig(text, "rig.yaml"), out)
     assert not list(out.glob(f"*{RECORDED_LOG}"))
     assert calibrated.judgement.verdict is not Verdict.DO_NOT_USE
     assert calibrated.log.detection.sources == ("cell.images.mcap",)
+    (fault,) = calibrated.log.detection.undecoded["camera2"]
+    assert fault.startswith("image/0100.png: ")
     # All 34 boards together have the camera here, to a millimetre.
     np.testing.assert_allclose(calibrated.refined.Y["camera2"].translation(), [1.7666, 2.0622, 1.1559], atol=0.02)
 
