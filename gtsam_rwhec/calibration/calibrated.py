@@ -181,9 +181,9 @@ class Calibration:
         seen_from : str, optional
             Where the point is expressed: the carrier of ``frame`` (the default), or another sensor or target on the
             same carrier; with ``A`` the other carrier (the default then), or a frame on it. A carrier has the name that
-            the problem states. Where it states none, "sensorcarrier", "hand", "base" and "rig" mean the carrier of the
-            sensors, and "targetcarrier", "base", "hand" and "world" the carrier of the targets: without ``A`` the one
-            that carries ``frame``, and with it the other one.
+            the problem states. Where it states none, "sensorcarrier", "hand" and "rig" mean the carrier of a sensor,
+            and "targetcarrier", "base" and "world" that of a target. With ``A`` these words, and "hand" and "base" of
+            either, mean the other carrier.
         level : float
             Probability of the ellipsoid and of the ball.
         A : (4, 4) array or gtsam.Pose3, optional
@@ -194,7 +194,7 @@ class Calibration:
         ------
         FrameError
             There is no such frame, or the two are not on one carrier and there is no ``A``; the message lists what
-            there is.
+            there is. Or it is not clear which carrier is meant: "base" for a sensor, where the problem names none.
         OptionError
             ``A`` is given for two frames on one carrier.
         PoseError

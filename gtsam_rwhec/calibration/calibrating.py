@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 
 from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.calibration.choices import READING
 from gtsam_rwhec.calibration.clock_stage import Answer, answer, check_offsets, late_in_place_of_shifted
 from gtsam_rwhec.calibration.lengths import doubted_lengths, undetectable
+from gtsam_rwhec.calibration.misreadings import are_too_few_to_tell
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.outlier_stage import (
     SPARE_EQUATIONS,
@@ -103,13 +105,23 @@ def _calibrated(run: Run) -> Calibration:
             doubt_one_pose(run, found.refined, found.inliers)
             found_sizes = doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
     problem, record = run.problem, run.record
+    lengths = None
+    if found.solution is not None and not reading.misreadings:
+        lengths = doubted_lengths(problem, found.solution)
+    if lengths is not None and (reading.finding is not None or not run.options.misreadings):
+        record.find(Ground.MISREAD, str(lengths))
+    elif lengths is not None:
+        record.start_again(Ground.MISREAD, str(lengths))
+        record.choose(READING, "nothing else is told", "lengths of the answer are those of no rig")
+        found, found_sizes = Answer(found.solution), ()
+    elif reading.finding is not None:
+        record.notes.clear()  # they warn of attempts at an answer that is not given
     solution, inliers, refined = found.solution, found.inliers, found.refined
     if solution is None:
         record.find(Ground.NO_SCALE, why)
-    elif not reading.misreadings and (lengths := doubted_lengths(problem, solution)):
-        record.find(Ground.MISREAD, str(lengths))
     outliers = outliers_of(run, inliers, is_answered=refined is not None and not refined.free_directions)
-    if refined is not None and not refined.free_directions and spare_equations(problem) < SPARE_EQUATIONS:
+    is_few = refined is not None and not refined.free_directions and spare_equations(problem) < SPARE_EQUATIONS
+    if is_few and refined is not None and refined.noise_source == "estimated":
         words = f"{problem.number_of_measurements} measurements are too few to tell how large their noise is"
         record.find(Ground.COVARIANCE_DOUBTED, words)
     elif refined is not None and found.noise.model is not None and found.noise.model.instants < FEWEST_POSES:
@@ -130,7 +142,7 @@ def _calibrated(run: Run) -> Calibration:
         misreadings=reading.misreadings,
         implausible=reading.implausible,
         sizes=found_sizes,
-        cannot_tell=undetectable(problem),
+        cannot_tell=undetectable(problem, unit_is_told=lengths is not None),
         findings=tuple(record.findings),
         choices=tuple(record.choices),
         notes=tuple(record.notes),
@@ -148,12 +160,19 @@ def _solved(run: Run) -> tuple[Solution | None, str]:
         return None, str(error)
 
 
+def _why_as_given(problem: Problem) -> str:
+    """Why the reading counts as right: it was tested, or nothing could test it."""
+    if are_too_few_to_tell(problem):
+        return f"{problem.number_of_measurements} measurements are too few to show a mistake of reading"
+    return "no likely mistake of reading explains the measurements far better"
+
+
 def _read_and_answered(run: Run, first: Solution | None) -> tuple[Reading, Answer]:
     """How the poses were read, and the answer. Of poses that were misread it is the first solution, and no more.
 
     Residuals of no sensor in the fit of all measurements may come from outliers alone: then those that agree decide.
     """
-    what, tries = "reading of A and B", run.options.misreadings
+    what, tries = READING, run.options.misreadings
     reading = (
         reading_of(run.problem, first, run.tell) if tries else Reading(implausible=implausible(run.problem, first))
     )
@@ -162,7 +181,7 @@ def _read_and_answered(run: Run, first: Solution | None) -> tuple[Reading, Answe
         if late is not None:
             return Reading(), late
     if reading.finding is None:
-        why = "no likely mistake of reading explains the measurements far better" if tries else "an option says so"
+        why = _why_as_given(run.problem) if tries else "an option says so"
         run.record.choose(what, "as given", why)
         return reading, answer(run, first)
     if reading.implausible is not None and (share := share_that_agrees_plausibly(run, first)) is not None:

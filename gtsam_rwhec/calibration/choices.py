@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 #: What is chosen where the choice says why there is no refined calibration.
 REFINEMENT = "covariances"
+#: What is chosen of the frames and units of A and B.
+READING = "reading of A and B"
 #: What is chosen of outliers.
 OUTLIERS = "outliers"
 

@@ -28,16 +28,26 @@ FEWEST_MEASUREMENTS = 8
 
 @dataclass(frozen=True)
 class GrossErrors:
-    """How many of the measurements that were looked at look wrong; ``str()`` is a sentence's part."""
+    """How many of the measurements that were looked at look wrong; ``str()`` is a sentence's part.
+
+    Attributes
+    ----------
+    number, looked_at, in_all : int
+        Measurements that look wrong, those that were looked at, and those of the problem: of large problems a sample is
+        looked at, and pairs with a few measurements are left out.
+    """
 
     number: int
     looked_at: int
+    in_all: int
 
     def __str__(self) -> str:
-        look = "measurement looks" if self.number == 1 else "measurements look"
+        look = "looks" if self.number == 1 else "look"
+        rest = self.in_all - self.looked_at
+        others = f"; {rest} more {'was' if rest == 1 else 'were'} not looked at" if rest else ""
         return (
-            f"{self.number} of {self.looked_at} {look} wrong (off by more than {GROSS:g} times what half of the others "
-            "are off by), and still every measurement counts"
+            f"{self.number} of {self.looked_at} measurements {look} wrong (off by more than {GROSS:g} times what half "
+            f"of the others are off by{others}), and still every measurement counts"
         )
 
 
@@ -54,7 +64,7 @@ def gross_errors(problem: Problem) -> GrossErrors | None:
     medians = np.median(errors, axis=1, keepdims=True)
     ratios = [_in_medians(of_pair, medians) for of_pair in np.split(errors, ends, axis=1)]
     number = int((np.concatenate(ratios) > GROSS).sum())
-    return GrossErrors(number, sampled.count) if number else None
+    return GrossErrors(number, sampled.count, problem.number_of_measurements) if number else None
 
 
 def _stated(sampled: Sampled) -> Array:

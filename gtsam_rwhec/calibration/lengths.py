@@ -76,13 +76,16 @@ def doubted_lengths(problem: Problem, solution: Solution) -> DoubtedLengths | No
     return DoubtedLengths(distance, arm) if distance > FAR_M or arm > LONG_ARM_M else None
 
 
-def undetectable(problem: Problem) -> tuple[str, ...]:
-    """The mistakes in reading A and B that would change no residual of this problem, one sentence each."""
+def undetectable(problem: Problem, *, unit_is_told: bool = False) -> tuple[str, ...]:
+    """The mistakes in reading A and B that would change no residual of this problem, one sentence each.
+
+    ``unit_is_told``: lengths that no rig has showed the unit.
+    """
     unit = "A and B" if problem.scale == "known" else "A"
     found = [
         f"{unit} in another unit than metres: every length of the answer would be in that unit",
         "A and B both from left-handed frames: the answer would be left-handed too",
-    ]
+    ][unit_is_told:]
     pairs = [pair for pair in problem.pairs if not pair.is_motion]
     names = [name for pair in pairs for name in pair]
     if pairs and len(set(names)) == len(names):  # no frame is in two pairs

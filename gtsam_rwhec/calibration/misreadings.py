@@ -90,6 +90,12 @@ class Misreading:
         return f"{self.likely}: the median residual is {before} as read, and {after} otherwise; {self.cure}"
 
 
+def are_too_few_to_tell(problem: Problem) -> bool:
+    """Whether the measurements, if they were kept, are too few to show that they were misread."""
+    sampled = Sampled.of(problem)
+    return sampled is not None and _degrees_of_freedom(sampled) < FEWEST_DEGREES_OF_FREEDOM
+
+
 @one_blas_thread()
 def misreadings(
     problem: Problem, solution: Solution | None, *, progress: Progress | None = None

@@ -16,7 +16,7 @@ from gtsam_rwhec.noise_model.found import MOST_BY_CHANCE, NoiseInData, ratio_wor
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.solving.solution import Solution
-from gtsam_rwhec.solving.weights import contradicted_by
+from gtsam_rwhec.solving.weights import contradicted_by, overstated_by
 
 
 def refined_under_its_noise(
@@ -48,7 +48,7 @@ def refined_under_its_noise(
             words = "the standard deviations lack the noise of A and errors that vary with the configuration"
             record.find(Ground.COVARIANCE_DOUBTED, words)
     else:
-        _say_sizes(run, noise.model, inliers)
+        _say_sizes(run, refined, noise.model, inliers)
         _say_drift(run, noise.model)
         _say_systematic(run, noise.model)
     return refined, noise, refined.solution, inliers
@@ -65,11 +65,28 @@ def _doubt_stated_noise(run: Run, refined: Refined, inliers: Inliers) -> None:
         run.record.find(Ground.NOISE_UNDERSTATED, words)
 
 
-def _say_sizes(run: Run, model: NoiseInData, inliers: Inliers) -> None:
+def _say_sizes(run: Run, refined: Refined, model: NoiseInData, inliers: Inliers) -> None:
     """How large the noise is, in one line; ``model`` says the rest."""
     number = sum(int(mask.sum()) for mask in inliers.values()) or run.problem.number_of_measurements
-    chosen = f"estimated, for each axis {model.size_words}"
-    run.record.choose("noise of A and B", chosen, f"that is what the residuals of {number} measurements show")
+    shown = f"that is what the residuals of {number} measurements show"
+    stated = run.options.carrier_noise
+    if stated is None:
+        run.record.choose("noise of A and B", f"estimated, for each axis {model.size_words}", shown)
+        return
+    run.record.choose("noise of B", f"estimated, for each axis {model.size_words_of_B}", f"{shown} beside A's")
+    size = f"{rounded(math.degrees(stated.rotation_rad))}° and {rounded(1e3 * stated.translation_m)} mm for each axis"
+    run.record.choose("noise of A", f"{size}, as you stated", "an option says so")
+    _doubt_noise_of_A(run, refined, inliers)
+
+
+def _doubt_noise_of_A(run: Run, refined: Refined, inliers: Inliers) -> None:
+    """Noise that was stated for A, and is far larger than the residuals: then the standard deviations are too large."""
+    kept = selected(run.problem, inliers) if inliers else run.problem
+    ratio = overstated_by(refined.cost, spare_equations(kept))
+    if ratio is not None:
+        factor = rounded(1.0 / math.sqrt(ratio))
+        words = f"the residuals are far smaller ({factor} times) than the noise that you stated for A makes them"
+        run.record.find(Ground.NOISE_OVERSTATED, words)
 
 
 def _say_drift(run: Run, model: NoiseInData) -> None:
@@ -114,10 +131,10 @@ def _say_systematic(run: Run, model: NoiseInData) -> None:
         record.choose(
             what,
             "none found; the covariances hold as much as could hide",
-            f"{tried} {how} better ({ratio_words(model.systematic_evidence)}; {MOST_BY_CHANCE:g} would count)",
+            f"{tried} {how} better ({ratio_words(model.systematic_evidence)}; more than {MOST_BY_CHANCE:g} counts)",
         )
         return
-    evidence = f"{tried} far better ({ratio_words(model.systematic_evidence)})"
+    evidence = f"{tried} far better ({ratio_words(model.systematic_evidence)}; more than {MOST_BY_CHANCE:g} counts)"
     record.choose(what, "found, and in the covariances", evidence)
     words = f"errors vary with the configuration of the carriers: {model.systematic_words}"
     if not model.has_stamps:

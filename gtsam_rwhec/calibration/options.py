@@ -52,7 +52,8 @@ class CalibrateOptions:
         is found. "known": it is not looked for.
     time_offsets : "auto", bool or tuple of str
         Estimate the offset of each sensor's clock, or of the named ones. The measurements need stamps. "auto": of each
-        sensor whose residuals show that its clock is late.
+        sensor where stamps and motion determine it, also where it is small; not over standstill, nor between stations
+        without a ``carrier_path``.
     carrier_path : Trajectory, optional
         T_sensorcarrier_targetcarrier over time, along which time offsets move A.
     level : float

@@ -40,6 +40,11 @@ class Record:
         """Say what was found against the poses."""
         self.findings.append(Finding(ground, words))
 
+    def start_again(self, ground: Ground, words: str) -> None:
+        """Forget all that was chosen and found: the answer to which it belongs is not given, for this reason."""
+        self.choices, self.findings = [], [Finding(ground, words)]
+        self.notes.clear()
+
     def take(self, other: Record) -> None:
         """Take over what an attempt chose and found, now that it counts."""
         self.choices += other.choices

@@ -11,12 +11,14 @@ from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.refinement.refined import RefinedPoses
 
-#: The words for a carrier that a problem does not name. Without A, each means the carrier of the point's own frame;
-#: with A, the other one.
+#: The words for a carrier that a problem does not name. Without A, each but one means the carrier of the point's own
+#: frame; with A, the other one.
 CARRIER_WORDS = {
     "sensor": ("sensorcarrier", "hand", "base", "rig"),
     "target": ("targetcarrier", "base", "hand", "world"),
 }
+#: Of these words, the one that is more often the other carrier. Without A it says too little.
+MORE_OFTEN_THE_OTHER = {"sensor": "base", "target": "hand"}
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,10 @@ def sides_of(refined: RefinedPoses, frame: object, carriers: Carriers, *, has_A:
         )
 
     def side(kind: str, *, all_words: bool) -> Side:
-        name, known = carriers.of(kind), CARRIER_WORDS[kind]
+        name = carriers.of(kind)
+        known: tuple[str, ...] = CARRIER_WORDS[kind]
+        if not has_A:
+            known = tuple(word for word in known if word != MORE_OFTEN_THE_OTHER[kind])
         words = (known if all_words else known[:1]) if name is None else (name, known[0])
         return Side(kind, poses[kind], words)
 
@@ -97,6 +102,14 @@ def place_of(seen_from: object, frame: str, own: Side, other: Side, carriers: Ca
         A is given, and has no use.
     """
     place = _named(seen_from, frame, own, other, carriers, has_A=has_A)
+    is_unclear = isinstance(seen_from, str) and seen_from == MORE_OFTEN_THE_OTHER[own.kind]
+    if place is None and is_unclear and not has_A and carriers.of(own.kind) is None:
+        raise FrameError(
+            f"it is not clear which carrier {seen_from!r} is, as the problem does not name its carriers; name them: "
+            f'rw.Problem(sensor_carrier="hand", target_carrier="base"), or say seen_from="{own.words[0]}" for the '
+            f"carrier of {frame}; for the other carrier, which moves relative to {frame}, give the pose at that moment "
+            "too: uncertainty_at(..., A=T_sensorcarrier_targetcarrier)"
+        )
     if place is None:
         raise FrameError(
             f"{brief(seen_from)} is no frame in which a point of {frame} can be expressed; there are its carrier "

@@ -125,7 +125,7 @@ class CommonFactor:
         return (
             f"the stated sizes of all {self.targets} targets are {_off(self.scale)} than the motion says (standard "
             f"deviation {rounded(100.0 * self.sigma)} %), by one factor: the unit of lengths in A, or the focal "
-            "length, may be wrong as well"
+            "length, may be wrong as well (the motion gives this factor with scale='shared' or --scale shared)"
         )
 
 

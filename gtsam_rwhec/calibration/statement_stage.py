@@ -43,7 +43,7 @@ def doubt_stated_poses(run: Run, refined: Refined, inliers: Inliers) -> None:
 
     found = contradicted_poses(run.problem, answer)
     for one in found:
-        off = Ground.COVARIANCE_DOUBTED if one.is_small else Ground.CONTRADICTED
+        off = Ground.COVARIANCE_DOUBTED if one.is_small else Ground.POSE_DOUBTED
         run.record.find(off if one.is_surely_off else Ground.POSE_UNCERTAIN, str(one))
     chosen, do = ("as stated, and doubted", "") if found else ("as stated", "do not ")
     run.record.choose("stated poses", chosen, f"the measurements {do}contradict them")

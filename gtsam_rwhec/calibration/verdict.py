@@ -58,6 +58,8 @@ class Ground(StrEnum):
     NOT_CERTIFIED = "not_certified"
     #: The measurements leave a direction free.
     NOT_UNIQUE = "not_unique"
+    #: A pose that was stated, by a prior or fixed, is not the one that the measurements give.
+    POSE_DOUBTED = "pose_doubted"
     #: Most measurements of a sensor were left out as outliers.
     CONTRADICTED = "contradicted"
     #: A sensor has no measurement in the answer, and so no pose.
@@ -86,6 +88,8 @@ class Ground(StrEnum):
     OUTLIERS_KEPT = "outliers_kept"
     #: The residuals are larger than the noise that was stated allows.
     NOISE_UNDERSTATED = "noise_understated"
+    #: The residuals are far smaller than the noise that was stated.
+    NOISE_OVERSTATED = "noise_overstated"
     #: Another reason for which the standard deviations may be too small.
     COVARIANCE_DOUBTED = "covariance_doubted"
 
@@ -110,8 +114,22 @@ _CARE = (
     Ground.SYSTEMATIC,
     Ground.OUTLIERS_KEPT,
     Ground.NOISE_UNDERSTATED,
+    Ground.NOISE_OVERSTATED,
     Ground.COVARIANCE_DOUBTED,
 )
+_MISREAD = frozenset({Ground.MISREAD, Ground.IMPLAUSIBLE})
+#: A wrong reading of A and B makes all of these, so they are no facts of their own beside it.
+_MADE_BY_A_MISREADING = frozenset({
+    Ground.NO_BOUND,
+    Ground.NOT_CERTIFIED,
+    Ground.NOT_UNIQUE,
+    Ground.NO_COVARIANCE,
+    Ground.CORRELATED,
+    Ground.SYSTEMATIC,
+})  # fmt: skip
+#: A wrong size, a wrong pose, what moved and a late clock make errors that vary with the configuration, and in time.
+_MISTAKES = frozenset({Ground.POSE_DOUBTED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED})
+_MADE_BY_A_MISTAKE = frozenset({Ground.CORRELATED, Ground.SYSTEMATIC})
 _ADVICE = {
     Ground.MISREAD: "correct how the file is read, and calibrate again",
     Ground.IMPLAUSIBLE: (
@@ -124,6 +142,10 @@ _ADVICE = {
     Ground.NO_BOUND: "check the units and the frames of A and B, then calibrate again",
     Ground.NOT_CERTIFIED: "measure with more and larger rotations, then calibrate again",
     Ground.NOT_UNIQUE: "turn the carriers about at least two different axes and measure again, or fix what you know",
+    Ground.POSE_DOUBTED: (
+        "correct the stated pose of the named frame, or do not state it (leave out its prior, or do not fix it); if "
+        "you are sure of it, check that the frame has not moved and has its right name"
+    ),
     Ground.CONTRADICTED: (
         "check whether the named frame has moved, has another frame's name or was stated at a wrong pose, and whether "
         "its intrinsics are right and its clock is not late"
@@ -134,8 +156,7 @@ _ADVICE = {
     ),
     Ground.SIZE_DOUBTED: (
         "measure the named targets again and state the right sizes, or let the motion tell them: rw.Problem(scale="
-        '"per_target") or --scale per_target (in a rig file: sizes: estimate), and scale="shared" or --scale shared '
-        "where all sizes are off by one factor"
+        '"per_target") or --scale per_target (in a rig file: sizes: estimate)'
     ),
     Ground.NO_COVARIANCE: "take more measurements",
     Ground.TARGET_CONTRADICTED: (
@@ -158,6 +179,9 @@ _ADVICE = {
     Ground.NOISE_UNDERSTATED: (
         'let the noise be estimated: CalibrateOptions(noise="auto") or --noise auto (in a rig file: noise: estimate), '
         "or state it as large as it is"
+    ),
+    Ground.NOISE_OVERSTATED: (
+        "state the noise of A as large as it is, or leave it out: it is then estimated from the residuals"
     ),
     Ground.COVARIANCE_DOUBTED: "use the poses, but do not rely on their standard deviations",
 }
@@ -192,14 +216,27 @@ class Judgement:
     def __str__(self) -> str:
         return f"{self.verdict.words}: {self.reason}."
 
+    @property
+    def is_of_the_reading(self) -> bool:
+        """Whether A and B were misread, or their residuals are of no sensor: then nothing else counts."""
+        return bool(_MISREAD.intersection(self.grounds))
+
     @staticmethod
     def of(findings: list[Finding], praise: str) -> Judgement:
         """The judgement that some findings lead to; without any, ``praise`` is why the poses are to be used.
 
-        What a misreading leaves undetermined says nothing of the motion, so it is no ground beside a misreading.
+        What a mistake makes is no ground beside it: what a misreading leaves undetermined says nothing of the motion,
+        and errors that a wrong size or a late clock make say nothing of the arm.
         """
-        if any(finding.ground is Ground.MISREAD for finding in findings):
-            findings = [finding for finding in findings if finding.ground is not Ground.NOT_UNIQUE]
+        found = frozenset(finding.ground for finding in findings)
+        made: frozenset[Ground] = frozenset()
+        if found & _MISREAD:
+            made |= _MADE_BY_A_MISREADING
+        if found & _MISTAKES:
+            made |= _MADE_BY_A_MISTAKE
+        if Ground.NOT_UNIQUE in found:  # how well poses are known that are not determined is no question
+            made |= {Ground.NO_COVARIANCE}
+        findings = [finding for finding in findings if finding.ground not in made]
         if not findings:
             return Judgement(Verdict.USE, (), praise)
         by_ground: dict[Ground, list[str]] = {}

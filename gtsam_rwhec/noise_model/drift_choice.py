@@ -76,8 +76,8 @@ def why_no_drift(task: Task) -> str:
     instants = task.instants
     if instants.chains > MOST_TRACKS:
         return (
-            f"{instants.chains} pairs are measured at the same instants, of which a model holds {MOST_TRACKS}, and "
-            "neighbours in time are not clearly alike"
+            f"{instants.chains} pairs are measured at the same instants, and it can take {MOST_TRACKS} at most; "
+            "errors of neighbours in time are not clearly alike"
         )
     if instants.count < SHORTEST_TRACK * len(task.data) / instants.chains:
         return f"it takes {SHORTEST_TRACK} instants of each pair, one after the other"

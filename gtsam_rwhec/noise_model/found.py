@@ -28,7 +28,7 @@ _UNITS = {
 def ratio_words(evidence: float) -> str:
     """A likelihood ratio: how much twice the log likelihood rose; a fall, which rounding and priors make, is none."""
     rise = max(evidence, 0.0)
-    return f"likelihood ratio 2 ln L = {rounded(rise) if rise < 10.0 else f'{rise:.0f}'}"
+    return f"evidence {rounded(rise) if rise < 10.0 else f'{rise:.0f}'}"
 
 
 @dataclass(frozen=True)
@@ -101,17 +101,21 @@ class NoiseInData:
     @property
     def size_words(self) -> str:
         """How large the noise of B and of A is, in short."""
-        of_B, of_A = (C.ROTATION, C.TRANSLATION), (C.CARRIER_ROTATION, C.CARRIER_TRANSLATION)
-        said = f"{' and '.join(self._size(each) for each in of_B)} for B"
-        if not any(each in self.deviations for each in of_A):
+        said = f"{self.size_words_of_B} for B"
+        if self.carrier_noise is None:
             return f"{said}; A counts as exact"
-        return f"{said}, {' and '.join(self._size(each) for each in of_A)} for A"
+        return f"{said}, {self._size(C.CARRIER_ROTATION)} and {self._size(C.CARRIER_TRANSLATION)} for A"
+
+    @property
+    def size_words_of_B(self) -> str:
+        """How large the noise of B is, in short."""
+        return f"{self._size(C.ROTATION)} and {self._size(C.TRANSLATION)}"
 
     @property
     def systematic_words(self) -> str:
         """The size of these errors."""
         return (
-            f"{self._words(C.SYSTEMATIC_ROTATION)} and {self._words(C.SYSTEMATIC_TRANSLATION)} for a far configuration"
+            f"{self._words(C.SYSTEMATIC_ROTATION)} and {self._words(C.SYSTEMATIC_TRANSLATION)} between poses far apart"
         )
 
     @property
@@ -126,7 +130,7 @@ class NoiseInData:
                 f"Noise of A for each axis: {self._words(C.CARRIER_ROTATION)} and "
                 f"{self._words(C.CARRIER_TRANSLATION)}"
                 + (f"; jitter of stamps: {self._words(C.JITTER)}." if C.JITTER in self.deviations else ".")
-                + " Only lever arms tell A's noise from B's: their sum is known better than either."
+                + " Only frames far from their carrier tell it from B's; the sum of both is known better."
             )
         if self.correlation is not None:
             steps = [self._words(component) for component in DRIFT if component in self.deviations]

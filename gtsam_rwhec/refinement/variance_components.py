@@ -184,6 +184,7 @@ def _check(group: Group, component: str, degrees_of_freedom: float, weighed: flo
         )
     joined = "" if group is None else "join groups (noise_groups='all'), "
     raise NoiseError(
-        f"the {component} noise of {where} cannot be estimated with {degrees_of_freedom:.2g} degrees of freedom. "
+        f"the {component} noise of {where} cannot be estimated: the measurements are hardly more than the unknowns "
+        f"({degrees_of_freedom:.2g} degrees of freedom). "
         f"Measure more, {joined}give less noise of A if you gave any, or give sigma and kappa (noise='given')"
     )

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
 from rich.console import Console
 
-from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.calibration.verdict import Ground, Judgement
+from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.report.printing import print_heading, print_list
 from gtsam_rwhec.results.log_history import LogFields
 
@@ -17,23 +20,43 @@ SIZE_SIGMAS = 3.0
 COMMON_SCALE = 0.005
 #: Unknown tags are named up to this number.
 MOST_NAMED = 10
+#: Grounds that name the targets whose sizes are wrong.
+SIZES = frozenset({Ground.SIZE_DOUBTED, Ground.SIZE_ESTIMATED})
 
 
-def print_advice(console: Console, free: Sequence[FreeDirection], log: LogFields | None = None) -> None:
-    """Print the section "What to do", if there is anything to do."""
-    doubts = [] if log is None else log_advice(log)
+def print_advice(
+    console: Console, free: Sequence[FreeDirection], log: LogFields | None = None, judgement: Judgement | None = None
+) -> None:
+    """Print the section "What to do", if there is anything to do that the ``judgement`` above it does not say.
+
+    What a misreading leaves free is no fault of the motion, so its cure is the only one.
+    """
+    if judgement is not None and judgement.is_of_the_reading:
+        free = ()
+    doubts = [] if log is None else log_advice(log, judgement)
     if not free and not doubts:
         return
     print_heading(console, "What to do")
-    print_list(console, (f"Not determined: {direction}" for direction in free), "bold red")
+    print_list(console, _not_determined(free), "bold red")
     if free:
         help_ = "Measure again, and turn the carriers about at least two different axes. Or fix frames that you know."
         print_list(console, [help_])
     print_list(console, doubts, "bold yellow")
 
 
-def log_advice(log: LogFields) -> list[str]:
-    """What is odd about a log or its rig file, and what to do about it."""
+def _not_determined(free: Sequence[FreeDirection]) -> list[str]:
+    """The free directions; those of too few measurements in one sentence, since each names the same frames."""
+    few = [direction for direction in free if direction.reason is FreeReason.FEW]
+    said = [f"Not determined: {direction}" for direction in free if len(few) < 2 or direction not in few]
+    if len(few) > 1:
+        frames = sorted({name for direction in few for name in direction.frames}, key=natural_key)
+        named = f"{', '.join(frames[:MOST_NAMED])}{' and others' if len(frames) > MOST_NAMED else ''}"
+        said.insert(0, f"Not determined: {len(few)} directions of {named}: {FreeReason.FEW.words}")
+    return said
+
+
+def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
+    """What is odd about a log or its rig file, and what to do about it, without the sizes that a judgement names."""
     advice = [
         f"{len(faults)} images of {sensor} could not be used. The first: {faults[0]}"
         for sensor, faults in log.detection.undecoded.items()
@@ -47,7 +70,8 @@ def log_advice(log: LogFields) -> list[str]:
             f"The time offset of {', '.join(given)} was not estimated. If the clock may be late, write time_offset: "
             "estimate in the rig file. Wrong intrinsics show like this, too."
         )
-    advice += _sizes(log)
+    said = judgement is not None and bool(SIZES.intersection(judgement.grounds))
+    advice += _sizes(log, judgement.reason if judgement is not None and said else "")
     if log.detection.strangers:
         names = [f"{name} ({count} times)" for name, count in list(log.detection.strangers.items())[:MOST_NAMED]]
         advice.append(f"The images show tags that the rig file does not name: {', '.join(names)}.")
@@ -71,12 +95,14 @@ def _without_answer(log: LogFields) -> list[str]:
     ]
 
 
-def _sizes(log: LogFields) -> list[str]:
-    """Stated sizes that do not fit the motion, or that the motion does not check."""
+def _sizes(log: LogFields, reason: str) -> list[str]:
+    """Stated sizes that do not fit the motion, or that the motion does not check; not those that ``reason`` names."""
     advice = []
     free = [size for size in log.sizes if size.is_free]
     doubted = [size for size in log.sizes if size.is_doubted and not size.is_free]
     for size in free + doubted:
+        if re.search(rf"(?<!\w){re.escape(size.target)}(?!\w)", reason):
+            continue
         off = size.percent_too_large
         fact = (
             f"The stated size of {size.target} is {abs(off):.2f} % too {'large' if off > 0 else 'small'}: the rig file "

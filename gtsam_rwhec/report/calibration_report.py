@@ -37,7 +37,7 @@ def print_calibration(
     free = () if refined is None else refined.free_directions
     if not free and solution is not None:
         free = solution.identifiability.free_directions
-    print_advice(console, free, log)
+    print_advice(console, free, log, judgement)
     points = calibration.points
     if points:
         print_heading(console, "How far off a point is")

@@ -20,7 +20,7 @@ from gtsam_rwhec.report.log_report import print_log
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, RESIDUAL_LEGEND, FrameTable, pose_cells, residual_table
 from gtsam_rwhec.report.printing import print_heading, print_sentence, print_tables, print_verdict, report_console
 from gtsam_rwhec.report.solution_report import print_solution_details
-from gtsam_rwhec.results.judging import contradicted_names, judge
+from gtsam_rwhec.results.judging import contradicted, contradicted_names, judge
 from gtsam_rwhec.results.log_history import LogFields
 
 DEVIATION_HEADINGS = ("±x mm", "±y mm", "±z mm", "±x°", "±y°", "±z°")
@@ -75,7 +75,8 @@ def print_refined_body(
     )
     print_tables(console, tables, legend(refined))
     if wrong:
-        print_sentence(console, f"{MARK}: do not use this pose; most measurements of it contradict the answer.", "bold")
+        counts = "; ".join(map(str, contradicted(refined, log)))
+        print_sentence(console, f"{MARK}: do not use this pose; {counts}.", "bold")
     for sentence in scale_and_offset_sentences(refined):
         print_sentence(console, sentence)
     print_heading(console, "Details")

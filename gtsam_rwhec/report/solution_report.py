@@ -42,8 +42,9 @@ def print_solution(solution: Solution, console: Console | None = None, *, findin
         What else is known against the poses: how A and B were read.
     """
     console = report_console() if console is None else console
-    print_verdict(console, judge(solution, findings=findings), solution)
-    print_advice(console, solution.identifiability.free_directions)
+    judgement = judge(solution, findings=findings)
+    print_verdict(console, judgement, solution)
+    print_advice(console, solution.identifiability.free_directions, judgement=judgement)
     print_solution_body(console, solution)
 
 

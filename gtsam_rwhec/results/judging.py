@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gtsam_rwhec.calibration.disagreement import contradicted_frames
+from gtsam_rwhec.calibration.disagreement import LeftOut, contradicted_frames
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.results.log_history import LogFields
+from gtsam_rwhec.results.log_history import FrameOutliers, LogFields
 from gtsam_rwhec.solving.solution import Solution
 
 
 def contradicted_names(refined: RefinedPoses | None, log: LogFields | None = None) -> frozenset[str]:
-    """The sensors and targets whose own measurements contradict the answer, for the most part: poses not to be used."""
+    """The sensors and targets whose own measurements contradict the answer, half of them or nearly: not to be used."""
+    return frozenset(one.frame for one in contradicted(refined, log))
+
+
+def contradicted(refined: RefinedPoses | None, log: LogFields | None = None) -> tuple[LeftOut | FrameOutliers, ...]:
+    """The same with the counts of their measurements."""
     if log is not None:
-        return frozenset(one.frame for one in log.contradicted)
-    counts = {} if refined is None else refined.inlier_counts
-    return frozenset(one.frame for one in contradicted_frames(counts))
+        return tuple(log.contradicted)
+    return contradicted_frames({} if refined is None else refined.inlier_counts)
 
 
 def judge(

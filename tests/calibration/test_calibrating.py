@@ -40,7 +40,7 @@ def test_a_good_problem_is_to_be_used_and_its_truth_is_inside() -> None:
     assert said.evidence == "that is what the residuals of 80 measurements show"
     said = choice(calibration, "systematic errors")
     assert said.chosen == "none found; the covariances hold as much as could hide"
-    assert "explains the residuals hardly better (likelihood ratio 2 ln L = " in said.evidence
+    assert "explains the residuals hardly better (evidence " in said.evidence
     assert calibration.noise.model is not None
     assert str(calibration.noise).startswith("Noise of B for each axis: ")
     assert "No outliers among 80 measurements" in str(calibration.outliers)
@@ -132,7 +132,11 @@ def test_millimetres_in_both_are_found_in_the_lengths() -> None:
     calibration = rw.calibrate(problem)
     assert calibration.judgement.grounds == (rw.Ground.MISREAD,)
     assert "this looks like millimetres in A and B" in calibration.verdict_reason
-    assert any("in another unit than metres" in words for words in calibration.cannot_tell)
+    assert not any("in another unit than metres" in words for words in calibration.cannot_tell)
+    assert calibration.refined is None
+    assert calibration.points == {}
+    assert [choice.what for choice in calibration.choices] == ["reading of A and B"]
+    assert not any("no likely mistake" in str(choice) for choice in calibration.choices)
 
 
 def test_planar_motion_is_not_determined() -> None:
@@ -170,6 +174,9 @@ def test_two_measurements_are_too_few_to_leave_one_out() -> None:
     calibration = rw.calibrate(few)
     assert calibration.judgement.grounds == (rw.Ground.NOT_UNIQUE,)
     assert calibration.verdict_reason.startswith("the measurements are too few (2 of a pair at most, ")
+    assert calibration.verdict_reason.count("too few") == 1
+    said = choice(calibration, "reading of A and B").evidence
+    assert said == "2 measurements are too few to show a mistake of reading"
     assert {direction.reason for direction in calibration.refined.free_directions} == {FreeReason.FEW}
     assert choice(calibration, "outliers").chosen == "not looked for"
     assert "2 measurements are too few to tell a wrong one from the others; 4 more" in str(calibration)
@@ -314,12 +321,15 @@ def test_a_wrong_size_of_a_fixed_target_is_doubted() -> None:
     assert rw.Ground.SIZE_DOUBTED in rw.calibrate(problem).judgement.grounds
 
 
-def test_more_noise_stated_for_A_than_the_residuals_have_is_no_contradiction() -> None:
+def test_more_noise_stated_for_A_than_the_residuals_have_asks_for_care() -> None:
     A, B, X, _ = exact_and_truth()
     problem = rw.Problem()
     problem.add("board", "camera", A, B)
     calibration = rw.calibrate(problem, rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(0.01, 0.01)))
-    assert calibration.verdict is rw.Verdict.USE
+    assert calibration.judgement.grounds == (rw.Ground.NOISE_OVERSTATED,)
+    assert calibration.verdict is rw.Verdict.CARE
+    assert "than the noise that you stated for A makes them" in calibration.verdict_reason
+    assert choice(calibration, "noise of A").chosen == "0.57° and 10 mm for each axis, as you stated"
     assert calibration.contains("board", X)
     covariances = {problem.pairs[0]: np.tile(1e-4 * np.eye(6), (len(A), 1, 1))}
     calibration = rw.calibrate(problem, rw.CalibrateOptions(carrier_noise=rw.CarrierNoise(covariances=covariances)))
@@ -364,6 +374,9 @@ def test_three_stations_are_too_few_for_a_covariance_that_is_relied_on() -> None
     calibration = rw.calibrate(problem)
     assert calibration.verdict is not rw.Verdict.USE
     assert "3 measurements are too few to tell how large their noise is" in calibration.verdict_reason
+    raw, given = problem.measurements("board", "camera"), rw.Problem()
+    given.add("board", "camera", raw.A, raw.B, sigma=0.001, kappa=5e5)
+    assert "too few" not in rw.calibrate(given, rw.CalibrateOptions(noise="given")).verdict_reason
 
 
 def with_a_third_camera(count: int, wrong: int) -> rw.Calibration:

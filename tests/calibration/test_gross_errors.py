@@ -25,7 +25,13 @@ def test_they_are_counted(share: float) -> None:
         return B
 
     problem = copied(rig(number_of_measurements=40).problem, B=spoilt)
-    assert gross_errors(problem) == GrossErrors(round(share * 160), 160)
+    assert gross_errors(problem) == GrossErrors(round(share * 160), 160, 160)
+
+
+def test_the_measurements_that_were_not_looked_at_are_said() -> None:
+    assert str(GrossErrors(10, 130, 133)).startswith("10 of 130 measurements look wrong (")
+    assert "; 3 more were not looked at)" in str(GrossErrors(10, 130, 133))
+    assert "not looked at" not in str(GrossErrors(1, 133, 133))
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -142,6 +142,20 @@ def test_carriers_have_the_names_that_the_problem_states(calibration: rw.Calibra
         named.uncertainty_at(POINT, "sensor0", "hand")
 
 
+def test_a_word_that_may_mean_either_carrier_is_refused(calibration: rw.Calibration) -> None:
+    """A camera is on the hand more often than on the base; a target the other way about."""
+    for frame, word in (("sensor0", "base"), ("target0", "hand")):
+        with pytest.raises(rw.errors.FrameError, match=f"it is not clear which carrier '{word}' is, .*; name them: "):
+            calibration.uncertainty_at(POINT, frame, word)
+        across = calibration.uncertainty_at(POINT, frame, word, A=np.eye(4))
+        assert across.seen_from.startswith("the frame that carries the ")
+    named = replace(calibration, carriers=Carriers("base", "hand"))
+    assert named.uncertainty_at(POINT, "sensor0", "base").seen_from == "base"
+    half = replace(calibration, carriers=Carriers(None, "base"))
+    with pytest.raises(rw.errors.FrameError, match=r"base is on the carrier of the targets, .*give the pose"):
+        half.uncertainty_at(POINT, "sensor0", "base")
+
+
 def test_what_cannot_be_asked_is_refused(calibration: rw.Calibration) -> None:
     with pytest.raises(rw.errors.FrameError, match="there is no frame 'cam_9'; there are the sensors sensor0, sensor1"):
         calibration.uncertainty_at(POINT, "cam_9")

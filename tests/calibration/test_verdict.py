@@ -36,8 +36,8 @@ def test_the_most_serious_ground_comes_first_and_decides() -> None:
     ]
     judgement = Judgement.of(findings, "praise")
     assert judgement.verdict is Verdict.DO_NOT_USE
-    assert judgement.grounds == (Ground.MISREAD, Ground.CONTRADICTED, Ground.CORRELATED)
-    facts = "the quaternions of B are x, y, z, w; cam_1 disagrees; cam_2 disagrees; neighbours are alike"
+    assert judgement.grounds == (Ground.MISREAD, Ground.CONTRADICTED)
+    facts = "the quaternions of B are x, y, z, w; cam_1 disagrees; cam_2 disagrees"
     assert judgement.reason == f"{facts}. What to do: {Ground.MISREAD.advice}"
 
 
@@ -58,6 +58,31 @@ def test_what_a_misreading_leaves_free_is_not_blamed_on_the_motion() -> None:
     misread = Finding(Ground.MISREAD, "A is inverted")
     assert Judgement.of([free, misread], "praise") == Judgement.of([misread], "praise")
     assert Judgement.of([free], "praise").grounds == (Ground.NOT_UNIQUE,)
+
+
+@pytest.mark.parametrize("mistake", [Ground.MISREAD, Ground.IMPLAUSIBLE])
+def test_what_a_misreading_makes_is_no_fact_of_its_own(mistake: Ground) -> None:
+    made = [Ground.NOT_UNIQUE, Ground.NOT_CERTIFIED, Ground.NO_COVARIANCE, Ground.SYSTEMATIC]
+    judgement = Judgement.of([*(Finding(ground, "made") for ground in made), Finding(mistake, "a fact")], "praise")
+    assert judgement == Judgement.of([Finding(mistake, "a fact")], "praise")
+    assert judgement.is_of_the_reading
+
+
+@pytest.mark.parametrize("mistake", [Ground.SIZE_DOUBTED, Ground.CONTRADICTED, Ground.POSE_DOUBTED, Ground.LATE_CLOCK])
+def test_errors_that_a_mistake_makes_are_not_blamed_on_the_arm(mistake: Ground) -> None:
+    made = [Finding(Ground.SYSTEMATIC, "errors vary"), Finding(Ground.CORRELATED, "neighbours are alike")]
+    judgement = Judgement.of([*made, Finding(mistake, "a fact")], "praise")
+    assert judgement == Judgement.of([Finding(mistake, "a fact")], "praise")
+    assert not judgement.is_of_the_reading
+
+
+def test_poses_that_are_not_determined_are_too_few_once() -> None:
+    few = [Finding(Ground.NOT_UNIQUE, "2 are too few"), Finding(Ground.NO_COVARIANCE, "2 are too few to tell")]
+    assert Judgement.of(few, "praise") == Judgement.of(few[:1], "praise")
+
+
+def test_one_wrong_size_is_not_cured_by_one_factor_of_all() -> None:
+    assert "shared" not in Ground.SIZE_DOUBTED.advice
 
 
 def test_without_findings_the_poses_are_to_be_used() -> None:

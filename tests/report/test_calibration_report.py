@@ -36,6 +36,16 @@ def test_a_misreading_is_said_first_and_there_are_no_covariances() -> None:
     assert str(calibration.misreadings[0]) in text
     assert "±x mm" not in text
     assert "How far off a point is" not in text
+    assert "Not determined" not in text
+    assert "turn the carriers" not in text
+
+
+def test_too_few_measurements_are_said_once_for_all_directions() -> None:
+    raw, few = rig(1, 1).problem.measurements("target0", "sensor0"), rw.Problem()
+    few.add("target0", "sensor0", raw.A[:2], raw.B[:2])
+    text = printed(rw.calibrate(few))
+    assert text.count("Not determined") == 1
+    assert " directions of sensor0, target0: no pair of these frames has more than two measurements" in text
 
 
 def test_without_an_answer_the_reasons_stand_alone() -> None:
