@@ -212,3 +212,38 @@ def test_mutated_files(tmp_path_factory: pytest.TempPathFactory, data: st.DataOb
         read(path)
     except RwhecError as error:
         assert "mutated.yaml" in str(error)  # noqa: PT017
+
+
+PLAIN = "fx: 500\nfy: 501\ncx: 320.5\ncy: 240.5\nwidth: 640\nheight: 480\n"
+
+
+@pytest.mark.parametrize(
+    ("more", "model", "D"),
+    [
+        ("", "pinhole", []),
+        ("k1: 0.1\nk2: 0.02\np1: 0.003\np2: 0.004\nk3: 0.5\n", "radtan", [0.1, 0.02, 0.003, 0.004, 0.5]),
+        ("dist_k0: 0.1\ndist_k1: 0.02\ndist_px: 3\ndist_py: 4\ndist_k2: 5\n", "radtan", [0.1, 0.02, 3.0, 4.0, 5.0]),
+        ("has_dist_coeff: 0\ndist_k0: 0.1\n", "pinhole", []),
+    ],
+)  # fmt: skip
+def test_plain_numbers(path: Path, more: str, model: str, D: list[float]) -> None:
+    path.write_text(PLAIN + more)
+    camera = read_calibration_yaml(path)
+    assert (camera.width, camera.height, camera.model) == (640, 480, model)
+    assert camera.K.tolist() == [[500.0, 0.0, 320.5], [0.0, 501.0, 240.5], [0.0, 0.0, 1.0]]
+    assert camera.D.tolist() == D
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("cy: 240.5\n", "", "no cy; plain intrinsics have fx, fy, cx and cy"),
+        ("fy: 501", "fy: wide", "fy.*'wide'; a finite number was expected"),
+        ("width: 640\n", "", "no image_width"),
+        ("fx: 500", "fx: 5", "fx = 5 pixels for an image of 640 x 480"),
+    ],
+)
+def test_plain_numbers_that_are_no_camera(path: Path, old: str, new: str, words: str) -> None:
+    path.write_text(PLAIN.replace(old, new))
+    with pytest.raises(RwhecError, match=words):
+        read_calibration_yaml(path)
