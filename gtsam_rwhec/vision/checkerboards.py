@@ -31,6 +31,8 @@ LEVELS = (1, 2)
 MOST_REGIONS = 3
 #: A region of at most this many pixels is searched at twice its size too: narrow squares of oblique boards need that.
 LARGEST_ENLARGED = 250_000
+#: After its first region, an image is searched up to this number of pixels, those of enlarged regions too.
+MOST_SEARCHED = 2_500_000
 #: A region is not searched if at least this share of it has been searched.
 SEARCHED = 0.95
 
@@ -62,12 +64,17 @@ def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = N
 def _candidates(gray: Gray, board: Checkerboard) -> Iterator[Array]:
     """Grids of corners (rows, columns, 2) that OpenCV finds, in the order in which they are asked for."""
     searched: list[tuple[slice, slice]] = []
+    spent = 0
     for level in LEVELS:
         for region in regions(gray, board.columns * board.rows, level)[:MOST_REGIONS]:
             if any(_share_inside(region, before) > SEARCHED for before in searched):
                 continue
-            searched.append(region)
             part = np.ascontiguousarray(gray[region])
+            cost = part.size * (5 if part.size <= LARGEST_ENLARGED else 1)
+            if searched and spent + cost > MOST_SEARCHED:
+                return
+            spent += cost
+            searched.append(region)
             corner = np.array([region[1].start, region[0].start], dtype=float)
             enlarged: Gray | None = None
             if part.size <= LARGEST_ENLARGED:
