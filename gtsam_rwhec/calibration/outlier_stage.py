@@ -14,6 +14,7 @@ from gtsam_rwhec.calibration.noise_choice import Inliers, offsets_of
 from gtsam_rwhec.calibration.outliers import Outliers, few_words
 from gtsam_rwhec.calibration.plausibility import implausible
 from gtsam_rwhec.calibration.run import Run
+from gtsam_rwhec.calibration.second_choice import more_consistent
 from gtsam_rwhec.calibration.stated_poses import stated_poses
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import NoiseError, OutlierError, ScaleError
@@ -22,6 +23,7 @@ from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.graduated import graduated
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 
 #: Without at least so many equations more than unknowns a wrong measurement cannot be told from the others: it has six
@@ -69,7 +71,11 @@ def without_outliers(
         return first, {}
     offsets = clearly_off or offsets_of(problem, options)
     try:
-        return _agreeing(run, first, offsets)
+        solution, inliers = _agreeing(run, first, offsets)
+        other = more_consistent(problem, inliers)
+        if other is not None:
+            solution, inliers = solve(selected(problem, other), options=options.solve), other
+        return solution, inliers
     except (OutlierError, NoiseError, ScaleError) as error:
         record.choose(OUTLIERS, "not left out", f"it is not possible: {error}")
         words = "too few measurements agree with one another to find out which are wrong"
