@@ -23,7 +23,7 @@ CUTS = tuple(np.arange(1, 8) / 8.0)
 #: one.
 FEWEST, MOST_FRAMES = 6, 6
 #: The product of the residuals' medians, rotation and translation, falls by this factor at least.
-BETTER = 3.0
+BETTER = 8.0
 #: The two poses are this many standard deviations of one measurement apart, in rotation or in translation.
 APART = 5.0
 #: Rounds of a fit on trial, and halvings of the interval in which the step is looked for.

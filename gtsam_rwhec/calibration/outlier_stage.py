@@ -31,6 +31,8 @@ from gtsam_rwhec.solving.solution import Solution
 SPARE_EQUATIONS = 24
 #: The share of the measurements that agree where the noise is about right.
 HALF = 0.5
+#: Of so large a share of outliers the verdict says something.
+MANY = 0.3
 #: Of fewer measurements than this, more than this share of outliers under the stated noise may be a noise stated too
 #: small: so it is where under the noise that the residuals show none is left out.
 FEW, MANY_OF_FEW = 20, 0.25
@@ -181,6 +183,11 @@ def outliers_of(run: Run, inliers: Inliers, *, is_answered: bool) -> Outliers:
         if name in sensors:
             words = f"{name} has no pose, because no measurement of it is in the answer"
             run.record.find(Ground.NO_ANSWER, words)
+    number = sum(len(mask) for mask in inliers.values())
+    left_out = sum(int((~mask).sum()) for mask in inliers.values())
+    if left_out > MANY * number and not contradicted:
+        words = f"{left_out} of {number} measurements contradict the answer and were left out"
+        run.record.find(Ground.MANY_OUTLIERS, words)
     if is_answered:
         known = {frame.frame for frame in contradicted} | set(stated_poses(run.problem))
         for name, number in outliers.resting_on_few.items():

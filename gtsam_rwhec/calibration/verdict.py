@@ -86,6 +86,8 @@ class Ground(StrEnum):
     SYSTEMATIC = "systematic"
     #: Every measurement counts, as an option says, and some of them look wrong.
     OUTLIERS_KEPT = "outliers_kept"
+    #: So many measurements were left out that A and B may not belong together.
+    MANY_OUTLIERS = "many_outliers"
     #: The residuals are larger than the noise that was stated allows.
     NOISE_UNDERSTATED = "noise_understated"
     #: The residuals are far smaller than the noise that was stated.
@@ -113,6 +115,7 @@ _CARE = (
     Ground.CORRELATED,
     Ground.SYSTEMATIC,
     Ground.OUTLIERS_KEPT,
+    Ground.MANY_OUTLIERS,
     Ground.NOISE_UNDERSTATED,
     Ground.NOISE_OVERSTATED,
     Ground.COVARIANCE_DOUBTED,
@@ -173,6 +176,9 @@ _ADVICE = {
     Ground.SIZE_ESTIMATED: "measure the named target again, and correct its size",
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
     Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",
+    Ground.MANY_OUTLIERS: (
+        "look at what was left out, and check that each B belongs to its A (order, stamps, names of files)"
+    ),
     Ground.OUTLIERS_KEPT: (
         'let them be found and left out: CalibrateOptions(robust="auto") or --robust auto (in a rig file: robust: gnc)'
     ),
