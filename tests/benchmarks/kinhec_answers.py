@@ -165,7 +165,9 @@ def our_answer(sequence: NeutralSequence, keyframes: Keyframes | None, offset_s:
     poses = {frame: T.matrix() for frame, T in (calibration.X | calibration.Y).items()}
     if set(poses) != set(true):
         # A refusal, not a failure: without poses nothing is called unique.
-        return OurAnswer("not unique", NO_ANSWER, calibration.verdict.value, calibration.verdict_reason, seconds=seconds)
+        return OurAnswer(
+            "not unique", NO_ANSWER, calibration.verdict.value, calibration.verdict_reason, seconds=seconds
+        )
     other = TARGET if sequence.frame == CAMERA else CAMERA
     errors = of_kinhec("metrics").calibration_errors(poses[sequence.frame], true[sequence.frame])
     refined = calibration.refined

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,14 @@ from gtsam_rwhec.pipeline.detection_stage import detect_log
 from gtsam_rwhec.rig import parse_rig
 
 
+def read(out: Path) -> str:
+    return (out / "result.json").read_text(encoding="utf-8")
+
+
 def numbers(out: Path) -> dict[str, Any]:
-    """A result without what differs by chance (times) or by name (of the log)."""
-    result: dict[str, Any] = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    """A result without what differs by chance (times) or by name (of the log, and of the file that holds the rig)."""
+    text = re.sub(r"\([^()]*: (targets|sensors)\.", r"(FILE: \1.", read(out))
+    result: dict[str, Any] = json.loads(text)
     certified = result["certified"]
     for certificate in (certified["certificate"], *(part["certificate"] for part in certified["parts"])):
         certificate.pop("seconds", None)

@@ -75,7 +75,7 @@ def few() -> rw.Problem:
         (
             lambda: refined(few(), noise="estimate"),
             rw.errors.NoiseError,
-            "noise of the measurements cannot be estimated .*degrees of freedom",
+            "noise of the measurements cannot be estimated: .*degrees of freedom",
         ),
         (lambda: RefineOptions(noise="guess"), rw.errors.OptionError, "noise='guess' is not one of 'auto'"),
         (lambda: RefineOptions(robust="l1"), rw.errors.OptionError, "robust='l1' is not one of"),
