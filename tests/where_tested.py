@@ -168,6 +168,7 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_commands.py": "drawn_detections",
         "vision/test_ambiguity.py": "agreement",
         "vision/test_camera.py": "distortion",
+        "vision/test_circle_grids.py": "circle_centres",
         "vision/test_detection.py": "options rejection",
         "vision/test_edges.py": "edge_geometry edge_profiles",
         "vision/test_images.py": "image_sizes",

@@ -22,7 +22,7 @@ from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.detection import Detection, Detector
 from gtsam_rwhec.vision.many_images import DetectedImage, detect_in_images, measured_corner_px
 from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import Checkerboard, Target
+from gtsam_rwhec.vision.targets import Checkerboard, CircleGrid, Target
 
 #: A camera's stamps are checked after these numbers of images, so that nobody waits long for a log of no use.
 CHECKED_AFTER = (10, 100, 1000, 10_000)
@@ -158,7 +158,7 @@ def _of_track(
         stamps = np.array([track[i][0] for i in good], dtype=np.int64)
         carrier = motion.A_where_known(stamps, rig.carriers.max_gap_s)
         sure_of_turn = np.full(len(good), np.inf)
-        if isinstance(target, Checkerboard) and target.ways > 1:
+        if isinstance(target, (Checkerboard, CircleGrid)) and target.ways > 1:
             detections, sure_of_turn = _turned(detections, target, carrier, corner_px, factor, upright)
             track = track.copy()
             for i, detection in zip(good, detections, strict=True):
@@ -200,7 +200,7 @@ def _of_track(
 
 def _turned(
     detections: list[Detection],
-    board: Checkerboard,
+    board: Checkerboard | CircleGrid,
     carrier: Array,
     corner_px: float,
     factor: float,

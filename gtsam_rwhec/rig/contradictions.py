@@ -11,7 +11,7 @@ from gtsam_rwhec.files.yaml_lines import KeyPath, suggestion
 from gtsam_rwhec.rig.sections import Carriers, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.options import DetectionOptions
-from gtsam_rwhec.vision.targets import Checkerboard, Target, print_of
+from gtsam_rwhec.vision.targets import Checkerboard, CircleGrid, Target, print_of
 
 Fault = tuple[KeyPath, str]
 
@@ -105,15 +105,18 @@ def _detection(detection: Mapping[str, Any]) -> Iterator[Fault]:
 
 
 def _lookalikes(targets: list[Target]) -> Iterator[Fault]:
-    boards: dict[frozenset[int], str] = {}
+    boards: dict[tuple[str, frozenset[int], bool], str] = {}
     prints: dict[tuple[str, int], str] = {}
     for target in targets:
-        if isinstance(target, Checkerboard):
-            other = boards.setdefault(frozenset((target.columns, target.rows)), target.name)
+        if isinstance(target, (Checkerboard, CircleGrid)):
+            is_checkerboard = isinstance(target, Checkerboard)
+            what, of = ("checkerboard", "inner corners") if is_checkerboard else ("grid", "circles")
+            dot = isinstance(target, CircleGrid) and bool(target.larger_dot)
+            other = boards.setdefault((what, frozenset((target.columns, target.rows)), dot), target.name)
             if other != target.name:
                 yield (
                     ("targets", target.name),
-                    f"a checkerboard of {target.columns} x {target.rows} inner corners, like {other}: the boards "
+                    f"a {what} of {target.columns} x {target.rows} {of}, like {other}: the boards "
                     "look the same in images; use boards with tags",
                 )
             continue

@@ -6,10 +6,9 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 
-from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.rig.field_types import Length, Positive, list_of
 from gtsam_rwhec.rig.sections import Section
-from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
+from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
 
 #: How many there are across and down, as the board is printed upright.
 Counts: TypeAlias = Annotated[tuple[int, int], list_of(2, "two whole numbers, [across, down]")]
@@ -78,14 +77,12 @@ class CheckerboardTarget(_TargetSection):
 class CircleGridTarget(_TargetSection):
     """A grid of circles, counted by circles."""
 
+    made: ClassVar = CircleGrid
+    counted: ClassVar = "circles"
     type: Literal["circle_grid"]
     circles: Counts = Field(description="[across, down]")
     spacing_m: Length = Field(description="between the centres of neighbours, metres")
     larger_dot: bool | Literal["lower_left", "lower_right", "upper_left", "upper_right"] = False
-
-    def target(self, name: str) -> Target:
-        """Raise `TargetError`: there is no detector of circles."""
-        raise TargetError("a circle_grid cannot be detected yet: this version has no detector of circles", name)
 
 
 TargetSection: TypeAlias = Annotated[

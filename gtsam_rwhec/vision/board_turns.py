@@ -1,4 +1,4 @@
-"""Which way up a board is that looks the same turned: a checkerboard by half a turn, some square ones by quarters.
+"""Which way up a board is that looks the same turned: checkerboards and grids of circles, by half a turn or quarters.
 
 One image cannot tell. Over a track the motion does: A_i R_X = R_Y B_i R_z(w_i) in every image, with one R_X, one R_Y
 and the turn w_i of each image. The turn of the first image stays free: it is a name for the target's frame, which all
@@ -16,7 +16,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.agreement import LAGS, extrinsic_rotations, first_rotation, nearest_rotation, rotations_off
 from gtsam_rwhec.vision.ambiguity import MOST_OF_A_LINK, MOST_OF_AN_IMAGE, SIGMA_TURN_RAD
 from gtsam_rwhec.vision.detection import Detection
-from gtsam_rwhec.vision.targets import Checkerboard
+from gtsam_rwhec.vision.targets import Checkerboard, CircleGrid
 
 #: With fewer images R_X and R_Y agree with too many turns.
 LEAST_IMAGES = 5
@@ -166,7 +166,7 @@ def _axes(R_A: Array, R_B: Array) -> tuple[Array, Array]:
     return se3.so3_logmap(A_i.swapaxes(1, 2) @ A_j), se3.so3_logmap(B_i.swapaxes(1, 2) @ B_j)
 
 
-def turned_detection(detection: Detection, board: Checkerboard, turn: int) -> Detection:
+def turned_detection(detection: Detection, board: Checkerboard | CircleGrid, turn: int) -> Detection:
     """The same corners with the numbers and the pose that they have if the board is turned by `turn` of its ways."""
     if turn == 0:
         return detection

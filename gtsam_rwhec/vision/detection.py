@@ -13,6 +13,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision import boards
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.checkerboards import find_checkerboard
+from gtsam_rwhec.vision.circle_grids import find_circle_grid
 from gtsam_rwhec.vision.codes import identified, quadrangles, unlike
 from gtsam_rwhec.vision.dictionaries import detector_of, modules
 from gtsam_rwhec.vision.edges import refine_corners
@@ -20,7 +21,7 @@ from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.pose import PlanePoses, plane_poses
 from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
+from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
 
 #: Family of tags, and the modules of their border.
 _Kind: TypeAlias = tuple[str, int]
@@ -112,6 +113,7 @@ class Detector:
         self._tags = {(*_kind(t), t.id): t for t in targets if isinstance(t, Tag)}
         self._boards = [t for t in targets if isinstance(t, (Charuco, AprilGrid))]
         self._checkerboards = [t for t in targets if isinstance(t, Checkerboard)]
+        self._circle_grids = [t for t in targets if isinstance(t, CircleGrid)]
         self._charuco = {t.name: boards.charuco_detector(t) for t in targets if isinstance(t, Charuco)}
 
     def __call__(self, images: Sequence[Gray]) -> list[ImageDetections]:
@@ -135,6 +137,13 @@ class Detector:
                 seen = find_checkerboard(gray, checkerboard, self.camera)
                 if seen is not None:
                     of_image.append(_Sighting(checkerboard, seen.indices, seen.corners_px, rejection=seen.rejection))
+        for circle_grid in self._circle_grids:
+            for of_image, gray in zip(sightings, images, strict=True):
+                circles = find_circle_grid(gray, circle_grid, self.camera)
+                if circles is not None:
+                    of_image.append(
+                        _Sighting(circle_grid, circles.indices, circles.corners_px, rejection=circles.rejection)
+                    )
         judged = iter(self._judged([sighting for of_image in sightings for sighting in of_image]))
         return [
             ImageDetections(tuple(next(judged) for _ in of_image), strangers)

@@ -23,4 +23,5 @@ class Rejection(StrEnum):
     NOT_A_GRID = "corners not on one plane's grid"
     NOT_WHOLE = "board not whole in the image"
     SQUARES = "squares do not alternate as printed"
+    CIRCLES = "circles not of the sizes as printed, or the larger dot not at its corner"
     OTHER_SIZE = "board goes on: other columns or rows"

@@ -1,4 +1,4 @@
-"""Targets and the places of their corners: tags, ChArUco boards, Kalibr's AprilGrids and checkerboards.
+"""Targets and the places of their corners: tags, ChArUco boards, Kalibr's AprilGrids, checkerboards, grids of circles.
 
 All targets have the same frame: the origin is the middle of the tag or of the board's pattern, x points to the right
 and y up as printed, z out of the paper. OpenCV orders a tag's corners: top left, top right, bottom right, bottom left.
@@ -23,6 +23,8 @@ FAMILIES: dict[str, int] = {
 }  # fmt: skip
 #: Lengths of targets must be below this (m), since longer lengths are probably millimetres.
 LARGEST_M = 10.0
+#: Where a larger dot can be, as printed.
+CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")
 
 
 @dataclass(frozen=True)
@@ -212,7 +214,62 @@ class Checkerboard:
         return _grid(self.columns, self.rows, self.square_m)
 
 
-Target: TypeAlias = Tag | Charuco | AprilGrid | Checkerboard
+@dataclass(frozen=True)
+class CircleGrid:
+    """A grid of columns x rows circles, numbered left to right, from the top.
+
+    Without a larger dot the grid looks the same turned (see `ways`): which way up it is only the motion tells.
+
+    Attributes
+    ----------
+    name : str
+    columns, rows : int
+        Numbers of circles.
+    spacing_m : float
+        Between the centres of neighbours, metres.
+    larger_dot : bool or str
+        Whether one circle, at a corner, is larger; or which corner, one of `CORNERS`. True is "lower_left".
+    """
+
+    name: str
+    columns: int
+    rows: int
+    spacing_m: float
+    larger_dot: bool | str = False
+    family: ClassVar[str] = "circle_grid"
+    ids: ClassVar[tuple[int, ...]] = ()
+
+    def __post_init__(self) -> None:
+        _check_grid(self.name, self.columns, self.rows, 3)
+        _check(self.name, None, (), {"spacing_m": self.spacing_m})
+        if not isinstance(self.larger_dot, bool) and self.larger_dot not in CORNERS:
+            raise TargetError(f"larger_dot = {self.larger_dot!r}; give true, false or {', '.join(CORNERS)}", self.name)
+
+    @property
+    def corner(self) -> str:
+        """The larger dot's corner as printed; empty if there is none."""
+        if isinstance(self.larger_dot, bool):
+            return CORNERS[0] if self.larger_dot else ""
+        return self.larger_dot
+
+    @property
+    def ways(self) -> int:
+        """In how many ways the grid looks the same: with a larger dot 1, else by half a turn 2, by quarters 4."""
+        if self.larger_dot:
+            return 1
+        return 4 if self.columns == self.rows else 2
+
+    @property
+    def length_m(self) -> float:
+        """The length that a scale multiplies."""
+        return self.spacing_m
+
+    def corners(self) -> Array:
+        """(columns rows, 3), metres: the circles' centres."""
+        return _grid(self.columns, self.rows, self.spacing_m)
+
+
+Target: TypeAlias = Tag | Charuco | AprilGrid | Checkerboard | CircleGrid
 
 
 def is_same_print(first: str, second: str) -> bool:

@@ -167,7 +167,7 @@ carriers: {sensors: wrist, targets: base, poses: {frames: [base, wrist]}}
 sensors:
   camera: {images: images, poses: poses, intrinsics: {K: [550, 550, 320, 240], size: [640, 480]}}
 targets:
-  board: {type: checkerboard, inner_corners: [3, 4], square_m: 0.05}
+  grid: {type: circle_grid, circles: [10, 10], spacing_m: 0.0254, larger_dot: true}
 """
 
 

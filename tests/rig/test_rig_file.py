@@ -252,4 +252,4 @@ def test_the_targets_of_the_page_on_logs_are_read() -> None:
     assert targets is not None
     rig = yaml.safe_load((CELL / "rig.yaml").read_text(encoding="utf-8")) | yaml.safe_load(targets[1])
     kinds = {type(target).__name__ for target in parse_rig(yaml.safe_dump(rig), "the page").target_list}
-    assert kinds == {"Tag", "Charuco", "AprilGrid", "Checkerboard"}
+    assert kinds == {"Tag", "Charuco", "AprilGrid", "Checkerboard", "CircleGrid"}

@@ -10,7 +10,7 @@ import numpy as np
 
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.dictionaries import dictionary
-from gtsam_rwhec.vision.targets import AprilGrid, Checkerboard, Tag, Target
+from gtsam_rwhec.vision.targets import AprilGrid, Checkerboard, CircleGrid, Tag, Target
 
 #: Rays a pixel along each axis, and the pictures' pixels along a tag's module.
 SAMPLES, PER_MODULE = 4, 16
@@ -57,12 +57,26 @@ def printed(target: Target, *, quarter_turns: int = 0) -> Print:
         rows, columns = np.indices((target.rows + 1, target.columns + 1))
         squares = np.pad(((rows + columns) % 2).astype(float), 1, constant_values=1.0)
         return Print(_enlarged(squares, 40), target.square_m / 40)
+    if isinstance(target, CircleGrid):
+        return circles(target)
     made = cv2.aruco.CharucoBoard(
         (target.columns, target.rows), target.square_m, target.marker_m, dictionary(target.family),
         np.array(target.ids, dtype=np.int32),
     )  # fmt: skip
     picture = made.generateImage((target.columns * 80, target.rows * 80), marginSize=0) / 255.0
     return Print(np.pad(picture, 40, constant_values=1.0), target.square_m / 80)
+
+
+def circles(grid: CircleGrid, *, light: bool = False, at: tuple[int, int] | None = None) -> Print:
+    """A grid of circles, dark or light, whose larger one is at its corner or `at` another row and column."""
+    row, column = -1 if "lower" in grid.corner else 0, -1 if "right" in grid.corner else 0
+    radii = np.full((grid.rows, grid.columns), 16.0)
+    if grid.larger_dot:
+        radii[at or (row, column)] = 26.0
+    y, x = np.indices((64, 64)) - 31.5
+    cells = np.clip(np.hypot(x, y) - radii[..., None, None] + 0.5, 0.0, 1.0)
+    picture = np.pad(cells.swapaxes(1, 2).reshape(64 * grid.rows, 64 * grid.columns), 32, constant_values=1.0)
+    return Print(1.0 - picture if light else picture, grid.spacing_m / 64)
 
 
 def _enlarged(modules: np.ndarray, by: int = PER_MODULE) -> np.ndarray:
