@@ -28,8 +28,6 @@ BETTER = 8.0
 APART = 5.0
 #: Rounds of a fit on trial, and halvings of the interval in which the step is looked for.
 ROUNDS, HALVINGS = 2, 5
-#: Neighbours are alike where the lag-1 correlation of their residuals is beyond this many standard deviations.
-ALIKE = 2.5
 
 
 def moved_frame(problem: Problem, sample: Sample) -> TwoPoses | None:
@@ -59,18 +57,6 @@ def moved_frame(problem: Problem, sample: Sample) -> TwoPoses | None:
     name, cut = best[1], _refined_cut(problem, sample, best)
     fit = _split(problem, sample, name, cut)
     return None if fit is None else _step(name, sample, cut, fit)
-
-
-def are_alike(residuals: list[Array]) -> bool:
-    """Whether residuals (N, 6) of neighbours, pair by pair, are clearly alike."""
-    products, squares, count = np.zeros(6), np.zeros(6), 0
-    for one in residuals:
-        r = one - one.mean(axis=0) if len(one) else one
-        products += (r[1:] * r[:-1]).sum(axis=0)
-        squares += (r**2).sum(axis=0)
-        count += max(len(r) - 1, 0)
-    correlation = products / np.maximum(squares, 1e-300)
-    return bool(correlation.mean() * np.sqrt(6 * max(count, 1)) > ALIKE)
 
 
 def _second(name: str) -> str:

@@ -7,15 +7,16 @@ from typing import Literal
 
 import numpy as np
 
-from gtsam_rwhec.calibration.moved_frames import are_alike, moved_frame
+from gtsam_rwhec.calibration.moved_frames import moved_frame
 from gtsam_rwhec.calibration.noise_choice import Inliers, estimated
 from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
 from gtsam_rwhec.calibration.stated_poses import contradicted_poses, stated_poses
-from gtsam_rwhec.calibration.two_poses import by_station, means_of, residual_twists, two_poses
+from gtsam_rwhec.calibration.two_poses import TwoPoses, by_station, means_of, residual_twists, two_poses
 from gtsam_rwhec.calibration.verdict import Ground
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.noise_model.drift_choice import CORRELATED, likeness_of_neighbours
 from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
@@ -53,19 +54,26 @@ def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
     """Frames that were at two poses are found."""
     if any(finding.ground is Ground.LATE_CLOCK for finding in run.record.findings):
         return  # a late clock makes such groups
-    found = two_poses(run.problem, refined, inliers)
-    if not found and run.problem.has_measurements:
-        problem = selected(run.problem, inliers) if inliers else run.problem
-        raw = {pair: problem.measurements(*pair) for pair in problem.pairs}
-        twists = [
-            means_of(residual_twists(refined, pair, of.A, of.B)[0], by_station(of.A)[0]) for pair, of in raw.items()
-        ]
-        if are_alike(twists):
-            run.tell("looking for a frame that moved")
-            moved = moved_frame(run.problem, {pair: (of.A, of.B) for pair, of in raw.items()})
-            found = () if moved is None else (moved,)
-    for one in found:
-        run.record.find(Ground.CONTRADICTED, str(one))
+    found = two_poses(run.problem, refined, inliers) or _moved(run, refined, inliers)
+    if found is not None:
+        run.record.find(Ground.CONTRADICTED, str(found))
+
+
+def _moved(run: Run, refined: Refined, inliers: Inliers) -> TwoPoses | None:
+    """A frame that moved once, where residuals of neighbours are alike."""
+    if not run.problem.has_measurements:
+        return None
+    problem = selected(run.problem, inliers) if inliers else run.problem
+    raw = {pair: problem.measurements(*pair) for pair in problem.pairs}
+    tracks = [means_of(residual_twists(refined, pair, of.A, of.B)[0], by_station(of.A)[0]) for pair, of in raw.items()]
+    if likeness_of_neighbours(tracks) < CORRELATED:
+        return None
+    run.tell("looking for a frame that moved")
+    found = moved_frame(run.problem, {pair: (of.A, of.B) for pair, of in raw.items()})
+    if found is None or found.from_row is None or not inliers:
+        return found
+    (mask,) = (mask for pair, mask in inliers.items() if found.frame in pair.frames)
+    return replace(found, from_row=int(np.flatnonzero(mask)[found.from_row - 1]) + 1)
 
 
 def doubt_stated_sizes(

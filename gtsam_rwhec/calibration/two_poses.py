@@ -41,7 +41,8 @@ class TwoPoses:
     angle_rad, distance_m : float
         How far apart the two poses of the frame are.
     from_row : int or None
-        The first measurement of the second group, where one follows the other; None where they alternate.
+        The first measurement of the second group among those of its pair, counted from one, where the frame is in one
+        pair and one group follows the other; else None.
     """
 
     frame: str
@@ -60,8 +61,10 @@ class TwoPoses:
         )
 
 
-def two_poses(problem: Problem, refined: Refined, inliers: Mapping[Pair, np.ndarray]) -> tuple[TwoPoses, ...]:
-    """The frames of an answer that were at two poses; the one whose groups are farthest apart first.
+def two_poses(problem: Problem, refined: Refined, inliers: Mapping[Pair, np.ndarray]) -> TwoPoses | None:
+    """The frame of an answer that was at two poses, the one whose groups are farthest apart; None where none was.
+
+    What moved makes two groups of whatever it is seen with, so no other frame is named beside it.
 
     Parameters
     ----------
@@ -70,22 +73,16 @@ def two_poses(problem: Problem, refined: Refined, inliers: Mapping[Pair, np.ndar
         The answer from the ``inliers``, by pair (N,) booleans; empty: from all measurements.
     """
     if not problem.has_measurements:
-        return ()
-    in_frame: dict[str, list[tuple[Array, Array]]] = {}
+        return None
+    in_frame: dict[str, list[_Stations]] = {}
     for pair in problem.pairs:
         raw = problem.measurements(*pair)
         kept = inliers.get(pair, np.ones(len(raw.A), dtype=bool))
-        station, A = by_station(raw.A[kept])
-        of_target, of_sensor = residual_twists(refined, pair, raw.A[kept], raw.B[kept])
-        in_frame.setdefault(pair.target, []).append((means_of(of_target, station), A))
-        in_frame.setdefault(pair.sensor, []).append((means_of(of_sensor, station), A))
-    found = [
-        (*_groups(name, *(np.concatenate(each) for each in zip(*parts, strict=True))), name)
-        for name, parts in in_frame.items()
-    ]
-    found = sorted((one for one in found if one[0] > APART), key=lambda one: -one[0])
-    # What moved makes two groups of whatever it is seen with; so a frame counts alone.
-    return tuple(groups for _, groups, _ in found[:1] if groups is not None)
+        for name, twists in zip(pair, residual_twists(refined, pair, raw.A[kept], raw.B[kept]), strict=True):
+            in_frame.setdefault(name, []).append(_Stations.of(twists, raw.A[kept], np.flatnonzero(kept)))
+    found = [_groups(name, parts) for name, parts in in_frame.items()]
+    apart, groups = max(found, key=lambda one: one[0], default=(0.0, None))
+    return groups if apart > APART else None
 
 
 def residual_twists(refined: Refined, pair: Pair, A: Array, B: Array) -> tuple[Array, Array]:
@@ -115,12 +112,33 @@ def means_of(twists: Array, station: np.ndarray) -> Array:
     return np.stack([np.bincount(station, column) / visits for column in twists.T], axis=1)
 
 
-def _groups(name: str, twists: Array, A: Array) -> tuple[float, TwoPoses | None]:
-    """How far apart the best two groups of some residuals (N, 6) are, in their own spread, and the groups.
+@dataclass(frozen=True)
+class _Stations:
+    """Of one pair: the mean residual (S, 6), a pose (S, 12), the number of visits and the first row of each station."""
 
-    Groups that come with the carriers' poses A (N, 12), and not one after the other in time, are an arm's error, or
-    views of a board.
+    twists: Array
+    A: Array
+    visits: np.ndarray
+    rows: np.ndarray
+
+    @staticmethod
+    def of(twists: Array, A: Array, rows: np.ndarray) -> _Stations:
+        station, poses = by_station(A)
+        first = np.unique(station, return_index=True)[1]
+        count = len(first) if len(twists) else 0
+        return _Stations(
+            means_of(twists, station), poses[:count], np.bincount(station, minlength=count)[:count], rows[first][:count]
+        )
+
+
+def _groups(name: str, parts: list[_Stations]) -> tuple[float, TwoPoses | None]:
+    """How far apart the best two groups of the residuals of a frame's pairs are, in their own spread, and the groups.
+
+    Groups that come with the carriers' poses, and not one after the other in time, are an arm's error, or views of a
+    board.
     """
+    twists, A = np.concatenate([part.twists for part in parts]), np.concatenate([part.A for part in parts])
+    visits = np.concatenate([part.visits for part in parts])
     n = len(twists)
     if n < FEWEST:
         return 0.0, None
@@ -146,10 +164,10 @@ def _groups(name: str, twists: Array, A: Array) -> tuple[float, TwoPoses | None]
         return 0.0, None
     groups = TwoPoses(
         frame=name,
-        first=int((~is_high).sum()),
-        second=int(is_high.sum()),
+        first=int(visits[~is_high].sum()),
+        second=int(visits[is_high].sum()),
         angle_rad=float(np.linalg.norm(step[:3])),
         distance_m=float(np.linalg.norm(step[3:])),
-        from_row=int(changes[0]) + 2 if len(changes) == 1 else None,
+        from_row=int(parts[0].rows[changes[0] + 1]) + 1 if len(changes) == 1 and len(parts) == 1 else None,
     )
     return float(apart[best]), groups

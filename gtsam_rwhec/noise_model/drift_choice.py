@@ -9,6 +9,7 @@ from typing import get_args
 import numpy as np
 
 from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.drift import DriftPrior, Frame, Walk
 from gtsam_rwhec.noise_model.options import Drift
 from gtsam_rwhec.noise_model.reml import ENOUGH, Fitted, fitted
@@ -91,16 +92,21 @@ def _height(tried: tuple[Walk, Fitted]) -> float:
 
 
 def is_correlated(found: Settled, limit: float = CORRELATED) -> bool:
-    """Whether residuals of neighbours in time are alike: the lag-1 correlation of each track's residuals."""
+    """Whether residuals of neighbours in time are alike, track by track."""
     rows = found.model.rows
-    products, squares, count = np.zeros(6), np.zeros(6), 0
     tracks = np.cumsum(rows.instants.step[rows.instants.index] == 0.0) if rows.instants.chains == 1 else None
     groups = rows.instants.chain if tracks is None else tracks
-    for group in np.unique(groups):
-        r = rows.residual[groups == group]
-        r = r - r.mean(axis=0)
-        products += (r[1:] * r[:-1]).sum(axis=0)
-        squares += (r**2).sum(axis=0)
-        count += len(r) - 1
+    return likeness_of_neighbours([rows.residual[groups == group] for group in np.unique(groups)]) > limit
+
+
+def likeness_of_neighbours(tracks: Sequence[Array]) -> float:
+    """The lag-1 correlation of residuals (N, 6), track by track, in the standard deviations of independent ones."""
+    products, squares, count = np.zeros(6), np.zeros(6), 0
+    for track in tracks:
+        if len(track) > 1:
+            r = track - track.mean(axis=0)
+            products += (r[1:] * r[:-1]).sum(axis=0)
+            squares += (r**2).sum(axis=0)
+            count += len(r) - 1
     correlation = products / np.maximum(squares, 1e-300)
-    return bool(correlation.mean() * np.sqrt(6 * max(count, 1)) > limit)
+    return float(correlation.mean() * np.sqrt(6 * max(count, 1)))

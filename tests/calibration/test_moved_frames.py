@@ -7,8 +7,9 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.moved_frames import are_alike, moved_frame
+from gtsam_rwhec.calibration.moved_frames import moved_frame
 from gtsam_rwhec.calibration.trial_fits import Sample
+from gtsam_rwhec.noise_model.drift_choice import CORRELATED, likeness_of_neighbours
 
 COUNT = 120
 
@@ -78,5 +79,5 @@ def test_few_poses_hold_no_step() -> None:
 
 def test_neighbours_of_a_walk_are_alike_and_those_of_noise_are_not() -> None:
     noise = np.random.default_rng(4).normal(size=(60, 6))
-    assert are_alike([np.cumsum(noise, axis=0)])
-    assert not are_alike([noise, noise[:1], noise[:0]])
+    assert likeness_of_neighbours([np.cumsum(noise, axis=0)]) > CORRELATED
+    assert likeness_of_neighbours([noise, noise[:1], noise[:0]]) < CORRELATED

@@ -39,7 +39,8 @@ def test_a_frame_that_moved_half_way_is_named(frame: str) -> None:
 def test_the_sentence_says_how_far_and_from_when() -> None:
     problem = problem_of(2, np.arange(COUNT) >= 31)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
-    (found,) = two_poses(problem, refined, {})
+    found = two_poses(problem, refined, {})
+    assert found is not None
     assert (found.frame, found.first, found.second, found.from_row) == ("board", 31, 29, 32)
     assert found.angle_rad == pytest.approx(0.05, rel=0.05)
     assert found.distance_m == pytest.approx(float(np.hypot(0.03, 0.02)), rel=0.1)
@@ -50,7 +51,8 @@ def test_the_sentence_says_how_far_and_from_when() -> None:
 def test_two_poses_that_alternate_have_no_first_row() -> None:
     problem = problem_of(3, np.arange(COUNT) % 2 == 1)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
-    (found,) = two_poses(problem, refined, {})
+    found = two_poses(problem, refined, {})
+    assert found is not None
     assert found.from_row is None
     assert "board was at two poses: its" in str(found)
 
@@ -59,6 +61,16 @@ def test_two_poses_that_alternate_have_no_first_row() -> None:
 def test_one_pose_is_not_accused(seed: int) -> None:
     problem = problem_of(seed, np.zeros(COUNT, dtype=bool), noise=3e-3)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
-    assert two_poses(problem, refined, {}) == ()
+    assert two_poses(problem, refined, {}) is None
     few = {pair: np.arange(COUNT) < 12 for pair in problem.pairs}
-    assert two_poses(problem, refined, few) == ()
+    assert two_poses(problem, refined, few) is None
+
+
+def test_the_row_is_that_of_all_measurements_with_those_that_were_left_out() -> None:
+    problem = problem_of(2, np.arange(COUNT) >= 31)
+    refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
+    kept = np.arange(COUNT) % 10 != 3
+    found = two_poses(problem, refined, {pair: kept for pair in problem.pairs})
+    assert found is not None
+    assert found.from_row == 32
+    assert found.first + found.second == kept.sum()
