@@ -34,7 +34,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec": {"test_bad_input.py": "errors"},
     "gtsam_rwhec/calibration": {
         "calibration/test_calibrating.py": (
-            "calibrated choices clock_stage disagreement noise_choice noise_found noise_stage options outlier_stage "
+            "calibrated choices clock_stage disagreement noise_choice noise_found noise_stage options "
             "outliers run statement_stage"
         ),
         "calibration/test_cross_validation.py": "folds prediction_errors",

@@ -34,6 +34,17 @@ MIDDLE, PER_SIDE = 0.5, 5
 
 
 @dataclass(frozen=True, eq=False)
+class FoundBoard:
+    """Corners (n, 2) of a board, or centres of its circles; their indices (n,) in its rows from the top, and why they
+    are not used.
+    """
+
+    corners_px: Array
+    indices: np.ndarray
+    rejection: Rejection | None
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """What the image says about a grid of corners.
 

@@ -8,13 +8,12 @@ reads all 34 boards at a tenth of the second's time; the second reads more where
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.board_evidence import Evidence, evidence, smallest_step
+from gtsam_rwhec.vision.board_evidence import Evidence, FoundBoard, evidence, smallest_step
 from gtsam_rwhec.vision.boards import refined_corners
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.images import Gray
@@ -37,22 +36,13 @@ MOST_SEARCHED = 2_500_000
 SEARCHED = 0.95
 
 
-@dataclass(frozen=True, eq=False)
-class FoundCheckerboard:
-    """Corners (n, 2) of a checkerboard, their indices (n,) in its rows from the top, and why they are not used."""
-
-    corners_px: Array
-    indices: np.ndarray
-    rejection: Rejection | None
-
-
-def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = None) -> FoundCheckerboard | None:
+def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = None) -> FoundBoard | None:
     """Find a board that is whole in the image; None where there is none.
 
     The top is where the first corner's outer square is black; a board of two even or two odd numbers of corners looks
     the same turned by half a turn, and is read in one of these ways.
     """
-    rejected: FoundCheckerboard | None = None
+    rejected: FoundBoard | None = None
     for grid in _candidates(gray, board):
         found = _tested(gray, grid, camera)
         if found.rejection is None:
@@ -106,7 +96,7 @@ def _sector_based(gray: Gray, board: Checkerboard) -> Array | None:
     return np.reshape(corners, (board.rows, board.columns, 2)).astype(float) if found else None
 
 
-def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundCheckerboard:
+def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundBoard:
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: a board is not seen from behind
         grid = grid[::-1]
@@ -121,7 +111,7 @@ def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundCheckerboard
     kept = seen.kept
     if not seen.first_is_dark:
         refined, kept = _other_colour(refined), _other_colour(kept)
-    return FoundCheckerboard(refined[kept], np.flatnonzero(kept), seen.rejection)
+    return FoundBoard(refined[kept], np.flatnonzero(kept), seen.rejection)
 
 
 def _other_colour(grid: np.ndarray) -> np.ndarray:

@@ -8,13 +8,12 @@ paper or dirt moves and that do not count, and no row may go on beyond the board
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.board_evidence import smallest_step
+from gtsam_rwhec.vision.board_evidence import FoundBoard, smallest_step
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.circle_centres import Circles, Plane, measured_circles
 from gtsam_rwhec.vision.images import Gray
@@ -43,21 +42,12 @@ GOES_ON = 0.5
 ROUNDS = 3
 
 
-@dataclass(frozen=True, eq=False)
-class FoundCircleGrid:
-    """Centres (n, 2) of a grid's circles, their indices (n,) in its rows from the top, and why they are not used."""
-
-    corners_px: Array
-    indices: np.ndarray
-    rejection: Rejection | None
-
-
-def find_circle_grid(gray: Gray, board: CircleGrid, camera: Camera) -> FoundCircleGrid | None:
+def find_circle_grid(gray: Gray, board: CircleGrid, camera: Camera) -> FoundBoard | None:
     """Find a grid that is whole in the image; None where there is none.
 
     Without a larger dot a grid looks the same turned (`CircleGrid.ways`), and is read in one of these ways.
     """
-    rejected: FoundCircleGrid | None = None
+    rejected: FoundBoard | None = None
     for grid, diameters in _candidates(gray, board):
         found = _tested(gray, board, grid, diameters, camera)
         if found.rejection is None:
@@ -111,13 +101,13 @@ def _blobs(gray: Gray, board: CircleGrid) -> Iterator[tuple[Array, Array]]:
     yield places[~dark], diameters[~dark]
 
 
-def _tested(gray: Gray, board: CircleGrid, grid: Array, diameters: Array, camera: Camera) -> FoundCircleGrid:
+def _tested(gray: Gray, board: CircleGrid, grid: Array, diameters: Array, camera: Camera) -> FoundBoard:
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: a board is not seen from behind
         grid, diameters = grid[::-1], diameters[::-1]
     rows, columns = grid.shape[:2]
     steps: Array = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(float)
-    blobs = FoundCircleGrid(grid.reshape(-1, 2), np.arange(rows * columns), Rejection.NOT_A_GRID)
+    blobs = FoundBoard(grid.reshape(-1, 2), np.arange(rows * columns), Rejection.NOT_A_GRID)
     plane = Plane.through(steps, grid, camera)
     if plane is None or (_off(plane, steps, grid) > MOST_OFF_BLOB * smallest_step(grid)).any():
         return blobs
@@ -127,7 +117,7 @@ def _tested(gray: Gray, board: CircleGrid, grid: Array, diameters: Array, camera
     for _ in range(ROUNDS):
         circles = measured_circles(gray, plane, steps, centres if circles is None else circles.seen_px, radii)
         if not circles.seen.all():
-            return FoundCircleGrid(blobs.corners_px, blobs.indices, Rejection.NOT_WHOLE)
+            return FoundBoard(blobs.corners_px, blobs.indices, Rejection.NOT_WHOLE)
         centres, radii = circles.centres_px, circles.radii
         again = Plane.through(steps, centres, camera)
         if again is None:
@@ -152,7 +142,7 @@ def _tested(gray: Gray, board: CircleGrid, grid: Array, diameters: Array, camera
     if turn is None:
         turn, rejection = 0, rejection or Rejection.CIRCLES
     kept = np.rot90(kept, turn)
-    return FoundCircleGrid(np.rot90(centres, turn)[kept], np.flatnonzero(kept), rejection)
+    return FoundBoard(np.rot90(centres, turn)[kept], np.flatnonzero(kept), rejection)
 
 
 def _off(plane: Plane, steps: Array, centres: Array) -> Array:
