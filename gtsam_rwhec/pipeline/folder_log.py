@@ -20,7 +20,7 @@ import numpy as np
 from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.paths import checked_path
-from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.progress import Counted, Progress, silent
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE
 from gtsam_rwhec.logs.matched_images import SAME_POSE, image_stamps, images_in, match, pose_stamps
@@ -120,7 +120,7 @@ def write_folder_log(
             topic = rig.sensors[sensor].images
             assert topic is not None
             out.compressed_image(topic, stamp, rig.frame_of(sensor), FORMATS[file.suffix.lower()], _content(file))
-            tell(f"reading images: {done} of {len(images)}")
+            tell(Counted("reading images:", done, len(images)))
     return len(images), len(poses)
 
 

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.progress import Counted, Progress
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion, check_order
@@ -82,7 +82,7 @@ def _detected(
     }
     total = sum(topic.count for topic in log.topics() if topic.name in sensor_of)
     yield from detect_in_images(
-        images(), makers, workers=workers, progress=lambda done: progress(f"detecting: image {done} of {total}")
+        images(), makers, workers=workers, progress=lambda done: progress(Counted("detecting: image", done, total))
     )
     for topic in sensor_of:
         check_order(np.array(stamps[topic], dtype=np.int64), f"topic {topic}")
