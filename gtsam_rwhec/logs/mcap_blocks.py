@@ -40,7 +40,7 @@ _HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), 
 
 @dataclass(frozen=True)
 class Block:
-    """The place of messages (the record of a chunk, or records outside chunks), and their first log time.
+    """The place of messages (the record of a chunk, or records outside chunks), and their first and last log time.
 
     `is_cut` says that the file ends inside the chunk; `indexed_size` is the opened size that the index states.
     """
@@ -51,6 +51,7 @@ class Block:
     start_ns: int
     is_cut: bool = False
     indexed_size: int | None = None
+    end_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -182,8 +183,8 @@ class McapFile:
             index = None
         if index is not None:
             self.blocks = [
-                Block(offset, length, True, start_ns, indexed_size=size)
-                for offset, length, start_ns, size in index.chunks
+                Block(offset, length, True, start_ns, indexed_size=size, end_ns=end_ns)
+                for offset, length, start_ns, end_ns, size in index.chunks
             ]
             self.seen, self.extras, self.is_indexed = index.seen, index.extras, True
             return
@@ -258,7 +259,7 @@ class McapFile:
             seen = self.seen.setdefault(channel, Seen())
             seen.count += count
             seen.widen(first_ns, last_ns)
-        self.blocks.append(replace(block, start_ns=int(log_time.min())))
+        self.blocks.append(replace(block, start_ns=int(log_time.min()), end_ns=int(log_time.max())))
         return len(log_time)
 
     def _split(self, data: bytes, offset: int) -> Messages:

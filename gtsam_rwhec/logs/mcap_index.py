@@ -49,9 +49,9 @@ class Extra:
 
 @dataclass
 class Index:
-    """What the index says: (offset, length, first log time, opened size) of each chunk, spans by channel, extras."""
+    """What the index says: spans by channel, extras, chunks (offset, length, first and last log time, opened size)."""
 
-    chunks: list[tuple[int, int, int, int]] = field(default_factory=list)
+    chunks: list[tuple[int, int, int, int, int]] = field(default_factory=list)
     seen: dict[int, Seen] = field(default_factory=dict)
     extras: list[Extra] = field(default_factory=list)
 
@@ -82,7 +82,8 @@ def read_index(
             statistics = parsed(Statistics, content)
         elif opcode == Opcode.CHUNK_INDEX:
             chunk = parsed(ChunkIndex, content)
-            place = chunk.chunk_start_offset, chunk.chunk_length, chunk.message_start_time, chunk.uncompressed_size
+            span = chunk.message_start_time, chunk.message_end_time
+            place = chunk.chunk_start_offset, chunk.chunk_length, *span, chunk.uncompressed_size
             if chunk.chunk_length < LEAST_BYTES or chunk.message_start_time > chunk.message_end_time:
                 return None
             index.chunks.append(place)
@@ -96,7 +97,7 @@ def read_index(
         elif opcode == Opcode.ATTACHMENT_INDEX:
             attached = parsed(AttachmentIndex, content)
             index.extras.append(Extra(Opcode.ATTACHMENT, attached.offset, attached.length, attached.name))
-    places = [(offset, length) for offset, length, _, _ in index.chunks]
+    places = [(offset, length) for offset, length, _, _, _ in index.chunks]
     places += [(extra.offset, extra.length) for extra in index.extras]
     if not _are_inside(places, start) or not _fits(statistics, index, descriptions, spending):
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion, check_order
 from gtsam_rwhec.pipeline.log_contract import IMAGES_METADATA, detections_topic, image_key
-from gtsam_rwhec.pipeline.sensor_detections import SensorDetections
+from gtsam_rwhec.pipeline.sensor_detections import LookedAt, SensorDetections
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.ambiguity import choose_over_time
 from gtsam_rwhec.vision.board_turns import Turns, choose_turns, turn_between, turned_detection
@@ -43,13 +44,17 @@ def detect_in_log(
     """
     sensor_of = {source.images: name for name, source in rig.sensors.items() if source.images is not None}
     images: dict[str, list[DetectedImage]] = {topic: [] for topic in sensor_of}
-    for image in _detected(log, rig, cameras, sensor_of, workers=workers, progress=progress):
+    logged_ns: dict[str, dict[int, int]] = {topic: {} for topic in sensor_of}
+    for image in _detected(log, rig, cameras, sensor_of, logged_ns, workers=workers, progress=progress):
         images[image.topic].append(image)
     upright: dict[str, Turns] = {}
-    return {
-        sensor: _of_sensor(log, rig, sensor, sorted(images[topic], key=lambda image: image.stamp_ns), motion, upright)
-        for topic, sensor in sensor_of.items()
-    }
+    found = {}
+    for topic, sensor in sensor_of.items():
+        in_order = sorted(images[topic], key=lambda image: image.stamp_ns)
+        of_sensor = _of_sensor(log, rig, sensor, in_order, motion, upright)
+        looked_at = {image.stamp_ns: LookedAt(logged_ns[topic][image.stamp_ns], image.fault) for image in in_order}
+        found[sensor] = replace(of_sensor, images=looked_at)
+    return found
 
 
 def _detected(
@@ -57,11 +62,15 @@ def _detected(
     rig: Rig,
     cameras: Mapping[str, Camera],
     sensor_of: Mapping[str, str],
+    logged_ns: dict[str, dict[int, int]],
     *,
     workers: int | None,
     progress: Progress,
 ) -> Iterator[DetectedImage]:
-    """The detections of every image, in any order. Stamps are checked while images are read."""
+    """The detections of every image, in any order. Stamps are checked while images are read.
+
+    `logged_ns` gets the log time of every image, by topic and stamp.
+    """
     if not sensor_of:
         return
     stamps: dict[str, list[int]] = defaultdict(list)
@@ -72,6 +81,7 @@ def _detected(
                 raise LogError(f"topic {record.topic} has no images but {type(record).__name__}s")
             of_topic = stamps[record.topic]
             of_topic.append(record.stamp_ns)
+            logged_ns[record.topic][record.stamp_ns] = record.logged_ns
             if len(of_topic) in CHECKED_AFTER:
                 check_order(np.array(of_topic, dtype=np.int64), f"topic {record.topic}")
             yield record

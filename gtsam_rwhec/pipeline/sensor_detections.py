@@ -11,6 +11,14 @@ from gtsam_rwhec.results.log_history import DetectionReport, TrackCount
 from gtsam_rwhec.rig import Rig
 
 
+@dataclass(frozen=True)
+class LookedAt:
+    """One image that was searched for targets."""
+
+    logged_ns: int  #: its log time, by which it is found again
+    fault: str = ""  #: why it could not be used; empty if it could
+
+
 @dataclass(frozen=True, eq=False)
 class SensorDetections:
     """The detections of one sensor."""
@@ -21,6 +29,7 @@ class SensorDetections:
     faults: tuple[str, ...] = ()  #: one sentence for each image that could not be used
     #: Measured standard deviation of a corner along each axis, pixels, by target/sensor.
     corner_px: Mapping[str, float] = field(default_factory=dict)
+    images: Mapping[int, LookedAt] = field(default_factory=dict)  #: every image, by stamp; none of a driver's
 
 
 def detection_report(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) -> DetectionReport:

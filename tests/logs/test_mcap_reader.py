@@ -53,6 +53,22 @@ def test_order_across_chunks_and_files_that_overlap(tmp_path: Path) -> None:
     assert [r.logged_ns for r in read(tmp_path)] == [T0 + i for i in range(600)]
 
 
+@pytest.mark.parametrize("chunk_size", [3000, 10_000_000])
+def test_records_of_some_log_times(tmp_path: Path, chunk_size: int) -> None:
+    path = ros2_log(tmp_path / "a.mcap", pose_messages(600), chunk_size=chunk_size)
+    wanted = [T0 + 299, T0 + 3, T0 + 4, T0 + 10_000]
+    with open_log(path) as log:
+        opened: list[object] = []
+        of_file = log.files[0].open
+        log.files[0].open = lambda block: opened.append(block) or of_file(block)  # type: ignore[method-assign, func-returns-value]
+        found = list(log.records_logged_at(["/0", "/2"], wanted))
+        assert sorted((r.topic, r.logged_ns) for r in found) == [("/0", T0 + 3), ("/2", T0 + 299)]
+        assert [r.T[0, 3] for r in found if isinstance(r, PoseRecord)] in ([3.0, 299.0], [299.0, 3.0])
+        assert len(opened) <= 2 < len(log.files[0].blocks) or len(log.files[0].blocks) == 1
+        with pytest.raises(LogError, match="no topic /9"):
+            list(log.records_logged_at(["/9"], wanted))
+
+
 def json_poses(count: int) -> list[Any]:
     time = {"sec": 1, "nsec": 0}
     message = {"timestamp": time, "frame_id": "w", "pose": POSE}
