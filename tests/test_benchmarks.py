@@ -6,13 +6,17 @@ import importlib
 import json
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
 from importlib.util import find_spec
 from types import ModuleType
 
+import cv2
 import numpy as np
 import pytest
 from places import REPOSITORY
+
+from gtsam_rwhec.vision.camera import Camera
 
 BENCHMARKS = REPOSITORY / "tests" / "benchmarks"
 #: Their imports need what is only in the extra `bench`.
@@ -141,3 +145,41 @@ def test_halves_of_a_log_are_calibrated_apart(imported: Callable[[str], ModuleTy
     halves = imported("split_halves").run(np.random.SeedSequence(0), frames=120)
     assert set(halves.squares) == set(halves.bounds) == set(halves.distance_mm)
     assert min(halves.bounds.values()) >= 16.8  # of chi2(6) at 99 %; more where the noise is estimated
+
+
+def test_rendered_targets_are_counted_and_the_same_each_time(imported: Callable[[str], ModuleType]) -> None:
+    boards, scenes = imported("rendered_boards"), imported("rendered_scenes")
+    for name in boards.KINDS:
+        kind = boards.KINDS[name]()
+        first, again = (
+            boards.pictured(kind, np.random.default_rng([5, zlib.crc32(name.encode()), 1])) for _ in range(2)
+        )
+        assert np.array_equal(first[0], again[0]), name
+        assert scenes.is_whole(first[1], kind.outline()) or first[1].tilt_deg > 0.0
+    found = boards.outcomes("checkerboard_3x4", images=3, seed=5)
+    assert [one.number for one in found] == [0, 1, 2]
+    assert not any(one.wrong for one in found)
+    table = {row.what: row for row in boards.rows(found, boards.KINDS["checkerboard_3x4"]())}
+    assert table["misread"].met
+
+
+def test_what_is_drawn_is_where_the_truth_says(imported: Callable[[str], ModuleType]) -> None:
+    """A dark square alone, sharp and without noise: the centroid of its ink is its middle's image to a hundredth."""
+    scenes, prints = imported("rendered_scenes"), imported("rendered_prints")
+    square = prints.drawn(np.zeros((1, 1)), 2e-3, 16, 1.0)
+    camera = Camera.of(720, 540, "plumb_bob", [[500.0, 0, 355.3], [0, 501.0, 270.0], [0, 0, 1]], (-0.2, 0.06), "test")
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.array([0.9, -0.4, 0.3]))[0] @ np.diag([1.0, -1.0, -1.0])
+    T[:3, 3] = [0.05, -0.03, 0.12]
+    image = np.full((540, 720), 0.75, dtype=np.float32)
+    scenes.laid_over(image, scenes.Pose(camera, T, 0.0), square, scenes.Light(0.25, 0.75, 0, 0, (0, 0), 1, 0))
+    ink = 0.75 - image.astype(float)
+    y, x = np.indices(image.shape)
+    middle = np.array([(ink * x).sum(), (ink * y).sum()]) / ink.sum()
+    share = np.linspace(-1e-3, 1e-3, 201)
+    over = np.stack(np.meshgrid(share, share, [0.0]), axis=-1).reshape(-1, 3)
+    step = 1e-6 * np.eye(3)
+    at = scenes.projected(camera, over, T)
+    right, up = (scenes.projected(camera, over + step[i], T) - at for i in range(2))
+    area = np.abs(right[:, 0] * up[:, 1] - right[:, 1] * up[:, 0])
+    assert np.abs(middle - (at * area[:, None]).sum(axis=0) / area.sum()).max() < 0.01
