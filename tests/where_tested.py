@@ -107,7 +107,6 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/pipeline": {
         "pipeline/test_all_stages.py": "image_options",
-        "pipeline/test_bad_images.py": "intrinsics",
         "pipeline/test_bad_logs.py": "no_detections",
         "pipeline/test_log_findings.py": "output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",

@@ -193,7 +193,7 @@ class _Reader:
         """The value that begins with `event`, inside `depth` mappings and lists."""
         self.lines.setdefault(path, _line(event))  # in a mapping the key's line is there already
         if isinstance(event, yaml.ScalarEvent):
-            return _scalar(event.value) if event.style is None else event.value
+            return scalar(event.value) if event.style is None else event.value
         if depth == DEEPEST:
             self._refuse(event, f"more than {DEEPEST} mappings and lists inside one another; nest less deeply")
         if isinstance(event, yaml.SequenceStartEvent):
@@ -236,8 +236,8 @@ def _line(event: Any) -> int:
     return int(event.start_mark.line) + 1
 
 
-def _scalar(text: str) -> str | int | float | bool | None:
-    """The value of a scalar without quotes, as in YAML 1.2's core schema (without 0o and 0x)."""
+def scalar(text: str) -> str | int | float | bool | None:
+    """Return the value of a scalar without quotes, as in YAML 1.2's core schema (without 0o and 0x)."""
     if text in _WORDS:
         return _WORDS[text]
     if _INTEGER.fullmatch(text):

@@ -17,6 +17,7 @@ from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
 from gtsam_rwhec.pipeline.folder_log import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.pipeline.image_options import check_image_options
+from gtsam_rwhec.pipeline.intrinsics import check_intrinsics_files
 from gtsam_rwhec.pipeline.log_contract import (
     CLEAN_LOG,
     CLEANING_METADATA,
@@ -116,6 +117,7 @@ def _calibrate_folder(
 ) -> Calibrated:
     """As `calibrate_log`, by way of a log of the folder's images, which is removed at the end."""
     rig = rig.model_copy(update={"folder": folder})
+    check_intrinsics_files(rig)  # before anything is copied
     made = made_output_folder(out)
     recorded = made / f"{folder.resolve().name}{RECORDED_LOG}"
     try:

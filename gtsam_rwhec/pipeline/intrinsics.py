@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.errors import CameraError, LogError
+from gtsam_rwhec.errors import CameraError, FileFormatError, LogError
 from gtsam_rwhec.logs import IntrinsicsRecord, Log
 from gtsam_rwhec.logs.message_kinds import INTRINSICS_SCHEMAS
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.sections import Intrinsics
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.intrinsics_files import read_calibration_yaml, read_kalibr_camchain
+from gtsam_rwhec.vision.intrinsics_files import read_cameras
 
 
 def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
@@ -23,17 +24,38 @@ def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
             continue
         if source.topic is not None:
             cameras[name] = _from_topic(log, source.topic, name)
-        elif source.kalibr is not None:
-            path = rig.folder / source.kalibr
-            chain = read_kalibr_camchain(path)
-            if source.camera not in chain:
-                raise CameraError(f"{path} has no camera {source.camera!r}; it has {', '.join(chain)}")
-            cameras[name] = chain[source.camera]
-        elif source.file is not None:
-            cameras[name] = read_calibration_yaml(rig.folder / source.file)
         else:
-            cameras[name] = source.camera_of_numbers(f"rig file, sensor {name}")
+            cameras[name] = _stated(rig, name, source)
     return cameras
+
+
+def check_intrinsics_files(rig: Rig) -> None:
+    """Read the intrinsics that are in files, with the errors of `read_intrinsics`, before a log is there."""
+    for name, sensor in rig.sensors.items():
+        if sensor.intrinsics is not None and sensor.intrinsics.topic is None:
+            _stated(rig, name, sensor.intrinsics)
+
+
+def _stated(rig: Rig, name: str, source: Intrinsics) -> Camera:
+    """A camera of numbers, or of a file: the one that is named, or the only one, or the one of the sensor's name."""
+    file = source.kalibr or source.file
+    if file is None:
+        return source.camera_of_numbers(f"rig file, sensor {name}")
+    place = rig.source.place(("sensors", name, "intrinsics"))
+    try:
+        cameras = read_cameras(rig.folder / file, source.size)
+    except FileFormatError as error:
+        raise FileFormatError(f"{error} ({place})") from error
+    if source.camera is not None:
+        wanted = source.camera
+    else:
+        wanted = name if name in cameras or len(cameras) > 1 else next(iter(cameras))
+    if wanted not in cameras:
+        named = ", ".join(cameras) if "" not in cameras else "one alone, without a name"
+        what = "camera" if source.camera is not None else "camera of the sensor's name,"
+        cure = "leave camera out" if "" in cameras else f"write {{file: {file}, camera: '{next(iter(cameras))}'}}, say"
+        raise CameraError(f"{place}: {rig.folder / file} has no {what} {wanted!r}; it has {named}: {cure}")
+    return cameras[wanted]
 
 
 def _from_topic(log: Log, topic: str, sensor: str) -> Camera:

@@ -97,15 +97,17 @@ class Intrinsics(Section):
 
     @model_validator(mode="after")
     def _is_one(self) -> Intrinsics:
-        numbers = self._given("model", "width", "height", "size", "K", "D")
+        of_file = self.file is not None or self.kalibr is not None
+        # A file of OpenCV may lack the size of the images.
+        numbers = self._given("model", "width", "height", "K", "D", *([] if of_file else ["size"]))
         sources = self._given("topic", "kalibr", "file") + (["numbers"] if numbers else [])
         if len(sources) != 1:
             raise ValueError(
                 f"{' and '.join(sources) or 'nothing'} given; give one of topic, kalibr (with camera), file, or "
                 "numbers (K, size, and model and D with distortion)"
             )
-        if (self.kalibr is None) != (self.camera is None):
-            raise ValueError("kalibr and camera go together: {kalibr: camchain.yaml, camera: cam0}")
+        if self.camera is not None and not of_file:
+            raise ValueError("camera goes with a file: {file: camchain.yaml, camera: cam0}")
         if numbers:
             self.camera_of_numbers("these numbers")
         return self

@@ -8,6 +8,7 @@ from .edges import RefinedCorners as RefinedCorners
 from .edges import refine_corners as refine_corners
 from .images import decode_gray as decode_gray
 from .intrinsics_files import read_calibration_yaml as read_calibration_yaml
+from .intrinsics_files import read_cameras as read_cameras
 from .intrinsics_files import read_kalibr_camchain as read_kalibr_camchain
 from .many_images import DetectedImage as DetectedImage
 from .many_images import detect_in_images as detect_in_images

@@ -1,7 +1,4 @@
-"""Intrinsics from files: Kalibr's camchains, ROS's camera_info YAML, and YAML of OpenCV's FileStorage.
-
-OpenCV's own reader is not used: it gives no line numbers and accepts nearly any content.
-"""
+"""Intrinsics from files: Kalibr's camchains, ROS's camera_info YAML, OpenCV's FileStorage (YAML, XML, JSON), COLMAP."""
 
 from __future__ import annotations
 
@@ -14,17 +11,20 @@ from typing import Any, NoReturn
 import numpy as np
 
 from gtsam_rwhec.errors import FileFormatError
-from gtsam_rwhec.files.yaml_lines import OPENCV_MATRIX, KeyPath, YamlFile, parse_yaml, read_text, read_yaml, shown
+from gtsam_rwhec.files.opencv_storage import parse_storage
+from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, read_text, read_yaml, shown
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import MODELS, Camera
+from gtsam_rwhec.vision.colmap_cameras import is_colmap, read_colmap_cameras
 
 #: Kalibr combines its camera model pinhole with these distortion models.
 KALIBR_DISTORTIONS = ("none", "radtan", "equidistant")
 _KALIBR_CAMERA = re.compile(r"cam\d+")
 #: ROS, OpenCV's samples and people write these keys of intrinsics; here they have lower case and no underscores.
 _WIDTH, _HEIGHT = ("imagewidth", "width", "imgwidth"), ("imageheight", "height", "imgheight")
-_MATRIX = ("cameramatrix", "k")
-_COEFFICIENTS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "d")
+_SIZE = ("imagesize", "imgsize", "resolution", "size")
+_MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx", "m")
+_COEFFICIENTS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "d", "dist")
 _MODEL = ("distortionmodel", "cameramodel")
 #: Messages give the needed fields these names.
 _FIELDS = {
@@ -53,7 +53,10 @@ def read_kalibr_camchain(path: str | Path) -> dict[str, Camera]:
     CameraError
         No camera has these intrinsics.
     """
-    file = read_yaml(path)
+    return _kalibr_cameras(read_yaml(path))
+
+
+def _kalibr_cameras(file: YamlFile) -> dict[str, Camera]:
     chain = file.data if isinstance(file.data, dict) else {}
     names = [name for name in chain if _KALIBR_CAMERA.fullmatch(name)]
     if not names:
@@ -86,14 +89,15 @@ def _kalibr_camera(file: YamlFile, name: str) -> Camera:
 
 
 def read_calibration_yaml(path: str | Path) -> Camera:
-    """Read a camera from ROS's camera_info YAML (``ost.yaml``) or from YAML of OpenCV's FileStorage.
+    """Read a camera from ROS's camera_info YAML (``ost.yaml``) or from a file of OpenCV's FileStorage.
 
     Parameters
     ----------
     path
-        Has image_width, image_height, camera_matrix, distortion_coefficients, and distortion_model; or the plain
-        numbers fx, fy, cx, cy with the size, and coefficients k1, k2, p1, p2, k3 by name. Without a
-        distortion_model, fisheye_model (of OpenCV's sample) tells the model; five coefficients or more are radtan.
+        YAML, JSON or OpenCV's XML. Has image_width, image_height, camera_matrix, distortion_coefficients, and
+        distortion_model; or the plain numbers fx, fy, cx, cy with the size, and coefficients k1, k2, p1, p2, k3 by
+        name. Other tools' names of these keys are read too (K, D, mtx, dist, image_size). Without a distortion_model,
+        fisheye_model (of OpenCV's sample) tells the model; five coefficients or more are radtan.
 
     Raises
     ------
@@ -103,28 +107,88 @@ def read_calibration_yaml(path: str | Path) -> Camera:
     CameraError
         No camera has these intrinsics.
     """
-    # OpenCV begins with "%YAML:1.0", which is not valid YAML.
-    text = re.sub(r"\A%YAML:", "%YAML ", read_text(path))
-    file = parse_yaml(text, str(path), tags=(OPENCV_MATRIX,))
+    file = parse_storage(read_text(path), str(path))
     fields = file.data if isinstance(file.data, dict) else {}
     if any(_KALIBR_CAMERA.fullmatch(name) for name in fields):
         _refuse(file, (), "a Kalibr camchain; give it in the rig file as {kalibr: FILE, camera: cam0}")
-    if _found(fields, _MATRIX) is None and _found(fields, ("fx",)) is not None:
-        return _of_plain_numbers(file)
-    width, height = (_pixels(file, (key,), fields[key]) for key in (_key(file, _WIDTH), _key(file, _HEIGHT)))
-    key = _key(file, _MATRIX)
-    K = _matrix(file, key, 9).reshape(3, 3)
-    D = _matrix(file, _key(file, _COEFFICIENTS), None)
-    return Camera.of(width, height, _model(file, D), K, D, file.place((key,)))
+    return _calibrated(file, "", None)
 
 
-def _of_plain_numbers(file: YamlFile) -> Camera:
+def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[str, Camera]:
+    """Read all cameras of a file of Kalibr, COLMAP, ROS or OpenCV, whichever it is.
+
+    Parameters
+    ----------
+    path
+        As `read_kalibr_camchain`, `read_colmap_cameras` or `read_calibration_yaml`; or a file of OpenCV's stereo
+        calibration, with M1, D1, M2, D2.
+    size : (int, int), optional
+        Width and height in pixels, for files of OpenCV that do not have them.
+
+    Returns
+    -------
+    dict of str to Camera
+        By the file's names: ``cam0`` of Kalibr, ``1`` of COLMAP and of stereo files; the name of one alone is empty.
+
+    Raises
+    ------
+    FileFormatError, CameraError
+        As these functions.
+    """
+    text = read_text(path)
+    if is_colmap(text):
+        return read_colmap_cameras(path)
+    file = parse_storage(text, str(path))
+    fields = file.data if isinstance(file.data, dict) else {}
+    if any(_KALIBR_CAMERA.fullmatch(name) for name in fields):
+        return _kalibr_cameras(file)
+    numbered = [
+        number for number in ("1", "2") if isinstance(fields.get(_found(fields, _MATRIX, number)), (dict, tuple))
+    ]
+    if numbered and _found(fields, _MATRIX) is None:
+        return {number: _calibrated(file, number, size) for number in numbered}
+    return {"": _calibrated(file, "", size)}
+
+
+def _calibrated(file: YamlFile, number: str, size: tuple[int, int] | None) -> Camera:
+    """The camera of a calibration; the keys of one of a stereo pair end with its number."""
+    fields = file.data if isinstance(file.data, dict) else {}
+    if not number and _found(fields, _MATRIX) is None and _found(fields, ("fx",)) is not None:
+        return _of_plain_numbers(file, size)
+    width, height = _image_size(file, size)
+    key = _key(file, _MATRIX, number)
+    value = fields[key]
+    if isinstance(value, tuple) and len(value) == 4:
+        fx, fy, cx, cy = _matrix(file, key, 4)
+        K = np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
+    else:
+        K = _matrix(file, key, 9)
+    D = _matrix(file, _key(file, _COEFFICIENTS, number), None)
+    return Camera.of(width, height, _model(file, D, number), K.reshape(3, 3), D, file.place((key,)))
+
+
+def _image_size(file: YamlFile, size: tuple[int, int] | None) -> tuple[int, int]:
+    """Width and height in pixels, of the file or as stated; a FileFormatError if both say it, and differ."""
+    fields = file.data if isinstance(file.data, dict) else {}
+    whole, wide = _found(fields, _SIZE), _found(fields, _WIDTH)
+    if whole is not None and wide is None:
+        width, height = (_pixels(file, (whole,), float(side)) for side in _numbers(file, (whole,), fields[whole], 2))
+    elif wide is None and size is not None:
+        return size
+    else:
+        width, height = (_pixels(file, (key,), fields[key]) for key in (_key(file, _WIDTH), _key(file, _HEIGHT)))
+    if size not in (None, (width, height)):
+        _refuse(file, (whole or wide or "",), f"{width} x {height} pixels, and size: {list(size or ())} was stated")
+    return width, height
+
+
+def _of_plain_numbers(file: YamlFile, size: tuple[int, int] | None) -> Camera:
     """A camera of numbers with names: fx, fy, cx, cy, and k1, k2, p1, p2, k3 to k6 of OpenCV's model.
 
     Files of multi-camera hand-eye tools count the coefficients from zero, dist_k0 to dist_k5 with dist_px and dist_py.
     """
     fields = file.data
-    width, height = (_pixels(file, (key,), fields[key]) for key in (_key(file, _WIDTH), _key(file, _HEIGHT)))
+    width, height = _image_size(file, size)
 
     def number(names: tuple[str, ...]) -> float:
         key = _found(fields, names)
@@ -145,7 +209,7 @@ def _of_plain_numbers(file: YamlFile) -> Camera:
     return Camera.of(width, height, model, K, D, file.place(()))
 
 
-def _model(file: YamlFile, D: Array) -> str:
+def _model(file: YamlFile, D: Array, number: str = "") -> str:
     fields = file.data
     key = _found(fields, _MODEL)
     if key is not None:
@@ -161,21 +225,24 @@ def _model(file: YamlFile, D: Array) -> str:
     if len(D) == 4 and D.any():
         words = "four coefficients can be of OpenCV's fisheye model or of its radtan model; add a line "
         words += "distortion_model: fisheye, or distortion_model: radtan"
-        _refuse(file, (_key(file, _COEFFICIENTS),), words)
+        _refuse(file, (_key(file, _COEFFICIENTS, number),), words)
     return "radtan"
 
 
-def _found(fields: dict[str, Any], names: tuple[str, ...]) -> str | None:
+def _found(fields: dict[str, Any], names: tuple[str, ...], number: str = "") -> str | None:
     """The key of the file that stands for one of `names`, or None."""
     plain = {key.lower().replace("_", ""): key for key in reversed(fields)}
-    return next((plain[name] for name in names if name in plain), None)
+    return next((plain[name + number] for name in names if name + number in plain), None)
 
 
-def _key(file: YamlFile, names: tuple[str, ...]) -> str:
-    key = _found(file.data, names) if isinstance(file.data, dict) else None
+def _key(file: YamlFile, names: tuple[str, ...], number: str = "") -> str:
+    key = _found(file.data, names, number) if isinstance(file.data, dict) else None
     if key is None:
         words = f"no {_FIELDS[names]}; give a calibration with {', '.join(_FIELDS.values())}, as ROS's camera_info and "
-        _refuse(file, (), words + "OpenCV's samples have it")
+        words += "OpenCV's samples have it"
+        if names in (_WIDTH, _HEIGHT):
+            words += "; or state the size in the rig file, intrinsics: {file: FILE, size: [width, height]}"
+        _refuse(file, (), words)
     return key
 
 

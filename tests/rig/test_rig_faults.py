@@ -91,7 +91,7 @@ FAULTS = [
         22,
         "sensors.driver: images without intrinsics; give FILE,",
     ),
-    ("{topic: /cam_left/camera_info}", "{kalibr: c.yaml}", 11, "sensors.cam_left.intrinsics: kalibr and camera go"),
+    ("{topic: /cam_left/camera_info}", "{topic: /c, camera: cam0}", 11, "sensors.cam_left.intrinsics: camera goes"),
     ("{topic: /cam_left/camera_info}", "{}", 11, "sensors.cam_left.intrinsics: nothing given; give one of topic,"),
     ("{topic: /cam_left/camera_info}", "{topic: /t, file: f}", 11, "sensors.cam_left.intrinsics: topic and file"),
     ("{topic: /cam_left/camera_info}", "{file: f, width: 3}", 11, "sensors.cam_left.intrinsics: file and numbers"),

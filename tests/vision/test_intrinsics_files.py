@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from intrinsics_samples import CAMCHAIN, ROS
 
 from gtsam_rwhec.errors import CameraError, FileFormatError, RwhecError
-from gtsam_rwhec.vision.intrinsics_files import read_calibration_yaml, read_kalibr_camchain
+from gtsam_rwhec.vision.intrinsics_files import read_calibration_yaml, read_cameras, read_kalibr_camchain
 
 
 @pytest.fixture
@@ -247,3 +247,46 @@ def test_plain_numbers_that_are_no_camera(path: Path, old: str, new: str, words:
     path.write_text(PLAIN.replace(old, new))
     with pytest.raises(RwhecError, match=words):
         read_calibration_yaml(path)
+
+
+@pytest.mark.parametrize("ending", ["yaml", "xml", "json"])
+def test_opencv_in_any_form(tmp_path: Path, ending: str) -> None:
+    """As tutorials write it: mtx and dist, without the size of the images."""
+    path = tmp_path / f"calibration.{ending}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("mtx", np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]]))
+    storage.write("dist", np.array([[0.1, -0.2, 1e-3, 2e-3, 0.05]]))
+    storage.release()
+    with pytest.raises(FileFormatError, match=r"no image_width.*intrinsics: {file: FILE, size: \[width, height\]}"):
+        read_cameras(path)
+    camera = read_cameras(path, (640, 480))[""]
+    assert (camera.width, camera.height, camera.model, camera.K[1, 1]) == (640, 480, "radtan", 501.0)
+    assert camera.D.tolist() == [0.1, -0.2, 1e-3, 2e-3, 0.05]
+
+
+def test_stereo_calibration(path: Path) -> None:
+    """OpenCV's sample stereo_calib writes M1, D1, M2, D2."""
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for number in (1, 2):
+        storage.write(f"M{number}", np.array([[500.0 * number, 0, 320], [0, 501, 240], [0, 0, 1]]))
+        storage.write(f"D{number}", np.array([[0.1, -0.2, 1e-3, 2e-3, 0.05 * number]]))
+    storage.release()
+    first, second = read_cameras(path, (640, 480)).values()
+    assert (first.K[0, 0], second.K[0, 0], second.D[4]) == (500.0, 1000.0, 0.1)
+
+
+def test_size_and_focal_lengths_as_lists(path: Path) -> None:
+    path.write_text("image_size: [640, 480]\nK: [500, 501, 320, 240]\ndist_coeffs: []\n")
+    camera = read_cameras(path)[""]
+    assert (camera.width, camera.height, camera.model) == (640, 480, "pinhole")
+    assert camera.K.tolist() == [[500.0, 0.0, 320.0], [0.0, 501.0, 240.0], [0.0, 0.0, 1.0]]
+    with pytest.raises(FileFormatError, match=r"line 1: image_size: 640 x 480 pixels, and size: \[64, 48\] was stated"):
+        read_cameras(path, (64, 48))
+
+
+def test_whichever_file_it_is(tmp_path: Path) -> None:
+    for name, text in {"chain.yaml": CAMCHAIN, "ost.yaml": ROS, "cameras.txt": "1 PINHOLE 64 48 50 50 32 24\n"}.items():
+        (tmp_path / name).write_text(text)
+    assert list(read_cameras(tmp_path / "chain.yaml")) == ["cam0", "cam1"]
+    assert list(read_cameras(tmp_path / "ost.yaml")) == [""]
+    assert list(read_cameras(tmp_path / "cameras.txt")) == ["1"]

@@ -1,0 +1,89 @@
+"""Which camera of which file is a sensor's; what is missing is said with the rig file's line, before anything is copied."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from intrinsics_samples import CAMCHAIN, ROS
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import CameraError, FileFormatError, RwhecError
+from gtsam_rwhec.pipeline.folder_log import write_folder_log
+from gtsam_rwhec.pipeline.intrinsics import check_intrinsics_files, read_intrinsics
+from gtsam_rwhec.rig.rig_file import parse_rig
+
+FILES = {
+    "chain.yaml": CAMCHAIN,
+    "alone.yaml": CAMCHAIN[: CAMCHAIN.index("cam1:")],
+    "ost.yaml": ROS,
+    "cameras.txt": "# Camera list\n1 PINHOLE 640 480 500 500 320 240\n2 OPENCV 640 480 600 600 320 240 0.1 0 0 0\n",
+}
+RIG = """\
+carriers: {{sensors: base, targets: hand, poses: {{frames: [base, hand]}}}}
+sensors:
+  cam1: {{images: images, poses: poses.csv, intrinsics: {source}}}
+targets:
+  board: {{type: checkerboard, inner_corners: [3, 4], square_m: 0.05}}
+"""
+
+
+def rig(folder: Path, source: str) -> rw.rig.Rig:
+    for name, text in FILES.items():
+        (folder / name).write_text(text)
+    return parse_rig(RIG.format(source=source), "rig.yaml", folder)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> rw.logs.Log:
+    """A log without topics of intrinsics."""
+    with rw.logs.LogWriter(tmp_path / "log.mcap") as out:
+        out.transforms("/tf", 1, [("base", "hand", np.eye(4))])
+    return rw.logs.open_log(tmp_path / "log.mcap")
+
+
+@pytest.mark.parametrize(
+    ("source", "fx"),
+    [
+        ("chain.yaml", 300.0),  # the camera of the sensor's name
+        ("{kalibr: chain.yaml}", 300.0),
+        ("{kalibr: chain.yaml, camera: cam0}", 458.6),
+        ("{file: chain.yaml, camera: cam0}", 458.6),
+        ("alone.yaml", 458.6),  # the only one
+        ("ost.yaml", 430.2),
+        ("{file: cameras.txt, camera: '2'}", 600.0),
+    ],
+)
+def test_whose_intrinsics(tmp_path: Path, log: rw.logs.Log, source: str, fx: float) -> None:
+    with log:
+        assert read_intrinsics(log, rig(tmp_path, source))["cam1"].K[0, 0] == fx
+
+
+@pytest.mark.parametrize(
+    ("source", "error", "words"),
+    [
+        ("cameras.txt", CameraError, r"line 3: sensors.cam1.intrinsics: .*has no camera of the sensor's name, 'cam1'; it "
+         r"has 1, 2: write {file: cameras\.txt, camera: '1'}"),
+        ("{file: chain.yaml, camera: cam7}", CameraError, "has no camera 'cam7'; it has cam0, cam1"),
+        ("{file: ost.yaml, camera: cam1}", CameraError, "it has one alone, without a name: leave camera out"),
+        ("none.yaml", FileFormatError, r"none\.yaml cannot be read: No such file.*\(rig\.yaml, line 3: sensors\.cam1\."),
+    ],
+)  # fmt: skip
+def test_whose_are_not_there(tmp_path: Path, source: str, error: type[RwhecError], words: str) -> None:
+    with pytest.raises(error, match=words):
+        check_intrinsics_files(rig(tmp_path, source))
+
+
+def test_missing_intrinsics_are_noticed_before_images_are_copied(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    _, png = cv2.imencode(".png", np.zeros((4, 6), dtype=np.uint8))
+    for i in range(2):
+        (tmp_path / "images" / f"{i}.png").write_bytes(png.tobytes())
+    (tmp_path / "poses.csv").write_text("0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
+    described = rig(tmp_path, "none.yaml")
+    with pytest.raises(FileFormatError, match="none"):
+        rw.pipeline.calibrate_log(tmp_path, described, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert write_folder_log(tmp_path, described, tmp_path / "whole.mcap") == (2, 2)
