@@ -1,4 +1,4 @@
-"""Which camera of which file is a sensor's; what is missing is said with the rig file's line, before anything is copied."""
+"""Which camera of which file is a sensor's; what is missing is said with its line, before anything is copied."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ def test_whose_intrinsics(tmp_path: Path, log: rw.logs.Log, source: str, fx: flo
 @pytest.mark.parametrize(
     ("source", "error", "words"),
     [
-        ("cameras.txt", CameraError, r"line 3: sensors.cam1.intrinsics: .*has no camera of the sensor's name, 'cam1'; it "
-         r"has 1, 2: write {file: cameras\.txt, camera: '1'}"),
+        ("cameras.txt", CameraError, r"line 3: sensors.cam1.intrinsics: .*has no camera of the sensor's name, 'cam1'; "
+         r"it has 1, 2: write {file: cameras\.txt, camera: '1'}"),
         ("{file: chain.yaml, camera: cam7}", CameraError, "has no camera 'cam7'; it has cam0, cam1"),
         ("{file: ost.yaml, camera: cam1}", CameraError, "it has one alone, without a name: leave camera out"),
-        ("none.yaml", FileFormatError, r"none\.yaml cannot be read: No such file.*\(rig\.yaml, line 3: sensors\.cam1\."),
+        ("none.yaml", FileFormatError, r"none\.yaml cannot be read: No such file.*\(rig\.yaml, line 3: sensors\.c"),
     ],
 )  # fmt: skip
 def test_whose_are_not_there(tmp_path: Path, source: str, error: type[RwhecError], words: str) -> None:
