@@ -62,7 +62,7 @@ class Ground(StrEnum):
     POSE_DOUBTED = "pose_doubted"
     #: Most measurements of a sensor were left out as outliers.
     CONTRADICTED = "contradicted"
-    #: A sensor has no measurement in the answer, and so no pose.
+    #: A sensor or a target has no measurement in the answer, and so no pose; or a sensor of a rig file has too few.
     NO_ANSWER = "no_answer"
     #: The clock of a sensor is late, and was taken as right.
     LATE_CLOCK = "late_clock"
@@ -153,7 +153,10 @@ _ADVICE = {
         "check whether the named frame has moved, has another frame's name or was stated at a wrong pose, and whether "
         "its intrinsics are right and its clock is not late"
     ),
-    Ground.NO_ANSWER: "measure with this sensor, or leave it out of the problem",
+    Ground.NO_ANSWER: (
+        "measure with the named sensor, or the named target, or leave it out of the problem or the rig file; the poses "
+        "of the others are given"
+    ),
     Ground.LATE_CLOCK: (
         'let its time offset be estimated: CalibrateOptions(time_offsets="auto"), in a rig file time_offset: estimate'
     ),

@@ -19,6 +19,7 @@ class RemovalReason(StrEnum):
     TURNING_FAST = "turning fast (rad/s)"
     MOVING_FAST = "moving fast (m/s)"
     STANDSTILL = "standstill (m moved)"
+    CLOCK_UNKNOWN = "the sensor's clock is not known"
     SINGLE = "a single measurement of the pair"
     NO_CONSENSUS = "the pair has no consensus (share that agrees)"
     ROTATION_OFF = "rotation off the pair's consensus (rad)"

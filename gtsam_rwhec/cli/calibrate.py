@@ -17,6 +17,7 @@ from gtsam_rwhec.cli.options import (
     CHOICES_PANEL,
     CSV_PANEL,
     FOLDER_OF_CSV,
+    AnywayOption,
     ImagesOption,
     KappaOption,
     RigOption,
@@ -25,6 +26,7 @@ from gtsam_rwhec.cli.options import (
     SigmaOption,
     TargetsOption,
     WorkersOption,
+    say_exported,
     show,
 )
 from gtsam_rwhec.cli.roads import refuse
@@ -36,7 +38,7 @@ Noise = Literal["auto", "given", "estimate"]
 Robust = Literal["auto", "gnc", "none"]
 
 #: Parameters that count for a log; its rig file states the rest.
-OF_LOG = frozenset({"source", "rig", "images", "workers", "output"})
+OF_LOG = frozenset({"source", "rig", "images", "workers", "anyway", "output"})
 #: Parameters that count for a folder of CSV files.
 OF_FOLDER = frozenset({"source", "scale", "sigma", "kappa", "targets", "sensors", "certified_only", "output"})
 #: Parameters that overrule a choice of ``rw.calibrate``.
@@ -126,6 +128,7 @@ def calibrate(
     ] = None,
     images: ImagesOption = False,
     workers: WorkersOption = None,
+    anyway: AnywayOption = False,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="For CSV files: result file (JSON). For a log: folder for all files."),
@@ -143,7 +146,7 @@ def calibrate(
             if rig is None:
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
-        return calibrate_log(source, rig, output, images=images, workers=workers)
+        return calibrate_log(source, rig, output, images=images, workers=workers, anyway=anyway)
     refuse(context, NOT_CERTIFIED_ONLY if certified_only else NOT_WITH_ALL)
     if (method == "local") != (initial is not None):
         raise typer.BadParameter("--method local and --initial FILE go together: give both, or neither")
@@ -190,7 +193,9 @@ def is_log(source: Path) -> bool:
     return source.suffix.lower() == ".mcap" or (source.is_dir() and any(source.glob("*.mcap")))
 
 
-def calibrate_log(source: Path, rig: Path | None, output: Path, *, images: bool, workers: int | None) -> ExitStatus:
+def calibrate_log(
+    source: Path, rig: Path | None, output: Path, *, images: bool, workers: int | None, anyway: bool = False
+) -> ExitStatus:
     """Run all stages and print the report."""
     with StageDisplay() as stage, said_in_the_report():
         calibrated = rw.calibrate_log(
@@ -199,9 +204,11 @@ def calibrate_log(source: Path, rig: Path | None, output: Path, *, images: bool,
             output,
             images="copy" if images else "leave_out",
             workers=workers,
+            anyway=anyway,
             progress=stage,
         )
     status = show(calibrated)
     written = [name for name in rw.pipeline.OUTPUTS if (output / name).exists()]
     say(f"Written to {shown_path(output)}: {', '.join(written)}.", to_errors=True)
+    say_exported(calibrated, anyway=anyway)
     return status

@@ -9,6 +9,7 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
+from gtsam_rwhec.cli.options import AnywayOption, say_exported
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
@@ -16,12 +17,14 @@ from gtsam_rwhec.files.terminal_text import say, shown_path
 def export(
     solved: Annotated[Path, typer.Argument(help="The clean.mcap that solve or calibrate wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")],
+    anyway: AnywayOption = False,
 ) -> ExitStatus:
     """Last stage: write a launch file, tf, URDF, a Kalibr camchain and plots from a solved log."""
     with StageDisplay() as stage:
-        for path in rw.pipeline.export_solved(solved, output, progress=stage):
+        for path in rw.pipeline.export_solved(solved, output, anyway=anyway, progress=stage):
             say(shown_path(path))
-    judgement = rw.pipeline.read_solved(solved).judgement
-    if judgement.verdict is rw.Verdict.DO_NOT_USE:
-        say(f"No files for other programs were written. {judgement}", to_errors=True)
-    return exit_status(judgement)
+    found = rw.pipeline.read_solved(solved)
+    if found.judgement.verdict is not rw.Verdict.USE:
+        say(str(found.judgement), to_errors=True)
+    say_exported(found, anyway=anyway)
+    return exit_status(found.judgement, of_rig=True)

@@ -9,6 +9,7 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
+from gtsam_rwhec.files.terminal_text import say
 
 FOLDER_OF_CSV = "folder of CSV files such as tag_0_cam_0_A.csv and tag_0_cam_0_B.csv"
 #: Headings in the help.
@@ -65,7 +66,28 @@ WorkersOption = Annotated[
 ]
 
 
+AnywayOption = Annotated[
+    bool,
+    typer.Option(
+        "--anyway",
+        rich_help_panel=LOG_PANEL,
+        help="Write the files for other programs of poses that are not to be used too, with the reason in their heads.",
+    ),
+]
+
+
+def say_exported(solved: rw.pipeline.Solved, *, anyway: bool) -> None:
+    """Say that files of poses that are not to be used were written, or that they were not."""
+    if solved.judgement.verdict is not rw.Verdict.DO_NOT_USE:
+        return
+    names = ", ".join(rw.export.FILES)
+    if anyway:
+        say(f"Written although the poses are not to be used, and marked so in the head: {names}.", to_errors=True)
+    else:
+        say(f"Not written, as the poses are not to be used: {names}. --anyway writes them, marked.", to_errors=True)
+
+
 def show(calibrated: rw.pipeline.Calibrated) -> ExitStatus:
     """Print the report of a calibrated log; its exit status."""
     rw.report.print_calibration(calibrated.calibration, log=calibrated.log)
-    return exit_status(calibrated.judgement)
+    return exit_status(calibrated.judgement, of_rig=True)

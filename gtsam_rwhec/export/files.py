@@ -14,7 +14,7 @@ from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
-#: A warning in a file has at most this many characters.
+#: A remark in a file has at most this many characters.
 LONGEST_COMMENT = 2_000
 #: These functions give the text of each file, by its name.
 FILES: dict[str, Callable[[RigFrames], str]] = {
@@ -45,23 +45,24 @@ def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
         A file cannot be written; the message says why.
     """
     # All texts come first: if one of them fails, no file is written.
-    texts = {Path(folder) / name: _warned(text(frames), frames.warnings, name) for name, text in FILES.items()}
+    remarks = (*frames.warnings, *(f"Left out, because it has no answer: {why}" for why in frames.left_out.values()))
+    texts = {Path(folder) / name: _with_head(text(frames), remarks, name) for name, text in FILES.items()}
     for path, text in texts.items():
         write_atomically(path, text.encode())
     return list(texts)
 
 
-def _warned(text: str, warnings: tuple[str, ...], name: str) -> str:
-    """The text with warnings as comments at its beginning."""
-    if not warnings:
+def _with_head(text: str, remarks: tuple[str, ...], name: str) -> str:
+    """The text with remarks as comments at its beginning."""
+    if not remarks:
         return text
     if name.endswith(".xacro"):
         declaration, rest = text.split("\n", 1)  # the first line of XML is its declaration
-        comment = re.sub("-(?=-)", "- ", "\n".join(map(_comment, warnings)))  # XML's comments hold no "--"
+        comment = re.sub("-(?=-)", "- ", "\n".join(map(_comment, remarks)))  # XML's comments hold no "--"
         return f"{declaration}\n<!--\n{comment}\n-->\n{rest}"
-    return "".join(f"# {_comment(warning)}\n" for warning in warnings) + text
+    return "".join(f"# {_comment(remark)}\n" for remark in remarks) + text
 
 
-def _comment(warning: str) -> str:
-    """A warning on one line: names in it come from a log, and a line break would end the comment."""
-    return shown(warning, LONGEST_COMMENT)
+def _comment(remark: str) -> str:
+    """A remark on one line: names in it come from a log, and a line break would end the comment."""
+    return shown(remark, LONGEST_COMMENT)

@@ -48,6 +48,7 @@ def calibrate_log(
     *,
     images: Images = "leave_out",
     workers: int | None = None,
+    anyway: bool = False,
     progress: Progress | None = None,
 ) -> Calibrated:
     """Detect, clean, solve and export: from a log and a rig file to a folder with the calibration.
@@ -70,6 +71,8 @@ def calibrate_log(
         Whether ``clean.mcap`` has the images too.
     workers : int, optional
         Threads, and for long logs processes, for detection; by default one for each core.
+    anyway : bool
+        As for `export_solved`.
     progress : callable, optional
 
     Raises
@@ -82,7 +85,9 @@ def calibrate_log(
     detected, clean = Path(out) / DETECTED_LOG, Path(out) / CLEAN_LOG
     check_is_no_other_folder(log_path, rig)
     if rig is not None and is_folder_of_images(log_path, rig):
-        return _calibrate_folder(Path(str(log_path)), rig, out, images=images, workers=workers, progress=progress)
+        return _calibrate_folder(
+            Path(str(log_path)), rig, out, images=images, workers=workers, anyway=anyway, progress=progress
+        )
     with open_log(log_path) as log:
         source = log.files[0].path
         is_raw = not is_from_stage(log)
@@ -106,14 +111,21 @@ def calibrate_log(
         clean_log(source, clean, rig, images=images, progress=progress)
         source = clean
     calibrated = solve_into(source, rig, out, images=images, progress=progress)
-    export_solved(out / CLEAN_LOG, out, progress=progress)
+    export_solved(out / CLEAN_LOG, out, anyway=anyway, progress=progress)
     if is_raw:
         detected.unlink(missing_ok=True)  # clean.mcap has all that was in it
     return calibrated
 
 
 def _calibrate_folder(
-    folder: Path, rig: Rig, out: str | Path, *, images: Images, workers: int | None, progress: Progress | None
+    folder: Path,
+    rig: Rig,
+    out: str | Path,
+    *,
+    images: Images,
+    workers: int | None,
+    anyway: bool,
+    progress: Progress | None,
 ) -> Calibrated:
     """As `calibrate_log`, by way of a log of the folder's images, which is removed at the end."""
     rig = rig.model_copy(update={"folder": folder})
@@ -122,7 +134,7 @@ def _calibrate_folder(
     recorded = made / f"{folder.resolve().name}{RECORDED_LOG}"
     try:
         write_folder_log(folder, rig, recorded, progress=progress)
-        return calibrate_log(recorded, rig, made, images=images, workers=workers, progress=progress)
+        return calibrate_log(recorded, rig, made, images=images, workers=workers, anyway=anyway, progress=progress)
     finally:
         recorded.unlink(missing_ok=True)
         if not any(made.iterdir()):
@@ -161,11 +173,23 @@ def solve_into(
 
 
 @one_blas_thread()
-def export_solved(solved_path: str | Path, out: str | Path, *, progress: Progress | None = None) -> list[Path]:
+def export_solved(
+    solved_path: str | Path, out: str | Path, *, anyway: bool = False, progress: Progress | None = None
+) -> list[Path]:
     """Write the files for other programs, and plots, from a solved log into a folder; return their paths.
 
     Poses that are not to be used get plots only, and no files for other programs: those of an earlier calibration in
     this folder are removed.
+
+    Parameters
+    ----------
+    solved_path
+        The log that ``solve_into`` wrote.
+    out
+        The folder; it is made if it does not exist.
+    anyway : bool
+        Whether to write the files of poses that are not to be used too, each with the reason as a comment in its head.
+    progress : callable, optional
 
     Raises
     ------
@@ -179,7 +203,7 @@ def export_solved(solved_path: str | Path, out: str | Path, *, progress: Progres
     tell("exporting")
     solved = read_solved(solved_path)
     written = []
-    if solved.judgement.verdict is Verdict.DO_NOT_USE:
+    if solved.judgement.verdict is Verdict.DO_NOT_USE and not anyway:
         for name in FILES:
             (out / name).unlink(missing_ok=True)
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from gtsam_rwhec.cleaning import (
     thin,
     without_fast,
 )
-from gtsam_rwhec.errors import LogError, StampError
+from gtsam_rwhec.cleaning.removed import RemovalReason
+from gtsam_rwhec.errors import LogError, LogWarning, StampError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
@@ -67,7 +69,12 @@ def clean_log(
     ------
     LogError, StampError, TransformError
         The log has no detections or no carriers' poses; its clocks have no time in common; the motion does not
-        determine a time offset; or no measurement is left.
+        determine a time offset of any sensor; or no measurement is left.
+
+    Warns
+    -----
+    LogWarning
+        The motion does not determine the time offset of a sensor; the others are cleaned without it.
     """
     tell = progress or silent
     check_writable(out_path)
@@ -79,10 +86,16 @@ def clean_log(
         pairs: list[MeasuredPairs] = []
         offsets_s: dict[str, float] = {}
         sigmas_s: dict[str, float] = {}
+        unknown: dict[str, StampError] = {}
         for sensor in rig.sensors:
             tell(f"synchronising {sensor}")
             tracks = read_tracks(log, rig, sensor)
-            offsets_s[sensor], sigma_s = _time_offset(rig, sensor, path, tracks)
+            try:
+                offsets_s[sensor], sigma_s = _time_offset(rig, sensor, path, tracks)
+            except StampError as error:  # the other sensors have an answer without this one
+                unknown[sensor] = error
+                pairs += [clean_track(track.without(RemovalReason.CLOCK_UNKNOWN), path, rig, 0.0) for track in tracks]
+                continue
             if sigma_s is not None:
                 sigmas_s[sensor] = sigma_s
             _check_overlap(tracks, path, sensor, offsets_s[sensor])
@@ -91,9 +104,13 @@ def clean_log(
             tracks=tuple(measured.count for measured in pairs), time_offsets_s=offsets_s, coarse_sigma_s=sigmas_s
         )
         if not any(track.used for track in report.tracks):
+            if unknown:
+                raise next(iter(unknown.values()))
             raise LogError(
                 f"{log.files[0].path}: no measurement is left after cleaning. {'; '.join(map(str, report.tracks))}."
             )
+        for why in unknown.values():
+            warnings.warn(f"{why}. None of its measurements is used", LogWarning, stacklevel=3)
         tell("writing pairs")
         with LogWriter(out_path) as out:
             out.copy(log, topics_up_to_detection(log), images)

@@ -77,6 +77,16 @@ def _stacked(pair: Pair, records: list[PairRecord]) -> MeasuredPairs:
     )
 
 
+def poses_used(pairs: Iterable[MeasuredPairs]) -> dict[str, int]:
+    """At how many poses of the carriers, which are stamps, each sensor and each target is used."""
+    stamps: dict[str, set[int]] = defaultdict(set)
+    for measured in pairs:
+        used = measured.stamps_ns[measured.used].tolist()
+        stamps[measured.sensor].update(used)
+        stamps[measured.target].update(used)
+    return {name: len(found) for name, found in stamps.items()}
+
+
 def problem_of(
     pairs: Mapping[Pair, MeasuredPairs],
     rig: Rig,

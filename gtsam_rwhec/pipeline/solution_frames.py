@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.pipeline.solving_stage import Solved
+from gtsam_rwhec.results.unanswered import shortage
 from gtsam_rwhec.rig import RigFrames
 
 
 def frames_of(solved: Solved) -> RigFrames:
     """The calibrated frames; a sensor has the name of its frame."""
     rig, refined = solved.rig, solved.refined
+    missing = [name for name in (*rig.sensors, *rig.targets) if name not in refined.X and name not in refined.Y]
     frame = {name: rig.frame_of(name) for name in refined.Y}
     return RigFrames(
         sensor_carrier=rig.carriers.sensors,
@@ -19,5 +22,14 @@ def frames_of(solved: Solved) -> RigFrames:
         cameras={frame[name]: camera for name, camera in solved.cameras.items() if name in frame},
         time_offsets_s={frame[o.sensor]: o.offset_s for o in solved.log.time_offsets if o.sensor in frame},
         topics={frame[n]: s.images for n, s in rig.sensors.items() if s.images is not None and n in frame},
-        warnings=() if solved.judgement.verdict is Verdict.USE else (str(solved.judgement),),
+        warnings=warnings_of(solved),
+        left_out={name: shortage(solved.log, name) for name in missing},
     )
+
+
+def warnings_of(solved: Solved) -> tuple[str, ...]:
+    """Why the frames, or some of them, are not to be used; empty where they are."""
+    if solved.judgement.verdict is Verdict.USE:
+        return ()
+    free = sorted({name for each in solved.refined.free_directions for name in each.frames}, key=natural_key)
+    return (str(solved.judgement), *([f"Not determined: {', '.join(free)}"] if free else []))

@@ -28,12 +28,13 @@ from gtsam_rwhec.pipeline.log_findings import (
     with_cures,
 )
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
-from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, read_pairs
+from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, poses_used, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, sigma_of, without_outlier_marks
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TimeOffsetFields, contradictions
+from gtsam_rwhec.results.unanswered import short_of_measurements
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.vision.camera import Camera
@@ -176,6 +177,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     if late:
         findings = not_of_late_clocks(findings, calibration.misreadings)
     findings = (*findings, *late, *estimated_sizes(fields.sizes, rig))
+    if not is_misread:  # a misreading makes cleaning remove measurements that are right
+        findings = (*findings, *short_of_measurements(fields, poses_used(settled.pairs.values())))
     if calibration.judgement.verdict is not Verdict.DO_NOT_USE:
         findings = (*findings, *known_to_nothing(calibration.points.values(), rig))
     judgement = judge(refined.solution, refined, fields, findings)

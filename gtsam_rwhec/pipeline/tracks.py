@@ -44,6 +44,10 @@ class Track:
         removed = Counter(reason for reason in self.reasons if reason)
         return TrackCount(target=self.target, sensor=self.sensor, used=int(self.used.sum()), removed=dict(removed))
 
+    def without(self, reason: str) -> Self:
+        """The track with no measurement used, for this reason where there is no other."""
+        return replace(self, reasons=tuple(why or reason for why in self.reasons))
+
     def marked(self, kept: Kept, at: np.ndarray) -> Self:
         """The track after a step of cleaning on the measurements `at`; a measurement keeps its first reason."""
         reasons = list(self.reasons)

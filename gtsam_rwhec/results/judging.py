@@ -9,6 +9,7 @@ from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, findings
 from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.results.log_history import FrameOutliers, LogFields
+from gtsam_rwhec.results.unanswered import shortage
 from gtsam_rwhec.solving.solution import Solution
 
 
@@ -53,11 +54,7 @@ def judge(
             for one in log.contradicted
         ]
         used = {count.sensor for count in log.outliers if count.used}
-        found += [
-            Finding(Ground.NO_ANSWER, f"{name} has no pose, because no measurement of it is in the answer")
-            for name in log.detection.images
-            if name not in used
-        ]
+        found += [Finding(Ground.NO_ANSWER, shortage(log, name)) for name in log.detection.images if name not in used]
         doubted = [size.target for size in log.sizes if size.is_doubted and not size.is_free]
         if doubted:
             words = f"the stated size of {', '.join(doubted)} does not fit the motion"

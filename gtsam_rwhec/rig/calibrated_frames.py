@@ -44,6 +44,8 @@ class RigFrames:
         Topics of images by sensor; may lack a sensor.
     warnings : tuple of str
         Why frames should not be used; written into every file.
+    left_out : dict of str to str
+        Why frames of the rig file are not here; written into every file.
 
     Raises
     ------
@@ -63,6 +65,7 @@ class RigFrames:
     time_offsets_s: Mapping[str, float] = field(default_factory=dict)
     topics: Mapping[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         names = [self.sensor_carrier, self.target_carrier, *self.sensors, *self.targets]

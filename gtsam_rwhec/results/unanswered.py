@@ -1,0 +1,59 @@
+"""Sensors and targets of a rig file with too few measurements: how many each had and needs, and where they went."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+
+from gtsam_rwhec.calibration.outliers import FEWEST_OF_A_FRAME
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.results.log_history import LogFields
+
+#: What a frame's pose needs: two motions about different axes are three poses.
+NEEDED = "at least 3 poses with two turning axes are needed"
+#: Words name at most this many reasons for which measurements were removed.
+MOST_REASONS = 3
+
+
+def short_of_measurements(log: LogFields, poses: Mapping[str, int]) -> list[Finding]:
+    """What speaks against the sensors and targets of the rig file that have no answer, or rest on too few measurements.
+
+    A sensor that was used at fewer than ``FEWEST_OF_A_FRAME`` poses has no answer that anything agrees to. Of a target
+    that was seen at one or two, only its own pose is to be doubted: the sensors' poses do not rest on it.
+
+    Parameters
+    ----------
+    log : LogFields
+    poses : mapping of sensor or target to int
+        At how many poses of the carriers the answer uses each; may lack those without any.
+    """
+    sensors = log.detection.images
+    targets = dict.fromkeys((*log.detection.unseen, *(track.target for track in log.detection.tracks)))
+    few = {name: poses.get(name, 0) for name in (*sensors, *targets) if poses.get(name, 0) < FEWEST_OF_A_FRAME}
+    return [
+        Finding(Ground.FEW_MEASUREMENTS if count and name in targets else Ground.NO_ANSWER, shortage(log, name, count))
+        for name, count in few.items()
+    ]
+
+
+def shortage(log: LogFields, name: str, poses: int = 0) -> str:
+    """``camera3: 2 measurements at 2 poses (of 9 detections in 40 images; ...), at least 3 poses ... are needed``."""
+    count = sum(count.used for count in log.outliers if name in count.pair)
+    at = f" at {poses} pose{'s' * (poses != 1)}" if count and poses else ""
+    return f"{name}: {count} measurement{'s' * (count != 1)}{at} ({_history(log, name)}), {NEEDED}"
+
+
+def _history(log: LogFields, name: str) -> str:
+    """How often a frame was seen, and why measurements of it were removed."""
+    detected = [track for track in log.detection.tracks if name in track.pair]
+    seen, images = sum(track.seen for track in detected), log.detection.images.get(name)
+    if not seen:
+        return "no sensor saw it" if images is None else f"its {images} images show no target"
+    removed = Counter[str]()
+    stages = {track.pair: track for track in (*detected, *(t for t in log.cleaning.tracks if name in t.pair))}
+    for track in stages.values():  # the cleaning counts the rejections of the detection again
+        removed.update(track.removed)
+    removed["outlier"] += sum(count.left_out for count in log.outliers if name in count.pair)
+    reasons = [f"{why.split(' (')[0]}: {number}" for why, number in removed.most_common(MOST_REASONS) if number]
+    where = "" if images is None else f" in {images} images"
+    return "; ".join([f"of {seen} detection{'s' * (seen != 1)}{where}", *reasons])
