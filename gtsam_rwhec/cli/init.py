@@ -9,7 +9,6 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
-from gtsam_rwhec.cli.options import LogArgument
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.atomic_write import write_atomically
@@ -17,16 +16,30 @@ from gtsam_rwhec.files.terminal_text import say, shown_path
 
 
 def init(
-    log: LogArgument,
+    log: Annotated[
+        Path | None, typer.Argument(help="MCAP file, or a folder of MCAP files (a ROS 2 bag).", show_default=False)
+    ] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Rig file to write.")] = Path("rig.yaml"),
+    schema: Annotated[
+        bool, typer.Option("--schema", help="Print the JSON Schema of rig files, for editors, and write nothing.")
+    ] = False,
+    reference: Annotated[
+        bool, typer.Option("--reference", help="Print every key of rig files, as Markdown, and write nothing.")
+    ] = False,
 ) -> ExitStatus:
     """Look at a log and write a first rig file. TODO marks the lines that you must complete."""
+    if schema + reference + (log is not None) != 1:
+        raise typer.BadParameter("give one of: a log, --schema, --reference")
+    if log is None:
+        typer.echo(rw.rig.schema_text() if schema else rw.rig.reference(), nl=False)
+        return ExitStatus.DONE
     if output.exists():
         raise FileFormatError(f"{output} exists already, perhaps with your changes. Give another name with -o.")
     with StageDisplay() as stage:
         stage(f"looking at {log}")
         with rw.logs.open_log(log) as opened:
             text, notes = rw.first_rig.propose_rig(opened, output)
+    text = rw.rig.editor_line() + text
     write_atomically(output, text.encode())
     call = f" gtsam-rwhec calibrate {shown_path(log)} --rig {shown_path(output)} -o out"
     for note in notes:

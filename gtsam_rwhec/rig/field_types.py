@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import AfterValidator, BeforeValidator
+from pydantic import AfterValidator, BeforeValidator, GetJsonSchemaHandler
+from pydantic_core import CoreSchema
 
 from gtsam_rwhec.files.yaml_lines import shown
 from gtsam_rwhec.vision.targets import LARGEST_M
@@ -18,6 +19,26 @@ LONGEST_NAME = 100
 LONGEST_TEXT = 1000
 #: Seconds. Offsets are at most this, because larger offsets in nanoseconds do not fit into 64 bits.
 LARGEST_OFFSET_S = 4e9
+
+
+class InSchema:
+    """What the JSON Schema of a value says beside its type, for values that a function checks."""
+
+    def __init__(self, **keywords: Any) -> None:
+        self.keywords = keywords
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return handler(core) | self.keywords
+
+
+class OrText:
+    """In the JSON Schema: text may stand in place of a section, and is described by these words."""
+
+    def __init__(self, words: str) -> None:
+        self.words = words
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"anyOf": [{"type": "string", "minLength": 1, "description": self.words}, handler(core)]}
 
 
 def is_name(text: str) -> bool:
@@ -88,10 +109,10 @@ def _offset(given: Any) -> Any:
     return given
 
 
-Name: TypeAlias = Annotated[str, AfterValidator(_name)]
-Text: TypeAlias = Annotated[str, AfterValidator(_text)]
+Name: TypeAlias = Annotated[str, AfterValidator(_name), InSchema(pattern=f"^{NAME.pattern}$", maxLength=LONGEST_NAME)]
+Text: TypeAlias = Annotated[str, AfterValidator(_text), InSchema(minLength=1, maxLength=LONGEST_TEXT)]
 FramePair: TypeAlias = Annotated[tuple[Name, Name], list_of(2, "two frames, [parent, child]")]
-EulerAxes: TypeAlias = Annotated[str, AfterValidator(_axes)]
-Positive: TypeAlias = Annotated[float, AfterValidator(_positive)]
-Length: TypeAlias = Annotated[float, AfterValidator(_length)]
+EulerAxes: TypeAlias = Annotated[str, AfterValidator(_axes), InSchema(pattern="^(rotation_vector|[xyz]{3}|[XYZ]{3})$")]
+Positive: TypeAlias = Annotated[float, AfterValidator(_positive), InSchema(exclusiveMinimum=0)]
+Length: TypeAlias = Annotated[float, AfterValidator(_length), InSchema(exclusiveMinimum=0, exclusiveMaximum=LARGEST_M)]
 TimeOffset: TypeAlias = Annotated[float | Literal["estimate"], BeforeValidator(_offset)]

@@ -27,13 +27,28 @@ class RigFile(Section):
     carriers: Carriers = Field(description="the frames that carry the sensors and the targets, and their poses")
     sensors: dict[Name, Sensor] = Field(description="by name, each with images or detections")
     targets: dict[Name, TargetSection] = Field(description="by name, each with type and sizes")
-    sizes: Literal["known", "check", "estimate"] = "check"
+    sizes: Literal["known", "check", "estimate"] = Field(
+        default="check",
+        description="known: the targets' sizes are right. check: they are taken as stated if the motion agrees, else "
+        "estimated and named. estimate: from the motion",
+        examples=["known"],
+    )
     noise: Annotated[
         Annotated[DetectionNoise, UnionTag("numbers")] | Annotated[Literal["estimate"], UnionTag("word")],
         Discriminator(lambda given: "word" if isinstance(given, str) else "numbers"),
-    ] = "estimate"
-    detection: dict[str, Any] = Field(default={}, description="fields of vision's DetectionOptions")
-    cleaning: Cleaning = Cleaning()
+    ] = Field(
+        default="estimate",
+        description="of the detections: the word estimate, from the residuals, or a section",
+        examples=[{"corner_px": 0.1}],
+    )
+    detection: dict[str, Any] = Field(
+        default={}, description="limits beyond which a detection is not used", examples=[{"min_side_px": 20}]
+    )
+    cleaning: Cleaning = Field(
+        default=Cleaning(),
+        description="which measurements are left out before solving",
+        examples=[{"max_rotation_deg_s": 60.0}],
+    )
 
     @cached_property
     def target_list(self) -> tuple[Target, ...]:

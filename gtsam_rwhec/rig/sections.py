@@ -1,6 +1,7 @@
-"""The sections of a rig file, field by field, with units; `target_sections` has the sections of targets.
+"""The sections of a rig file, field by field; `target_sections` has the sections of targets.
 
-No value is converted, and an unknown key is an error.
+No value is converted, and an unknown key is an error. What a key is, its example, and its unit where its name does not
+end with it stand beside the field: the reference (`reference`) and the JSON Schema (`json_schema`) are made of them.
 """
 
 from __future__ import annotations
@@ -9,7 +10,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from gtsam_rwhec.rig.field_types import EulerAxes, FramePair, Name, Positive, Text, TimeOffset, list_of
+from gtsam_rwhec.rig.field_types import (
+    EulerAxes,
+    FramePair,
+    Name,
+    OrText,
+    Positive,
+    Text,
+    TimeOffset,
+    list_of,
+)
 from gtsam_rwhec.vision.camera import Camera
 
 
@@ -23,11 +33,21 @@ class Section(BaseModel):
         return [name for name in names if getattr(self, name) is not None]
 
 
+def one_of(*choices: str | tuple[str, ...], together: tuple[tuple[str, ...], ...] = ()) -> ConfigDict:
+    """For the JSON Schema of a section: exactly one of these keys, or sets of keys, must be there.
+
+    Of each tuple in `together`, the first key needs the others.
+    """
+    required = [{"required": [keys] if isinstance(keys, str) else list(keys)} for keys in choices]
+    needs: dict[str, Any] = {"dependencies": {first: list(others) for first, *others in together}} if together else {}
+    return ConfigDict(json_schema_extra={"oneOf": required, **needs})
+
+
 class PoseNoise(Section):
     """Noise of poses: standard deviations about and along each axis."""
 
-    rotation_deg: Positive = Field(description="standard deviation about each axis, degrees")
-    translation_mm: Positive = Field(description="standard deviation along each axis, millimetres")
+    rotation_deg: Positive = Field(description="standard deviation about each axis", examples=[0.02])
+    translation_mm: Positive = Field(description="standard deviation along each axis", examples=[0.2])
 
 
 class PoseSource(Section):
@@ -36,16 +56,61 @@ class PoseSource(Section):
     Poses are T_parent_child. How the numbers of files are meant is stated here where the files do not say it.
     """
 
-    tf: FramePair | None = None
-    topic: Text | None = None
-    parent: Name | None = None
-    child: Name | None = None
-    frames: FramePair | None = None
-    quaternion: Literal["xyzw", "wxyz"] | None = None
-    euler: EulerAxes | None = None
-    angles: Literal["degrees", "radians"] | None = None
-    length: Literal["m", "mm"] | None = None
-    one_instant: bool | None = None
+    model_config = one_of(
+        "tf", "topic", "frames",
+        together=(
+            ("topic", "parent", "child"), ("parent", "topic"), ("child", "topic"), ("quaternion", "frames"),
+            ("euler", "frames"), ("angles", "frames"), ("length", "frames"), ("one_instant", "frames"),
+        ),
+    )  # fmt: skip
+
+    tf: FramePair | None = Field(
+        default=None,
+        description="two frames of tf, [parent, child], also over several links",
+        examples=[["base", "hand"]],
+    )
+    topic: Text | None = Field(
+        default=None,
+        description="a topic of PoseStamped, Odometry or PoseInFrame; with parent and child",
+        examples=["/vicon/hand/pose"],
+    )
+    parent: Name | None = Field(
+        default=None, description="with topic: the frame that the poses are in", examples=["world"]
+    )
+    child: Name | None = Field(
+        default=None, description="with topic: the frame that the poses are of", examples=["hand"]
+    )
+    frames: FramePair | None = Field(
+        default=None,
+        description="of poses in files beside images, [parent, child]: the files have T_parent_child",
+        examples=[["base", "hand"]],
+    )
+    quaternion: Literal["xyzw", "wxyz"] | None = Field(
+        default=None,
+        description="with frames: the order of quaternions; without it the files' names of columns or keys "
+        "tell, else xyzw",
+        examples=["wxyz"],
+    )
+    euler: EulerAxes | None = Field(
+        default=None,
+        description="with frames: axes in the order of the turns, capitals about turning axes, small letters "
+        "about fixed ones; or rotation_vector. Angles in files are refused without it",
+        examples=["ZYX"],
+    )
+    angles: Literal["degrees", "radians"] | None = Field(
+        default=None, description="with euler: the unit of the files' angles", examples=["degrees"]
+    )
+    length: Literal["m", "mm"] | None = Field(
+        default=None,
+        description="with frames: the unit of the files' positions; without it names of columns tell, else m",
+        examples=["mm"],
+    )
+    one_instant: bool | None = Field(
+        default=None,
+        description="with frames, images taken at rest: whether images of one name, of different cameras, are "
+        "of one instant",
+        examples=[True],
+    )
 
     @property
     def parent_and_child(self) -> tuple[str, str]:
@@ -72,28 +137,74 @@ class PoseSource(Section):
 class Carriers(Section):
     """The frame that carries the sensors, the frame that carries the targets, and where their poses are."""
 
-    sensors: Name = Field(description="the frame that carries the sensors, such as hand")
-    targets: Name = Field(description="the frame that carries the targets, such as base")
-    poses: PoseSource = Field(
-        description="where their poses are: {tf: [parent, child]}, {topic, parent, child} or {frames: [parent, child]}"
+    sensors: Name = Field(
+        description="the frame that carries the sensors: the moving one for a camera on a hand, the fixed one for a "
+        "camera beside the robot",
+        examples=["hand"],
     )
-    max_gap_s: Positive = 0.2
-    noise: PoseNoise | None = None
+    targets: Name = Field(description="the frame that carries the targets", examples=["base"])
+    poses: PoseSource = Field(
+        description="where their poses are: {tf: [parent, child]}, {topic, parent, child} or {frames: [parent, child]}",
+        examples=[{"tf": ["base", "hand"]}],
+    )
+    max_gap_s: Positive = Field(
+        default=0.2, description="between poses further apart in time nothing is interpolated", examples=[0.1]
+    )
+    noise: PoseNoise | None = Field(
+        default=None,
+        description="standard deviations of these poses; leave it out if you do not know them",
+        examples=[{"rotation_deg": 0.02, "translation_mm": 0.2}],
+    )
 
 
 class Intrinsics(Section):
     """Where a camera's intrinsics are: a topic, a Kalibr camchain, another file, or numbers in this section."""
 
-    topic: Text | None = None
-    kalibr: Text | None = None
-    camera: Text | None = None
-    file: Text | None = None
-    model: str | None = None
-    width: int | None = None
-    height: int | None = None
-    size: Annotated[tuple[int, int], list_of(2, "[width, height] in pixels")] | None = None
-    K: Annotated[tuple[float, float, float, float], list_of(4, "[fx, fy, cx, cy] in pixels")] | None = None
-    D: tuple[float, ...] | None = None
+    model_config = one_of(
+        "topic", "kalibr", "file", "K",
+        together=(
+            ("kalibr", "camera"), ("camera", "kalibr"), ("size", "K"), ("width", "K"), ("height", "K"), ("model", "K"),
+            ("D", "K"),
+        ),
+    )  # fmt: skip
+
+    topic: Text | None = Field(
+        default=None, description="a topic of CameraInfo or CameraCalibration", examples=["/cam_left/camera_info"]
+    )
+    kalibr: Text | None = Field(
+        default=None,
+        description="Kalibr's camchain; with camera",
+        examples=["camchain.yaml"],
+    )
+    camera: Text | None = Field(default=None, description="with kalibr: the camera in it", examples=["cam0"])
+    file: Text | None = Field(
+        default=None,
+        description="a file of ROS, OpenCV or plain numbers; intrinsics: FILE is the same in short",
+        examples=["left.yaml"],
+    )
+    model: str | None = Field(
+        default=None,
+        description="with K: what D is: pinhole (no D), radtan (OpenCV, plumb_bob) or equidistant (fisheye)",
+        examples=["radtan"],
+    )
+    width: int | None = Field(
+        default=None, description="with K, in place of size", examples=[640], json_schema_extra={"unit": "pixels"}
+    )
+    height: int | None = Field(
+        default=None, description="with K, in place of size", examples=[480], json_schema_extra={"unit": "pixels"}
+    )
+    size: Annotated[tuple[int, int], list_of(2, "[width, height] in pixels")] | None = Field(
+        default=None, description="[width, height]", examples=[[640, 480]], json_schema_extra={"unit": "pixels"}
+    )
+    K: Annotated[tuple[float, float, float, float], list_of(4, "[fx, fy, cx, cy] in pixels")] | None = Field(
+        default=None,
+        description="[fx, fy, cx, cy]; the middle of the first pixel is at 0, 0",
+        examples=[[550.0, 550.0, 320.0, 240.0]],
+        json_schema_extra={"unit": "pixels"},
+    )
+    D: tuple[float, ...] | None = Field(
+        default=None, description="with model: coefficients in OpenCV's order", examples=[[-0.1, 0.02, 0.0, 0.0]]
+    )
 
     @model_validator(mode="after")
     def _is_one(self) -> Intrinsics:
@@ -135,12 +246,39 @@ def _file_or_section(given: Any) -> Any:
 class Sensor(Section):
     """A camera with images, or with the detections of a driver."""
 
-    images: Text | None = Field(default=None, description="topic of the camera's images; in a folder, their path")
-    poses: Text | None = Field(default=None, description="in a folder: path of the carriers' poses, a file or a folder")
-    detections: Text | None = Field(default=None, description="topic of a driver's detections")
-    intrinsics: Annotated[Intrinsics, BeforeValidator(_file_or_section)] | None = None
-    time_offset: TimeOffset = 0.0
-    frame: Name | None = None
+    model_config = one_of("images", "detections", together=(("images", "intrinsics"), ("poses", "images")))
+
+    images: Text | None = Field(
+        default=None,
+        description="topic of the camera's images; of a folder of images, their path in it",
+        examples=["/cam_left/image"],
+    )
+    poses: Text | None = Field(
+        default=None,
+        description="with images in a folder: path of the carriers' poses, one file for all images, a folder "
+        "with a file an image, or an index",
+        examples=["poses.csv"],
+    )
+    detections: Text | None = Field(
+        default=None, description="topic of a driver's detections, in place of images", examples=["/tag_detections"]
+    )
+    intrinsics: Annotated[Intrinsics, BeforeValidator(_file_or_section), OrText("a file of intrinsics")] | None = Field(
+        default=None,
+        description="with images: a file, or a section; detections with poses need none",
+        examples=["left.yaml", {"topic": "/cam_left/camera_info"}],
+    )
+    time_offset: TimeOffset = Field(
+        default=0.0,
+        description="the sensor's stamp t is the carriers' t + offset; or the word estimate, which needs a "
+        "rotation that speeds up and slows down. Images taken at rest: leave it out",
+        examples=["estimate"],
+        json_schema_extra={"unit": "s"},
+    )
+    frame: Name | None = Field(
+        default=None,
+        description="its frame in the results; without it the sensor's name",
+        examples=["cam_left_optical"],
+    )
 
     @model_validator(mode="after")
     def _is_one(self) -> Sensor:
@@ -163,9 +301,17 @@ class Sensor(Section):
 class DetectionNoise(Section):
     """Noise of the detections (B): standard deviations about and along each axis, or of a corner in pixels."""
 
-    rotation_deg: Positive | None = None
-    translation_mm: Positive | None = None
-    corner_px: Positive | None = None
+    model_config = one_of(("rotation_deg", "translation_mm"), ("corner_px",))
+
+    rotation_deg: Positive | None = Field(
+        default=None, description="standard deviation about each axis; with translation_mm", examples=[0.3]
+    )
+    translation_mm: Positive | None = Field(
+        default=None, description="standard deviation along each axis; with rotation_deg", examples=[3.0]
+    )
+    corner_px: Positive | None = Field(
+        default=None, description="standard deviation of a corner along each axis", examples=[0.1]
+    )
 
     @model_validator(mode="after")
     def _is_one(self) -> DetectionNoise:
@@ -181,10 +327,31 @@ class DetectionNoise(Section):
 class Cleaning(Section):
     """Which measurements cleaning removes before solving; a limit of null removes nothing."""
 
-    min_rotation_deg: Positive = 0.5
-    min_translation_mm: Positive = 3.0
-    max_rotation_deg_s: Positive | None = None
-    max_translation_m_s: Positive | None = None
-    consensus: bool = True
-    thin: bool = True
-    robust: Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "gnc"] = "gnc"
+    min_rotation_deg: Positive = Field(
+        default=0.5,
+        description="a measurement at which the carriers have turned less and moved less than this since the "
+        "one before is left out",
+        examples=[1.0],
+    )
+    min_translation_mm: Positive = Field(default=3.0, description="see min_rotation_deg", examples=[5.0])
+    max_rotation_deg_s: Positive | None = Field(
+        default=None,
+        description="measurements while the carriers turn faster are left out; null: none is",
+        examples=[60.0],
+    )
+    max_translation_m_s: Positive | None = Field(
+        default=None,
+        description="measurements while the carriers move faster are left out; null: none is",
+        examples=[0.5],
+    )
+    consensus: bool = Field(
+        default=True,
+        description="whether measurements that disagree with most others are left out before solving",
+        examples=[False],
+    )
+    thin: bool = Field(
+        default=True, description="whether standstill is thinned, see min_rotation_deg", examples=[False]
+    )
+    robust: Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "gnc"] = Field(
+        default="gnc", description="how solving treats outliers; gnc leaves them out", examples=["none"]
+    )

@@ -6,12 +6,14 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 
-from gtsam_rwhec.rig.field_types import Length, Positive, list_of
+from gtsam_rwhec.rig.field_types import InSchema, Length, Positive, list_of
 from gtsam_rwhec.rig.sections import Section
-from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
+from gtsam_rwhec.vision.targets import FAMILIES, AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
 
 #: How many there are across and down, as the board is printed upright.
 Counts: TypeAlias = Annotated[tuple[int, int], list_of(2, "two whole numbers, [across, down]")]
+#: The dictionary of a tag.
+Family: TypeAlias = Annotated[str, InSchema(enum=list(FAMILIES))]
 
 
 class _TargetSection(Section):
@@ -33,9 +35,9 @@ class TagTarget(_TargetSection):
 
     made: ClassVar = Tag
     type: Literal["tag"]
-    family: str = Field(description="such as tag36h11")
-    id: int = Field(description="the number of the tag")
-    size_m: Length = Field(description="side of the black square, metres")
+    family: Family = Field(description="dictionary of the tags", examples=["tag36h11"])
+    id: int = Field(description="the number of the tag", examples=[0])
+    size_m: Length = Field(description="side of the black square", examples=[0.12])
 
 
 class CharucoTarget(_TargetSection):
@@ -44,11 +46,11 @@ class CharucoTarget(_TargetSection):
     made: ClassVar = Charuco
     counted: ClassVar = "squares"
     type: Literal["charuco"]
-    family: str = Field(description="such as aruco_5x5_100")
-    squares: Counts = Field(description="[across, down], whole squares")
-    square_m: Length = Field(description="side of a square, metres")
-    marker_m: Length = Field(description="side of a marker, metres")
-    first_id: int = 0
+    family: Family = Field(description="dictionary of the markers", examples=["aruco_5x5_100"])
+    squares: Counts = Field(description="[across, down], whole squares, black and white", examples=[[7, 5]])
+    square_m: Length = Field(description="side of a square", examples=[0.04])
+    marker_m: Length = Field(description="side of a marker's black square", examples=[0.03])
+    first_id: int = Field(default=0, description="the smallest number; the others follow it", examples=[0])
 
 
 class AprilGridTarget(_TargetSection):
@@ -57,11 +59,11 @@ class AprilGridTarget(_TargetSection):
     made: ClassVar = AprilGrid
     counted: ClassVar = "tags"
     type: Literal["aprilgrid"]
-    family: str = Field(description="most often tag36h11")
-    tags: Counts = Field(description="[across, down]")
-    tag_m: Length = Field(description="side of a tag's black square, metres (Kalibr's tagSize)")
-    spacing: Positive = Field(description="gap between tags / side of a tag (Kalibr's tagSpacing)")
-    first_id: int = 0
+    family: Family = Field(description="dictionary of the tags, most often tag36h11", examples=["tag36h11"])
+    tags: Counts = Field(description="[across, down], tags", examples=[[6, 6]])
+    tag_m: Length = Field(description="side of a tag's black square (Kalibr's tagSize)", examples=[0.088])
+    spacing: Positive = Field(description="gap between tags / side of a tag (Kalibr's tagSpacing)", examples=[0.3])
+    first_id: int = Field(default=0, description="the smallest number; the others follow it", examples=[0])
 
 
 class CheckerboardTarget(_TargetSection):
@@ -70,8 +72,10 @@ class CheckerboardTarget(_TargetSection):
     made: ClassVar = Checkerboard
     counted: ClassVar = "inner_corners"
     type: Literal["checkerboard"]
-    inner_corners: Counts = Field(description="[across, down], corners where four squares meet")
-    square_m: Length = Field(description="side of a square, metres")
+    inner_corners: Counts = Field(
+        description="[across, down], corners where four squares meet: one less than squares", examples=[[9, 6]]
+    )
+    square_m: Length = Field(description="side of a square", examples=[0.04])
 
 
 class CircleGridTarget(_TargetSection):
@@ -80,9 +84,13 @@ class CircleGridTarget(_TargetSection):
     made: ClassVar = CircleGrid
     counted: ClassVar = "circles"
     type: Literal["circle_grid"]
-    circles: Counts = Field(description="[across, down]")
-    spacing_m: Length = Field(description="between the centres of neighbours, metres")
-    larger_dot: bool | Literal["lower_left", "lower_right", "upper_left", "upper_right"] = False
+    circles: Counts = Field(description="[across, down], circles", examples=[[10, 10]])
+    spacing_m: Length = Field(description="between the centres of neighbours", examples=[0.0254])
+    larger_dot: bool | Literal["lower_left", "lower_right", "upper_left", "upper_right"] = Field(
+        default=False,
+        description="whether one circle at a corner is larger, and at which as printed; true: lower_left",
+        examples=[True],
+    )
 
 
 TargetSection: TypeAlias = Annotated[

@@ -82,7 +82,7 @@ def test_init_writes_a_rig_file_once(tmp_path: Path) -> None:
     assert f"Written to {rig}" in done.stdout
     written = rig.read_text(encoding="utf-8").splitlines()
     *said, call = done.stdout.split("take the mark TODO away:\n")[1].splitlines()
-    assert len(said) == sum("TODO" in line for line in written[2:])
+    assert len(said) == sum("TODO" in line for line in written[3:])
     for line in said:
         number, key = line.split(": ")[0].removeprefix("  line ").split(", ")
         assert written[int(number) - 1].strip().startswith(f"{key}:")

@@ -1,0 +1,163 @@
+"""The reference of rig files, as Markdown, made of their sections: every key, its unit, default and an example."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from gtsam_rwhec.rig.json_schema import detection_keys, json_schema
+from gtsam_rwhec.rig.rig import RigFile
+from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Intrinsics, PoseNoise, PoseSource, Sensor
+from gtsam_rwhec.rig.target_sections import TargetSection
+from gtsam_rwhec.vision.targets import FAMILIES
+
+#: Units that keys end with, longest first.
+UNITS = {
+    "_deg_s": "degrees/s", "_m_s": "m/s", "_deg": "degrees", "_mm": "mm", "_px": "pixels", "_m": "m", "_s": "s",
+}  # fmt: skip
+#: Before the tables.
+HEAD = """\
+# The rig file: every key
+
+<!-- Written by `gtsam-rwhec init --reference > docs/rig_file.md`: change the fields in gtsam_rwhec/rig. -->
+
+A rig file names the sensors and the targets, what carries them, and where the log or the folder has the data of each.
+[from_a_log.md](from_a_log.md) says how it is used; `gtsam-rwhec init LOG -o rig.yaml` writes a first one,
+`gtsam-rwhec init --template NAME -o rig.yaml` one of the usual cells.
+
+- It is YAML. A key that is not in the tables is an error that names the line and the nearest key.
+- No value is converted: `"0.1"` in quotes is text, and not a number.
+- A unit is the end of the key's name, as in `size_m`; else the table has it. Lengths of targets are in metres.
+- Frames are right-handed, and T_a_b maps coordinates in b to a. `[parent, child]` means poses T_parent_child.
+- **Every board is counted [across, down]**, as it is printed upright, and the key says what is counted: whole `squares`
+  of a ChArUco board, `inner_corners` of a checkerboard (one less than its squares each way), `tags`, `circles`.
+- Paths start from the rig file's folder; with images in a folder (`carriers.poses: {frames: ...}`), from that folder.
+- Editors complete and check with the JSON Schema, [rig_file.schema.json](../gtsam_rwhec/rig/rig_file.schema.json)
+  (`gtsam-rwhec init --schema` prints it). Rig files that `init` writes name it in their first line; in one of your own,
+  write `# yaml-language-server: $schema=PATH`.
+"""
+#: Sections with the path of their place; targets follow.
+SECTIONS: tuple[tuple[str, type[BaseModel]], ...] = (
+    ("carriers", Carriers),
+    ("carriers.poses", PoseSource),
+    ("carriers.noise", PoseNoise),
+    ("sensors.NAME", Sensor),
+    ("sensors.NAME.intrinsics", Intrinsics),
+)
+#: Sections that come after the targets.
+LAST: tuple[tuple[str, type[BaseModel]], ...] = (("noise", DetectionNoise), ("cleaning", Cleaning))
+
+
+def reference() -> str:
+    """The text of ``docs/rig_file.md``."""
+    definitions = json_schema()["$defs"]
+    parts = [HEAD, "## The file\n\n" + _table(RigFile, json_schema())]
+    for where, section in SECTIONS:
+        parts.append(f"## `{where}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
+    parts.append(
+        "## `targets.NAME`\n\nA target's frame has its origin in the middle of what is printed, x to the right, y up, "
+        "z towards who looks\nat it. `type` says which keys there are. Families of tags: "
+        + ", ".join(f"`{family}`" for family in FAMILIES)
+        + "."
+    )
+    for section in target_sections():
+        kind = get_args(section.model_fields["type"].annotation)[0]
+        parts.append(f"### `type: {kind}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
+    for where, section in LAST:
+        parts.append(f"## `{where}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
+    rows = [
+        (f"`{key}`", words, "number above 0", _unit(key), f"`{default:g}`", f"`{key}: {default:g}`")
+        for key, default, words in detection_keys()
+    ]
+    parts.append("## `detection`\n\nLimits beyond which a detection is not used.\n\n" + _markdown(rows))
+    return "\n".join(part.rstrip("\n") + "\n" for part in parts)
+
+
+def target_sections() -> tuple[type[BaseModel], ...]:
+    """The section of each type of target, in the order of `TargetSection`."""
+    return get_args(get_args(TargetSection)[0])
+
+
+def _about(section: type[BaseModel]) -> str:
+    return " ".join((section.__doc__ or "").split())
+
+
+def _table(section: type[BaseModel], schema: dict[str, Any]) -> str:
+    rows = []
+    for key, field in section.model_fields.items():
+        said = schema["properties"][key]
+        rows.append((
+            f"`{key}`", field.description or _kind(said), _kind(said), _unit(key, field), _default(field),
+            f"`{key}: {_shown(_example(said, field))}`",
+        ))  # fmt: skip
+    return _markdown(rows)
+
+
+def _markdown(rows: list[tuple[str, ...]]) -> str:
+    head = ("key", "is", "value", "unit", "default", "example")
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
+        for row in (head, ("---",) * len(head), *rows)
+    )
+
+
+def _unit(key: str, field: FieldInfo | None = None) -> str:
+    extra = field.json_schema_extra if field is not None else None
+    if isinstance(extra, dict) and "unit" in extra:
+        return str(extra["unit"])
+    return next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "must be given"
+    given = field.default
+    if isinstance(given, BaseModel):
+        given = {}
+    return "" if given is None or given == {} else f"`{_shown(given)}`"
+
+
+def _example(said: dict[str, Any], field: FieldInfo) -> Any:
+    if field.examples:
+        return field.examples[0]
+    return said.get("const", {})
+
+
+def _shown(value: Any) -> str:
+    """A value as YAML in one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_shown(item)}" for key, item in value.items()) + "}" if value else "..."
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_shown, value)) + "]"
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _kind(said: dict[str, Any]) -> str:
+    """What a value is, in words, from its schema."""
+    return " or ".join(dict.fromkeys(_kinds(said)))
+
+
+def _kinds(said: dict[str, Any]) -> Iterator[str]:
+    for choice in said.get("anyOf", said.get("oneOf", ())):
+        yield from _kinds(choice)
+    if "anyOf" in said or "oneOf" in said or said.get("type") == "null":
+        return
+    if "const" in said:
+        yield f"`{said['const']}`"
+    elif "enum" in said:
+        is_family = said["enum"] == list(FAMILIES)
+        yield "a family, see above" if is_family else ", ".join(f"`{name}`" for name in said["enum"])
+    elif said.get("type") == "array":
+        item = _kind(said["items"])
+        many = said.get("minItems")
+        yield f"[{', '.join([item] * many)}]" if many else f"list of {item}s"
+    elif "$ref" in said or said.get("type") == "object":
+        yield "section"
+    elif said.get("type") == "number":
+        yield "number" + (" above 0" if "exclusiveMinimum" in said else "")
+    else:
+        yield {"string": "text", "integer": "whole number", "boolean": "true or false"}[said["type"]]
