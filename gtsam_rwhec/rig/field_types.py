@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import AfterValidator, BeforeValidator, GetJsonSchemaHandler
+from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema
 
 from gtsam_rwhec.files.yaml_lines import shown
@@ -19,6 +21,11 @@ LONGEST_NAME = 100
 LONGEST_TEXT = 1000
 #: Seconds. Offsets are at most this, because larger offsets in nanoseconds do not fit into 64 bits.
 LARGEST_OFFSET_S = 4e9
+
+#: Units that keys end with, longest first.
+UNITS = {
+    "_deg_s": "degrees/s", "_m_s": "m/s", "_deg": "degrees", "_mm": "mm", "_px": "pixels", "_m": "m", "_s": "s",
+}  # fmt: skip
 
 
 class InSchema:
@@ -39,6 +46,23 @@ class OrText:
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         return {"anyOf": [{"type": "string", "minLength": 1, "description": self.words}, handler(core)]}
+
+
+def unit_of(key: str, field: FieldInfo | None = None) -> str:
+    """The unit of a key: the end of its name, or what its field states; empty if it has none."""
+    extra = field.json_schema_extra if field is not None else None
+    if isinstance(extra, dict) and "unit" in extra:
+        return str(extra["unit"])
+    return next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
+
+
+def in_yaml(value: Any) -> str:
+    """A value as YAML in one line, for pages and messages."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {in_yaml(item)}" for key, item in value.items()) + "}" if value else "..."
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(in_yaml, value)) + "]"
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def is_name(text: str) -> bool:

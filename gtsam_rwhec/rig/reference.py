@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from typing import Any, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from gtsam_rwhec.rig.field_types import in_yaml, unit_of
 from gtsam_rwhec.rig.json_schema import detection_keys, json_schema
 from gtsam_rwhec.rig.rig import RigFile
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Intrinsics, PoseNoise, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.targets import FAMILIES
 
-#: Units that keys end with, longest first.
-UNITS = {
-    "_deg_s": "degrees/s", "_m_s": "m/s", "_deg": "degrees", "_mm": "mm", "_px": "pixels", "_m": "m", "_s": "s",
-}  # fmt: skip
 #: Before the tables.
 HEAD = """\
 # The rig file: every key
@@ -70,7 +66,7 @@ def reference() -> str:
     for where, section in LAST:
         parts.append(f"## `{where}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
     rows = [
-        (f"`{key}`", words, "number above 0", _unit(key), f"`{default:g}`", f"`{key}: {default:g}`")
+        (f"`{key}`", words, "number above 0", unit_of(key), f"`{default:g}`", f"`{key}: {default:g}`")
         for key, default, words in detection_keys()
     ]
     parts.append("## `detection`\n\nLimits beyond which a detection is not used.\n\n" + _markdown(rows))
@@ -91,8 +87,8 @@ def _table(section: type[BaseModel], schema: dict[str, Any]) -> str:
     for key, field in section.model_fields.items():
         said = schema["properties"][key]
         rows.append((
-            f"`{key}`", field.description or _kind(said), _kind(said), _unit(key, field), _default(field),
-            f"`{key}: {_shown(_example(said, field))}`",
+            f"`{key}`", field.description or _kind(said), _kind(said), unit_of(key, field), _default(field),
+            f"`{key}: {in_yaml(_example(said, field))}`",
         ))  # fmt: skip
     return _markdown(rows)
 
@@ -105,35 +101,19 @@ def _markdown(rows: list[tuple[str, ...]]) -> str:
     )
 
 
-def _unit(key: str, field: FieldInfo | None = None) -> str:
-    extra = field.json_schema_extra if field is not None else None
-    if isinstance(extra, dict) and "unit" in extra:
-        return str(extra["unit"])
-    return next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
-
-
 def _default(field: FieldInfo) -> str:
     if field.is_required():
         return "must be given"
     given = field.default
     if isinstance(given, BaseModel):
         given = {}
-    return "" if given is None or given == {} else f"`{_shown(given)}`"
+    return "" if given is None or given == {} else f"`{in_yaml(given)}`"
 
 
 def _example(said: dict[str, Any], field: FieldInfo) -> Any:
     if field.examples:
         return field.examples[0]
     return said.get("const", {})
-
-
-def _shown(value: Any) -> str:
-    """A value as YAML in one line."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_shown(item)}" for key, item in value.items()) + "}" if value else "..."
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_shown, value)) + "]"
-    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _kind(said: dict[str, Any]) -> str:

@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
 from gtsam_rwhec.rig import sections, target_sections
+from gtsam_rwhec.rig.field_types import in_yaml, unit_of
 from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
 from gtsam_rwhec.rig.unfinished import todo_lines
 
@@ -149,8 +151,7 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
     if kind == "missing":
         model = _section(path[:-1], file.data)
         field = model.model_fields.get(str(path[-1])) if model else None
-        about = f": {field.description}" if field is not None and field.description else ""
-        return f"is missing{about}"
+        return f"is missing{'' if field is None else _about(str(path[-1]), field)}"
     if kind == "extra_forbidden":
         model = _section(path[:-1], file.data)
         counted = getattr(model, "counted", "")
@@ -171,6 +172,13 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
     if kind in _KINDS:
         return f"{shown(given)}; {_KINDS[kind]}"
     return str(context.get("error", fault["msg"]))
+
+
+def _about(key: str, field: FieldInfo) -> str:
+    """What a key is, its unit, and an example."""
+    unit = unit_of(key, field)
+    example = f", such as {key}: {in_yaml(field.examples[0])}" if field.examples else ""
+    return f": {field.description}{f', {unit}' if unit else ''}{example}" if field.description else ""
 
 
 def _counts_before(target: dict[str, Any], counted: str) -> str:

@@ -14,7 +14,7 @@ from gtsam_rwhec.rig.rig_file import MOST_FAULTS
 
 # What stands in place of what, the line that the message has, and its words.
 FAULTS = [
-    ("  sensors: hand", "  sensers: hand", 2, "carriers.sensors: is missing: the frame that carries the sensors,"),
+    ("  sensors: hand", "  sensers: hand", 2, "carriers.sensors: is missing: the frame that carries the sensors"),
     ("  sensors: hand", "  sensers: hand", 3, "carriers.sensers: unknown key; did you mean sensors?"),
     ("sizes: check", "size: check", 29, "size: unknown key; did you mean sizes?"),
     (
@@ -54,7 +54,12 @@ FAULTS = [
     ("max_gap_s: 0.3", "max_gap_s: .inf", 6, "carriers.max_gap_s: inf; give a finite number"),
     ("max_gap_s: 0.3", "max_gap_s: 1e999", 6, "carriers.max_gap_s: inf; give a finite number"),
     ("max_gap_s: 0.3", "max_gap_s: true", 6, "carriers.max_gap_s: true; give a number"),
-    ("rotation_deg: 0.02, ", "", 7, "carriers.noise.rotation_deg: is missing: standard deviation about each axis,"),
+    (
+        "rotation_deg: 0.02, ",
+        "",
+        7,
+        "carriers.noise.rotation_deg: is missing: standard deviation about each axis, degrees, such as",
+    ),
     ("cam_left:", "2cam:", 9, "sensors.2cam: '2cam' cannot be a frame's name: a name has first a letter, then"),
     ("cam_left:", "'../cam':", 9, "sensors.../cam: '../cam' cannot be a frame's name: a name has first a letter, then"),
     (
@@ -112,7 +117,12 @@ FAULTS = [
     ("size_m: 0.12", "size_m: 0", 25, "targets.tag_0.size_m: 0 is not a length; give metres, above 0"),
     ("size_m: 0.12", "size_m: -0.12", 25, "targets.tag_0.size_m: -0.12 is not a length; give metres, above 0"),
     ("size_m: 0.12", "size_m: 120mm", 25, "targets.tag_0.size_m: '120mm'; give a number"),
-    ("size_m: 0.12", "size_mm: 120", 25, "targets.tag_0.size_m: is missing: side of the black square, metres"),
+    (
+        "size_m: 0.12",
+        "size_mm: 120",
+        25,
+        "targets.tag_0.size_m: is missing: side of the black square, m, such as size_m: 0.12",
+    ),
     ("size_m: 0.12", "size_mm: 120", 25, "targets.tag_0.size_mm: unknown key; did you mean size_m?"),
     ("type: tag,", "type: aruco,", 25, "targets.tag_0.type: 'aruco'; give one of tag, charuco, aprilgrid,"),
     ("type: tag,", "type: [tag],", 25, "targets.tag_0.type: ['tag']; give one of tag, charuco, aprilgrid,"),
