@@ -38,9 +38,10 @@ def one_of(*choices: str | tuple[str, ...], together: tuple[tuple[str, ...], ...
 
     Of each tuple in `together`, the first key needs the others.
     """
-    required = [{"required": [keys] if isinstance(keys, str) else list(keys)} for keys in choices]
-    needs: dict[str, Any] = {"dependencies": {first: list(others) for first, *others in together}} if together else {}
-    return ConfigDict(json_schema_extra={"oneOf": required, **needs})
+    said: dict[str, Any] = {"oneOf": [{"required": [keys] if isinstance(keys, str) else [*keys]} for keys in choices]}
+    if together:
+        said["dependencies"] = {first: others for first, *others in together}
+    return ConfigDict(json_schema_extra=said)
 
 
 class PoseNoise(Section):
