@@ -31,7 +31,7 @@ def init(
     if schema + reference + (log is not None) != 1:
         raise typer.BadParameter("give one of: a log, --schema, --reference")
     if log is None:
-        typer.echo(rw.rig.schema_text() if schema else rw.rig.reference(), nl=False)
+        typer.echo(rw.rig.schema_text() if schema else rw.rig.reference_text(), nl=False)
         return ExitStatus.DONE
     if output.exists():
         raise FileFormatError(f"{output} exists already, perhaps with your changes. Give another name with -o.")

@@ -6,10 +6,10 @@ from .rig import Rig as Rig
 from .rig_file import parse_rig as parse_rig
 from .rig_file import read_rig as read_rig
 from .json_schema import SCHEMA_FILE as SCHEMA_FILE
-from .json_schema import json_schema as json_schema
+from .json_schema import rig_file_schema as rig_file_schema
 from .json_schema import schema_text as schema_text
 from .json_schema import editor_line as editor_line
-from .reference import reference as reference
+from .reference import reference_text as reference_text
 from .unfinished import TodoLine as TodoLine
 from .unfinished import todo_lines as todo_lines
 

@@ -35,7 +35,7 @@ class _Draft07(GenerateJsonSchema):
         return False
 
 
-def json_schema() -> dict[str, Any]:
+def rig_file_schema() -> dict[str, Any]:
     """The JSON Schema of rig files, of draft 07.
 
     It knows every key, its type, its limits, and which keys exclude or need each other within a section. Faults between
@@ -55,7 +55,7 @@ def json_schema() -> dict[str, Any]:
 
 def schema_text() -> str:
     """The content of `SCHEMA_FILE`."""
-    return json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
+    return json.dumps(rig_file_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
 def editor_line() -> str:

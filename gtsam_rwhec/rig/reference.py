@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from gtsam_rwhec.rig.field_types import in_yaml, unit_of
-from gtsam_rwhec.rig.json_schema import detection_keys, json_schema
+from gtsam_rwhec.rig.json_schema import detection_keys, rig_file_schema
 from gtsam_rwhec.rig.rig import RigFile
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Intrinsics, PoseNoise, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
@@ -48,10 +48,10 @@ SECTIONS: tuple[tuple[str, type[BaseModel]], ...] = (
 LAST: tuple[tuple[str, type[BaseModel]], ...] = (("noise", DetectionNoise), ("cleaning", Cleaning))
 
 
-def reference() -> str:
+def reference_text() -> str:
     """The text of ``docs/rig_file.md``."""
-    definitions = json_schema()["$defs"]
-    parts = [HEAD, "## The file\n\n" + _table(RigFile, json_schema())]
+    definitions = rig_file_schema()["$defs"]
+    parts = [HEAD, "## The file\n\n" + _table(RigFile, rig_file_schema())]
     for where, section in SECTIONS:
         parts.append(f"## `{where}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
     parts.append(

@@ -13,9 +13,9 @@ from rig_texts import FULL, MINIMAL
 
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import parse_yaml
-from gtsam_rwhec.rig import SCHEMA_FILE, editor_line, json_schema, parse_rig, schema_text
+from gtsam_rwhec.rig import SCHEMA_FILE, editor_line, parse_rig, rig_file_schema, schema_text
 
-VALIDATOR = jsonschema.Draft7Validator(json_schema())
+VALIDATOR = jsonschema.Draft7Validator(rig_file_schema())
 FOLDER = """\
 carriers: {sensors: base, targets: hand, poses: {frames: [base, hand], euler: ZYX, angles: degrees, length: mm}}
 sensors:
@@ -44,7 +44,7 @@ def lists(node: Any) -> Any:
 
 
 def test_the_schema_is_one_and_its_file_is_up_to_date() -> None:
-    jsonschema.Draft7Validator.check_schema(json_schema())
+    jsonschema.Draft7Validator.check_schema(rig_file_schema())
     said = "the fields changed: gtsam-rwhec init --schema > gtsam_rwhec/rig/rig_file.schema.json"
     assert SCHEMA_FILE.read_text(encoding="utf-8") == schema_text(), said
     assert editor_line().endswith("/gtsam_rwhec/rig/rig_file.schema.json\n")
@@ -102,7 +102,7 @@ def test_what_is_wrong_is_refused_as_reading_refuses_it(text: str, right: str, w
 
 
 def test_every_example_is_valid_where_it_stands() -> None:
-    schema = json_schema()
+    schema = rig_file_schema()
     checked = 0
 
     def walk(node: dict[str, Any]) -> None:

@@ -6,19 +6,19 @@ import re
 
 from places import REPOSITORY
 
-from gtsam_rwhec.rig import reference
-from gtsam_rwhec.rig.json_schema import json_schema
+from gtsam_rwhec.rig import reference_text
+from gtsam_rwhec.rig.json_schema import rig_file_schema
 from gtsam_rwhec.rig.reference import target_sections
 
 
 def test_the_page_is_up_to_date() -> None:
     said = "the fields changed: gtsam-rwhec init --reference > docs/rig_file.md"
-    assert (REPOSITORY / "docs" / "rig_file.md").read_text(encoding="utf-8") == reference(), said
+    assert (REPOSITORY / "docs" / "rig_file.md").read_text(encoding="utf-8") == reference_text(), said
 
 
 def test_every_key_has_a_row_with_words_and_an_example() -> None:
-    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", reference(), re.MULTILINE)
-    schema = json_schema()
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", reference_text(), re.MULTILINE)
+    schema = rig_file_schema()
     keys = [key for section in (schema, *schema["$defs"].values()) for key in section["properties"]]
     keys += schema["properties"]["detection"]["properties"]
     assert sorted(key for key, _ in rows) == sorted(keys)
