@@ -39,10 +39,10 @@ A rig file names the sensors and the targets, what carries them, and where the l
 #: Sections with the path of their place; targets follow.
 SECTIONS: tuple[tuple[str, type[BaseModel]], ...] = (
     ("carriers", Carriers),
-    ("carriers.poses", PoseSource),
-    ("carriers.noise", PoseNoise),
-    ("sensors.NAME", Sensor),
-    ("sensors.NAME.intrinsics", Intrinsics),
+    ("carriers: poses", PoseSource),
+    ("carriers: noise", PoseNoise),
+    ("sensors: NAME", Sensor),
+    ("sensors: NAME: intrinsics", Intrinsics),
 )
 #: Sections that come after the targets.
 LAST: tuple[tuple[str, type[BaseModel]], ...] = (("noise", DetectionNoise), ("cleaning", Cleaning))
@@ -55,7 +55,7 @@ def reference_text() -> str:
     for where, section in SECTIONS:
         parts.append(f"## `{where}`\n\n{_about(section)}\n\n{_table(section, definitions[section.__name__])}")
     parts.append(
-        "## `targets.NAME`\n\nA target's frame has its origin in the middle of what is printed, x to the right, y up, "
+        "## `targets: NAME`\n\nA target's frame has its origin in the middle of what is printed, x to the right, y up, "
         "z towards who looks\nat it. `type` says which keys there are. Families of tags: "
         + ", ".join(f"`{family}`" for family in FAMILIES)
         + "."
