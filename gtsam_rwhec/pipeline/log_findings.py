@@ -27,8 +27,44 @@ def is_of_the_poses(misreadings: Sequence[Misreading]) -> bool:
 
 
 def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading, ...]:
-    """The misreadings with the cure for a log: the line of the rig file to change, or the messages that are wrong."""
-    return tuple(replace(one, cure=_cure(one, rig)) for one in misreadings)
+    """The misreadings with the cure for a log: the line of the rig file to change, or the messages that are wrong.
+
+    Carriers that are exchanged in the rig file make A the inverse of what it says. For one target in one sensor that is
+    the same as B inverted, so this is not said beside it.
+    """
+    exchanged = [one for one in misreadings if _is_exchange(one, rig)]
+    said = [replace(one, likely=_exchange(rig), cure=_unless_carried(rig)) for one in exchanged[:1]]
+    is_B = [one.mistake is Mistake.INVERTED and bool(exchanged) for one in misreadings]
+    others = [one for one, left_out in zip(misreadings, is_B, strict=True) if one not in exchanged and not left_out]
+    return (*said, *(replace(one, cure=_cure(one, rig)) for one in others))
+
+
+def _is_exchange(misreading: Misreading, rig: Rig) -> bool:
+    """Whether exchanged carriers explain it. What this library detects in images is never inverted."""
+    if misreading.mistake is Mistake.INVERTED and "A is inverted" in misreading.likely:
+        return True
+    from_images = all(sensor.images is not None for sensor in rig.sensors.values())
+    return from_images and misreading.mistake in (Mistake.INVERTED, Mistake.ROLES_EXCHANGED)
+
+
+def _exchange(rig: Rig) -> str:
+    place = rig.source.place(("carriers", "sensors"), ("carriers", "targets"))
+    return f"exchange `sensors` and `targets` in the rig file ({place})"
+
+
+def _unless_carried(rig: Rig) -> str:
+    """The other cure, where the carriers are as the rig file says, and their poses are the inverse of what it says."""
+    carriers, place = rig.carriers, rig.source.place
+    parent, child = carriers.poses.parent_and_child
+    if carriers.poses.frames is not None:
+        key = place(("carriers", "poses"))
+        cure = f"the files have T_{child}_{parent}: write frames: [{child}, {parent}] ({key})"
+    elif carriers.poses.topic is not None:
+        key = place(("carriers", "poses", "parent"))
+        cure = f"topic {carriers.poses.topic} has poses of {parent} in {child}: exchange parent and child in {key}"
+    else:
+        cure = f"what publishes tf writes the inverse of T_{parent}_{child}"
+    return f"or, if {carriers.sensors} does carry the sensors, {cure}"
 
 
 def with_cures(findings: Sequence[Finding], before: tuple[Misreading, ...], rig: Rig) -> tuple[Finding, ...]:
@@ -51,22 +87,10 @@ def not_of_marked_outliers(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 
 def _cure(misreading: Misreading, rig: Rig) -> str:
-    carriers, place = rig.carriers, rig.source.place
-    of_A = "A is inverted" in misreading.likely
-    if carriers.poses.frames is not None and (cure := _cure_of_files(misreading.mistake, of_A, rig)):
-        return cure
-    if misreading.mistake is Mistake.INVERTED and of_A:
-        parent, child = carriers.poses.parent_and_child
-        exchange = (
-            f"if {carriers.targets} carries the sensors, exchange the two names in "
-            f"{place(('carriers', 'sensors'), ('carriers', 'targets'))}"
-        )
-        if carriers.poses.topic is not None:
-            return (
-                f"{exchange}; if it does not, topic {carriers.poses.topic} has poses of {parent} in {child}: exchange "
-                f"parent and child in {place(('carriers', 'poses', 'parent'))}"
-            )
-        return f"{exchange}; if it does not, what publishes tf writes the inverse of T_{parent}_{child}"
+    place = rig.source.place
+    also = f"; {_exchange(rig)}" if "A is inverted" in misreading.likely else ""
+    if rig.carriers.poses.frames is not None and (cure := _cure_of_files(misreading.mistake, rig)):
+        return cure + also
     if misreading.mistake is Mistake.INVERTED:
         topics = ", ".join(sensor.detections for sensor in rig.sensors.values() if sensor.detections is not None)
         return f"let the driver publish the target's pose in the sensor's frame (topics {topics})" if topics else (
@@ -81,24 +105,16 @@ def _cure(misreading: Misreading, rig: Rig) -> str:
             "length or the focal lengths are wrong"
         )
     if misreading.mistake is Mistake.QUATERNION_ORDER:
-        return "ROS and Foxglove messages have quaternions as x, y, z, w: correct what publishes these poses"
+        return f"ROS and Foxglove messages have quaternions as x, y, z, w: correct what publishes these poses{also}"
     return misreading.cure
 
 
-def _cure_of_files(mistake: Mistake, of_A: bool, rig: Rig) -> str:
+def _cure_of_files(mistake: Mistake, rig: Rig) -> str:
     """The cure where the carriers' poses are in files beside images; empty where it is the same as for a log."""
-    carriers, place = rig.carriers, rig.source.place
-    poses, key = carriers.poses, place(("carriers", "poses"))
+    poses, key = rig.carriers.poses, rig.source.place(("carriers", "poses"))
     if mistake is Mistake.QUATERNION_ORDER:
         other = "xyzw" if poses.quaternion == "wxyz" else "wxyz"
         return f"write quaternion: {other} beside the frames ({key}); where the files name their columns, rename those"
-    if mistake is Mistake.INVERTED and of_A:
-        parent, child = poses.parent_and_child
-        return (
-            f"if {carriers.targets} carries the sensors, exchange the two names in "
-            f"{place(('carriers', 'sensors'), ('carriers', 'targets'))}; if it does not, the files have "
-            f"T_{child}_{parent}: write frames: [{child}, {parent}] ({key})"
-        )
     if mistake is Mistake.ROWS_SHIFTED and all(sensor.time_offset == 0.0 for sensor in rig.sensors.values()):
         paths = ", ".join(f"{sensor.images} with {sensor.poses}" for sensor in rig.sensors.values())
         return (

@@ -11,11 +11,13 @@ import pytest
 import synthetic_logs as made
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.misreadings import Misreading
+from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.calibration.task_units import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.pipeline.all_stages import calibrate_log
-from gtsam_rwhec.pipeline.log_findings import known_to_nothing, not_of_marked_outliers
+from gtsam_rwhec.pipeline.log_findings import in_rig_file, known_to_nothing, not_of_marked_outliers
 from gtsam_rwhec.rig import parse_rig
 
 EXCHANGED = made.RIG.replace("sensors: hand", "sensors: base").replace("targets: base", "targets: hand")
@@ -34,10 +36,14 @@ def test_exchanged_carriers_are_named_with_their_lines_though_clocks_are_estimat
     judgement = judged(tmp_path, made.recording(6.0), text.replace("sizes: known", "sizes: check"))
     assert judgement.verdict is rw.Verdict.DO_NOT_USE
     said = str(judgement)
-    assert said.startswith("Do not use these poses: A is inverted (the poses of the base and the hand are exchanged)")
-    assert "deg and" in said.split("the median residual is ")[1].split(" as read, and ")[0]
     rig = tmp_path / "rig.yaml"
-    assert f"if hand carries the sensors, exchange the two names in {rig}, lines 2 and 3: carriers.sensors" in said
+    assert said.startswith(
+        "Do not use these poses: exchange `sensors` and `targets` in the rig file "
+        f"({rig}, lines 2 and 3: carriers.sensors and carriers.targets): the median residual is "
+    )
+    assert "inverted" not in said
+    assert "deg and" in said.split("the median residual is ")[1].split(" as read, and ")[0]
+    assert "or, if base does carry the sensors, what publishes tf writes the inverse of T_base_hand" in said
     assert "contradict" not in said
     assert judgement.grounds == (Ground.MISREAD,)
 
@@ -56,6 +62,7 @@ def test_poses_of_a_topic_that_are_the_inverse_of_what_the_rig_file_says(tmp_pat
     judgement = judged(tmp_path, messages, text)
     assert judgement.verdict is rw.Verdict.DO_NOT_USE
     said = str(judgement)
+    assert "exchange parent and child in" in said
     assert "rig.yaml, line 4: carriers.poses.parent" in said
 
 
@@ -138,3 +145,25 @@ def test_points_that_are_known_to_nothing_are_no_success_and_others_are() -> Non
     assert found.ground.verdict is rw.Verdict.DO_NOT_USE
     assert found.words.startswith("a point 1.50 m from cam_1 is known to 870 mm only")
     assert "(rig.yaml, line 9: sensors.cam_1.intrinsics)" in found.words
+
+
+@pytest.mark.parametrize("found", [("A is inverted",), ("B is inverted",), ("A is inverted", "B is inverted")], ids=str)
+def test_in_images_an_inverse_is_an_exchange(found: tuple[str, ...]) -> None:
+    """For one board in one camera A inverted is B inverted; and what is found in images is not inverted."""
+    camera = "images: /cam_{0}/image\n    intrinsics: {{K: [400, 400, 320, 240], size: [640, 480]}}"
+    rig = parse_rig(made.rig_text(cam_0=camera.format(0), cam_1=camera.format(1)), "rig.yaml")
+    given = [Misreading(Mistake.INVERTED, likely, "", (9.0, 1.0), (9.0, 1.0)) for likely in found]
+    (said,) = in_rig_file(given, rig)
+    assert str(said).startswith("exchange `sensors` and `targets` in the rig file (rig.yaml, lines 2 and 3: ")
+    assert "inverted" not in str(said)
+
+
+def test_other_readings_are_said_beside_an_exchange() -> None:
+    rig = parse_rig(made.RIG, "rig.yaml")
+    given = [
+        Misreading(mistake, likely, "", (9.0, 1.0), (9.0, 1.0))
+        for mistake, likely in ((Mistake.QUATERNION_ORDER, "quaternions"), (Mistake.INVERTED, "A is inverted"))
+    ]
+    assert [one.mistake for one in in_rig_file(given, rig)] == [Mistake.INVERTED, Mistake.QUATERNION_ORDER]
+    (of_B,) = in_rig_file([replace(given[1], likely="B is inverted")], rig)
+    assert of_B.cure.startswith("let the driver publish the target's pose")
