@@ -107,6 +107,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/pipeline": {
         "pipeline/test_all_stages.py": "image_options",
+        "pipeline/test_seen_sheet.py": "detected_source image_names",
         "pipeline/test_bad_logs.py": "no_detections",
         "pipeline/test_log_findings.py": "output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",
@@ -164,10 +165,10 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/trajectories": {"trajectories/test_trajectory.py": "local_paths"},
     "gtsam_rwhec/vision": {
-        "pipeline/test_commands.py": "drawn_detections",
         "vision/test_ambiguity.py": "agreement",
         "vision/test_camera.py": "distortion",
         "vision/test_circle_grids.py": "circle_centres",
+        "vision/test_contact_sheet.py": "picture_text",
         "vision/test_detection.py": "options rejection",
         "vision/test_edges.py": "edge_geometry edge_profiles",
         "vision/test_images.py": "image_sizes",

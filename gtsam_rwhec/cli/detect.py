@@ -1,41 +1,79 @@
-"""``gtsam-rwhec detect``: the first stage of a log's calibration."""
+"""``gtsam-rwhec detect``: the first stage of a calibration from images."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
-from gtsam_rwhec.cli.options import ImagesOption, LogArgument, McapOption, WorkersOption
+from gtsam_rwhec.cli.options import ImagesOption, McapOption, WorkersOption
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.terminal_text import say, shown_path
+
+if TYPE_CHECKING:
+    from gtsam_rwhec.results.log_history import DetectionReport
 
 
 def detect(
-    log: LogArgument,
+    source: Annotated[
+        Path, typer.Argument(help="MCAP file, folder of MCAP files (a ROS 2 bag), or folder of images with poses.")
+    ],
     rig: Annotated[Path, typer.Option(help="Rig file (YAML).")],
     output: McapOption,
     images: ImagesOption = False,
     draw: Annotated[Path | None, typer.Option(help="Folder for pictures: each image with its detections.")] = None,
     workers: WorkersOption = None,
 ) -> ExitStatus:
-    """First stage: find the targets in the images and compute their poses."""
-    with StageDisplay() as stage:
-        sources = rw.rig.read_rig(rig)
-        if draw is not None:
-            rw.pipeline.check_drawable(sources, draw)
-        report = rw.pipeline.detect_log(
-            log, sources, output, images="copy" if images else "leave_out", workers=workers, progress=stage
-        )
-        used = sum(track.used for track in report.tracks)
-        rejected = sum(track.seen for track in report.tracks) - used
-        say(
-            f"Written to {shown_path(output)}: {used} detections to use, and {rejected} rejected ones with the reasons."
-        )
-        if draw is not None:
-            say(f"Written to {shown_path(draw)}: {rw.pipeline.draw_log(log, output, draw, progress=stage)} pictures.")
-        say(f"Next: gtsam-rwhec clean {shown_path(output)} -o cleaned.mcap")
+    """First stage: find the targets in the images and compute their poses.
+
+    A contact sheet beside the log that is written (OUTPUT.seen.png) shows some of the images with what was found,
+    rejected and not seen; --draw draws all of them. Both are written where no target was found, too.
+    """
+    try:
+        with StageDisplay() as stage:
+            report = rw.pipeline.detect_source(
+                source,
+                rw.rig.read_rig(rig),
+                output,
+                images="copy" if images else "leave_out",
+                workers=workers,
+                draw=draw,
+                progress=stage,
+            )
+    except RwhecError:
+        _say_pictures(output, draw)
+        raise
+    used = sum(track.used for track in report.tracks)
+    rejected = sum(track.seen for track in report.tracks) - used
+    for sensor, count in report.images.items():
+        say(f"{sensor}: {count} images or messages; {_in_words(report, sensor)}")
+    say(f"Written to {shown_path(output)}: {used} detections to use, and {rejected} rejected ones with the reasons.")
+    _say_pictures(output, draw)
+    say(f"Next: gtsam-rwhec clean {shown_path(output)} -o cleaned.mcap")
     return ExitStatus.DONE
+
+
+def _in_words(report: DetectionReport, sensor: str) -> str:
+    """What became of the targets in a sensor's images."""
+    tracks = [track for track in report.tracks if track.sensor == sensor]
+    said = [
+        f"{track.target} {track.used} to use" + "".join(f", {count} {why}" for why, count in track.removed.items())
+        for track in tracks
+    ]
+    faults = report.undecoded.get(sensor, ())
+    if faults:
+        said.append(f"{len(faults)} images not usable, the first: {faults[0]}")
+    return "; ".join(said) or "no target seen"
+
+
+def _say_pictures(output: Path, draw: Path | None) -> None:
+    """Name the pictures that there are."""
+    sheet = rw.pipeline.sheet_beside(output)
+    if sheet.exists():
+        say(f"Contact sheet: {shown_path(sheet)}")
+    if draw is not None and draw.is_dir():
+        say(f"Pictures of each image: {shown_path(draw)}")

@@ -6,6 +6,8 @@ from .all_stages import calibrate_log as calibrate_log
 from .all_stages import export_solved as export_solved
 from .all_stages import solve_into as solve_into
 from .cleaning_stage import clean_log as clean_log
+from .detected_source import detect_source as detect_source
+from .detected_source import sheet_beside as sheet_beside
 from .detection_stage import detect_log as detect_log
 from .detections_in_images import draw_log as draw_log
 from .folder_log import is_folder_of_images as is_folder_of_images

@@ -25,6 +25,7 @@ from gtsam_rwhec.pipeline.log_contract import (
     PLOTS_FOLDER,
     RECORDED_LOG,
     RESULT_FILE,
+    SEEN_SHEET,
     is_from_stage,
 )
 from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig
@@ -37,7 +38,7 @@ from gtsam_rwhec.results.written_result import write_calibration
 from gtsam_rwhec.rig import Rig
 
 #: Names of all that `calibrate_log` leaves in its folder.
-OUTPUTS = (CLEAN_LOG, RESULT_FILE, *FILES, PLOTS_FOLDER)
+OUTPUTS = (CLEAN_LOG, RESULT_FILE, *FILES, SEEN_SHEET, PLOTS_FOLDER)
 
 
 @one_blas_thread()
@@ -54,9 +55,10 @@ def calibrate_log(
     """Detect, clean, solve and export: from a log and a rig file to a folder with the calibration.
 
     The folder gets ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``,
-    ``camchain.yaml`` and ``plots/``. During the work it has a ``detected.mcap`` too. To go on after an interruption,
-    give ``detected.mcap`` as the log. For a log that a stage wrote, only the stages after it run. A cleaned log is
-    cleaned again if the settings for cleaning in `rig` differ from those that the log was cleaned with.
+    ``camchain.yaml``, ``seen.png`` (a contact sheet of the images) and ``plots/``. During the work it has a
+    ``detected.mcap`` too. To go on after an interruption, give ``detected.mcap`` as the log. For a log that a stage
+    wrote, only the stages after it run. A cleaned log is cleaned again if the settings for cleaning in `rig` differ
+    from those that the log was cleaned with.
 
     Parameters
     ----------
@@ -105,7 +107,7 @@ def calibrate_log(
     out = made_output_folder(out)
     if is_raw:
         assert rig is not None
-        detect_log(log_path, rig, detected, images=images, workers=workers, progress=progress)
+        detect_log(log_path, rig, detected, images=images, workers=workers, sheet=out / SEEN_SHEET, progress=progress)
         source = detected
     if not is_cleaned:
         clean_log(source, clean, rig, images=images, progress=progress)

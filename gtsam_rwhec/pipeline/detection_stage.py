@@ -13,14 +13,16 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
+from gtsam_rwhec.pipeline.detections_in_images import draw_images
 from gtsam_rwhec.pipeline.driver_detections import read_driver_detections
 from gtsam_rwhec.pipeline.image_detections import detect_in_log
-from gtsam_rwhec.pipeline.image_options import check_image_options
+from gtsam_rwhec.pipeline.image_options import check_drawable, check_image_options
 from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
 from gtsam_rwhec.pipeline.log_contract import annotations_topic, detections_topic, poses_topic, raw_topics
 from gtsam_rwhec.pipeline.log_metadata import LogMetadata
 from gtsam_rwhec.pipeline.no_detections import no_detections
 from gtsam_rwhec.pipeline.output_paths import check_is_not_read, check_writable
+from gtsam_rwhec.pipeline.seen_sheet import write_contact_sheet
 from gtsam_rwhec.pipeline.sensor_detections import detection_report
 from gtsam_rwhec.pipeline.topics_of_rig import check_topics
 from gtsam_rwhec.results.log_history import DetectionReport
@@ -35,6 +37,8 @@ def detect_log(
     *,
     images: Images = "leave_out",
     workers: int | None = None,
+    sheet: str | Path | None = None,
+    draw: str | Path | None = None,
     progress: Progress | None = None,
 ) -> DetectionReport:
     """Detect the targets, and write a log with the detections.
@@ -54,12 +58,15 @@ def detect_log(
         Whether the written log has the images too.
     workers : int, optional
         Threads, and for long logs processes; by default one for each core.
+    sheet, draw : path, optional
+        A PNG file for a contact sheet of the images, and a folder for a picture of each: written also where no target
+        was detected. A sheet needs images; without any it is not written.
     progress : callable, optional
 
     Raises
     ------
     OptionError
-        `workers` is given, and no sensor has images; or ``images="copy"``, and the log has none.
+        `workers` or `draw` is given, and no sensor has images; or ``images="copy"``, and the log has none.
     LogError, StampError, TransformError, CameraError, FrameError
         The log lacks a topic of the rig file or the carriers' poses, or no target was detected.
     """
@@ -69,6 +76,8 @@ def detect_log(
         check_is_not_read(log, out_path)
         check_image_options(log, rig, images=images, workers=workers)
         check_topics(log, rig)
+        if draw is not None:
+            check_drawable(rig, draw)
         cameras = read_intrinsics(log, rig)
         tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
         motion = read_carrier_motion(log, rig)
@@ -77,6 +86,11 @@ def detect_log(
             if source.detections is not None:
                 found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))
         report = detection_report(log, rig, found)
+        if sheet is not None:
+            tell("drawing the contact sheet")
+            write_contact_sheet(Path(sheet), log, rig, cameras, found)
+        if draw is not None:
+            draw_images(log, rig, cameras, {sensor: of.records for sensor, of in found.items()}, draw, tell)
         if not any(track.used for track in report.tracks):
             raise LogError(no_detections(log, rig, report))
         tell("writing detections")

@@ -18,7 +18,7 @@ from gtsam_rwhec.errors import LogError, RwhecError
 from gtsam_rwhec.export.files import FILES
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, PLOTS_FOLDER, RESULT_FILE
+from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, PLOTS_FOLDER, RESULT_FILE, SEEN_SHEET
 from gtsam_rwhec.pipeline.log_metadata import read_metadata
 from gtsam_rwhec.pipeline.output_paths import made_folder
 from gtsam_rwhec.pipeline.solution_plots import COVERAGE, DEVIATIONS, FRAMES, RESIDUALS
@@ -32,6 +32,7 @@ _NAMING_THE_LOG = (RESULT_FILE, CLEAN_LOG, DETECTED_LOG)
 _WRITTEN = (
     *_NAMING_THE_LOG,
     *FILES,
+    SEEN_SHEET,
     *(f"{PLOTS_FOLDER}/{name}" for name in (FRAMES, RESIDUALS, COVERAGE, DEVIATIONS)),
 )
 

@@ -44,6 +44,8 @@ DETECTED_LOG = "detected.mcap"
 CLEAN_LOG = "clean.mcap"
 #: The result's file in the output folder has this name, and so has its copy attached to the solved log.
 RESULT_FILE = "result.json"
+#: The contact sheet of the images in the output folder: what was found, and what was not.
+SEEN_SHEET = "seen.png"
 #: The pictures are in this folder of the output folder.
 PLOTS_FOLDER = "plots"
 

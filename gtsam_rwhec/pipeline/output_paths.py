@@ -9,7 +9,7 @@ from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export.files import FILES
 from gtsam_rwhec.files.atomic_write import why_not_writable
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, PLOTS_FOLDER, RESULT_FILE
+from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, PLOTS_FOLDER, RESULT_FILE, SEEN_SHEET
 
 
 def check_writable(path: str | Path) -> None:
@@ -39,7 +39,7 @@ def made_folder(path: str | Path) -> Path:
 def made_output_folder(path: str | Path) -> Path:
     """As `made_folder`, for all files of a calibration: whatever could not be replaced at its end is told before it."""
     path = made_folder(path)
-    for name in (DETECTED_LOG, RESULT_FILE, *FILES):
+    for name in (DETECTED_LOG, RESULT_FILE, *FILES, SEEN_SHEET):
         check_writable(path / name)
     plots = path / PLOTS_FOLDER
     if plots.is_dir():

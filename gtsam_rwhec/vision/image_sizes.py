@@ -11,8 +11,8 @@ import struct
 from collections.abc import Callable
 
 #: Files begin with these bytes.
-PNG = b"\x89PNG\r\n\x1a\n"
-_JPEG, _BMP, _RIFF = b"\xff\xd8", b"BM", b"RIFF"
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_BMP, _RIFF = b"BM", b"RIFF"
 #: These chunks of a PNG make its pixels.
 _PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
@@ -34,7 +34,7 @@ def stated_size(data: bytes) -> Size | None:
     """(width, height) in pixels of a PNG, JPEG, WebP, TIFF or BMP file; None for another file or a broken header."""
     readers: list[tuple[bool, Callable[[bytes], Size | None]]] = [
         (data.startswith(PNG), _png),
-        (data.startswith(_JPEG), _jpeg),
+        (data.startswith(JPEG), _jpeg),
         (data.startswith(_RIFF) and data[8:12] == b"WEBP", _webp),
         (data[:4] in _TIFF, _tiff),
         (data.startswith(_BMP), _bmp),
@@ -111,7 +111,7 @@ def bytes_a_pixel(data: bytes) -> int:
 
 def jpeg_scans(data: bytes) -> int:
     """How many scans a JPEG has, with those of its thumbnails; none for another file."""
-    return data.count(b"\xff\xda") if data.startswith(_JPEG) else 0
+    return data.count(b"\xff\xda") if data.startswith(JPEG) else 0
 
 
 def is_whole_png(data: bytes) -> bool:

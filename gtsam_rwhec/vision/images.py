@@ -11,6 +11,7 @@ from gtsam_rwhec.files.budgets import SCANS, pixel_budget
 from gtsam_rwhec.logs.records import ImageRecord
 from gtsam_rwhec.vision.camera import MOST_PIXELS
 from gtsam_rwhec.vision.image_sizes import (
+    JPEG,
     PNG,
     Size,
     bytes_a_pixel,
@@ -34,6 +35,13 @@ _RAW: dict[str, tuple[int, int, int | None]] = {
     "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2GRAY_YUY2), "yuyv": (2, 1, cv2.COLOR_YUV2GRAY_YUY2),
 }  # fmt: skip
 RAW_ENCODINGS = tuple(_RAW)
+#: Intrinsics are for the pixels as recorded: EXIF's orientation is ignored. More than 8 bits are kept until they are
+#: scaled.
+_WHOLE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+#: Parts of its size at which a JPEG can be decoded.
+_REDUCED = {
+    8: cv2.IMREAD_REDUCED_GRAYSCALE_8, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4, 2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
+}  # fmt: skip
 #: Pixels are scaled to 8 bits in pieces of about this many.
 _PIECE = 1 << 20
 
@@ -59,6 +67,22 @@ def decode_gray(image: ImageRecord, size: Size | None = None) -> Gray:
     return gray
 
 
+def decode_small(image: ImageRecord, width: int) -> Gray:
+    """Pixels, 8 bits, of a small picture of so many columns; a JPEG is decoded at a part of its size, which is faster.
+
+    Raises
+    ------
+    ImageError
+        As `decode_gray`.
+    """
+    where = f"topic {image.topic}, image at {image.stamp_ns} ns"
+    size = stated_size(image.data) if image.is_compressed and image.data.startswith(JPEG) else None
+    part = 1 if size is None else next((part for part in _REDUCED if size[0] >= part * width), 1)
+    gray = decode_gray(image) if part == 1 else _compressed(image, where, None, _REDUCED[part])
+    height = max(1, round(gray.shape[0] * width / gray.shape[1]))
+    return np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
 def _check_size(where: str, found: Size, wanted: Size | None) -> None:
     if wanted is not None and found != wanted:
         raise ImageError(
@@ -66,7 +90,7 @@ def _check_size(where: str, found: Size, wanted: Size | None) -> None:
         )
 
 
-def _compressed(image: ImageRecord, where: str, wanted: Size | None) -> Gray:
+def _compressed(image: ImageRecord, where: str, wanted: Size | None, flags: int = _WHOLE) -> Gray:
     begins, claims = image.data[:8].hex(), image.encoding[:40]
     what = f"{where}: {len(image.data)} bytes that begin with {begins} and claim to be {claims!r}"
     size = stated_size(image.data)
@@ -84,10 +108,8 @@ def _compressed(image: ImageRecord, where: str, wanted: Size | None) -> Gray:
     if jpeg_scans(image.data) > SCANS:
         raise ImageError(f"{where}: a JPEG of {jpeg_scans(image.data)} scans, more than the {SCANS} that are decoded")
     buffer = np.frombuffer(with_pixels_only(image.data), dtype=np.uint8)
-    # Intrinsics are for the pixels as recorded: ignore EXIF's orientation. Keep more than 8 bits until they are scaled.
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        gray = cv2.imdecode(buffer, flags)
+        gray = cv2.imdecode(buffer, flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:  # OpenCV 4 and 5 raise for some broken images and return None for others
         gray = None
     if gray is None:

@@ -45,7 +45,7 @@ def refused(folder: Path, messages: Iterable[Message], kind: type[RwhecError], *
     for word in words:
         assert word in str(caught.value), f"{word!r} is not in: {caught.value}"
     left = {path.name for path in (folder / "out").rglob("*")}
-    assert left <= {"detected.mcap"}  # a whole stage, from which to go on
+    assert left <= {"detected.mcap", "seen.png"}  # a whole stage, from which to go on, and what was seen
     return str(caught.value)
 
 

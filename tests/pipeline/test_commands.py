@@ -54,7 +54,8 @@ def test_stage_by_stage(log: Path, tmp_path: Path) -> None:
 
     said = run("detect", log, "--rig", rig, "-o", detected, "--draw", tmp_path / "drawn", "--images").stdout
     assert "detections to use" in said
-    assert f"{2 * IMAGES} pictures" in said
+    assert f"Pictures of each image: {tmp_path / 'drawn'}" in said
+    assert (tmp_path / "detected.seen.png").exists()
     pictures = sorted((tmp_path / "drawn").iterdir())
     assert len(pictures) == 2 * IMAGES
     picture = cv2.imread(str(pictures[0]))
