@@ -62,8 +62,9 @@ def draw(gray: Gray, detections: Iterable[DetectionRecord], camera: Camera, capt
             words += _draw_axes(picture, record.T_camera_tag, camera, scale, letters)
         label = f"{record.id}: rejected, {record.reason}" if record.reason else record.id
         top = corners[np.argmin(corners[:, 1])]
-        left = min(max(top[0] - 0.5 * width_of(label, letters), 2.0), picture.shape[1] - width_of(label, letters) - 2.0)
-        place = max(left, 2.0), max(top[1] - mark - 1.6 * letters, 2.0)
+        most = np.array([picture.shape[1] - width_of(label, letters), picture.shape[0] - 1.5 * letters]) - 2.0
+        beside = top - [0.5 * width_of(label, letters), mark + 1.6 * letters]
+        place = tuple(np.maximum(np.minimum(beside, most), 2.0).tolist())
         words.append(Words(place, label, letters, colour, is_bold=True, outline=WHITE))
     if caption:
         height = round(1.8 * letters)
