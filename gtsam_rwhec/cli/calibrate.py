@@ -51,6 +51,11 @@ NOT_FOR_A_LOG = {
     "file, or leave the option out.": (OF_FOLDER | OF_CHOICES | OF_SOLVE) - OF_LOG,
 }
 NOT_FOR_A_FOLDER = {"only for a log. A folder of CSV files has no images: leave the option out.": OF_LOG - OF_FOLDER}
+NOT_FOR_SAMPLES = {
+    "not for samples of a hand-eye tool, which are of one camera and one target. Leave the option out.": frozenset(
+        {"scale", "sigma", "kappa", "targets", "sensors"}
+    )
+}
 NOT_WITH_ALL = NOT_FOR_A_FOLDER | {
     "only with --certified-only. Add it, or leave the option out.": OF_SOLVE,
 }
@@ -62,7 +67,11 @@ NOT_CERTIFIED_ONLY = NOT_FOR_A_FOLDER | {
 def calibrate(
     context: typer.Context,
     source: Annotated[
-        Path, typer.Argument(help=f"MCAP log, folder of images with poses beside them (--rig), or {FOLDER_OF_CSV}.")
+        Path,
+        typer.Argument(
+            help="MCAP log, folder of images with poses beside them (--rig), samples of MoveIt, easy_handeye or OpenCV "
+            f"(YAML, JSON, XML), or {FOLDER_OF_CSV}."
+        ),
     ],
     rig: RigOption = None,
     scale: ScaleOption = "known",
@@ -148,6 +157,9 @@ def calibrate(
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
         return calibrate_log(source, rig, output, images=images, workers=workers, anyway=anyway)
     refuse(context, NOT_CERTIFIED_ONLY if certified_only else NOT_WITH_ALL)
+    is_samples = rw.logs.is_samples_file(source)
+    if is_samples:
+        refuse(context, NOT_FOR_SAMPLES)
     if (method == "local") != (initial is not None):
         raise typer.BadParameter("--method local and --initial FILE go together: give both, or neither")
     if (carrier_noise_deg is None) != (carrier_noise_mm is None):
@@ -160,7 +172,12 @@ def calibrate(
         carriers = rw.CarrierNoise(math.radians(carrier_noise_deg), 1e-3 * carrier_noise_mm)
     with StageDisplay() as stage, said_in_the_report():
         stage(f"reading {source}")
-        problem = rw.read_csv(source, scale, sigma, kappa, targets, sensors)
+        if is_samples:
+            of_samples = rw.pipeline.samples_problem(source)
+            problem = of_samples.problem
+            say(of_samples.said, to_errors=True)
+        else:
+            problem = rw.read_csv(source, scale, sigma, kappa, targets, sensors)
         write: Callable[[Path], None]
         if certified_only:
             earlier = None if initial is None else rw.read_solution(initial)
@@ -198,9 +215,13 @@ def calibrate_log(
 ) -> ExitStatus:
     """Run all stages and print the report."""
     with StageDisplay() as stage, said_in_the_report():
+        described = None if rig is None else rw.rig.read_rig(rig)
+        if described is not None and rw.pipeline.is_file_of_samples(source, described):
+            samples, on_hand = rw.pipeline.samples_of_rig(source, described)
+            say(f"{samples.reading(on_hand)}.", to_errors=True)
         calibrated = rw.calibrate_log(
             source,
-            None if rig is None else rw.rig.read_rig(rig),
+            described,
             output,
             images="copy" if images else "leave_out",
             workers=workers,

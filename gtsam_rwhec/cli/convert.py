@@ -32,7 +32,10 @@ NOT_WITH_A_RIG = {
 
 def convert(
     context: typer.Context,
-    source: Annotated[Path, typer.Argument(help="ROS 1 bag, folder of a ROS 2 db3 bag, or folder of images.")],
+    source: Annotated[
+        Path,
+        typer.Argument(help="ROS 1 bag, folder of a ROS 2 db3 bag, folder of images, or samples of a hand-eye tool."),
+    ],
     output: McapOption,
     rig: Annotated[
         Path | None,
@@ -57,6 +60,13 @@ def convert(
         if rig is not None:
             refuse(context, NOT_WITH_A_RIG)
             described = rw.rig.read_rig(rig)
+            if rw.pipeline.is_file_of_samples(source, described):
+                reading = rw.pipeline.write_samples_log(source, described, output)
+                say(
+                    f"{reading}.\nWritten to {shown_path(output)}.\n"
+                    f"Next: gtsam-rwhec calibrate {shown_path(output)} --rig {shown_path(rig)} -o out"
+                )
+                return ExitStatus.DONE
             if not rw.pipeline.is_folder_of_images(source, described):
                 raise LogError(
                     f"{source}: --rig is for a folder of images with poses beside them, and a rig file with "

@@ -1,5 +1,8 @@
 # Read a log.
 # Write a log, or make one of something else.
+from .hand_eye_samples import HandEyeSamples as HandEyeSamples
+from .hand_eye_samples import is_samples_file as is_samples_file
+from .hand_eye_samples import read_hand_eye_samples as read_hand_eye_samples
 from .image_folder import is_image_folder as is_image_folder
 from .image_folder import write_image_folder as write_image_folder
 from .mcap_reader import Log as Log

@@ -13,7 +13,7 @@ from gtsam_rwhec.logs.pose_tables import pose_text, read_pose_table
 from gtsam_rwhec.logs.pose_trees import PoseReference, read_pose_tree
 
 #: Files of trees, and files of tables.
-TREES, TABLES = (".json", ".yaml", ".yml"), (".csv", ".txt", ".tum", ".dat", ".tsv", ".asc")
+TREES, TABLES = (".json", ".yaml", ".yml", ".xml", ".samples"), (".csv", ".txt", ".tum", ".dat", ".tsv", ".asc")
 
 
 def read_poses(path: str | Path, stated: PoseStatement | None = None) -> NamedPoses:

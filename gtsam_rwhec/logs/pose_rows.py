@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,8 +15,8 @@ from gtsam_rwhec.logs.checked_poses import transforms
 from gtsam_rwhec.logs.records import Array
 
 #: What a pose's numbers are: 16 of a matrix, row by row; a position and a quaternion (x, y, z, w or in an order that
-#: the file does not say); a position and three angles.
-Kind = Literal["matrix", "quaternion", "quaternion_of_any_order", "angles"]
+#: the file does not say); a position and three angles, or OpenCV's rotation vector.
+Kind = Literal["matrix", "quaternion", "quaternion_of_any_order", "angles", "rotation_vector"]
 #: A rotation matrix R may differ from a rotation by this much in R'R.
 ROTATION_TOLERANCE = 1e-3
 #: Angles beyond a turn are degrees.
@@ -98,7 +98,7 @@ def poses_of(rows: Sequence[PoseRow], stated: PoseStatement) -> NamedPoses:
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     for kind, made in (
         ("matrix", _of_matrices), ("quaternion", _of_quaternions), ("quaternion_of_any_order", _of_quaternions),
-        ("angles", _of_angles),
+        ("angles", _of_angles), ("rotation_vector", _of_rotation_vectors),
     ):  # fmt: skip
         at = [i for i, row in enumerate(rows) if row.kind == kind]
         if at:
@@ -173,15 +173,20 @@ def _of_angles(rows: list[PoseRow], stated: PoseStatement) -> Array:
     return T
 
 
+def _of_rotation_vectors(rows: list[PoseRow], stated: PoseStatement) -> Array:
+    return _of_angles(rows, replace(stated, euler="rotation_vector", angles=stated.angles or "radians"))
+
+
 def _check_workspace(T: Array, rows: Sequence[PoseRow]) -> None:
-    """Refuse positions that are spread as millimetres are."""
+    """Refuse positions that are spread, or away from the origin, as millimetres are."""
     t = T[:, :3, 3]
     with np.errstate(over="ignore"):
-        extent = float(np.ptp(t, axis=0).max())
-    if len(rows) > 1 and extent > WORKSPACE_M:
+        extent, away = float(np.ptp(t, axis=0).max()), float(np.abs(np.median(t, axis=0)).max())
+    if len(rows) > 1 and max(extent, away) > WORKSPACE_M:
         far = int(np.argmax(np.abs(t - np.median(t, axis=0)).max(axis=1)))
+        how = f"spread over {extent:.4g} m" if extent > WORKSPACE_M else f"{away:.4g} m from their origin"
         raise LogError(
-            f"{rows[far].place}: position {t[far].tolist()}; the poses are spread over {extent:.4g} m if these are "
+            f"{rows[far].place}: position {t[far].tolist()}; the poses are {how} if these are "
             "metres. Are they millimetres? Write length: mm where the rig file has the frames, or length: m if it is "
             "true"
         )

@@ -1,8 +1,9 @@
-"""Poses in JSON and YAML: one pose, a list of them, or a mapping by name, in the words of ROS and of many tools.
+"""Poses in JSON, YAML and OpenCV's XML: one, a list, or a mapping by name, in the words of ROS and of many tools.
 
 A pose is a 4 x 4 matrix (nested, flat, or OpenCV's rows, cols and data), or a position (x, y, z) with a rotation (qx,
 qy, qz, qw; a quaternion as a mapping or a list; a 3 x 3 matrix; three angles). What stands around it gives its name: an
-image, a stamp, or its key.
+image, a stamp, or its key. Rotations and positions may be apart, as OpenCV's users write them: R_gripper2base_0 and
+t_gripper2base_0, or lists of the same length. Poses of a target that stand beside them are passed over.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from gtsam_rwhec.errors import FileFormatError, LogError
-from gtsam_rwhec.files.yaml_lines import OPENCV_MATRIX, YamlFile, parse_yaml
-from gtsam_rwhec.logs.pose_rows import PoseRow
+from gtsam_rwhec.files.opencv_storage import parse_storage
+from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile
+from gtsam_rwhec.logs.pose_rows import Kind, PoseRow
 
 _POSITION = ("position", "translation", "t", "tvec", "xyz", "pos", "trans")
 _ROTATION = ("orientation", "rotation", "quaternion", "q", "quat", "r", "rot", "rvec", "rpy", "euler")
@@ -38,6 +40,13 @@ _HOLDERS = frozenset({
     "images",
 })  # fmt: skip
 _LAST_ROW = (0.0, 0.0, 0.0, 1.0)
+#: Keys of rotations and of positions that belong together where the rest of both is the same.
+_APART = (("R", "t"), ("r", "t"), ("rvec", "tvec"), ("rvecs", "tvecs"), ("rot", "trans"), ("R", "T"))
+#: Keys of poses of a target, which are not the carriers' poses.
+_OF_TARGET = re.compile(
+    r"(target|board|marker|object|tag|pattern|obj)_?(2|to|in|wrt)|(camera|cam)_?marker|object_wrt_sensor|tracking$|optical$",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True)
@@ -50,15 +59,9 @@ class PoseReference:
 
 
 def read_pose_tree(path: str, text: str) -> list[PoseRow | PoseReference]:
-    """The poses of a text in JSON or YAML, in its order; a LogError if it is neither, or has no poses."""
-    text = re.sub(r"\A%YAML:", "%YAML ", text)
-    if path.lower().endswith(".json"):
-        text = text.replace("\t", " ")
-    try:
-        file = parse_yaml(text, path, tags=(OPENCV_MATRIX,))
-    except FileFormatError as error:
-        raise LogError(str(error)) from error
-    found = list(_Tree(file).poses(file.data, (), ""))
+    """The poses of a text in JSON, YAML or OpenCV's XML, in its order; a LogError if it is none, or has no poses."""
+    file = pose_tree(path, text)
+    found = list(PoseTree(file).poses(file.data, (), ""))
     if not found:
         raise LogError(
             f"{path} has no poses. A pose is a 4 x 4 matrix, or x, y, z with qx, qy, qz, qw, or position with "
@@ -67,25 +70,38 @@ def read_pose_tree(path: str, text: str) -> list[PoseRow | PoseReference]:
     return found
 
 
+def pose_tree(path: str, text: str) -> YamlFile:
+    """The tree of a text in JSON, YAML or OpenCV's XML; a LogError if it is none."""
+    try:
+        return parse_storage(text, path)
+    except FileFormatError as error:
+        raise LogError(str(error)) from error
+
+
 @dataclass(frozen=True)
-class _Tree:
+class PoseTree:
     """One file, walked from its root."""
 
     file: YamlFile
 
-    def poses(self, node: Any, path: tuple[str | int, ...], name: str) -> Iterator[PoseRow | PoseReference]:
-        """The poses in a value; `name` is what stands around it."""
+    def poses(self, node: Any, path: KeyPath, name: str) -> Iterator[PoseRow | PoseReference]:
+        """The poses in a value; `name` is what stands around it. Those of a target are passed over."""
         fields = _fields(node)
         name = _name(fields) or name
         if isinstance(fields.get("pose"), str) and isinstance(fields.get("image"), str):
             yield PoseReference(fields["image"], self.file.place(path), fields["pose"])
             return
-        row = self._pose(node, fields, path, name)
+        row = self.pose(node, path, name)
         if row is not None:
             yield row
         elif isinstance(node, dict):
+            apart = {rotation: self.apart(path, rotation, position) for rotation, position in pairs_of_keys(node)}
+            used = {key for pair in pairs_of_keys(node) if apart[pair[0]] for key in pair}
             for key, value in node.items():
-                if isinstance(value, (dict, tuple)):
+                if _OF_TARGET.search(key):
+                    continue
+                yield from apart.get(key, [])
+                if key not in used and isinstance(value, (dict, tuple)):
                     under = name if key.lower() in _HOLDERS else name or key
                     yield from self.poses(value, (*path, key), under)
         elif isinstance(node, tuple):
@@ -93,8 +109,32 @@ class _Tree:
                 if isinstance(value, (dict, tuple)):
                     yield from self.poses(value, (*path, i), name if len(node) == 1 else "")
 
-    def _pose(self, node: Any, fields: dict[str, Any], path: tuple[str | int, ...], name: str) -> PoseRow | None:
+    def apart(self, path: KeyPath, rotation: str, position: str) -> list[PoseRow]:
+        """The poses of rotations and positions that have keys of their own; empty if they are none."""
+        of = self.file.data
+        for key in path:
+            of = of[key]
+        turned, moved = of[rotation], of[position]
+        number = re.search(r"\d+$", rotation)
+        one = _joined(turned, moved)
+        if one is not None:
+            return [PoseRow(number[0] if number else "", self.file.place((*path, rotation)), *one)]
+        turned, moved = _items(turned), _items(moved)
+        rows = [
+            PoseRow("", self.file.place((*path, rotation, i)), *joined)
+            for i, pair in enumerate(zip(turned, moved, strict=False))
+            if (joined := _joined(*pair)) is not None
+        ]
+        if rows and not len(rows) == len(turned) == len(moved):
+            raise LogError(
+                f"{self.file.place((*path, rotation))}: {len(turned)} rotations and {len(moved)} positions in "
+                f"{position}, of which {len(rows)} are poses; give one of each"
+            )
+        return rows
+
+    def pose(self, node: Any, path: KeyPath, name: str = "") -> PoseRow | None:
         """The pose that a value is, or None."""
+        fields = _fields(node)
         place = self.file.place(path) if path else self.file.where
         if matrix := _matrix(node):
             return PoseRow(name, place, "matrix", matrix)
@@ -112,11 +152,48 @@ class _Tree:
         if (numbers := _flat(turned, 4)) is not None:
             return PoseRow(name, place, "quaternion_of_any_order", (*position, *numbers))
         if turned is not node and (numbers := _flat(turned, 3)) is not None:
-            return PoseRow(name, place, "angles", (*position, *numbers))
+            return PoseRow(name, place, "rotation_vector" if "rvec" in fields else "angles", (*position, *numbers))
         if (numbers := _flat(turned, 9)) is not None:
             rows = [(*numbers[3 * r : 3 * r + 3], position[r]) for r in range(3)]
             return PoseRow(name, place, "matrix", (*sum(rows, ()), *_LAST_ROW))
         return None
+
+
+def pairs_of_keys(node: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """The keys of rotations and positions that belong together, as ``R_gripper2base`` and ``t_gripper2base``."""
+    for key in node:
+        for rotation, position in _APART:
+            rest = key.removeprefix(rotation)
+            if key.startswith(rotation) and (not rest or rest[0] in "_0123456789") and position + rest in node:
+                yield key, position + rest
+                break
+
+
+def _joined(turned: Any, moved: Any) -> tuple[Kind, tuple[float, ...]] | None:
+    """The kind and numbers of a pose of a rotation (a matrix, a quaternion or a vector) and a position."""
+    position = _flat(moved, 3)
+    if position is None:
+        return None
+    if (numbers := _flat(turned, 9)) is not None:
+        rows = [(*numbers[3 * r : 3 * r + 3], position[r]) for r in range(3)]
+        return "matrix", (*sum(rows, ()), *_LAST_ROW)
+    if (numbers := _flat(turned, 4)) is not None:
+        return "quaternion_of_any_order", (*position, *numbers)
+    if (numbers := _flat(turned, 3)) is not None:
+        return "rotation_vector", (*position, *numbers)
+    return None
+
+
+def _items(node: Any) -> tuple[Any, ...]:
+    """The items of a list, or the slices of OpenCV's matrix by its first dimension."""
+    if isinstance(node, dict) and isinstance(node.get("data"), tuple):
+        sizes = node.get("sizes", (node.get("rows"), node.get("cols")))
+        data, count = node["data"], sizes[0] if isinstance(sizes, tuple) and sizes else 0
+        if not isinstance(count, int) or count < 1 or len(data) % count:
+            return ()
+        each = len(data) // count
+        return tuple(data[i : i + each] for i in range(0, len(data), each)) if each else ()
+    return node if isinstance(node, tuple) else ()
 
 
 def _fields(node: Any) -> dict[str, Any]:

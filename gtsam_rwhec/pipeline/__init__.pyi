@@ -13,6 +13,11 @@ from .detections_in_images import draw_log as draw_log
 from .folder_log import is_folder_of_images as is_folder_of_images
 from .folder_log import write_folder_log as write_folder_log
 
+from .samples_log import is_file_of_samples as is_file_of_samples
+from .samples_log import samples_of_rig as samples_of_rig
+from .samples_log import samples_problem as samples_problem
+from .samples_log import write_samples_log as write_samples_log
+
 # What comes out, and what a log that a stage wrote holds.
 from .earlier_output import replacing_output as replacing_output
 from .image_options import check_drawable as check_drawable

@@ -30,6 +30,7 @@ from gtsam_rwhec.pipeline.log_contract import (
 )
 from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig
 from gtsam_rwhec.pipeline.output_paths import check_is_not_read, made_folder, made_output_folder
+from gtsam_rwhec.pipeline.samples_log import is_file_of_samples, write_samples_log
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solution_plots import plot_all
 from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
@@ -63,8 +64,8 @@ def calibrate_log(
     Parameters
     ----------
     log_path
-        As for ``open_log``; or a folder of images, for a rig file with poses in files (``frames``),
-        whose paths then start from this folder.
+        As for ``open_log``; or, for a rig file with poses in files (``frames``), a folder of images, from which its
+        paths then start, or a file of samples of a hand-eye tool.
     rig : Rig or None
         None: the rig file embedded in a log that a stage wrote.
     out
@@ -86,8 +87,8 @@ def calibrate_log(
     """
     detected, clean = Path(out) / DETECTED_LOG, Path(out) / CLEAN_LOG
     check_is_no_other_folder(log_path, rig)
-    if rig is not None and is_folder_of_images(log_path, rig):
-        return _calibrate_folder(
+    if rig is not None and (is_folder_of_images(log_path, rig) or is_file_of_samples(log_path, rig)):
+        return _calibrate_files(
             Path(str(log_path)), rig, out, images=images, workers=workers, anyway=anyway, progress=progress
         )
     with open_log(log_path) as log:
@@ -119,8 +120,8 @@ def calibrate_log(
     return calibrated
 
 
-def _calibrate_folder(
-    folder: Path,
+def _calibrate_files(
+    source: Path,
     rig: Rig,
     out: str | Path,
     *,
@@ -129,13 +130,18 @@ def _calibrate_folder(
     anyway: bool,
     progress: Progress | None,
 ) -> Calibrated:
-    """As `calibrate_log`, by way of a log of the folder's images, which is removed at the end."""
-    rig = rig.model_copy(update={"folder": folder})
+    """As `calibrate_log`, by way of a log of a folder's images or of samples, which is removed at the end."""
+    has_images = source.is_dir()
+    if has_images:
+        rig = rig.model_copy(update={"folder": source})
     check_intrinsics_files(rig)  # before anything is copied
     made = made_output_folder(out)
-    recorded = made / f"{folder.resolve().name}{RECORDED_LOG}"
+    recorded = made / f"{source.resolve().name}{RECORDED_LOG}"
     try:
-        write_folder_log(folder, rig, recorded, progress=progress)
+        if has_images:
+            write_folder_log(source, rig, recorded, progress=progress)
+        else:
+            (progress or silent)(write_samples_log(source, rig, recorded))
         return calibrate_log(recorded, rig, made, images=images, workers=workers, anyway=anyway, progress=progress)
     finally:
         recorded.unlink(missing_ok=True)
