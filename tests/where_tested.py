@@ -145,6 +145,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/rig": {
         "rig/test_rig_faults.py": "contradictions",
+        "export/test_exported_files.py": "camera_link",
         "rig/test_rig_file.py": "field_types rig sections target_sections written_rig",
     },
     "gtsam_rwhec/simulate": {

@@ -6,7 +6,8 @@ from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.pipeline.solving_stage import Solved
 from gtsam_rwhec.results.unanswered import shortage
-from gtsam_rwhec.rig import RigFrames
+from gtsam_rwhec.rig import CameraLink, RigFrames
+from gtsam_rwhec.rig.camera_link import link_of_optical
 
 
 def frames_of(solved: Solved) -> RigFrames:
@@ -22,6 +23,11 @@ def frames_of(solved: Solved) -> RigFrames:
         cameras={frame[name]: camera for name, camera in solved.cameras.items() if name in frame},
         time_offsets_s={frame[o.sensor]: o.offset_s for o in solved.log.time_offsets if o.sensor in frame},
         topics={frame[n]: s.images for n, s in rig.sensors.items() if s.images is not None and n in frame},
+        links={
+            frame[name]: CameraLink(sensor.link.frame, link_of_optical(sensor.link.T_link_optical))
+            for name, sensor in rig.sensors.items()
+            if sensor.link is not None and name in frame
+        },
         warnings=warnings_of(solved),
         left_out={name: shortage(solved.log, name) for name in missing},
     )

@@ -1,6 +1,7 @@
 # Rig files, read and written.
 # A calibrated rig, for export and for plots.
 from .calibrated_frames import CalibratedFrame as CalibratedFrame
+from .calibrated_frames import CameraLink as CameraLink
 from .calibrated_frames import RigFrames as RigFrames
 from .rig import Rig as Rig
 from .rig_file import parse_rig as parse_rig
@@ -18,6 +19,7 @@ from .sections import Carriers as Carriers
 from .sections import Cleaning as Cleaning
 from .sections import DetectionNoise as DetectionNoise
 from .sections import Intrinsics as Intrinsics
+from .sections import Link as Link
 from .sections import PoseNoise as PoseNoise
 from .sections import PoseSource as PoseSource
 from .sections import Sensor as Sensor

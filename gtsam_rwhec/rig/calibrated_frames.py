@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from rwhec_factors.se3 import inverse
+
 from gtsam_rwhec.errors import FrameError, StampError
 from gtsam_rwhec.geometry.poses import Array, one_transform
 from gtsam_rwhec.rig.field_types import NAME
@@ -19,6 +21,13 @@ class CalibratedFrame(NamedTuple):
     parent: str
     child: str
     T_parent_child: Array
+
+
+class CameraLink(NamedTuple):
+    """The frame of a camera's body: its name, and T_link_optical (4, 4), metres, which the driver publishes."""
+
+    name: str
+    T_link_optical: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +51,8 @@ class RigFrames:
         Time offsets by sensor, seconds: the sensor's stamp t is the carriers' t + offset. A missing offset is 0.
     topics : dict of str to str
         Topics of images by sensor; may lack a sensor.
+    links : dict of str to CameraLink
+        Frames of cameras' bodies by sensor, which are written in the place of the optical frames; may lack a sensor.
     warnings : tuple of str
         Why frames should not be used; written into every file.
     left_out : dict of str to str
@@ -64,11 +75,13 @@ class RigFrames:
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     time_offsets_s: Mapping[str, float] = field(default_factory=dict)
     topics: Mapping[str, str] = field(default_factory=dict)
+    links: Mapping[str, CameraLink] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        names = [self.sensor_carrier, self.target_carrier, *self.sensors, *self.targets]
+        links = [link.name for link in self.links.values()]
+        names = [self.sensor_carrier, self.target_carrier, *self.sensors, *self.targets, *links]
         for index, name in enumerate(names):
             if not isinstance(name, str) or not NAME.fullmatch(name):
                 raise FrameError(
@@ -79,7 +92,7 @@ class RigFrames:
                 raise FrameError(
                     f"{name} is the name of two frames; rename one (each carrier, sensor and target needs its own name)"
                 )
-        for what in ("cameras", "time_offsets_s", "topics"):
+        for what in ("cameras", "time_offsets_s", "topics", "links"):
             for name in getattr(self, what):
                 if name not in self.sensors:
                     sensors = ", ".join(self.sensors) or "none"
@@ -91,6 +104,11 @@ class RigFrames:
         for name, topic in self.topics.items():
             if not topic or not topic.isprintable():
                 raise FrameError(f"the topic of {name} is {topic!r}; give one line of printable characters")
+        checked_links = {
+            name: link._replace(T_link_optical=one_transform(link.T_link_optical, f"the pose of {name} in {link.name}"))
+            for name, link in self.links.items()
+        }
+        object.__setattr__(self, "links", checked_links)
         # Copies: the checked values cannot change any more.
         for what, carrier in (("sensors", self.sensor_carrier), ("targets", self.target_carrier)):
             given = getattr(self, what)
@@ -98,8 +116,25 @@ class RigFrames:
             object.__setattr__(self, what, checked)
 
     def frames(self) -> Iterator[CalibratedFrame]:
-        """Each sensor on the sensors' carrier, then each target on the targets' carrier."""
-        for name, T in self.sensors.items():
-            yield CalibratedFrame(self.sensor_carrier, name, T)
+        """Each sensor on the sensors' carrier, or its link, then each target on the targets' carrier."""
+        yield from self.sensor_frames()
         for name, T in self.targets.items():
             yield CalibratedFrame(self.target_carrier, name, T)
+
+    def sensor_frames(self) -> Iterator[CalibratedFrame]:
+        """Each sensor on the sensors' carrier; of a camera with a link the link, so that the driver's own tree holds.
+
+        T_carrier_link = T_carrier_optical T_link_optical^-1: with the driver's T_link_optical it composes to the
+        calibrated pose, and no frame has two parents.
+        """
+        for name, T in self.sensors.items():
+            link = self.links.get(name)
+            if link is None:
+                yield CalibratedFrame(self.sensor_carrier, name, T)
+            else:
+                yield CalibratedFrame(self.sensor_carrier, link.name, T @ inverse(link.T_link_optical))
+
+    def optical_frames(self) -> Iterator[CalibratedFrame]:
+        """The optical frame of each camera with a link, on its link: what its driver publishes."""
+        for name, link in self.links.items():
+            yield CalibratedFrame(link.name, name, link.T_link_optical)

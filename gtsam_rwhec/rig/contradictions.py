@@ -85,6 +85,8 @@ def _names(carriers: Carriers, sensors: Mapping[str, Sensor], targets: Mapping[s
         named.append((name, ("sensors", name), f"sensor {name}"))
         if sensor.frame not in (None, name):
             named.append((str(sensor.frame), ("sensors", name, "frame"), f"the frame of sensor {name}"))
+        if sensor.link is not None:
+            named.append((sensor.link.frame, ("sensors", name, "link"), f"the link of sensor {name}"))
     named += [(name, ("targets", name), f"target {name}") for name in targets]
     first: dict[str, str] = {}
     for name, path, what in named:

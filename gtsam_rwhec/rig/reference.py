@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from gtsam_rwhec.rig.field_types import in_yaml, unit_of
 from gtsam_rwhec.rig.json_schema import detection_keys, rig_file_schema
 from gtsam_rwhec.rig.rig import RigFile
-from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Intrinsics, PoseNoise, PoseSource, Sensor
+from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Intrinsics, Link, PoseNoise, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.targets import FAMILIES
 
@@ -43,6 +43,7 @@ SECTIONS: tuple[tuple[str, type[BaseModel]], ...] = (
     ("carriers: noise", PoseNoise),
     ("sensors: NAME", Sensor),
     ("sensors: NAME: intrinsics", Intrinsics),
+    ("sensors: NAME: link", Link),
 )
 #: Sections that come after the targets.
 LAST: tuple[tuple[str, type[BaseModel]], ...] = (("noise", DetectionNoise), ("cleaning", Cleaning))

@@ -36,6 +36,7 @@ _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     ("carriers", "noise"): sections.PoseNoise,
     ("sensors", "*"): sections.Sensor,
     ("sensors", "*", "intrinsics"): sections.Intrinsics,
+    ("sensors", "*", "link"): sections.Link,
     ("noise",): sections.DetectionNoise,
     ("cleaning",): sections.Cleaning,
 }

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from gtsam_rwhec.rig.camera_link import link_of_optical
 from gtsam_rwhec.rig.field_types import (
     EulerAxes,
     FramePair,
@@ -244,6 +245,36 @@ def _file_or_section(given: Any) -> Any:
     return {"file": given} if isinstance(given, str) else given
 
 
+class Link(Section):
+    """The frame of a camera's body, of which its driver publishes the optical frame: exported in its place."""
+
+    frame: Name = Field(description="the name of that frame", examples=["camera_link"])
+    T_link_optical: (
+        Annotated[
+            tuple[float, float, float, float, float, float, float],
+            list_of(7, "[x, y, z, qx, qy, qz, qw], metres and a unit quaternion"),
+        ]
+        | None
+    ) = Field(
+        default=None,
+        description="pose of the optical frame in it, [x, y, z, qx, qy, qz, qw], as `ros2 run tf2_ros tf2_echo "
+        "camera_link camera_optical_frame` prints it; without it that of REP 103: one origin, the link's x "
+        "forward, y left, z up",
+        examples=[[0.0, 0.015, 0.0, -0.5, 0.5, -0.5, 0.5]],
+        json_schema_extra={"unit": "m"},
+    )
+
+    @model_validator(mode="after")
+    def _is_pose(self) -> Link:
+        link_of_optical(self.T_link_optical)
+        return self
+
+
+def _frame_or_section(given: Any) -> Any:
+    """A section of a link; text alone is the name of its frame."""
+    return {"frame": given} if isinstance(given, str) else given
+
+
 class Sensor(Section):
     """A camera with images, or with the detections of a driver."""
 
@@ -279,6 +310,11 @@ class Sensor(Section):
         default=None,
         description="its frame in the results; without it the sensor's name",
         examples=["cam_left_optical"],
+    )
+    link: Annotated[Link, BeforeValidator(_frame_or_section), OrText("the name of the frame")] | None = Field(
+        default=None,
+        description="the frame of a camera's body; it takes the optical frame's place in the files for ROS",
+        examples=["camera_link"],
     )
 
     @model_validator(mode="after")

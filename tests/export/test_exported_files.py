@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.export import camchain_yaml, export_all, static_tf_launch, tf_yaml, urdf_xacro
 from gtsam_rwhec.export.written_poses import fixed_axis_angles, number, quaternion_xyzw
-from gtsam_rwhec.rig import RigFrames
+from gtsam_rwhec.rig import CameraLink, RigFrames
+from gtsam_rwhec.rig.camera_link import link_of_optical
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.intrinsics_files import read_kalibr_camchain
 
@@ -127,16 +128,23 @@ class Node:
         self.fields = fields
 
 
-def launched(text: str, monkeypatch: pytest.MonkeyPatch) -> list[Node]:
+def launched(text: str, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """What generate_launch_description gives, with modules in place of ROS's."""
-    launch, launch_ros, actions = (types.ModuleType(name) for name in ("launch", "launch_ros", "launch_ros.actions"))
-    launch.LaunchDescription = list  # type: ignore[attr-defined]
-    actions.Node = Node  # type: ignore[attr-defined]
-    for module in (launch, launch_ros, actions):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
+    contents: dict[str, dict[str, Any]] = {
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {"DeclareLaunchArgument": lambda name, default_value: (name, default_value)},
+        "launch.conditions": {"IfCondition": lambda value: ("if", value)},
+        "launch.substitutions": {"LaunchConfiguration": lambda name: ("argument", name)},
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": Node},
+    }
+    for name, content in contents.items():
+        module = types.ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
     names: dict[str, Any] = {}
     exec(compile(text, "static_tf.launch.py", "exec"), names)
-    nodes: list[Node] = names["generate_launch_description"]()
+    nodes: list[Any] = names["generate_launch_description"]()
     return nodes
 
 
@@ -148,17 +156,88 @@ def test_the_launch_file_publishes_every_frame(frames: RigFrames) -> None:
     for node in nodes:
         assert node.fields["package"] == "tf2_ros"
         assert node.fields["executable"] == "static_transform_publisher"
-        arguments = node.fields["arguments"]
-        assert all(isinstance(argument, str) for argument in arguments)
-        assert arguments[0::2] == [
-            "--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw", "--frame-id", "--child-frame-id",
-        ]  # fmt: skip
-        values = dict(zip(arguments[0::2], arguments[1::2], strict=True))
-        T = composed(
-            *([float(values[f"--{key}"]) for key in keys] for keys in (["x", "y", "z"], ["qx", "qy", "qz", "qw"]))
-        )
-        found[values["--frame-id"], values["--child-frame-id"]] = T
+        names, T = transform_of(node)
+        found[names] = T
     assert_same(found, expected(frames))
+
+
+def transform_of(node: Node) -> tuple[tuple[str, str], np.ndarray]:
+    """What a static_transform_publisher publishes: parent and child, and T_parent_child."""
+    arguments = node.fields["arguments"]
+    assert all(isinstance(argument, str) for argument in arguments)
+    assert arguments[0::2] == [
+        "--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw", "--frame-id", "--child-frame-id",
+    ]  # fmt: skip
+    values = dict(zip(arguments[0::2], arguments[1::2], strict=True))
+    T = composed(*([float(values[f"--{key}"]) for key in keys] for keys in (["x", "y", "z"], ["qx", "qy", "qz", "qw"])))
+    return (values["--frame-id"], values["--child-frame-id"]), T
+
+
+REALSENSE = [0.0, 0.015, -0.002, -0.5, 0.5, -0.5, 0.5]
+LINKS = {
+    "cam_left": CameraLink("camera_link", link_of_optical()),
+    "rig/cam_right": CameraLink("right/camera_link", link_of_optical(REALSENSE)),
+}
+
+
+def with_optical_frames(found: dict[tuple[str, str], np.ndarray], frames: RigFrames) -> dict[str, np.ndarray]:
+    """The poses of the optical frames, by the links' poses and T_link_optical, as the drivers print it."""
+    return {
+        name: found[frames.sensor_carrier, link.name] @ composed(given[:3], given[3:])
+        for (name, link), given in zip(
+            frames.links.items(), ([0.0, 0.0, 0.0, -0.5, 0.5, -0.5, 0.5], REALSENSE), strict=True
+        )
+    }
+
+
+def test_a_link_is_that_of_rep_103() -> None:
+    """What the camera has in front of it, to its right and below it is on the link's x, -y and -z."""
+    np.testing.assert_array_equal(link_of_optical()[:3, :3] @ [2.0, 3.0, 5.0], [5.0, -2.0, -3.0])
+    np.testing.assert_allclose(link_of_optical(REALSENSE)[:3, :3], link_of_optical()[:3, :3], atol=1e-15)
+    with pytest.raises(ValueError, match=r"has the length 0\.7071; give \[x, y, z, qx, qy, qz, qw\]"):
+        link_of_optical([0.0, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0])
+
+
+@on_random_poses
+def test_links_take_the_place_of_optical_frames_and_compose_to_them(frames: RigFrames) -> None:
+    frames = replace(frames, links=LINKS)
+    published = expected(frames)
+    wanted = {name: published.pop((frames.sensor_carrier, name)) for name in frames.sensors}
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        nodes = launched(static_tf_launch(frames), monkeypatch)
+    assert nodes[0] == ("optical_frames", "false")
+    transforms = {of: T for of, T in map(transform_of, nodes[1:])}
+    assert len(transforms) == len(nodes) - 1
+    children = [child for _, child in transforms]
+    assert len(set(children)) == len(children)  # no frame has two parents
+    for name, T in with_optical_frames(transforms, frames).items():
+        np.testing.assert_allclose(T, wanted[name], rtol=0.0, atol=1e-12)
+    # What the launch argument adds is what the drivers publish.
+    added = {child: node for (_, child), node in zip(transforms, nodes[1:], strict=True) if node.fields["condition"]}
+    assert set(added) == set(frames.sensors)
+    for name, link in frames.links.items():
+        np.testing.assert_allclose(transforms[link.name, name], link.T_link_optical, rtol=0.0, atol=1e-12)
+    for of, T in published.items():
+        np.testing.assert_allclose(transforms[of], T, rtol=0.0, atol=1e-12)
+
+    of_yaml = {}
+    for entry in yaml.safe_load(tf_yaml(frames))["transforms"]:
+        at = entry["transform"]
+        T = composed([at["translation"][key] for key in "xyz"], [at["rotation"][key] for key in "xyzw"])
+        of_yaml[entry["header"]["frame_id"], entry["child_frame_id"]] = T
+    assert set(of_yaml) == {of for of in transforms if of[1] not in added}
+    for name, T in with_optical_frames(of_yaml, frames).items():
+        np.testing.assert_allclose(T, wanted[name], rtol=0.0, atol=1e-12)
+
+    (macro,) = ElementTree.fromstring(urdf_xacro(frames)).findall("xacro:macro", XACRO)
+    assert macro.get("params") == f"parent:={frames.sensor_carrier} optical_frames:=false"
+    joints = {of: T for of, T in map(joint_of, macro.findall("joint"))}
+    assert set(joints) == {("${parent}", link.name) for link in frames.links.values()}
+    (optional,) = macro.findall("xacro:if", XACRO)
+    assert optional.get("value") == "${optical_frames}"
+    for of, T in map(joint_of, optional.findall("joint")):
+        np.testing.assert_allclose(joints["${parent}", of[0]] @ T, wanted[of[1]], rtol=0.0, atol=1e-12)
+    assert camchain_yaml(frames) == camchain_yaml(replace(frames, links={}))  # Kalibr knows optical frames alone
 
 
 def test_nodes_of_the_launch_file_have_names_that_ros_takes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,20 +302,26 @@ def test_urdf_joints_compose_to_the_sensors(frames: RigFrames) -> None:
     assert [link.get("name") for link in macro.findall("link")] == list(frames.sensors)
     found = {}
     for joint in macro.findall("joint"):
-        assert joint.get("type") == "fixed"
-        parent, child, origin = joint.find("parent"), joint.find("child"), joint.find("origin")
-        assert parent is not None
-        assert child is not None
-        assert origin is not None
-        assert parent.get("link") == "${parent}"
-        roll, pitch, yaw = (float(angle) for angle in origin.attrib["rpy"].split())
-        T = np.eye(4)
-        T[:3, :3] = rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll)
-        T[:3, 3] = [float(value) for value in origin.attrib["xyz"].split()]
-        found[child.attrib["link"]] = T
+        (parent, child), T = joint_of(joint)
+        assert parent == "${parent}"
+        found[child] = T
     assert_same(found, dict(frames.sensors))
     joints = [joint.get("name") for joint in macro.findall("joint")]
     assert len(set(joints)) == len(frames.sensors)
+
+
+def joint_of(joint: ElementTree.Element) -> tuple[tuple[str, str], np.ndarray]:
+    """A fixed joint: its parent and child, and T_parent_child."""
+    assert joint.get("type") == "fixed"
+    parent, child, origin = joint.find("parent"), joint.find("child"), joint.find("origin")
+    assert parent is not None
+    assert child is not None
+    assert origin is not None
+    roll, pitch, yaw = (float(angle) for angle in origin.attrib["rpy"].split())
+    T = np.eye(4)
+    T[:3, :3] = rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll)
+    T[:3, 3] = [float(value) for value in origin.attrib["xyz"].split()]
+    return (parent.attrib["link"], child.attrib["link"]), T
 
 
 # Kalibr's camchain

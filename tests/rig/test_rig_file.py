@@ -24,6 +24,7 @@ from gtsam_rwhec.rig import (
     Cleaning,
     DetectionNoise,
     Intrinsics,
+    Link,
     PoseNoise,
     PoseSource,
     Rig,
@@ -65,6 +66,22 @@ def test_everything_is_read(tmp_path: Path) -> None:
     assert (rig.sizes, rig.noise) == ("check", "estimate")
     assert rig.detection == {"min_side_px": 18, "max_reprojection_px": 2.0}
     assert rig.cleaning == Cleaning(max_translation_m_s=0.5, thin=False)
+
+
+def test_the_link_of_a_camera_is_a_name_or_a_section_and_is_no_other_frame() -> None:
+    section = "{frame: camera_link, T_link_optical: [0.0, 0.015, 0.0, -0.5, 0.5, -0.5, 0.5]}"
+    for link, T in (("camera_link", None), (section, (0.0, 0.015, 0.0, -0.5, 0.5, -0.5, 0.5))):
+        rig = parse_rig(MINIMAL.replace("/tags}", f"/tags, link: {link}}}"), "rig.yaml")
+        assert rig.sensors["cam"].link == Link(frame="camera_link", T_link_optical=T)
+        assert parse_rig(rig_text(rig), "rig.yaml") == rig
+    for wrong, words in (
+        ("hand", r"sensors\.cam\.link: 'hand' is already the name of the sensors' carrier"),
+        ("cam", r"sensors\.cam\.link: 'cam' is already the name of sensor cam"),
+        (section.replace("-0.5, 0.5, -0.5", "0.5, -0.5, 0.9"), r"link: the quaternion .* has the length 1\.2"),
+        (section.replace("0.015, ", ""), r"T_link_optical: .*; give \[x, y, z, qx, qy, qz, qw\], metres"),
+    ):
+        with pytest.raises(RigError, match=words):
+            parse_rig(MINIMAL.replace("/tags}", f"/tags, link: {given}}}"), "rig.yaml")
 
 
 def test_what_is_left_out() -> None:
