@@ -81,7 +81,7 @@ def test_the_link_of_a_camera_is_a_name_or_a_section_and_is_no_other_frame() -> 
         (section.replace("0.015, ", ""), r"T_link_optical: .*; give \[x, y, z, qx, qy, qz, qw\], metres"),
     ):
         with pytest.raises(RigError, match=words):
-            parse_rig(MINIMAL.replace("/tags}", f"/tags, link: {given}}}"), "rig.yaml")
+            parse_rig(MINIMAL.replace("/tags}", f"/tags, link: {wrong}}}"), "rig.yaml")
 
 
 def test_what_is_left_out() -> None:
