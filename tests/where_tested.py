@@ -167,13 +167,14 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/trajectories": {"trajectories/test_trajectory.py": "local_paths"},
     "gtsam_rwhec/vision": {
         "vision/test_ambiguity.py": "agreement",
+        "vision/test_board_tags.py": "detected layout_cures sightings tag_agreement",
         "vision/test_camera.py": "distortion",
         "vision/test_circle_grids.py": "circle_centres",
         "vision/test_contact_sheet.py": "picture_text",
         "vision/test_detection.py": "options rejection",
         "vision/test_edges.py": "edge_geometry edge_profiles",
         "vision/test_images.py": "image_sizes",
-        "vision/test_targets.py": "dictionaries",
+        "vision/test_targets.py": "dictionaries tag_boards target_checks",
     },
     "factors": {
         "factors/test_drop_in.py": "hand_eye",

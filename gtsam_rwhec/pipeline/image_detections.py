@@ -20,6 +20,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.ambiguity import choose_over_time
 from gtsam_rwhec.vision.board_turns import Turns, choose_turns, turn_between, turned_detection
 from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.detected import layouts_over_track
 from gtsam_rwhec.vision.detection import Detection, Detector
 from gtsam_rwhec.vision.many_images import DetectedImage, detect_in_images, measured_corner_px
 from gtsam_rwhec.vision.rejection import Rejection
@@ -154,6 +155,8 @@ def _of_track(
     `upright` has the first track of each board that looks the same turned, and gets this one if there is none.
     """
     options = rig.detection_options
+    judged = layouts_over_track([detection for _, detection in track])
+    track = [(stamp_ns, detection) for (stamp_ns, _), detection in zip(track, judged, strict=True)]
     chosen = [0] * len(track)
     rejections = [detection.rejection for _, detection in track]
     factor, corner_px = 1.0, None
@@ -201,7 +204,7 @@ def _of_track(
                 covariance=factor * detection.covariance[which] if has_pose else None,
                 size_m=target.length_m,
                 reprojection_px=float(detection.reprojection_px[which]) if has_pose else None,
-                reason=rejection or "",
+                reason=detection.reason(rejection),
                 corner_indices=tuple(detection.indices.tolist()),
             )
         )

@@ -24,7 +24,9 @@ from .sections import PoseNoise as PoseNoise
 from .sections import PoseSource as PoseSource
 from .sections import Sensor as Sensor
 from .target_sections import AprilGridTarget as AprilGridTarget
+from .target_sections import BundleTarget as BundleTarget
 from .target_sections import CharucoTarget as CharucoTarget
 from .target_sections import CheckerboardTarget as CheckerboardTarget
+from .target_sections import TagGridTarget as TagGridTarget
 from .target_sections import TagTarget as TagTarget
 from .written_rig import rig_text as rig_text

@@ -12,7 +12,7 @@ from gtsam_rwhec.rig.field_types import in_yaml, unit_of
 from gtsam_rwhec.rig.json_schema import detection_keys, rig_file_schema
 from gtsam_rwhec.rig.rig import RigFile
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Intrinsics, Link, PoseNoise, PoseSource, Sensor
-from gtsam_rwhec.rig.target_sections import TargetSection
+from gtsam_rwhec.rig.target_sections import BundleTagPlace, TargetSection
 from gtsam_rwhec.vision.targets import FAMILIES
 
 #: Before the tables.
@@ -46,7 +46,11 @@ SECTIONS: tuple[tuple[str, type[BaseModel]], ...] = (
     ("sensors: NAME: link", Link),
 )
 #: Sections that come after the targets.
-LAST: tuple[tuple[str, type[BaseModel]], ...] = (("noise", DetectionNoise), ("cleaning", Cleaning))
+LAST: tuple[tuple[str, type[BaseModel]], ...] = (
+    ("targets: NAME: layout", BundleTagPlace),
+    ("noise", DetectionNoise),
+    ("cleaning", Cleaning),
+)
 
 
 def reference_text() -> str:

@@ -25,6 +25,8 @@ _TARGETS: dict[str, type[BaseModel]] = {
     "tag": target_sections.TagTarget,
     "charuco": target_sections.CharucoTarget,
     "aprilgrid": target_sections.AprilGridTarget,
+    "tag_grid": target_sections.TagGridTarget,
+    "bundle": target_sections.BundleTarget,
     "checkerboard": target_sections.CheckerboardTarget,
     "circle_grid": target_sections.CircleGridTarget,
 }
@@ -196,5 +198,7 @@ def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
         target = data["targets"][path[1]]
         kind = target.get("type") if isinstance(target, dict) else None
         return _TARGETS.get(kind) if isinstance(kind, str) else None
+    if len(path) == 4 and path[0] == "targets" and path[2] == "layout":
+        return target_sections.BundleTagPlace
     general = tuple("*" if i == 1 and path[0] == "sensors" else key for i, key in enumerate(path))
     return _SECTIONS.get(general)

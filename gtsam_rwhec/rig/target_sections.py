@@ -8,6 +8,7 @@ from pydantic import Field
 
 from gtsam_rwhec.rig.field_types import InSchema, Length, Positive, list_of
 from gtsam_rwhec.rig.sections import Section
+from gtsam_rwhec.vision.tag_boards import Bundle, BundleTag, TagGrid
 from gtsam_rwhec.vision.targets import FAMILIES, AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
 
 #: How many there are across and down, as the board is printed upright.
@@ -66,6 +67,61 @@ class AprilGridTarget(_TargetSection):
     first_id: int = Field(default=0, description="the smallest number; the others follow it", examples=[0])
 
 
+class TagGridTarget(_TargetSection):
+    """OpenCV's GridBoard, counted by tags."""
+
+    made: ClassVar = TagGrid
+    counted: ClassVar = "tags"
+    type: Literal["tag_grid"]
+    family: Family = Field(description="dictionary of the tags", examples=["aruco_5x5_100"])
+    tags: Counts = Field(description="[across, down], tags", examples=[[5, 7]])
+    tag_m: Length = Field(description="side of a tag's black square", examples=[0.04])
+    gap_m: Length = Field(description="white gap between two tags", examples=[0.01])
+    first_id: int = Field(default=0, description="at the top left; then to the right, then down", examples=[0])
+    ids: Annotated[tuple[int, ...], Field(max_length=10_000)] | None = Field(
+        default=None,
+        description="of all tags, left to right, from the top, in place of first_id",
+        examples=[[7, 3, 9, 4]],
+    )
+
+    def target(self, name: str) -> Target:
+        """The target with this name."""
+        columns, rows = self.tags
+        sizes = {"tag_m": self.tag_m, "gap_m": self.gap_m}
+        return TagGrid(name, self.family, columns, rows, **sizes, first_id=self.first_id, ids=self.ids or ())
+
+
+class BundleTagPlace(Section):
+    """A tag of a bundle, as apriltag_ros writes it."""
+
+    id: int = Field(description="the number of the tag", examples=[0])
+    size: Length = Field(description="side of the black square", examples=[0.05], json_schema_extra={"unit": "m"})
+    x: float = Field(default=0.0, description="the tag's middle in the bundle's frame, metres", examples=[0.035])
+    y: float = Field(default=0.0, description="as x", examples=[0.0])
+    z: float = Field(default=0.0, description="as x", examples=[0.0])
+    qw: float = Field(default=1.0, description="quaternion of the tag's axes in the bundle's frame", examples=[0.7071])
+    qx: float = Field(default=0.0, description="as qw", examples=[0.0])
+    qy: float = Field(default=0.0, description="as qw", examples=[0.7071])
+    qz: float = Field(default=0.0, description="as qw", examples=[0.0])
+
+
+class BundleTarget(_TargetSection):
+    """apriltag_ros's bundle of tags at known places."""
+
+    made: ClassVar = Bundle
+    type: Literal["bundle"]
+    family: Family = Field(description="dictionary of the tags", examples=["tag36h11"])
+    layout: Annotated[tuple[BundleTagPlace, ...], Field(max_length=10_000)] = Field(
+        description="the tags, each with size and pose, as in apriltag_ros's tags.yaml",
+        examples=[[{"id": 0, "size": 0.05, "z": 0.035}]],
+    )
+
+    def target(self, name: str) -> Target:
+        """The target with this name."""
+        tags = (BundleTag(t.id, t.size, (t.x, t.y, t.z), (t.qw, t.qx, t.qy, t.qz)) for t in self.layout)
+        return Bundle(name, self.family, tuple(tags))
+
+
 class CheckerboardTarget(_TargetSection):
     """A checkerboard, counted by inner corners."""
 
@@ -94,5 +150,6 @@ class CircleGridTarget(_TargetSection):
 
 
 TargetSection: TypeAlias = Annotated[
-    TagTarget | CharucoTarget | AprilGridTarget | CheckerboardTarget | CircleGridTarget, Field(discriminator="type")
+    TagTarget | CharucoTarget | AprilGridTarget | TagGridTarget | BundleTarget | CheckerboardTarget | CircleGridTarget,
+    Field(discriminator="type"),
 ]

@@ -76,7 +76,7 @@ def _value(value: Any) -> str:
     if isinstance(value, BaseModel):  # in one line, without what is not given
         return "{" + ", ".join(f"{key}: {_value(item)}" for key, item in value if item is not None) + "}"
     if isinstance(value, tuple):
-        return "[" + ", ".join(map(_scalar, value)) + "]"
+        return "[" + ", ".join(map(_value, value)) + "]"
     return _scalar(value)
 
 

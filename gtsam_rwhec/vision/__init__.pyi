@@ -16,6 +16,9 @@ from .options import DetectionOptions as DetectionOptions
 from .pose import PlanePoses as PlanePoses
 from .pose import plane_poses as plane_poses
 from .rejection import Rejection as Rejection
+from .tag_boards import Bundle as Bundle
+from .tag_boards import BundleTag as BundleTag
+from .tag_boards import TagGrid as TagGrid
 from .tag_survey import SeenTag as SeenTag
 from .tag_survey import tags_in_image as tags_in_image
 from .targets import AprilGrid as AprilGrid

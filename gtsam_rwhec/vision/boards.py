@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.vision.board_tags import charuco_board
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.dictionaries import dictionary
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco
 
@@ -30,17 +30,8 @@ ASTRAY_PX = 1.5
 GRADIENT_PX = 0.5
 
 
-def charuco_detector(board: Charuco) -> cv2.aruco.CharucoDetector:
-    """OpenCV's detector of a board."""
-    ids = np.array(board.ids, dtype=np.int32)
-    made = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.square_m, board.marker_m, dictionary(board.family), ids
-    )
-    return cv2.aruco.CharucoDetector(made)
-
-
 def charuco_corners(
-    gray: Gray, board: Charuco, detector: cv2.aruco.CharucoDetector, ids: np.ndarray, markers_px: Array
+    gray: Gray, board: Charuco, ids: np.ndarray, markers_px: Array, *, is_legacy: bool = False
 ) -> tuple[np.ndarray, Array]:
     """Indices (n,) and places (n, 2) of a board's inner corners, from its markers' ids (m,) and corners (m, 4, 2).
 
@@ -49,7 +40,7 @@ def charuco_corners(
     """
     if len(ids) == 0:
         return np.zeros(0, dtype=int), np.zeros((0, 2))
-    corners, indices, _, _ = detector.detectBoard(
+    corners, indices, _, _ = cv2.aruco.CharucoDetector(charuco_board(board, is_legacy)).detectBoard(
         gray, markerCorners=list(markers_px.astype(np.float32)[:, None]), markerIds=ids.astype(np.int32)[:, None]
     )
     if indices is None or len(indices) == 0:
@@ -75,18 +66,12 @@ def _to_the_markers(board: Charuco, plane: Array, pixels: Array) -> float:
 def aprilgrid_corners(gray: Gray, board: AprilGrid, ids: np.ndarray, tags_px: Array) -> tuple[np.ndarray, Array]:
     """Indices (n,) and places (n, 2) of a grid's corners, from its tags' ids (m,) and corners (m, 4, 2).
 
-    Generators print tags turned by different multiples of a right angle. This function takes the
-    multiple with which all corners together fit a plane best.
+    The corners are in the board's own order, as `board_tags` gives them.
     """
-    unique, counts = np.unique(ids, return_counts=True)
-    once = np.isin(ids, unique[counts == 1])
-    ids, tags_px = ids[once], tags_px[once]
     if len(ids) == 0:
         return np.zeros(0, dtype=int), np.zeros((0, 2))
     indices = (4 * (ids - board.first_id)[:, None] + np.arange(4)).ravel()
-    plane = board.corners()[indices, :2]
-    fits = [_plane_error(plane, np.roll(tags_px, turn, axis=1).reshape(-1, 2)) for turn in range(4)]
-    corners = np.roll(tags_px, int(np.argmin(fits)), axis=1)
+    corners = tags_px
     side = float(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min())
     rough = corners.reshape(-1, 2)
     # A window holds only the corner's two black squares: a tag's border is a fifth of its side.
@@ -113,12 +98,3 @@ def refined_corners(gray: Gray, corners: Array, half: int) -> Array:
     """Places (n, 2) of corners where two dark squares meet, in windows of 2 half + 1 pixels."""
     places = np.ascontiguousarray(corners.reshape(-1, 1, 2), dtype=np.float32)
     return cv2.cornerSubPix(gray, places, (half, half), (-1, -1), CRITERIA).reshape(-1, 2).astype(float)
-
-
-def _plane_error(plane: Array, pixels: Array) -> float:
-    """The mean squared error (pixels^2) of the homography that least squares fits to all points."""
-    H, _ = cv2.findHomography(plane, pixels)
-    if H is None:
-        return float("inf")
-    projected = cv2.perspectiveTransform(plane[:, None], H)[:, 0]
-    return float(((projected - pixels) ** 2).sum(axis=1).mean())

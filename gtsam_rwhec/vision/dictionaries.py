@@ -7,6 +7,9 @@ from functools import cache
 
 import cv2
 
+#: Tags of sides of this many pixels are looked for: OpenCV's limit, a share of the image, is 14 pixels at 1080p.
+LEAST_PX = 10.0
+
 
 @cache
 def dictionary(family: str) -> cv2.aruco.Dictionary:
@@ -29,8 +32,12 @@ def tag_detector(family: str, border_bits: int = 1) -> cv2.aruco.ArucoDetector:
     return cv2.aruco.ArucoDetector(dictionary(family), _parameters(border_bits))
 
 
-def detector_of(ids: Mapping[str, Sequence[int]], border_bits: int = 1) -> cv2.aruco.ArucoDetector:
+def detector_of(
+    ids: Mapping[str, Sequence[int]], border_bits: int = 1, *, larger_side_px: int = 640
+) -> cv2.aruco.ArucoDetector:
     """A detector of some tags of several families, for ``detectMarkersMultiDict``.
+
+    The smallest tag that it finds in images of this larger side has sides of `LEAST_PX`, or of OpenCV's share of it.
 
     The detector returns an id as an index into the family's `ids`, and a family as an index into the families. Two
     threads must not use one detector at once.
@@ -39,7 +46,9 @@ def detector_of(ids: Mapping[str, Sequence[int]], border_bits: int = 1) -> cv2.a
     for family, wanted in ids.items():
         tags = dictionary(family)
         some.append(cv2.aruco.Dictionary(tags.bytesList[list(wanted)], tags.markerSize, tags.maxCorrectionBits))
-    return cv2.aruco.ArucoDetector(some, _parameters(border_bits))
+    parameters = _parameters(border_bits)
+    parameters.minMarkerPerimeterRate = min(parameters.minMarkerPerimeterRate, 4.0 * LEAST_PX / larger_side_px)
+    return cv2.aruco.ArucoDetector(some, parameters)
 
 
 def _parameters(border_bits: int) -> cv2.aruco.DetectorParameters:

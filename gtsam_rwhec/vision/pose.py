@@ -1,8 +1,11 @@
-"""Poses of flat targets from their corners: both of a plane's two candidates, refined, with covariances.
+"""Poses of targets from their corners: both of a plane's two candidates, refined, with covariances.
 
 IPPE (Collins and Bartoli 2014, in OpenCV) gives two poses. Gauss-Newton on the reprojection error in pixels refines
 both, for all targets at once. A far or nearly frontal plane has two minima of nearly the same error: a single image
 does not tell which minimum is right (see `ambiguity`).
+
+Corners of several planes start from SQPnP (Terzakis and Lourakis 2020, in OpenCV). The second candidate is that of the
+plane nearest to them, if it leads to another minimum: a thin bundle far away is almost a plane.
 """
 
 from __future__ import annotations
@@ -21,11 +24,13 @@ from gtsam_rwhec.vision.camera import Camera
 STEPS = 15
 #: The iteration ends when the costs change by less than this share.
 SETTLED = 1e-9
+#: Corners are in one plane if they are nearer to it than this share of their extent.
+FLAT = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class PlanePoses:
-    """Poses of N flat targets. Each target has two candidates, and the better candidate is first.
+    """Poses of N targets. Each target has up to two candidates, and the better candidate is first.
 
     Attributes
     ----------
@@ -51,13 +56,13 @@ class PlanePoses:
 def plane_poses(
     camera: Camera, corners_m: Sequence[Array], corners_px: Sequence[Array], *, corner_px: float
 ) -> PlanePoses:
-    """Estimate poses of flat targets.
+    """Estimate poses of targets.
 
     Parameters
     ----------
     camera : Camera
     corners_m : sequence of (n_i, 3) arrays
-        In each target's frame, z = 0. A target with fewer than four corners has no pose (nan).
+        In each target's frame, in one plane or not. A target with fewer than four corners has no pose (nan).
     corners_px : sequence of (n_i, 2) arrays
         Where the corners were seen.
     corner_px : float
@@ -69,7 +74,7 @@ def plane_poses(
         n = len(points)
         p[i, :n], u[i, :n], known[i, :n] = points, pixels, True
     x = camera.undistort(np.where(known[..., None], u, camera.K[:2, 2]))
-    start = np.array([_ippe(p[i, k], x[i, k]) for i, k in enumerate(known)]).reshape(N, 2, 4, 4)
+    start = np.array([_starts(p[i, k], x[i, k]) for i, k in enumerate(known)]).reshape(N, 2, 4, 4)
     T, squared, covariance, errors = _refined(camera, start, p, u, known, corner_px)
     order = np.argsort(np.where(np.isfinite(squared), squared, np.inf), axis=1)
     T, covariance = (np.take_along_axis(x, order[:, :, None, None], axis=1) for x in (T, covariance))
@@ -78,6 +83,31 @@ def plane_poses(
     errors[~known] = np.nan
     count = np.maximum(known.sum(axis=1), 1)[:, None]
     return PlanePoses(T, squared, np.sqrt(squared / count), covariance, errors)
+
+
+def _starts(points: Array, x: Array) -> Array:
+    """First poses (2, 4, 4) from corners (n, 3) and normalised coordinates; nan where there is none."""
+    if len(points) < 4 or not points[:, 2].any():
+        return _ippe(points, x)
+    middle = points.mean(axis=0)
+    _, extent, axes = np.linalg.svd(points - middle, full_matrices=False)
+    to_plane = np.eye(4)  # T_plane_target, with z = 0 in the plane
+    to_plane[:3, :3] = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])[:, None]
+    to_plane[:3, 3] = -to_plane[:3, :3] @ middle
+    in_plane = points @ to_plane[:3, :3].T + to_plane[:3, 3]
+    is_flat = extent[2] <= FLAT * extent[0]
+    in_plane[:, 2] = 0.0
+    T = _ippe(in_plane, x) @ to_plane
+    if is_flat or not np.isfinite(x).all():
+        return T
+    found, turn, t = cv2.solvePnP(points[:, None], x[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
+    if not found or not np.isfinite(turn).all() or not t[2, 0] > 0.0:
+        return T
+    best = np.eye(4)
+    best[:3, :3], best[:3, 3] = cv2.Rodrigues(turn)[0], t[:, 0]
+    # The plane's pose that is further from SQPnP's may lead to another minimum.
+    likeness = np.nan_to_num(np.einsum("cij,ij->c", T[:, :3, :3], best[:3, :3]), nan=np.inf)
+    return np.stack([best, T[int(np.argmin(likeness))]])
 
 
 def _ippe(points: Array, x: Array) -> Array:

@@ -21,6 +21,7 @@ class Rejection(StrEnum):
     REPROJECTION = "reprojection error"
     AMBIGUOUS = "ambiguous"
     NOT_A_GRID = "corners not on one plane's grid"
+    LAYOUT = "tags are not where the rig file has them"
     NOT_WHOLE = "board not whole in the image"
     SQUARES = "squares do not alternate as printed"
     CIRCLES = "circles not of the sizes as printed, or the larger dot not at its corner"

@@ -1,5 +1,7 @@
 """Targets and the places of their corners: tags, ChArUco boards, Kalibr's AprilGrids, checkerboards, grids of circles.
 
+Grids and bundles of tags are in `tag_boards`.
+
 All targets have the same frame: the origin is the middle of the tag or of the board's pattern, x points to the right
 and y up as printed, z out of the paper. OpenCV orders a tag's corners: top left, top right, bottom right, bottom left.
 """
@@ -10,19 +12,13 @@ import re
 from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
-import numpy as np
-
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.vision.tag_boards import Bundle, TagGrid
+from gtsam_rwhec.vision.target_checks import FAMILIES as FAMILIES
+from gtsam_rwhec.vision.target_checks import LARGEST_M as LARGEST_M
+from gtsam_rwhec.vision.target_checks import check, check_grid, grid, square
 
-#: Each family has this number of tags.
-FAMILIES: dict[str, int] = {
-    "tag16h5": 30, "tag25h9": 35, "tag36h10": 2320, "tag36h11": 587,
-    **{f"aruco_{n}x{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
-    "aruco_original": 1024, "aruco_mip_36h12": 250,
-}  # fmt: skip
-#: Lengths of targets must be below this (m), since longer lengths are probably millimetres.
-LARGEST_M = 10.0
 #: Where a larger dot can be, as printed.
 CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")
 
@@ -47,7 +43,7 @@ class Tag:
     size_m: float
 
     def __post_init__(self) -> None:
-        _check(self.name, self.family, (self.id,), {"size_m": self.size_m})
+        check(self.name, self.family, (self.id,), {"size_m": self.size_m})
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -61,7 +57,7 @@ class Tag:
 
     def corners(self) -> Array:
         """(4, 3), metres."""
-        return _square(self.size_m)
+        return square(self.size_m)
 
 
 @dataclass(frozen=True)
@@ -92,8 +88,8 @@ class Charuco:
     first_id: int = 0
 
     def __post_init__(self) -> None:
-        _check_grid(self.name, self.columns, self.rows, 2)
-        _check(self.name, self.family, self.ids, {"square_m": self.square_m, "marker_m": self.marker_m})
+        check_grid(self.name, self.columns, self.rows, 2)
+        check(self.name, self.family, self.ids, {"square_m": self.square_m, "marker_m": self.marker_m})
         if not self.marker_m < self.square_m:
             raise TargetError(f"marker_m = {self.marker_m:g} must be less than square_m = {self.square_m:g}", self.name)
 
@@ -109,7 +105,7 @@ class Charuco:
 
     def corners(self) -> Array:
         """((columns - 1) (rows - 1), 3), metres."""
-        return _grid(self.columns - 1, self.rows - 1, self.square_m)
+        return grid(self.columns - 1, self.rows - 1, self.square_m)
 
 
 @dataclass(frozen=True)
@@ -141,8 +137,8 @@ class AprilGrid:
     first_id: int = 0
 
     def __post_init__(self) -> None:
-        _check_grid(self.name, self.columns, self.rows, 1)
-        _check(self.name, self.family, self.ids, {"tag_m": self.tag_m})
+        check_grid(self.name, self.columns, self.rows, 1)
+        check(self.name, self.family, self.ids, {"tag_m": self.tag_m})
         if not 0.0 < self.spacing <= 10.0:
             raise TargetError(
                 f"spacing = {self.spacing!r}; give gap / tag size, above 0 and at most 10 (Kalibr's default is 0.3)",
@@ -161,9 +157,9 @@ class AprilGrid:
 
     def corners(self) -> Array:
         """(4 columns rows, 3), metres; rows of tags from the bottom."""
-        middles = _grid(self.columns, self.rows, self.tag_m * (1.0 + self.spacing))
+        middles = grid(self.columns, self.rows, self.tag_m * (1.0 + self.spacing))
         from_below = middles.reshape(self.rows, self.columns, 3)[::-1].reshape(-1, 1, 3)
-        corners: Array = (from_below + _square(self.tag_m)).reshape(-1, 3)
+        corners: Array = (from_below + square(self.tag_m)).reshape(-1, 3)
         return corners
 
 
@@ -191,8 +187,8 @@ class Checkerboard:
     ids: ClassVar[tuple[int, ...]] = ()
 
     def __post_init__(self) -> None:
-        _check_grid(self.name, self.columns, self.rows, 3)
-        _check(self.name, None, (), {"square_m": self.square_m})
+        check_grid(self.name, self.columns, self.rows, 3)
+        check(self.name, None, (), {"square_m": self.square_m})
 
     @property
     def ways(self) -> int:
@@ -211,7 +207,7 @@ class Checkerboard:
 
     def corners(self) -> Array:
         """(columns rows, 3), metres."""
-        return _grid(self.columns, self.rows, self.square_m)
+        return grid(self.columns, self.rows, self.square_m)
 
 
 @dataclass(frozen=True)
@@ -240,8 +236,8 @@ class CircleGrid:
     ids: ClassVar[tuple[int, ...]] = ()
 
     def __post_init__(self) -> None:
-        _check_grid(self.name, self.columns, self.rows, 3)
-        _check(self.name, None, (), {"spacing_m": self.spacing_m})
+        check_grid(self.name, self.columns, self.rows, 3)
+        check(self.name, None, (), {"spacing_m": self.spacing_m})
         if not isinstance(self.larger_dot, bool) and self.larger_dot not in CORNERS:
             raise TargetError(f"larger_dot = {self.larger_dot!r}; give true, false or {', '.join(CORNERS)}", self.name)
 
@@ -266,10 +262,10 @@ class CircleGrid:
 
     def corners(self) -> Array:
         """(columns rows, 3), metres: the circles' centres."""
-        return _grid(self.columns, self.rows, self.spacing_m)
+        return grid(self.columns, self.rows, self.spacing_m)
 
 
-Target: TypeAlias = Tag | Charuco | AprilGrid | Checkerboard | CircleGrid
+Target: TypeAlias = Tag | Charuco | AprilGrid | TagGrid | Bundle | Checkerboard | CircleGrid
 
 
 def is_same_print(first: str, second: str) -> bool:
@@ -294,33 +290,3 @@ def family_named(word: str) -> str | None:
 def _bare(word: str) -> str:
     """A driver's name of a family without prefixes: 36h11 for tag36h11, tagStandard36h11 and DICT_APRILTAG_36h11."""
     return re.sub(r"^(dict_)?(apriltag_|aruco_)?(tag)?(standard)?", "", word.strip().lower())
-
-
-def _square(side_m: float) -> Array:
-    """Corners of a square about the origin, in the order top left, top right, bottom right, bottom left."""
-    return 0.5 * side_m * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
-
-
-def _grid(columns: int, rows: int, step_m: float) -> Array:
-    """Points of a grid about the origin, left to right, from the top."""
-    x, y = np.meshgrid(np.arange(columns) - 0.5 * (columns - 1), 0.5 * (rows - 1) - np.arange(rows))
-    return step_m * np.stack([x.ravel(), y.ravel(), np.zeros(columns * rows)], axis=1)
-
-
-def _check(name: str, family: str | None, ids: tuple[int, ...], lengths: dict[str, float]) -> None:
-    if family is not None:
-        if family not in FAMILIES:
-            raise TargetError(f"there is no family {family!r}; there are {', '.join(FAMILIES)}", name)
-        if min(ids) < 0 or max(ids) >= FAMILIES[family]:
-            raise TargetError(
-                f"ids {min(ids)} to {max(ids)} are not in {family}: 0 to {FAMILIES[family] - 1}",
-                name,
-            )
-    for word, length in lengths.items():
-        if not 0.0 < length < LARGEST_M:
-            raise TargetError(f"{word} = {length!r}; give metres, above 0 and below {LARGEST_M:g}", name)
-
-
-def _check_grid(name: str, columns: int, rows: int, least: int) -> None:
-    if not (least <= columns <= 100 and least <= rows <= 100):
-        raise TargetError(f"{columns} columns and {rows} rows; each must be {least} to 100", name)

@@ -18,6 +18,7 @@ from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.refinement.options import Robust
 from gtsam_rwhec.rig import (
     AprilGridTarget,
+    BundleTarget,
     Carriers,
     CharucoTarget,
     CheckerboardTarget,
@@ -29,11 +30,13 @@ from gtsam_rwhec.rig import (
     PoseSource,
     Rig,
     Sensor,
+    TagGridTarget,
     TagTarget,
     parse_rig,
     read_rig,
     rig_text,
 )
+from gtsam_rwhec.rig.target_sections import BundleTagPlace
 from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag
 
@@ -190,6 +193,13 @@ def rigs(draw: st.DrawFn) -> Rig:
             type="aprilgrid", family="tag36h11", tags=(3, 2), tag_m=draw(LENGTHS), spacing=0.3, first_id=100
         ),
         next(names): CheckerboardTarget(type="checkerboard", inner_corners=(5, 4), square_m=draw(LENGTHS)),
+        next(names): TagGridTarget(
+            type="tag_grid", family="aruco_4x4_50", tags=(2, 1), tag_m=draw(LENGTHS), gap_m=0.01,
+            ids=draw(st.none() | st.just((7, 3))),
+        ),
+        next(names): BundleTarget(
+            type="bundle", family="tag25h9", layout=(BundleTagPlace(id=1, size=draw(LENGTHS), z=draw(LENGTHS)),)
+        ),
     }  # fmt: skip
     some = draw(st.sets(st.sampled_from(sorted(targets)), min_size=1))
     return Rig(
@@ -269,4 +279,4 @@ def test_the_targets_of_the_page_on_logs_are_read() -> None:
     assert targets is not None
     rig = yaml.safe_load((CELL / "rig.yaml").read_text(encoding="utf-8")) | yaml.safe_load(targets[1])
     kinds = {type(target).__name__ for target in parse_rig(yaml.safe_dump(rig), "the page").target_list}
-    assert kinds == {"Tag", "Charuco", "AprilGrid", "Checkerboard", "CircleGrid"}
+    assert kinds == {"Tag", "Charuco", "AprilGrid", "TagGrid", "Bundle", "Checkerboard", "CircleGrid"}

@@ -10,6 +10,7 @@ import numpy as np
 
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.dictionaries import dictionary
+from gtsam_rwhec.vision.tag_boards import Bundle, TagGrid
 from gtsam_rwhec.vision.targets import AprilGrid, Checkerboard, CircleGrid, Tag, Target
 
 #: Rays a pixel along each axis, and the pictures' pixels along a tag's module.
@@ -46,8 +47,11 @@ def tag_modules(family: str, number: int, border_bits: int = 1) -> np.ndarray:
     return cv2.aruco.generateImageMarker(dictionary(family), number, side, borderBits=border_bits) / 255.0
 
 
-def printed(target: Target, *, quarter_turns: int = 0) -> Print:
-    """A target with a white margin; `quarter_turns` turns the tags of an AprilGrid where they are."""
+def printed(target: Target, *, quarter_turns: int = 0, legacy: bool = False) -> Print:
+    """A target with a white margin; `quarter_turns` turns the tags of an AprilGrid where they are.
+
+    `legacy` gives a ChArUco board the pattern of OpenCV before 4.6.
+    """
     if isinstance(target, Tag):
         modules = tag_modules(target.family, target.id)
         return Print(_enlarged(np.pad(modules, 1, constant_values=1.0)), target.size_m / len(modules) / PER_MODULE)
@@ -59,12 +63,42 @@ def printed(target: Target, *, quarter_turns: int = 0) -> Print:
         return Print(_enlarged(squares, 40), target.square_m / 40)
     if isinstance(target, CircleGrid):
         return circles(target)
+    if isinstance(target, TagGrid):
+        return tag_grid(target)
+    assert not isinstance(target, Bundle), "its tags are printed each: see `bundle`"
     made = cv2.aruco.CharucoBoard(
         (target.columns, target.rows), target.square_m, target.marker_m, dictionary(target.family),
         np.array(target.ids, dtype=np.int32),
     )  # fmt: skip
+    made.setLegacyPattern(legacy)
     picture = made.generateImage((target.columns * 80, target.rows * 80), marginSize=0) / 255.0
     return Print(np.pad(picture, 40, constant_values=1.0), target.square_m / 80)
+
+
+def tag_grid(grid: TagGrid) -> Print:
+    """A grid of tags with white gaps and margins."""
+    side = PER_MODULE * (int(dictionary(grid.family).markerSize) + 2)
+    gap = round(grid.gap_m / grid.tag_m * side)
+    picture = np.ones((grid.rows * (side + gap) + gap, grid.columns * (side + gap) + gap))
+    for k, number in enumerate(grid.ids):
+        y, x = (gap + (side + gap) * place for place in divmod(k, grid.columns))
+        picture[y : y + side, x : x + side] = _enlarged(tag_modules(grid.family, number))
+    return Print(np.pad(picture, 20, constant_values=1.0), grid.tag_m / side)
+
+
+def bundle(made: Bundle, T: np.ndarray) -> list[tuple[Print, np.ndarray]]:
+    """A bundle's tags with their poses in the camera: those that face it, the furthest first."""
+    scene = []
+    for tag in made.tags:
+        corners = tag.corners()
+        across, up = corners[1] - corners[0], corners[0] - corners[3]
+        axes = np.stack([across, up, np.cross(across, up) / tag.size_m], axis=1) / tag.size_m
+        T_tag = np.eye(4)
+        T_tag[:3, :3], T_tag[:3, 3] = axes, corners.mean(axis=0)
+        at = T @ T_tag
+        if at[:3, 2] @ at[:3, 3] < 0.0:
+            scene.append((printed(Tag("tag", made.family, tag.id, tag.size_m)), at))
+    return sorted(scene, key=lambda drawn: -float(drawn[1][2, 3]))
 
 
 def circles(grid: CircleGrid, *, light: bool = False, at: tuple[int, int] | None = None) -> Print:

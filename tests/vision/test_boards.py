@@ -65,15 +65,6 @@ def test_aprilgrids_tags_may_be_turned(camera: Camera, far: float, quarter_turns
     assert np.abs(off).max() < 0.15
 
 
-def test_an_aprilgrids_tag_seen_twice_is_not_used() -> None:
-    T = pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.3))
-    image = render(PINHOLE, [(printed(GRID), T)], blur_px=0.8)
-    ids = np.array([11, 12, 13, 14, 15, 16])
-    tags = projected(PINHOLE, GRID.corners(), T).reshape(-1, 4, 2)
-    indices, _ = boards.aprilgrid_corners(image, GRID, np.append(ids, 12), np.concatenate([tags, tags[4:5] + 3.0]))
-    assert sorted(set((indices // 4).tolist())) == [0, 2, 3, 4, 5]
-
-
 def test_only_covered_corners_of_boards_are_missing() -> None:
     T = pose((10.0, -15.0, 5.0), (0.0, 0.0, 0.3))
     for target in (BOARD, GRID):

@@ -137,12 +137,12 @@ def test_edges_not_found() -> None:
 
 def test_every_reason_has_its_test() -> None:
     # "ambiguous" is for whole tracks to say; test_board_evidence.py has those of checkerboards,
-    # test_circle_grids.py those of circles.
+    # test_circle_grids.py those of circles, test_board_tags.py those of layouts.
     tested = {
         Rejection.SMALL, Rejection.BLURRED, Rejection.GRAZING, Rejection.FEW_CORNERS, Rejection.NO_POSE,
         Rejection.REPROJECTION, Rejection.SEEN_TWICE, Rejection.NO_EDGES, Rejection.AMBIGUOUS,
         Rejection.NOT_A_GRID, Rejection.NOT_WHOLE, Rejection.SQUARES, Rejection.OTHER_SIZE,
-        Rejection.CIRCLES,
+        Rejection.CIRCLES, Rejection.LAYOUT,
     }  # fmt: skip
     assert tested == set(Rejection)
 

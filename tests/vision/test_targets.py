@@ -8,6 +8,7 @@ import pytest
 
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.vision.dictionaries import dictionary, modules
+from gtsam_rwhec.vision.tag_boards import Bundle, BundleTag, TagGrid
 from gtsam_rwhec.vision.tag_survey import BY_TRUST
 from gtsam_rwhec.vision.targets import (
     FAMILIES,
@@ -54,6 +55,28 @@ def test_a_charuco_boards_corners_are_opencvs() -> None:
     assert BOARD.ids == tuple(np.ravel(made.getIds()))
     assert BOARD.corners()[0, 0] < 0.0 < BOARD.corners()[0, 1]  # top left first
     assert BOARD.length_m == 0.04
+
+
+def test_a_tag_grid_is_opencvs() -> None:
+    made = cv2.aruco.GridBoard((4, 3), 0.03, 0.008, dictionary("aruco_4x4_50"))
+    expected = from_opencvs(
+        np.array(made.getObjPoints(), dtype=float).reshape(-1, 3), 4 * 0.038 - 0.008, 3 * 0.038 - 0.008
+    )
+    grid = TagGrid("grid", "aruco_4x4_50", 4, 3, 0.03, 0.008)
+    np.testing.assert_allclose(grid.corners(), expected, atol=1e-8)
+    assert grid.ids == tuple(np.ravel(made.getIds()))
+    assert TagGrid("grid", "aruco_4x4_50", 2, 1, 0.03, 0.008, ids=(7, 3)).ids == (7, 3)
+
+
+def test_a_bundles_tags_are_turned_and_moved() -> None:
+    half = np.sqrt(0.5)
+    tags = (BundleTag(5, 0.1), BundleTag(2, 0.2, (1.0, 2.0, 3.0), (half, 0.0, half, 0.0)))
+    bundle = Bundle("bundle", "tag36h11", tags)
+    assert (bundle.ids, bundle.length_m) == ((5, 2), 0.1)
+    np.testing.assert_allclose(bundle.corners()[:4], Tag("tag", "tag36h11", 5, 0.1).corners())
+    # A quarter of a turn about y takes x to -z: the left corners come forward.
+    places = [[1.0, 2.1, 3.1], [1.0, 2.1, 2.9], [1.0, 1.9, 2.9], [1.0, 1.9, 3.1]]
+    np.testing.assert_allclose(bundle.corners()[4:], places, atol=1e-12)
 
 
 def test_aprilgrid_is_kalibrs() -> None:
@@ -125,6 +148,15 @@ def test_the_widest_dictionaries_begin_with_the_others() -> None:
         (lambda: AprilGrid("t", "tag36h11", 6, 6, 88.0, 0.3), "tag_m = 88.0; give metres"),
         (lambda: Checkerboard("t", 2, 5, 0.03), "2 columns"),
         (lambda: Checkerboard("t", 8, 5, 30.0), "square_m = 30.0"),
+        (lambda: TagGrid("t", "aruco_4x4_50", 3, 2, 0.03, 0.008, ids=(1, 2)), "3 x 2 tags need 6 ids, and ids has 2"),
+        (lambda: TagGrid("t", "aruco_4x4_50", 2, 1, 0.03, 0.008, ids=(1, 1)), "id 1 is there 2 times"),
+        (lambda: TagGrid("t", "aruco_4x4_50", 2, 1, 0.03, 0.008, first_id=3, ids=(3, 4)), "both first_id and ids"),
+        (lambda: TagGrid("t", "aruco_4x4_50", 2, 1, 0.03, 0.0), "gap_m = 0.0"),
+        (lambda: Bundle("t", "tag36h11", ()), "without tags"),
+        (lambda: Bundle("t", "tag36h11", (BundleTag(1, 0.1), BundleTag(1, 0.1))), "id 1 is there 2 times"),
+        (lambda: Bundle("t", "tag36h11", (BundleTag(1, 50.0),)), "size of tag 1 = 50.0; give metres"),
+        (lambda: Bundle("t", "tag36h11", (BundleTag(1, 0.1, (0.0, 250.0, 0.0)),)), "tag 1 is at .* give metres"),
+        (lambda: Bundle("t", "tag36h11", (BundleTag(1, 0.1, wxyz=(1.0, 1.0, 0.0, 0.0)),)), "norm 1.414; give qw, qx"),
     ],
 )  # fmt: skip
 def test_wrong_targets_are_refused(make: object, words: str) -> None:
