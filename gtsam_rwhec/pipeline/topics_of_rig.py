@@ -7,17 +7,32 @@ from collections.abc import Iterator
 
 from gtsam_rwhec.errors import LogError, LogWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, ros2_detections
+from gtsam_rwhec.logs.message_kinds import TAG_DETECTIONS
 from gtsam_rwhec.rig import Rig
+
+#: The types of messages that are read, by what the rig file takes from them.
+READ = {
+    "images": ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage"),
+    "detections": (*ros2_detections.SCHEMAS, TAG_DETECTIONS),
+    "intrinsics": ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"),
+    "poses": (
+        "geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped", "geometry_msgs/TransformStamped",
+        "nav_msgs/Odometry", "tf2_msgs/TFMessage", "foxglove.PoseInFrame", "foxglove.FrameTransform",
+        "foxglove.FrameTransforms",
+    ),
+}  # fmt: skip
 
 
 def check_topics(log: Log, rig: Rig) -> None:
     """Check the topics that a rig file names, before anything is read.
 
-    Raises `LogError` for a topic that is not in the log, with the line that names it. Warns (`LogWarning`) of topics
+    Raises `LogError` for a topic that is not in the log, or whose type cannot be read, with the line that names it and
+    what can be read. Warns (`LogWarning`) of topics
     whose messages are of the frame of another sensor of the rig file: then two topics were exchanged.
     """
     there = {topic.name for topic in log.topics()}
+    _check_types(log, rig)
     for path, topic in _named(rig):
         if topic not in there and path[-1] != "topic":  # the reader of intrinsics says what else there is
             raise LogError(
@@ -32,6 +47,23 @@ def check_topics(log: Log, rig: Rig) -> None:
                 f"{owners[frame]} and not of {sensor}. Are the topics of the two exchanged?",
                 LogWarning,
                 stacklevel=2,
+            )
+
+
+def _check_types(log: Log, rig: Rig) -> None:
+    """Refuse topics of a type that cannot be read."""
+    named = list(_named(rig))
+    if rig.carriers.poses.topic is not None:
+        named.append((("carriers", "poses", "topic"), rig.carriers.poses.topic))
+    of_topic = {topic.name: topic for topic in log.topics()}
+    for path, name in named:
+        topic = of_topic.get(name)
+        if topic is not None and topic.unreadable:
+            what = "poses" if path[0] == "carriers" else "intrinsics" if path[-1] == "topic" else str(path[-1])
+            can = [each.name for each in of_topic.values() if each.schema.replace("/msg/", "/") in READ[what]]
+            raise LogError(
+                f"{rig.source.place(path)}: {log.files[0].path}, topic {name}: {topic.unreadable}. The types of {what} "
+                f"that are read: {', '.join(READ[what])}. Topics of these in this log: {', '.join(can) or 'none'}"
             )
 
 
