@@ -63,28 +63,62 @@ class Evidence:
     first_is_dark: bool = True
 
 
-def evidence(gray: Gray, grid: Array, camera: Camera | None) -> Evidence:
-    """Test a board's inner corners (rows, columns, 2), pixels; without a camera, as one of no distortion."""
+@dataclass(frozen=True, eq=False)
+class BoardPlane:
+    """A board before a camera: H (3, 3) from squares, from the first corner, to pixels without distortion."""
+
+    H: Array
+    focal: float
+    camera: Camera | None
+
+    def pixels(self, squares: Array) -> Array:
+        """Pixels (..., 2) of places (..., 2) on the board, in squares to the right and down from the first corner."""
+        flat = cv2.perspectiveTransform(np.asarray(squares, dtype=float).reshape(-1, 1, 2), self.H)
+        found: Array = np.asarray(flat, dtype=float).reshape(np.shape(squares))
+        return found if self.camera is None else self.camera.pixels(found / self.focal)
+
+
+def plane_through(
+    grid: Array, camera: Camera | None, most_px: float, good: np.ndarray
+) -> tuple[BoardPlane, Array] | None:
+    """The plane of those corners (rows, columns, 2) that are `good`, and how far (rows, columns) each is off, pixels.
+
+    It is that of least squares if no corner is off by more than most_px, else that of the least median.
+    """
     rows, columns = grid.shape[:2]
-    plane = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
-    seen = grid.reshape(-1, 2)
+    squares: Array = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(float)
     focal = 1.0 if camera is None else 0.5 * float(camera.K[0, 0] + camera.K[1, 1])
-    flat = seen if camera is None else camera.undistort(seen) * focal
-    most_px = max(MOST_OFF_PX, MOST_OFF * smallest_step(grid))
-    none_left_out = np.ones((rows, columns), dtype=bool)
-    H: Array = np.eye(3)
-    off: Array = np.full(len(seen), np.inf)
-    for method in (0, cv2.LMEDS):  # least squares of all; where some are off, the median's homography finds which
-        fitted = _homography(plane, flat, method)
-        if fitted is None:
-            return Evidence(Rejection.NOT_A_GRID, none_left_out)
-        H, off = fitted, np.linalg.norm(_pixels(plane, fitted, focal, camera) - seen, axis=1)
-        if (off <= most_px).all():
+    flat = grid[good] if camera is None else camera.undistort(grid[good]) * focal
+    if len(flat) < 4 or not np.isfinite(flat).all():
+        return None
+    found: tuple[BoardPlane, Array] | None = None
+    for method in (0, cv2.LMEDS):
+        H = cv2.findHomography(squares[good], flat, method)[0]
+        if H is None or not np.isfinite(H).all():
+            return None
+        plane = BoardPlane(np.asarray(H, dtype=float), focal, camera)
+        found = plane, np.asarray(np.linalg.norm(plane.pixels(squares) - grid, axis=-1))
+        if (found[1][good] <= most_px).all():
             break
-    kept = (off <= most_px).reshape(rows, columns)
+    return found
+
+
+def evidence(gray: Gray, grid: Array, camera: Camera | None, good: np.ndarray | None = None) -> Evidence:
+    """Test a board's inner corners (rows, columns, 2), pixels; without a camera, as one of no distortion.
+
+    `good` says which corners (rows, columns) were measured; the others are at no place.
+    """
+    rows, columns = grid.shape[:2]
+    counted = np.ones((rows, columns), dtype=bool) if good is None else good
+    most_px = max(MOST_OFF_PX, MOST_OFF * smallest_step(grid))
+    fitted = plane_through(grid, camera, most_px, counted)
+    if fitted is None:
+        return Evidence(Rejection.NOT_A_GRID, np.ones((rows, columns), dtype=bool))
+    plane, off = fitted
+    kept = counted & (off <= most_px)
     if not (kept.mean() >= LEAST_KEPT and all((kept.mean(axis=axis) > 0.5).all() for axis in (0, 1))):
-        return Evidence(Rejection.NOT_A_GRID, none_left_out)
-    values = _values(gray, H, focal, camera, rows, columns)
+        return Evidence(Rejection.NOT_A_GRID, np.ones((rows, columns), dtype=bool))
+    values = _values(gray, plane, rows, columns)
     white = np.indices(values.shape).sum(axis=0) % 2 == 1
     inner = np.s_[2:-2, 2:-2]
     first_is_dark = bool(values[inner][white[inner]].mean() > values[inner][~white[inner]].mean())
@@ -104,12 +138,6 @@ def evidence(gray: Gray, grid: Array, camera: Camera | None) -> Evidence:
     return Evidence(None, kept, first_is_dark)
 
 
-def _homography(plane: Array, flat: Array, method: int) -> Array | None:
-    """The homography (3, 3) from the board to pixels without distortion; None where there is none."""
-    H = cv2.findHomography(plane, flat, method)[0] if np.isfinite(flat).all() else None
-    return None if H is None or not np.isfinite(H).all() else np.asarray(H, dtype=float)
-
-
 def smallest_step(grid: Array) -> float:
     """The smallest distance between neighbouring lines of a grid of corners (rows, columns, 2), pixels."""
     right, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
@@ -118,18 +146,12 @@ def smallest_step(grid: Array) -> float:
     return float((area / np.maximum(longest, 1e-9)).min())
 
 
-def _pixels(plane: Array, H: Array, focal: float, camera: Camera | None) -> Array:
-    """Pixels (..., 2) of places (..., 2) on the board, in squares from the first corner."""
-    flat: Array = np.asarray(cv2.perspectiveTransform(plane.reshape(-1, 1, 2), H), dtype=float).reshape(plane.shape)
-    return flat if camera is None else camera.pixels(flat / focal)
-
-
-def _values(gray: Gray, H: Array, focal: float, camera: Camera | None, rows: int, columns: int) -> Array:
+def _values(gray: Gray, plane: BoardPlane, rows: int, columns: int) -> Array:
     """Gray values (rows + 3, columns + 3) of the squares and of one more square on each side; nan outside the image."""
     share = 0.5 + MIDDLE * ((np.arange(PER_SIDE) + 0.5) / PER_SIDE - 0.5)
     x = (np.arange(-2, columns + 1)[:, None] + share).ravel()
     y = (np.arange(-2, rows + 1)[:, None] + share).ravel()
-    places = _pixels(np.stack(np.meshgrid(x, y), axis=-1), H, focal, camera)
+    places = plane.pixels(np.stack(np.meshgrid(x, y), axis=-1))
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((places >= 0.0) & (places <= np.array(gray.shape[::-1]) - 1.0)).all(axis=-1))
     column, row = np.moveaxis(np.rint(np.where(inside[..., None], places, 0.0)).astype(int), -1, 0)

@@ -13,17 +13,28 @@ import cv2
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.board_evidence import Evidence, FoundBoard, evidence, smallest_step
+from gtsam_rwhec.vision.board_evidence import (
+    LEAST_KEPT,
+    Evidence,
+    FoundBoard,
+    evidence,
+    plane_through,
+    smallest_step,
+)
 from gtsam_rwhec.vision.boards import refined_corners
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.rejection import Rejection
+from gtsam_rwhec.vision.saddle_fits import fitted_corners
 from gtsam_rwhec.vision.saddles import regions
 from gtsam_rwhec.vision.targets import Checkerboard
 
 #: The half window at a corner is this share of the distance between neighbouring lines of corners, at most 9 pixels.
 #: The second is tried where corners are not on a grid.
 OF_SQUARE = (0.4, 0.25)
+#: Before they are measured, corners are off their places in a plane by at most this (pixels), or by this share of the
+#: distance between lines: a shadow's edge moves them.
+ROUGHLY_PX, ROUGHLY = 1.0, 0.06
 #: Images are halved this often before saddles are looked for: sharp corners first, blurred ones in what is smaller.
 LEVELS = (1, 2)
 #: At most this number of regions of an image are searched.
@@ -102,9 +113,9 @@ def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundBoard:
         grid = grid[::-1]
     tried: list[tuple[Array, Evidence]] = []
     for share in OF_SQUARE:  # a smaller window where something else is in the larger one, as a shadow's edge
-        half = int(np.clip(share * smallest_step(grid), 2, 9))
-        refined = refined_corners(gray, grid.reshape(-1, 2), half).reshape(grid.shape)
-        tried.append((refined, evidence(gray, refined, camera)))
+        step = smallest_step(grid)
+        rough = refined_corners(gray, grid.reshape(-1, 2), int(np.clip(share * step, 2, 9))).reshape(grid.shape)
+        tried.append(_measured(gray, rough, max(ROUGHLY_PX, ROUGHLY * step), camera))
         if tried[-1][1].rejection is not Rejection.NOT_A_GRID and tried[-1][1].kept.all():
             break
     refined, seen = max(tried, key=lambda one: (one[1].rejection is None, int(one[1].kept.sum())))
@@ -112,6 +123,17 @@ def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundBoard:
     if not seen.first_is_dark:
         refined, kept = _other_colour(refined), _other_colour(kept)
     return FoundBoard(refined[kept], np.flatnonzero(kept), seen.rejection)
+
+
+def _measured(gray: Gray, rough: Array, most_px: float, camera: Camera | None) -> tuple[Array, Evidence]:
+    """Corners (rows, columns, 2) measured where the plane of most of the rough ones says, and what they show."""
+    rows, columns = rough.shape[:2]
+    everyone = np.ones((rows, columns), dtype=bool)
+    found = plane_through(rough, camera, most_px, everyone)
+    if found is None or (found[1] <= most_px).mean() < LEAST_KEPT:
+        return rough, Evidence(Rejection.NOT_A_GRID, everyone)
+    fitted = fitted_corners(gray, found[0].pixels, rows, columns)
+    return fitted.corners_px, evidence(gray, fitted.corners_px, camera, fitted.good)
 
 
 def _other_colour(grid: np.ndarray) -> np.ndarray:
