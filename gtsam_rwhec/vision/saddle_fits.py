@@ -152,7 +152,7 @@ class _Fit:
     def place(self) -> Array:
         """(n, 2) where the edges cross, squares."""
         (a, b), (c, d) = self.edges.transpose(1, 2, 0)
-        return np.stack([a + b * c, c + d * a], axis=-1) / (1.0 - b * d)[:, None]
+        return np.asarray(np.stack([a + b * c, c + d * a], axis=-1) / (1.0 - b * d)[:, None], dtype=float)
 
 
 def _solved(normal: Array, right: Array) -> Array:
