@@ -47,6 +47,13 @@ from .refinement import Refined as Refined
 from .refinement import RefinedPoses as RefinedPoses
 from .refinement import refine as refine
 
+# Refine it from the corners in the images, with the cameras' intrinsics.
+from . import reprojection as reprojection
+from .reprojection import CornerOptions as CornerOptions
+from .reprojection import CornersRefined as CornersRefined
+from .reprojection import Observations as Observations
+from .reprojection import refine_corners as refine_corners
+
 # Keep it in files, print it, draw it.
 from . import report as report
 from . import results as results

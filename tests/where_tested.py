@@ -140,6 +140,11 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/report/plots": {
         "report/plots/test_plots.py": "coverage deviations frames plotted residuals",
     },
+    "gtsam_rwhec/reprojection": {
+        "methods/test_evangelista2023.py": "observations",
+        "reprojection/test_graph.py": "model",
+        "reprojection/test_refining.py": "corner_outliers intrinsics options refined stated_intrinsics",
+    },
     "gtsam_rwhec/results": {
         "results/test_agreement.py": "covariance_agreement",
         "results/test_result_file.py": "json_tree schema written_result",

@@ -135,3 +135,29 @@ def _equidistant(x: Array, D: Array) -> tuple[Array, Array]:
     dg = np.where(small, 2.0 * (k1 - 1.0 / 3.0), (slope / (1.0 + r2) - g) / (safe * safe))
     J = g[..., None, None] * np.eye(2) + dg[..., None, None] * x[..., :, None] * x[..., None, :]
     return x * g[..., None], J
+
+
+def coefficient_jacobian(model: Model, D: Array, x: Array) -> Array:
+    """Derivatives (..., 2, n) of the distorted coordinates of x (..., 2) by the n coefficients."""
+    r2 = np.einsum("...i,...i->...", x, x)
+    if model == "equidistant":
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        over_r = np.where(r < 1e-6, 1.0, theta / np.where(r < 1e-6, 1.0, r))
+        powers = np.stack([over_r * theta ** (2 * k) for k in range(1, 5)], axis=-1)
+        along: Array = x[..., :, None] * powers[..., None, :]
+        return along
+    if model == "pinhole":
+        return np.zeros((*x.shape, 0))
+    k1, k2, _, _, k3, k4, k5, k6 = np.pad(D, (0, 14))[:8]
+    a, b = x[..., 0], x[..., 1]
+    above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    up, down = 1.0 / below, -above / (below * below)
+    J = np.zeros((*x.shape, 12))
+    radial = np.stack([r2 * up, r2**2 * up, r2**3 * up, r2 * down, r2**2 * down, r2**3 * down], axis=-1)
+    J[..., [0, 1, 4, 5, 6, 7]] = x[..., :, None] * radial[..., None, :]
+    J[..., 0, 2], J[..., 0, 3] = 2 * a * b, r2 + 2 * a * a
+    J[..., 1, 2], J[..., 1, 3] = r2 + 2 * b * b, 2 * a * b
+    J[..., 0, 8], J[..., 0, 9] = r2, r2 * r2
+    J[..., 1, 10], J[..., 1, 11] = r2, r2 * r2
+    return J[..., : len(D)]

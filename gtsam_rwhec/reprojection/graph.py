@@ -1,0 +1,174 @@
+"""The GTSAM graph of corners: one factor an image, whose rows are computed for all images at once.
+
+Variables
+
+    x, y   poses of targets and sensors on their carriers
+    a      the carriers' pose A at an instant, held by its measurement and its noise; absent where A is exact
+    k      a camera's parameters, held by a prior; sensors may share a camera
+    b      a board's shape, held by a prior; absent where it is not free
+
+GTSAM asks each factor by itself, in any order. All rows are computed when the first factor is asked at new values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.reprojection.model import Model, Point
+from gtsam_rwhec.reprojection.views import SHAPE
+
+
+def key_of(letter: str, number: int) -> int:
+    """A variable's key."""
+    key: int = gtsam.symbol(letter, number)
+    return key
+
+
+@dataclass(eq=False)
+class CornerGraph:
+    """The graph of a model, with its variables' keys.
+
+    A factor's vector is not the pixel errors but a turn of them, which has the same length: the linear rows of an image
+    are as few as its variables have columns.
+    """
+
+    model: Model
+    start: Point
+    graph: gtsam.NonlinearFactorGraph = field(init=False)
+    _at: dict[int, Array] = field(init=False, default_factory=dict)
+    _point: Point = field(init=False)
+    _errors: list[Array] = field(init=False, default_factory=list)
+    _triangles: list[tuple[Array, dict[str, slice]]] = field(init=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        model = self.model
+        self.x = {name: key_of("x", i) for i, name in enumerate(model.targets)}
+        self.y = {name: key_of("y", i) for i, name in enumerate(model.sensors)}
+        self.k = {name: key_of("k", i) for i, name in enumerate(model.camera_priors)}
+        self.b = {name: key_of("b", i) for i, name in enumerate(model.shape_priors)}
+        carriers = range(len(model.A)) if model.A_noise is not None else ()
+        self._keys = [
+            *self.x.values(), *self.y.values(), *self.k.values(), *self.b.values(), *(key_of("a", i) for i in carriers),
+        ]  # fmt: skip
+        self.graph = gtsam.NonlinearFactorGraph()
+        self._add_priors()
+        for s, stack in enumerate(model.stacks):
+            for v in range(len(stack.instant)):
+                self._add_view(s, v)
+
+    def values(self, point: Point) -> gtsam.Values:
+        """A point as GTSAM's values."""
+        values = gtsam.Values()
+        for keys, poses in ((self.x, point.X), (self.y, point.Y)):
+            for name, key in keys.items():
+                values.insert(key, gtsam.Pose3(poses[name]))
+        if self.model.A_noise is not None:
+            for i, T in enumerate(point.A):
+                values.insert(key_of("a", i), gtsam.Pose3(T))
+        for keys, vectors in ((self.k, point.cameras), (self.b, point.shapes)):
+            for name, key in keys.items():
+                values.insert(key, np.asarray(vectors[name], dtype=float))
+        return values
+
+    def point(self, values: gtsam.Values) -> Point:
+        """GTSAM's values as a point."""
+        A = self.model.A
+        if self.model.A_noise is not None:
+            A = np.array([values.atPose3(key_of("a", i)).matrix() for i in range(len(A))])
+        return Point(
+            {name: values.atPose3(key).matrix() for name, key in self.x.items()},
+            {name: values.atPose3(key).matrix() for name, key in self.y.items()},
+            A,
+            {name: values.atVector(key) for name, key in self.k.items()},
+            self.start.shapes | {name: values.atVector(key) for name, key in self.b.items()},
+        )
+
+    def covariance(self, values: gtsam.Values, slots: Mapping[tuple[str, str], slice]) -> tuple[Array, float]:
+        """The covariance (d, d) of the unknowns in `slots`, all else eliminated; and how far off the optimum is.
+
+        That is the length of one more Gauss-Newton step in deviations. Slots have ("x", target), ("y", sensor),
+        ("k", camera) and ("b", target).
+        """
+        linear = self.graph.linearize(values)
+        of_letter = {"x": self.x, "y": self.y, "k": self.k, "b": self.b}
+        keys = [of_letter[letter][name] for letter, name in slots]
+        marginal = linear.marginal(keys)
+        ordering = gtsam.Ordering()
+        for key in keys:
+            ordering.push_back(key)
+        information, gradient = marginal.hessian(ordering)
+        size = np.sqrt(np.diagonal(information))
+        inverse = np.linalg.inv(information / size[:, None] / size) / size[:, None] / size
+        joint: Array = 0.5 * (inverse + inverse.T)
+        return joint, float(np.sqrt(gradient @ joint @ gradient))
+
+    def _add_priors(self) -> None:
+        model = self.model
+        if model.A_noise is not None:
+            columns = model.to_right * model.A_noise
+            for i, (T, covariance) in enumerate(zip(model.A, columns @ columns.transpose(0, 2, 1), strict=True)):
+                noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+                self.graph.add(gtsam.PriorFactorPose3(key_of("a", i), gtsam.Pose3(T), noise))
+        for name, key in self.k.items():
+            mean, deviation = model.camera_priors[name]
+            # an infinite deviation is a weight of zero
+            self.graph.add(gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Diagonal.Precisions(deviation**-2.0)))
+        for name, key in self.b.items():
+            noise = gtsam.noiseModel.Diagonal.Sigmas(model.shape_priors[name])
+            self.graph.add(gtsam.PriorFactorVector(key, np.zeros(SHAPE), noise))
+
+    def _add_view(self, s: int, v: int) -> None:
+        stack = self.model.stacks[s]
+        key_of_variable = {
+            "X": self.x[stack.target],
+            "Y": self.y[stack.sensor],
+            "camera": self.k[self.model.camera_of[stack.sensor]],
+            "A": key_of("a", int(stack.instant[v])),
+            "shape": self.b.get(stack.target, 0),
+        }
+        variables = self.model.variables_of(stack)
+        width = 12 + len(self.start.cameras[self.model.camera_of[stack.sensor]])
+        width += 6 * ("A" in variables) + SHAPE * ("shape" in variables)
+        size = min(2 * stack.known.shape[1], width + 1)
+        keys = [key_of_variable[name] for name in variables]
+
+        def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any | None) -> NDArray[np.float64]:
+            self._come_to(keys, values)
+            if jacobians is None:
+                length = np.zeros(size)
+                length[0] = np.linalg.norm(self._errors[s][v])
+                return length
+            if not self._triangles:
+                self._triangles = self.model.triangles(self._point)
+            R, columns = self._triangles[s]
+            for i, name in enumerate(variables):
+                jacobians[i] = R[v][:, columns[name]]
+            residual: NDArray[np.float64] = R[v][:, -1]
+            return residual
+
+        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error))
+
+    def _come_to(self, keys: list[int], values: gtsam.Values) -> None:
+        """Compute all residuals at the values anew, if one of the variables with these keys has changed."""
+        for key in keys:
+            known = self._at.get(key)
+            if known is None or not np.array_equal(known, _value(values, key)):
+                self._point = self.point(values)
+                self._at = {key: _value(values, key) for key in self._keys}
+                self._errors, self._triangles = self.model.errors(self._point), []
+                break
+
+
+def _value(values: gtsam.Values, key: int) -> Array:
+    if gtsam.symbolChr(key) in (ord("k"), ord("b")):
+        vector: Array = values.atVector(key)
+        return vector
+    pose: Array = values.atPose3(key).matrix()
+    return pose

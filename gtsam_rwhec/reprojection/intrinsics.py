@@ -1,0 +1,48 @@
+"""What is known of a camera before the images are looked at: its stated parameters, and how far they may be off.
+
+Intrinsics are stated by a calibration, or they are nominal: from a data sheet, a simulator, another camera of the same
+kind. A calibration without a covariance is taken to be right to 0.3 % of the focal length and 3 pixels of the centre;
+nominal intrinsics to 3 %, and to 30 pixels or 2 % of the image's width, whichever is more. Coefficients of the
+lens model move the image's corner by a calibration's 3 pixels, or by a nominal 5 % of the focal length.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.reprojection.lens import PINHOLE, parameters_of
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.distortion import coefficient_jacobian
+
+Stated = Literal["calibration", "nominal"]
+
+#: Deviation of the focal length (a share), of the centre (pixels), and of the coefficients (pixels at the corner of
+#: the image, or a share of the focal length).
+FOCAL = {"calibration": 0.003, "nominal": 0.03}
+CENTRE_PX = {"calibration": 3.0, "nominal": 30.0}
+CENTRE_OF_WIDTH = 0.02
+LENS_PX, LENS_OF_FOCAL = 3.0, 0.05
+#: fx and fy differ by no more than a tenth of what both may be off by.
+UNEQUAL = 0.1
+
+
+def free_model(camera: Camera, stated: Stated) -> Camera:
+    """The camera with the lens model that is estimated: a nominal pinhole may have distortion that nobody stated."""
+    if camera.model == "pinhole" and stated == "nominal":
+        return Camera(camera.width, camera.height, "radtan", camera.K, np.zeros(4))
+    return camera
+
+
+def prior_of(camera: Camera, stated: Stated) -> tuple[Array, Array]:
+    """Mean (m,) and standard deviation (m,) of a camera's parameters."""
+    mean = parameters_of(camera)
+    f, c = mean[:2], np.maximum(CENTRE_PX[stated], CENTRE_OF_WIDTH * camera.width if stated == "nominal" else 0.0)
+    lens_px = LENS_PX if stated == "calibration" else LENS_OF_FOCAL * float(f.mean())
+    corner = 0.5 * np.array([camera.width, camera.height]) / f
+    moved = np.linalg.norm(coefficient_jacobian(camera.model, camera.D, corner) * f[:, None], axis=0)
+    deviation = np.concatenate([FOCAL[stated] * f, [float(c), float(c)], lens_px / moved])
+    assert len(deviation) == PINHOLE + len(camera.D)
+    return mean, deviation

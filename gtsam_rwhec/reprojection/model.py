@@ -1,0 +1,125 @@
+"""What is observed and what is known of it, and a point at which all of it has values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.options import About
+from gtsam_rwhec.reprojection.views import Linear, Stack, linearised, pixel_errors
+
+#: A residual of this many deviations stands for a corner behind its camera: the step is refused, and stays finite.
+BEHIND = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Values of all variables: poses by name (4, 4), A (I, 4, 4), cameras' parameters and boards' shapes by name."""
+
+    X: dict[str, Array]
+    Y: dict[str, Array]
+    A: Array
+    cameras: dict[str, Array]
+    shapes: dict[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What is observed and what is known of it.
+
+    Attributes
+    ----------
+    stacks : tuple of Stack
+    A : (I, 4, 4) array
+        The carriers' poses as measured.
+    A_noise : (6,) array or None
+        Standard deviations of A's perturbation [omega, v], rad and m; None: A is exact.
+    about : "targetcarrier" or "sensorcarrier"
+        The carrier whose axes and origin A's perturbation has: A Expmap(xi), or Expmap(xi) A.
+    camera_of : dict of str to str
+        The camera of each sensor: several sensors may share one.
+    camera_priors : dict of str to (mean (m,), deviation (m,))
+        By camera. A deviation may be infinite.
+    shape_priors : dict of str to (3,) array
+        Deviations of a board's shape by target; zero: that number is not free.
+    corner_px : float
+        Standard deviation of a corner along each axis.
+    weights : tuple of (V, n) arrays
+        Of each corner's squared residual, by stack.
+    """
+
+    stacks: tuple[Stack, ...]
+    A: Array
+    A_noise: Array | None
+    about: About
+    camera_of: dict[str, str]
+    camera_priors: dict[str, tuple[Array, Array]]
+    shape_priors: dict[str, Array]
+    corner_px: float
+    weights: tuple[Array, ...]
+
+    @property
+    def to_right(self) -> Array:
+        """The matrices (I, 6, 6) that turn A's perturbations into right ones."""
+        if self.about == "targetcarrier":
+            return np.broadcast_to(np.eye(6), (len(self.A), 6, 6))
+        return se3.adjoint(se3.inverse(self.A))
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the targets."""
+        return tuple(dict.fromkeys(stack.target for stack in self.stacks))
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors."""
+        return tuple(dict.fromkeys(stack.sensor for stack in self.stacks))
+
+    def errors(self, point: Point) -> list[Array]:
+        """Residuals (V, 2n) of every stack, weighted, over the corners' deviation."""
+        return [
+            _finite(pixel_errors(stack, *self._arguments(stack, point)), root)
+            for stack, root in zip(self.stacks, self._roots, strict=True)
+        ]
+
+    def linearised(self, stack: Stack, point: Point) -> Linear:
+        """Rows of a stack, in pixels."""
+        return linearised(stack, *self._arguments(stack, point))
+
+    def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array]:
+        camera = point.cameras[self.camera_of[stack.sensor]]
+        return point.X[stack.target], point.Y[stack.sensor], point.A, camera, point.shapes[stack.target]
+
+    @property
+    def _roots(self) -> list[Array]:
+        return [np.repeat(np.sqrt(weights), 2, axis=1) / self.corner_px for weights in self.weights]
+
+    def triangles(self, point: Point) -> list[tuple[Array, dict[str, slice]]]:
+        """The rows of every image, turned into at most as many as there are columns: Q of [J, r] = Q R is left out.
+
+        They have the same cost and the same information. By stack: R (V, m, columns), whose last column is the
+        residual, and the columns of each variable.
+        """
+        result = []
+        for stack, root in zip(self.stacks, self._roots, strict=True):
+            rows = self.linearised(stack, point)
+            residual = _finite(rows.residual, root)
+            blocks = {name: getattr(rows, f"by_{name}") * root[..., None] for name in self.variables_of(stack)}
+            ends = np.cumsum([block.shape[2] for block in blocks.values()]).tolist()
+            columns = {name: slice(a, b) for name, a, b in zip(blocks, [0, *ends], ends, strict=False)}
+            stacked = np.concatenate([*blocks.values(), residual[..., None]], axis=2)
+            result.append((np.asarray(np.linalg.qr(stacked, mode="r")), columns))
+        return result
+
+    def variables_of(self, stack: Stack) -> tuple[str, ...]:
+        """X, Y, camera, and A and shape where they are free."""
+        free = [("A", self.A_noise is not None), ("shape", stack.target in self.shape_priors)]
+        return ("X", "Y", "camera", *(name for name, is_free in free if is_free))
+
+
+def _finite(error: Array, root: Array) -> Array:
+    """Weighted errors, finite behind the camera too."""
+    return np.asarray(np.where(np.isfinite(error), error, BEHIND) * np.where(np.isfinite(error), root, root > 0.0))

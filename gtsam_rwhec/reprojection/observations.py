@@ -1,0 +1,156 @@
+"""What cameras saw: corners of targets in pixels, with the carriers' pose of each image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rwhec_factors import se3
+
+from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, TargetError
+from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms, checked_rows, rows_to_transforms
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.vision.camera import Camera
+
+#: A target is flat when its corners are no farther from a plane than this share of its size.
+FLAT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Images of one target by one camera: A (N, 4, 4), metres; pixels (N, n, 2), nan where a corner was not seen."""
+
+    A: Array
+    pixels: Array
+
+    @property
+    def known(self) -> np.ndarray:
+        """(N, n) booleans: which corners were seen."""
+        return np.asarray(np.isfinite(self.pixels).all(axis=2))
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What cameras saw.
+
+    Attributes
+    ----------
+    cameras : dict of str to Camera
+        By sensor.
+    corners : dict of str to (n, 3) array
+        By target, in its own frame, metres.
+    views : dict of (target, sensor) to Views
+    corner_px : float
+        Standard deviation of a corner along each axis, pixels.
+    """
+
+    cameras: Mapping[str, Camera]
+    corners: Mapping[str, Array]
+    views: Mapping[tuple[str, str], Views]
+    corner_px: float = 0.1
+
+    @staticmethod
+    def of(
+        cameras: Mapping[str, Camera],
+        corners: Mapping[str, ArrayLike],
+        views: Mapping[tuple[str, str], tuple[PosesLike, ArrayLike]],
+        corner_px: float = 0.1,
+    ) -> Observations:
+        """Make checked observations; views are given as A = T_sensorcarrier_targetcarrier and pixels of each image.
+
+        Raises
+        ------
+        CountError, FrameError, NoiseError, PoseError, TargetError
+            When shapes do not fit, a name has no camera or target, or a matrix is not a pose.
+        """
+        if not (np.isfinite(corner_px) and corner_px > 0.0):
+            raise NoiseError(f"corner_px is {corner_px!r}; give a positive number of pixels")
+        points = {name: np.asarray(value, dtype=float) for name, value in corners.items()}
+        for name, p in points.items():
+            if p.ndim != 2 or p.shape[1] != 3 or len(p) < 4 or not np.isfinite(p).all():
+                raise TargetError(f"the corners of {name} have shape {p.shape}; give four or more finite (n, 3) points")
+        checked = {}
+        for (target, sensor), (A, pixels) in views.items():
+            where = f"the views of {target} by {sensor}"
+            if target not in points or sensor not in cameras:
+                missing = f"corners of {target}" if target not in points else f"camera {sensor}"
+                raise FrameError(f"{where}: there are no {missing}")
+            transforms = as_transforms(A, None, f"A of {where}")
+            seen = np.asarray(pixels, dtype=float)
+            if seen.shape != (len(transforms), len(points[target]), 2) or not len(seen):
+                raise CountError(
+                    f"{where}: pixels have shape {seen.shape} for {len(transforms)} poses and {len(points[target])} "
+                    f"corners; give ({len(transforms)}, {len(points[target])}, 2), nan where a corner was not seen"
+                )
+            fewest = int(np.isfinite(seen).all(axis=2).sum(axis=1).min())
+            if fewest < 4:
+                raise CountError(f"{where}: an image has {fewest} corners; leave out images with fewer than 4")
+            rows = checked_rows(transforms, 0, f"A of {where}").rows
+            checked[target, sensor] = Views(rows_to_transforms(rows), seen)
+        if not checked:
+            raise CountError("there are no views; give images of a target by a camera")
+        return Observations(dict(cameras), points, checked, float(corner_px))
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the targets that were seen."""
+        return tuple(dict.fromkeys(target for target, _ in self.views))
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the cameras that saw a target."""
+        return tuple(dict.fromkeys(sensor for _, sensor in self.views))
+
+    def poses(self, predicted: Mapping[tuple[str, str], Array] | None = None) -> Problem:
+        """A problem of poses: each image's pose by its corners alone, with covariances.
+
+        ``predicted`` has each image's T_camera_target (N, 4, 4) by a calibration, metres: the image takes the nearer of
+        a flat target's two poses. Left out, each image takes the pose with less reprojection error. Raises TargetError
+        when a target is not flat, and CameraError when an image's corners have no pose.
+        """
+        from gtsam_rwhec.vision.pose import plane_poses
+
+        problem = Problem()
+        for (target, sensor), view in self.views.items():
+            flat, T_target_flat = _in_plane(self.corners[target], target)
+            known = view.known
+            found = plane_poses(
+                self.cameras[sensor],
+                [flat[seen] for seen in known],
+                [pixels[seen] for pixels, seen in zip(view.pixels, known, strict=True)],
+                corner_px=self.corner_px,
+            )
+            T = found.T @ np.linalg.inv(T_target_flat)
+            choice = np.zeros(len(T), dtype=int)
+            if predicted is not None:
+                off = np.linalg.norm(T[:, :, :3, :3] - predicted[target, sensor][:, None, :3, :3], axis=(2, 3))
+                choice = np.where(np.isnan(off[:, 1]), 0, np.argmin(np.nan_to_num(off, nan=np.inf), axis=1))
+            at = np.arange(len(T))
+            lost = np.flatnonzero(~np.isfinite(T[at, choice]).all(axis=(1, 2)))
+            if lost.size:
+                raise CameraError(f"image {lost[0]} of {target} by {sensor} has no pose: are its corners on one line?")
+            # right perturbations of the flat frame become right perturbations of the target's frame by the adjoint
+            ad = se3.adjoint(np.broadcast_to(T_target_flat, (len(T), 4, 4)))
+            covariance = ad @ found.covariance[at, choice] @ ad.mT
+            problem.add(target, sensor, view.A, T[at, choice], covariances=0.5 * (covariance + covariance.mT))
+        return problem
+
+
+def _in_plane(points: Array, name: str) -> tuple[Array, Array]:
+    """A flat target's corners with z = 0, and T_target_flat; TargetError for a target that is not flat."""
+    middle = points.mean(axis=0)
+    _, singular, Vt = np.linalg.svd(points - middle)
+    if singular[2] > FLAT * singular[0]:
+        raise TargetError(
+            f"the corners of {name} do not lie in one plane (the root mean square distance is "
+            f"{singular[2] / np.sqrt(len(points)):.3g} m), and only flat targets have poses from "
+            "single images; give a start by MethodOptions.start"
+        )
+    if singular[1] <= FLAT * singular[0]:
+        raise TargetError(f"the corners of {name} lie on one line, which determines no pose; give corners in a plane")
+    R = Vt.T * np.array([1.0, 1.0, np.linalg.det(Vt)])
+    flat = (points - middle) @ R
+    flat[:, 2] = 0.0
+    return flat, se3.pose(R, middle)

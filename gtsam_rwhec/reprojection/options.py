@@ -1,0 +1,89 @@
+"""The options of a refinement from corners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.real_numbers import LARGEST_WHOLE, is_one_of, is_real, is_whole
+from gtsam_rwhec.refinement.options import About, CarrierNoise
+from gtsam_rwhec.reprojection.intrinsics import Stated
+
+CarrierPoses = Literal["exact", "estimate"]
+
+
+@dataclass(frozen=True)
+class CornerOptions:
+    """The options of `refine_corners`.
+
+    Attributes
+    ----------
+    stated : "calibration" or "nominal", or a dict of them by sensor
+        Where the stated intrinsics come from. A calibration's are right to 0.3 % of f and 3 pixels of c, nominal ones
+        to 3 % and to 30 pixels or 2 % of the width. Sensors that a dict lacks are nominal. Where the images contradict
+        it, the deviation is widened, and the result says so.
+    shared : tuple of tuple of str
+        Groups of sensors whose intrinsics are the same: those of the group's first sensor are stated.
+    size_share : float
+        Standard deviation of the targets' sizes, a share of 1; 0: they are exactly as stated.
+    warp_m : float
+        Standard deviation of the height of a bent board's edge over its middle, metres; 0: boards are flat.
+    carrier_noise : CarrierNoise, "estimate" or "exact"
+        The noise of the carriers' poses A: given (standard deviations), estimated, or none.
+    about : "targetcarrier" or "sensorcarrier"
+        The carrier whose axes and origin A's noise has, where it is estimated: the one that moves.
+    outliers : bool
+        Leave corners out that disagree with all others.
+    max_iterations : int
+        Largest number of Levenberg-Marquardt steps of one round.
+    """
+
+    stated: Stated | Mapping[str, Stated] = "nominal"
+    shared: tuple[tuple[str, ...], ...] = field(default=())
+    size_share: float = 0.0
+    warp_m: float = 0.0
+    carrier_noise: CarrierNoise | CarrierPoses = "estimate"
+    about: About = "targetcarrier"
+    outliers: bool = True
+    max_iterations: int = 100
+
+    def __post_init__(self) -> None:
+        every = self.stated.values() if isinstance(self.stated, Mapping) else (self.stated,)
+        for value, words, choices in (
+            *((each, "stated", Stated) for each in every),
+            (self.about, "about", About),
+        ):
+            if not is_one_of(value, get_args(choices)):
+                raise OptionError(
+                    f"CornerOptions.{words}={brief(value)} is not one of {', '.join(map(repr, get_args(choices)))}"
+                )
+        for name in ("size_share", "warp_m"):
+            value = getattr(self, name)
+            if not (is_real(value) and 0.0 <= value < np.inf):
+                raise OptionError(f"CornerOptions.{name}={brief(value)}; give a standard deviation, or 0")
+        noise = self.carrier_noise
+        if not isinstance(noise, CarrierNoise) and not is_one_of(noise, get_args(CarrierPoses)):
+            raise OptionError(
+                f"CornerOptions.carrier_noise={brief(noise)}; give CarrierNoise(rotation_rad=..., translation_m=...), "
+                "'estimate' or 'exact'"
+            )
+        if isinstance(noise, CarrierNoise) and noise.covariances is not None:
+            raise OptionError("CornerOptions.carrier_noise has covariances; give rotation_rad and translation_m")
+        if not is_whole(self.max_iterations, 1):
+            raise OptionError(
+                f"CornerOptions.max_iterations={brief(self.max_iterations)}; give a whole number from 1 to "
+                f"{LARGEST_WHOLE}"
+            )
+
+    def stated_of(self, sensor: str) -> Stated:
+        """Where a sensor's intrinsics come from."""
+        return self.stated.get(sensor, "nominal") if isinstance(self.stated, Mapping) else self.stated
+
+    def camera_of(self, sensor: str) -> str:
+        """The sensor whose intrinsics this sensor has: its own, or the first one's of its group."""
+        return next((group[0] for group in self.shared if sensor in group), sensor)

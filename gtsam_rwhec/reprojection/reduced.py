@@ -1,0 +1,204 @@
+"""The rows at one point, summed by instant: what the noise's likelihood and the covariance need of them.
+
+All sums are in pixels: rows are not divided by the corners' deviation. With the common unknowns theta (poses, cameras,
+shapes) and the carriers' errors a_i at the instants, to first order
+
+    r = r_0 + J theta + J_i a_i + noise,    a_i ~ N(0, S),
+
+so the sums G = J'J, C_i = J_i'J, M_i = J_i'J_i, g = J'r_0, b_i = J_i'r_0 and r_0'r_0 are all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import TypeAlias
+
+import numpy as np
+from rwhec_factors import se3
+from scipy.optimize import minimize
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.reprojection.model import Model, Point
+from gtsam_rwhec.reprojection.views import SHAPE
+
+Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
+
+#: Noise is looked for between these standard deviations: pixels of a corner; rad, and m, of the carriers' poses.
+CORNER_PX = (1e-3, 30.0)
+CARRIER = (1e-7, 0.1)
+#: Deviations below this (rad, m) move no corner.
+NOTHING = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations: of a corner (pixels), and of A's right perturbation (rad, m); 0: A is exact."""
+
+    corner_px: float
+    carrier_rad: float
+    carrier_m: float
+
+    @property
+    def carrier(self) -> Array | None:
+        """The deviations of [omega, v] (6,), or None for exact poses."""
+        if self.carrier_rad == 0.0 and self.carrier_m == 0.0:
+            return None
+        return np.repeat([self.carrier_rad, self.carrier_m], 3)
+
+    def change(self, before: Noise) -> float:
+        """The largest change of a deviation since before, as a share; deviations that move nothing do not count."""
+        pairs = [(getattr(before, field.name), getattr(self, field.name)) for field in fields(self)]
+        return max(abs(b - a) / max(a, b) if max(a, b) > NOTHING else 0.0 for a, b in pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """Sums of the rows.
+
+    Attributes
+    ----------
+    slots : dict of (letter, name) to slice
+        "x", "y", "k", "b" with the frame's name: its rows in theta.
+    G, g : (d, d) and (d,) arrays
+    C, M, b : (I, 6, d), (I, 6, 6) and (I, 6) arrays
+    rr : float
+    count : float
+        Number of residuals, weights counted.
+    prior : (d,) array
+        Precisions of the priors on theta, and `prior_off` (d,) how far the point is from their means.
+    """
+
+    slots: Mapping[tuple[str, str], slice]
+    G: Array
+    g: Array
+    C: Array
+    M: Array
+    b: Array
+    rr: float
+    count: float
+    prior: Array
+    prior_off: Array
+
+    @staticmethod
+    def of(model: Model, point: Point) -> Reduced:
+        """The sums at a point. The errors of its A are taken off the residuals, to first order."""
+        slots: dict[tuple[str, str], slice] = {}
+        size = 0
+
+        def add(letter: str, name: str, number: int) -> None:
+            nonlocal size
+            slots[letter, name] = slice(size, size + number)
+            size += number
+
+        for name in model.targets:
+            add("x", name, 6)
+        for name in model.sensors:
+            add("y", name, 6)
+        for name, (mean, _) in model.camera_priors.items():
+            add("k", name, len(mean))
+        for name in model.shape_priors:
+            add("b", name, SHAPE)
+        count = len(model.A)
+        G, g = np.zeros((size, size)), np.zeros(size)
+        C, M, b = np.zeros((count, 6, size)), np.zeros((count, 6, 6)), np.zeros((count, 6))
+        rr = number = 0.0
+        to_right = model.to_right
+        at = np.linalg.solve(to_right, se3.logmap(se3.inverse(model.A) @ point.A)[..., None])[..., 0]
+        for stack, weights in zip(model.stacks, model.weights, strict=True):
+            rows = model.linearised(stack, point)
+            parts = {("x", stack.target): rows.by_X, ("y", stack.sensor): rows.by_Y}
+            parts["k", model.camera_of[stack.sensor]] = rows.by_camera
+            if ("b", stack.target) in slots:
+                parts["b", stack.target] = rows.by_shape
+            where = np.concatenate([np.arange(slots[name].start, slots[name].stop) for name in parts])
+            root = np.repeat(np.sqrt(weights), 2, axis=1)
+            J = np.concatenate(list(parts.values()), axis=2) * root[..., None]
+            by_A = rows.by_A @ to_right[stack.instant]
+            off_A = np.einsum("vni,vi->vn", by_A, at[stack.instant])
+            J_A, r = by_A * root[..., None], (rows.residual - off_A) * root
+            flat = J.reshape(-1, J.shape[2])
+            G[np.ix_(where, where)] += flat.T @ flat
+            g[where] += flat.T @ r.ravel()
+            rr += float(r.ravel() @ r.ravel())
+            number += 2.0 * float(weights[stack.known].sum())
+            J_At = J_A.transpose(0, 2, 1)
+            of_view = np.zeros((len(stack.instant), 6, size))
+            of_view[:, :, where] = J_At @ J
+            np.add.at(C, stack.instant, of_view)
+            np.add.at(M, stack.instant, J_At @ J_A)
+            np.add.at(b, stack.instant, (J_At @ r[..., None])[..., 0])
+        prior, off = np.zeros(size), np.zeros(size)
+        for name, (mean, deviation) in model.camera_priors.items():
+            prior[slots["k", name]] = deviation**-2.0
+            off[slots["k", name]] = point.cameras[name] - mean
+        for name, deviation in model.shape_priors.items():
+            with np.errstate(divide="ignore"):
+                prior[slots["b", name]] = np.where(deviation > 0.0, deviation**-2.0, 1e30)
+            off[slots["b", name]] = point.shapes[name]
+        return Reduced(slots, G, g, C, M, b, rr, number, prior, off)
+
+    def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:
+        """Restricted: theta integrated out; and its derivatives by the logarithms of the three deviations.
+
+        With K_i = (S^-1 + M_i / s^2)^-1 the carriers' errors are eliminated:
+
+            H = G / s^2 - sum C_i' K_i C_i / s^4 + prior,    -2 log L = r' F^-1 r - h' H^-1 h + log |F| + log |H|.
+
+        The derivative by a component's log variance is its number less its squares, as estimated and as uncertain, over
+        its variance (Patterson and Thompson's equations).
+        """
+        s2, S = noise.corner_px**2, noise.carrier
+        H, h, rr, log_det = self.G / s2, self.g / s2, self.rr / s2, self.count * np.log(s2)
+        if S is not None:
+            # K = D (I + D M D / s2)^-1 D, D = diag(S)
+            inner = np.eye(6) + self.M * S[:, None] * S / s2
+            root = np.linalg.inv(inner)
+            K = root * S[:, None] * S
+            KC, Kb = K @ self.C / s2, (K @ self.b[..., None])[..., 0] / s2
+            flat = self.C.reshape(-1, len(H))
+            H = H - flat.T @ KC.reshape(flat.shape) / s2
+            h = h - flat.T @ Kb.ravel() / s2
+            rr -= float((self.b * Kb).sum()) / s2
+            log_det += float(np.linalg.slogdet(inner)[1].sum())
+        H = H + np.diag(self.prior)
+        h = h + self.prior * self.prior_off
+        rr += float(self.prior @ self.prior_off**2)
+        size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
+        sign, log_H = np.linalg.slogdet(H / size[:, None] / size)
+        if sign <= 0.0:
+            return np.inf, np.zeros(3)
+        inverse = np.linalg.inv(H / size[:, None] / size) / size[:, None] / size
+        theta = -inverse @ h
+        value = rr + float(h @ theta) + log_det + log_H + 2.0 * float(np.log(size).sum())
+        free = len(H) - float(self.prior @ np.diagonal(inverse))
+        squares = self.rr + 2.0 * float(self.g @ theta) + float(theta @ self.G @ theta)
+        gradient = np.zeros(3)
+        if S is not None:
+            a = -(Kb + KC @ theta)
+            variances = np.diagonal(K, axis1=1, axis2=2) + np.einsum("nid,de,nie->ni", KC, inverse, KC, optimize=True)
+            squares += float(np.einsum("ni,nij,nj->", a, self.M, a)) + 2.0 * float(
+                (a * (self.b + self.C @ theta)).sum()
+            )
+            free += float((1.0 - variances / S**2).sum())
+            off = 2.0 * (len(a) - (a**2 + variances).sum(axis=0) / S**2)
+            gradient[1:] = off[:3].sum(), off[3:].sum()
+        gradient[0] = 2.0 * (self.count - squares / s2 - free)
+        return value, gradient
+
+    def likeliest(self, start: Noise, *, carrier: bool = True) -> Noise:
+        """The noise of greatest restricted likelihood; with `carrier` false, the carriers' noise is as it is."""
+        number = 3 if carrier else 1
+        begin = np.log([start.corner_px, max(start.carrier_rad, 1e-5), max(start.carrier_m, 1e-5)])[:number]
+
+        def noise(x: Vector) -> Noise:
+            px, *of_carrier = np.exp(x).tolist()
+            return Noise(px, *of_carrier) if carrier else replace(start, corner_px=px)
+
+        def cost(x: Vector) -> tuple[float, Array]:
+            value, gradient = self.minus_two_log_likelihood(noise(x))
+            return value, gradient[:number]
+
+        bounds = [(np.log(low), np.log(high)) for low, high in (CORNER_PX, CARRIER, CARRIER)[:number]]
+        found = minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11})
+        return noise(found.x)

@@ -1,0 +1,127 @@
+"""The result of a refinement from corners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.reprojection.graph import CornerGraph
+from gtsam_rwhec.reprojection.reduced import Noise
+from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, held_by_prior
+from gtsam_rwhec.vision.camera import Camera
+
+#: Names of a camera's parameters by its number of coefficients and its model.
+_PINHOLE = ("fx", "fy", "cx", "cy")
+_RADTAN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+_EQUIDISTANT = ("k1", "k2", "k3", "k4")
+
+
+def parameter_names(camera: Camera) -> tuple[str, ...]:
+    """fx, fy, cx, cy and the coefficients' names."""
+    coefficients = _EQUIDISTANT if camera.model == "equidistant" else _RADTAN
+    return _PINHOLE + coefficients[: len(camera.D)]
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedIntrinsics:
+    """A camera's intrinsics.
+
+    Attributes
+    ----------
+    camera : Camera
+    covariance : (m, m) array
+        Of fx, fy, cx, cy (pixels) and the coefficients.
+    stated_deviations : (m,) array
+        Of the prior, as widened.
+    widened : float
+        By how much: 1 where the images do not contradict what was stated.
+    innovation : Innovation
+        The test of the intrinsics as they were stated.
+    rms_px : float
+        Of the corners that count, along each axis.
+    """
+
+    camera: Camera
+    covariance: Array
+    stated_deviations: Array
+    widened: float
+    innovation: Innovation
+    rms_px: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+        return parameter_names(self.camera)
+
+    @property
+    def held_by_prior(self) -> tuple[str, ...]:
+        """Parameters that the images do not determine: what is known of them is what was stated."""
+        held = held_by_prior(self.stated_deviations, self.covariance)
+        return tuple(name for name, is_held in zip(self.names, held, strict=True) if is_held)
+
+
+@dataclass(frozen=True, eq=False)
+class CornersRefined:
+    """Poses, cameras and boards refined from corners, with their joint covariance.
+
+    Attributes
+    ----------
+    X, Y : dict of str to gtsam.Pose3
+        T_targetcarrier_target and T_sensorcarrier_sensor, metres.
+    intrinsics : dict of str to RefinedIntrinsics
+        By sensor.
+    shapes : dict of str to (3,) array
+        By target: its size less the stated one, a share; heights of its edge over its middle along x and y, metres.
+    noise : Noise
+    joint : (d, d) array
+        Covariance of all unknowns; right perturbations [omega, v] of poses, rad and m.
+    left_out : dict of (target, sensor) to (V, n) booleans
+        Corners that disagree with all others.
+    A : (I, 4, 4) array
+        The carriers' poses at the instants, as refined.
+    iterations : int
+        Levenberg-Marquardt steps, in all rounds together.
+    last_step : float
+        What one more Gauss-Newton step would move, in deviations: it is far below 1 at an optimum.
+    """
+
+    X: dict[str, gtsam.Pose3]
+    Y: dict[str, gtsam.Pose3]
+    intrinsics: dict[str, RefinedIntrinsics]
+    shapes: dict[str, Array]
+    noise: Noise
+    joint: Array = field(repr=False)
+    slots: Mapping[tuple[str, str], slice] = field(repr=False)
+    left_out: dict[tuple[str, str], np.ndarray] = field(repr=False)
+    A: Array = field(repr=False)
+    graph: CornerGraph = field(repr=False)
+    iterations: int
+    last_step: float
+
+    def covariance(self, *names: str) -> Array:
+        """The joint covariance of frames (six rows each), ``intrinsics:SENSOR`` and ``shape:TARGET``, as given.
+
+        Raises
+        ------
+        FrameError
+            A name is none of the unknowns.
+        """
+        there = self.names
+        rows: list[int] = []
+        for name in names or tuple(there):
+            if name not in there:
+                raise FrameError(f"{name!r} is not among the unknowns; they are {', '.join(there)}")
+            at = self.slots[there[name]]
+            rows += range(at.start, at.stop)
+        return self.joint[np.ix_(rows, rows)]
+
+    @property
+    def names(self) -> dict[str, tuple[str, str]]:
+        """The unknowns' names."""
+        words = {"x": "", "y": "", "k": "intrinsics:", "b": "shape:"}
+        return {f"{words[letter]}{name}": (letter, name) for letter, name in self.slots}

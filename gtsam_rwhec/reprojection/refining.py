@@ -1,0 +1,205 @@
+"""Refinement from corners: GTSAM's optimum, the noise that the corners have, and what was stated and is not so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.errors import CameraError
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
+from gtsam_rwhec.refinement.options import CarrierNoise
+from gtsam_rwhec.reprojection.corner_outliers import weights_of
+from gtsam_rwhec.reprojection.graph import CornerGraph
+from gtsam_rwhec.reprojection.intrinsics import free_model, prior_of
+from gtsam_rwhec.reprojection.lens import camera_with, parameters_of
+from gtsam_rwhec.reprojection.model import BEHIND, Model, Point
+from gtsam_rwhec.reprojection.observations import Observations
+from gtsam_rwhec.reprojection.options import CornerOptions
+from gtsam_rwhec.reprojection.reduced import Noise, Reduced
+from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
+from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, innovation_of
+from gtsam_rwhec.reprojection.views import SHAPE, stacks_of
+
+#: Rounds of noise, outliers and optimum in turns end when no deviation changes by more than this share.
+ROUNDS, SETTLED = 12, 1e-3
+#: A contradicted prior is widened by this factor, at most so many times.
+WIDER, WIDENINGS = 3.0, 6
+#: Deviations at the start: of a corner (pixels) and of the carriers' poses (rad, m).
+ROUGH = Noise(0.3, 1e-3, 1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Settled:
+    """The optimum under the noise that the residuals have."""
+
+    model: Model
+    point: Point
+    noise: Noise
+    graph: CornerGraph
+    joint: Array
+    slots: Mapping[tuple[str, str], slice]
+    iterations: int
+    last_step: float
+
+
+@one_blas_thread()
+def refine_corners(
+    observations: Observations,
+    X: Mapping[str, PoseLike],
+    Y: Mapping[str, PoseLike],
+    options: CornerOptions | None = None,
+    progress: Progress | None = None,
+) -> CornersRefined:
+    """Refine poses, cameras and boards from corners.
+
+    Parameters
+    ----------
+    observations : Observations
+        Corners, with the cameras' stated intrinsics.
+    X, Y : dict of str to pose
+        The start, T_targetcarrier_target and T_sensorcarrier_sensor in metres: the certified answer's.
+    options : CornerOptions, optional
+    progress : callable, optional
+
+    Raises
+    ------
+    CameraError
+        The start puts a corner that was seen behind its camera.
+    PoseError
+        A start is not a pose.
+    """
+    options, tell = options or CornerOptions(), progress or silent
+    first = {name: options.camera_of(name) for name in observations.sensors}
+    stated = {name: options.stated_of(first[name]) for name in observations.sensors}
+    cameras = {name: free_model(observations.cameras[first[name]], stated[name]) for name in observations.sensors}
+    observations = replace(observations, cameras=cameras)
+    priors = {first[name]: prior_of(camera, stated[name]) for name, camera in cameras.items()}
+    stacks, A = stacks_of(observations)
+    given = options.carrier_noise
+    noise, about = ROUGH, options.about
+    if isinstance(given, CarrierNoise):
+        noise, about = Noise(ROUGH.corner_px, given.rotation_rad, given.translation_m), given.about
+    elif given == "exact":
+        noise = Noise(ROUGH.corner_px, 0.0, 0.0)
+    shape = np.array([options.size_share, options.warp_m, options.warp_m])
+    model = Model(
+        stacks, A, noise.carrier, about, first, priors,
+        dict.fromkeys(observations.targets, shape) if shape.any() else {},
+        noise.corner_px, tuple(stack.known.astype(float) for stack in stacks),
+    )  # fmt: skip
+    point = Point(
+        {name: one_transform(X[name], f"start of {name}") for name in observations.targets},
+        {name: one_transform(Y[name], f"start of {name}") for name in observations.sensors},
+        A,
+        {name: parameters_of(observations.cameras[name]) for name in priors},
+        {name: np.zeros(SHAPE) for name in observations.targets},
+    )
+    _check_start(model, point)
+    settled = _settled(model, point, noise, options, tell)
+    tests = _innovations(settled, priors)
+    widened = dict.fromkeys(priors, 1.0)
+    for _ in range(WIDENINGS):
+        contradicted = [
+            name for name, test in _innovations(settled, settled.model.camera_priors).items() if test.is_contradicted
+        ]
+        if not contradicted:
+            break
+        for name in contradicted:
+            widened[name] *= WIDER
+        wider = {name: (mean, deviation * widened[name]) for name, (mean, deviation) in priors.items()}
+        settled = _settled(
+            replace(settled.model, camera_priors=wider), settled.point, settled.noise, options, tell, settled.iterations
+        )
+    rms = _rms(settled)
+    point = settled.point
+    return CornersRefined(
+        X={name: gtsam.Pose3(T) for name, T in point.X.items()},
+        Y={name: gtsam.Pose3(T) for name, T in point.Y.items()},
+        intrinsics={
+            name: RefinedIntrinsics(
+                camera_with(camera, point.cameras[first[name]]),
+                _block(settled, ("k", first[name])),
+                settled.model.camera_priors[first[name]][1],
+                widened[first[name]],
+                tests[first[name]],
+                rms[name],
+            )
+            for name, camera in cameras.items()
+        },
+        shapes=point.shapes,
+        noise=settled.noise,
+        joint=settled.joint,
+        slots=settled.slots,
+        left_out={
+            (stack.target, stack.sensor): stack.known & (weights == 0.0)
+            for stack, weights in zip(stacks, settled.model.weights, strict=True)
+        },
+        A=point.A,
+        graph=settled.graph,
+        iterations=settled.iterations,
+        last_step=settled.last_step,
+    )
+
+
+def _settled(
+    model: Model, point: Point, noise: Noise, options: CornerOptions, tell: Progress, iterations: int = 0
+) -> _Settled:
+    """Optimum, noise and outliers in turns, until the noise settles."""
+    is_first = iterations == 0
+    for number in range(ROUNDS):
+        tell(f"refining from corners: round {number + 1} of at most {ROUNDS}")
+        graph = CornerGraph(model, point)
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(options.max_iterations)
+        parameters.setRelativeErrorTol(1e-9)
+        parameters.setAbsoluteErrorTol(1e-7)
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph.graph, graph.values(point), parameters)
+        values = optimiser.optimize()
+        point, iterations = graph.point(values), iterations + optimiser.iterations()
+        reduced, before = Reduced.of(model, point), noise
+        noise = reduced.likeliest(noise, carrier=options.carrier_noise == "estimate")
+        weights = model.weights
+        if options.outliers:
+            weights = weights_of(model, point, noise.corner_px, first=number == 0 and is_first)
+        same = all(np.array_equal(a, b) for a, b in zip(weights, model.weights, strict=True))
+        if same and noise.change(before) < SETTLED:
+            break
+        model = replace(model, A_noise=noise.carrier, corner_px=noise.corner_px, weights=weights)
+    joint, last_step = graph.covariance(values, reduced.slots)
+    return _Settled(model, point, noise, graph, joint, reduced.slots, iterations, last_step)
+
+
+def _check_start(model: Model, point: Point) -> None:
+    for stack, error in zip(model.stacks, model.errors(point), strict=True):
+        if not (np.abs(error) < BEHIND).all():
+            raise CameraError(
+                f"the start puts a corner of {stack.target} behind {stack.sensor}, which saw it; start at the "
+                "certified answer's poses"
+            )
+
+
+def _block(settled: _Settled, name: tuple[str, str]) -> Array:
+    at = settled.slots[name]
+    return settled.joint[at, at]
+
+
+def _innovations(settled: _Settled, priors: Mapping[str, tuple[Array, Array]]) -> dict[str, Innovation]:
+    return {
+        name: innovation_of(settled.point.cameras[name] - mean, deviation, _block(settled, ("k", name)))
+        for name, (mean, deviation) in priors.items()
+    }
+
+
+def _rms(settled: _Settled) -> dict[str, float]:
+    """Of the corners that count, along each axis, by sensor."""
+    sums: dict[str, Array] = {}
+    model = settled.model
+    for stack, error, weights in zip(model.stacks, model.errors(settled.point), model.weights, strict=True):
+        of_stack = np.array([(error**2).sum() * model.corner_px**2, 2.0 * weights.sum()])
+        sums[stack.sensor] = sums.get(stack.sensor, np.zeros(2)) + of_stack
+    return {name: float(np.sqrt(total / max(count, 1.0))) for name, (total, count) in sums.items()}

@@ -1,0 +1,132 @@
+"""Cells with fixed cameras and a board on the hand, whose truth is known: corners are drawn with their noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from rwhec_factors import se3
+
+from gtsam_rwhec.reprojection.intrinsics import Stated, prior_of
+from gtsam_rwhec.reprojection.lens import camera_with, parameters_of, pixels_of
+from gtsam_rwhec.reprojection.observations import Observations
+from gtsam_rwhec.reprojection.views import shaped
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.targets import Checkerboard
+
+Array = NDArray[np.float64]
+BOARD = Checkerboard("board", 7, 5, 0.04)
+CAMERA = Camera.of(
+    1920,
+    1080,
+    "radtan",
+    [[1400.0, 0.0, 960.0], [0.0, 1400.0, 540.0], [0.0, 0.0, 1.0]],
+    (-0.1, 0.05, 1e-3, -5e-4),
+    "cell",
+)
+#: The middle of the board's poses in the base.
+MIDDLE = np.array([0.0, 0.0, 0.3])
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """What was observed, with intrinsics as stated; and the truth."""
+
+    observations: Observations
+    X: dict[str, Array]
+    Y: dict[str, Array]
+    cameras: dict[str, Camera]
+    shape: Array
+
+    def near(self, rng: np.random.Generator, off: float = 3e-3) -> tuple[dict[str, Array], dict[str, Array]]:
+        """A start near the truth."""
+
+        def moved(poses: dict[str, Array]) -> dict[str, Array]:
+            return {name: T @ se3.expmap(rng.normal(scale=off, size=(1, 6)))[0] for name, T in poses.items()}
+
+        return moved(self.X), moved({name: self.Y[name] for name in self.observations.sensors})
+
+
+def cell(
+    seed: int,
+    *,
+    cameras: int = 2,
+    images: int = 30,
+    board: Checkerboard = BOARD,
+    camera: Camera = CAMERA,
+    stated: Stated | None = None,
+    stated_off: Array | None = None,
+    carrier: tuple[float, float] = (0.0, 0.0),
+    corner_px: float = 0.1,
+    shape: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Cell:
+    """A cell of fixed cameras in a ring about the arm; the board turns to one of them at each instant.
+
+    Stated intrinsics are off by a draw of the prior of `stated`, or by `stated_off` (m,). `carrier` and `shape` are
+    standard deviations: of A (rad, m), and of the board's size and warp.
+    """
+    rng = np.random.default_rng(seed)
+    X = se3.expmap(np.array([[0.1, 0.2, -0.3, 0.05, 0.02, 0.1]]))[0]
+    Y = {}
+    for k in range(cameras):
+        angle = 2.0 * np.pi * k / cameras
+        at = np.array([1.5 * np.cos(angle), 1.5 * np.sin(angle), 0.8]) + rng.normal(scale=0.1, size=3)
+        Y[f"cam_{k}"] = _looking(MIDDLE, at) @ se3.expmap(rng.normal(scale=0.05, size=(1, 6)))[0]
+    true_shape = rng.normal(size=3) * shape
+    points, _ = shaped(board.corners(), true_shape)
+    seen: dict[str, tuple[list[Array], list[Array]]] = {name: ([], []) for name in Y}
+    done = 0
+    while done < images:
+        A = _facing(Y[f"cam_{rng.integers(cameras)}"], rng) @ se3.inverse(X)
+        measured = A @ se3.expmap(rng.normal(size=(1, 6)) * np.repeat(carrier, 3))[0]
+        any_seen = False
+        for name, T_base_cam in Y.items():
+            pixels = _pixels(se3.inverse(T_base_cam) @ A @ X, points, camera)
+            if pixels is not None:
+                seen[name][0].append(measured)
+                seen[name][1].append(pixels + rng.normal(scale=corner_px, size=pixels.shape))
+                any_seen = True
+        done += any_seen
+    truth = parameters_of(camera)
+    as_stated = {}
+    for name in Y:
+        off = np.zeros(len(truth)) if stated_off is None else stated_off
+        if stated is not None:
+            off = off + rng.normal(size=len(truth)) * prior_of(camera, stated)[1]
+        as_stated[name] = camera_with(camera, truth + off)
+    observations = Observations.of(
+        as_stated,
+        {"board": board.corners()},
+        {("board", name): (np.array(A), np.array(pixels)) for name, (A, pixels) in seen.items() if A},
+    )
+    return Cell(observations, {"board": X}, Y, dict.fromkeys(Y, camera), true_shape)
+
+
+def _looking(at: Array, place: Array) -> Array:
+    """T_base_camera of a camera at a place that looks at a point, upright."""
+    z = (at - place) / np.linalg.norm(at - place)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    return se3.pose(np.stack([x, np.cross(z, x), z], axis=1), place)
+
+
+def _facing(T_base_camera: Array, rng: np.random.Generator) -> Array:
+    """T_base_board of a board near the middle that faces a camera more or less, turned about its normal."""
+    place = MIDDLE + rng.normal(scale=0.15, size=3)
+    z = T_base_camera[:3, 3] - place
+    z = z / np.linalg.norm(z) + rng.normal(scale=0.35, size=3)
+    z /= np.linalg.norm(z)
+    x = np.cross(rng.normal(size=3), z)
+    x /= np.linalg.norm(x)
+    return se3.pose(np.stack([x, np.cross(z, x), z], axis=1), place)
+
+
+def _pixels(T_camera_board: Array, points: Array, camera: Camera) -> Array | None:
+    """All corners in the image, or None."""
+    seen = points @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
+    t = T_camera_board[:3, 3]
+    if seen[:, 2].min() < 0.2 or -(T_camera_board[:3, 2] @ t) / np.linalg.norm(t) < 0.35:
+        return None
+    pixels = pixels_of(camera, parameters_of(camera), seen[:, :2] / seen[:, 2:])
+    return pixels if camera.inside(pixels).all() else None

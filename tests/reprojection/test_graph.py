@@ -1,0 +1,110 @@
+"""The GTSAM graph: its cost, its rows, and GTSAM's own factors as a peer."""
+
+from __future__ import annotations
+
+import gtsam
+import gtsam_unstable
+import numpy as np
+import pytest
+from rwhec_factors import se3
+from simulated_cells import Cell, cell
+
+from gtsam_rwhec.reprojection.graph import CornerGraph, key_of
+from gtsam_rwhec.reprojection.intrinsics import prior_of
+from gtsam_rwhec.reprojection.lens import parameters_of
+from gtsam_rwhec.reprojection.model import Model, Point
+from gtsam_rwhec.reprojection.reduced import Reduced
+from gtsam_rwhec.reprojection.views import stacks_of
+
+A_NOISE = np.repeat([1e-3, 5e-4], 3)
+CORNER_PX = 0.1
+
+
+def model_and_point(small: Cell, *, about: str = "targetcarrier", exact: bool = False) -> tuple[Model, Point]:
+    stacks, A = stacks_of(small.observations)
+    cameras = small.observations.cameras
+    names = small.observations.sensors
+    model = Model(
+        stacks, A, None if exact else A_NOISE, about, {name: name for name in names},  # type: ignore[arg-type]
+        {name: prior_of(cameras[name], "nominal") for name in names}, {"board": np.full(3, 1e-3)}, CORNER_PX,
+        tuple(stack.known.astype(float) for stack in stacks),
+    )  # fmt: skip
+    rng = np.random.default_rng(7)
+    moved = A if exact else A @ se3.expmap(rng.normal(size=(len(A), 6)) * A_NOISE)
+    X, Y = small.near(rng, 1e-3)
+    cameras_at = {name: parameters_of(cameras[name]) * (1.0 + 1e-3) for name in names}
+    return model, Point(X, Y, moved, cameras_at, {"board": np.full(3, 5e-4)})
+
+
+@pytest.fixture(scope="module")
+def small() -> Cell:
+    return cell(3, images=6)
+
+
+@pytest.mark.parametrize("about", ["targetcarrier", "sensorcarrier"])
+def test_the_cost_is_half_the_sum_of_squares(small: Cell, about: str) -> None:
+    model, point = model_and_point(small, about=about)
+    graph = CornerGraph(model, point)
+    xi = se3.logmap(se3.inverse(model.A) @ point.A)
+    if about == "sensorcarrier":
+        xi = se3.logmap(point.A @ se3.inverse(model.A))
+    expected = 0.5 * sum((error**2).sum() for error in model.errors(point)) + 0.5 * ((xi / A_NOISE) ** 2).sum()
+    expected += 0.5 * 3 * 0.5**2
+    for name, (mean, deviation) in model.camera_priors.items():
+        expected += 0.5 * (((point.cameras[name] - mean) / deviation) ** 2).sum()
+    assert graph.graph.error(graph.values(point)) == pytest.approx(
+        expected, rel=1e-5 if about == "sensorcarrier" else 1e-9
+    )
+
+
+def test_linear_rows_have_the_cost_and_the_gradient_of_the_residuals(small: Cell) -> None:
+    model, point = model_and_point(small)
+    graph = CornerGraph(model, point)
+    values = graph.values(point)
+    linear = graph.graph.linearize(values)
+    error = graph.graph.error(values)
+    for key in (graph.x["board"], graph.y["cam_0"], key_of("a", 0)):
+        for step in 1e-7 * np.eye(6):
+            moved = [gtsam.Values(values), gtsam.Values(values)]
+            for at, sign in zip(moved, (1.0, -1.0), strict=True):
+                at.update(key, values.atPose3(key).retract(sign * step))
+            numeric = (graph.graph.error(moved[0]) - graph.graph.error(moved[1])) / (2e-7)
+            gradient = linear.gradientAtZero().at(key) @ (step / 1e-7)
+            assert gradient == pytest.approx(numeric, rel=1e-4, abs=1e-4 * error)
+
+
+def test_gtsams_own_factors_have_the_same_cost(small: Cell) -> None:
+    """ProjectionFactorPPPC sees points of the board from the pose V = X^-1 A^-1, with Y as the sensor's transform."""
+    model, point = model_and_point(small, exact=True)
+    point = Point(point.X, point.Y, point.A, point.cameras, {"board": np.zeros(3)})
+    native, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, CORNER_PX)
+    for j, p in enumerate(small.observations.corners["board"]):
+        values.insert(key_of("p", j), p)
+    for i, A in enumerate(point.A):
+        values.insert(key_of("v", i), gtsam.Pose3(se3.inverse(A @ point.X["board"])))
+    for s, stack in enumerate(model.stacks):
+        fx, fy, cx, cy, k1, k2, p1, p2 = point.cameras[stack.sensor]
+        values.insert(key_of("y", s), gtsam.Pose3(point.Y[stack.sensor]))
+        values.insert(key_of("k", s), gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, k1, k2, p1, p2))
+        for i, pixels in zip(stack.instant.tolist(), stack.pixels, strict=True):
+            for j, pixel in enumerate(pixels):
+                keys = (key_of("v", i), key_of("y", s), key_of("p", j), key_of("k", s))
+                native.add(gtsam_unstable.ProjectionFactorPPPCCal3DS2(pixel, noise, *keys))
+    assert native.error(values) == pytest.approx(0.5 * sum((error**2).sum() for error in model.errors(point)), rel=1e-9)
+
+
+@pytest.mark.parametrize("about", ["targetcarrier", "sensorcarrier"])
+def test_the_sums_by_instant_have_the_graphs_information(small: Cell, about: str) -> None:
+    model, point = model_and_point(small, about=about)
+    point = Point(point.X, point.Y, model.A, point.cameras, point.shapes)
+    graph = CornerGraph(model, point)
+    reduced = Reduced.of(model, point)
+    joint, last_step = graph.covariance(graph.values(point), reduced.slots)
+    s2 = CORNER_PX**2
+    H = reduced.G / s2 + np.diag(reduced.prior)
+    for C, M in zip(reduced.C, reduced.M, strict=True):
+        H -= C.T @ np.linalg.solve(np.diag(A_NOISE**-2.0) + M / s2, C) / s2**2
+    size = np.sqrt(np.diagonal(joint))
+    assert joint / np.outer(size, size) == pytest.approx(np.linalg.inv(H) / np.outer(size, size), abs=1e-6)
+    assert last_step > 1.0  # it is not an optimum

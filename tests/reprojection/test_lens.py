@@ -1,0 +1,58 @@
+"""Pixels as functions of a camera's parameters."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from gtsam_rwhec.reprojection.lens import camera_with, parameters_of, pixels_and_derivatives, pixels_of
+from gtsam_rwhec.vision.camera import Camera
+
+K = [[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]]
+LENSES = {
+    "pinhole": ("", ()),
+    "radtan of four": ("radtan", (-0.2, 0.05, 1e-3, -2e-3)),
+    "radtan of five": ("radtan", (-0.2, 0.05, 1e-3, -2e-3, 0.01)),
+    "rational": ("radtan", (-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02, 0.03, 0.01)),
+    "thin prism": ("radtan", (-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02, 0.03, 0.01, 1e-3, 2e-3, -1e-3, 1e-3)),
+    "equidistant": ("equidistant", (-0.02, 0.006, -0.004, 0.001)),
+}
+
+
+@pytest.fixture(params=LENSES)
+def camera(request: pytest.FixtureRequest) -> Camera:
+    model, D = LENSES[request.param]
+    return Camera.of(640, 480, model, K, D, "test")
+
+
+def test_parameters_are_those_of_the_camera(camera: Camera) -> None:
+    again = camera_with(camera, parameters_of(camera))
+    assert np.array_equal(again.K, camera.K)
+    assert np.array_equal(again.D, camera.D)
+    assert again.model == camera.model
+
+
+def test_pixels_are_opencvs(camera: Camera) -> None:
+    x = np.random.default_rng(0).uniform(-0.4, 0.4, size=(20, 2))
+    points = np.column_stack([x, np.ones(len(x))])[:, None]
+    zero = np.zeros(3)
+    if camera.model == "equidistant":
+        expected, _ = cv2.fisheye.projectPoints(points, zero, zero, camera.K, camera.D)
+    else:
+        expected, _ = cv2.projectPoints(points, zero, zero, camera.K, camera.D)
+    assert pixels_of(camera, parameters_of(camera), x) == pytest.approx(expected[:, 0], abs=1e-9)
+
+
+def test_derivatives_are_right_in_the_middle_too(camera: Camera) -> None:
+    x = np.vstack([np.random.default_rng(1).uniform(-0.4, 0.4, size=(9, 2)), np.zeros((1, 2))])
+    p = parameters_of(camera)
+    pixels, by_x, by_p = pixels_and_derivatives(camera, p, x)
+    assert pixels == pytest.approx(pixels_of(camera, p, x))
+    e = 1e-6
+    for i, step in enumerate(e * np.eye(len(p))):
+        numeric = (pixels_of(camera, p + step, x) - pixels_of(camera, p - step, x)) / (2 * e)
+        assert by_p[..., i] == pytest.approx(numeric, abs=1e-6)
+    for i, step in enumerate(e * np.eye(2)):
+        numeric = (pixels_of(camera, p, x + step) - pixels_of(camera, p, x - step)) / (2 * e)
+        assert by_x[..., i] == pytest.approx(numeric, abs=1e-5)

@@ -1,0 +1,184 @@
+"""Refinement from corners: truth, noise, intrinsics that are off, outliers, words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rwhec_factors import se3
+from scipy.stats import chi2
+from simulated_cells import CAMERA, Cell, cell
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import CameraError, FrameError, OptionError
+from gtsam_rwhec.reprojection.lens import parameters_of
+from gtsam_rwhec.reprojection.stated_intrinsics import innovation_of
+
+Array = NDArray[np.float64]
+
+
+def refined(given: Cell, options: rw.CornerOptions | None = None) -> rw.CornersRefined:
+    X, Y = given.near(np.random.default_rng(9))
+    return rw.refine_corners(given.observations, X, Y, options)
+
+
+def off(given: Cell, result: rw.CornersRefined, name: str) -> Array:
+    """The error of a pose."""
+    poses, truth = (result.X, given.X) if name in given.X else (result.Y, given.Y)
+    error: Array = se3.logmap((se3.inverse(poses[name].matrix()) @ truth[name])[None])[0]
+    return error
+
+
+def squared_deviations(given: Cell, result: rw.CornersRefined) -> tuple[float, int]:
+    """Of all unknowns together: chi-square of their number."""
+    errors = [off(given, result, name) for name in (*result.X, *result.Y)]
+    errors += [parameters_of(given.cameras[name]) - parameters_of(result.intrinsics[name].camera) for name in result.Y]
+    names = [*result.X, *result.Y, *(f"intrinsics:{name}" for name in result.Y)]
+    if "shape:board" in result.names:
+        errors.append(given.shape - result.shapes["board"])
+        names.append("shape:board")
+    error = np.concatenate(errors)
+    return float(error @ np.linalg.solve(result.covariance(*names), error)), len(error)
+
+
+def test_exact_corners_give_the_truth() -> None:
+    given = cell(1, corner_px=1e-9, images=12)
+    result = refined(given, rw.CornerOptions(carrier_noise="exact"))
+    for name in ("board", "cam_0", "cam_1"):
+        assert np.abs(off(given, result, name)).max() < 1e-6
+    assert parameters_of(result.intrinsics["cam_0"].camera) == pytest.approx(parameters_of(CAMERA), abs=1e-4)
+
+
+@pytest.mark.parametrize("about", ["targetcarrier", "sensorcarrier"])
+def test_noise_is_found_and_everything_is_within_its_covariance(about: str) -> None:
+    given = cell(2, images=40, stated="calibration", carrier=(1e-3, 5e-4), shape=(1e-3, 1e-3, 1e-3))
+    options = rw.CornerOptions(stated="calibration", size_share=1e-3, warp_m=1e-3, about=about)  # type: ignore[arg-type]
+    result = refined(given, options)
+    assert result.noise.corner_px == pytest.approx(0.1, rel=0.05)
+    if about == "targetcarrier":
+        assert result.noise.carrier_rad == pytest.approx(1e-3, rel=0.3)
+        assert result.noise.carrier_m == pytest.approx(5e-4, rel=0.3)
+        squares, number = squared_deviations(given, result)
+        assert chi2.ppf(0.001, number) < squares < chi2.ppf(0.999, number)
+    assert result.last_step < 1e-3
+    assert (
+        not any(mask.any() for mask in result.left_out.values()) or sum(m.sum() for m in result.left_out.values()) < 3
+    )
+
+
+def test_nominal_intrinsics_that_are_off_do_not_move_the_poses_beyond_their_covariance() -> None:
+    given = cell(5, images=30, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
+    result = refined(given, rw.CornerOptions(carrier_noise="exact"))
+    squares, number = squared_deviations(given, result)
+    assert squares < chi2.ppf(0.999, number)
+    assert result.intrinsics["cam_0"].widened == 1.0
+
+
+def test_a_calibration_that_the_images_contradict_is_widened_and_said() -> None:
+    given = cell(5, images=30, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
+    result = refined(given, rw.CornerOptions(stated="calibration", carrier_noise="exact"))
+    intrinsics = result.intrinsics["cam_0"]
+    assert intrinsics.widened > 1.0
+    assert intrinsics.innovation.is_contradicted
+    assert intrinsics.innovation.deviations > 5.0
+    squares, number = squared_deviations(given, result)
+    assert squares < chi2.ppf(0.999, number)
+
+
+def test_a_pinhole_that_nobody_calibrated_may_have_distortion() -> None:
+    given = cell(6, images=30)
+    pinhole = rw.vision.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
+    stated = replace(given.observations, cameras=dict.fromkeys(given.observations.cameras, pinhole))
+    result = refined(replace(given, observations=stated), rw.CornerOptions(carrier_noise="exact"))
+    assert pytest.approx(CAMERA.D, abs=0.02) == result.intrinsics["cam_0"].camera.D
+    squares, number = squared_deviations(given, result)
+    assert squares < chi2.ppf(0.999, number)
+
+
+def test_what_one_flat_view_cannot_tell_is_held_by_the_prior() -> None:
+    given = cell(7, images=3, cameras=1)
+    result = refined(given, rw.CornerOptions(stated="calibration", carrier_noise="exact"))
+    assert result.intrinsics["cam_0"].held_by_prior
+    deviations = np.sqrt(np.diagonal(result.covariance("intrinsics:cam_0")))
+    assert (deviations <= result.intrinsics["cam_0"].stated_deviations * (1.0 + 1e-9)).all()
+
+
+def test_cameras_of_one_model_may_share_their_intrinsics() -> None:
+    given = cell(8, images=30, stated="calibration")
+    options = rw.CornerOptions(stated="calibration", carrier_noise="exact", shared=(("cam_0", "cam_1"),))
+    shared, apart = refined(given, options), refined(given, replace(options, shared=()))
+    first, second = (parameters_of(shared.intrinsics[name].camera) for name in ("cam_0", "cam_1"))
+    assert np.array_equal(first, second)
+    better = np.diagonal(shared.intrinsics["cam_0"].covariance) < np.diagonal(apart.intrinsics["cam_0"].covariance)
+    assert better.all()
+
+
+def test_a_tenth_of_misread_corners_is_left_out() -> None:
+    given = cell(10, images=30, carrier=(1e-3, 5e-4))
+    rng = np.random.default_rng(0)
+    views, wrong = {}, {}
+    for pair, view in given.observations.views.items():
+        wrong[pair] = rng.random(view.pixels.shape[:2]) < 0.1
+        views[pair] = replace(
+            view, pixels=view.pixels + wrong[pair][..., None] * rng.normal(scale=20.0, size=view.pixels.shape)
+        )
+    result = refined(replace(given, observations=replace(given.observations, views=views)))
+    for pair, mask in wrong.items():
+        assert (result.left_out[pair] & ~mask).sum() <= 2
+        assert (mask & ~result.left_out[pair]).sum() <= 2  # some are off by less than their limit
+    assert result.noise.corner_px == pytest.approx(0.1, rel=0.1)
+    squares, number = squared_deviations(given, result)
+    assert squares < chi2.ppf(0.999, number)
+
+
+def test_intrinsics_are_no_worse_than_opencvs_and_better_with_the_arm_known() -> None:
+    ours, theirs = [], []
+    for seed in range(5):
+        given = cell(20 + seed, images=12, cameras=1, stated="nominal")
+        result = refined(given, rw.CornerOptions(carrier_noise="exact"))
+        view = given.observations.views["board", "cam_0"]
+        points = [given.observations.corners["board"].astype(np.float32)] * len(view.A)
+        stated = given.observations.cameras["cam_0"]
+        flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
+        _, K, _, _, _ = cv2.calibrateCamera(
+            points,
+            list(view.pixels.astype(np.float32)),
+            (1920, 1080),
+            stated.K.copy(),
+            np.pad(stated.D, (0, 1)),
+            flags=flags,
+        )
+        truth = parameters_of(CAMERA)[:4]
+        ours.append(parameters_of(result.intrinsics["cam_0"].camera)[:4] - truth)
+        theirs.append(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) - truth)
+    assert np.square(ours).mean() < 0.7 * np.square(theirs).mean()
+
+
+def test_a_start_behind_a_camera_is_refused() -> None:
+    given = cell(1, images=5)
+    turned = {name: T @ np.diag([1.0, -1.0, -1.0, 1.0]) for name, T in given.Y.items()}
+    with pytest.raises(CameraError, match="puts a corner of board behind cam_0"):
+        rw.refine_corners(given.observations, given.X, turned)
+
+
+def test_names_and_options_are_checked() -> None:
+    given = cell(0, images=5)
+    with pytest.raises(
+        FrameError, match="'cam_9' is not among the unknowns; they are board, cam_0, cam_1, intrinsics:cam_0"
+    ):
+        refined(given).covariance("cam_9")
+    for wrong in ({"stated": "guessed"}, {"stated": {"cam_0": "guessed"}}, {"about": "base"}, {"warp_m": -1.0},
+                  {"carrier_noise": "some"}, {"max_iterations": 0}):  # fmt: skip
+        with pytest.raises(OptionError, match=next(iter(wrong))):
+            rw.CornerOptions(**wrong)  # type: ignore[arg-type]
+
+
+def test_an_innovation_counts_only_what_the_images_tell() -> None:
+    prior, posterior = np.array([1.0, 1.0]), np.diag([0.01, 0.999])
+    assert innovation_of(np.array([0.0, 100.0]), prior, posterior).probability == 1.0
+    assert innovation_of(np.array([5.0, 0.0]), prior, posterior).deviations == pytest.approx(
+        5.0 / np.sqrt(0.99), rel=1e-3
+    )
