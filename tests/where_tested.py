@@ -175,7 +175,7 @@ TABLE: dict[str, dict[str, str]] = {
         "vision/test_ambiguity.py": "agreement",
         "vision/test_board_tags.py": "detected layout_cures sightings tag_agreement",
         "vision/test_camera.py": "distortion",
-        "vision/test_circle_grids.py": "circle_centres",
+        "vision/test_circle_grids.py": "circle_centres circle_lattice",
         "vision/test_contact_sheet.py": "picture_text",
         "vision/test_detection.py": "options rejection",
         "vision/test_edges.py": "edge_geometry edge_profiles",

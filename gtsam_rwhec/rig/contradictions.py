@@ -107,14 +107,19 @@ def _detection(detection: Mapping[str, Any]) -> Iterator[Fault]:
 
 
 def _lookalikes(targets: list[Target]) -> Iterator[Fault]:
-    boards: dict[tuple[str, frozenset[int], bool], str] = {}
+    boards: dict[tuple[str, tuple[int, ...], bool], str] = {}
     prints: dict[tuple[str, int], str] = {}
     for target in targets:
         if isinstance(target, (Checkerboard, CircleGrid)):
             is_checkerboard = isinstance(target, Checkerboard)
             what, of = ("checkerboard", "inner corners") if is_checkerboard else ("grid", "circles")
             dot = isinstance(target, CircleGrid) and bool(target.larger_dot)
-            other = boards.setdefault((what, frozenset((target.columns, target.rows)), dot), target.name)
+            counts: tuple[int, ...] = (target.columns, target.rows)
+            if isinstance(target, CircleGrid) and target.asymmetric:
+                what = "asymmetric grid"
+            else:
+                counts = tuple(sorted(counts))
+            other = boards.setdefault((what, counts, dot), target.name)
             if other != target.name:
                 yield (
                     ("targets", target.name),

@@ -140,11 +140,23 @@ class CircleGridTarget(_TargetSection):
     made: ClassVar = CircleGrid
     counted: ClassVar = "circles"
     type: Literal["circle_grid"]
-    circles: Counts = Field(description="[across, down], circles", examples=[[10, 10]])
-    spacing_m: Length = Field(description="between the centres of neighbours", examples=[0.0254])
+    circles: Counts = Field(
+        description="[in a row, rows], circles (OpenCV's patternSize; Kalibr's targetCols, targetRows)",
+        examples=[[10, 10]],
+    )
+    spacing_m: Length = Field(
+        description="between the centres of neighbours; in an asymmetric grid between two rows, which is half the "
+        "distance between neighbours in a row (OpenCV's square size, Kalibr's spacingMeters)",
+        examples=[0.0254],
+    )
     larger_dot: bool | Literal["lower_left", "lower_right", "upper_left", "upper_right"] = Field(
         default=False,
         description="whether one circle at a corner is larger, and at which as printed; true: lower_left",
+        examples=[True],
+    )
+    asymmetric: bool = Field(
+        default=False,
+        description="every other row is shifted to the right by spacing_m, the first is not (Kalibr's asymmetricGrid)",
         examples=[True],
     )
 

@@ -21,6 +21,10 @@ OUTLINE = 32
 RING = 0.5
 #: The part of a circle's radius inside which its contrast is measured.
 MIDDLE = 0.6
+#: Light changes within a circle by 0.3 % a pixel, and noise is 2 % of it: the squared quotient (pixels squared).
+STEADY = 44.0
+#: Light falls to this share of its value in the middle of a circle at most.
+LEAST_LIT = 0.2
 #: A window with a larger half side than this (pixels) is sampled at every second pixel, or third, and so on.
 LARGEST_WINDOW_PX = 32
 #: Pixels further away than this are nowhere near an image.
@@ -72,7 +76,10 @@ class Circles:
     radii : (...) array
         In steps of the grid, from the areas.
     contrasts : (...) array
-        (background - circle) / background; negative if the circle is lighter.
+        (background - circle) / the lighter of the two; negative if that is the circle.
+    uneven : (...) array
+        By how much the light on the background around a circle is off a plane: root mean square, as a share of it.
+        Where a shadow's edge crosses a circle, its centroid is off.
     seen : (...) array of bool
         Whether a circle is whole in the image and its numbers are finite.
     """
@@ -81,6 +88,7 @@ class Circles:
     centres_px: Array
     radii: Array
     contrasts: Array
+    uneven: Array
     seen: np.ndarray
 
 
@@ -99,12 +107,13 @@ def measured_circles(gray: Gray, plane: Plane, steps: Array, about_px: Array, ra
         usable &= np.abs(np.linalg.det(np.where(usable[:, None, None], J, np.eye(2)))) > 1e-9
     J, about = np.where(usable[:, None, None], J, np.eye(2)), np.where(usable[:, None], about, 0.0)
     reach = edge * np.linalg.norm(J, ord=2, axis=(1, 2))
-    moved, total, contrast, whole = np.zeros((len(r), 2)), np.zeros(len(r)), np.zeros(len(r)), np.zeros(len(r), bool)
+    moved, whole = np.zeros((len(r), 2)), np.zeros(len(r), bool)
+    total, contrast, uneven = np.zeros((3, len(r)))
     small = reach <= 1.3 * np.median(reach)
     for group in (small, ~small):  # the larger dot's window is not everyone's
         if group.any():
             seen_here = _shaded(gray, about[group], J[group], r[group], edge[group], float(reach[group].max()))
-            moved[group], total[group], contrast[group], whole[group] = seen_here
+            moved[group], total[group], contrast[group], uneven[group], whole[group] = seen_here
     area, astray = _outlines(plane, steps, r)
     with np.errstate(divide="ignore", invalid="ignore"):
         found = r * np.sqrt(np.maximum(total / contrast, 0.0) / area)
@@ -113,16 +122,17 @@ def measured_circles(gray: Gray, plane: Plane, steps: Array, about_px: Array, ra
     centroid = about + moved
     return Circles(
         centroid.reshape(*shape, 2), (centroid - astray).reshape(*shape, 2), found.reshape(shape),
-        contrast.reshape(shape), seen.reshape(shape),
+        contrast.reshape(shape), uneven.reshape(shape), seen.reshape(shape),
     )  # fmt: skip
 
 
 def _shaded(
     gray: Gray, about: Array, J: Array, r: Array, edge: Array, reach_px: float
-) -> tuple[Array, Array, Array, np.ndarray]:
+) -> tuple[Array, Array, Array, Array, np.ndarray]:
     """Centroids (n, 2) from `about`, sums (n,) of shade, contrasts (n,), and whether circles are whole in the image.
 
-    A pixel's shade is (background - gray) / background.
+    A pixel's shade is (background - gray) / light. How the light falls is seen on the lighter of circle and background:
+    a dark background's values, by which noise would be divided, say little.
     """
     stride = int(np.ceil((reach_px + 1.0) / LARGEST_WINDOW_PX))
     half = int(np.ceil((reach_px + 1.0) / stride))
@@ -137,18 +147,28 @@ def _shaded(
     near = (away <= edge[:, None]) & inside
     ring = near & (away >= (r + RING * (edge - r))[:, None])
     whole = (inside | (away > r[:, None])).all(axis=1) & (ring.sum(axis=1) >= 6)
-    # Normal equations of gray = a + b du + c dv over the ring of each circle.
+    core = (away <= MIDDLE * r[:, None]) & inside
     basis = np.concatenate([np.ones((*there.shape[:2], 1)), there], axis=2)
-    weighed = (basis * ring[..., None]).swapaxes(1, 2)
-    normal = weighed @ basis + 1e-9 * np.eye(3)
-    ground = (basis @ np.linalg.solve(normal, weighed @ values[..., None]))[..., 0]
-    shade = np.where(near, 1.0 - values / np.maximum(ground, 1.0), 0.0)
-    core = away <= MIDDLE * r[:, None]
+    of_ground, of_circle = _light(values, basis, ring, 1e-9), _light(values, basis, core, STEADY)
+    ground = (basis @ of_ground[..., None])[..., 0]
+    lighter = np.where(of_circle[:, :1] > of_ground[:, :1], of_circle, of_ground)
+    lit = np.maximum((basis @ lighter[..., None])[..., 0], np.maximum(LEAST_LIT * lighter[:, :1], 1.0))
+    shade = np.where(near, (ground - values) / lit, 0.0)
     contrast = (shade * core).sum(axis=1) / np.maximum(core.sum(axis=1), 1)
     total = shade.sum(axis=1)
+    squared = (((ground - values) / lit) ** 2 * ring).sum(axis=1)
+    uneven = np.sqrt(squared / np.maximum(ring.sum(axis=1), 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = np.nan_to_num((shade[..., None] * there).sum(axis=1) / total[:, None], nan=np.inf)
-    return moved, stride**2 * total, contrast, whole
+    return moved, stride**2 * total, contrast, uneven, whole
+
+
+def _light(values: Array, basis: Array, where: np.ndarray, steady: float) -> Array:
+    """The planes (n, 3) that fit gray values (n, p) best in some of the pixels; basis (n, p, 3) has 1, du, dv."""
+    weighed = (basis * where[..., None]).swapaxes(1, 2)
+    normal = weighed @ basis + np.diag([1e-9, steady, steady])
+    planes: Array = np.linalg.solve(normal, weighed @ values[..., None])[..., 0]
+    return planes
 
 
 def _gaps(steps: Array, radii: Array) -> Array:

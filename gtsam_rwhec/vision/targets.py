@@ -214,17 +214,24 @@ class Checkerboard:
 class CircleGrid:
     """A grid of columns x rows circles, numbered left to right, from the top.
 
-    Without a larger dot the grid looks the same turned (see `ways`): which way up it is only the motion tells.
+    An asymmetric grid is OpenCV's and Kalibr's: row i, circle j is at (2 j + i % 2, i) spacings from the first, so that
+    the first row begins at the left edge and every other row is shifted to the right by one spacing. The first circle
+    is the upper left one as printed. Neighbours in a row are two spacings apart, diagonal ones sqrt(2).
+
+    A grid may look the same turned (see `ways`): which way up it is only the motion tells.
 
     Attributes
     ----------
     name : str
     columns, rows : int
-        Numbers of circles.
+        Numbers of circles: in a row, and rows. OpenCV's patternSize (4, 11) is 4 columns and 11 rows.
     spacing_m : float
-        Between the centres of neighbours, metres.
+        Between the centres of neighbours, metres. In an asymmetric grid it is the distance between two rows, which is
+        half the distance between neighbours in a row (OpenCV's square size, Kalibr's spacingMeters).
     larger_dot : bool or str
         Whether one circle, at a corner, is larger; or which corner, one of `CORNERS`. True is "lower_left".
+    asymmetric : bool
+        Whether every other row is shifted. Such a grid has no larger dot.
     """
 
     name: str
@@ -232,6 +239,7 @@ class CircleGrid:
     rows: int
     spacing_m: float
     larger_dot: bool | str = False
+    asymmetric: bool = False
     family: ClassVar[str] = "circle_grid"
     ids: ClassVar[tuple[int, ...]] = ()
 
@@ -240,6 +248,11 @@ class CircleGrid:
         check(self.name, None, (), {"spacing_m": self.spacing_m})
         if not isinstance(self.larger_dot, bool) and self.larger_dot not in CORNERS:
             raise TargetError(f"larger_dot = {self.larger_dot!r}; give true, false or {', '.join(CORNERS)}", self.name)
+        if self.asymmetric and self.larger_dot:
+            raise TargetError(
+                "an asymmetric grid has no larger dot: leave out larger_dot, or asymmetric if no row is shifted",
+                self.name,
+            )
 
     @property
     def corner(self) -> str:
@@ -250,10 +263,22 @@ class CircleGrid:
 
     @property
     def ways(self) -> int:
-        """In how many ways the grid looks the same: with a larger dot 1, else by half a turn 2, by quarters 4."""
-        if self.larger_dot:
+        """In how many ways the grid looks the same: with a larger dot 1, else by half a turn 2, by quarters 4.
+
+        Half a turn of an asymmetric grid brings the first row to the last one. With an odd number of rows both begin
+        at the left edge, and then the turned rows begin one spacing off it: the grid looks the same in one way only.
+        With an even number they fit. A quarter never does: it takes circles to the places between circles.
+        """
+        if self.larger_dot or (self.asymmetric and self.rows % 2 == 1):
             return 1
-        return 4 if self.columns == self.rows else 2
+        return 4 if self.columns == self.rows and not self.asymmetric else 2
+
+    def steps(self) -> Array:
+        """(rows, columns, 2): each circle's place from the first one, right and down, in spacings."""
+        places: Array = np.stack(np.meshgrid(np.arange(self.columns), np.arange(self.rows)), axis=-1).astype(float)
+        if self.asymmetric:
+            places[..., 0] = 2.0 * places[..., 0] + places[..., 1] % 2.0
+        return places
 
     @property
     def length_m(self) -> float:
@@ -261,8 +286,10 @@ class CircleGrid:
         return self.spacing_m
 
     def corners(self) -> Array:
-        """(columns rows, 3), metres: the circles' centres."""
-        return grid(self.columns, self.rows, self.spacing_m)
+        """(columns rows, 3), metres: the circles' centres. The origin is the middle of their bounding box."""
+        steps = self.steps().reshape(-1, 2)
+        x, y = (steps - 0.5 * steps.max(axis=0)).T
+        return self.spacing_m * np.stack([x, -y, np.zeros(len(steps))], axis=1)
 
 
 Target: TypeAlias = Tag | Charuco | AprilGrid | TagGrid | Bundle | Checkerboard | CircleGrid

@@ -103,13 +103,16 @@ def bundle(made: Bundle, T: np.ndarray) -> list[tuple[Print, np.ndarray]]:
 
 def circles(grid: CircleGrid, *, light: bool = False, at: tuple[int, int] | None = None) -> Print:
     """A grid of circles, dark or light, whose larger one is at its corner or `at` another row and column."""
-    row, column = -1 if "lower" in grid.corner else 0, -1 if "right" in grid.corner else 0
+    steps = grid.steps()
     radii = np.full((grid.rows, grid.columns), 16.0)
     if grid.larger_dot:
-        radii[at or (row, column)] = 26.0
+        radii[at or (-1 if "lower" in grid.corner else 0, -1 if "right" in grid.corner else 0)] = 26.0
+    width, height = (64 * (steps.reshape(-1, 2).max(axis=0) + 1)).astype(int)
+    picture = np.ones((height + 64, width + 64))
     y, x = np.indices((64, 64)) - 31.5
-    cells = np.clip(np.hypot(x, y) - radii[..., None, None] + 0.5, 0.0, 1.0)
-    picture = np.pad(cells.swapaxes(1, 2).reshape(64 * grid.rows, 64 * grid.columns), 32, constant_values=1.0)
+    for (column, row), radius in zip(steps.reshape(-1, 2).astype(int), radii.ravel(), strict=True):
+        cell = np.clip(np.hypot(x, y) - radius + 0.5, 0.0, 1.0)
+        picture[32 + 64 * row :, 32 + 64 * column :][:64, :64] = cell
     return Print(1.0 - picture if light else picture, grid.spacing_m / 64)
 
 

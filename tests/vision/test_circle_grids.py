@@ -87,6 +87,51 @@ def test_the_larger_dot_says_which_way_up(corner: str, columns: int) -> None:
         assert np.abs(found.corners_px - projected(LONG, board.corners(), T)[found.indices]).max() < 0.1
 
 
+@pytest.mark.parametrize(("columns", "rows", "light"), [(4, 11, False), (4, 7, True), (3, 6, False)])
+def test_asymmetric_grids_are_opencvs(columns: int, rows: int, light: bool) -> None:
+    board = CircleGrid("grid", columns, rows, 0.02, asymmetric=True)
+    for camera, angles in ((LONG, (10.0, 15.0, 5.0)), (LONG, (-20.0, 60.0, 110.0)), (BARREL, (50.0, 10.0, -140.0))):
+        T = pose(angles, (0.0, 0.0, 0.45))
+        image = render(camera, [(circles(board, light=light), T)])
+        found = find_circle_grid(image, board, camera)
+        assert found is not None
+        assert found.rejection is None
+        truth = projected(camera, board.corners(), T)
+        if board.ways == 2 and np.abs(found.corners_px[0] - truth[found.indices[0]]).max() > 1.0:
+            truth = truth[::-1]  # half a turn
+        assert np.abs(found.corners_px - truth[found.indices]).max() < 0.15
+        if camera is LONG and angles[0] > 0.0 and rows == 11:  # OpenCV orders an upright grid as we do
+            is_found, theirs = cv2.findCirclesGrid(image, (columns, rows), flags=cv2.CALIB_CB_ASYMMETRIC_GRID)
+            assert is_found
+            assert np.abs(theirs.reshape(-1, 2) - truth).max() < 1.0
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(4, 11), (5, 6), (3, 3)])
+def test_asymmetric_grids_of_another_size_are_not_read(columns: int, rows: int) -> None:
+    board = CircleGrid("grid", columns, rows, 0.02, asymmetric=True)
+    image = render(LONG, [(circles(board), pose((20.0, -15.0, 12.0), (0.0, 0.0, 0.45)))])
+    assert rejection_of(image, board) is None
+    for other in ((columns - 1, rows), (columns, rows - 1), (columns + 1, rows), (columns, rows + 1), (rows, columns)):
+        if min(other) >= 3 and other != (columns, rows):
+            found = find_circle_grid(image, CircleGrid("grid", *other, 0.02, asymmetric=True), LONG)
+            assert found is None or found.rejection is not None, other
+    found = find_circle_grid(image, CircleGrid("grid", 4, 5, 0.02), LONG)
+    assert found is None or found.rejection is not None
+
+
+def test_circles_at_a_shadows_edge_do_not_count() -> None:
+    board = CircleGrid("grid", 7, 5, 0.025)
+    image = render(LONG, [(circles(board), FRONT)]).astype(float)
+    light = 1.0 - 0.5 / (1.0 + np.exp(-(np.arange(640) - 330.0) / 5.0))
+    found = find_circle_grid(np.rint(image * light).astype(np.uint8), board, LONG)
+    assert found is not None
+    assert found.rejection is None
+    assert 21 <= len(found.indices) < 35
+    truth = projected(LONG, board.corners(), FRONT)
+    turned = found.corners_px - truth[::-1][found.indices]
+    assert min(np.abs(found.corners_px - truth[found.indices]).max(), np.abs(turned).max()) < 0.15
+
+
 def test_a_larger_dot_elsewhere_or_none_is_said() -> None:
     plain = CircleGrid("grid", 7, 5, 0.025)
     dotted, bare = render(LONG, [(circles(GRID), FRONT)]), render(LONG, [(circles(plain), FRONT)])

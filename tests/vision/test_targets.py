@@ -15,6 +15,7 @@ from gtsam_rwhec.vision.targets import (
     AprilGrid,
     Charuco,
     Checkerboard,
+    CircleGrid,
     Tag,
     Target,
     family_named,
@@ -109,6 +110,30 @@ def test_a_checkerboards_corners_go_left_to_right_from_the_top() -> None:
     np.testing.assert_allclose(np.diff(corners, axis=1), np.broadcast_to([0.03, 0.0, 0.0], (5, 7, 3)), atol=1e-12)
     np.testing.assert_allclose(np.diff(corners, axis=0), np.broadcast_to([0.0, -0.03, 0.0], (4, 8, 3)), atol=1e-12)
     assert (CHESS.ids, CHESS.family, CHESS.length_m) == ((), "checkerboard", 0.03)
+
+
+def test_asymmetric_circles_are_opencvs_and_kalibrs() -> None:
+    # Both have ((2 j + i % 2) s, i s) for row i from the first one, circle j; their y goes down where ours goes up.
+    grid = CircleGrid("dots", 4, 11, 0.02, asymmetric=True)
+    theirs = [((2 * j + i % 2) * 0.02, i * 0.02, 0.0) for i in range(11) for j in range(4)]
+    np.testing.assert_allclose(grid.corners(), from_opencvs(np.array(theirs), 7 * 0.02, 10 * 0.02), atol=1e-15)
+    assert grid.length_m == 0.02
+    with pytest.raises(TargetError, match="has no larger dot"):
+        CircleGrid("dots", 4, 11, 0.02, True, asymmetric=True)
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+@pytest.mark.parametrize("rows", [3, 4, 6, 8, 10, 11, 12])
+@pytest.mark.parametrize("asymmetric", [False, True])
+def test_a_grid_of_circles_looks_the_same_in_as_many_ways_as_it_says(columns: int, rows: int, asymmetric: bool) -> None:
+    grid = CircleGrid("dots", columns, rows, 1.0, asymmetric=asymmetric)
+    about_mean = grid.corners()[:, :2] - grid.corners()[:, :2].mean(axis=0)  # every turn to itself keeps the mean
+    turns = [np.array([[1, 0], [0, 1]]), np.array([[0, -1], [1, 0]])]
+    turns += [-turn for turn in turns]
+    same = [np.abs((about_mean @ turn)[:, None] - about_mean).max(axis=2).min(axis=1).max() < 1e-9 for turn in turns]
+    assert grid.ways == sum(same)
+    if grid.ways > 1:  # and then about the origin
+        np.testing.assert_allclose(grid.corners().mean(axis=0), 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
