@@ -141,7 +141,7 @@ class CircleGridTarget(_TargetSection):
     counted: ClassVar = "circles"
     type: Literal["circle_grid"]
     circles: Counts = Field(
-        description="[in a row, rows], circles (OpenCV's patternSize; Kalibr's targetCols, targetRows)",
+        description="[across, down], circles in a row and rows (OpenCV's patternSize; Kalibr's targetCols, targetRows)",
         examples=[[10, 10]],
     )
     spacing_m: Length = Field(

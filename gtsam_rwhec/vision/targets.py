@@ -12,6 +12,8 @@ import re
 from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
+import numpy as np
+
 from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.tag_boards import Bundle, TagGrid
