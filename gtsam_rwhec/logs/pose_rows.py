@@ -195,4 +195,4 @@ def _check_workspace(T: Array, rows: Sequence[PoseRow]) -> None:
 def stem_of(name: str) -> str:
     """A name without folders and without the ending of an image."""
     bare = re.split(r"[/\\]", name.strip().strip("\"'"))[-1]
-    return re.sub(r"\.(png|jpe?g|webp|bmp|tiff?|ya?ml|json|csv|txt)$", "", bare, flags=re.IGNORECASE)
+    return re.sub(r"\.(png|jpe?g|webp|bmp|tiff?|ya?ml|json|xml|csv|tum|txt)$", "", bare, flags=re.IGNORECASE)

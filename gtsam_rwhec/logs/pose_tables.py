@@ -44,6 +44,8 @@ def read_pose_table(path: str, text: str, *, stated: PoseStatement) -> list[Pose
         raise LogError(f"{path} has no poses.")
     if header is not None and (columns := _columns(header)):
         return _by_columns(path, columns, header, lines)
+    if header is not None and len(header) >= 7 and all(len(fields) == len(header) for _, fields in lines):
+        _refuse_names(path, header)
     counts = {len(fields) for _, fields in lines}
     if counts == {4} and not _name_first(lines, 4):
         return _stacked(path, lines)
@@ -108,12 +110,26 @@ def _columns(header: Sequence[str]) -> dict[str, int]:
         }
     if all(f"m{r}{c}" in found for r in range(3) for c in range(4)):
         return found
+    for axes in ("c", "b", "a"), ("qw", "p", "r"):  # KUKA's A, B, C and FANUC's W, P, R
+        if all(axis in found for axis in axes) and not {"qx", "rx"} & set(found):
+            found |= {f"r{axis}": found[name] for axis, name in zip("xyz", axes, strict=True)}
     is_whole = all(f"t{axis}" in found for axis in "xyz") and (
         all(f"q{axis}" in found for axis in "xyzw")
         or all(f"r{axis}" in found for axis in "xyz")
         or all(f"m{r}{c}" in found for r in range(3) for c in range(3))
     )
     return found if is_whole else {}
+
+
+def _refuse_names(path: str, header: Sequence[str]) -> None:
+    """Refuse names of columns that tell no pose: an order that is guessed would give other poses."""
+    is_imu = any(re.search(r"omega|alpha|gyr|acc|w_RS", word, re.IGNORECASE) for word in header)
+    what = "Are they the rates and accelerations of an IMU? These are no poses. " if is_imu else ""
+    raise LogError(
+        f"{path}, line 1: the names of columns {brief(', '.join(header))} tell no position with a rotation. {what}"
+        "Known names: x, y, z (tx, p_x, position.x, ...) with qx, qy, qz, qw (orientation.x, q_x, ...), rx, ry, "
+        "rz (roll, pitch, yaw; a, b, c), or m00 to m23. Without that line, columns go by their order"
+    )
 
 
 def _role(word: str) -> str:
@@ -129,7 +145,7 @@ def _role(word: str) -> str:
     if match is None:
         return bare
     of, axis = match["of"], match["axis"]
-    if re.search(r"(^|[._/ ])(q|quat\w*|orient\w*|rot|rotation)($|[._/ ])", of) or re.search(r"(^|[._/ ])q_", of):
+    if re.search(r"(^|[._/ ])(q|o|quat\w*|orient\w*|rot|rotation)($|[._/ ])", of) or re.search(r"(^|[._/ ])q_", of):
         return f"q{axis}"
     if axis == "w" and not of:
         return "qw"

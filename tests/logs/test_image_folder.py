@@ -47,7 +47,7 @@ def test_by_name(tmp_path: Path) -> None:
 
 
 def test_by_stamp(tmp_path: Path) -> None:
-    text = f"1700000000.25 {POSE}\n1700000001.000000001 {POSE}\n"
+    text = f"1.700000000250000000e+09 {POSE}\n1700000001.000000001 {POSE}\n"  # as numpy.savetxt writes it, too
     records = written(tmp_path, ["1700000000300000000.png"], text)
     assert [r.stamp_ns for r in records] == [1700000000250000000, 1700000000300000000, 1700000001000000001]
 

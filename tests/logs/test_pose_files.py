@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -173,3 +174,61 @@ def test_any_file_gives_poses_or_an_error_of_ours(
         R = found.T[:, :3, :3]
         assert np.isfinite(found.T).all()
         np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-9)
+
+
+def test_names_of_columns_that_tell_no_pose_are_refused(tmp_path: Path) -> None:
+    """An order that is guessed would give other poses."""
+    (tmp_path / "imu0.csv").write_text(
+        lines("timestamp,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z", range(4), P, P)
+    )
+    (tmp_path / "odd.csv").write_text(lines("u0,u1,u2,u3,u4,u5,u6", P, Q))
+    with pytest.raises(LogError, match=r"imu0\.csv, line 1: .* Are they the rates and accelerations of an IMU"):
+        read_poses(tmp_path / "imu0.csv")
+    with pytest.raises(LogError, match=r"odd\.csv, line 1: .* tell no position with a rotation. Known names"):
+        read_poses(tmp_path / "odd.csv")
+
+
+@pytest.mark.parametrize("header", ["X,Y,Z,A,B,C", "px,py,pz,ox,oy,oz,ow", "X [mm],Y [mm],Z [mm],W,P,R"])
+def test_names_of_robots(tmp_path: Path, header: str) -> None:
+    if "A" in header:  # KUKA: about z, y, x
+        text, stated = lines(header, P, DEGREES), {"euler": "ZYX", "angles": "degrees"}
+    elif "W" in header:  # FANUC: about fixed x, y, z
+        text, stated = lines(header, 1e3 * P, ABOUT_XYZ), {"euler": "xyz", "angles": "degrees"}
+    else:
+        text, stated = lines(header, P, Q), {}
+    (tmp_path / "a.csv").write_text(text)
+    np.testing.assert_allclose(read_poses(tmp_path / "a.csv", PoseStatement(**stated)).T, T, atol=1e-9)
+
+
+def opencv(path: Path, poses: dict[str, np.ndarray]) -> None:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in poses.items():
+        storage.write(name, np.ascontiguousarray(value))
+    storage.release()
+
+
+@pytest.mark.parametrize("ending", ["yaml", "xml", "json"])
+def test_rotations_and_positions_apart(tmp_path: Path, ending: str) -> None:
+    """As users of OpenCV's FileStorage write them; poses of the target beside them are passed over."""
+    path, apart, whole, stacked = tmp_path / f"a.{ending}", {}, {}, {}
+    for i in range(4):
+        apart |= {f"R_gripper2base_{i}": T[i, :3, :3], f"t_gripper2base_{i}": T[i, :3, 3]}
+        apart |= {f"R_target2cam_{i}": np.eye(3), f"t_target2cam_{i}": np.ones(3)}
+        whole |= {f"T_gripper2base_{i}": T[i]}
+    stacked = {"rvecs": TURNS.as_rotvec(), "tvecs": T[:, :3, 3]}
+    for poses, names in ((apart, ("0", "1", "2", "3")), (whole, tuple(whole)), (stacked, ("",) * 4)):
+        opencv(path, poses)
+        found = read_poses(path)
+        np.testing.assert_allclose(found.T, T, atol=1e-12)
+        assert found.names == names
+    opencv(path, {"rvecs": TURNS.as_rotvec(), "tvecs": T[:3, :3, 3]})
+    with pytest.raises(LogError, match=r"rvecs.*: 4 rotations and 3 positions in tvecs"):
+        read_poses(path)
+
+
+def test_one_file_an_image_of_opencv(tmp_path: Path) -> None:
+    for i in range(4):
+        opencv(tmp_path / f"im_{i}.xml", {"R": T[i, :3, :3], "t": T[i, :3, 3]})
+    found = read_poses(tmp_path)
+    np.testing.assert_allclose(found.T, T, atol=1e-12)
+    assert found.names == ("im_0.xml", "im_1.xml", "im_2.xml", "im_3.xml")
