@@ -66,7 +66,10 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_hostile_names.py": "terminal",
         "problem/test_csv_folder.py": "natural_order",
     },
-    "gtsam_rwhec/first_rig": {"first_rig/test_first_rig.py": "carriers log_contents proposal targets"},
+    "gtsam_rwhec/first_rig": {
+        "first_rig/test_first_rig.py": "carriers log_contents names proposal targets",
+        "first_rig/test_folder_proposal.py": "boards_seen guessed_intrinsics",
+    },
     "gtsam_rwhec/handeye": {
         "handeye/test_certified.py": "chordal_form",
         "handeye/test_cost.py": "motion_costs weights",

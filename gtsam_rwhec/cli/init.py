@@ -17,7 +17,11 @@ from gtsam_rwhec.files.terminal_text import say, shown_path
 
 def init(
     log: Annotated[
-        Path | None, typer.Argument(help="MCAP file, or a folder of MCAP files (a ROS 2 bag).", show_default=False)
+        Path | None,
+        typer.Argument(
+            help="MCAP file, a folder of MCAP files (a ROS 2 bag), or a folder of images with poses beside them.",
+            show_default=False,
+        ),
     ] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Rig file to write.")] = Path("rig.yaml"),
     schema: Annotated[
@@ -27,7 +31,7 @@ def init(
         bool, typer.Option("--reference", help="Print every key of rig files, as Markdown, and write nothing.")
     ] = False,
 ) -> ExitStatus:
-    """Look at a log and write a first rig file. TODO marks the lines that you must complete."""
+    """Look at a log or a folder of images, and write a first rig file. TODO marks the lines that you must complete."""
     if schema + reference + (log is not None) != 1:
         raise typer.BadParameter("give one of: a log, --schema, --reference")
     if log is None:
@@ -37,8 +41,11 @@ def init(
         raise FileFormatError(f"{output} exists already, perhaps with your changes. Give another name with -o.")
     with StageDisplay() as stage:
         stage(f"looking at {log}")
-        with rw.logs.open_log(log) as opened:
-            text, notes = rw.first_rig.propose_rig(opened, output)
+        if rw.first_rig.is_folder_without_logs(log):
+            text, notes = rw.first_rig.propose_folder_rig(log, output, progress=stage)
+        else:
+            with rw.logs.open_log(log) as opened:
+                text, notes = rw.first_rig.propose_rig(opened, output)
     text = rw.rig.editor_line() + text
     write_atomically(output, text.encode())
     call = f" gtsam-rwhec calibrate {shown_path(log)} --rig {shown_path(output)} -o out"

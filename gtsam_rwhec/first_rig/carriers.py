@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gtsam_rwhec.first_rig.log_contents import PoseTopic
+from gtsam_rwhec.first_rig.names import frame_name
 from gtsam_rwhec.rig.field_types import is_name
 from gtsam_rwhec.rig.sections import PoseSource
 
@@ -87,9 +88,3 @@ def _of_topic(series: PoseTopic) -> MovingPair:
 def _words(series: PoseTopic, where: str) -> str:
     moved, turned = series.motion()
     return f"{where}: {series.count} poses, up to {moved:.2f} m and {math.degrees(turned):.0f} degrees"
-
-
-def frame_name(text: str) -> str:
-    """A valid frame name made from a text: characters that are not allowed become _; empty if none is left."""
-    words = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in text)[:60].strip("_")
-    return words if is_name(words) else (f"f_{words}" if words else "")

@@ -14,7 +14,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, PoseRecord, Topic
 from gtsam_rwhec.logs.message_kinds import schema_word
 from gtsam_rwhec.rig.field_types import is_text
-from gtsam_rwhec.vision.images import decode_gray
+from gtsam_rwhec.vision.images import Gray, decode_gray
 from gtsam_rwhec.vision.tag_survey import BY_TRUST, tags_in_image
 
 #: This number of images of each topic, taken evenly from all, is searched for tags.
@@ -39,7 +39,7 @@ class Tags:
 
 @dataclass
 class ImageTopic:
-    """A topic of images: its frame, and the tags in the images that were searched."""
+    """A topic or folder of images: its frame, and the tags in the images that were searched."""
 
     topic: str
     schema: str
@@ -50,6 +50,20 @@ class ImageTopic:
     tags: dict[str, Tags] = field(default_factory=dict)
     wanted: frozenset[int] = frozenset()
     passed: int = 0
+    pictures: list[Gray] = field(default_factory=list)
+    places: list[int] = field(default_factory=list)
+
+    def search(self, gray: Gray, place: int) -> None:
+        """Search an image for tags, and keep it; its place is its stamp in a log, its number in a folder."""
+        # The first few images show which families there are; the search for all of them takes a second for each image.
+        families = BY_TRUST if self.looked_at < IMAGES_FOR_ALL else tuple(self.tags)
+        self.looked_at += 1
+        tags = tags_in_image(gray, families)
+        for family, number, is_double in {(tag.family, tag.id, tag.is_double) for tag in tags}:
+            found = self.tags.setdefault(family, Tags())
+            (found.double if is_double else found.single)[number] += 1
+        self.pictures.append(gray)
+        self.places.append(place)
 
 
 @dataclass
@@ -151,13 +165,7 @@ def _look_at(images: ImageTopic, record: ImageRecord) -> None:
     except ImageError as error:
         images.undecoded = str(error)
         return
-    # The first few images show which families there are; the search for all of them takes a second for each image.
-    families = BY_TRUST if images.looked_at < IMAGES_FOR_ALL else tuple(images.tags)
-    images.looked_at += 1
-    tags = tags_in_image(gray, families)
-    for family, number, is_double in {(tag.family, tag.id, tag.is_double) for tag in tags}:
-        found = images.tags.setdefault(family, Tags())
-        (found.double if is_double else found.single)[number] += 1
+    images.search(gray, record.stamp_ns)
 
 
 def _take_detection(driver: DriverTopic, record: DetectionRecord) -> None:

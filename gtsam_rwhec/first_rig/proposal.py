@@ -7,8 +7,9 @@ from pathlib import Path
 
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
-from gtsam_rwhec.first_rig.carriers import MovingPair, frame_name, moving_pairs
+from gtsam_rwhec.first_rig.carriers import MovingPair, moving_pairs
 from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic, LogContents, read_contents
+from gtsam_rwhec.first_rig.names import camera_name, free_name
 from gtsam_rwhec.first_rig.targets import Guess, targets_seen
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig.field_types import is_name, is_text
@@ -18,12 +19,6 @@ from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseNoise, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
 
-#: These words in names of topics say what is published, and not by which camera.
-_COMMON = frozenset({
-    "image", "image_raw", "image_color", "image_mono", "image_rect", "image_rect_color", "image_rect_raw", "compressed",
-    "raw", "color", "colour", "rgb", "detections", "tag_detections", "apriltag_detections", "detection", "tags",
-    "apriltag", "apriltags", "aruco", "aruco_markers", "aruco_detections", "markers", "marker_publisher",
-})  # fmt: skip
 #: Comment on a sensor's time offset.
 _TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs rotation that speeds up and slows down)"
 #: Comment on the noise of the carriers' poses.
@@ -103,10 +98,10 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
 def _text(log: Log, carriers: Carriers, carrier_remark: str, cameras: list[_Camera], guesses: list[Guess]) -> str:
     taken = {carriers.sensors, carriers.targets}
     remarks: dict[KeyPath, str] = {("carriers", "poses"): carrier_remark, ("carriers", "noise"): _NOISE}
-    names = {camera.name: _free(camera.name, taken) for camera in cameras}
+    names = {camera.name: free_name(camera.name, taken) for camera in cameras}
     targets: dict[str, TargetSection] = {}
     for guess in guesses:
-        name = _free(guess.name, taken)
+        name = free_name(guess.name, taken)
         targets[name] = guess.section
         remarks["targets", name] = guess.remark
     sensors = {}
@@ -151,7 +146,7 @@ def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:
         intrinsics, remark = _intrinsics(source.topic, source.frame, contents.intrinsics, sources)
         if intrinsics is None and missing:
             intrinsics, remark = Intrinsics(file="camera.yaml"), missing
-        name = _free(_name(source.topic, source.frame), taken)
+        name = free_name(camera_name(source.topic, source.frame), taken)
         section = Sensor.model_validate({key: source.topic, "intrinsics": intrinsics})
         cameras.append(_Camera(name, section, source.frame, {"intrinsics": remark} if remark else {}))
         return name
@@ -176,7 +171,7 @@ def _without_copies(contents: LogContents, notes: list[str]) -> list[ImageTopic]
     best: dict[tuple[str, str], ImageTopic] = {}
     ranked = sorted(contents.images.values(), key=lambda images: ("Compressed" in images.schema, images.topic))
     for images in sorted(ranked, key=lambda images: -images.looked_at):
-        key = _name(images.topic, images.frame), images.frame
+        key = camera_name(images.topic, images.frame), images.frame
         if "depth" in images.topic.lower():
             notes.append(f"not used: {images.topic}, depth")
         elif not images.looked_at:
@@ -205,20 +200,6 @@ def _shared(first: str, second: str) -> int:
     """Count the common words with which two topics begin."""
     pairs = list(zip(first.strip("/").split("/"), second.strip("/").split("/"), strict=False))
     return next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
-
-
-def _name(topic: str, frame: str) -> str:
-    """Name a camera by the words of its topic that are not common, or else by its frame."""
-    words = [word for word in topic.split("/") if word.lower() not in _COMMON]
-    return frame_name("_".join(words)) or frame_name(frame) or "camera"
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """Return the name, with a number added if it is taken. It is taken from now on."""
-    numbered = (f"{name}_{number}" for number in range(2, len(taken) + 3))
-    free = next(candidate for candidate in (name, *numbered) if candidate not in taken)
-    taken.add(free)
-    return free
 
 
 def _pair_words(pair: MovingPair) -> str:

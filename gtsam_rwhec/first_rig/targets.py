@@ -8,9 +8,17 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
+from gtsam_rwhec.first_rig.boards_seen import BoardSeen
 from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic
-from gtsam_rwhec.rig.target_sections import AprilGridTarget, CharucoTarget, TagTarget
-from gtsam_rwhec.vision.targets import FAMILIES, family_named
+from gtsam_rwhec.rig.target_sections import (
+    AprilGridTarget,
+    CharucoTarget,
+    CheckerboardTarget,
+    CircleGridTarget,
+    TagTarget,
+    TargetSection,
+)
+from gtsam_rwhec.vision.targets import FAMILIES, Checkerboard, family_named
 
 #: Metres. A tag's side has this value in a first rig file, until a person measures it.
 TAG_M = 0.1
@@ -33,7 +41,7 @@ class Guess:
     """A guess of a target: its name, its section, and the comment beside it."""
 
     name: str
-    section: TagTarget | CharucoTarget | AprilGridTarget
+    section: TargetSection
     remark: str
 
 
@@ -59,6 +67,43 @@ def targets_seen(images: Iterable[ImageTopic], drivers: Iterable[DriverTopic]) -
         guesses += _of_family(_smallest(family, sure), sure, looked_at)
     guesses += _of_drivers(drivers, guesses)
     return guesses, remarks
+
+
+def boards_guessed(seen: Iterable[tuple[str, int, BoardSeen]]) -> list[Guess]:
+    """Guesses of boards without tags, of those that were seen by each camera: its name and its number of images."""
+    most: dict[tuple[str, tuple[int, int]], list[tuple[str, int, BoardSeen]]] = {}
+    for one in seen:
+        most.setdefault((one[2].board.family, one[2].counts), []).append(one)
+    guesses: dict[str, tuple[int, Guess]] = {}
+    for (family, (across, down)), views in most.items():
+        images = sum(len(board.images) for _, _, board in views)
+        of = sum(count for _, count, _ in views)
+        passed = f"{across} x {down} passed every test in {images} of {of} images"
+        board = views[0][2].board
+        if isinstance(board, Checkerboard):
+            section: TargetSection = CheckerboardTarget(
+                type="checkerboard", inner_corners=(across, down), square_m=SQUARE_M
+            )
+            name, remark = "board", f"{TODO} a square; {passed} (inner corners, not squares)"
+        else:
+            section = CircleGridTarget(
+                type="circle_grid", circles=(across, down), spacing_m=SQUARE_M, larger_dot=bool(board.larger_dot)
+            )
+            dot = ", with one larger dot: at the lower left as printed, or name its corner" if board.larger_dot else ""
+            name, remark = "grid", f"{TODO} between centres of neighbours; {passed}{dot}"
+        if images > guesses.get(family, (0, None))[0]:
+            guesses[family] = images, Guess(name, section, remark)
+    return [guess for _, guess in guesses.values()]
+
+
+def with_size(section: TargetSection, factor: float) -> TargetSection:
+    """The section with its lengths times this factor, to four digits."""
+    lengths = {
+        name: float(f"{getattr(section, name) * factor:.4g}")
+        for name in type(section).model_fields
+        if name.endswith("_m")
+    }
+    return section.model_copy(update=lengths)
 
 
 def least_sightings(family: str, looked_at: int) -> int:

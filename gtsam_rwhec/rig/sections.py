@@ -164,10 +164,7 @@ class Intrinsics(Section):
 
     model_config = one_of(
         "topic", "kalibr", "file", "K",
-        together=(
-            ("kalibr", "camera"), ("camera", "kalibr"), ("size", "K"), ("width", "K"), ("height", "K"), ("model", "K"),
-            ("D", "K"),
-        ),
+        together=(("width", "K"), ("height", "K"), ("model", "K"), ("D", "K")),
     )  # fmt: skip
 
     topic: Text | None = Field(
@@ -175,13 +172,17 @@ class Intrinsics(Section):
     )
     kalibr: Text | None = Field(
         default=None,
-        description="Kalibr's camchain; with camera",
+        description="Kalibr's camchain: the same as file",
         examples=["camchain.yaml"],
     )
-    camera: Text | None = Field(default=None, description="with kalibr: the camera in it", examples=["cam0"])
+    camera: Text | None = Field(
+        default=None,
+        description="with a file of several cameras: the one; without it the one of the sensor's name",
+        examples=["cam0"],
+    )
     file: Text | None = Field(
         default=None,
-        description="a file of ROS, OpenCV or plain numbers; intrinsics: FILE is the same in short",
+        description="a file of Kalibr, COLMAP, ROS, OpenCV or plain numbers; intrinsics: FILE is the same in short",
         examples=["left.yaml"],
     )
     model: str | None = Field(
@@ -196,7 +197,10 @@ class Intrinsics(Section):
         default=None, description="with K, in place of size", examples=[480], json_schema_extra={"unit": "pixels"}
     )
     size: Annotated[tuple[int, int], list_of(2, "[width, height] in pixels")] | None = Field(
-        default=None, description="[width, height]", examples=[[640, 480]], json_schema_extra={"unit": "pixels"}
+        default=None,
+        description="[width, height], with K or with a file that lacks it",
+        examples=[[640, 480]],
+        json_schema_extra={"unit": "pixels"},
     )
     K: Annotated[tuple[float, float, float, float], list_of(4, "[fx, fy, cx, cy] in pixels")] | None = Field(
         default=None,

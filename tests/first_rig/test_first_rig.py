@@ -18,8 +18,8 @@ from mcap.writer import Writer
 
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.first_rig import propose_rig
-from gtsam_rwhec.first_rig.carriers import frame_name
 from gtsam_rwhec.first_rig.log_contents import ImageTopic, Tags
+from gtsam_rwhec.first_rig.names import frame_name
 from gtsam_rwhec.first_rig.targets import targets_seen
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
 from gtsam_rwhec.rig import AprilGridTarget, CharucoTarget, Rig, parse_rig

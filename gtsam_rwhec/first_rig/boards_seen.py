@@ -1,0 +1,163 @@
+"""Boards without tags in some images: how many corners or circles they have, found out from the images.
+
+OpenCV's detectors must be told a board's size. Candidates come from its sector-based detector, which can say how far a
+board goes on, and from lattices that saddles or blobs form. Each candidate is then looked for in all the images by the
+detection itself, which tests every square and circle and that nothing goes on beyond the board; a board is what passes
+in at least two images, the one that passes most often.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+
+from gtsam_rwhec.first_rig.lattice import lattice_size
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.vision.board_evidence import evidence
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.checkerboards import find_checkerboard
+from gtsam_rwhec.vision.circle_grids import find_circle_grid
+from gtsam_rwhec.vision.images import Gray
+from gtsam_rwhec.vision.saddles import regions
+from gtsam_rwhec.vision.targets import CORNERS, Checkerboard, CircleGrid
+
+#: The smallest board that is looked for, in corners or circles a side, and the largest.
+SMALLEST, LARGEST = 3, 30
+#: A board must pass in at least this number of images.
+LEAST_IMAGES = 2
+#: At most this number of candidates of each kind, the most frequent, are looked for in all images.
+MOST_CANDIDATES = 4
+#: Regions with at least this number of saddles are searched; a region is searched at twice its size below this.
+LEAST_CORNERS, ENLARGED_PX = 9, 250_000
+#: Circles have at least this area, pixels.
+LEAST_AREA_PX = 20.0
+#: At most this number of regions of each image and level are searched.
+MOST_REGIONS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class BoardSeen:
+    """A board that was found out.
+
+    Attributes
+    ----------
+    board : Checkerboard or CircleGrid
+        With 1 m for the length that is not known.
+    images : tuple of int
+        The images in which it was found.
+    corners_px : tuple of (n, 2) arrays
+        Its corners or centres in each of them.
+    indices : tuple of (n,) arrays
+        Their rows in ``board.corners()``.
+    """
+
+    board: Checkerboard | CircleGrid
+    images: tuple[int, ...]
+    corners_px: tuple[Array, ...]
+    indices: tuple[np.ndarray, ...]
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many corners or circles, [across, down]."""
+        return self.board.columns, self.board.rows
+
+
+def boards_seen(images: Sequence[Gray]) -> list[BoardSeen]:
+    """The checkerboard and the grid of circles in a camera's images: at most one of each."""
+    found = []
+    for candidates, look in ((_checkerboards, _with_checkerboard), (_circle_grids, _with_circles)):
+        counted = Counter(size for gray in images for size in set(candidates(gray)))
+        best: BoardSeen | None = None
+        for size, _ in counted.most_common(MOST_CANDIDATES):
+            seen = look(images, *size)
+            if len(seen.images) >= LEAST_IMAGES and (best is None or len(seen.images) > len(best.images)):
+                best = seen
+        if best is not None:
+            found.append(best)
+    return found
+
+
+def _checkerboards(gray: Gray) -> Iterator[tuple[int, int]]:
+    """Numbers of inner corners that an image's checkerboard may have, the larger first.
+
+    The detector may go on beyond a board with a thin margin. So what it found is tested as it is, and with each of the
+    outermost rows and columns left out.
+    """
+    for level in (1, 2):
+        for region in regions(gray, LEAST_CORNERS, level)[:MOST_REGIONS]:
+            part = np.ascontiguousarray(gray[region])
+            enlarged = part.size <= ENLARGED_PX
+            if enlarged:
+                part = np.asarray(cv2.resize(part, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
+            found, corners, meta = cv2.findChessboardCornersSBWithMeta(part, (SMALLEST, SMALLEST), cv2.CALIB_CB_LARGER)
+            if not found or max(meta.shape) > LARGEST:
+                continue
+            grid = np.reshape(corners, (*meta.shape, 2)).astype(float)
+            corner = np.array([region[1].start, region[0].start], dtype=float)
+            grid = corner + (0.5 * grid - 0.25 if enlarged else grid)
+            rows, columns = meta.shape
+            for top, bottom, left, right in product((0, 1), repeat=4):
+                trimmed = grid[top : rows - bottom, left : columns - right]
+                if min(trimmed.shape[:2]) >= SMALLEST and evidence(gray, trimmed, None).rejection is None:
+                    yield _larger_first(*trimmed.shape[:2])
+
+
+def _circle_grids(gray: Gray) -> Iterator[tuple[int, int]]:
+    """Numbers of circles that an image's grid may have, the larger first."""
+    wanted = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
+    wanted.minThreshold, wanted.maxThreshold, wanted.thresholdStep = 20.0, 240.0, 20.0
+    wanted.filterByCircularity, wanted.filterByArea, wanted.filterByColor = False, True, True
+    wanted.minArea, wanted.maxArea = LEAST_AREA_PX, gray.size / SMALLEST**2
+    wanted.minConvexity, wanted.minInertiaRatio, wanted.minDistBetweenBlobs = 0.85, 0.05, 3.0
+    for colour in (0, 255):
+        wanted.blobColor = colour
+        blobs = cv2.SimpleBlobDetector.create(wanted).detect(gray)
+        places = np.array([blob.pt for blob in blobs], dtype=float).reshape(-1, 2)
+        size = lattice_size(places, np.array([blob.size for blob in blobs], dtype=float))
+        if size is not None and min(size) >= SMALLEST and max(size) <= LARGEST:
+            yield _larger_first(*size)
+
+
+def _larger_first(first: int, second: int) -> tuple[int, int]:
+    return max(first, second), min(first, second)
+
+
+def _with_checkerboard(images: Sequence[Gray], columns: int, rows: int) -> BoardSeen:
+    board = Checkerboard("board", columns, rows, 1.0)
+    found = [(i, find_checkerboard(gray, board)) for i, gray in enumerate(images)]
+    good = [(i, seen) for i, seen in found if seen is not None and seen.rejection is None]
+    return BoardSeen(
+        board, tuple(i for i, _ in good), tuple(s.corners_px for _, s in good), tuple(s.indices for _, s in good)
+    )
+
+
+def _with_circles(images: Sequence[Gray], columns: int, rows: int) -> BoardSeen:
+    """The grid as it is in most images: without a larger dot, or with one."""
+    best: BoardSeen | None = None
+    for dot in (False, True):
+        board = CircleGrid("grid", columns, rows, 1.0, larger_dot=CORNERS[0] if dot else False)
+        good = []
+        for i, gray in enumerate(images):
+            height, width = gray.shape
+            # No lens that cameras on robots have bends a small grid much: a pinhole serves to test it.
+            camera = Camera.of(width, height, "pinhole", _any_K(width, height), (), "a first guess")
+            seen = find_circle_grid(gray, board, camera)
+            if seen is not None and seen.rejection is None:
+                good.append((i, seen))
+        tried = BoardSeen(
+            board, tuple(i for i, _ in good), tuple(s.corners_px for _, s in good), tuple(s.indices for _, s in good)
+        )
+        if best is None or len(tried.images) > len(best.images):
+            best = tried
+    assert best is not None
+    return best
+
+
+def _any_K(width: int, height: int) -> Array:
+    """Intrinsics of a lens that sees about 60 degrees across."""
+    return np.array([[0.9 * width, 0.0, 0.5 * width], [0.0, 0.9 * width, 0.5 * height], [0.0, 0.0, 1.0]])

@@ -1,0 +1,225 @@
+"""A first rig file, proposed from the content of a folder of images; TODO marks the values that a person must state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.first_rig.boards_seen import BoardSeen, boards_seen
+from gtsam_rwhec.first_rig.folder_contents import FolderPoses, ImageFolder, read_folder, read_gray
+from gtsam_rwhec.first_rig.guessed_intrinsics import guessed_intrinsics
+from gtsam_rwhec.first_rig.log_contents import ImageTopic
+from gtsam_rwhec.first_rig.names import camera_name, free_name
+from gtsam_rwhec.first_rig.pose_origin import Rest, origin_of, rest_of
+from gtsam_rwhec.first_rig.roles import RoleEvidence, Seen, evidence_of_roles
+from gtsam_rwhec.first_rig.targets import Guess, boards_guessed, targets_seen, with_size
+from gtsam_rwhec.logs.matched_images import pose_stamps
+from gtsam_rwhec.rig.field_types import is_text
+from gtsam_rwhec.rig.rig import Rig
+from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseSource, Sensor
+from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
+from gtsam_rwhec.rig.written_rig import rig_text
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.detection import Detector
+from gtsam_rwhec.vision.targets import Target
+
+#: At most this number of images of each folder, spread over all, is searched for targets, and solved for roles.
+IMAGES = 16
+#: The frames of a folder's poses, whose names no file has.
+PARENT, CHILD = "base", "hand"
+
+
+def propose_folder_rig(
+    folder: str | Path, path: str | Path, *, progress: Progress | None = None
+) -> tuple[str, tuple[str, ...]]:
+    """Propose a rig file for folders of images with poses beside them; a person completes it.
+
+    Parameters
+    ----------
+    folder
+        Where the paths of the rig file start.
+    path
+        The rig file that will be written, for messages.
+    progress : callable, optional
+
+    Returns
+    -------
+    text : str
+        A rig file that `parse_rig` reads.
+    notes : tuple of str
+        What was seen, what was chosen, and what was left out.
+
+    Raises
+    ------
+    RigError
+        There are no images, or no poses that fit them; the message says what was looked at.
+    """
+    folder, tell = Path(folder), progress or silent
+    notes: list[str] = []
+    cameras = _cameras(folder, notes)
+    topics, boards = [], []
+    for camera in cameras:
+        tell(f"searching {camera.path}")
+        topic = ImageTopic(camera.path, "", len(camera.files))
+        for i in np.unique(np.linspace(0, len(camera.files) - 1, IMAGES).round().astype(int)):
+            gray = read_gray(camera.files[i])
+            if gray is not None and gray.shape[::-1] == camera.size:
+                topic.search(gray, int(i))
+        topics.append(topic)
+        boards.append(boards_seen(topic.pictures))
+    guesses, remarks = targets_seen(topics, [])
+    guesses += boards_guessed(
+        (topic.topic, topic.looked_at, seen) for topic, found in zip(topics, boards, strict=True) for seen in found
+    )
+    notes += remarks
+    if guesses:
+        notes.append(f"targets seen: {', '.join(guess.name for guess in guesses)}")
+    else:
+        notes.append(
+            f"no target in {sum(topic.looked_at for topic in topics)} images: no tags of any family, no checkerboard "
+            "and no grid of circles that passes the tests. Write the targets into the rig file"
+        )
+        nothing = TagTarget(type="tag", family="tag36h11", id=0, size_m=0.1)
+        guesses = [Guess("tag_0", nothing, "TODO an example: no targets were seen")]
+    text = _text(folder, cameras, topics, boards, guesses, notes, tell)
+    parse_rig(text, str(path))
+    return text, tuple(notes)
+
+
+def _cameras(folder: Path, notes: list[str]) -> list[ImageFolder]:
+    """The folders of images that have poses."""
+    if not folder.is_dir():
+        raise RigError(f"{folder}: there is no such folder")
+    found = [camera for camera in read_folder(folder) if is_text(camera.path)]
+    if not found:
+        raise RigError(f"{folder}: no folder in it has two images or more that can be read")
+    with_poses = [camera for camera in found if camera.poses is not None]
+    if not with_poses:
+        named = ", ".join(f"{camera.path} ({len(camera.files)} images)" for camera in found[:5])
+        raise RigError(
+            f"{folder}: images in {named}, and no file of poses that fits them. Put the robot's pose at each image "
+            "beside them, as poses.csv with a line an image: name, x, y, z, qx, qy, qz, qw (metres)"
+        )
+    notes += [f"not used: {camera.path}, no poses fit its images" for camera in found if camera.poses is None]
+    for camera in with_poses:
+        assert camera.poses is not None
+        number = int(np.isfinite(camera.poses.T[:, 0, 0]).sum())
+        notes.append(
+            f"camera {camera.path}: {len(camera.files)} images of {camera.size[0]} x {camera.size[1]}, {number} with a "
+            f"pose in {camera.poses.path}, intrinsics {camera.intrinsics or 'in no file'}"
+        )
+    return with_poses
+
+
+def _text(
+    folder: Path,
+    cameras: Sequence[ImageFolder],
+    topics: Sequence[ImageTopic],
+    boards: Sequence[Sequence[BoardSeen]],
+    guesses: Sequence[Guess],
+    notes: list[str],
+    tell: Progress,
+) -> str:
+    taken = {PARENT, CHILD}
+    remarks: dict[KeyPath, str] = {}
+    names = [free_name(camera_name(camera.path, ""), taken) for camera in cameras]
+    targets: dict[str, TargetSection] = {}
+    for guess in guesses:
+        name = free_name(guess.name, taken)
+        targets[name], remarks["targets", name] = guess.section, guess.remark
+    sensors: dict[str, Sensor] = {}
+    stated: list[tuple[str, Camera]] = []
+    for name, camera, found in zip(names, cameras, boards, strict=True):
+        assert camera.poses is not None
+        if camera.camera is not None:
+            section = Intrinsics(file=camera.intrinsics, camera=camera.camera_name or None)
+            stated.append((name, camera.camera))
+        else:
+            guess_ = guessed_intrinsics(camera.size, found)
+            section, remarks["sensors", name, "intrinsics"] = guess_.section, guess_.words
+            stated.append((name, section.camera_of_numbers("a first guess")))
+        rest = _rest(camera.poses)
+        remarks["sensors", name, "time_offset"] = (
+            f"s; {rest.words}, so no clock is estimated" if rest.at_rest else f"in motion: {rest.words}; or seconds"
+        )
+        sensors[name] = Sensor(
+            images=camera.path, poses=camera.poses.path, intrinsics=section,
+            time_offset=0.0 if rest.at_rest else "estimate",
+        )  # fmt: skip
+    tell("solving with the cameras on either carrier")
+    evidence = _roles(cameras, topics, stated, [section.target(name) for name, section in targets.items()])
+    notes.append(f"{evidence.in_words(PARENT, CHILD)}: {_role_words(evidence)}")
+    for name, factor in evidence.sizes.items():
+        targets[name] = with_size(targets[name], factor)
+        remarks["targets", name] += "; the length here is what the motion says"
+    carriers, remarks["carriers", "poses"] = _carriers(cameras, evidence)
+    origin = origin_of([f for camera in cameras if camera.poses for f in camera.poses.path.split("/")])
+    notes.append(f"poses: {origin.words}; their noise is left out, and residuals tell it")
+    rig = Rig(carriers=carriers, sensors=sensors, targets=targets)
+    where = folder.resolve().name
+    head = (
+        f"# A first rig file, made from the folder {where if is_text(where) else repr(where)}; paths start from it.\n"
+        "# TODO marks what only a person knows, above all the sizes of the targets.\n"
+    )
+    return head + rig_text(rig, remarks)
+
+
+def _rest(poses: FolderPoses) -> Rest:
+    """Whether the images were taken at rest."""
+    stamps = poses.stamps_ns
+    if stamps is None:
+        return Rest(True, "images whose names are no stamps were taken at rest")
+    of_poses = np.array(pose_stamps(poses.all) or (), dtype=np.int64)
+    order = np.argsort(of_poses, kind="stable")
+    order = order[np.append(np.diff(of_poses[order]) > 0, True)]
+    return rest_of(stamps, Trajectory(of_poses[order], poses.all.T[order], poses.path))
+
+
+def _roles(
+    cameras: Sequence[ImageFolder],
+    topics: Sequence[ImageTopic],
+    stated: Sequence[tuple[str, Camera]],
+    targets: Sequence[Target],
+) -> RoleEvidence:
+    seen = []
+    by_name = {target.name: target for target in targets}
+    for camera, topic, (name, intrinsics) in zip(cameras, topics, stated, strict=True):
+        assert camera.poses is not None
+        for place, found in zip(topic.places, Detector(intrinsics, targets)(topic.pictures), strict=True):
+            seen += [Seen(name, by_name[d.target], d, camera.poses.T[place]) for d in found.detections]
+    return evidence_of_roles(seen)
+
+
+def _role_words(evidence: RoleEvidence) -> str:
+    return {
+        "child": f"the cameras are on {CHILD}",
+        "parent": f"the cameras are on {PARENT}, and the targets on {CHILD}",
+        None: "the data cannot tell",
+    }[evidence.role]
+
+
+def _carriers(cameras: Sequence[ImageFolder], evidence: RoleEvidence) -> tuple[Carriers, str]:
+    statements = {camera.poses.stated for camera in cameras if camera.poses is not None}
+    said = next(iter(statements))
+    source = PoseSource(frames=(PARENT, CHILD), euler=said.euler, angles=said.angles, length=said.length)
+    if evidence.role is None:
+        remark = (
+            "TODO the images cannot tell what carries the sensors: exchange the two names for cameras beside the robot "
+            f"({evidence.in_words(PARENT, CHILD)})"
+        )
+    else:
+        remark = (
+            f"a guess, as is that the files have T_{PARENT}_{CHILD}: {evidence.in_words(PARENT, CHILD)}. If the files "
+            f"have T_{CHILD}_{PARENT}, exchange the two frames here, and sensors and targets above"
+        )
+    if said.euler is not None:
+        remark += f"; TODO the files have three angles, and {said.euler} in degrees is a guess"
+    sensors, targets = (PARENT, CHILD) if evidence.role == "parent" else (CHILD, PARENT)
+    return Carriers(sensors=sensors, targets=targets, poses=source), remark
