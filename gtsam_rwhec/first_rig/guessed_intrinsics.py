@@ -41,10 +41,10 @@ def guessed_intrinsics(size: tuple[int, int], boards: Iterable[BoardSeen]) -> Gu
         pixels = [of_image.astype(np.float32)[:, None] for of_image in seen.corners_px]
         flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
         try:
-            rms, K, *_ = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)  # type: ignore[call-overload]
+            rms, fitted, *_ = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
         except cv2.error:
             continue
-        fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        fx, fy, cx, cy = (float(fitted[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         is_lens = all(SHORTEST * width < f < LONGEST * width for f in (fx, fy)) and 0 < cx < width and 0 < cy < height
         if is_lens and rms < LARGEST_RMS_PX:
             numbers = (round(fx, 1), round(fy, 1), round(cx, 1), round(cy, 1))
