@@ -14,6 +14,7 @@ from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
 from gtsam_rwhec.rig import sections, target_sections
 from gtsam_rwhec.rig.field_types import in_yaml, unit_of
+from gtsam_rwhec.rig.kalibr_targets import with_kalibr_targets
 from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
 from gtsam_rwhec.rig.unfinished import todo_lines
 
@@ -112,6 +113,7 @@ def parse_rig(text: str, where: str, folder: Path = Path()) -> Rig:
         raise RigError(str(error)) from error
     if not isinstance(file.data, dict):
         raise RigError(file.fault((), f"{shown(file.data)} in place of the sections carriers, sensors and targets"))
+    file = with_kalibr_targets(file, folder)
     try:
         said = RigFile.model_validate(file.data)
     except ValidationError as error:
