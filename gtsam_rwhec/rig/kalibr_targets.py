@@ -73,11 +73,11 @@ def _section(file: YamlFile) -> dict[str, Any]:
         if given["colSpacingMeters"] != length:
             _refuse(file, "colSpacingMeters", "squares that are no squares are not detected")
         return {"type": "checkerboard", "inner_corners": (columns, rows), "square_m": float(length)}
-    if given.get("asymmetricGrid", False) is not False:
-        _refuse(
-            file, "asymmetricGrid", "write the section of this grid into the rig file, as docs/from_a_log.md has it"
-        )
-    return {"type": "circle_grid", "circles": (columns, rows), "spacing_m": float(length)}
+    shifted = given.get("asymmetricGrid", False)
+    if not isinstance(shifted, bool):
+        _refuse(file, "asymmetricGrid", f"{shown(shifted)}; give True or False")
+    section = {"type": "circle_grid", "circles": (columns, rows), "spacing_m": float(length)}
+    return {**section, "asymmetric": True} if shifted else section
 
 
 def _refuse(file: YamlFile, key: str, words: str) -> NoReturn:

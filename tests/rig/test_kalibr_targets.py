@@ -25,6 +25,10 @@ FILES = {
         "target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\nrowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n",
         "{type: checkerboard, inner_corners: [6, 7], square_m: 0.06}",
     ),
+    "asymmetric": (
+        "target_type: 'circlegrid'\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\nasymmetricGrid: True\n",
+        "{type: circle_grid, circles: [4, 11], spacing_m: 0.02, asymmetric: true}",
+    ),
     "circlegrid": (
         "target_type: 'circlegrid'\ntargetCols: 6\ntargetRows: 7\nspacingMeters: 0.02\nasymmetricGrid: False\n",
         "{type: circle_grid, circles: [6, 7], spacing_m: 0.02}",
@@ -45,11 +49,11 @@ def test_each_target_of_kalibr(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "old", "new", "words"),
     [
-        ("aprilgrid", "'aprilgrid'", "'dots'", "target.yaml, line 1: target_type: 'dots'; Kalibr's targets are aprilgrid"),
+        ("aprilgrid", "'aprilgrid'", "'dots'", "line 1: target_type: 'dots'; Kalibr's targets are aprilgrid, checker"),
         ("aprilgrid", "tagCols: 6\n", "", "tagCols: is missing"),
         ("aprilgrid", "tagSize: 0.088", "tagSize: wide", "line 4: tagSize: 'wide'; a number was expected"),
         ("checkerboard", "colSpacingMeters: 0.06", "colSpacingMeters: 0.05", "squares that are no squares"),
-        ("circlegrid", "False", "True", "line 5: asymmetricGrid: write the section of this grid"),
+        ("circlegrid", "False", "2", "line 5: asymmetricGrid: 2; give True or False"),
         ("aprilgrid", "tagCols: 6", "tagCols: 6.5", "rig.yaml, line 5: targets.board.tags"),
     ],
 )  # fmt: skip
