@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.model import Model, Point
-from gtsam_rwhec.reprojection.views import SHAPE
 
 
 def key_of(letter: str, number: int) -> int:
@@ -72,9 +71,10 @@ class CornerGraph:
         if self.model.A_noise is not None:
             for i, T in enumerate(point.A):
                 values.insert(key_of("a", i), gtsam.Pose3(T))
-        for keys, vectors in ((self.k, point.cameras), (self.b, point.shapes)):
-            for name, key in keys.items():
-                values.insert(key, np.asarray(vectors[name], dtype=float))
+        for name, key in self.k.items():
+            values.insert(key, np.asarray(point.cameras[name], dtype=float))
+        for name, key in self.b.items():
+            values.insert(key, point.shapes[name][self.model.free_shape(name)])
         return values
 
     def point(self, values: gtsam.Values) -> Point:
@@ -87,8 +87,14 @@ class CornerGraph:
             {name: values.atPose3(key).matrix() for name, key in self.y.items()},
             A,
             {name: values.atVector(key) for name, key in self.k.items()},
-            self.start.shapes | {name: values.atVector(key) for name, key in self.b.items()},
+            {name: self._shape(values, name) for name in self.start.shapes},
         )
+
+    def _shape(self, values: gtsam.Values, name: str) -> Array:
+        shape = self.start.shapes[name].copy()
+        if name in self.b:
+            shape[self.model.free_shape(name)] = values.atVector(self.b[name])
+        return shape
 
     def covariance(self, values: gtsam.Values, slots: Mapping[tuple[str, str], slice]) -> tuple[Array, float]:
         """The covariance (d, d) of the unknowns in `slots`, all else eliminated; and how far off the optimum is.
@@ -121,8 +127,9 @@ class CornerGraph:
             # an infinite deviation is a weight of zero
             self.graph.add(gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Diagonal.Precisions(deviation**-2.0)))
         for name, key in self.b.items():
-            noise = gtsam.noiseModel.Diagonal.Sigmas(model.shape_priors[name])
-            self.graph.add(gtsam.PriorFactorVector(key, np.zeros(SHAPE), noise))
+            deviation = model.shape_priors[name][model.free_shape(name)]
+            noise = gtsam.noiseModel.Diagonal.Sigmas(deviation)
+            self.graph.add(gtsam.PriorFactorVector(key, np.zeros(len(deviation)), noise))
 
     def _add_view(self, s: int, v: int) -> None:
         stack = self.model.stacks[s]
@@ -135,7 +142,7 @@ class CornerGraph:
         }
         variables = self.model.variables_of(stack)
         width = 12 + len(self.start.cameras[self.model.camera_of[stack.sensor]])
-        width += 6 * ("A" in variables) + SHAPE * ("shape" in variables)
+        width += 6 * ("A" in variables) + len(self.model.free_shape(stack.target))
         size = min(2 * stack.known.shape[1], width + 1)
         keys = [key_of_variable[name] for name in variables]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors import se3
@@ -86,8 +86,9 @@ class Model:
         ]
 
     def linearised(self, stack: Stack, point: Point) -> Linear:
-        """Rows of a stack, in pixels."""
-        return linearised(stack, *self._arguments(stack, point))
+        """Rows of a stack, in pixels; by the numbers of the board's shape that are free."""
+        rows = linearised(stack, *self._arguments(stack, point))
+        return replace(rows, by_shape=rows.by_shape[..., self.free_shape(stack.target)])
 
     def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array]:
         camera = point.cameras[self.camera_of[stack.sensor]]
@@ -113,6 +114,10 @@ class Model:
             stacked = np.concatenate([*blocks.values(), residual[..., None]], axis=2)
             result.append((np.asarray(np.linalg.qr(stacked, mode="r")), columns))
         return result
+
+    def free_shape(self, target: str) -> np.ndarray:
+        """Which of the three numbers of a board's shape are free."""
+        return np.flatnonzero(self.shape_priors.get(target, ()))
 
     def variables_of(self, stack: Stack) -> tuple[str, ...]:
         """X, Y, camera, and A and shape where they are free."""

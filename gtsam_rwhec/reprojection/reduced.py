@@ -20,7 +20,6 @@ from scipy.optimize import minimize
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.model import Model, Point
-from gtsam_rwhec.reprojection.views import SHAPE
 
 Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
 
@@ -98,7 +97,7 @@ class Reduced:
         for name, (mean, _) in model.camera_priors.items():
             add("k", name, len(mean))
         for name in model.shape_priors:
-            add("b", name, SHAPE)
+            add("b", name, len(model.free_shape(name)))
         count = len(model.A)
         G, g = np.zeros((size, size)), np.zeros(size)
         C, M, b = np.zeros((count, 6, size)), np.zeros((count, 6, 6)), np.zeros((count, 6))
@@ -133,9 +132,9 @@ class Reduced:
             prior[slots["k", name]] = deviation**-2.0
             off[slots["k", name]] = point.cameras[name] - mean
         for name, deviation in model.shape_priors.items():
-            with np.errstate(divide="ignore"):
-                prior[slots["b", name]] = np.where(deviation > 0.0, deviation**-2.0, 1e30)
-            off[slots["b", name]] = point.shapes[name]
+            free = model.free_shape(name)
+            prior[slots["b", name]] = deviation[free] ** -2.0
+            off[slots["b", name]] = point.shapes[name][free]
         return Reduced(slots, G, g, C, M, b, rr, number, prior, off)
 
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:

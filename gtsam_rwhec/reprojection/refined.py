@@ -106,6 +106,8 @@ class CornersRefined:
     def covariance(self, *names: str) -> Array:
         """The joint covariance of frames (six rows each), ``intrinsics:SENSOR`` and ``shape:TARGET``, as given.
 
+        Of a shape it has the numbers that are free: the size, and the two heights of its edge.
+
         Raises
         ------
         FrameError

@@ -69,6 +69,15 @@ def test_noise_is_found_and_everything_is_within_its_covariance(about: str) -> N
     )
 
 
+def test_a_warped_board_of_known_size() -> None:
+    given = cell(2, images=20, shape=(0.0, 1e-3, 1e-3))
+    result = refined(given, rw.CornerOptions(carrier_noise="exact", warp_m=1e-3))
+    assert result.shapes["board"][0] == 0.0
+    assert result.shapes["board"][1:] == pytest.approx(given.shape[1:], abs=3e-4)
+    error = given.shape[1:] - result.shapes["board"][1:]
+    assert error @ np.linalg.solve(result.covariance("shape:board"), error) < chi2.ppf(0.999, 2)
+
+
 def test_nominal_intrinsics_that_are_off_do_not_move_the_poses_beyond_their_covariance() -> None:
     given = cell(5, images=30, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
     result = refined(given, rw.CornerOptions(carrier_noise="exact"))
