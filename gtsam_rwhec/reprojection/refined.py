@@ -11,6 +11,7 @@ import numpy as np
 from gtsam_rwhec.errors import FrameError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.graph import CornerGraph
+from gtsam_rwhec.reprojection.model import Point
 from gtsam_rwhec.reprojection.reduced import Noise
 from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, held_by_prior
 from gtsam_rwhec.vision.camera import Camera
@@ -82,8 +83,10 @@ class CornersRefined:
         Covariance of all unknowns; right perturbations [omega, v] of poses, rad and m.
     left_out : dict of (target, sensor) to (V, n) booleans
         Corners that disagree with all others.
-    A : (I, 4, 4) array
-        The carriers' poses at the instants, as refined.
+    graph : CornerGraph
+        The GTSAM graph at the optimum's noise, with its model and its variables' keys.
+    point : Point
+        The values of all variables, with the carriers' poses at the instants.
     iterations : int
         Levenberg-Marquardt steps, in all rounds together.
     last_step : float
@@ -98,8 +101,8 @@ class CornersRefined:
     joint: Array = field(repr=False)
     slots: Mapping[tuple[str, str], slice] = field(repr=False)
     left_out: dict[tuple[str, str], np.ndarray] = field(repr=False)
-    A: Array = field(repr=False)
     graph: CornerGraph = field(repr=False)
+    point: Point = field(repr=False)
     iterations: int
     last_step: float
 
@@ -125,5 +128,6 @@ class CornersRefined:
     @property
     def names(self) -> dict[str, tuple[str, str]]:
         """The unknowns' names."""
-        words = {"x": "", "y": "", "k": "intrinsics:", "b": "shape:"}
-        return {f"{words[letter]}{name}": (letter, name) for letter, name in self.slots}
+        frames = {name: (letter, name) for letter, name in self.slots if letter in "xy"}
+        cameras = {f"intrinsics:{name}": ("k", self.graph.model.camera_of[name]) for name in self.Y}
+        return frames | cameras | {f"shape:{name}": ("b", name) for letter, name in self.slots if letter == "b"}

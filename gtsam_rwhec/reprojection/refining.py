@@ -139,8 +139,8 @@ def refine_corners(
             (stack.target, stack.sensor): stack.known & (weights == 0.0)
             for stack, weights in zip(stacks, settled.model.weights, strict=True)
         },
-        A=point.A,
         graph=settled.graph,
+        point=point,
         iterations=settled.iterations,
         last_step=settled.last_step,
     )

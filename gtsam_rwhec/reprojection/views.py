@@ -152,6 +152,11 @@ def pixel_errors(stack: Stack, X: Array, Y: Array, A: Array, parameters: Array, 
     return seen.errors(stack, pixels)
 
 
+def depths(stack: Stack, X: Array, Y: Array, A: Array, shape: Array) -> Array:
+    """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
+    return _seen(stack, X, Y, A, shape).z
+
+
 def linearised(stack: Stack, X: Array, Y: Array, A: Array, parameters: Array, shape: Array) -> Linear:
     """Residuals and derivatives of a stack at X, Y (4, 4), the instants' poses A (I, 4, 4), a camera and a shape."""
     V, n = stack.known.shape

@@ -1,0 +1,85 @@
+"""What would move the extrinsics, and by how much: intrinsics that are kept although they are off, and errors of A.
+
+To first order an error dk of intrinsics that are held moves the other unknowns by -H_ee^-1 H_ek dk, with the
+information H of all unknowns; and errors of A with the covariance S at each instant, where A is taken as exact, have
+the covariance H^-1 (sum C_i' S C_i) H^-1 / s^4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.reprojection.reduced import Reduced
+from gtsam_rwhec.reprojection.refined import CornersRefined
+
+#: What is asked: pixels of the centre, a share of the focal length, radians of A's rotation about each axis.
+CENTRE_PX, FOCAL_SHARE, CARRIER_RAD = 1.0, 1e-3, np.radians(0.1)
+
+
+@dataclass(frozen=True)
+class Consequence:
+    """How far a frame would be off.
+
+    Attributes
+    ----------
+    frame : str
+    cause : str
+        In words, with its size.
+    rotation_deg, translation_mm : float
+        Of an error of A: one standard deviation, along the worst axis.
+    """
+
+    frame: str
+    cause: str
+    rotation_deg: float
+    translation_mm: float
+
+
+def consequences_of(refined: CornersRefined) -> tuple[Consequence, ...]:
+    """What one pixel of c, one part in a thousand of f and 0.1 degrees of A's noise would do to each frame."""
+    slots = refined.slots
+    information = np.linalg.inv(refined.joint)
+    poses = {name: at for (letter, name), at in slots.items() if letter in "xy"}
+    rest = np.concatenate([np.arange(at.start, at.stop) for (letter, _), at in slots.items() if letter != "k"])
+    result = []
+    for (letter, name), at in slots.items():
+        if letter != "k":
+            continue
+        focal = refined.intrinsics[name].camera.K[[0, 1], [0, 1]]
+        steps: dict[str, tuple[int | slice, float | Array]] = {
+            f"{CENTRE_PX:g} pixel of {name}'s cx": (2, CENTRE_PX),
+            f"{CENTRE_PX:g} pixel of {name}'s cy": (3, CENTRE_PX),
+            f"{FOCAL_SHARE:.1%} of {name}'s focal length": (slice(0, 2), FOCAL_SHARE * focal),
+        }
+        for cause, (which, size) in steps.items():
+            dk = np.zeros(at.stop - at.start)
+            dk[which] = size
+            moved = np.zeros(len(information))
+            moved[rest] = -np.linalg.solve(information[np.ix_(rest, rest)], information[rest, at] @ dk)
+            result += [_moved(frame, cause, moved[rows]) for frame, rows in poses.items()]
+    covariance = _of_carrier_noise(refined)
+    cause = f"{np.degrees(CARRIER_RAD):.1f} degrees of A's noise about each axis"
+    for frame, rows in poses.items():
+        block = covariance[rows, rows]
+        worst = [np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (block[:3, :3], block[3:, 3:])]
+        result.append(Consequence(frame, cause, float(np.degrees(worst[0])), float(1e3 * worst[1])))
+    return tuple(result)
+
+
+def _moved(frame: str, cause: str, xi: Array) -> Consequence:
+    return Consequence(frame, cause, float(np.degrees(np.linalg.norm(xi[:3]))), float(1e3 * np.linalg.norm(xi[3:])))
+
+
+def _of_carrier_noise(refined: CornersRefined) -> Array:
+    """The covariance of all unknowns from errors of A about each axis, where A is taken as exact."""
+    model = refined.graph.model
+    reduced = Reduced.of(model, replace(refined.point, A=model.A))
+    s2 = refined.noise.corner_px**2
+    inverse = np.linalg.inv(reduced.G / s2 + np.diag(reduced.prior))
+    C = reduced.C[:, :3] / s2 * CARRIER_RAD
+    flat = C.reshape(-1, C.shape[2])
+    covariance: Array = inverse @ (flat.T @ flat) @ inverse
+    return covariance
