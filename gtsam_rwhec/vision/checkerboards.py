@@ -8,6 +8,7 @@ reads all 34 boards at a tenth of the second's time; the second reads more where
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -26,7 +27,8 @@ from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.saddle_fits import fitted_corners
-from gtsam_rwhec.vision.saddles import regions
+from gtsam_rwhec.vision.saddle_lattices import boards_in, lattices
+from gtsam_rwhec.vision.saddles import regions, saddles, scaled_down
 from gtsam_rwhec.vision.targets import Checkerboard
 
 #: The half window at a corner is this share of the distance between neighbouring lines of corners, at most 9 pixels.
@@ -37,6 +39,8 @@ OF_SQUARE = (0.4, 0.25)
 ROUGHLY_PX, ROUGHLY = 1.0, 0.06
 #: Images are halved this often before saddles are looked for: sharp corners first, blurred ones in what is smaller.
 LEVELS = (1, 2)
+#: Not a level: the corners were put in order by OpenCV.
+BY_OPENCV = -1
 #: At most this number of regions of an image are searched.
 MOST_REGIONS = 3
 #: A region of at most this many pixels is searched at twice its size too: narrow squares of oblique boards need that.
@@ -51,41 +55,64 @@ def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = N
     """Find a board that is whole in the image; None where there is none.
 
     The top is where the first corner's outer square is black; a board of two even or two odd numbers of corners looks
-    the same turned by half a turn, and is read in one of these ways.
+    the same turned by half a turn, and is read in one of these ways. Two such boards in one image are told by no sign:
+    neither counts.
     """
     rejected: FoundBoard | None = None
-    for grid in _candidates(gray, board):
-        found = _tested(gray, grid, camera)
-        if found.rejection is None:
-            return found
-        rejected = rejected or found
-    return rejected
+    found: tuple[FoundBoard, int] | None = None
+    for grid, way in _candidates(gray, board):
+        if found is None:
+            tested = _tested(gray, grid, camera)
+            if tested.rejection is None:
+                found = tested, way
+            rejected = rejected or tested
+        elif way != found[1] or way == BY_OPENCV:
+            break
+        elif _is_apart(grid, found[0].corners_px) and _tested(gray, grid, camera).rejection is None:
+            return replace(found[0], rejection=Rejection.SEEN_TWICE)
+    return rejected if found is None else found[0]
 
 
-def _candidates(gray: Gray, board: Checkerboard) -> Iterator[Array]:
-    """Grids of corners (rows, columns, 2) that OpenCV finds, in the order in which they are asked for."""
+def _is_apart(grid: Array, corners_px: Array) -> bool:
+    """Whether a grid's middle (rows, columns, 2) is outside the hull of other corners (n, 2)."""
+    hull = cv2.convexHull(corners_px.astype(np.float32))
+    middle = grid.reshape(-1, 2).mean(axis=0)
+    return cv2.pointPolygonTest(hull, (float(middle[0]), float(middle[1])), False) < 0.0
+
+
+def _candidates(gray: Gray, board: Checkerboard) -> Iterator[tuple[Array, int]]:
+    """Grids of corners (rows, columns, 2) in the order in which they are asked for, with a level or `BY_OPENCV`."""
+    there = []
+    for level in LEVELS:
+        places = saddles(scaled_down(gray, level))
+        found = regions(gray.shape, places.places, board.columns * board.rows, level)
+        there.append(found[:MOST_REGIONS])
+        for region in found[:MOST_REGIONS]:
+            for lattice in lattices(places, region.members, board.columns * board.rows):
+                for grid in boards_in(lattice, places.places, board.rows, board.columns):
+                    # Pixel centres are at whole numbers: the first of the halved ones is at 1/2.
+                    yield grid * 2**level + 0.5 * (2**level - 1), level
     searched: list[tuple[slice, slice]] = []
     spent = 0
-    for level in LEVELS:
-        for region in regions(gray, board.columns * board.rows, level)[:MOST_REGIONS]:
-            if any(_share_inside(region, before) > SEARCHED for before in searched):
-                continue
-            part = np.ascontiguousarray(gray[region])
-            cost = part.size * (5 if part.size <= LARGEST_ENLARGED else 1)
-            if searched and spent + cost > MOST_SEARCHED:
-                return
-            spent += cost
-            searched.append(region)
-            corner = np.array([region[1].start, region[0].start], dtype=float)
-            enlarged: Gray | None = None
-            if part.size <= LARGEST_ENLARGED:
-                enlarged = np.asarray(cv2.resize(part, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
-            for picture in (part, enlarged):
-                for finder in (_classic, _sector_based):
-                    grid = None if picture is None else finder(picture, board)
-                    if grid is not None:
-                        # Pixel centres are at whole numbers: the first of the enlarged ones is at -1/4.
-                        yield corner + (grid if picture is part else 0.5 * grid - 0.25)
+    for region in (region for of_level in there for region in of_level):
+        if any(_share_inside(region.part, before) > SEARCHED for before in searched):
+            continue
+        part = np.ascontiguousarray(gray[region.part])
+        cost = part.size * (5 if part.size <= LARGEST_ENLARGED else 1)
+        if searched and spent + cost > MOST_SEARCHED:
+            return
+        spent += cost
+        searched.append(region.part)
+        corner = np.array([region.part[1].start, region.part[0].start], dtype=float)
+        enlarged: Gray | None = None
+        if part.size <= LARGEST_ENLARGED:
+            enlarged = np.asarray(cv2.resize(part, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
+        for picture in (part, enlarged):
+            for finder in (_classic, _sector_based):
+                grid = None if picture is None else finder(picture, board)
+                if grid is not None:
+                    # Pixel centres are at whole numbers: the first of the enlarged ones is at -1/4.
+                    yield corner + (grid if picture is part else 0.5 * grid - 0.25), BY_OPENCV
 
 
 def _share_inside(region: tuple[slice, slice], other: tuple[slice, slice]) -> float:

@@ -88,7 +88,8 @@ def _started(gray: Gray, on_image: Callable[[Array], Array], at: Array, sigma: A
     column, row = np.moveaxis(np.clip(pixel, 0, limit), -1, 0)
     away = pixel - centre[:, None]
     flat = away @ inverse.swapaxes(1, 2)
-    curved = 0.5 * np.einsum("npi,npj,nijk->npk", flat, flat, bend)
+    products = np.stack([0.5 * flat[..., 0] ** 2, flat[..., 0] * flat[..., 1], 0.5 * flat[..., 1] ** 2], axis=-1)
+    curved = products @ bend[:, [0, 0, 1], [0, 1, 1]]
     flat = (away - curved) @ inverse.swapaxes(1, 2)  # (n, p, 2): squares from the place
     inside &= (np.abs(flat) <= REACH).all(axis=2)
     # Those nearest to an edge tell most.

@@ -6,6 +6,8 @@ Few images without a checkerboard have a dozen such points close together, so th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -30,43 +32,77 @@ SHARE = 0.6
 BEYOND, BEYOND_PX = 0.45, 12.0
 
 
-def regions(gray: Gray, corners: int, level: int) -> list[tuple[slice, slice]]:
-    """Regions (rows, columns) of an image that may show a board of this number of corners, the likeliest first.
+@dataclass(frozen=True, eq=False)
+class Saddles:
+    """n saddles of an image, the strongest first.
+
+    Attributes
+    ----------
+    places : (n, 2) array
+        Pixels, right to some tenths.
+    edges : (n, 2, 2) array
+        Unit vectors along the two edges that cross.
+    light : (n, 2) array
+        A unit vector towards a light side.
+    """
+
+    places: Array
+    edges: Array
+    light: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Rows and columns of an image that may show a board, and which of the saddles of a level (m,) are there."""
+
+    part: tuple[slice, slice]
+    members: np.ndarray
+
+
+def scaled_down(gray: Gray, level: int) -> Gray:
+    """An image that is halved `level` times, or while there is something to halve."""
+    small = np.asarray(gray)
+    for _ in range(level):
+        if min(small.shape) < 2:
+            break
+        small = np.asarray(cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return small
+
+
+def regions(shape: tuple[int, ...], places: Array, corners: int, level: int) -> list[Region]:
+    """Regions of an image (height, width) that may show a board of this number of corners, the likeliest first.
 
     A group of about as many saddles as the board has corners is likelier than a larger one, which may be any clutter.
-
-    The image is halved `level` times first: this is fast, and finds blurred corners too.
+    The saddles' places (n, 2) are those in the image that is halved `level` times: this is fast, and finds blurred
+    corners too.
     """
-    small = np.asarray(gray)
-    if min(small.shape) < 4 * RING_PX * 2**level:
-        return []
-    for _ in range(level):
-        small = np.asarray(cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    places = saddles(small)
     boxes = []
     for members in _groups(places):
         if len(members) >= SHARE * corners:
             low, high = places[members].min(axis=0), places[members].max(axis=0)
             more = BEYOND * float((high - low).max()) + BEYOND_PX
-            boxes.append((abs(float(np.log(len(members) / corners))), low - more, high + more))
+            boxes.append((abs(float(np.log(len(members) / corners))), low - more, high + more, members))
     boxes.sort(key=lambda box: box[0])
     found = []
-    for _, low, high in boxes:
-        (left, top), (right, bottom) = (np.rint(side * 2**level).astype(int) for side in (low, high))
-        height, width = gray.shape
-        found.append((slice(max(top, 0), min(bottom, height)), slice(max(left, 0), min(right, width))))
+    for _, low, high, members in boxes:
+        (left, top), (right, bottom) = (np.rint(side * 2**level).astype(int).tolist() for side in (low, high))
+        height, width = shape[:2]
+        part = slice(max(top, 0), min(bottom, height)), slice(max(left, 0), min(right, width))
+        found.append(Region(part, members))
     return found
 
 
-def saddles(gray: Gray) -> Array:
-    """Places (n, 2), to a pixel, of an image's saddles with rings that alternate; the strongest first."""
+def saddles(gray: Gray) -> Saddles:
+    """An image's saddles with rings that alternate."""
+    edge = int(np.ceil(RING_PX)) + 1
+    if min(gray.shape) <= 2 * edge:
+        return Saddles(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2)))
     smooth = cv2.GaussianBlur(gray, (0, 0), SIGMA_PX).astype(np.float32)
     xx = cv2.filter2D(smooth, -1, np.array([[1.0, -2.0, 1.0]], np.float32))
     yy = cv2.filter2D(smooth, -1, np.array([[1.0], [-2.0], [1.0]], np.float32))
     xy = cv2.filter2D(smooth, -1, 0.25 * np.array([[1.0, 0.0, -1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 1.0]], np.float32))
     strength = xy * xy - xx * yy
     peak = (strength >= LEAST_CURVATURE**2) & (strength >= cv2.dilate(strength, np.ones((5, 5), np.uint8)))
-    edge = int(np.ceil(RING_PX)) + 1
     rows, columns = np.nonzero(peak[edge:-edge, edge:-edge])
     rows, columns = rows + edge, columns + edge
     order = np.argsort(-strength[rows, columns], kind="stable")[: 4 * MOST]
@@ -78,9 +114,25 @@ def saddles(gray: Gray) -> Array:
     changes = (np.sign(ring) != np.sign(np.roll(ring, 1, axis=1))).sum(axis=1)
     opposite = np.abs(ring - np.roll(ring, RING // 2, axis=1)).mean(axis=1)
     quarter = np.abs(ring - np.roll(ring, RING // 4, axis=1)).mean(axis=1)
-    good = (changes == 4) & (opposite < UNLIKE * quarter)
-    places: Array = np.stack([columns[good], rows[good]], axis=1)[:MOST].astype(float)
-    return places
+    good = np.flatnonzero((changes == 4) & (opposite < UNLIKE * quarter))[:MOST]
+    rows, columns = rows[good], columns[good]
+    hessian = np.array([[xx[rows, columns], xy[rows, columns]], [xy[rows, columns], yy[rows, columns]]], dtype=float)
+    hessian = np.moveaxis(hessian, -1, 0)
+    right, down = (
+        smooth[rows, columns + 1] - smooth[rows, columns - 1],
+        smooth[rows + 1, columns] - smooth[rows - 1, columns],
+    )
+    flat_at = -np.linalg.solve(hessian, 0.5 * np.stack([right, down], axis=-1).astype(float)[..., None])[..., 0]
+    curvature, axes = np.linalg.eigh(hessian)  # the larger one last: gray values rise along it
+    open_by = np.arctan2(np.sqrt(np.maximum(curvature[:, 1], 0.0)), np.sqrt(np.maximum(-curvature[:, 0], 1e-12)))
+    light = axes[:, :, 1]
+    middle = np.arctan2(light[:, 1], light[:, 0])
+    turned_by = middle[:, None] + np.stack([open_by, -open_by], axis=-1)
+    return Saddles(
+        np.stack([columns, rows], axis=1) + np.clip(flat_at, -1.0, 1.0),
+        np.stack([np.cos(turned_by), np.sin(turned_by)], axis=-1),
+        light,
+    )
 
 
 def _groups(places: Array) -> list[np.ndarray]:

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from rendered import PINHOLE, pose, printed, projected, render
 
-from gtsam_rwhec.vision.saddles import regions, saddles
+from gtsam_rwhec.vision.saddles import Region, regions, saddles, scaled_down
 from gtsam_rwhec.vision.targets import Checkerboard, Tag
 
 CHESS = Checkerboard("chess", 5, 4, 0.03)
+
+
+def regions_of(image: np.ndarray, corners: int = 20, level: int = 1) -> list[Region]:
+    return regions(image.shape, saddles(scaled_down(image, level)).places, corners, level)
 
 
 @pytest.mark.parametrize("turn", [0.0, 45.0, 100.0])
@@ -17,9 +21,17 @@ def test_a_boards_corners_are_saddles(turn: float) -> None:
     T = pose((20.0, -15.0, turn), (0.0, 0.0, 0.3))
     image = render(PINHOLE, [(printed(CHESS), T)])
     there = projected(PINHOLE, CHESS.corners(), T)
-    off = np.linalg.norm(saddles(image)[:, None] - there, axis=2)
-    assert (off.min(axis=0) < 2.0).all()
-    ((rows, columns), *_) = regions(image, 20, 1)
+    found = saddles(image)
+    off = np.linalg.norm(found.places[:, None] - there, axis=2)
+    assert (off.min(axis=0) < 0.5).all()
+    right, down = (projected(PINHOLE, CHESS.corners() + step, T) - there for step in 1e-4 * np.eye(3)[:2])
+    for k, nearest in enumerate(off.argmin(axis=0)):
+        axes = np.stack([right[k], down[k]]) / np.linalg.norm([right[k], down[k]], axis=1)[:, None]
+        along = np.abs(found.edges[nearest] @ axes.T)
+        assert along.max(axis=1).min() > 0.95
+        x, y = found.places[nearest] + 5.0 * found.light[nearest]
+        assert image[round(y), round(x)] > 128
+    rows, columns = regions_of(image)[0].part
     assert (there >= [columns.start, rows.start]).all()
     assert (there < [columns.stop, rows.stop]).all()
 
@@ -28,9 +40,9 @@ def test_tags_noise_and_plain_walls_are_no_regions() -> None:
     plain = render(PINHOLE, [], noise=4.0)
     tag = render(PINHOLE, [(printed(Tag("tag", "tag36h11", 7, 0.1)), pose((10.0, 10.0, 0.0), (0.0, 0.0, 0.4)))])
     for image in (plain, tag):
-        assert regions(image, 20, 1) == []
+        assert regions_of(image) == []
 
 
 def test_two_boards_are_two_regions() -> None:
     scene = [(printed(Checkerboard("c", 5, 4, 0.012)), pose((0.0, 0.0, 0.0), (x, 0.0, 0.3))) for x in (-0.08, 0.08)]
-    assert len(regions(render(PINHOLE, scene, blur_px=0.5), 20, 1)) == 2
+    assert len(regions_of(render(PINHOLE, scene, blur_px=0.5))) == 2
