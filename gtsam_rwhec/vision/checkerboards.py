@@ -28,7 +28,7 @@ from gtsam_rwhec.vision.images import Gray
 from gtsam_rwhec.vision.rejection import Rejection
 from gtsam_rwhec.vision.saddle_fits import fitted_corners
 from gtsam_rwhec.vision.saddle_lattices import boards_in, lattices
-from gtsam_rwhec.vision.saddles import regions, saddles, scaled_down
+from gtsam_rwhec.vision.saddles import Region, regions_among, saddles, scaled_down
 from gtsam_rwhec.vision.targets import Checkerboard
 
 #: The half window at a corner is this share of the distance between neighbouring lines of corners, at most 9 pixels.
@@ -39,8 +39,6 @@ OF_SQUARE = (0.4, 0.25)
 ROUGHLY_PX, ROUGHLY = 1.0, 0.06
 #: Images are halved this often before saddles are looked for: sharp corners first, blurred ones in what is smaller.
 LEVELS = (1, 2)
-#: Not a level: the corners were put in order by OpenCV.
-BY_OPENCV = -1
 #: At most this number of regions of an image are searched.
 MOST_REGIONS = 3
 #: A region of at most this many pixels is searched at twice its size too: narrow squares of oblique boards need that.
@@ -59,18 +57,25 @@ def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = N
     neither counts.
     """
     rejected: FoundBoard | None = None
-    found: tuple[FoundBoard, int] | None = None
-    for grid, way in _candidates(gray, board):
-        if found is None:
-            tested = _tested(gray, grid, camera)
-            if tested.rejection is None:
-                found = tested, way
-            rejected = rejected or tested
-        elif way != found[1] or way == BY_OPENCV:
-            break
-        elif _is_apart(grid, found[0].corners_px) and _tested(gray, grid, camera).rejection is None:
-            return replace(found[0], rejection=Rejection.SEEN_TWICE)
-    return rejected if found is None else found[0]
+    there: list[Region] = []
+    for level in LEVELS:
+        found: FoundBoard | None = None
+        for grid in _in_order(gray, board, level, there):
+            if found is None:
+                tested = _tested(gray, grid, camera)
+                if tested.rejection is None:
+                    found = tested
+                rejected = rejected or tested
+            elif _is_apart(grid, found.corners_px) and _tested(gray, grid, camera).rejection is None:
+                return replace(found, rejection=Rejection.SEEN_TWICE)
+        if found is not None:
+            return found
+    for grid in _by_opencv(gray, board, there):
+        tested = _tested(gray, grid, camera)
+        if tested.rejection is None:
+            return tested
+        rejected = rejected or tested
+    return rejected
 
 
 def _is_apart(grid: Array, corners_px: Array) -> bool:
@@ -80,21 +85,24 @@ def _is_apart(grid: Array, corners_px: Array) -> bool:
     return cv2.pointPolygonTest(hull, (float(middle[0]), float(middle[1])), False) < 0.0
 
 
-def _candidates(gray: Gray, board: Checkerboard) -> Iterator[tuple[Array, int]]:
-    """Grids of corners (rows, columns, 2) in the order in which they are asked for, with a level or `BY_OPENCV`."""
-    there = []
-    for level in LEVELS:
-        places = saddles(scaled_down(gray, level))
-        found = regions(gray.shape, places.places, board.columns * board.rows, level)
-        there.append(found[:MOST_REGIONS])
-        for region in found[:MOST_REGIONS]:
-            for lattice in lattices(places, region.members, board.columns * board.rows):
-                for grid in boards_in(lattice, places.places, board.rows, board.columns):
-                    # Pixel centres are at whole numbers: the first of the halved ones is at 1/2.
-                    yield grid * 2**level + 0.5 * (2**level - 1), level
+def _in_order(gray: Gray, board: Checkerboard, level: int, there: list[Region]) -> Iterator[Array]:
+    """Grids of corners (rows, columns, 2) that lattices of saddles give; the regions searched are added to `there`."""
+    found = saddles(scaled_down(gray, level))
+    corners = board.columns * board.rows
+    regions = regions_among(gray.shape, found.places, corners, level)[:MOST_REGIONS]
+    there += regions
+    for region in regions:
+        for lattice in lattices(found, region.members, corners):
+            for grid in boards_in(lattice, found.places, board.rows, board.columns):
+                # Pixel centres are at whole numbers: the first of the halved ones is at 1/2.
+                yield grid * 2**level + 0.5 * (2**level - 1)
+
+
+def _by_opencv(gray: Gray, board: Checkerboard, there: list[Region]) -> Iterator[Array]:
+    """Grids of corners (rows, columns, 2) that OpenCV finds in some regions."""
     searched: list[tuple[slice, slice]] = []
     spent = 0
-    for region in (region for of_level in there for region in of_level):
+    for region in there:
         if any(_share_inside(region.part, before) > SEARCHED for before in searched):
             continue
         part = np.ascontiguousarray(gray[region.part])
@@ -109,10 +117,10 @@ def _candidates(gray: Gray, board: Checkerboard) -> Iterator[tuple[Array, int]]:
             enlarged = np.asarray(cv2.resize(part, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
         for picture in (part, enlarged):
             for finder in (_classic, _sector_based):
-                grid = None if picture is None else finder(picture, board)
-                if grid is not None:
+                seen = None if picture is None else finder(picture, board)
+                if seen is not None:
                     # Pixel centres are at whole numbers: the first of the enlarged ones is at -1/4.
-                    yield corner + (grid if picture is part else 0.5 * grid - 0.25), BY_OPENCV
+                    yield corner + (seen if picture is part else 0.5 * seen - 0.25)
 
 
 def _share_inside(region: tuple[slice, slice], other: tuple[slice, slice]) -> float:

@@ -69,7 +69,13 @@ def scaled_down(gray: Gray, level: int) -> Gray:
     return small
 
 
-def regions(shape: tuple[int, ...], places: Array, corners: int, level: int) -> list[Region]:
+def regions(gray: Gray, corners: int, level: int) -> list[tuple[slice, slice]]:
+    """Rows and columns of an image's regions that may show a board of this number of corners (`regions_among`)."""
+    places = saddles(scaled_down(gray, level)).places
+    return [region.part for region in regions_among(gray.shape, places, corners, level)]
+
+
+def regions_among(shape: tuple[int, ...], places: Array, corners: int, level: int) -> list[Region]:
     """Regions of an image (height, width) that may show a board of this number of corners, the likeliest first.
 
     A group of about as many saddles as the board has corners is likelier than a larger one, which may be any clutter.

@@ -6,14 +6,10 @@ import numpy as np
 import pytest
 from rendered import PINHOLE, pose, printed, projected, render
 
-from gtsam_rwhec.vision.saddles import Region, regions, saddles, scaled_down
+from gtsam_rwhec.vision.saddles import regions, saddles
 from gtsam_rwhec.vision.targets import Checkerboard, Tag
 
 CHESS = Checkerboard("chess", 5, 4, 0.03)
-
-
-def regions_of(image: np.ndarray, corners: int = 20, level: int = 1) -> list[Region]:
-    return regions(image.shape, saddles(scaled_down(image, level)).places, corners, level)
 
 
 @pytest.mark.parametrize("turn", [0.0, 45.0, 100.0])
@@ -31,7 +27,7 @@ def test_a_boards_corners_are_saddles(turn: float) -> None:
         assert along.max(axis=1).min() > 0.95
         x, y = found.places[nearest] + 5.0 * found.light[nearest]
         assert image[round(y), round(x)] > 128
-    rows, columns = regions_of(image)[0].part
+    rows, columns = regions(image, 20, 1)[0]
     assert (there >= [columns.start, rows.start]).all()
     assert (there < [columns.stop, rows.stop]).all()
 
@@ -40,9 +36,9 @@ def test_tags_noise_and_plain_walls_are_no_regions() -> None:
     plain = render(PINHOLE, [], noise=4.0)
     tag = render(PINHOLE, [(printed(Tag("tag", "tag36h11", 7, 0.1)), pose((10.0, 10.0, 0.0), (0.0, 0.0, 0.4)))])
     for image in (plain, tag):
-        assert regions_of(image) == []
+        assert regions(image, 20, 1) == []
 
 
 def test_two_boards_are_two_regions() -> None:
     scene = [(printed(Checkerboard("c", 5, 4, 0.012)), pose((0.0, 0.0, 0.0), (x, 0.0, 0.3))) for x in (-0.08, 0.08)]
-    assert len(regions_of(render(PINHOLE, scene, blur_px=0.5))) == 2
+    assert len(regions(render(PINHOLE, scene, blur_px=0.5), 20, 1)) == 2
