@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,6 +13,8 @@ from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.terminal_text import say, shown_path
+
+Template = Literal["eye-in-hand", "eye-to-hand", "rig", "several-cameras", "odometry"]
 
 
 def init(
@@ -24,6 +26,10 @@ def init(
         ),
     ] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Rig file to write.")] = Path("rig.yaml"),
+    template: Annotated[
+        Template | None,
+        typer.Option(help="Write a whole rig file of a usual cell, with comments, in place of one made from a log."),
+    ] = None,
     schema: Annotated[
         bool, typer.Option("--schema", help="Print the JSON Schema of rig files, for editors, and write nothing.")
     ] = False,
@@ -32,23 +38,19 @@ def init(
     ] = False,
 ) -> ExitStatus:
     """Look at a log or a folder of images, and write a first rig file. TODO marks the lines that you must complete."""
-    if schema + reference + (log is not None) != 1:
-        raise typer.BadParameter("give one of: a log, --schema, --reference")
-    if log is None:
+    if schema + reference + (template is not None) + (log is not None) != 1:
+        raise typer.BadParameter("give one of: a log or a folder of images, --template, --schema, --reference")
+    if schema or reference:
         typer.echo(rw.rig.schema_text() if schema else rw.rig.reference_text(), nl=False)
         return ExitStatus.DONE
     if output.exists():
         raise FileFormatError(f"{output} exists already, perhaps with your changes. Give another name with -o.")
     with StageDisplay() as stage:
-        stage(f"looking at {log}")
-        if rw.first_rig.is_folder_without_logs(log):
-            text, notes = rw.first_rig.propose_folder_rig(log, output, progress=stage)
-        else:
-            with rw.logs.open_log(log) as opened:
-                text, notes = rw.first_rig.propose_rig(opened, output)
+        text, notes = _first(log, template, output, stage)
     text = rw.rig.editor_line() + text
     write_atomically(output, text.encode())
-    call = f" gtsam-rwhec calibrate {shown_path(log)} --rig {shown_path(output)} -o out"
+    source = "LOG_OR_FOLDER" if log is None else shown_path(log)
+    call = f" gtsam-rwhec calibrate {source} --rig {shown_path(output)} -o out"
     for note in notes:
         say(note)
     say(f"\nWritten to {shown_path(output)}.")
@@ -61,3 +63,17 @@ def init(
     else:
         say("Next:" + call)
     return ExitStatus.DONE
+
+
+def _first(
+    log: Path | None, template: Template | None, output: Path, stage: StageDisplay
+) -> tuple[str, tuple[str, ...]]:
+    """The text of a first rig file, and what was seen."""
+    if template is not None:
+        return rw.first_rig.template_text(template), ()
+    assert log is not None
+    stage(f"looking at {log}")
+    if rw.first_rig.is_folder_without_logs(log):
+        return rw.first_rig.propose_folder_rig(log, output, progress=stage)
+    with rw.logs.open_log(log) as opened:
+        return rw.first_rig.propose_rig(opened, output)
