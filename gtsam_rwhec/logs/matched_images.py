@@ -41,11 +41,21 @@ class Matched:
 def images_in(folder: Path) -> list[Path]:
     """The images of a folder in natural order; a LogError if it does not exist or has none."""
     if not folder.is_dir():
-        raise LogError(f"{folder}: there is no such folder of images")
+        raise LogError(f"{folder}: there is no such folder of images{_folders_near(folder)}")
     files = sorted((f for f in folder.glob("*") if f.suffix.lower() in FORMATS), key=lambda f: natural_key(f.name))
     if not files:
         raise LogError(f"{folder} has no images ({', '.join(FORMATS)})")
     return files
+
+
+def _folders_near(folder: Path) -> str:
+    """The folders with images beside one that is not there, in words."""
+    above = next((each for each in (folder.parent, folder.parent.parent) if each.is_dir()), None)
+    if above is None:
+        return ""
+    beside = sorted((each for each in above.iterdir() if each.is_dir()), key=lambda each: natural_key(each.name))
+    names = [each.name for each in beside[:100] if any(file.suffix.lower() in FORMATS for file in each.glob("*"))]
+    return f"; {above} has images in {_some(names)}" if names else ""
 
 
 def image_stamps(files: Sequence[Path]) -> list[int] | None:

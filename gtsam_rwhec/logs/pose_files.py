@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import LogError, LogWarning
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.logs.pose_rows import NamedPoses, PoseRow, PoseStatement, poses_of
@@ -37,6 +39,7 @@ def read_poses(path: str | Path, stated: PoseStatement | None = None) -> NamedPo
     files = sorted((f for f in path.iterdir() if f.suffix.lower() in TREES + TABLES), key=lambda f: natural_key(f.name))
     if not files:
         raise LogError(f"{path} has no files of poses ({', '.join(TREES + TABLES)})")
+    files = _of_one_kind(path, files)
     if len(files) == 1:
         return poses_of(_file(files[0], stated), stated)
     rows = []
@@ -49,6 +52,17 @@ def read_poses(path: str | Path, stated: PoseStatement | None = None) -> NamedPo
             )
         rows.append(replace(of_file[0], name=file.name))
     return poses_of(rows, stated)
+
+
+def _of_one_kind(folder: Path, files: list[Path]) -> list[Path]:
+    """The files with the ending that most have; the others are said, as a LICENSE.txt beside the poses."""
+    ending, _ = Counter(file.suffix.lower() for file in files).most_common(1)[0]
+    others = [file.name for file in files if file.suffix.lower() != ending]
+    if others:
+        names = ", ".join(others[:5]) + (", ..." if len(others) > 5 else "")
+        words = f"{folder}: poses are read from the {len(files) - len(others)} files {ending}, and not from {names}"
+        warnings.warn(words, LogWarning, stacklevel=4)
+    return [file for file in files if file.suffix.lower() == ending]
 
 
 def _file(path: Path, stated: PoseStatement) -> list[PoseRow]:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.logs.checked_poses import transforms
+from gtsam_rwhec.logs.checked_poses import LARGEST_M, transforms
 from gtsam_rwhec.logs.records import Array
 
 #: What a pose's numbers are: 16 of a matrix, row by row; a position and a quaternion (x, y, z, w or in an order that
@@ -117,6 +117,7 @@ def _of_matrices(rows: list[PoseRow], _: PoseStatement) -> Array:
         off = np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(axis=(1, 2))
         good = (off <= ROTATION_TOLERANCE) & (np.linalg.det(np.nan_to_num(R)) > 0.0) & np.isfinite(T).all(axis=(1, 2))
         good &= (np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]) < ROTATION_TOLERANCE).all(axis=1)
+        good &= (np.abs(T[:, :3, 3]) <= LARGEST_M).all(axis=1)
     if not good.all():
         i = int(np.argmin(good))
         shape = " It has the position in the last row: transpose it." if (T[i, :3, 3] == 0.0).all() else ""

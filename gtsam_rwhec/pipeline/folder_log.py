@@ -11,7 +11,8 @@ same rig file serves for the folder and for the log. There are two kinds of fold
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.progress import Counted, Progress, silent
 from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE
 from gtsam_rwhec.logs.matched_images import SAME_POSE, image_stamps, images_in, match, pose_stamps
 from gtsam_rwhec.logs.mcap_writer import LogWriter
@@ -131,6 +133,15 @@ def _content(file: Path) -> bytes:
         raise LogError(str(error)) from error
 
 
+@contextmanager
+def _said_with(rig: Rig, path: KeyPath) -> Iterator[None]:
+    """Add the rig file's line to an error of files that it names."""
+    try:
+        yield
+    except LogError as error:
+        raise type(error)(f"{error} ({rig.source.place(path)})") from error
+
+
 def _stamped(folder: Path, rig: Rig) -> list[_Stamped]:
     source = rig.carriers.poses
     stated = PoseStatement(source.quaternion, source.euler, source.angles, source.length)
@@ -144,10 +155,12 @@ def _stamped(folder: Path, rig: Rig) -> list[_Stamped]:
                 f"{rig.source.place(('sensors', name))}: no poses. Name the file or the folder of the poses at which "
                 "the images were taken: poses: PATH"
             )
-        files = images_in(checked_path(folder / sensor.images))
+        with _said_with(rig, ("sensors", name, "images")):
+            files = images_in(checked_path(folder / sensor.images))
         where = checked_path(folder / sensor.poses)
         if where not in read:
-            read[where] = read_poses(where, stated)
+            with _said_with(rig, ("sensors", name, "poses")):
+                read[where] = read_poses(where, stated)
         found.append((name, files, read[where]))
     of_images = [image_stamps(files) for _, files, _ in found]
     of_poses = [pose_stamps(poses) for _, _, poses in found]

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from intrinsics_samples import CAMCHAIN, ROS
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
+import gtsam_rwhec as rw
 from gtsam_rwhec.cli.app import app
+from gtsam_rwhec.errors import LogWarning
 from gtsam_rwhec.logs import ImageRecord, PoseRecord, open_log
 from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
 from gtsam_rwhec.rig import read_rig
@@ -163,15 +165,18 @@ LAYOUTS: dict[str, tuple[Callable[[Path], str], int, float]] = {
 }
 
 
+def convert(folder: Path, layout: str, log: Path) -> Result:
+    """The one command, on a folder with such a layout."""
+    folder.mkdir()
+    (folder / "rig.yaml").write_text(LAYOUTS[layout][0](folder))
+    return CliRunner().invoke(app, ["convert", str(folder), "--rig", str(folder / "rig.yaml"), "-o", str(log)])
+
+
 @pytest.mark.parametrize("layout", sorted(LAYOUTS))
 def test_each_layout_is_read_by_one_command(tmp_path: Path, layout: str) -> None:
-    write, cameras, fx = LAYOUTS[layout]
+    _, cameras, fx = LAYOUTS[layout]
     folder = tmp_path / "cell"
-    folder.mkdir()
-    (folder / "rig.yaml").write_text(write(folder))
-    done = CliRunner().invoke(
-        app, ["convert", str(folder), "--rig", str(folder / "rig.yaml"), "-o", str(tmp_path / "log.mcap")]
-    )
+    done = convert(folder, layout, tmp_path / "log.mcap")
     assert done.exit_code == 0, done.output
     rig = read_rig(folder / "rig.yaml")
     with open_log(tmp_path / "log.mcap") as log:
@@ -183,3 +188,74 @@ def test_each_layout_is_read_by_one_command(tmp_path: Path, layout: str) -> None
         np.testing.assert_allclose([poses[stamp] for stamp in stamps], T, atol=1e-9)
     assert len(found) == cameras
     assert next(iter(found.values())).K[0, 0] == fx
+
+
+#: Layouts whose files or rig files do not say the unit of lengths, and where their poses are.
+WITHOUT_UNIT = {
+    "workcell": ("camera1/pose/", "camera1"), "industrial_calibration": ("poses/", "camera"),
+    "kalibr": ("poses.tum, line", "cam0"), "opencv_one_file": ("poses.xml, line", "camera"),
+    "colmap_and_json": ("transforms.json, line", "camera"),
+}  # fmt: skip
+
+
+def said(done: Result) -> str:
+    return " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("layout", sorted(WITHOUT_UNIT))
+def test_millimetres_are_found_when_poses_are_read(
+    tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_mm = T.copy()
+    in_mm[:, :3, 3] *= 1e3
+    monkeypatch.setitem(globals(), "T", in_mm)
+    done = convert(tmp_path / "cell", layout, tmp_path / "log.mcap")
+    assert done.exit_code != 0
+    assert "Are they millimetres? Write length: mm" in said(done)
+    file, sensor = WITHOUT_UNIT[layout]
+    assert file in said(done)
+    assert f"line 3: sensors.{sensor}.poses" in said(done)
+    assert not (tmp_path / "log.mcap").exists()
+
+
+@pytest.mark.parametrize("layout", ["industrial_calibration", "kalibr"])
+def test_quaternions_of_another_norm_are_found(tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "Q", 1.1 * Q)
+    done = convert(tmp_path / "cell", layout, tmp_path / "log.mcap")
+    assert done.exit_code != 0
+    assert "has norm 1.1 in place of 1" in said(done)
+
+
+@pytest.mark.parametrize(
+    ("layout", "missing", "words"),
+    [
+        ("workcell", "camera2/image", "camera2/image: there is no such folder of images (", ),
+        ("kalibr", "cam1", "there is no such folder of images; {folder} has images in cam0 ("),
+        ("kalibr", "poses.tum", "poses.tum cannot be read: No such file or directory. ("),
+        ("industrial_calibration", "poses", "line 2: data[0]: there is no file {folder}/poses/2.yaml ("),
+    ],
+)  # fmt: skip
+def test_what_is_missing_is_named_with_its_line(tmp_path: Path, layout: str, missing: str, words: str) -> None:
+    folder = tmp_path / "cell"
+    write = LAYOUTS[layout][0]
+    folder.mkdir()
+    (folder / "rig.yaml").write_text(write(folder))
+    (folder / missing).rename(tmp_path / "elsewhere")
+    done = CliRunner().invoke(
+        app, ["convert", str(folder), "--rig", str(folder / "rig.yaml"), "-o", str(tmp_path / "log.mcap")]
+    )
+    assert done.exit_code != 0
+    assert words.format(folder=folder) in said(done)
+    assert "rig.yaml, line" in said(done)
+    assert not (tmp_path / "log.mcap").exists()
+
+
+def test_other_files_beside_poses_are_passed_over_and_said(tmp_path: Path) -> None:
+    folder = tmp_path / "cell"
+    folder.mkdir()
+    (folder / "rig.yaml").write_text(workcell(folder))
+    (folder / "camera1" / "pose" / "README.txt").write_text("poses of the hand")
+    with pytest.warns(
+        LogWarning, match=r"camera1/pose: poses are read from the 4 files \.csv, and not from README\.txt"
+    ):
+        rw.pipeline.write_folder_log(folder, read_rig(folder / "rig.yaml"), tmp_path / "log.mcap")
