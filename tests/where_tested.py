@@ -113,6 +113,7 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_all_stages.py": "image_options",
         "pipeline/test_seen_sheet.py": "detected_source image_names",
         "pipeline/test_bad_logs.py": "no_detections",
+        "pipeline/test_kept_detections.py": "detection_inputs",
         "pipeline/test_log_findings.py": "output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",
         "pipeline/test_same_log.py": "changed_rig log_metadata",

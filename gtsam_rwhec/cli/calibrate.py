@@ -17,6 +17,7 @@ from gtsam_rwhec.cli.options import (
     CHOICES_PANEL,
     CSV_PANEL,
     FOLDER_OF_CSV,
+    LOG_PANEL,
     AnywayOption,
     ImagesOption,
     KappaOption,
@@ -38,7 +39,7 @@ Noise = Literal["auto", "given", "estimate"]
 Robust = Literal["auto", "gnc", "none"]
 
 #: Parameters that count for a log; its rig file states the rest.
-OF_LOG = frozenset({"source", "rig", "images", "workers", "anyway", "output"})
+OF_LOG = frozenset({"source", "rig", "images", "workers", "anyway", "force", "output"})
 #: Parameters that count for a folder of CSV files.
 OF_FOLDER = frozenset({"source", "scale", "sigma", "kappa", "targets", "sensors", "certified_only", "output"})
 #: Parameters that overrule a choice of ``rw.calibrate``.
@@ -50,7 +51,10 @@ NOT_FOR_A_LOG = {
     "not for a log. Its rig file states sizes, noise and names, and its calibration is always refined. Change the rig "
     "file, or leave the option out.": (OF_FOLDER | OF_CHOICES | OF_SOLVE) - OF_LOG,
 }
-NOT_FOR_A_FOLDER = {"only for a log. A folder of CSV files has no images: leave the option out.": OF_LOG - OF_FOLDER}
+NOT_FOR_A_FOLDER = {
+    "only for a log. A folder of CSV files has no images, and its result is one file, which is replaced: leave the "
+    "option out.": OF_LOG - OF_FOLDER,
+}
 NOT_FOR_SAMPLES = {
     "not for samples of a hand-eye tool, which are of one camera and one target. Leave the option out.": frozenset(
         {"scale", "sigma", "kappa", "targets", "sensors"}
@@ -138,6 +142,16 @@ def calibrate(
     images: ImagesOption = False,
     workers: WorkersOption = None,
     anyway: AnywayOption = False,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force",
+            rich_help_panel=LOG_PANEL,
+            help="Replace a finished calibration in the output folder, or an unfinished run of other inputs. Only "
+            "files that a calibration wrote are replaced. An unfinished run of the same inputs is gone on with, "
+            "without this option too.",
+        ),
+    ] = False,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="For CSV files: result file (JSON). For a log: folder for all files."),
@@ -155,7 +169,7 @@ def calibrate(
             if rig is None:
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
-        return calibrate_log(source, rig, output, images=images, workers=workers, anyway=anyway)
+        return calibrate_log(source, rig, output, images=images, workers=workers, anyway=anyway, force=force)
     refuse(context, NOT_CERTIFIED_ONLY if certified_only else NOT_WITH_ALL)
     is_samples = rw.logs.is_samples_file(source)
     if is_samples:
@@ -211,7 +225,14 @@ def is_log(source: Path) -> bool:
 
 
 def calibrate_log(
-    source: Path, rig: Path | None, output: Path, *, images: bool, workers: int | None, anyway: bool = False
+    source: Path,
+    rig: Path | None,
+    output: Path,
+    *,
+    images: bool,
+    workers: int | None,
+    anyway: bool = False,
+    force: bool = False,
 ) -> ExitStatus:
     """Run all stages and print the report."""
     with StageDisplay() as stage, said_in_the_report():
@@ -226,6 +247,7 @@ def calibrate_log(
             images="copy" if images else "leave_out",
             workers=workers,
             anyway=anyway,
+            replace=force,
             progress=stage,
         )
     status = show(calibrated)

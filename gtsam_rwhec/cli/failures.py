@@ -65,7 +65,7 @@ def failures_in_words() -> Iterator[None]:
             status = ExitStatus.DOWNLOAD_FAILED if isinstance(error, FetchError) else ExitStatus.BAD_INPUT
             raise typer.Exit(status) from error
         except KeyboardInterrupt as error:
-            console.print("Interrupted.")
+            console.print(" ".join(["Interrupted.", *map(_indented, getattr(error, "__notes__", ()))]), markup=False)
             raise typer.Exit(ExitStatus.INTERRUPTED) from error
 
 

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.table import Table
 from rich.text import Text
 
-from gtsam_rwhec.files.progress import Counted, Pace, duration, share
+from gtsam_rwhec.files.progress import Counted, Pace, Remark, duration, share
 from gtsam_rwhec.files.terminal import SafeConsole
 from gtsam_rwhec.files.terminal_text import shown
 
@@ -69,7 +69,10 @@ class StageDisplay:
             self._progress.stop()
 
     def __call__(self, stage: str) -> None:
-        """Show the stage that begins now, or how far a stage with a count has come."""
+        """Show the stage that begins now, or how far a stage with a count has come; a remark gets a line that stays."""
+        if isinstance(stage, Remark):
+            self._console.print(shown(stage, LONGEST_STAGE), markup=False, soft_wrap=True)
+            return
         if isinstance(stage, Counted):
             if self._pace[0] != stage.what:
                 self._pace = stage.what, Pace(time.monotonic(), stage.done)

@@ -41,6 +41,12 @@ class Counted(str):
         return type(self), (self.what, self.done, self.total)
 
 
+class Remark(str):
+    """A stage that is said once and stays to be read: "going on with an unfinished run: ..."."""
+
+    __slots__ = ()
+
+
 @dataclass
 class Pace:
     """How fast a counted stage goes, from when it was first told.

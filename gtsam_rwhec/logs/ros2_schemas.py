@@ -85,7 +85,7 @@ def _compressed_image(batch: Batch, topic: str, logged_ns: list[int]) -> list[Re
     tree = batch.shape.tree
     frame, encoding = frame_of(batch, tree), batch.text(tree, "format")
     return [
-        (ImageRecord(logged, stamp, topic, frame, encoding, data),) if data else "image without data"
+        (ImageRecord(logged, stamp, topic, frame, encoding, data),)
         for logged, stamp, data in zip(logged_ns, stamps_of(batch, tree), _bytes(batch), strict=True)
     ]
 

@@ -19,7 +19,7 @@ from .samples_log import samples_problem as samples_problem
 from .samples_log import write_samples_log as write_samples_log
 
 # What comes out, and what a log that a stage wrote holds.
-from .earlier_output import replacing_output as replacing_output
+from .earlier_output import earlier_run as earlier_run
 from .image_options import check_drawable as check_drawable
 from .log_contract import CLEAN_LOG as CLEAN_LOG
 from .log_contract import RESULT_FILE as RESULT_FILE

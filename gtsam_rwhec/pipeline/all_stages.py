@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from gtsam_rwhec.calibration.verdict import Verdict
@@ -14,10 +15,14 @@ from gtsam_rwhec.logs import Log, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.changed_rig import changes
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
+from gtsam_rwhec.pipeline.detection_inputs import inputs_of
 from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.earlier_output import OutputFolder, list_written, log_name, output_folder
 from gtsam_rwhec.pipeline.folder_log import check_is_no_other_folder, is_folder_of_images, write_folder_log
+from gtsam_rwhec.pipeline.image_detections import image_count
 from gtsam_rwhec.pipeline.image_options import check_image_options
 from gtsam_rwhec.pipeline.intrinsics import check_intrinsics_files
+from gtsam_rwhec.pipeline.kept_detections import KeptDetections
 from gtsam_rwhec.pipeline.log_contract import (
     CLEAN_LOG,
     CLEANING_METADATA,
@@ -28,8 +33,8 @@ from gtsam_rwhec.pipeline.log_contract import (
     SEEN_SHEET,
     is_from_stage,
 )
-from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig
-from gtsam_rwhec.pipeline.output_paths import check_is_not_read, made_folder, made_output_folder
+from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig, read_metadata
+from gtsam_rwhec.pipeline.output_paths import LEFT, check_is_not_read, made_folder, made_output_folder
 from gtsam_rwhec.pipeline.samples_log import is_file_of_samples, write_samples_log
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solution_plots import plot_all
@@ -37,9 +42,10 @@ from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, solve_log
 from gtsam_rwhec.results.written_result import write_calibration
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.vision.camera import Camera
 
-#: Names of all that `calibrate_log` leaves in its folder.
-OUTPUTS = (CLEAN_LOG, RESULT_FILE, *FILES, SEEN_SHEET, PLOTS_FOLDER)
+#: Names of all that `calibrate_log` leaves in its folder, beside the list of them.
+OUTPUTS = tuple(dict.fromkeys(name.partition("/")[0] for name in LEFT))
 
 
 @one_blas_thread()
@@ -51,15 +57,19 @@ def calibrate_log(
     images: Images = "leave_out",
     workers: int | None = None,
     anyway: bool = False,
+    replace: bool = True,
     progress: Progress | None = None,
 ) -> Calibrated:
     """Detect, clean, solve and export: from a log and a rig file to a folder with the calibration.
 
     The folder gets ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``,
-    ``camchain.yaml``, ``seen.png`` (a contact sheet of the images) and ``plots/``. During the work it has a
-    ``detected.mcap`` too. To go on after an interruption, give ``detected.mcap`` as the log. For a log that a stage
-    wrote, only the stages after it run. A cleaned log is cleaned again if the settings for cleaning in `rig` differ
-    from those that the log was cleaned with.
+    ``camchain.yaml``, ``seen.png`` (a contact sheet of the images) and ``plots/``. For a log that a stage wrote, only
+    the stages after it run. A cleaned log is cleaned again if the settings for cleaning in `rig` differ from those that
+    the log was cleaned with.
+
+    During the work the folder has the detections so far. A run that was interrupted, or killed, goes on from them when
+    it is started again: what it finds is the same as without the interruption. Images, sensors, targets and options of
+    detection must be the same; the rest of the rig file may change.
 
     Parameters
     ----------
@@ -76,47 +86,94 @@ def calibrate_log(
         Threads, and for long logs processes, for detection; by default one for each core.
     anyway : bool
         As for `export_solved`.
+    replace : bool
+        Whether a finished calibration in the folder, or an unfinished run of other inputs, is replaced: by default yes,
+        so that a script can be run again. False refuses both, as the command does without ``--force``. In either case
+        an unfinished run of the same inputs is gone on with, and only files that a calibration wrote are replaced: a
+        folder with other files, and without a calibration, is refused.
     progress : callable, optional
 
     Raises
     ------
     OptionError
         `workers` is given, and no images will be searched; or ``images="copy"``, and the log has none.
+    LogError
+        The folder is not free for this calibration; nothing was changed.
     RwhecError
         As each stage does.
     """
-    detected, clean = Path(out) / DETECTED_LOG, Path(out) / CLEAN_LOG
     check_is_no_other_folder(log_path, rig)
     if rig is not None and (is_folder_of_images(log_path, rig) or is_file_of_samples(log_path, rig)):
+        source = Path(str(log_path))
         return _calibrate_files(
-            Path(str(log_path)), rig, out, images=images, workers=workers, anyway=anyway, progress=progress
+            source, rig, out, images=images, workers=workers, anyway=anyway, replace=replace, progress=progress
         )
     with open_log(log_path) as log:
-        source = log.files[0].path
+        files = [file.path for file in log.files]
         is_raw = not is_from_stage(log)
         if is_raw:
             if rig is None:
-                raise LogError(f"{source}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one")
-            check_is_not_read(log, detected)
-            check_is_not_read(log, clean)
+                raise LogError(
+                    f"{files[0]}: a raw log needs a rig file (--rig); gtsam-rwhec init LOG makes a first one"
+                )
+            check_is_not_read(log, Path(out) / DETECTED_LOG)
+            check_is_not_read(log, Path(out) / CLEAN_LOG)
+            sources = tuple(file.name for file in files)
         else:
             _check_is_alone(log)
+            sources = read_metadata(log).detection.sources
         check_image_options(log, rig if is_raw else None, images=images, workers=workers)
         is_cleaned = CLEANING_METADATA in log.metadata() and (
             rig is None or not changes(read_embedded_rig(log), rig).cleaning
         )
-    out = made_output_folder(out)
-    if is_raw:
-        assert rig is not None
-        detect_log(log_path, rig, detected, images=images, workers=workers, sheet=out / SEEN_SHEET, progress=progress)
-        source = detected
+    with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
+        if is_raw:
+            assert rig is not None
+            return _from_raw(files, rig, output, images=images, workers=workers, anyway=anyway, progress=progress)
+        output.begin()
+        return _from_stage(
+            files[0], rig, output.path, is_cleaned=is_cleaned, images=images, anyway=anyway, progress=progress
+        )
+
+
+def _from_raw(
+    files: list[Path],
+    rig: Rig,
+    output: OutputFolder,
+    folder: Path | None = None,
+    *,
+    images: Images,
+    workers: int | None,
+    anyway: bool,
+    progress: Progress | None,
+) -> Calibrated:
+    """All stages; `folder` is the one whose images the log has, if it is of a folder."""
+
+    def keep(log: Log, cameras: Mapping[str, Camera]) -> KeptDetections:
+        return output.kept_detections(inputs_of(log, rig, cameras, folder), image_count(log, rig))
+
+    detected = output.path / DETECTED_LOG
+    sheet = output.path / SEEN_SHEET
+    detect_log(list(files), rig, detected, images=images, workers=workers, sheet=sheet, progress=progress, keep=keep)
+    return _from_stage(detected, rig, output.path, is_cleaned=False, images=images, anyway=anyway, progress=progress)
+
+
+def _from_stage(
+    source: Path,
+    rig: Rig | None,
+    out: Path,
+    *,
+    is_cleaned: bool,
+    images: Images,
+    anyway: bool,
+    progress: Progress | None,
+) -> Calibrated:
+    """The stages after the one that wrote the log."""
     if not is_cleaned:
-        clean_log(source, clean, rig, images=images, progress=progress)
-        source = clean
+        clean_log(source, out / CLEAN_LOG, rig, images=images, progress=progress)
+        source = out / CLEAN_LOG
     calibrated = solve_into(source, rig, out, images=images, progress=progress)
     export_solved(out / CLEAN_LOG, out, anyway=anyway, progress=progress)
-    if is_raw:
-        detected.unlink(missing_ok=True)  # clean.mcap has all that was in it
     return calibrated
 
 
@@ -128,6 +185,7 @@ def _calibrate_files(
     images: Images,
     workers: int | None,
     anyway: bool,
+    replace: bool,
     progress: Progress | None,
 ) -> Calibrated:
     """As `calibrate_log`, by way of a log of a folder's images or of samples, which is removed at the end."""
@@ -135,18 +193,21 @@ def _calibrate_files(
     if has_images:
         rig = rig.model_copy(update={"folder": source})
     check_intrinsics_files(rig)  # before anything is copied
-    made = made_output_folder(out)
-    recorded = made / f"{source.resolve().name}{RECORDED_LOG}"
-    try:
-        if has_images:
-            write_folder_log(source, rig, recorded, progress=progress)
-        else:
-            (progress or silent)(write_samples_log(source, rig, recorded))
-        return calibrate_log(recorded, rig, made, images=images, workers=workers, anyway=anyway, progress=progress)
-    finally:
-        recorded.unlink(missing_ok=True)
-        if not any(made.iterdir()):
-            made.rmdir()
+    name = f"{source.resolve().name}{RECORDED_LOG}"
+    with output_folder(out, name, replace=replace) as output:
+        recorded = output.path / name
+        output.begin()
+        try:
+            if has_images:
+                write_folder_log(source, rig, recorded, progress=progress)
+            else:
+                (progress or silent)(write_samples_log(source, rig, recorded))
+            folder = source if has_images else None
+            return _from_raw(
+                [recorded], rig, output, folder, images=images, workers=workers, anyway=anyway, progress=progress
+            )
+        finally:
+            recorded.unlink(missing_ok=True)
 
 
 def _check_is_alone(log: Log) -> None:
@@ -177,6 +238,7 @@ def solve_into(
     calibrated = solve_log(clean_path, rig, progress=progress)
     write_calibration(calibrated.calibration, out / RESULT_FILE, calibrated.log)
     write_solved(clean_path, calibrated, out / CLEAN_LOG, images=images)
+    list_written(out, calibrated.log.detection.sources, [out / RESULT_FILE, out / CLEAN_LOG])
     return calibrated
 
 
@@ -217,4 +279,6 @@ def export_solved(
     else:
         written = export_all(frames_of(solved), out)
     tell("plotting")
-    return written + plot_all(solved, solved_path, made_folder(out / PLOTS_FOLDER))
+    written += plot_all(solved, solved_path, made_folder(out / PLOTS_FOLDER))
+    list_written(out, solved.log.detection.sources, written)
+    return written

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
+from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.detections_in_images import draw_images
@@ -18,6 +19,7 @@ from gtsam_rwhec.pipeline.driver_detections import read_driver_detections
 from gtsam_rwhec.pipeline.image_detections import detect_in_log
 from gtsam_rwhec.pipeline.image_options import check_drawable, check_image_options
 from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
+from gtsam_rwhec.pipeline.kept_detections import KeptDetections
 from gtsam_rwhec.pipeline.log_contract import annotations_topic, detections_topic, poses_topic, raw_topics
 from gtsam_rwhec.pipeline.log_metadata import LogMetadata
 from gtsam_rwhec.pipeline.no_detections import no_detections
@@ -27,6 +29,7 @@ from gtsam_rwhec.pipeline.sensor_detections import detection_report
 from gtsam_rwhec.pipeline.topics_of_rig import check_topics
 from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.vision.camera import Camera
 
 
 @one_blas_thread()
@@ -40,6 +43,7 @@ def detect_log(
     sheet: str | Path | None = None,
     draw: str | Path | None = None,
     progress: Progress | None = None,
+    keep: Callable[[Log, Mapping[str, Camera]], KeptDetections] | None = None,
 ) -> DetectionReport:
     """Detect the targets, and write a log with the detections.
 
@@ -62,6 +66,8 @@ def detect_log(
         A PNG file for a contact sheet of the images, and a folder for a picture of each: written also where no target
         was detected. A sheet needs images; without any it is not written.
     progress : callable, optional
+    keep : callable, optional
+        Gives the file of the detections so far, for the log and the cameras, before anything is written.
 
     Raises
     ------
@@ -81,7 +87,8 @@ def detect_log(
         cameras = read_intrinsics(log, rig)
         tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
         motion = read_carrier_motion(log, rig)
-        found = detect_in_log(log, rig, cameras, motion, workers=workers, progress=tell)
+        kept = None if keep is None else keep(log, cameras)
+        found = detect_in_log(log, rig, cameras, motion, workers=workers, progress=tell, kept=kept)
         for sensor, source in rig.sensors.items():
             if source.detections is not None:
                 found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))

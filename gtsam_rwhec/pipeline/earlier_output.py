@@ -1,40 +1,52 @@
-"""Whether the files that a run would replace are its own earlier output: it refuses to replace any other file.
+"""What an output folder has before a calibration: an unfinished run, a finished one, or files of somebody else.
 
-Pictures and files for other programs do not name the log that they are from. So the folder has a list of the files
-that were written into it, with a checksum of each.
+The folder has a list of the files that were written into it, with a checksum of each: pictures and files for other
+programs do not say what they are from. One rule serves ``calibrate``, ``demo`` and Python:
+
+- A file that is not on the list, or was changed since, is never replaced.
+- A finished calibration is replaced only on request. An unfinished run is gone on with; one that ended with an error is
+  too, or begun anew where its inputs are other ones: they were mended.
+- Other files beside ours are refused, since the folder may be meant for something else; with a request to replace a
+  calibration that is there, they stay as they are.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict
 
 from gtsam_rwhec.errors import LogError, RwhecError
-from gtsam_rwhec.export.files import FILES
 from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.logs import open_log
-from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, PLOTS_FOLDER, RESULT_FILE, SEEN_SHEET
-from gtsam_rwhec.pipeline.log_metadata import read_metadata
-from gtsam_rwhec.pipeline.output_paths import made_folder
-from gtsam_rwhec.pipeline.solution_plots import COVERAGE, DEVIATIONS, FRAMES, RESIDUALS
-from gtsam_rwhec.results.result_file import read_result
+from gtsam_rwhec.pipeline.detection_inputs import differences
+from gtsam_rwhec.pipeline.kept_detections import KeptDetections, kept_inputs
+from gtsam_rwhec.pipeline.log_contract import DETECTED_LOG, PLOTS_FOLDER, RECORDED_LOG
+from gtsam_rwhec.pipeline.output_paths import WRITTEN, made_output_folder
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 #: The list of the written files, in the output folder.
 LIST_FILE = ".written.json"
-#: Files that name the log that they are from.
-_NAMING_THE_LOG = (RESULT_FILE, CLEAN_LOG, DETECTED_LOG)
-#: All files that `calibrate_log` writes, relative to the output folder.
-_WRITTEN = (
-    *_NAMING_THE_LOG,
-    *FILES,
-    SEEN_SHEET,
-    *(f"{PLOTS_FOLDER}/{name}" for name in (FRAMES, RESIDUALS, COVERAGE, DEVIATIONS)),
-)
+#: The detections so far, in the output folder. It is removed at the end.
+DETECTIONS = "detections.jsonl"
+#: A file that was half written when the run was killed: the name that it would have had.
+_PART = re.compile(r"\.(.+)\.\d+\.(?:part|trial)")
+#: Files that desktops leave in folders that were looked at.
+_OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
+#: A message names at most this many files.
+MOST_NAMED = 5
+
+#: "failed" is a run that ended with an error: who mended its inputs need not ask for a new start.
+State: TypeAlias = Literal["unfinished", "failed", "finished"]
 
 
 class _Written(BaseModel):
@@ -43,84 +55,265 @@ class _Written(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     log: str
+    state: State = "finished"
     sha256: dict[str, str]
 
 
-@contextmanager
-def replacing_output(folder: Path, log_name: str) -> Iterator[None]:
-    """Run `calibrate_log` in the block: it replaces its own earlier output in the folder, and no other file.
+class OutputFolder:
+    """The output folder of a calibration while it is at work. `output_folder` makes it.
 
-    Only the names of the files that `calibrate_log` writes count. Other files may be in the folder. The list of the
-    written files is brought up to date at the end of the block, also if an error or the user ends it.
+    Attributes
+    ----------
+    path : Path
+    log : str
+        The name of the log, or of the folder, that is calibrated.
+    begins_anew : bool
+        Whether an unfinished run of other inputs is replaced.
+    """
+
+    def __init__(self, path: Path, log: str, before: _Written | None, *, replace: bool) -> None:
+        self.path = path
+        self.log = log
+        self.begins_anew = replace or (before is not None and before.state != "unfinished")
+        self._before = before
+        self._has_begun = False
+        self._kept: KeptDetections | None = None
+
+    def begin(self) -> None:
+        """Say in the folder's list that a run is at work, before its first file is written."""
+        if not self._has_begun:
+            earlier = self._before
+            if earlier is not None and earlier.state != "finished" and earlier.log.endswith(RECORDED_LOG):
+                (self.path / Path(earlier.log).name).unlink(missing_ok=True)
+            sums = {} if self._before is None else self._before.sha256
+            _write_list(self.path, _Written(log=self.log, state="unfinished", sha256=sums))
+            self._has_begun = True
+
+    def kept_detections(self, inputs: dict[str, str], total: int) -> KeptDetections:
+        """The detections that an interrupted run kept, if its inputs were the same; else none.
+
+        Raises
+        ------
+        LogError
+            The folder has an unfinished run of other inputs, and nobody asked to replace it.
+        """
+        file = self.path / DETECTIONS
+        earlier = kept_inputs(file)
+        other = "" if earlier is None else differences(earlier, inputs)
+        if other and not self.begins_anew:
+            self._has_begun = False  # the list stays as it was
+            raise LogError(
+                f"{self.path} has an unfinished run of other inputs, and nothing was changed: {other}. Put that back, "
+                "and the run goes on; or begin anew (--force; in Python replace=True), or give another folder"
+            )
+        self.begin()
+        self._kept = KeptDetections(file, inputs, total)
+        if earlier is None or other:
+            file.unlink(missing_ok=True)
+        else:
+            self._kept.go_on()
+        return self._kept
+
+    def end(self, error: BaseException | None, sources: Sequence[Path]) -> None:
+        """Bring the list up to date, and remove what only an unfinished run needs; `sources` stay."""
+        if self._kept is not None:
+            self._kept.close()
+        if isinstance(error, KeyboardInterrupt):
+            error.add_note(self._how_to_go_on())
+        if self._has_begun:
+            state: State = "finished" if error is None else "failed" if isinstance(error, RwhecError) else "unfinished"
+            written = [name for name in WRITTEN if (self.path / name).is_file()]
+            if error is not None and not written and self._before is None and not (self.path / DETECTIONS).exists():
+                (self.path / LIST_FILE).unlink(missing_ok=True)
+            else:
+                sums = {name: _sha256(self.path / name) for name in written}
+                _write_list(self.path, _Written(log=self.log, state=state, sha256=sums))
+        if error is None:
+            for name in (DETECTED_LOG, DETECTIONS):
+                if not _is_one_of(self.path / name, sources):
+                    (self.path / name).unlink(missing_ok=True)
+
+    def _how_to_go_on(self) -> str:
+        if self._kept is None or not self._kept.done:
+            return f"The same command starts again; {self.path} has no detections yet."
+        done = f"{self._kept.done:,} of {self._kept.total:,} images are done"
+        return f"The same command goes on from here: {done}, and kept in {self.path}."
+
+
+@contextmanager
+def output_folder(path: str | Path, log: str, *, replace: bool, sources: Sequence[Path] = ()) -> Iterator[OutputFolder]:
+    """Calibrate in the block: into a folder that is free for it, whose list is brought up to date at the end.
 
     Parameters
     ----------
-    folder : Path
-        It is made if it does not exist.
-    log_name : str
-        File name of the log whose earlier output may be replaced.
+    path
+        It is made if it does not exist, and removed if an error ends the block before anything was written.
+    log : str
+        Name of the log or folder that is calibrated.
+    replace : bool
+        Whether a finished calibration, or an unfinished run of other inputs, is replaced.
+    sources : sequence of Path
+        The files of the log: one that is in the folder is not foreign.
 
     Raises
     ------
     LogError
-        A file that would be replaced is not known as an output of this log. Nothing was changed.
+        The folder is not free, another run is at work in it, or files cannot be written into it. Nothing was changed.
     """
-    foreign = _foreign(folder, log_name)
-    if foreign:
-        raise LogError(
-            f"{folder} has files that are not from an earlier run on {log_name}, or were changed since: "
-            f"{', '.join(foreign)}. Give another folder, or remove them."
-        )
-    made_folder(folder)
-    _write_list(folder, log_name)
+    path = Path(path)
+    before = _check_is_free(path, log, replace=replace, sources=sources)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    made_output_folder(path)
+    output = OutputFolder(path, log, before, replace=replace)
+    error: BaseException | None = None
     try:
-        yield
+        with _alone_in(path):
+            try:
+                for name in _names_in(path):
+                    if _is_part(name, log):
+                        (path / name).unlink(missing_ok=True)
+                yield output
+            except BaseException as caught:
+                error = caught
+                raise
+            finally:
+                output.end(error, sources)
     finally:
-        _write_list(folder, log_name)
+        with suppress(OSError):  # what has files in it stays
+            for folder in made:
+                folder.rmdir()
 
 
-def _foreign(folder: Path, log_name: str) -> list[str]:
-    """The names in the folder that would be replaced, and are not known as an output of the log."""
-    # A link counts too if nothing is at its end: a file would be written there.
-    there = [name for name in (*_WRITTEN, LIST_FILE) if os.path.lexists(folder / name)]
-    if os.path.lexists(folder / PLOTS_FOLDER) and not (folder / PLOTS_FOLDER).is_dir():
-        there.append(PLOTS_FOLDER)
+def earlier_run(path: str | Path) -> tuple[str, State] | None:
+    """The log of the run that wrote a folder's files, and how that run ended; None if there was none."""
+    written = _read_list(Path(path))
+    return None if written is None else (written.log, written.state)
+
+
+def log_name(sources: Sequence[str]) -> str:
+    """The name of a log of several files: those of all, as a list of written files has it."""
+    return ", ".join(sources)
+
+
+def list_written(folder: Path, sources: Sequence[str], files: Iterable[Path]) -> None:
+    """Put files that a stage wrote on the folder's list; `sources` are the files of the raw log."""
+    before = _read_list(folder) or _Written(log=log_name(sources), sha256={})
+    sums = {file.relative_to(folder).as_posix(): _sha256(file) for file in files if file.is_file()}
+    if sums:
+        _write_list(folder, before.model_copy(update={"sha256": before.sha256 | sums}))
+
+
+def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[Path]) -> _Written | None:
+    """Refuse a folder that is not free for a calibration; return the list of what was written into it before."""
+    before = _read_list(folder)
+    there = _names_in(folder)
+    if before is not None and before.state == "finished" and not replace:
+        raise LogError(
+            f"{folder} has a finished calibration of {_named_log(before.log)}, and nothing was changed. Replace it "
+            "(--force; in Python replace=True), or give another folder"
+        )
+    is_going_on = before is not None and before.state != "finished"
+    ours = {*WRITTEN, LIST_FILE, DETECTIONS, PLOTS_FOLDER}
+    if before is not None and is_going_on and before.log.endswith(RECORDED_LOG):
+        ours.add(before.log)
+    own = {name for name in there if name in ours or _is_part(name, log) or _is_one_of(folder / name, sources)}
+    others = [name for name in there if name not in own]
+    if others and (before is None or not replace):
+        raise LogError(
+            f"{folder} has files that are not of a calibration, and nothing was changed: {_named(others)}. Give "
+            "another folder"
+        )
+    if before is not None and before.state == "unfinished" and before.log != log and not replace:
+        earlier = _named_log(before.log)
+        raise LogError(
+            f"{folder} has an unfinished run on {earlier}, which is not {_named_log(log)}, and nothing was changed. "
+            f"Give {earlier}, and the run goes on; or begin anew (--force; in Python replace=True), or give another "
+            "folder"
+        )
+    if not is_going_on:
+        listed = () if before is None else (LIST_FILE, DETECTIONS)
+        sums = {} if before is None else before.sha256
+        changed = [
+            name
+            for name in there
+            if name in ours and name not in listed and not _is_one_of(folder / name, sources)
+            and not _is_as_written(folder / name, sums.get(name))
+        ]  # fmt: skip
+        if changed:
+            raise LogError(
+                f"{folder} has files that no earlier calibration wrote there, or that were changed since, and nothing "
+                f"was changed: {_named(changed)}. Give another folder, or remove them"
+            )
+    return before
+
+
+def _names_in(folder: Path) -> list[str]:
+    """The names of all that is in a folder, and in its folder of plots."""
+    names = []
+    for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if entry.name == PLOTS_FOLDER and entry.is_dir() and not entry.is_symlink():
+            names += [f"{PLOTS_FOLDER}/{of_plots.name}" for of_plots in sorted(entry.iterdir())]
+        elif entry.name not in _OF_DESKTOPS:
+            names.append(entry.name)
+    return names
+
+
+def _is_part(name: str, log: str) -> bool:
+    """Whether a file is what a killed run of ours left half written."""
+    folder, _, file = name.rpartition("/")
+    part = _PART.fullmatch(file)
+    return part is not None and f"{folder}/{part[1]}".lstrip("/") in (*WRITTEN, LIST_FILE, DETECTIONS, log)
+
+
+def _is_one_of(path: Path, sources: Sequence[Path]) -> bool:
+    """Whether a file is one of those that the log is read from."""
+    return any(os.path.realpath(path) == os.path.realpath(source) for source in sources)
+
+
+def _is_as_written(path: Path, sha256: str | None) -> bool:
+    return path.is_file() and not path.is_symlink() and sha256 == _sha256(path)
+
+
+def _named_log(log: str) -> str:
+    """A log's name for messages: that of the folder, if it is of one."""
+    return log.removesuffix(RECORDED_LOG)
+
+
+def _named(names: Sequence[str]) -> str:
+    more = len(names) - MOST_NAMED
+    return ", ".join(names[:MOST_NAMED]) + (f" and {more} others" if more > 0 else "")
+
+
+def _read_list(folder: Path) -> _Written | None:
     try:
-        written = _Written.model_validate_json((folder / LIST_FILE).read_bytes())
+        return _Written.model_validate_json((folder / LIST_FILE).read_bytes())
     except (OSError, ValueError):
-        return there
-    if written.log != log_name:
-        return there
-    return [name for name in there if name != LIST_FILE and not _is_own(folder, name, written)]
+        return None
 
 
-def _is_own(folder: Path, name: str, written: _Written) -> bool:
-    """Whether a file is as it was written, or names the log: a run that was killed had no time to list it."""
-    path = folder / name
-    if not path.is_file():
-        return False
-    if written.sha256.get(name) == _sha256(path):
-        return True
-    return name in _NAMING_THE_LOG and _sources(path) == (written.log,)
-
-
-def _write_list(folder: Path, log_name: str) -> None:
-    sums = {name: _sha256(folder / name) for name in _WRITTEN if (folder / name).is_file()}
-    content = _Written(log=log_name, sha256=sums).model_dump_json(indent=2)
-    write_atomically(folder / LIST_FILE, content.encode())
+def _write_list(folder: Path, written: _Written) -> None:
+    write_atomically(folder / LIST_FILE, written.model_dump_json(indent=2).encode())
 
 
 def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _sources(path: Path) -> tuple[str, ...]:
-    """The names of the logs that a result or a stage's log was made from; empty for any other file."""
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold a folder against other runs; the system gives it back when the process ends, however it ends."""
+    if fcntl is None:
+        yield
+        return
+    held = os.open(folder, os.O_RDONLY)
     try:
-        if path.name == RESULT_FILE:
-            log = read_result(path).log
-            return () if log is None else log.detection.sources
-        with open_log(path) as opened:
-            return read_metadata(opened).detection.sources
-    except RwhecError:
-        return ()
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise LogError(f"{folder}: another run is at work in this folder. Wait for it, or give another") from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        os.close(held)

@@ -10,10 +10,11 @@ from functools import partial
 import numpy as np
 
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.progress import Counted, Progress
+from gtsam_rwhec.files.progress import Counted, Progress, Remark
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion, check_order
+from gtsam_rwhec.pipeline.kept_detections import KeptDetections
 from gtsam_rwhec.pipeline.log_contract import IMAGES_METADATA, detections_topic, image_key
 from gtsam_rwhec.pipeline.sensor_detections import LookedAt, SensorDetections
 from gtsam_rwhec.rig import Rig
@@ -38,22 +39,22 @@ def detect_in_log(
     *,
     workers: int | None,
     progress: Progress,
+    kept: KeptDetections | None = None,
 ) -> dict[str, SensorDetections]:
-    """The detections of every sensor that has images.
+    """The detections of every sensor that has images; those that `kept` has are not detected again.
 
     Raises `LogError` if a topic has no images, or if no image of a sensor can be used; `StampError` as `check_order`.
     """
     sensor_of = {source.images: name for name, source in rig.sensors.items() if source.images is not None}
     images: dict[str, list[DetectedImage]] = {topic: [] for topic in sensor_of}
-    logged_ns: dict[str, dict[int, int]] = {topic: {} for topic in sensor_of}
-    for image in _detected(log, rig, cameras, sensor_of, logged_ns, workers=workers, progress=progress):
+    for image in _detected(log, rig, cameras, sensor_of, workers=workers, progress=progress, kept=kept):
         images[image.topic].append(image)
     upright: dict[str, Turns] = {}
     found = {}
     for topic, sensor in sensor_of.items():
         in_order = sorted(images[topic], key=lambda image: image.stamp_ns)
         of_sensor = _of_sensor(log, rig, sensor, in_order, motion, upright)
-        looked_at = {image.stamp_ns: LookedAt(logged_ns[topic][image.stamp_ns], image.fault) for image in in_order}
+        looked_at = {image.stamp_ns: LookedAt(image.logged_ns, image.fault) for image in in_order}
         found[sensor] = replace(of_sensor, images=looked_at)
     return found
 
@@ -63,16 +64,20 @@ def _detected(
     rig: Rig,
     cameras: Mapping[str, Camera],
     sensor_of: Mapping[str, str],
-    logged_ns: dict[str, dict[int, int]],
     *,
     workers: int | None,
     progress: Progress,
+    kept: KeptDetections | None,
 ) -> Iterator[DetectedImage]:
-    """The detections of every image, in any order. Stamps are checked while images are read.
-
-    `logged_ns` gets the log time of every image, by topic and stamp.
-    """
+    """The detections of every image, in any order. Stamps are checked while images are read."""
     if not sensor_of:
+        return
+    total = image_count(log, rig)
+    if kept is not None and kept.done:
+        progress(Remark(f"going on with an unfinished run: {kept.done:,} of {total:,} images are done"))
+        progress(Counted("detecting: image", kept.done, total))
+    if kept is not None and kept.is_whole:
+        yield from kept.all()
         return
     stamps: dict[str, list[int]] = defaultdict(list)
 
@@ -82,7 +87,6 @@ def _detected(
                 raise LogError(f"topic {record.topic} has no images but {type(record).__name__}s")
             of_topic = stamps[record.topic]
             of_topic.append(record.stamp_ns)
-            logged_ns[record.topic][record.stamp_ns] = record.logged_ns
             if len(of_topic) in CHECKED_AFTER:
                 check_order(np.array(of_topic, dtype=np.int64), f"topic {record.topic}")
             yield record
@@ -91,12 +95,17 @@ def _detected(
         topic: partial(Detector, cameras[sensor], rig.target_list, rig.detection_options)
         for topic, sensor in sensor_of.items()
     }
-    total = sum(topic.count for topic in log.topics() if topic.name in sensor_of)
     yield from detect_in_images(
-        images(), makers, workers=workers, progress=lambda done: progress(Counted("detecting: image", done, total))
+        images(),
+        makers,
+        workers=workers,
+        kept=kept,
+        progress=lambda done: progress(Counted("detecting: image", done, total)),
     )
     for topic in sensor_of:
         check_order(np.array(stamps[topic], dtype=np.int64), f"topic {topic}")
+    if kept is not None:
+        kept.finish()
 
 
 def _of_sensor(
@@ -239,6 +248,12 @@ def _turned(
     which = (turns.which + more) % board.ways
     turned = [turned_detection(*pair) for pair in zip(detections, [board] * len(which), which.tolist(), strict=True)]
     return turned, np.minimum(turns.margin, margin)
+
+
+def image_count(log: Log, rig: Rig) -> int:
+    """How many images a log has for the sensors of a rig file, with those that cannot be read."""
+    topics = {source.images for source in rig.sensors.values() if source.images is not None}
+    return sum(topic.count for topic in log.topics() if topic.name in topics)
 
 
 def message_count(log: Log, topic: str | None) -> int:

@@ -63,9 +63,10 @@ def read_metadata(log: Log) -> LogMetadata:
     LogError
         No stage wrote the log, or its metadata is damaged.
     """
+    rig = read_embedded_rig(log)
     cleaning = read_cleaning_report(log) if CLEANING_METADATA in log.metadata() else None
     detection = _report(log, DETECTION_METADATA, DetectionReport)
-    return LogMetadata(read_embedded_rig(log), read_cameras(log), detection, cleaning)
+    return LogMetadata(rig, read_cameras(log), detection, cleaning)
 
 
 def read_cleaning_report(log: Log) -> CleaningReport:

@@ -10,6 +10,18 @@ from gtsam_rwhec.export.files import FILES
 from gtsam_rwhec.files.atomic_write import why_not_writable
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, PLOTS_FOLDER, RESULT_FILE, SEEN_SHEET
+from gtsam_rwhec.pipeline.solution_plots import COVERAGE, DEVIATIONS, FRAMES, RESIDUALS
+
+#: All files that a calibration leaves in its folder, relative to it. A file that is written there has its name here.
+LEFT = (
+    CLEAN_LOG,
+    RESULT_FILE,
+    *FILES,
+    SEEN_SHEET,
+    *(f"{PLOTS_FOLDER}/{name}" for name in (FRAMES, RESIDUALS, COVERAGE, DEVIATIONS)),
+)
+#: With the log that it has during the work.
+WRITTEN = (*LEFT, DETECTED_LOG)
 
 
 def check_writable(path: str | Path) -> None:
@@ -39,8 +51,9 @@ def made_folder(path: str | Path) -> Path:
 def made_output_folder(path: str | Path) -> Path:
     """As `made_folder`, for all files of a calibration: whatever could not be replaced at its end is told before it."""
     path = made_folder(path)
-    for name in (DETECTED_LOG, RESULT_FILE, *FILES, SEEN_SHEET):
-        check_writable(path / name)
+    for name in WRITTEN:
+        if "/" not in name:
+            check_writable(path / name)
     plots = path / PLOTS_FOLDER
     if plots.is_dir():
         check_writable(plots / CLEAN_LOG)

@@ -91,6 +91,8 @@ def _check_size(where: str, found: Size, wanted: Size | None) -> None:
 
 
 def _compressed(image: ImageRecord, where: str, wanted: Size | None, flags: int = _WHOLE) -> Gray:
+    if not len(image.data):
+        raise ImageError(f"{where}: there are no bytes in it")
     begins, claims = image.data[:8].hex(), image.encoding[:40]
     what = f"{where}: {len(image.data)} bytes that begin with {begins} and claim to be {claims!r}"
     size = stated_size(image.data)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -45,6 +46,21 @@ class DetectedImage:
     stamp_ns: int
     found: ImageDetections | None
     fault: str = ""
+    logged_ns: int = 0  #: its log time, by which it is found again
+
+
+class Kept(Protocol):
+    """Detections that are kept batch by batch, so that an interrupted run goes on from them.
+
+    The images of a batch are the same whatever was kept, and they are detected together or not at all: so a run that
+    was interrupted finds the same as one that was not, to the last bit.
+    """
+
+    def known(self, number: int, batch: Sequence[ImageRecord]) -> list[DetectedImage] | None:
+        """What was found in the batch of this number; None if it is not known."""
+
+    def keep(self, number: int, found: list[DetectedImage]) -> None:
+        """Keep what was found in the batch of this number."""
 
 
 def detect_in_images(
@@ -53,6 +69,7 @@ def detect_in_images(
     *,
     workers: int | None = None,
     few: int = FEW,
+    kept: Kept | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Iterator[DetectedImage]:
     """Decode images and detect targets in them.
@@ -67,8 +84,10 @@ def detect_in_images(
         Number of threads or processes; by default the number of cores that this process may use.
     few : int
         After this many images processes take over from threads.
+    kept : Kept, optional
+        Batches that it knows are not decoded again, and every other is given to it.
     progress : callable, optional
-        Called with the number of images that are done.
+        Called with the number of images that are done, with those that were known, after each new batch.
 
     Yields
     ------
@@ -76,32 +95,47 @@ def detect_in_images(
         One for each image, in batches of a topic.
     """
     count = workers or cpu_count()
-    done = 0
+    done = submitted = 0
 
-    def results(future: Future[list[DetectedImage]]) -> list[DetectedImage]:
+    def results(number: int, future: Future[list[DetectedImage]], is_new: bool) -> list[DetectedImage]:
         nonlocal done
         of_batch = future.result()
         done += len(of_batch)
-        if progress is not None:
+        if is_new and kept is not None:
+            kept.keep(number, of_batch)
+        if is_new and progress is not None:
             progress(done)
         return of_batch
 
     with _opencv_as_before(), ThreadPoolExecutor(count) as threads, _Processes(count) as processes:
         _quiet_on_one_thread()
-        waiting: deque[Future[list[DetectedImage]]] = deque()
+        waiting: deque[tuple[int, Future[list[DetectedImage]], bool]] = deque()
         try:
             for number, batch in enumerate(_batches(images)):
-                if count > 1 and number * BATCH >= few and processes.are_ready():
-                    waiting.append(processes.submit(batch, make_detector[batch[0].topic]))
+                known = None if kept is None else kept.known(number, batch)
+                if known is not None:
+                    waiting.append((number, _finished(known), False))
                 else:
-                    waiting.append(threads.submit(_look, batch, make_detector[batch[0].topic]))
-                while len(waiting) > count + 1 or (waiting and waiting[0].done()):
-                    yield from results(waiting.popleft())
+                    if count > 1 and submitted >= few and processes.are_ready():
+                        future = processes.submit(batch, make_detector[batch[0].topic])
+                    else:
+                        future = threads.submit(_look, batch, make_detector[batch[0].topic])
+                    waiting.append((number, future, True))
+                    submitted += len(batch)
+                while len(waiting) > count + 1 or (waiting and waiting[0][1].done()):
+                    yield from results(*waiting.popleft())
             while waiting:
-                yield from results(waiting.popleft())
+                yield from results(*waiting.popleft())
         finally:
-            for future in waiting:
+            for _, future, _ in waiting:
                 future.cancel()
+
+
+def _finished(known: list[DetectedImage]) -> Future[list[DetectedImage]]:
+    """A future that has its result: known batches keep their places among the others."""
+    future: Future[list[DetectedImage]] = Future()
+    future.set_result(known)
+    return future
 
 
 class _Processes:
@@ -155,8 +189,8 @@ def _look(batch: list[ImageRecord], make_detector: Callable[[], Detector]) -> li
 def _with_result(image: ImageRecord, result: ImageDetections | str) -> DetectedImage:
     """An image with its detections or its fault."""
     if isinstance(result, str):
-        return DetectedImage(image.topic, image.stamp_ns, None, result)
-    return DetectedImage(image.topic, image.stamp_ns, result)
+        return DetectedImage(image.topic, image.stamp_ns, None, result, logged_ns=image.logged_ns)
+    return DetectedImage(image.topic, image.stamp_ns, result, logged_ns=image.logged_ns)
 
 
 def _detected(detector: Detector, images: list[tuple[ImageRecord, Gray]]) -> list[ImageDetections | str]:

@@ -17,6 +17,7 @@ from synthetic_logs import BEGIN_NS, Message
 
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.pipeline.all_stages import calibrate_log
+from gtsam_rwhec.pipeline.earlier_output import DETECTIONS, LIST_FILE
 
 RECORDED = made.recording(4.0)
 MOVING = [message for message in RECORDED if message.topic == "/tf"]
@@ -45,7 +46,7 @@ def refused(folder: Path, messages: Iterable[Message], kind: type[RwhecError], *
     for word in words:
         assert word in str(caught.value), f"{word!r} is not in: {caught.value}"
     left = {path.name for path in (folder / "out").rglob("*")}
-    assert left <= {"detected.mcap", "seen.png"}  # a whole stage, from which to go on, and what was seen
+    assert left <= {"detected.mcap", "seen.png", DETECTIONS, LIST_FILE}  # from which to go on, and what was seen
     return str(caught.value)
 
 

@@ -65,17 +65,13 @@ def test_intrinsics_of_another_resolution(tmp_path: Path) -> None:
     [
         (b"no picture at all", "17 bytes that begin with 6e6f20706963"),
         (picture()[:60], "60 bytes of a PNG file that is cut short"),
+        (b"", "there are no bytes in it"),
     ],
 )
 def test_images_that_do_not_decode(tmp_path: Path, data: bytes, words: str) -> None:
     messages = MOVING + images(data)
     where = "topic /cam_0/image: none of the 6 images of cam_0 can be used", f"image at {BEGIN_NS} ns"
     refused(tmp_path, messages, LogError, *where, words, **WITH_IMAGES)
-
-
-def test_images_that_are_empty(tmp_path: Path) -> None:
-    with pytest.warns(LogWarning, match="/cam_0/image"):
-        refused(tmp_path, MOVING + images(b""), LogError, "topic /cam_0/image: none of the 6 images", **WITH_IMAGES)
 
 
 def test_some_images_that_do_not_decode_are_counted_and_named(tmp_path: Path) -> None:

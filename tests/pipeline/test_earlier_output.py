@@ -1,96 +1,165 @@
-"""An earlier output of the same log is replaced without asking, and nothing else."""
+"""What is in an output folder before a run: which of it is gone on with, replaced, or refused."""
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
 
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.pipeline import replacing_output
+from gtsam_rwhec.pipeline.earlier_output import LIST_FILE, MOST_NAMED, earlier_run, list_written, output_folder
 
-GOLDEN = Path(__file__).parents[1] / "golden"
-LOG = "eye_to_hand.mcap"
+LOG = "run.mcap"
 ALL = (
     "result.json", "clean.mcap", "detected.mcap", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
     "plots/frames.png", "plots/residuals.png", "plots/coverage.png", "plots/deviations.png",
 )  # fmt: skip
 
 
-def run(folder: Path, *names: str, log: str = LOG, content: bytes = b"output") -> None:
-    """What a calibration does: it writes files while the folder is known to be free."""
-    with replacing_output(folder, log):
+def run(
+    folder: Path,
+    *names: str,
+    log: str = LOG,
+    content: bytes = b"output",
+    replace: bool = False,
+    ends_with: BaseException | None = None,
+    sources: tuple[Path, ...] = (),
+) -> None:
+    """What a calibration does: it writes files while the folder is its own."""
+    with output_folder(folder, log, replace=replace, sources=sources) as output:
+        output.begin()
         for name in names:
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(content)
+        if ends_with is not None:
+            raise ends_with
 
 
-def test_a_folder_that_is_missing_empty_or_has_other_files_is_free(tmp_path: Path) -> None:
-    run(tmp_path / "new" / "folder")
+def interrupted(folder: Path, *names: str, ends_with: BaseException | None = None, **options: str) -> None:
+    """A run that ends early."""
+    error = KeyboardInterrupt() if ends_with is None else ends_with
+    with pytest.raises(type(error)):
+        run(folder, *names, ends_with=error, **options)  # type: ignore[arg-type]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_finished_calibration_is_replaced_on_request_only(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "folder"
+    run(out, *ALL, content=b"first")
+    assert earlier_run(out) == (LOG, "finished")
+    assert not (out / "detected.mcap").exists()  # the others have all that was in it
+    before = contents(out)
+    with pytest.raises(LogError, match=rf"has a finished calibration of {LOG}, and nothing was changed.*--force"):
+        run(out, *ALL, content=b"second")
+    assert contents(out) == before
+    run(out, *ALL, content=b"second", replace=True)
+    run(out, *ALL, content=b"third", replace=True, log="other.mcap")
+    assert contents(out)["plots/frames.png"] == b"third"
+    assert earlier_run(out) == ("other.mcap", "finished")
+
+
+@pytest.mark.parametrize("replace", [False, True])
+def test_a_folder_with_anything_else_is_refused(tmp_path: Path, replace: bool) -> None:
+    for number in range(MOST_NAMED + 2):
+        (tmp_path / f"mine_{number}.txt").write_text("mine", encoding="utf-8")
+    before = contents(tmp_path)
+    with pytest.raises(LogError, match=r"not of a calibration.*mine_0\.txt, mine_1\.txt.* and 2 others\. Give another"):
+        run(tmp_path, *ALL, replace=replace)
+    assert contents(tmp_path) == before
+
+
+def test_other_files_beside_a_calibration_stay(tmp_path: Path) -> None:
+    run(tmp_path, *ALL)
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
-    run(tmp_path)
+    run(tmp_path, *ALL, replace=True)
+    assert (tmp_path / "notes.txt").read_text(encoding="utf-8") == "mine"
+    interrupted(tmp_path / "unfinished", "tf.yaml")
+    (tmp_path / "unfinished" / "plots").mkdir()
+    (tmp_path / "unfinished" / "plots" / "mine.png").write_bytes(b"mine")
+    with pytest.raises(LogError, match=r"not of a calibration.*plots/mine\.png"):
+        run(tmp_path / "unfinished")
 
 
-def test_the_output_of_the_same_log_may_be_replaced(tmp_path: Path) -> None:
-    for content in (b"first", b"second", b"third"):
-        run(tmp_path, *ALL, content=content)
-    with pytest.raises(LogError, match=r"not from an earlier run on other.mcap, .*: result.json, .*tf.yaml, .*another"):
-        run(tmp_path, log="other.mcap")
-
-
-@pytest.mark.parametrize("name", [*ALL, ".written.json"])
-def test_what_cannot_be_recognised_is_refused(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", [*ALL, LIST_FILE, "detections.jsonl"])
+def test_what_cannot_be_recognised_is_never_replaced(name: str, tmp_path: Path) -> None:
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_bytes(b"somebody else's")
-    with pytest.raises(LogError, match=f"not from an earlier run on {LOG}, or were changed since: {name}. Give"):
-        run(tmp_path, name)
-    assert (tmp_path / name).read_bytes() == b"somebody else's"
-    assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 1
+    for replace in (False, True):
+        with pytest.raises(LogError, match=f"that no earlier calibration wrote there.*: {name}. Give another"):
+            run(tmp_path, name, replace=replace)
+    assert contents(tmp_path) == {name: b"somebody else's"}
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_a_foreign_or_changed_file_beside_known_ones_is_refused(name: str, tmp_path: Path) -> None:
+def test_a_foreign_or_changed_file_beside_known_ones_is_never_replaced(name: str, tmp_path: Path) -> None:
     run(tmp_path, *(other for other in ALL if other != name))
     (tmp_path / name).write_bytes(b"somebody else's")
-    with pytest.raises(LogError, match=f"since: {name}. Give"):
-        run(tmp_path)
+    with pytest.raises(LogError, match=f"was changed: {name}. Give"):
+        run(tmp_path, replace=True)
     (tmp_path / name).unlink()
-    run(tmp_path, name)
+    run(tmp_path, *ALL, replace=True)
     (tmp_path / name).write_bytes(b"changed")
-    with pytest.raises(LogError, match=f"since: {name}. Give"):
-        run(tmp_path)
-
-
-def test_a_result_of_the_log_does_not_excuse_what_is_beside_it(tmp_path: Path) -> None:
-    shutil.copy(GOLDEN / "result_version_3.json", tmp_path / "result.json")
-    (tmp_path / "tf.yaml").write_text("mine", encoding="utf-8")
-    with pytest.raises(LogError, match=r"since: result\.json, tf\.yaml\."):
-        run(tmp_path)
+    with pytest.raises(LogError, match=f"was changed: {name}. Give"):
+        run(tmp_path, replace=True)
 
 
 def test_a_link_and_a_folder_in_the_place_of_a_file_are_refused(tmp_path: Path) -> None:
     (tmp_path / "tf.yaml").symlink_to(tmp_path / "nothing")
     (tmp_path / "camchain.yaml").mkdir()
     (tmp_path / "plots").write_text("mine", encoding="utf-8")
-    with pytest.raises(LogError, match=r"since: tf\.yaml, camchain\.yaml, plots\."):
+    with pytest.raises(LogError, match=r"was changed: camchain\.yaml, plots, tf\.yaml\."):
         run(tmp_path)
 
 
-def test_an_interrupted_run_is_taken_up(tmp_path: Path) -> None:
-    def interrupted() -> None:
-        with replacing_output(tmp_path, LOG):
-            (tmp_path / "tf.yaml").write_text("half of the output", encoding="utf-8")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
+def test_an_unfinished_run_is_gone_on_with(tmp_path: Path) -> None:
+    """Also one that was killed in the middle of a file, when it could not bring its list up to date."""
+    interrupted(tmp_path, "tf.yaml")
+    (tmp_path / "result.json").write_bytes(b"written just before the end")
+    (tmp_path / "plots").mkdir(exist_ok=True)
+    for part in (".clean.mcap.123.part", "plots/.frames.png.123.part"):
+        (tmp_path / part).write_bytes(b"half")
+    with pytest.raises(LogError, match=rf"unfinished run on {LOG}, which is not other\.mcap.*Give {LOG}.*--force"):
+        run(tmp_path, *ALL, log="other.mcap")
+    assert (tmp_path / ".clean.mcap.123.part").exists()
     run(tmp_path, *ALL)
+    assert earlier_run(tmp_path) == (LOG, "finished")
+    assert not list(tmp_path.rglob("*.part"))
 
 
-def test_a_killed_run_is_taken_up_where_files_name_the_log(tmp_path: Path) -> None:
-    with replacing_output(tmp_path, LOG):
-        at_the_start = (tmp_path / ".written.json").read_bytes()
-        shutil.copy(GOLDEN / "result_version_3.json", tmp_path / "result.json")
-    (tmp_path / ".written.json").write_bytes(at_the_start)
-    run(tmp_path)
+def test_who_mended_the_inputs_of_a_run_that_failed_need_not_ask(tmp_path: Path) -> None:
+    interrupted(tmp_path, "detected.mcap", ends_with=LogError("a wrong rig file"))
+    assert contents(tmp_path).keys() == {LIST_FILE, "detected.mcap"}
+    run(tmp_path, *ALL, log="other.mcap")
+
+
+@pytest.mark.parametrize("error", [LogError("a wrong rig file"), KeyboardInterrupt(), ZeroDivisionError()])
+def test_an_empty_folder_is_not_left_behind(error: BaseException, tmp_path: Path) -> None:
+    interrupted(tmp_path / "new" / "folder", ends_with=error)
+    assert not list(tmp_path.iterdir())
+    interrupted(tmp_path, ends_with=error)
+    assert tmp_path.is_dir()  # it was there
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_log_itself_is_not_foreign(tmp_path: Path) -> None:
+    for name in ("detected.mcap", "cleaned.mcap"):
+        (tmp_path / name).write_bytes(b"a stage's log")
+    sources = tmp_path / "detected.mcap", tmp_path / "cleaned.mcap"
+    run(tmp_path, *(name for name in ALL if name != "detected.mcap"), sources=sources)
+    assert (tmp_path / "detected.mcap").read_bytes() == b"a stage's log"
+
+
+def test_files_of_single_stages_are_listed(tmp_path: Path) -> None:
+    (tmp_path / "tf.yaml").write_bytes(b"exported")
+    list_written(tmp_path, ["a.mcap", "b.mcap"], [tmp_path / "tf.yaml", tmp_path / "not_written"])
+    assert earlier_run(tmp_path) == ("a.mcap, b.mcap", "finished")
+    run(tmp_path, "tf.yaml", replace=True)
+
+
+def test_two_runs_at_once_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("fcntl")
+    with output_folder(tmp_path, LOG, replace=True), pytest.raises(LogError, match="another run is at work in this"):
+        run(tmp_path, replace=True)

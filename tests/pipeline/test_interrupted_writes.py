@@ -21,6 +21,7 @@ from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.all_stages import calibrate_log, solve_into
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.earlier_output import LIST_FILE, earlier_run
 from gtsam_rwhec.pipeline.log_contract import DETECTION_METADATA
 
 try:
@@ -34,7 +35,7 @@ def check_whole(folder: Path) -> None:
     for path in folder.rglob("*"):
         if path.is_dir():
             continue
-        assert path.name in WRITTEN | {"detected.mcap"} or path.parent.name == "plots", path
+        assert path.name in WRITTEN | {"detected.mcap", LIST_FILE} or path.parent.name == "plots", path
         if path.suffix == ".mcap":
             with open_log(path) as log:
                 assert not log.losses
@@ -45,7 +46,7 @@ def check_whole(folder: Path) -> None:
         elif path.suffix == ".png":
             assert cv2.imread(str(path)) is not None
         else:
-            assert path.read_bytes().endswith(b"\n")
+            assert path.read_bytes().endswith(b"}" if path.name == LIST_FILE else b"\n")
 
 
 @contextmanager
@@ -122,8 +123,10 @@ def test_a_calibration_that_ends_early_leaves_whole_files(
         assert re.search(rf"{re.escape(name)} cannot be written: No space left on device", str(caught.value))
     check_whole(tmp_path / "out")
     there = {path.name for path in (tmp_path / "out").iterdir()}
-    assert there - {"detected.mcap"} == WRITTEN | {"plots"}
+    assert there - {"detected.mcap"} == WRITTEN | {"plots", LIST_FILE}
     assert ("detected.mcap" in there) == (name == "clean.mcap")  # from which to go on
+    state = "unfinished" if kind is KeyboardInterrupt else "failed"  # the next run need not be told to replace it
+    assert earlier_run(tmp_path / "out") == ("raw.mcap", state)
     if name in before:
         assert (tmp_path / "out" / name).read_bytes() == before[name]
 
@@ -136,7 +139,7 @@ def test_an_interrupted_calibration_goes_on(tmp_path: Path) -> None:
     log, out = made.write(tmp_path / "raw.mcap", RECORDED), tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         calibrate_log(log, made.rig(), out, progress=interrupted)
-    assert {path.name for path in out.iterdir()} == {"detected.mcap"}
+    assert {path.name for path in out.iterdir()} == {"detected.mcap", LIST_FILE}
     check_whole(out)
     calibrate_log(out / "detected.mcap", None, out)
     check_whole(out)

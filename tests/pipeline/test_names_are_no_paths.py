@@ -14,6 +14,7 @@ from synthetic_logs import BEGIN_NS
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.logs import LogWriter
 from gtsam_rwhec.pipeline.all_stages import calibrate_log
+from gtsam_rwhec.pipeline.earlier_output import LIST_FILE
 from gtsam_rwhec.pipeline.log_contract import DETECTION_METADATA, RIG_METADATA
 
 TAG = f"{{type: tag, family: tag36h11, id: 0, size_m: {made.SIZE_M}}}"
@@ -55,5 +56,5 @@ def test_a_logs_names_are_no_paths(tmp_path: Path) -> None:
     calibrated = calibrate_log(log, made.rig(cam_0=f"detections: /{ELSEWHERE}/tags"), out)
     assert calibrated.log.detection.strangers == {f"{ELSEWHERE} {ELSEWHERE}": 1}
     assert [path for path in tmp_path.rglob("*") if path.is_file() and out not in path.parents] == [log]
-    assert {path.name for path in out.iterdir()} == WRITTEN | {"plots"}
+    assert {path.name for path in out.iterdir()} == WRITTEN | {"plots", LIST_FILE}
     assert all(path.suffix == ".png" for path in (out / "plots").iterdir())

@@ -216,9 +216,9 @@ def test_the_size_that_a_webp_states(size: tuple[int, int], options: tuple[int, 
 
 
 def test_few_large_images_are_decoded_together() -> None:
-    """Memory holds the pixels of a batch: each is black, has 16 megapixels and few bytes."""
-    camera = Camera.of(4096, 4096, "", [[3000.0, 0, 2048], [0, 3000, 2048], [0, 0, 1]], [], "test")
-    data = png(4096, 4096, depth=1)
+    """Memory holds the pixels of a batch: each is black, has 4 megapixels and few bytes."""
+    camera = Camera.of(2048, 2048, "", [[1500.0, 0, 1024], [0, 1500, 1024], [0, 0, 1]], [], "test")
+    data = png(2048, 2048, depth=1)
     images = [ImageRecord(i, i, "/cam", "cam", "png", data) for i in range(12)]
     together: list[int] = []
 

@@ -1,0 +1,197 @@
+"""What was detected so far, on disk: an interrupted run goes on from there.
+
+The file has one line for each batch of images, appended when the batch is done: a checksum and JSON. The first line has
+the inputs that the detections depend on, the last one says that no image is missing. A line that a killed run left torn
+has no right checksum: it is dropped, and its images are detected again. Arrays keep every bit.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.logs import ImageRecord
+from gtsam_rwhec.vision.detected import Detection, ImageDetections
+from gtsam_rwhec.vision.many_images import DetectedImage
+from gtsam_rwhec.vision.rejection import Rejection
+
+#: The kinds of objects that a line has, by the names that it has for them.
+_KINDS: dict[str, Any] = {kind.__name__: kind for kind in (DetectedImage, ImageDetections, Detection)}
+#: Arrays may have these types.
+_DTYPES = ("<f8", "<f4", "<i8", "<i4")
+
+
+class KeptDetections:
+    """The detections that a file keeps, and to which others are added.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it is made with the first batch.
+    inputs : mapping of str to str
+        What the detections depend on.
+    total : int
+        How many images there are.
+
+    Attributes
+    ----------
+    is_whole : bool
+        Whether no image is missing.
+    """
+
+    def __init__(self, path: Path, inputs: Mapping[str, str], total: int) -> None:
+        self.path = path
+        self.inputs = dict(inputs)
+        self.total = total
+        self.is_whole = False
+        #: Where the line of each batch begins, its length, and how many images it has.
+        self._places: dict[int, tuple[int, int, int]] = {}
+        self._stream: BinaryIO | None = None
+
+    @property
+    def done(self) -> int:
+        """How many images are kept."""
+        return sum(count for _, _, count in self._places.values())
+
+    def go_on(self) -> None:
+        """Find what the file keeps; what is behind its last whole line is cut off."""
+        with self.path.open("r+b") as stream:
+            end = len(stream.readline())
+            while line := stream.readline():
+                content = _content(line)
+                if content is None:
+                    break
+                if "batch" in content:
+                    self._places[int(content["batch"])] = end, len(line), int(content["count"])
+                else:
+                    self.is_whole = content.get("whole") == self.done
+                end += len(line)
+            stream.truncate(end)
+
+    def known(self, number: int, batch: Sequence[ImageRecord]) -> list[DetectedImage] | None:
+        """What was found in the batch of this number; None if it is not kept, or is of other images."""
+        if number not in self._places:
+            return None
+        found = self._read(number)
+        of_batch = [(image.topic, image.stamp_ns) for image in batch]
+        return found if [(image.topic, image.stamp_ns) for image in found] == of_batch else None
+
+    def all(self) -> Iterator[DetectedImage]:
+        """What was found in all images, in the order of the batches."""
+        for number in sorted(self._places):
+            yield from self._read(number)
+
+    def keep(self, number: int, found: list[DetectedImage]) -> None:
+        """Append what was found in the batch of this number."""
+        place = self._append({"batch": number, "count": len(found), "images": _plain(found)})
+        self._places[number] = *place, len(found)
+
+    def finish(self) -> None:
+        """Say that no image is missing."""
+        if self.done and not self.is_whole:
+            self._append({"whole": self.done})
+            self.is_whole = True
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def _append(self, content: Mapping[str, Any]) -> tuple[int, int]:
+        """Append a line; return where it begins, and its length."""
+        line = _line(content)
+        try:
+            if self._stream is None:
+                if not self.path.exists():
+                    write_atomically(self.path, _line({"inputs": self.inputs}))
+                self._stream = self.path.open("ab")
+            self._stream.write(line)
+            self._stream.flush()  # a killed process loses nothing that is flushed
+            return self._stream.tell() - len(line), len(line)
+        except OSError as error:
+            raise LogError(f"{self.path} cannot be written: {error.strerror}.") from error
+
+    def _read(self, number: int) -> list[DetectedImage]:
+        start, length, _ = self._places[number]
+        try:
+            with self.path.open("rb") as stream:
+                stream.seek(start)
+                content = _content(stream.read(length))
+            found: list[DetectedImage] = [] if content is None else _object(content["images"])
+        except (OSError, LookupError, TypeError, ValueError) as error:
+            raise LogError(f"{self.path} cannot be read: {error!r}. Remove this file, and start again") from error
+        return found
+
+
+def kept_inputs(path: Path) -> dict[str, str] | None:
+    """The inputs of the detections that a file keeps; None if there is no such file, or it keeps nothing."""
+    try:
+        with path.open("rb") as stream:
+            content = _content(stream.readline())
+    except OSError:
+        return None
+    inputs = None if content is None else content.get("inputs")
+    return inputs if isinstance(inputs, dict) else None
+
+
+def _line(content: Mapping[str, Any]) -> bytes:
+    text = json.dumps(content, separators=(",", ":")).encode()
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def _content(line: bytes) -> dict[str, Any] | None:
+    """The content of a line; None if it is torn."""
+    sum_, _, text = line.removesuffix(b"\n").partition(b" ")
+    if not line.endswith(b"\n") or sum_ != b"%08x" % zlib.crc32(text):
+        return None
+    content = json.loads(text)
+    return content if isinstance(content, dict) else None
+
+
+def _plain(value: Any) -> Any:
+    """An object in JSON's types."""
+    if isinstance(value, np.ndarray):
+        data = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
+        return {"array": base64.b64encode(data.tobytes()).decode(), "dtype": data.dtype.str, "shape": value.shape}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Rejection):
+        return {"rejection": value.value}
+    if type(value).__name__ in _KINDS:
+        of_object = {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+        return {"kind": type(value).__name__, "fields": of_object}
+    if isinstance(value, dict):
+        return {"items": [[_plain(key), _plain(of_key)] for key, of_key in value.items()]}
+    if isinstance(value, tuple):
+        return {"tuple": [_plain(each) for each in value]}
+    return [_plain(each) for each in value] if isinstance(value, list) else value
+
+
+def _object(plain: Any) -> Any:
+    """The object that `_plain` made this of."""
+    if isinstance(plain, list):
+        return [_object(each) for each in plain]
+    if not isinstance(plain, dict):
+        return plain
+    if "array" in plain:
+        if plain["dtype"] not in _DTYPES:
+            raise ValueError(f"an array of {plain['dtype']!r}")
+        data = np.frombuffer(base64.b64decode(plain["array"]), dtype=plain["dtype"])
+        return data.reshape(plain["shape"]).copy()
+    if "rejection" in plain:
+        return Rejection(plain["rejection"])
+    if "items" in plain:
+        return {_object(key): _object(of_key) for key, of_key in plain["items"]}
+    if "tuple" in plain:
+        return tuple(_object(each) for each in plain["tuple"])
+    return _KINDS[plain["kind"]](**{name: _object(of_name) for name, of_name in plain["fields"].items()})
