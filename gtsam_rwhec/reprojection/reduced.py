@@ -52,6 +52,19 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
+class _WithoutCarriers:
+    """H, h, r'F^-1 r and log |F| without the carriers' errors; K (I, 6, 6), K C / s^2 and K b / s^2."""
+
+    H: Array
+    h: Array
+    rr: float
+    log_det: float
+    K: Array
+    KC: Array
+    Kb: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Reduced:
     """Sums of the rows.
 
@@ -148,28 +161,15 @@ class Reduced:
         its variance (Patterson and Thompson's equations).
         """
         s2, S = noise.corner_px**2, noise.carrier
-        H, h, rr, log_det = self.G / s2, self.g / s2, self.rr / s2, self.count * np.log(s2)
-        if S is not None:
-            # K = D (I + D M D / s2)^-1 D, D = diag(S)
-            inner = np.eye(6) + self.M * S[:, None] * S / s2
-            root = np.linalg.inv(inner)
-            K = root * S[:, None] * S
-            KC, Kb = K @ self.C / s2, (K @ self.b[..., None])[..., 0] / s2
-            flat = self.C.reshape(-1, len(H))
-            H = H - flat.T @ KC.reshape(flat.shape) / s2
-            h = h - flat.T @ Kb.ravel() / s2
-            rr -= float((self.b * Kb).sum()) / s2
-            log_det += float(np.linalg.slogdet(inner)[1].sum())
-        H = H + np.diag(self.prior)
-        h = h + self.prior * self.prior_off
-        rr += float(self.prior @ self.prior_off**2)
+        at = self._without_carriers(noise)
+        H, h, K, KC, Kb = at.H, at.h, at.K, at.KC, at.Kb
         size = np.sqrt(np.maximum(np.diagonal(H), 1e-300))
         sign, log_H = np.linalg.slogdet(H / size[:, None] / size)
         if sign <= 0.0:
             return np.inf, np.zeros(3)
         inverse = np.linalg.inv(H / size[:, None] / size) / size[:, None] / size
         theta = -inverse @ h
-        value = rr + float(h @ theta) + log_det + log_H + 2.0 * float(np.log(size).sum())
+        value = at.rr + float(h @ theta) + at.log_det + log_H + 2.0 * float(np.log(size).sum())
         free = len(H) - float(self.prior @ np.diagonal(inverse))
         squares = self.rr + 2.0 * float(self.g @ theta) + float(theta @ self.G @ theta)
         gradient = np.zeros(3)
@@ -184,6 +184,28 @@ class Reduced:
             gradient[1:] = off[:3].sum(), off[3:].sum()
         gradient[0] = 2.0 * (self.count - squares / s2 - free)
         return value, gradient
+
+    def _without_carriers(self, noise: Noise) -> _WithoutCarriers:
+        s2, S = noise.corner_px**2, noise.carrier
+        H, h, rr, log_det = self.G / s2, self.g / s2, self.rr / s2, self.count * np.log(s2)
+        K, KC, Kb = np.zeros_like(self.M), np.zeros_like(self.C), np.zeros_like(self.b)
+        if S is not None:
+            # K = D (I + D M D / s2)^-1 D, D = diag(S)
+            inner = np.eye(6) + self.M * S[:, None] * S / s2
+            K = np.linalg.inv(inner) * S[:, None] * S
+            KC, Kb = K @ self.C / s2, (K @ self.b[..., None])[..., 0] / s2
+            flat = self.C.reshape(-1, len(H))
+            H = H - flat.T @ KC.reshape(flat.shape) / s2
+            h = h - flat.T @ Kb.ravel() / s2
+            rr -= float((self.b * Kb).sum()) / s2
+            log_det += float(np.linalg.slogdet(inner)[1].sum())
+        H = H + np.diag(self.prior)
+        h = h + self.prior * self.prior_off
+        return _WithoutCarriers(H, h, rr + float(self.prior @ self.prior_off**2), log_det, K, KC, Kb)
+
+    def information(self, noise: Noise) -> Array:
+        """The information (d, d) of theta under a noise, the carriers' errors eliminated."""
+        return self._without_carriers(noise).H
 
     def likeliest(self, start: Noise, *, carrier: bool = True) -> Noise:
         """The noise of greatest restricted likelihood; with `carrier` false, the carriers' noise is as it is."""

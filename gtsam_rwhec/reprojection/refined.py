@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+from scipy.special import chdtri, fdtri
 
-from gtsam_rwhec.errors import FrameError
+from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import is_real
 from gtsam_rwhec.reprojection.graph import CornerGraph
 from gtsam_rwhec.reprojection.model import Point
 from gtsam_rwhec.reprojection.reduced import Noise
@@ -81,6 +84,8 @@ class CornersRefined:
     noise : Noise
     joint : (d, d) array
         Covariance of all unknowns; right perturbations [omega, v] of poses, rad and m.
+    freedom : dict of (letter, name) to float
+        Degrees of freedom of each unknown's covariance, whose noise was estimated.
     left_out : dict of (target, sensor) to (V, n) booleans
         Corners that disagree with all others.
     graph : CornerGraph
@@ -100,6 +105,7 @@ class CornersRefined:
     noise: Noise
     joint: Array = field(repr=False)
     slots: Mapping[tuple[str, str], slice] = field(repr=False)
+    freedom: Mapping[tuple[str, str], float] = field(repr=False)
     left_out: dict[tuple[str, str], np.ndarray] = field(repr=False)
     graph: CornerGraph = field(repr=False)
     point: Point = field(repr=False)
@@ -124,6 +130,23 @@ class CornersRefined:
             at = self.slots[there[name]]
             rows += range(at.start, at.stop)
         return self.joint[np.ix_(rows, rows)]
+
+    def squared_radius(self, name: str, confidence: float = 0.95) -> float:
+        """The largest error' covariance^-1 error of an unknown inside its confidence ellipsoid: by an F quantile.
+
+        Raises
+        ------
+        FrameError
+            The name is none of the unknowns.
+        OptionError
+            The confidence is not between 0 and 1.
+        """
+        if not (is_real(confidence) and 0.0 < confidence < 1.0):
+            raise OptionError(f"confidence={brief(confidence)}; give one between 0 and 1")
+        dimension, freedom = len(self.covariance(name)), self.freedom[self.names[name]]
+        if np.isinf(freedom):
+            return float(chdtri(dimension, 1.0 - confidence))
+        return float(dimension * fdtri(dimension, freedom, confidence))
 
     @property
     def names(self) -> dict[str, tuple[str, str]]:

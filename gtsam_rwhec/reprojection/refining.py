@@ -14,6 +14,7 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.reprojection.corner_outliers import weights_of
+from gtsam_rwhec.reprojection.freedom import degrees_of_freedom
 from gtsam_rwhec.reprojection.graph import CornerGraph
 from gtsam_rwhec.reprojection.intrinsics import free_model, prior_of
 from gtsam_rwhec.reprojection.lens import camera_with, parameters_of
@@ -43,6 +44,7 @@ class _Settled:
     graph: CornerGraph
     joint: Array
     slots: Mapping[tuple[str, str], slice]
+    freedom: Mapping[tuple[str, str], float]
     iterations: int
     last_step: float
 
@@ -135,6 +137,7 @@ def refine_corners(
         noise=settled.noise,
         joint=settled.joint,
         slots=settled.slots,
+        freedom=settled.freedom,
         left_out={
             (stack.target, stack.sensor): stack.known & (weights == 0.0)
             for stack, weights in zip(stacks, settled.model.weights, strict=True)
@@ -171,7 +174,8 @@ def _settled(
             break
         model = replace(model, A_noise=noise.carrier, corner_px=noise.corner_px, weights=weights)
     joint, last_step = graph.covariance(values, reduced.slots)
-    return _Settled(model, point, noise, graph, joint, reduced.slots, iterations, last_step)
+    freedom = degrees_of_freedom(reduced, noise, carrier=options.carrier_noise == "estimate")
+    return _Settled(model, point, noise, graph, joint, reduced.slots, freedom, iterations, last_step)
 
 
 def _check_start(model: Model, point: Point) -> None:

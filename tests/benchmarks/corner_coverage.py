@@ -20,7 +20,6 @@ from bars import Row, benchmark_parser, print_rows
 from binomial import Share
 from loky import ProcessPoolExecutor
 from rwhec_factors import se3
-from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reprojection"))
 import simulated_cells
@@ -52,8 +51,8 @@ KINDS = {
 }
 
 
-def one(name: str, seed: int) -> dict[str, tuple[float, int]]:
-    """Squared deviations of the errors, and their number, by what is estimated."""
+def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
+    """Squared deviations of the errors, over the ellipsoid's and over their number, by what is estimated."""
     kind = KINDS[name]
     given = simulated_cells.cell(seed, stated=kind.drawn, carrier=kind.carrier, shape=(0.0, kind.warp_m, kind.warp_m))
     exact = kind.carrier == (0.0, 0.0)
@@ -73,7 +72,8 @@ def one(name: str, seed: int) -> dict[str, tuple[float, int]]:
     found = {}
     for what, (unknown, error) in errors.items():
         covariance = result.covariance(unknown)
-        found[what] = (float(error @ np.linalg.solve(covariance, error)), len(error))
+        squared = float(error @ np.linalg.solve(covariance, error))
+        found[what] = (squared / result.squared_radius(unknown, LEVEL), squared / len(error))
     return found
 
 
@@ -91,9 +91,9 @@ def main() -> int:
                 for what, each in found.items():
                     squares[what].append(each)
             for what, each in squares.items():
-                share = Share.of([square < chi2.ppf(LEVEL, number) for square, number in each])
+                share = Share.of([radius < 1.0 for radius, _ in each])
                 low, high = share.interval()
-                ratio = np.mean([square / number for square, number in each])
+                ratio = np.mean([ratio for _, ratio in each])
                 figure = f"{100 * share.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}], ratio {ratio:.2f}"
                 rows.append(Row(f"{name}: {what}", figure, "95 +- 1.5 %", share.meets(LEAST, MOST)))
     return print_rows("95 % ellipsoids of a refinement from corners", rows, store=given.store)

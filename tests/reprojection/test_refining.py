@@ -185,6 +185,18 @@ def test_names_and_options_are_checked() -> None:
             rw.CornerOptions(**wrong)  # type: ignore[arg-type]
 
 
+def test_ellipsoids_are_wider_where_the_carriers_noise_was_estimated_from_few_images() -> None:
+    few, many = (refined(cell(3, images=n, carrier=(1e-3, 5e-4))) for n in (12, 60))
+    known = refined(
+        cell(3, images=12, carrier=(1e-3, 5e-4)), rw.CornerOptions(carrier_noise=rw.CarrierNoise(1e-3, 5e-4))
+    )
+    chi_square = chi2.ppf(0.95, 6)
+    assert few.squared_radius("board") > many.squared_radius("board") > chi_square
+    assert known.squared_radius("board") == pytest.approx(chi_square, rel=0.02)
+    with pytest.raises(OptionError, match="between 0 and 1"):
+        few.squared_radius("board", 95.0)
+
+
 def test_an_innovation_counts_only_what_the_images_tell() -> None:
     prior, posterior = np.array([1.0, 1.0]), np.diag([0.01, 0.999])
     assert innovation_of(np.array([0.0, 100.0]), prior, posterior).probability == 1.0
