@@ -119,13 +119,14 @@ def _quaternions() -> list[Reading]:
     return found
 
 
+A_INVERTED = Reading(
+    Mistake.INVERTED,
+    "A is inverted (the poses of the base and the hand are exchanged)",
+    "give A = T_sensorcarrier_targetcarrier: the inverse of each pose in A",
+    _of_sides(("A",), _inverted),
+)
 _INVERTED = [
-    Reading(
-        Mistake.INVERTED,
-        "A is inverted (the poses of the base and the hand are exchanged)",
-        "give A = T_sensorcarrier_targetcarrier: the inverse of each pose in A",
-        _of_sides(("A",), _inverted),
-    ),
+    A_INVERTED,
     Reading(
         Mistake.INVERTED,
         "B is inverted",

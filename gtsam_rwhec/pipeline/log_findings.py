@@ -67,6 +67,16 @@ def _unless_carried(rig: Rig) -> str:
     return f"or, if {carriers.sensors} does carry the sensors, {cure}"
 
 
+def may_be_exchanged(rig: Rig, measurements: int) -> Finding:
+    """So few measurements that exchanged carriers, or another reading of the poses, would not show."""
+    place = rig.source.place(("carriers", "sensors"), ("carriers", "targets"))
+    return Finding(
+        Ground.NO_COVARIANCE,
+        f"{measurements} measurements are too few to tell whether the poses were read right, and whether `sensors` and "
+        f"`targets` are exchanged ({place}): measure at 10 poses or more",
+    )
+
+
 def with_cures(findings: Sequence[Finding], before: tuple[Misreading, ...], rig: Rig) -> tuple[Finding, ...]:
     """The findings, with the cures for a log in that of the misreadings."""
     said, now = Reading(before).finding, Reading(in_rig_file(before, rig)).finding

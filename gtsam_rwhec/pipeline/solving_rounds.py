@@ -12,6 +12,7 @@ import numpy as np
 
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.calibrating import calibrate
+from gtsam_rwhec.calibration.exchanged_carriers import exchange_of
 from gtsam_rwhec.calibration.misreadings import Misreading
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.reading import reading_of
@@ -86,14 +87,20 @@ class SolvingRounds:
         return marked
 
     def misreadings(self, given: SynchronisedPairs) -> tuple[Misreading, ...]:
-        """Likely misreadings of the poses of all measurements, before any is left out."""
+        """Likely misreadings of the poses of all measurements, before any is left out; at least exchanged carriers."""
         problem = problem_of(given.pairs, self.rig, given.offsets_s)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)
             try:
-                return reading_of(problem, solve(problem, progress=self.progress), self.progress).misreadings
+                found = reading_of(problem, solve(problem, progress=self.progress), self.progress).misreadings
             except ScaleError:
                 return ()
+            exchanged = exchange_of(problem).misreading if not found else None
+            return found if exchanged is None else (exchanged,)
+
+    def may_be_exchanged(self, given: SynchronisedPairs) -> bool:
+        """Whether the measurements are too few to tell that the carriers are not exchanged."""
+        return exchange_of(problem_of(given.pairs, self.rig, given.offsets_s)).is_open
 
     def at(self, pairs: Pairs, offsets_s: Mapping[str, float]) -> SynchronisedPairs:
         """The pairs with A at new time offsets. Pairs of sensors with a stated offset stay as they are."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.choices import OUTLIERS, Choice
 from gtsam_rwhec.calibration.outliers import Outliers
+from gtsam_rwhec.calibration.reading import Reading
 from gtsam_rwhec.calibration.verdict import Judgement, Verdict
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import LogError
@@ -23,6 +24,7 @@ from gtsam_rwhec.pipeline.log_findings import (
     in_rig_file,
     is_of_the_poses,
     known_to_nothing,
+    may_be_exchanged,
     not_of_late_clocks,
     not_of_marked_outliers,
     with_cures,
@@ -125,7 +127,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     late = late_clocks(given.pairs, motion.trajectory, rig, stated_s)
     sizes: tuple[SizeFields, ...] = ()
     free: set[str] = set()
-    is_misread = is_of_the_poses(rounds.misreadings(given))
+    before = rounds.misreadings(given)
+    is_misread = is_of_the_poses(before)
     if is_misread or late:
         settled = given  # outliers and sizes mean nothing where poses were misread, or are of another time
     else:
@@ -177,8 +180,14 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     if late:
         findings = not_of_late_clocks(findings, calibration.misreadings)
     findings = (*findings, *late, *estimated_sizes(fields.sizes, rig))
+    if is_misread and not calibration.misreadings:
+        found = Reading(in_rig_file(before, rig)).finding
+        findings = (*findings, *([found] if found is not None else []))
+        calibration = replace(calibration, misreadings=before)
     if not is_misread:  # a misreading makes cleaning remove measurements that are right
         findings = (*findings, *short_of_measurements(fields, poses_used(settled.pairs.values())))
+        if calibration.judgement.verdict is not Verdict.DO_NOT_USE and rounds.may_be_exchanged(settled):
+            findings = (*findings, may_be_exchanged(rig, sum(count.used for count in outliers)))
     if calibration.judgement.verdict is not Verdict.DO_NOT_USE:
         findings = (*findings, *known_to_nothing(calibration.points.values(), rig))
     judgement = judge(refined.solution, refined, fields, findings)
