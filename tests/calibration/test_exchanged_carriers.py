@@ -40,4 +40,3 @@ def test_three_stations_do_not_tell() -> None:
 def test_without_a_motion_that_tells_nothing_is_said() -> None:
     """Of many stations that hardly move either reading fits: that the poses are not determined is said elsewhere."""
     assert exchange_of(at_stations(30, exchanged=True, turn=1e-4)) == Exchange()
-    assert exchange_of(rw.Problem(keep_measurements=False)) == Exchange()
