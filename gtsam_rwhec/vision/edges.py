@@ -4,7 +4,8 @@ Blur rounds the right angle in a corner detector's window: all four corners move
 tag looks smaller and further away. A straight edge stays where it is under any symmetric blur. Therefore each side is
 found in profiles across it, a line is fitted to each side in undistorted coordinates, and the lines meet in the
 corners. The area under each profile gives a first place of the edge and needs no start; then a model of the edge's
-neighbours, which blur into it, gives the place (`edge_profiles`).
+neighbours, which blur into it, gives the place (`edge_profiles`). Last, the border's inner edges tell by how much all
+edges moved towards black or white, by a camera's gamma or by ink.
 """
 
 from __future__ import annotations
@@ -54,6 +55,15 @@ MOST_BLUR = 1.0
 MOST_LEFT = 0.15
 #: A profile is good only if its step is at least this share of the tag's step.
 LEAST_STEP = 0.5
+#: The inner edges of the border, beside the code's white cells, have this number of profiles for each cell, at these
+#: places in it.
+IN_CELL = np.array([0.35, 0.5, 0.65])
+#: A cell is white if its step is at least this share of the tag's.
+INNER_STEP = 0.7
+#: A tag's edges are corrected if at least this number of inner profiles is good.
+LEAST_INNER = 9
+#: At most this correction, in units of the blur: more is no gamma, and no ink.
+MOST_GROWN = 0.6
 #: A tag needs a step of at least this, in gray values.
 LEAST_GRAY = 8.0
 
@@ -101,8 +111,10 @@ def refine_corners(
     state = _Edges(corners, np.repeat(np.clip(np.nan_to_num(blur, nan=1.0), 0.5, 3.0)[:, None], 4, axis=1), None)
     for _ in range(MODEL_ROUNDS):
         state = _by_model(stack, image_of, state, camera, modules)
+    grown = _grown(stack, image_of, state, camera, modules)
     return RefinedCorners(
-        state.corners_px, np.where(np.isfinite(state.corners_px[:, 0, 0]), state.blur_px.max(axis=1), np.nan)
+        _moved_outwards(state, grown, camera),
+        np.where(np.isfinite(state.corners_px[:, 0, 0]), state.blur_px.max(axis=1), np.nan),
     )
 
 
@@ -172,20 +184,73 @@ def _corners(camera: Camera, edge: Array, good: np.ndarray) -> Array:
         return camera.pixels(crossings(lines_through(camera.undistort(edge), good, LEAST)))
 
 
+def _line(camera: Camera, H: Array, share: Array, y: float, inner: float) -> tuple[Array, Array, Array, Array]:
+    """Feet (N, 4, P, 2) on lines at y of unit squares, normals away from the line at `inner`, its distances (N, 4, P).
+
+    The last (N, 4, P, 2) are directions along the square's other sides, of length 1 along the normals.
+    """
+    foot, other = (camera.pixels(mapped(H, share, at)) for at in (y, inner))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = camera.pixels(mapped(H, share + 0.01, y)) - camera.pixels(mapped(H, share - 0.01, y))
+        along /= np.linalg.norm(along, axis=-1, keepdims=True)
+        normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+        module = np.einsum("nkpi,nkpi->nkp", foot - other, normal)
+        normal *= np.sign(module)[..., None]
+        module = np.clip(np.nan_to_num(np.abs(module), nan=1.0), 0.1, 1e3)
+    return (
+        foot,
+        normal,
+        module,
+        np.asarray((foot - other) / np.einsum("nkpi,nkpi->nkp", foot - other, normal)[..., None]),
+    )
+
+
+def _grown(stack: Gray, image_of: np.ndarray, edges: _Edges, camera: Camera, modules: int) -> Array:
+    """By how much (N,) white has grown into black, in units of the blur; 0 where it cannot be measured.
+
+    A camera's gamma makes the light side of a blurred edge wider, and ink spreads or does not reach: all edges move
+    towards black, or all towards white. The border is a module wide. Its inner edges, beside white cells, tell by how
+    much it looks thinner, without a model of either.
+    """
+    x = camera.undistort(edges.corners_px)
+    H = from_unit_square(np.stack([np.roll(x, -k, axis=1) for k in range(4)], axis=1))
+    share = ((np.arange(1, modules - 1)[:, None] + IN_CELL) / modules).ravel()
+    # From the border into the code, along the cells: across the edges of a slanted tag lie other cells.
+    foot, _, module, along = _line(camera, H, share, 1.0 / modules, 0.0)
+    blur = np.repeat(edges.blur_px[..., None], len(share), axis=2)
+    reach = np.minimum(MODEL_OUTWARDS * module, BLURS * blur + MORE_PX)[..., None]
+    places = reach * np.linspace(-1.0, 1.0, SAMPLES)
+    values = sampled(stack, image_of, foot[..., None, :] + places[..., None] * along[..., None, :])
+    assert edges.step is not None, "it follows the model"
+    step = np.asarray(np.maximum(edges.step, LEAST_GRAY))
+    fitted = fit_profiles(values, places, module, blur, np.broadcast_to(step[:, None, None], module.shape))
+    with np.errstate(invalid="ignore"):
+        good = (fitted.step > INNER_STEP * step[:, None, None]) & (fitted.rms < MOST_LEFT)
+        good &= np.abs(fitted.shift) < blur
+        inwards = np.where(good, fitted.shift / blur, np.inf).reshape(len(step), -1)
+    count = good.sum(axis=(1, 2))
+    # Outer edges move inwards as well, and with them the place where the inner ones are looked for.
+    found = -median(inwards, count) / (2.0 * (1.0 - 1.0 / modules))
+    return np.where((count >= LEAST_INNER) & (np.abs(found) < MOST_GROWN), found, 0.0)
+
+
+def _moved_outwards(edges: _Edges, grown: Array, camera: Camera) -> Array:
+    """Corners (N, 4, 2) of edges that are moved outwards by `grown` (N,) times their blur."""
+    share = np.linspace(*PART, LEAST)
+    x = camera.undistort(edges.corners_px)
+    H = from_unit_square(np.stack([np.roll(x, -k, axis=1) for k in range(4)], axis=1))
+    foot, normal, _, _ = _line(camera, H, share, 0.0, 0.5)
+    edge = foot + (grown[:, None] * edges.blur_px)[..., None, None] * normal
+    return _corners(camera, edge, np.ones(edge.shape[:3], dtype=bool))
+
+
 def _by_model(stack: Gray, image_of: np.ndarray, edges: _Edges, camera: Camera, modules: int) -> _Edges:
     """Refine edges that are right to a pixel, by one round of the model."""
     x = camera.undistort(edges.corners_px)
     # Each side gets the square whose first side it is.
     H = from_unit_square(np.stack([np.roll(x, -k, axis=1) for k in range(4)], axis=1))
     share = np.linspace(*PART, PROFILES)
-    foot, inner = (camera.pixels(mapped(H, share, y)) for y in (0.0, 1.0 / modules))  # (N, 4, P, 2)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        along = camera.pixels(mapped(H, share + 0.01, 0.0)) - camera.pixels(mapped(H, share - 0.01, 0.0))
-        along /= np.linalg.norm(along, axis=-1, keepdims=True)
-        normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-        module = np.einsum("nkpi,nkpi->nkp", foot - inner, normal)
-        normal *= np.sign(module)[..., None]
-        module = np.clip(np.nan_to_num(np.abs(module), nan=1.0), 0.1, 1e3)
+    foot, normal, module, _ = _line(camera, H, share, 0.0, 1.0 / modules)
     blur = np.repeat(edges.blur_px[..., None], PROFILES, axis=2)
     inwards, outwards = (
         np.minimum(reach * module, BLURS * blur + MORE_PX)[..., None] for reach in (MODEL_INWARDS, MODEL_OUTWARDS)

@@ -49,6 +49,17 @@ def outward(corners: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return ((corners - truth) * off / np.linalg.norm(off, axis=2, keepdims=True)).sum(axis=2)
 
 
+@pytest.mark.parametrize("gamma", [0.45, 0.7, 1.2])
+@pytest.mark.parametrize("blur_px", [0.6, 1.2])
+def test_gamma_does_not_move_corners(gamma: float, blur_px: float) -> None:
+    # Blur is of light, and a power of it has its edges elsewhere: by 0.3 pixels with 0.45.
+    images, truth = views(PINHOLE, 0.25, blur_px=blur_px, noise=0.0)
+    powers = [np.rint(255.0 * (image / 255.0) ** gamma).astype(np.uint8) for image in images]
+    found = refined(powers, disturbed(truth))
+    assert abs(outward(found.corners_px, truth).mean()) < 0.05
+    assert np.sqrt(((found.corners_px - truth) ** 2).mean()) < 0.04
+
+
 @pytest.mark.parametrize("blur_px", [0.5, 1.0, 1.5, 2.0])
 def test_blur_does_not_move_corners_as_it_does_for_corner_detectors(blur_px: float) -> None:
     images, truth = views(PINHOLE, 0.35, slant_deg=25.0, blur_px=blur_px)
@@ -82,7 +93,7 @@ def test_small_tags() -> None:
     images, truth = views(PINHOLE, 1.2, blur_px=0.6)  # 25 pixels: a module is three
     found = refined(images, disturbed(truth))
     assert np.linalg.norm(np.diff(truth, axis=1), axis=2).mean() < 27.0
-    assert abs(outward(found.corners_px, truth).mean()) < 0.03
+    assert abs(outward(found.corners_px, truth).mean()) < 0.05
     assert np.sqrt(((found.corners_px - truth) ** 2).mean()) < 0.05
 
 
