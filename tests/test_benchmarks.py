@@ -9,6 +9,7 @@ import sys
 import zlib
 from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 
 import cv2
@@ -161,6 +162,18 @@ def test_rendered_targets_are_counted_and_the_same_each_time(imported: Callable[
     assert not any(one.wrong for one in found)
     table = {row.what: row for row in boards.rows(found, boards.KINDS["checkerboard_3x4"]())}
     assert table["misread"].met
+
+
+def test_boards_of_the_workcell_are_compared_with_the_joint_solution(
+    imported: Callable[[str], ModuleType], workcell_camera2: Path
+) -> None:
+    workcell = imported("workcell")
+    names = sorted(path.stem for path in (workcell_camera2 / "image").glob("*.png"))[::3]
+    images = {name: workcell.decoded((workcell_camera2 / "image" / f"{name}.png").read_bytes()) for name in names}
+    workcell.FOLDER = workcell_camera2
+    off = workcell.off_the_joint_solution(workcell.the_camera(), images)
+    assert {name for name in off if not np.isfinite(off[name])} == set(names) & set(workcell.WITHOUT_A_BOARD)
+    assert max(value for value in off.values() if np.isfinite(value)) < workcell.WRONG_PX
 
 
 def test_what_is_drawn_is_where_the_truth_says(imported: Callable[[str], ModuleType]) -> None:

@@ -37,6 +37,8 @@ OF_SQUARE = (0.4, 0.25)
 #: Before they are measured, corners are off their places in a plane by at most this (pixels), or by this share of the
 #: distance between lines: a shadow's edge moves them.
 ROUGHLY_PX, ROUGHLY = 1.0, 0.06
+#: Corners that are not sharp do not count if at least this share is.
+LEAST_SHARP = 0.5
 #: Images are halved this often before saddles are looked for: sharp corners first, blurred ones in what is smaller.
 LEVELS = (1, 2)
 #: At most this number of regions of an image are searched.
@@ -151,9 +153,9 @@ def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundBoard:
         step = smallest_step(grid)
         rough = refined_corners(gray, grid.reshape(-1, 2), int(np.clip(share * step, 2, 9))).reshape(grid.shape)
         tried.append(_measured(gray, rough, max(ROUGHLY_PX, ROUGHLY * step), camera))
-        if tried[-1][1].rejection is not Rejection.NOT_A_GRID and tried[-1][1].kept.all():
+        if tried[-1][1].rejection is not Rejection.NOT_A_GRID:
             break
-    refined, seen = max(tried, key=lambda one: (one[1].rejection is None, int(one[1].kept.sum())))
+    refined, seen = tried[-1]
     kept = seen.kept
     if not seen.first_is_dark:
         refined, kept = _other_colour(refined), _other_colour(kept)
@@ -168,7 +170,9 @@ def _measured(gray: Gray, rough: Array, most_px: float, camera: Camera | None) -
     if found is None or (found[1] <= most_px).mean() < LEAST_KEPT:
         return rough, Evidence(Rejection.NOT_A_GRID, everyone)
     fitted = fitted_corners(gray, found[0].pixels, rows, columns)
-    return fitted.corners_px, evidence(gray, fitted.corners_px, camera, fitted.good)
+    seen = evidence(gray, fitted.corners_px, camera, fitted.good)
+    sharp = seen.kept & fitted.sharp
+    return fitted.corners_px, replace(seen, kept=sharp) if sharp.mean() >= LEAST_SHARP else seen
 
 
 def _other_colour(grid: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 Where the plane of the board is known roughly, so are the edges' directions and their curves under the lens, and the
 window can follow the squares: an edge is used over three quarters of a square on each side of the corner, where a
 corner detector's window takes a fraction. Light changes linearly in the model, apart for paper and ink. What does not
-fit, as a shadow's edge, weighs little; a corner where much does not fit is not good.
+fit, as a shadow's edge, weighs little; a corner where much does not fit is not sharp.
 """
 
 from __future__ import annotations
@@ -33,17 +33,32 @@ MOST_STEP = 0.1
 MOST_MOVED = 0.3
 #: A residual of this share of half the contrast, or of this many times the residuals' mean size, weighs a quarter.
 OUTLYING, OUTLYING_MEANS = 0.08, 3.0
-#: Residuals' root mean square over half the contrast is at most this, or at most this many times the board's median
-#: (noise is in all windows, and a shadow's edge in a few), and never over `MOST_LEFT`.
-LEFT, LEFT_MEDIANS, MOST_LEFT = 0.1, 2.0, 0.5
+#: Residuals' root mean square over half the contrast is at most this.
+MOST_LEFT = 0.5
+#: Of a sharp corner it is at most this, or at most this many times the board's median: noise is in all windows, and a
+#: shadow's edge in a few.
+LEFT, LEFT_MEDIANS = 0.1, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class FittedCorners:
-    """Corners (rows, columns, 2), pixels, which of them (rows, columns) the model explains, and the blur."""
+    """Corners of a board.
+
+    Attributes
+    ----------
+    corners_px : (rows, columns, 2) array
+        Pixels.
+    good : (rows, columns) array of bool
+        Whether there is a corner, near where it was expected.
+    sharp : (rows, columns) array of bool
+        Whether the model explains all about it: the other good ones may be some tenths of a pixel off.
+    blur_px : (rows, columns) array
+        Standard deviation of the blur, pixels.
+    """
 
     corners_px: Array
     good: np.ndarray
+    sharp: np.ndarray
     blur_px: Array
 
 
@@ -69,10 +84,13 @@ def fitted_corners(gray: Gray, on_image: Callable[[Array], Array], rows: int, co
         good &= (np.abs(at + place - first) < MOST_MOVED).all(axis=1) & fit.inside.any(axis=1)
         at, sigma = np.where(good[:, None], at + place, first), fit.sigma
     usual = float(np.median(fit.left))
-    good &= fit.left <= min(max(LEFT, LEFT_MEDIANS * usual), MOST_LEFT)
+    good &= fit.left <= MOST_LEFT
+    sharp = good & (fit.left <= max(LEFT, LEFT_MEDIANS * usual))
     shape = (rows, columns)
     blur = np.sqrt(np.prod(fit.sigma / fit.slope, axis=1))
-    return FittedCorners(on_image(at).reshape(*shape, 2), good.reshape(shape), blur.reshape(shape))
+    return FittedCorners(
+        on_image(at).reshape(*shape, 2), good.reshape(shape), sharp.reshape(shape), blur.reshape(shape)
+    )
 
 
 def _started(gray: Gray, on_image: Callable[[Array], Array], at: Array, sigma: Array | None) -> _Fit:

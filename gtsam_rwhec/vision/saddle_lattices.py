@@ -19,6 +19,8 @@ from gtsam_rwhec.vision.saddles import Saddles
 
 #: A first neighbour is at most this far beside an edge's direction (radians), and among this number of nearest saddles.
 BESIDE_RAD, NEAREST = 0.35, 12
+#: Corners are at least this far apart (pixels of the level).
+LEAST_STEP_PX = 2.5
 #: A saddle is at most this share of the smaller step from where the lattice goes on.
 OFF = 0.3
 #: A lattice has at least this share of a board's corners, and this number of them.
@@ -69,7 +71,8 @@ def _grown(saddles: Saddles, members: np.ndarray, apart: Array, start: int) -> d
     """Places in `members` by their steps from `start`; empty where it has no neighbour along each of its edges."""
     places, edges = saddles.places[members], saddles.edges[members]
     light = saddles.light[members]
-    nearest = np.argsort(apart[start])[1 : NEAREST + 1]
+    nearest = np.argsort(apart[start])[: NEAREST + 1]
+    nearest = nearest[apart[start][nearest] > LEAST_STEP_PX]
     first: list[Array] = []
     for along in edges[start]:
         away = places[nearest] - places[start]

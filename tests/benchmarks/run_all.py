@@ -40,6 +40,7 @@ import real_dataset
 import single_pairs
 import start_time
 import vision_rate
+import workcell
 import world_origin
 from bars import Row, benchmark_parser, print_rows
 from kinhec_sequences import STANDARD_SEED
@@ -131,6 +132,7 @@ def parts(sizes: Sizes, plot: Path | None) -> dict[str, Callable[[], list[Row]]]
         "time of rw.calibrate": lambda: calibrate_times.rows(sizes.few_repetitions),
         "from camera images": lambda: camera_logs.rows(sizes.log_poses),
         "images a second": lambda: vision_rate.rows(max(1, sizes.few_repetitions // 2), sizes.bare_loop_s),
+        "a real workcell": lambda: workcell.rows(sizes.few_repetitions),
         "wrong detections": lambda: corrupted_detections.rows(sizes.corrupted_seeds),
         "our own code against libraries": lambda: own_code_against_libraries.rows(sizes.log_messages),
     }
@@ -141,6 +143,8 @@ def cannot_run() -> dict[str, str]:
     lacking = {}
     if find_spec("scs") is None:
         lacking["real dataset against SCS"] = "scs"
+    if not workcell.FOLDER.is_dir():
+        lacking["a real workcell"] = "GTSAM_RWHEC_DATA, the folder that holds workcell_camera2"
     if not hasattr(cv2, "calibrateRobotWorldHandEye"):
         for name in ("one X, one Y, against OpenCV", "OpenCV's hand-eye methods"):
             lacking[name] = "opencv-python-headless<5"
