@@ -85,6 +85,11 @@ def convert(
             said = f"{images} images and {number} poses"
         else:
             refuse(context, NOT_FOR_A_BAG)
+            if rw.logs.is_samples_file(source):
+                raise LogError(
+                    f"{source}: samples of a hand-eye tool become a log with --rig FILE, whose carriers have poses: "
+                    "{frames: [base, hand]}. Without one, gtsam-rwhec calibrate reads them as they are"
+                )
             if rw.logs.is_image_folder(source):
                 raise LogError(
                     f"{source} is a folder of images. Name the file with the robot's poses as well: --poses FILE; or "

@@ -24,6 +24,7 @@ from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.progress import Counted, Progress, silent
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.logs.hand_eye_samples import is_samples_file
 from gtsam_rwhec.logs.image_folder import FORMATS, LARGEST_IMAGE
 from gtsam_rwhec.logs.matched_images import SAME_POSE, image_stamps, images_in, match, pose_stamps
 from gtsam_rwhec.logs.mcap_writer import LogWriter
@@ -59,7 +60,13 @@ def is_folder_of_images(path: object, rig: Rig | None) -> bool:
 
 
 def check_is_no_other_folder(path: object, rig: Rig | None) -> None:
-    """Refuse a folder that has no log, with a rig file of a log; a `LogError` says what to write."""
+    """Refuse a folder without a log, and samples, with a rig file of a log; a `LogError` says what to write."""
+    if rig is not None and rig.carriers.poses.frames is None and is_samples_file(path):
+        parent, child = rig.carriers.poses.parent_and_child
+        raise LogError(
+            f"{path} is no log, and {rig.source.place(('carriers', 'poses'))} is of a log. For samples of a hand-eye "
+            f"tool write poses: {{frames: [{parent}, {child}]}}, and detections: /samples for the one sensor"
+        )
     if rig is None or not isinstance(path, str | Path) or not Path(path).is_dir() or is_folder_of_images(path, rig):
         return
     if not any(Path(path).glob("*.mcap")):

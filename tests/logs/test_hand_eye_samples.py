@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import sample_files
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import damaged
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs.hand_eye_samples import read_hand_eye_samples
 
+POSE = {"translation": {"x": 1, "y": 2, "z": 3}, "rotation": {"x": 0, "y": 0, "z": 0.6, "w": 0.8}}
 WRITERS = {
     "moveit.yaml": sample_files.moveit,
     "take_sample.yaml": sample_files.easy_handeye,
@@ -77,3 +82,27 @@ def test_millimetres_and_norms_are_found_when_samples_are_read(tmp_path: Path) -
     (tmp_path / "a.yaml").write_text(text.replace("w: 0", "w: 1", 1))
     with pytest.raises(LogError, match=r"a\.yaml, line \d+: samples.hand_world_samples\[0\]: quaternion .* has norm"):
         read_hand_eye_samples(tmp_path / "a.yaml")
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    text=st.text(alphabet="[]{}:,- \n1.e-x", max_size=60).map(
+        lambda part: f"- {{effector_wrt_world: {part}, object_wrt_sensor: [1]}}\n"
+    )
+    | damaged([json.dumps({"samples": [{"robot": POSE, "tracking": POSE}] * 2}).encode()]).map(
+        lambda content: content.decode(errors="replace")
+    )
+    | damaged([b'{"R_gripper2base": [[1,0,0,0,1,0,0,0,1]], "t_gripper2base": [[1,2,3]], "rvec_target2cam": [[1,2,3]], '
+               b'"tvec_target2cam": [[1,2,3]]}']).map(lambda content: content.decode(errors="replace"))
+)  # fmt: skip
+def test_any_file_gives_samples_or_an_error_of_ours(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.getbasetemp() / "any_samples.yaml"
+    path.write_text(text)
+    try:
+        found = read_hand_eye_samples(path)
+    except LogError as error:
+        assert path.name in str(error)  # noqa: PT017
+        assert len(str(error)) < 2000  # noqa: PT017
+    else:
+        assert np.isfinite(found.robot).all()
+        assert np.isfinite(found.B).all()

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 import sample_files
-from test_commands import run
+from typer.testing import CliRunner
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.pipeline.samples_log import samples_problem
 from gtsam_rwhec.rig.rig_file import parse_rig
@@ -59,14 +61,37 @@ def test_samples_that_tell_no_setup_are_refused(tmp_path: Path) -> None:
         samples_problem(path)
 
 
+def command(*arguments: object, status: int = 0) -> str:
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exit_code == status, done.output
+    return " ".join(done.output.split())
+
+
 def test_one_command_from_samples_to_a_result(tmp_path: Path) -> None:
     hands, B, _, Y = sample_files.rig_poses(on_hand=True)
     path = sample_files.moveit(tmp_path / "samples.yaml", hands, B)
-    done = run("calibrate", path, "-o", tmp_path / "result.json")
-    assert "14 samples of MoveIt; the robot's poses were read as T_base_hand" in done.stderr
+    said = command("calibrate", path, "-o", tmp_path / "result.json")
+    assert "14 samples of MoveIt; the robot's poses were read as T_base_hand" in said
     found = rw.read_refined(tmp_path / "result.json")
     np.testing.assert_allclose(found.Y["camera"].matrix(), Y, atol=3e-3)
-    run("calibrate", path, "-o", tmp_path / "result.json", "--scale", "shared", status=2)
+
+
+def test_commands_that_do_not_fit_samples(tmp_path: Path) -> None:
+    hands, B, _, _ = sample_files.rig_poses(on_hand=True)
+    path = sample_files.moveit(tmp_path / "samples.yaml", hands, B)
+    of_a_log = tmp_path / "rig.yaml"
+    of_a_log.write_text(RIG.format(sensors="hand", targets="base", source="detections: /t").replace("frames", "tf"))
+    assert "--scale: not for samples" in command("calibrate", path, "--scale", "shared", status=2)
+    assert "become a log with --rig FILE" in command("convert", path, "-o", tmp_path / "a.mcap", status=2)
+    said = command("calibrate", path, "--rig", of_a_log, "-o", tmp_path / "out", status=2)
+    assert "write poses: {frames: [base, hand]}, and detections: /samples" in said
+    described = tmp_path / "samples_rig.yaml"
+    described.write_text(RIG.format(sensors="hand", targets="base", source="detections: /samples"))
+    said = command("convert", path, "--rig", described, "-o", tmp_path / "a.mcap")
+    assert "14 samples of MoveIt" in said
+    with rw.logs.open_log(tmp_path / "a.mcap") as log:
+        kinds = Counter(type(record).__name__ for record in log.records())
+    assert kinds == {"PoseRecord": 14, "DetectionRecord": 14}
 
 
 def test_with_a_rig_file_as_any_log(tmp_path: Path) -> None:
