@@ -48,6 +48,8 @@ class Ground(StrEnum):
 
     #: The measurements fit far better when they are read in another way.
     MISREAD = "misread"
+    #: The corners of a sensor's boards contradict its stated intrinsics, by so much that poses are wrong.
+    INTRINSICS_DOUBTED = "intrinsics_doubted"
     #: The residuals are larger than any noise of measurement.
     IMPLAUSIBLE = "implausible"
     #: The scale at the optimum is not positive, so there is no answer.
@@ -72,6 +74,8 @@ class Ground(StrEnum):
     NO_COVARIANCE = "no_covariance"
     #: Most measurements of a target were left out as outliers; the sensors' poses rest on other targets.
     TARGET_CONTRADICTED = "target_contradicted"
+    #: The corners of a sensor's boards fit its stated intrinsics badly.
+    INTRINSICS_UNCERTAIN = "intrinsics_uncertain"
     #: The stated size of a target fits the motion badly.
     SIZE_UNCERTAIN = "size_uncertain"
     #: A stated pose fits the measurements badly.
@@ -108,6 +112,7 @@ class Ground(StrEnum):
 
 _CARE = (
     Ground.TARGET_CONTRADICTED,
+    Ground.INTRINSICS_UNCERTAIN,
     Ground.SIZE_UNCERTAIN,
     Ground.POSE_UNCERTAIN,
     Ground.FEW_MEASUREMENTS,
@@ -133,8 +138,21 @@ _MADE_BY_A_MISREADING = frozenset({
 #: A wrong size, a wrong pose, what moved and a late clock make errors that vary with the configuration, and in time.
 _MISTAKES = frozenset({Ground.POSE_DOUBTED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED})
 _MADE_BY_A_MISTAKE = frozenset({Ground.CORRELATED, Ground.SYSTEMATIC})
+#: Wrong focal lengths make sizes look wrong, and errors that vary with where a board is seen.
+_MADE_BY_INTRINSICS = frozenset({
+    Ground.SIZE_DOUBTED,
+    Ground.SIZE_ESTIMATED,
+    Ground.SIZE_UNCERTAIN,
+    Ground.CORRELATED,
+    Ground.SYSTEMATIC,
+})  # fmt: skip
+_CALIBRATE_INTRINSICS = (
+    "calibrate the intrinsics of the named sensor with its distortion (cv2.calibrateCamera, Kalibr, ROS's "
+    "camera_calibration) at this resolution, and state them in place of the stated ones"
+)
 _ADVICE = {
     Ground.MISREAD: "correct how the file is read, and calibrate again",
+    Ground.INTRINSICS_DOUBTED: _CALIBRATE_INTRINSICS,
     Ground.IMPLAUSIBLE: (
         "check that A = T_sensorcarrier_targetcarrier and B = T_sensor_target, the order of the quaternions, the "
         "units, and that A and B are of the same instants"
@@ -168,6 +186,7 @@ _ADVICE = {
     Ground.TARGET_CONTRADICTED: (
         "do not use the pose of the named target; check whether it has moved, and measure it again"
     ),
+    Ground.INTRINSICS_UNCERTAIN: _CALIBRATE_INTRINSICS,
     Ground.SIZE_UNCERTAIN: (
         'measure the named target with a caliper, or let its size be estimated: rw.Problem(scale="per_target") or '
         "--scale per_target (in a rig file: sizes: estimate)"
@@ -235,7 +254,7 @@ class Judgement:
         """The judgement that some findings lead to; without any, ``praise`` is why the poses are to be used.
 
         What a mistake makes is no ground beside it: what a misreading leaves undetermined says nothing of the motion,
-        and errors that a wrong size or a late clock make say nothing of the arm.
+        and errors that a wrong size, wrong intrinsics or a late clock make say nothing of the arm.
         """
         found = frozenset(finding.ground for finding in findings)
         made: frozenset[Ground] = frozenset()
@@ -243,6 +262,8 @@ class Judgement:
             made |= _MADE_BY_A_MISREADING
         if found & _MISTAKES:
             made |= _MADE_BY_A_MISTAKE
+        if Ground.INTRINSICS_DOUBTED in found:
+            made |= _MADE_BY_INTRINSICS
         if Ground.NOT_UNIQUE in found:  # how well poses are known that are not determined is no question
             made |= {Ground.NO_COVARIANCE}
         findings = [finding for finding in findings if finding.ground not in made]

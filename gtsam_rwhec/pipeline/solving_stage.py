@@ -18,6 +18,7 @@ from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
 from gtsam_rwhec.pipeline.clocks_by_turning import late_clocks
+from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics
 from gtsam_rwhec.pipeline.log_contract import CLEANING_METADATA
 from gtsam_rwhec.pipeline.log_findings import (
     estimated_sizes,
@@ -114,6 +115,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         if not used_sensors:
             raise LogError(f"{clean_path}: it has no usable pair of measurements")
         motion = read_carrier_motion(log, rig)
+        of_intrinsics = doubted_intrinsics(log, rig, metadata.cameras)
     estimated = tuple(
         name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used_sensors
     )
@@ -179,7 +181,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         findings = not_of_marked_outliers(findings)
     if late:
         findings = not_of_late_clocks(findings, calibration.misreadings)
-    findings = (*findings, *late, *estimated_sizes(fields.sizes, rig))
+    findings = (*of_intrinsics, *findings, *late, *estimated_sizes(fields.sizes, rig))
     if is_misread and not calibration.misreadings:
         found = Reading(in_rig_file(before, rig)).finding
         findings = (*findings, *([found] if found is not None else []))

@@ -71,8 +71,10 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
             f"The time offset of {', '.join(given)} was not estimated. If the clock may be late, write time_offset: "
             "estimate in the rig file. Wrong intrinsics show like this, too."
         )
-    said = judgement is not None and bool(SIZES.intersection(judgement.grounds))
-    advice += _sizes(log, judgement.reason if judgement is not None and said else "")
+    grounds = () if judgement is None else judgement.grounds
+    said = judgement is not None and bool(SIZES.intersection(grounds))
+    if Ground.INTRINSICS_DOUBTED not in grounds:  # with wrong focal lengths sizes say nothing
+        advice += _sizes(log, judgement.reason if judgement is not None and said else "")
     if log.detection.strangers:
         names = [f"{name} ({count} times)" for name, count in list(log.detection.strangers.items())[:MOST_NAMED]]
         advice.append(f"The images show tags that the rig file does not name: {', '.join(names)}.")

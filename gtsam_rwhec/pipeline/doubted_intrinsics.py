@@ -1,0 +1,59 @@
+"""Stated intrinsics that the corners of a log's boards contradict: named before a size, an arm or a clock is blamed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.logs import DetectionRecord, Log
+from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.intrinsics_evidence import (
+    LEAST_CORNERS,
+    IntrinsicsEvidence,
+    View,
+    evidence_of_intrinsics,
+)
+
+
+def doubted_intrinsics(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tuple[Finding, ...]:
+    """What the corners of the detections in a log say against the intrinsics of its sensors.
+
+    Sensors without intrinsics, and those whose targets have few corners (single tags), are not judged.
+    """
+    corners = {target.name: target.corners() for target in rig.target_list}
+    boards = {name: points for name, points in corners.items() if len(points) >= LEAST_CORNERS}
+    findings = []
+    for sensor, camera in cameras.items():
+        if not boards or sensor not in rig.sensors:
+            continue
+        views = [
+            View(boards[record.id][list(record.corner_indices)], record.corners_px, record.T_camera_tag)
+            for record in records_of(log, [detections_topic(sensor)], DetectionRecord)
+            if not record.reason
+            and record.id in boards
+            and record.corners_px is not None
+            and record.corner_indices is not None
+            and record.T_camera_tag is not None
+        ]
+        found = evidence_of_intrinsics(camera, views)
+        if found is not None and found.contradicts:
+            findings.append(_finding(sensor, found, rig))
+    return tuple(findings)
+
+
+def _finding(sensor: str, found: IntrinsicsEvidence, rig: Rig) -> Finding:
+    def numbers(camera: Camera) -> str:
+        K = np.rint(camera.K).astype(int)
+        return f"fx, fy = {K[0, 0]}, {K[1, 1]} and cx, cy = {K[0, 2]}, {K[1, 2]}"
+
+    give_or_take = f"standard deviations {found.sigma[:2].max():.2g} and {found.sigma[2:].max():.2g} px"
+    words = (
+        f"the intrinsics of {sensor} ({rig.source.place(('sensors', sensor, 'intrinsics'))}) do not fit its corners: "
+        f"{numbers(found.stated)}, as stated, leave {found.stated_px:.2f} px rms in {found.views} images, and "
+        f"{numbers(found.fitted)} would leave {found.fitted_px:.2f} px ({give_or_take})"
+    )
+    return Finding(Ground.INTRINSICS_DOUBTED if found.is_far_off else Ground.INTRINSICS_UNCERTAIN, words)

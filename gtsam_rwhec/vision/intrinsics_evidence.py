@@ -1,0 +1,219 @@
+"""Whether the corners of a plane, seen from many sides, fit the stated intrinsics: Zhang's test, with known distortion.
+
+A view of a plane has eight numbers, and its pose takes six: two are left that say something of the intrinsics (Zhang
+2000, section 2.3). Focal lengths and principal point are estimated with all poses, from what is stated as a nominal
+prior (3 % and 30 pixels). The change counts by the scatter between the views too, since errors of one view's corners
+are alike where a board is bent or the lens has a distortion that was not stated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from rwhec_factors import se3
+from scipy import stats
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.vision.camera import Camera
+
+#: With fewer views nothing is said; a view needs this number of corners.
+LEAST_VIEWS, LEAST_CORNERS = 8, 8
+#: Of more views, this number is taken, evenly over the track.
+MOST_VIEWS = 40
+#: Nominal intrinsics: the focal length's share, and pixels of the principal point.
+NOMINAL_SHARE, NOMINAL_PX = 0.03, 30.0
+#: Where the stated numbers contradict the corners, the prior is this many times as wide.
+WIDER = 10.0
+#: Views are different if the board is turned by this angle (radians), or moved by this share of its distance.
+APART = 0.03
+#: Corners have at least this standard deviation, pixels.
+LEAST_PX = 0.02
+#: Rounds of Gauss-Newton; it ends when no intrinsic number changes by more than `SETTLED_PX`.
+ROUNDS, SETTLED_PX = 30, 1e-3
+#: Shares of a step that are tried, until the cost is smaller.
+SHARES = (1.0, 0.5, 0.25, 0.1, 0.02)
+#: The stated intrinsics do not fit if the scatter between views explains the change with at most this probability, and
+#: residuals are larger by at least this factor, and by this much (pixels, in squares).
+LEAST_PROBABILITY, LARGER, LARGER_PX = 1e-4, 1.08, 0.02
+#: A change by more than this share of the focal length, beyond two standard deviations, makes poses useless.
+USELESS = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Corners of a plane in an image: their places (n, 3), metres, z = 0; pixels (n, 2); T_camera_target (4, 4)."""
+
+    corners_m: Array
+    corners_px: Array
+    T: Array
+
+
+@dataclass(frozen=True, eq=False)
+class IntrinsicsEvidence:
+    """What the corners of a sensor say about its stated intrinsics.
+
+    Attributes
+    ----------
+    stated, fitted : Camera
+        The distortion is the same.
+    sigma : (4,) array
+        Standard deviations of the fitted fx, fy, cx, cy, pixels.
+    stated_px, fitted_px : float
+        Root mean squares of the reprojection errors, pixels, each with the poses that fit best.
+    probability : float
+        That right intrinsics lead to so large a change.
+    views : int
+    """
+
+    stated: Camera
+    fitted: Camera
+    sigma: Array
+    stated_px: float
+    fitted_px: float
+    probability: float
+    views: int
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the stated intrinsics do not fit the corners."""
+        excess = self.stated_px**2 - self.fitted_px**2
+        return (
+            self.probability < LEAST_PROBABILITY and self.stated_px > LARGER * self.fitted_px and excess > LARGER_PX**2
+        )
+
+    @property
+    def is_far_off(self) -> bool:
+        """Whether a number is so far off that poses are wrong by more than `USELESS` of a distance."""
+        change = np.abs(_numbers(self.fitted) - _numbers(self.stated)) - 2.0 * self.sigma
+        return bool((change > USELESS * self.stated.K[0, 0]).any())
+
+
+def evidence_of_intrinsics(camera: Camera, views: Sequence[View]) -> IntrinsicsEvidence | None:
+    """Fit focal lengths and principal point to the views of planes; None if they are too few, or no fit is found."""
+    views = _apart([view for view in views if len(view.corners_px) >= LEAST_CORNERS])
+    if len(views) < LEAST_VIEWS:
+        return None
+    most = max(len(view.corners_px) for view in views)
+    p, u = np.zeros((len(views), most, 3)), np.zeros((len(views), most, 2))
+    known = np.zeros((len(views), most), dtype=bool)
+    for i, view in enumerate(views):
+        n = len(view.corners_px)
+        p[i, :n], u[i, :n], known[i, :n] = view.corners_m, view.corners_px, True
+    T = np.array([view.T for view in views])
+    stated = _fitted(camera, T, p, u, known, free=0.0)
+    fitted = None if stated is None else _fitted(camera, stated.T, p, u, known, free=1.0)
+    if stated is None or fitted is None:
+        return None
+    found = _compared(camera, stated, fitted, len(views), int(known.sum()))
+    if found.contradicts:  # then the stated numbers are no prior for what fits
+        again = _fitted(camera, fitted.T, p, u, known, free=WIDER)
+        found = found if again is None else _compared(camera, stated, again, len(views), int(known.sum()))
+    return found
+
+
+def _apart(views: Sequence[View]) -> list[View]:
+    """Views of different poses, evenly over the track: a camera at rest sees one view, however many images it takes."""
+    some = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, 4 * MOST_VIEWS).astype(int))] if views else []
+    kept: list[View] = []
+    for view in some:
+        if kept:
+            T = np.array([one.T for one in kept])
+            turned = np.linalg.norm(se3.so3_logmap(T[:, :3, :3].swapaxes(1, 2) @ view.T[:3, :3]), axis=1)
+            moved = np.linalg.norm(T[:, :3, 3] - view.T[:3, 3], axis=1) / np.linalg.norm(view.T[:3, 3])
+            if (np.maximum(turned, moved) < APART).any():
+                continue
+        kept.append(view)
+    return [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, MOST_VIEWS).astype(int))] if kept else []
+
+
+def _compared(camera: Camera, stated: _Fit, fitted: _Fit, n: int, corners: int) -> IntrinsicsEvidence:
+    """Test the change by the scatter between n views, and by that of all corners: the less sure of both counts."""
+    change, freedom = _numbers(fitted.camera) - _numbers(camera), max(2 * corners - 6 * n - 4, 1)
+    back = np.linalg.inv(fitted.H)
+    # Each view's part of the gradient: their scatter holds what is alike within a view (Liang and Zeger 1986).
+    of_views = back @ (fitted.parts.T @ fitted.parts) @ back * n / (n - 1.0)
+    of_corners = fitted.rms_px**2 * corners / freedom * back
+    squared = [float(change @ np.linalg.solve(S + 1e-12 * np.eye(4), change)) for S in (of_views, of_corners)]
+    probability = max(
+        float(stats.f.sf(squared[0] * (n - 4.0) / (4.0 * (n - 1.0)), 4, n - 4)),  # Hotelling's T^2
+        float(stats.f.sf(squared[1] / 4.0, 4, freedom)),
+    )
+    sigma = np.sqrt(np.maximum(np.diag(of_views), np.diag(of_corners)))
+    return IntrinsicsEvidence(camera, fitted.camera, sigma, stated.rms_px, fitted.rms_px, probability, n)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Intrinsics and poses at the minimum; H (4, 4) and gradients (views, 4) of the intrinsics, poses eliminated."""
+
+    camera: Camera
+    T: Array
+    rms_px: float
+    H: Array
+    parts: Array
+
+
+def _fitted(prior: Camera, T: Array, p: Array, u: Array, known: np.ndarray, *, free: float) -> _Fit | None:
+    """Gauss-Newton on all poses, and on focal lengths and principal point: as free as a nominal prior, times `free`."""
+    nominal = np.array([NOMINAL_SHARE * prior.K[0, 0], NOMINAL_SHARE * prior.K[1, 1], NOMINAL_PX, NOMINAL_PX])
+    nominal *= free or 1.0
+    count = int(known.sum())
+    camera, (r, J, K) = prior, _linearised(prior, T, p, u, known)
+    for _ in range(ROUNDS):
+        if not np.isfinite(r).all():
+            return None
+        Jt, Kt, from_prior = J.swapaxes(1, 2), K.swapaxes(1, 2), _numbers(camera) - _numbers(prior)
+        H_pk = Jt @ K
+        try:
+            solved = np.linalg.solve(Jt @ J, np.concatenate([H_pk, Jt @ r[..., None]], axis=2))  # by intrinsics, and 1
+        except np.linalg.LinAlgError:
+            return None
+        weight = max(float((r**2).sum()) / max(2 * count - 6 * len(T), 1), LEAST_PX**2) / nominal**2
+        parts = (Kt @ r[..., None])[..., 0] - np.einsum("vij,vi->vj", H_pk, solved[..., 4])
+        H = (Kt @ K - H_pk.swapaxes(1, 2) @ solved[..., :4]).sum(axis=0) + np.diag(weight)
+        step = -np.linalg.solve(H, parts.sum(axis=0) + weight * from_prior) if free else np.zeros(4)
+        motion = -(solved[..., 4] + solved[..., :4] @ step)
+        cost = float((r**2).sum() + weight @ from_prior**2)
+        for share in SHARES:
+            T_next, next_ = T @ se3.expmap(share * motion), _with_numbers(camera, _numbers(camera) + share * step)
+            of_next = _linearised(next_, T_next, p, u, known)
+            if (of_next[0] ** 2).sum() + weight @ (_numbers(next_) - _numbers(prior)) ** 2 <= cost * (1.0 + 1e-9):
+                break
+        T, camera, (r, J, K) = T_next, next_, of_next
+        if max(np.abs(step).max(), np.abs(motion).max() * camera.K[0, 0]) < SETTLED_PX:
+            break
+    of_corners = float(np.sqrt((r**2).sum() / count))
+    return _Fit(camera, T, of_corners, H, parts)
+
+
+def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray) -> tuple[Array, Array, Array]:
+    """Residuals (views, 2 n), and their derivatives by the poses (right perturbations) and by fx, fy, cx, cy."""
+    seen = p @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
+    seen = np.where(known[..., None], seen, [0.0, 0.0, 1.0])
+    x = seen[..., :2] / seen[..., 2:]
+    pixels, by_x = camera.pixel_jacobian(x)
+    by_seen = np.concatenate([by_x, -(by_x @ x[..., None])], axis=-1) / seen[..., 2, None, None]
+    by_body = by_seen @ T[:, None, :3, :3]
+    J = np.concatenate([-by_body @ se3.hat(p), by_body], axis=-1)
+    bent = (pixels - camera.K[:2, 2]) / np.diagonal(camera.K)[:2]
+    K = np.zeros((*bent.shape, 4))
+    K[..., 0, 0], K[..., 1, 1] = bent[..., 0], bent[..., 1]
+    K[..., 0, 2] = K[..., 1, 3] = 1.0
+    on = known[..., None].astype(float)
+    views, n = len(T), 2 * known.shape[1]
+    return (
+        ((pixels - u) * on).reshape(views, n),
+        (J * on[..., None]).reshape(views, n, 6),
+        (K * on[..., None]).reshape(views, n, 4),
+    )
+
+
+def _numbers(camera: Camera) -> Array:
+    return np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]])
+
+
+def _with_numbers(camera: Camera, numbers: Array) -> Camera:
+    fx, fy, cx, cy = numbers.tolist()
+    return replace(camera, K=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
