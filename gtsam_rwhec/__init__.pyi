@@ -52,6 +52,7 @@ from . import reprojection as reprojection
 from .reprojection import CornerOptions as CornerOptions
 from .reprojection import CornersRefined as CornersRefined
 from .reprojection import Observations as Observations
+from .reprojection import calibrate_corners as calibrate_corners
 from .reprojection import refine_corners as refine_corners
 
 # Keep it in files, print it, draw it.

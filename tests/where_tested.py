@@ -146,6 +146,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/reprojection": {
         "methods/test_evangelista2023.py": "observations",
+        "reprojection/test_calibrating.py": "first_intrinsics",
         "reprojection/test_graph.py": "model",
         "reprojection/test_refining.py": "corner_outliers freedom intrinsics options refined stated_intrinsics",
     },

@@ -4,6 +4,8 @@ from .observations import Views as Views
 
 # Refine from it.
 from .options import CornerOptions as CornerOptions
+from .calibrating import CornersCalibrated as CornersCalibrated
+from .calibrating import calibrate_corners as calibrate_corners
 from .refining import refine_corners as refine_corners
 
 # The result, and its parts.

@@ -3,7 +3,8 @@
 Intrinsics are stated by a calibration, or they are nominal: from a data sheet, a simulator, another camera of the same
 kind. A calibration without a covariance is taken to be right to 0.3 % of the focal length and 3 pixels of the centre;
 nominal intrinsics to 3 %, and to 30 pixels or 2 % of the image's width, whichever is more. Coefficients of the
-lens model move the image's corner by a calibration's 3 pixels, or by a nominal 5 % of the focal length.
+lens model move the image's corner by a calibration's 3 pixels, or by a nominal 5 % of the focal length. Unknown ones
+are right to the focal length itself and half the width: the images must say them.
 """
 
 from __future__ import annotations
@@ -17,21 +18,22 @@ from gtsam_rwhec.reprojection.lens import PINHOLE, parameters_of
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.distortion import coefficient_jacobian
 
-Stated = Literal["calibration", "nominal"]
+Stated = Literal["calibration", "nominal", "unknown"]
 
 #: Deviation of the focal length (a share), of the centre (pixels), and of the coefficients (pixels at the corner of
 #: the image, or a share of the focal length).
-FOCAL = {"calibration": 0.003, "nominal": 0.03}
-CENTRE_PX = {"calibration": 3.0, "nominal": 30.0}
-CENTRE_OF_WIDTH = 0.02
-LENS_PX, LENS_OF_FOCAL = 3.0, 0.05
+FOCAL = {"calibration": 0.003, "nominal": 0.03, "unknown": 1.0}
+CENTRE_PX = {"calibration": 3.0, "nominal": 30.0, "unknown": 30.0}
+CENTRE_OF_WIDTH = {"calibration": 0.0, "nominal": 0.02, "unknown": 0.5}
+LENS_PX = 3.0
+LENS_OF_FOCAL = {"nominal": 0.05, "unknown": 0.5}
 #: fx and fy differ by no more than a tenth of what both may be off by.
 UNEQUAL = 0.1
 
 
 def free_model(camera: Camera, stated: Stated) -> Camera:
     """The camera with the lens model that is estimated: a nominal pinhole may have distortion that nobody stated."""
-    if camera.model == "pinhole" and stated == "nominal":
+    if camera.model == "pinhole" and stated != "calibration":
         return Camera(camera.width, camera.height, "radtan", camera.K, np.zeros(4))
     return camera
 
@@ -39,10 +41,10 @@ def free_model(camera: Camera, stated: Stated) -> Camera:
 def prior_of(camera: Camera, stated: Stated) -> tuple[Array, Array]:
     """Mean (m,) and standard deviation (m,) of a camera's parameters."""
     mean = parameters_of(camera)
-    f, c = mean[:2], np.maximum(CENTRE_PX[stated], CENTRE_OF_WIDTH * camera.width if stated == "nominal" else 0.0)
-    lens_px = LENS_PX if stated == "calibration" else LENS_OF_FOCAL * float(f.mean())
+    f, c = mean[:2], max(CENTRE_PX[stated], CENTRE_OF_WIDTH[stated] * camera.width)
+    lens_px = LENS_PX if stated == "calibration" else LENS_OF_FOCAL[stated] * float(f.mean())
     corner = 0.5 * np.array([camera.width, camera.height]) / f
     moved = np.linalg.norm(coefficient_jacobian(camera.model, camera.D, corner) * f[:, None], axis=0)
-    deviation = np.concatenate([FOCAL[stated] * f, [float(c), float(c)], lens_px / moved])
+    deviation = np.concatenate([FOCAL[stated] * f, [c, c], lens_px / moved])
     assert len(deviation) == PINHOLE + len(camera.D)
     return mean, deviation

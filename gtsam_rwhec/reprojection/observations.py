@@ -114,7 +114,7 @@ class Observations:
 
         problem = Problem()
         for (target, sensor), view in self.views.items():
-            flat, T_target_flat = _in_plane(self.corners[target], target)
+            flat, T_target_flat = in_plane(self.corners[target], target)
             known = view.known
             found = plane_poses(
                 self.cameras[sensor],
@@ -138,7 +138,7 @@ class Observations:
         return problem
 
 
-def _in_plane(points: Array, name: str) -> tuple[Array, Array]:
+def in_plane(points: Array, name: str) -> tuple[Array, Array]:
     """A flat target's corners with z = 0, and T_target_flat; TargetError for a target that is not flat."""
     middle = points.mean(axis=0)
     _, singular, Vt = np.linalg.svd(points - middle)

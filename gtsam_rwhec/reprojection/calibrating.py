@@ -1,0 +1,108 @@
+"""From corners and carriers' poses alone to everything: intrinsics, certified poses, refinement from the corners."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gtsam_rwhec.errors import RwhecWarning
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.reprojection.first_intrinsics import first_intrinsics
+from gtsam_rwhec.reprojection.observations import Observations, Views
+from gtsam_rwhec.reprojection.options import CornerOptions
+from gtsam_rwhec.reprojection.refined import CornersRefined
+from gtsam_rwhec.reprojection.refining import refine_corners
+from gtsam_rwhec.solving.certified_solution import solve
+from gtsam_rwhec.solving.solution import Solution
+
+#: In so many rounds the calibration of the round before chooses between a flat target's two poses.
+ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class CornersCalibrated:
+    """A calibration from corners.
+
+    Attributes
+    ----------
+    solution : Solution
+        The certified solution of the images' poses.
+    refined : CornersRefined
+        The answer.
+    inliers : dict of (target, sensor) to (V,) booleans
+        Images whose pose agrees with the others; only these were refined from.
+    """
+
+    solution: Solution
+    refined: CornersRefined
+    inliers: dict[Pair, np.ndarray]
+
+
+@one_blas_thread()
+def calibrate_corners(
+    observations: Observations, options: CornerOptions | None = None, progress: Progress | None = None
+) -> CornersCalibrated:
+    """Calibrate from corners: certified poses first, then all together.
+
+    Cameras whose intrinsics are "unknown" in the options (`CornerOptions.stated`) are first calibrated by themselves;
+    of what observations state for them only the size of images and the lens model count.
+
+    Parameters
+    ----------
+    observations : Observations
+    options : CornerOptions, optional
+    progress : callable, optional
+
+    Raises
+    ------
+    CameraError
+        Unknown intrinsics cannot be estimated, or an image has no pose.
+    TargetError
+        A target is not flat.
+    RwhecError
+        As ``solve``, ``refine`` and ``refine_corners`` do.
+    """
+    options, tell = options or CornerOptions(), progress or silent
+    cameras = dict(observations.cameras)
+    for sensor in observations.sensors:
+        if options.stated_of(options.camera_of(sensor)) == "unknown":
+            tell(f"estimating the intrinsics of {sensor}")
+            cameras[sensor] = first_intrinsics(observations, sensor)
+    observations = replace(observations, cameras=cameras)
+    robust = RefineOptions(noise="estimate", robust="gnc")
+    problem = observations.poses()
+    refined = _refined(problem, robust, tell)
+    for _ in range(ROUNDS - 1):
+        problem = observations.poses(_predicted(observations, refined))
+        refined = _refined(problem, robust, tell)
+    views = {
+        pair: Views(view.A[kept], view.pixels[kept])
+        for pair, view in observations.views.items()
+        if (kept := refined.inliers[Pair(*pair)]).any()
+    }
+    answer = refine_corners(replace(observations, views=views), refined.X, refined.Y, options, tell)
+    return CornersCalibrated(refined.solution, answer, dict(refined.inliers))
+
+
+def _refined(problem: Problem, options: RefineOptions, tell: Progress) -> Refined:
+    """Poses of the images, refined: a start. What they warn of, the answer's residuals show."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RwhecWarning)
+        return refine(problem, solve(problem, progress=tell), options, progress=tell)
+
+
+def _predicted(observations: Observations, refined: Refined) -> dict[tuple[str, str], Array]:
+    """T_camera_target of each image by a calibration."""
+    return {
+        (target, sensor): np.linalg.inv(refined.Y[sensor].matrix()) @ view.A @ refined.X[target].matrix()
+        for (target, sensor), view in observations.views.items()
+    }
