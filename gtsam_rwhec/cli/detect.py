@@ -51,6 +51,8 @@ def detect(
     rejected = sum(track.seen for track in report.tracks) - used
     for sensor, count in report.images.items():
         say(f"{sensor}: {count} images or messages; {_in_words(report, sensor)}")
+    for cause in report.likely:
+        say(f"Likely: {cause}")
     say(f"Written to {shown_path(output)}: {used} detections to use, and {rejected} rejected ones with the reasons.")
     _say_pictures(output, draw)
     say(f"Next: gtsam-rwhec clean {shown_path(output)} -o cleaned.mcap")

@@ -20,6 +20,7 @@ from gtsam_rwhec.pipeline.image_detections import detect_in_log
 from gtsam_rwhec.pipeline.image_options import check_drawable, check_image_options
 from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
 from gtsam_rwhec.pipeline.kept_detections import KeptDetections
+from gtsam_rwhec.pipeline.likely_causes import likely_causes
 from gtsam_rwhec.pipeline.log_contract import annotations_topic, detections_topic, poses_topic, raw_topics
 from gtsam_rwhec.pipeline.log_metadata import LogMetadata
 from gtsam_rwhec.pipeline.no_detections import no_detections
@@ -98,8 +99,10 @@ def detect_log(
             write_contact_sheet(Path(sheet), log, rig, cameras, found)
         if draw is not None:
             draw_images(log, rig, cameras, {sensor: of.records for sensor, of in found.items()}, draw, tell)
+        tell("looking for what hides targets")
+        report = report.model_copy(update={"likely": likely_causes(log, rig, cameras, found)})
         if not any(track.used for track in report.tracks):
-            raise LogError(no_detections(log, rig, report))
+            raise LogError(no_detections(log, report))
         tell("writing detections")
         with LogWriter(out_path) as out:
             out.copy(log, raw_topics(log), images)

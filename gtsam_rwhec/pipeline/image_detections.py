@@ -14,6 +14,7 @@ from gtsam_rwhec.files.progress import Counted, Progress, Remark
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion, check_order
+from gtsam_rwhec.pipeline.causes_in_words import of_size
 from gtsam_rwhec.pipeline.kept_detections import KeptDetections
 from gtsam_rwhec.pipeline.log_contract import IMAGES_METADATA, detections_topic, image_key
 from gtsam_rwhec.pipeline.sensor_detections import LookedAt, SensorDetections
@@ -122,7 +123,7 @@ def _of_sensor(
         why = f"the first: {faults[0]}" if faults else "none can be read as its schema says"
         raise LogError(
             f"{log.files[0].path}, topic {topic}: none of the {message_count(log, topic)} images of {sensor} can "
-            f"be used; {why}"
+            f"be used; {why}{of_size(rig, sensor, why)}"
         )
     strangers: Counter[tuple[str, str]] = Counter()
     tracks: dict[str, list[tuple[int, Detection]]] = defaultdict(list)

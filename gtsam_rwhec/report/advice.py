@@ -63,7 +63,8 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
         if faults
     ]
     if judgement is None or Ground.NO_ANSWER not in judgement.grounds:  # which says it with the counts
-        advice += _without_answer(log)
+        advice += log.detection.likely
+    advice += _without_answer(log)
     contradicted = {counts.frame for counts in log.contradicted}
     given = [clock.sensor for clock in log.time_offsets if clock.sigma_s is None and clock.sensor in contradicted]
     if given:

@@ -80,6 +80,9 @@ class DetectionReport(_Record):
         description="how often each tag that belongs to no target was seen, by family and id"
     )
     unseen: tuple[str, ...] = Field(default=(), description="targets that no sensor saw")
+    likely: tuple[str, ...] = Field(
+        default=(), description="why targets were not read where most were not: what some of the images show, and cures"
+    )
     corner_px: dict[str, NotNegative] = Field(
         description="measured standard deviation of a corner along each axis, pixels, by target/sensor"
     )

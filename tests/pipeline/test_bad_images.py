@@ -53,7 +53,9 @@ def test_intrinsics_of_another_resolution(tmp_path: Path) -> None:
     larger = made.camera_info("cam_0", width=1280, height=960, K=[800.0, 0, 640, 0, 800, 480, 0, 0, 1])
     refused(
         tmp_path, [larger, *images(picture())[1:], *MOVING], LogError, "topic /cam_0/image", "none of the 6 images",
-        f"{BEGIN_NS} ns: 640 x 480 pixels, but the intrinsics are for 1280 x 960", **WITH_IMAGES,
+        f"{BEGIN_NS} ns: 640 x 480 pixels, but the intrinsics are for 1280 x 960",
+        "multiply fx, fy, cx and cy by 0.5 and write size: [640, 480]", "line 9: sensors.cam_0.intrinsics",
+        **WITH_IMAGES,
     )  # fmt: skip
 
 
