@@ -111,7 +111,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/pipeline": {
         "pipeline/test_all_stages.py": "image_options",
-        "pipeline/test_likely_causes.py": "causes_in_words",
+        "vision/test_likely_causes.py": "causes_in_words likely_causes",
         "pipeline/test_seen_sheet.py": "detected_source image_names",
         "pipeline/test_bad_logs.py": "no_detections",
         "pipeline/test_kept_detections.py": "detection_inputs",

@@ -34,7 +34,7 @@ def sentence(rig: Rig, target: Target, about: About, value: object, figures: Seq
     match about:
         case About.COUNTS:
             assert isinstance(value, tuple)
-            assert not isinstance(target, Tag)
+            assert isinstance(target, (Checkerboard, CircleGrid))
             key = "inner_corners" if isinstance(target, Checkerboard) else "circles"
             things = "inner corners" if isinstance(target, Checkerboard) else "circles"
             stated = (target.columns, target.rows)
@@ -145,6 +145,13 @@ def of_rejections(
             f"{name}: in {len(off)} of {len(records)} detections the corners are {np.median(off):.1f} pixels off those "
             f"of a plane that this camera sees. Are the intrinsics those of these images ({places}), and is the target "
             "flat?"
+        )
+    layouts = Counter(r.reason for _, r in records if r.reason.startswith(Rejection.LAYOUT))
+    if layouts and layouts.total() >= MOSTLY * len(records):
+        reason = layouts.most_common(1)[0][0]
+        causes.append(
+            f"{name}: in {layouts.total()} of {len(records)} detections the {reason} "
+            f"({rig.source.place(('targets', name))})"
         )
     unsure = len(with_reason(Rejection.AMBIGUOUS))
     if unsure:

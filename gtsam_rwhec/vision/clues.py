@@ -217,6 +217,8 @@ def _other_grid(gray: Gray, grid: CircleGrid, camera: Camera, options: Detection
         yield Clue(About.COUNTS, (r, c))  # as likely as another place of the dot, and the commoner mistake
         return
     dots: list[bool | str] = [word for word in (*CORNERS, False) if word != (grid.corner or False)]
+    if grid.asymmetric:  # such a grid has no larger dot
+        dots = []
     for dot in dots:
         if read(gray, camera, replace(grid, larger_dot=dot), options) is not None:
             yield Clue(About.DOT, dot or "")
@@ -234,7 +236,7 @@ def _other_grid(gray: Gray, grid: CircleGrid, camera: Camera, options: Detection
 
 
 def tags_seen(gray: Gray) -> list[tuple[str, int, int]]:
-    """Family, border in modules (0 where it is not known) and id of the tags of all families; each place counts once."""
+    """Family, border in modules (0: not known) and id of the tags of all families in an image, each place once."""
     quads = quadrangles(gray)
     quads = unlike(quads, quads[:0])
     found: list[tuple[str, int, int]] = []
