@@ -184,16 +184,18 @@ def of_size(rig: Rig, sensor: str, fault: str) -> str:
     return f". Give the intrinsics of these images ({place}): what was cut out of an image has another centre"
 
 
-def nothing_explains(target: Target, found: Mapping[str, SensorDetections], looked_at: int) -> str:
-    """What is said where nothing that was tried explains why a target is not read."""
-    tried = "other families, ids and borders" if target.ids else "other numbers of columns and rows"
-    reasons = Counter(r.reason for of in found.values() for r in of.records if r.id == target.name and r.reason)
-    rejected = (
-        f" Rejected: {', '.join(f'{count} {reason}' for reason, count in reasons.most_common())}." if reasons else ""
-    )
+def nothing_explains(targets: Sequence[Target], found: Mapping[str, SensorDetections]) -> str:
+    """What is said where nothing that was tried explains why targets are not read."""
+    names = [target.name for target in targets]
+    tried = ["other families, ids and borders"] * any(target.ids for target in targets)
+    tried += ["other numbers of columns and rows"] * any(not target.ids for target in targets)
+    reasons = Counter(r.reason for of in found.values() for r in of.records if r.id in names and r.reason)
+    counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+    rejected = f" Rejected: {counts}." if reasons else ""
+    them = "it" if len(targets) == 1 else "them"
     return (
-        f"{target.name}: {looked_at} images were searched for {tried}, enlarged, brightened and made smaller, and that "
-        f"did not help.{rejected} Is it in the images, whole and in focus?"
+        f"{', '.join(names)}: some images were searched for {them} with {' and '.join(tried)}, enlarged, brightened "
+        f"and made smaller, and that did not help.{rejected} Does an image show {them}, whole and in focus?"
     )
 
 

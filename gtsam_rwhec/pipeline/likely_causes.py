@@ -23,8 +23,9 @@ from gtsam_rwhec.vision.clues import About, Clue, clues
 from gtsam_rwhec.vision.images import Gray, decode_gray
 from gtsam_rwhec.vision.targets import Target
 
-#: At most this number of images is looked at, and nothing more is tried after this number of seconds.
-MOST, SECONDS = 12, 5.0
+#: At most this number of images is looked at, of several targets at least `LEAST` for each; nothing more is tried after
+#: this number of seconds of the processor.
+MOST, LEAST, SECONDS = 12, 4, 5.0
 #: At most this number of targets is looked for, and at most this number of others is named.
 MOST_TARGETS, MOST_NAMED = 4, 10
 #: A cause is named if at least this share of the images shows it, and at least two, where there are three or more.
@@ -47,20 +48,26 @@ def likely_causes(
     doubted = [target for target in rig.target_list if _is_doubted(target, [found[sensor] for sensor in found])]
     if not sensors or not doubted:
         return ()
-    until = time.monotonic() + SECONDS
+    until_s = time.thread_time() + SECONDS
     images = {
         sensor: _some_images(log, str(rig.sensors[sensor].images), cameras[sensor], found[sensor], MOST // len(sensors))
         for sensor in sensors
     }
     said: list[str] = []
-    for number, target in enumerate(doubted[:MOST_TARGETS], start=1):
-        now = time.monotonic()
-        ends = now + (until - now) / (min(len(doubted), MOST_TARGETS) - number + 1)
+    unexplained: list[Target] = []
+    examined = doubted[:MOST_TARGETS]
+    for number, target in enumerate(examined):
+        now_s = time.thread_time()
+        ends_s = now_s + (until_s - now_s) / (len(examined) - number)
         causes = of_rejections(rig, target, found, images)
         if not causes:
-            seen = _look(rig, target, cameras, found, images, ends)
-            causes = _of_clues(rig, target, seen) or [nothing_explains(target, found, seen.looked_at)]
+            seen = _look(rig, target, cameras, found, images, max(LEAST, MOST // len(examined)), ends_s)
+            causes = _of_clues(rig, target, seen)
+            if not causes:
+                unexplained.append(target)
         said += causes
+    if unexplained:
+        said.append(nothing_explains(unexplained, found))
     if len(doubted) > MOST_TARGETS:
         others = [target.name for target in doubted[MOST_TARGETS : MOST_TARGETS + MOST_NAMED]]
         said.append(f"{len(doubted) - MOST_TARGETS} other targets are as badly seen ({', '.join(others)})")
@@ -101,12 +108,13 @@ def _look(
     cameras: Mapping[str, Camera],
     found: Mapping[str, SensorDetections],
     images: Mapping[str, Mapping[int, Gray]],
+    most: int,
     until_s: float,
 ) -> _Seen:
     """The clues about a target in the images in which it was not read, one of each sensor in turn."""
 
     def is_late() -> bool:
-        return time.monotonic() > until_s
+        return time.thread_time() > until_s
 
     used = {
         (sensor, record.stamp_ns)
@@ -122,7 +130,7 @@ def _look(
         for place, (stamp, gray) in enumerate(of_sensor.items())
         if (sensor, stamp) not in used
     ]
-    for _, sensor, gray in sorted(turns, key=lambda turn: turn[0]):
+    for _, sensor, gray in sorted(turns, key=lambda turn: turn[0])[:most]:
         if is_late():
             break
         seen = clues(gray, target, cameras[sensor], rig.detection_options, is_late)
