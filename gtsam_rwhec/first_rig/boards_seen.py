@@ -30,8 +30,9 @@ from gtsam_rwhec.vision.targets import CORNERS, Checkerboard, CircleGrid
 SMALLEST, LARGEST = 3, 30
 #: A board must pass in at least this number of images.
 LEAST_IMAGES = 2
-#: At most this number of candidates of each kind, the most frequent, are looked for in all images.
-MOST_CANDIDATES = 4
+#: At most this number of candidates of each kind, the most frequent, are looked for in all images; of this number of
+#: images, those that `LEAST_IMAGES` of them propose.
+MOST_CANDIDATES, ENOUGH_IMAGES = 3, 6
 #: Regions with at least this number of saddles are searched; a region is searched at twice its size below this.
 LEAST_CORNERS, ENLARGED_PX = 9, 250_000
 #: Circles have at least this area, pixels.
@@ -73,7 +74,8 @@ def boards_seen(images: Sequence[Gray]) -> list[BoardSeen]:
     for candidates, look in ((_checkerboards, _with_checkerboard), (_circle_grids, _with_circles)):
         counted = Counter(size for gray in images for size in set(candidates(gray)))
         best: BoardSeen | None = None
-        for size, _ in counted.most_common(MOST_CANDIDATES):
+        least = LEAST_IMAGES if len(images) >= ENOUGH_IMAGES else 1
+        for size in [size for size, times in counted.most_common(MOST_CANDIDATES) if times >= least]:
             seen = look(images, *size)
             if len(seen.images) >= LEAST_IMAGES and (best is None or len(seen.images) > len(best.images)):
                 best = seen
@@ -129,8 +131,14 @@ def _larger_first(first: int, second: int) -> tuple[int, int]:
 
 def _with_checkerboard(images: Sequence[Gray], columns: int, rows: int) -> BoardSeen:
     board = Checkerboard("board", columns, rows, 1.0)
-    found = [(i, find_checkerboard(gray, board)) for i, gray in enumerate(images)]
-    good = [(i, seen) for i, seen in found if seen is not None and seen.rejection is None]
+    good = []
+    for i, gray in enumerate(images):
+        try:
+            seen = find_checkerboard(gray, board)
+        except cv2.error:  # one image's failure costs one image, as in detection
+            continue
+        if seen is not None and seen.rejection is None:
+            good.append((i, seen))
     return BoardSeen(
         board, tuple(i for i, _ in good), tuple(s.corners_px for _, s in good), tuple(s.indices for _, s in good)
     )

@@ -18,9 +18,11 @@ from gtsam_rwhec.vision.images import Gray, decode_gray
 from gtsam_rwhec.vision.tag_survey import BY_TRUST, tags_in_image
 
 #: This number of images of each topic, taken evenly from all, is searched for tags.
-IMAGES = 8
+IMAGES = 12
 #: This number of images of each topic is searched for tags of all families, which takes about a second for each image.
 IMAGES_FOR_ALL = 3
+#: At most this number of a driver's detections are kept, spread over the log.
+DETECTIONS = 600
 #: At most this many poses of each pair of frames are kept, to see whether the pair moves.
 POSES = 1000
 #: Metres. A frame stands still if it moves less than this and turns less than `STILL_RAD`.
@@ -52,6 +54,7 @@ class ImageTopic:
     passed: int = 0
     pictures: list[Gray] = field(default_factory=list)
     places: list[int] = field(default_factory=list)
+    stamps_ns: list[int] = field(default_factory=list)
 
     def search(self, gray: Gray, place: int) -> None:
         """Search an image for tags, and keep it; its place is its stamp in a log, its number in a folder."""
@@ -76,6 +79,8 @@ class DriverTopic:
     ids: dict[str, Counter[int]] = field(default_factory=dict)
     size_m: dict[tuple[str, int], float] = field(default_factory=dict)
     has_poses: bool = True
+    stride: int = 1
+    kept: list[DetectionRecord] = field(default_factory=list)
 
 
 @dataclass
@@ -124,6 +129,7 @@ class LogContents:
     images: dict[str, ImageTopic] = field(default_factory=dict)
     intrinsics: dict[str, str] = field(default_factory=dict)
     drivers: dict[str, DriverTopic] = field(default_factory=dict)
+    cameras: dict[str, IntrinsicsRecord] = field(default_factory=dict)
     poses: dict[tuple[str, str, str], PoseTopic] = field(default_factory=dict)
 
 
@@ -150,6 +156,7 @@ def read_contents(log: Log) -> LogContents:
             _look_at(contents.images[record.topic], record)
         elif isinstance(record, IntrinsicsRecord):
             contents.intrinsics.setdefault(record.topic, record.frame)
+            contents.cameras.setdefault(record.topic, record)
         elif isinstance(record, DetectionRecord):
             _take_detection(contents.drivers.setdefault(record.topic, DriverTopic(record.topic)), record)
     return contents
@@ -158,6 +165,7 @@ def read_contents(log: Log) -> LogContents:
 def _look_at(images: ImageTopic, record: ImageRecord) -> None:
     images.frame = images.frame or record.frame
     place, images.passed = images.passed, images.passed + 1
+    images.stamps_ns.append(record.stamp_ns)
     if place not in images.wanted:
         return
     try:
@@ -175,5 +183,9 @@ def _take_detection(driver: DriverTopic, record: DetectionRecord) -> None:
     if record.id.isdecimal() and len(record.id) < 10:
         number = int(record.id)
         driver.ids.setdefault(record.family, Counter())[number] += 1
+        if driver.count % driver.stride == 0:
+            driver.kept.append(record)
+            if len(driver.kept) > DETECTIONS:
+                driver.kept, driver.stride = driver.kept[::2], 2 * driver.stride
         if record.size_m is not None:
             driver.size_m[record.family, number] = record.size_m

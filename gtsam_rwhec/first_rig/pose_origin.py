@@ -114,6 +114,10 @@ class Rest:
 REST_M_S, REST_RAD_S = 0.003, np.radians(0.5)
 #: Nanoseconds on each side of an image's stamp, over which speeds are measured.
 SIDE_NS = 50_000_000
+#: Poses that are further apart than this (s), and at the images' stamps to this (ns), are those of stations.
+STATIONS_S, SAME_NS = 0.5, 10_000_000
+#: At most this number of images are compared with all poses.
+MOST_COMPARED = 200
 #: This share of the images must be at rest, or in motion, for all of them to count as such.
 MOST = 0.8
 
@@ -125,7 +129,8 @@ def rest_of(image_ns: np.ndarray, path: Trajectory) -> Rest:
     """
     inside = image_ns[(image_ns - SIDE_NS >= path.stamps_ns[0]) & (image_ns + SIDE_NS <= path.stamps_ns[-1])]
     apart_s = 1e-9 * float(np.median(np.diff(path.stamps_ns))) if len(path.stamps_ns) > 1 else np.inf
-    if apart_s > 0.5:
+    nearest = np.abs(path.stamps_ns[:, None] - image_ns[:MOST_COMPARED]).min(axis=0)
+    if apart_s > STATIONS_S and np.median(nearest) < SAME_NS:
         return Rest(True, f"poses are {rounded(apart_s, 2)} s apart: the robot stopped for each image")
     if not len(inside):
         return Rest(False, "no image is within the poses' time")

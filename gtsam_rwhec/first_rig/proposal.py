@@ -7,24 +7,25 @@ from pathlib import Path
 
 from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.first_rig.boards_seen import boards_seen
 from gtsam_rwhec.first_rig.carriers import MovingPair, moving_pairs
 from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic, LogContents, read_contents
+from gtsam_rwhec.first_rig.log_evidence import evidence_of_log
 from gtsam_rwhec.first_rig.names import camera_name, free_name
-from gtsam_rwhec.first_rig.targets import Guess, targets_seen
+from gtsam_rwhec.first_rig.pose_origin import Origin
+from gtsam_rwhec.first_rig.roles import RoleEvidence
+from gtsam_rwhec.first_rig.targets import TODO as _TODO_SIZE
+from gtsam_rwhec.first_rig.targets import Guess, boards_guessed, targets_seen, with_size
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig.field_types import is_name, is_text
 from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseNoise, Sensor
+from gtsam_rwhec.rig.sections import Carriers, Intrinsics, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
 
 #: Comment on a sensor's time offset.
 _TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs rotation that speeds up and slows down)"
-#: Comment on the noise of the carriers' poses.
-_NOISE = "TODO errors of these poses, here a guess; leave the line out if you do not know them: residuals tell too"
-#: Good robot arms have this noise; motion capture and SLAM have more.
-_GUESSED_NOISE = PoseNoise(rotation_deg=0.03, translation_mm=0.2)
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,10 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     pair = pairs[0]
     notes.append(f"moving: {_pair_words(pair)}")
     notes += [f"moves too, not used: {_pair_words(other)}" for other in pairs[1:6]]
-    carriers, carrier_remark = _carriers(pair)
     used = [contents.images[c.section.images] for c in cameras if c.section.images is not None]
     drivers = [contents.drivers[c.section.detections] for c in cameras if c.section.detections is not None]
     guesses, remarks = targets_seen(used, drivers)
+    guesses += boards_guessed((topic.topic, topic.looked_at, b) for topic in used for b in boards_seen(topic.pictures))
     notes += remarks
     looked_at = sum(images.looked_at for images in used)
     if guesses:
@@ -85,33 +86,54 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
         )
     else:
         notes.append(
-            f"no tags in {looked_at} images that were searched, and none from drivers. Checkerboards are not searched "
-            "for: write the targets into the rig file"
+            f"no tags in {looked_at} images that were searched, no checkerboard and no grid of circles, and none from "
+            "drivers. Write the targets into the rig file"
         )
         nothing = TagTarget(type="tag", family="tag36h11", id=0, size_m=0.1)
         guesses = [Guess("tag_0", nothing, "TODO an example: no tags were seen")]
-    text = _text(log, carriers, carrier_remark, cameras, guesses)
+    text = _text(log, contents, pair, cameras, guesses, notes)
     parse_rig(text, str(path))
     return text, tuple(notes)
 
 
-def _text(log: Log, carriers: Carriers, carrier_remark: str, cameras: list[_Camera], guesses: list[Guess]) -> str:
-    taken = {carriers.sensors, carriers.targets}
-    remarks: dict[KeyPath, str] = {("carriers", "poses"): carrier_remark, ("carriers", "noise"): _NOISE}
-    names = {camera.name: free_name(camera.name, taken) for camera in cameras}
+def _text(
+    log: Log, contents: LogContents, pair: MovingPair, cameras: list[_Camera], guesses: list[Guess], notes: list[str]
+) -> str:
+    parent, child = pair.source.parent_and_child
+    taken = {parent, child}
+    remarks: dict[KeyPath, str] = {}
+    sensors: dict[str, Sensor] = {}
     targets: dict[str, TargetSection] = {}
+    names = {camera.name: free_name(camera.name, taken) for camera in cameras}
     for guess in guesses:
         name = free_name(guess.name, taken)
-        targets[name] = guess.section
-        remarks["targets", name] = guess.remark
-    sensors = {}
+        targets[name], remarks["targets", name] = guess.section, guess.remark
     for camera in cameras:
         name = names[camera.name]
         frame = camera.frame if is_name(camera.frame) and camera.frame not in taken else None
         taken |= {frame} if frame else set()
         sensors[name] = camera.section.model_copy(update={"frame": frame, "time_offset": "estimate"})
         remarks |= {("sensors", name, key): words for key, words in camera.remarks.items()}
+    of_log = evidence_of_log(log, contents, pair.source, sensors, [s.target(name) for name, s in targets.items()])
+    for name, sensor in sensors.items():
+        rest = of_log.rest.get(sensor.images or "")
         remarks["sensors", name, "time_offset"] = _TIME_OFFSET
+        if rest is not None and rest.at_rest:
+            sensors[name] = sensor.model_copy(update={"time_offset": 0.0})
+            remarks["sensors", name, "time_offset"] = f"s; a guess: {rest.words}, and no clock is estimated from that"
+    if of_log.roles.images:
+        notes.append(of_log.roles.in_words(parent, child))
+    for name, factor in of_log.roles.sizes.items():
+        if _TODO_SIZE in remarks["targets", name] and "as its driver says" not in remarks["targets", name]:
+            targets[name] = with_size(targets[name], factor)
+            remarks["targets", name] += "; the length here is what the motion says"
+    carriers, remarks["carriers", "poses"] = _carriers(pair, of_log.roles, of_log.origin)
+    notes.append(f"poses: {of_log.origin.words}")
+    if carriers.noise is not None:
+        remarks["carriers", "noise"] = (
+            f"TODO errors of these poses, a guess: {of_log.origin.words}. Leave the line out if you do not know them: "
+            "residuals tell too"
+        )
     rig = Rig(carriers=carriers, sensors=sensors, targets=targets)
     file = log.files[0].path.name
     head = (
@@ -121,19 +143,26 @@ def _text(log: Log, carriers: Carriers, carrier_remark: str, cameras: list[_Came
     return head + rig_text(rig, remarks)
 
 
-def _carriers(pair: MovingPair) -> tuple[Carriers, str]:
+def _carriers(pair: MovingPair, roles: RoleEvidence, origin: Origin) -> tuple[Carriers, str]:
     parent, child = pair.source.parent_and_child
-    if pair.on_parent > pair.on_child:
-        remark = f"{parent} carries the sensors, as tf has it"
-        return Carriers(sensors=parent, targets=child, poses=pair.source, noise=_GUESSED_NOISE), remark
-    remark = (
-        f"{child} carries the sensors, as tf has it"
-        if pair.on_child
-        else "TODO fixed camera and target on the hand: exchange the two names"
-    )
+    solved = roles.role
+    of_tf = "parent" if pair.on_parent > pair.on_child else "child" if pair.on_child else None
+    role = of_tf or solved or "child"
+    sensors, targets = (parent, child) if role == "parent" else (child, parent)
+    words = f"; {roles.in_words(parent, child)}" if roles.images else ""
+    if of_tf is not None and solved not in (of_tf, None):
+        remark = f"TODO {sensors} carries the sensors, as tf has it, but the images say the reverse{words}"
+    elif of_tf is not None:
+        remark = f"{sensors} carries the sensors, as tf has it{words}"
+    elif solved is not None:
+        remark = f"a guess: {sensors} carries the sensors{words}"
+        if pair.source.topic is not None:
+            remark += f". If the poses are T_{child}_{parent}, exchange parent and child, and sensors and targets above"
+    else:
+        remark = f"TODO fixed camera and target on the hand: exchange the two names{words}"
     if pair.source.topic is not None:
         remark += "; TODO check the frames' names: they are guesses if the topic has none"
-    return Carriers(sensors=child, targets=parent, poses=pair.source, noise=_GUESSED_NOISE), remark
+    return Carriers(sensors=sensors, targets=targets, poses=pair.source, noise=origin.noise), remark
 
 
 def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:

@@ -32,7 +32,7 @@ from gtsam_rwhec.vision.targets import Checkerboard, CircleGrid, Target
 #: A sensor's target counts with at least this number of images.
 LEAST_IMAGES = 6
 #: At most this number of pairs of a sensor and a target, those with the most images, are solved for.
-MOST_PAIRS = 6
+MOST_PAIRS = 12
 #: The product of the residuals' ratios, rotations and translations, must be at least this: one role fits far better.
 FAR_BETTER = 9.0
 #: And what fits better must explain the rotations to this (rad).
