@@ -26,7 +26,9 @@ from gtsam_rwhec.logs.stamp_text import as_ns
 
 Columns = Literal["tx ty tz qx qy qz qw", "tx ty tz qw qx qy qz", "qw qx qy qz tx ty tz", "qx qy qz qw tx ty tz"]
 #: Foxglove gives the formats of images these names; the keys are the files' endings.
-FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
+FORMATS = {
+    ".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp", ".bmp": "bmp", ".tif": "tiff", ".tiff": "tiff",
+}  # fmt: skip
 #: Bytes of the largest file that is taken as an image. A log keeps images as they are.
 LARGEST_IMAGE = MESSAGE
 

@@ -39,12 +39,18 @@ class Matched:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The images of a folder in natural order; a LogError if it does not exist or has none."""
+    """The images of a folder in natural order; a LogError if it does not exist or has none.
+
+    The last part of the path may be a pattern, ``rgb/*_color.png``, for folders that have other images too.
+    """
+    pattern = "*"
+    if "*" in folder.name:
+        folder, pattern = folder.parent, folder.name
     if not folder.is_dir():
         raise LogError(f"{folder}: there is no such folder of images{_folders_near(folder)}")
-    files = sorted((f for f in folder.glob("*") if f.suffix.lower() in FORMATS), key=lambda f: natural_key(f.name))
+    files = sorted((f for f in folder.glob(pattern) if f.suffix.lower() in FORMATS), key=lambda f: natural_key(f.name))
     if not files:
-        raise LogError(f"{folder} has no images ({', '.join(FORMATS)})")
+        raise LogError(f"{folder / pattern if pattern != '*' else folder} has no images ({', '.join(FORMATS)})")
     return files
 
 
@@ -59,8 +65,11 @@ def _folders_near(folder: Path) -> str:
 
 
 def image_stamps(files: Sequence[Path]) -> list[int] | None:
-    """The stamps that the images' names are, nanoseconds; None if a name is no stamp: they were taken at rest."""
-    stamps = [as_ns(file.stem) for file in files]
+    """The stamps that the images' names are, nanoseconds; None if a name is no stamp: they were taken at rest.
+
+    All names may have words before the stamp, as ``frame_1700000000.25.png``.
+    """
+    stamps = [as_ns(re.sub(r"^([A-Za-z]+[0-9]{0,2}[_-]+)+", "", file.stem)) for file in files]
     known = [stamp for stamp in stamps if stamp is not None]
     return known if len(known) == len(files) else None
 

@@ -162,6 +162,7 @@ def _by_columns(path: str, columns: dict[str, int], header: Sequence[str], lines
         named = next((columns[name] for name in _STAMPS if name in columns), None)
     if named is None:
         named = next((i for i, word in enumerate(header) if "stamp" in word.lower() or "time" in word.lower()), None)
+    parted = None if any(name in columns for name in _NAMES) else _seconds_and_nanoseconds(header)
     keys, kind = _wanted(columns)
     unit_m = _unit_m(header[columns["tx"]]) if "tx" in columns else None
     rows = []
@@ -172,8 +173,18 @@ def _by_columns(path: str, columns: dict[str, int], header: Sequence[str], lines
         if kind == "matrix":
             numbers = (*numbers, *_LAST)
         name = "" if named is None else fields[named].strip("\"'")
+        if parted is not None and re.fullmatch(r"\d{1,10}", fields[parted[0]]) and fields[parted[1]].isdigit():
+            name = str(int(fields[parted[0]]) * 10**9 + int(fields[parted[1]]))
         rows.append(PoseRow(name, f"{path}, line {number}", kind, numbers, kind == "angles", unit_m))
     return rows
+
+
+def _seconds_and_nanoseconds(header: Sequence[str]) -> tuple[int, int] | None:
+    """The columns of a ROS stamp in two parts, such as ``secs`` and ``nsecs``; None without them."""
+    words = [word.strip("\"' ").lower() for word in header]
+    whole = next((i for i, word in enumerate(words) if re.search(r"(^|[._ ])secs?(onds)?$", word)), None)
+    part = next((i for i, word in enumerate(words) if re.search(r"(^|[._ ])n(ano)?secs?(onds)?$", word)), None)
+    return None if whole is None or part is None else (whole, part)
 
 
 def _wanted(columns: dict[str, int]) -> tuple[list[str], Kind]:

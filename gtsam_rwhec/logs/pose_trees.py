@@ -18,8 +18,15 @@ from gtsam_rwhec.files.opencv_storage import parse_storage
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile
 from gtsam_rwhec.logs.pose_rows import Kind, PoseRow
 
-_POSITION = ("position", "translation", "t", "tvec", "xyz", "pos", "trans")
-_ROTATION = ("orientation", "rotation", "quaternion", "q", "quat", "r", "rot", "rvec", "rpy", "euler")
+_POSITION = ("position", "translation", "t", "tvec", "xyz", "pos", "trans", "translationvector")
+_ROTATION = (
+    "orientation", "rotation", "quaternion", "q", "quat", "r", "rot", "rotationmatrix", "rotmat", "rvec", "rotvec",
+    "rotationvector", "rpy", "euler",
+)  # fmt: skip
+#: Their three numbers are a rotation vector, and not angles about axes.
+_VECTORS = ("rvec", "rotvec", "rotationvector")
+#: Six or seven numbers under these keys are a position with a rotation; elsewhere they may be joints.
+_LISTED = re.compile(r"^(?!.*joint).*(pose|tcp|flange|tool|gripper|effector|hand|transform|base|eef)", re.IGNORECASE)
 _NAME = (
     "image",
     "imagepath",
@@ -40,6 +47,8 @@ _HOLDERS = frozenset({
     "images",
 })  # fmt: skip
 _LAST_ROW = (0.0, 0.0, 0.0, 1.0)
+#: How many numbers a position has with a rotation in a list, and what the rotation is.
+_OF_LISTS: tuple[tuple[int, Kind], ...] = ((7, "quaternion_of_any_order"), (6, "angles"))
 #: Keys of rotations and of positions that belong together where the rest of both is the same.
 _APART = (("R", "t"), ("r", "t"), ("rvec", "tvec"), ("rvecs", "tvecs"), ("rot", "trans"), ("R", "T"))
 #: Keys of poses of a target, which are not the carriers' poses.
@@ -73,9 +82,26 @@ def read_pose_tree(path: str, text: str) -> list[PoseRow | PoseReference]:
 def pose_tree(path: str, text: str) -> YamlFile:
     """The tree of a text in JSON, YAML or OpenCV's XML; a LogError if it is none."""
     try:
-        return parse_storage(text, path)
+        return parse_storage(_one_document(text), path)
     except FileFormatError as error:
         raise LogError(str(error)) from error
+
+
+def _one_document(text: str) -> str:
+    """YAML of several documents, as ``ros2 topic echo`` prints them, as a list of them; lines keep their numbers."""
+    if len(re.findall(r"^---[ \t]*$", text, flags=re.MULTILINE)) < 2 or text.startswith("%"):
+        return text
+    lines, begins = [], True
+    for line in text.split("\n"):
+        if line.rstrip() in ("---", "..."):
+            begins = True
+            lines.append("")
+        elif not line.strip() or line.startswith("#"):
+            lines.append(line)
+        else:
+            lines.append(("- " if begins else "  ") + line)
+            begins = False
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True)
@@ -138,6 +164,10 @@ class PoseTree:
         place = self.file.place(path) if path else self.file.where
         if matrix := _matrix(node):
             return PoseRow(name, place, "matrix", matrix)
+        key = next((part for part in reversed(path) if isinstance(part, str)), "pose")
+        for count, kind in _OF_LISTS:
+            if isinstance(node, tuple) and _LISTED.search(key) and (numbers := _flat(node, count)) is not None:
+                return PoseRow(name, place, kind, numbers)
         position = _three(next((fields[key] for key in _POSITION if key in fields), node))
         if position is None:
             return None
@@ -152,7 +182,8 @@ class PoseTree:
         if (numbers := _flat(turned, 4)) is not None:
             return PoseRow(name, place, "quaternion_of_any_order", (*position, *numbers))
         if turned is not node and (numbers := _flat(turned, 3)) is not None:
-            return PoseRow(name, place, "rotation_vector" if "rvec" in fields else "angles", (*position, *numbers))
+            is_vector = any(key in fields for key in _VECTORS)
+            return PoseRow(name, place, "rotation_vector" if is_vector else "angles", (*position, *numbers))
         if (numbers := _flat(turned, 9)) is not None:
             rows = [(*numbers[3 * r : 3 * r + 3], position[r]) for r in range(3)]
             return PoseRow(name, place, "matrix", (*sum(rows, ()), *_LAST_ROW))

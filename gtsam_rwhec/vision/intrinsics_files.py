@@ -21,10 +21,12 @@ from gtsam_rwhec.vision.colmap_cameras import is_colmap, read_colmap_cameras
 KALIBR_DISTORTIONS = ("none", "radtan", "equidistant")
 _KALIBR_CAMERA = re.compile(r"cam\d+")
 #: ROS, OpenCV's samples and people write these keys of intrinsics; here they have lower case and no underscores.
-_WIDTH, _HEIGHT = ("imagewidth", "width", "imgwidth"), ("imageheight", "height", "imgheight")
+_WIDTH, _HEIGHT = ("imagewidth", "width", "imgwidth", "w"), ("imageheight", "height", "imgheight", "h")
 _SIZE = ("imagesize", "imgsize", "resolution", "size")
 _MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx", "m")
 _COEFFICIENTS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "d", "dist")
+#: Plain numbers, as RealSense and NeRF name them too.
+_PLAIN = (("fx", "flx"), ("fy", "fly"), ("cx", "ppx"), ("cy", "ppy"))
 _MODEL = ("distortionmodel", "cameramodel")
 #: Messages give the needed fields these names.
 _FIELDS = {
@@ -153,7 +155,7 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
 def _calibrated(file: YamlFile, number: str, size: tuple[int, int] | None) -> Camera:
     """The camera of a calibration; the keys of one of a stereo pair end with its number."""
     fields = file.data if isinstance(file.data, dict) else {}
-    if not number and _found(fields, _MATRIX) is None and _found(fields, ("fx",)) is not None:
+    if not number and _found(fields, _MATRIX) is None and _found(fields, _PLAIN[0]) is not None:
         return _of_plain_numbers(file, size)
     width, height = _image_size(file, size)
     key = _key(file, _MATRIX, number)
@@ -196,7 +198,7 @@ def _of_plain_numbers(file: YamlFile, size: tuple[int, int] | None) -> Camera:
             _refuse(file, (), f"no {names[0]}; plain intrinsics have fx, fy, cx and cy")
         return float(_numbers(file, (key,), (fields[key],), 1)[0])
 
-    fx, fy, cx, cy = (number((name,)) for name in ("fx", "fy", "cx", "cy"))
+    fx, fy, cx, cy = map(number, _PLAIN)
     from_zero = _found(fields, ("distk0", "k0")) is not None
     names = ("0", "1", "px", "py", "2", "3", "4", "5") if from_zero else ("1", "2", "p1", "p2", "3", "4", "5", "6")
     wanted = [(f"dist{name}", name) if name[0] == "p" else (f"distk{name}", f"k{name}") for name in names]

@@ -232,3 +232,47 @@ def test_one_file_an_image_of_opencv(tmp_path: Path) -> None:
     found = read_poses(tmp_path)
     np.testing.assert_allclose(found.T, T, atol=1e-12)
     assert found.names == ("im_0.xml", "im_1.xml", "im_2.xml", "im_3.xml")
+
+
+#: More forms that programs print: of each, the file and what is stated.
+PRINTED = {
+    "topic_echo.yaml": (
+        "---\n".join(
+            f"header:\n  stamp:\n    sec: 1700000000\n    nanosec: {i}\n  frame_id: base\npose:\n"
+            f"  position: {dict(zip('xyz', P[i].tolist(), strict=True))}\n"
+            f"  orientation: {dict(zip('xyzw', Q[i].tolist(), strict=True))}\n"
+            for i in range(4)
+        )
+        + "---\n",
+        {},
+    ),
+    "robot.json": (
+        json.dumps([
+            {"joints": [0.1] * 7, "tcp_pose": [*P[i].tolist(), *TURNS[i].as_rotvec().tolist()]} for i in range(4)
+        ]),
+        {"euler": "rotation_vector", "angles": "radians"},
+    ),
+    "sevens.json": (json.dumps({"poses": np.hstack([P, Q]).tolist()}), {}),
+    "words.yaml": (
+        json.dumps([
+            {"rotation_matrix": T[i, :3, :3].tolist(), "translation_vector": P[i].tolist()} for i in range(4)
+        ]),
+        {},
+    ),
+    "two_parts.csv": (
+        lines("secs,nsecs,x,y,z,qx,qy,qz,qw", [1700000000] * 4, range(4), P, Q),
+        {},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(PRINTED))
+def test_what_programs_print(tmp_path: Path, name: str) -> None:
+    text, stated = PRINTED[name]
+    (tmp_path / name).write_text(text)
+    found = read_poses(tmp_path / name, PoseStatement(**stated))
+    np.testing.assert_allclose(found.T, T, atol=1e-9)
+    if name in ("topic_echo.yaml", "two_parts.csv"):
+        assert found.names == tuple(str(1_700_000_000 * 10**9 + i) for i in range(4))
+    if name == "topic_echo.yaml":
+        assert found.places[1] == f"{tmp_path / name}, line 15: [1].pose"

@@ -224,3 +224,18 @@ def test_from_a_folder_to_a_result(workcell_camera2: Path, tmp_path: Path) -> No
 def test_the_cures_of_files(mistake: Mistake, likely: str, words: str) -> None:
     (found,) = in_rig_file((Misreading(mistake, likely, "", (9.0, 1.0), (9.0, 1.0)),), rig("a"))
     assert words in found.cure
+
+
+def test_patterns_and_words_before_stamps(tmp_path: Path) -> None:
+    """Other images in the folder are left out by a pattern; a stamp may have words before it."""
+    stamps = [1700000000300000000, 1700000000500000000]
+    add(tmp_path, "a", [f"frame_{stamp}{kind}" for stamp in stamps for kind in (".bmp", ".depth.png")], {})
+    rows = [f"17000000{i:02d}.25,{i}.0,0,0,0,0,0,1" for i in range(3)]
+    (tmp_path / "poses.csv").write_text("\n".join(rows))
+    text = rw.rig.rig_text(rig("a", poses="poses.csv")).replace("a/image", "a/image/*.bmp")
+    assert write_folder_log(tmp_path, parse_rig(text, "rig.yaml"), tmp_path / "log.mcap") == (2, 3)
+    images, _ = read(tmp_path / "log.mcap")
+    assert images == [("a/image/*.bmp", stamp) for stamp in stamps]
+    text = text.replace("*.bmp", "*.webp")
+    with pytest.raises(LogError, match=r"a/image/\*\.webp has no images"):
+        write_folder_log(tmp_path, parse_rig(text, "rig.yaml"), tmp_path / "log.mcap")

@@ -290,3 +290,10 @@ def test_whichever_file_it_is(tmp_path: Path) -> None:
     assert list(read_cameras(tmp_path / "chain.yaml")) == ["cam0", "cam1"]
     assert list(read_cameras(tmp_path / "ost.yaml")) == [""]
     assert list(read_cameras(tmp_path / "cameras.txt")) == ["1"]
+
+
+def test_names_of_other_programs(path: Path) -> None:
+    for text in ("w: 640\nh: 480\nfl_x: 500\nfl_y: 501\ncx: 320\ncy: 240\n",
+                 "width: 640\nheight: 480\nfx: 500\nfy: 501\nppx: 320\nppy: 240\n"):  # fmt: skip
+        path.write_text(text)
+        assert read_cameras(path)[""].K.tolist() == [[500.0, 0.0, 320.0], [0.0, 501.0, 240.0], [0.0, 0.0, 1.0]]
