@@ -70,7 +70,10 @@ def _short(words: str) -> str:
 
 
 def _state(path: Path) -> str:
-    status = path.stat()
+    try:
+        status = path.stat()
+    except OSError as error:
+        return error.strerror or "cannot be read"
     return f"{status.st_size} bytes, changed at {status.st_mtime_ns} ns"
 
 

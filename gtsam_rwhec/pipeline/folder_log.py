@@ -11,6 +11,7 @@ same rig file serves for the folder and for the log. There are two kinds of fold
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gtsam_rwhec.errors import FileFormatError, LogError
+from gtsam_rwhec.errors import FileFormatError, LogError, LogWarning
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.progress import Counted, Progress, silent
@@ -107,7 +108,7 @@ def write_folder_log(
     Warns
     -----
     LogWarning
-        Images without a pose, or poses without an image, are left out.
+        Images without a pose, or poses without an image, are left out; or a file of an image cannot be read.
     """
     folder, tell = checked_path(folder), progress or silent
     tell(f"reading {folder}")
@@ -134,10 +135,12 @@ def write_folder_log(
 
 
 def _content(file: Path) -> bytes:
+    """The bytes of an image; none of a file that cannot be read, which costs this image and no other."""
     try:
         return read_whole(file, LARGEST_IMAGE, "An image was")
     except FileFormatError as error:
-        raise LogError(str(error)) from error
+        warnings.warn(f"{error} It counts as an image that cannot be used", LogWarning, stacklevel=3)
+        return b""
 
 
 @contextmanager
