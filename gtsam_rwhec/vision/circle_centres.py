@@ -172,10 +172,13 @@ def _light(values: Array, basis: Array, where: np.ndarray, steady: float) -> Arr
 
 
 def _gaps(steps: Array, radii: Array) -> Array:
-    """From each circle's edge to the nearest one's (n,), in steps; at least a twentieth."""
+    """From each circle's edge to the nearest one's (n,), in steps; at least a twentieth.
+
+    At most as far as in a symmetric grid: half a step from the outer circles' centres a board may end.
+    """
     apart = np.linalg.norm(steps[:, None] - steps, axis=-1) - radii[:, None] - radii
     np.fill_diagonal(apart, np.inf)
-    return np.asarray(np.clip(apart.min(axis=1), 0.05, 1.0))
+    return np.asarray(np.clip(apart.min(axis=1), 0.05, np.maximum(1.0 - 2.0 * radii, 0.2)))
 
 
 def _outlines(plane: Plane, steps: Array, radii: Array) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -152,14 +153,18 @@ def of_tag() -> Kind:
     return Kind(tag, prints.single_tag, 0.01, 0.08, 24.0, (1.0, 3.0), (0.04, 0.04), _apriltags())
 
 
-def of_circles(columns: int, rows: int, larger_dot: bool) -> Kind:
-    grid = CircleGrid("grid", columns, rows, 0.03, larger_dot)
+def of_circles(
+    columns: int, rows: int, *, larger_dot: bool = False, asymmetric: bool = False, light: bool = False
+) -> Kind:
+    grid = CircleGrid("grid", columns, rows, 0.03, larger_dot, asymmetric)
+    flag = cv2.CALIB_CB_ASYMMETRIC_GRID if asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
 
     def peer(gray: Gray) -> object:
-        return cv2.findCirclesGrid(gray, (columns, rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
+        return cv2.findCirclesGrid(gray, (columns, rows), flags=flag)
 
-    half = (0.015 * columns, 0.015 * rows)
-    return Kind(grid, prints.circle_grid, 0.03, 0.03, 12.0, (0.0, 0.5), half, peer, grid.ways)
+    half = (0.015 * (2 * columns if asymmetric else columns), 0.015 * rows)
+    draw = partial(prints.circle_grid, light=light)
+    return Kind(grid, draw, 0.03, 0.03, 12.0, (0.0, 0.5), half, peer, grid.ways)
 
 
 #: By name, what makes a kind: OpenCV's detectors are made in the process that uses them.
@@ -171,8 +176,11 @@ KINDS: dict[str, Callable[[], Kind]] = {
     "charuco": lambda: of_charuco(7, 5),
     "aprilgrid": lambda: of_aprilgrid(6, 6),
     "tag": of_tag,
-    "circles": lambda: of_circles(9, 7, False),
-    "circles_larger_dot": lambda: of_circles(10, 10, True),
+    "circles": lambda: of_circles(9, 7),
+    "circles_larger_dot": lambda: of_circles(10, 10, larger_dot=True),
+    "circles_light": lambda: of_circles(9, 7, light=True),
+    "circles_asymmetric": lambda: of_circles(4, 11, asymmetric=True),
+    "circles_asymmetric_light": lambda: of_circles(5, 8, asymmetric=True, light=True),
 }
 
 

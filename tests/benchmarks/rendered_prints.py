@@ -92,13 +92,20 @@ def charuco(board: Charuco, per_unit: int, margin: float) -> Print:
     return drawn(modules, board.square_m / of_square, per_unit, margin)
 
 
-def circle_grid(grid: CircleGrid, per_unit: int, margin: float) -> Print:
-    """The unit is the spacing; half a unit is around the outer circles' centres before the margin begins."""
+def circle_grid(grid: CircleGrid, per_unit: int, margin: float, *, light: bool = False) -> Print:
+    """The unit is the spacing; half a unit is around the outer circles' centres before the margin begins.
+
+    Light circles are on a dark board, margin and all.
+    """
+    places = grid.steps()
     radii = np.full((grid.rows, grid.columns), RADIUS)
     if grid.larger_dot:
         radii[-1 if "lower" in grid.corner else 0, -1 if "right" in grid.corner else 0] = LARGER
+    across, down = (places.reshape(-1, 2).max(axis=0).astype(int) + 1).tolist()
+    picture = np.ones((down * per_unit, across * per_unit))
     y, x = np.indices((per_unit, per_unit)) - 0.5 * (per_unit - 1)
-    cells = np.clip(np.hypot(x, y) - per_unit * radii[..., None, None] + 0.5, 0.0, 1.0)
-    picture = cells.swapaxes(1, 2).reshape(per_unit * grid.rows, per_unit * grid.columns)
+    for (column, row), radius in zip(places.reshape(-1, 2).astype(int).tolist(), radii.ravel().tolist(), strict=True):
+        cell = np.clip(np.hypot(x, y) - per_unit * radius + 0.5, 0.0, 1.0)
+        picture[row * per_unit :, column * per_unit :][:per_unit, :per_unit] = cell
     picture = np.pad(picture, ceil(margin * per_unit), constant_values=1.0)
-    return Print(picture.astype(np.float32), grid.spacing_m / per_unit)
+    return Print((1.0 - picture if light else picture).astype(np.float32), grid.spacing_m / per_unit)
