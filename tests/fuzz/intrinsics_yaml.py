@@ -1,4 +1,4 @@
-"""Intrinsics: the first byte says whether the rest is Kalibr's, or of ROS or OpenCV."""
+"""Intrinsics: the first byte says whether the rest is Kalibr's, of ROS or OpenCV, or of whichever it is."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ def read(data: bytes) -> None:
     path.write_bytes(data[1:])
     if data[:1] == b"K":
         cameras = list(intrinsics_files.read_kalibr_camchain(path).values())
+    elif data[:1] == b"C":
+        cameras = list(intrinsics_files.read_cameras(path, (640, 480)).values())
     else:
         cameras = [intrinsics_files.read_calibration_yaml(path)]
     for each in cameras:
@@ -39,6 +41,12 @@ def seeds() -> Iterable[bytes]:
     yield b"K" + CAMCHAIN.encode()
     yield b"R" + ROS.encode()
     yield b"R" + OPENCV.encode()
+    yield b"C# Camera list\n1 PINHOLE 640 480 500 501 320 240\n2 OPENCV 640 480 500 500 320 240 0.1 0 0 1e-3\n"
+    yield (
+        b'C<?xml version="1.0"?>\n<opencv_storage><M1 type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>'
+        b'<data>500. 0. 320. 0. 500. 240. 0. 0. 1.</data></M1>\n<D1 type_id="opencv-matrix"><rows>1</rows>'
+        b"<cols>5</cols><data>0. 0. 0. 0. 0.</data></D1></opencv_storage>\n"
+    )
     yield b"R" + eight_coefficients.replace("-2.e-4, 0]", "-2.e-4, 0, 0, 0, 0]").encode()
 
 

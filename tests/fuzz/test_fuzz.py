@@ -13,7 +13,7 @@ import run
 #: So many executions take about five seconds.
 EXECUTIONS = {
     "csv": 12_000, "results": 2_000, "foxglove": 10_000, "rig": 1_500, "mcap": 1_000, "cdr": 10_000,
-    "intrinsics": 3_000, "protobuf": 30_000, "poses": 12_000, "images": 60_000,
+    "intrinsics": 2_500, "protobuf": 30_000, "poses": 5_000, "images": 60_000,
 }  # fmt: skip
 PLANTED = """
 from harness import Harness
