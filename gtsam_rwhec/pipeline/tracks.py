@@ -19,6 +19,7 @@ from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
 from gtsam_rwhec.results.log_history import TrackCount
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.rejection import Rejection
+from gtsam_rwhec.vision.tag_boards import Bundle
 from gtsam_rwhec.vision.targets import Tag, Target, is_same_print
 
 
@@ -92,7 +93,7 @@ def _track(target: str, sensor: str, records: list[DetectionRecord]) -> Track:
 
 
 def target_of(record: DetectionRecord, targets: Iterable[Target]) -> Target | None:
-    """The target of a detection, found by its name (which this library writes) or by family and id.
+    """The target of a detection, found by its name (which this library writes), by family and id, or a bundle's ids.
 
     Raises `FrameError` if the driver does not say the family, and two targets have the id.
     """
@@ -104,6 +105,9 @@ def target_of(record: DetectionRecord, targets: Iterable[Target]) -> Target | No
         and record.id == str(t.id)
         and (not record.family or is_same_print(record.family, t.family))
     ]
+    if "," in record.id:  # a bundle of apriltag_ros, whose pose is of the layout's frame
+        ids = record.id.split(",")
+        mine = mine or [t for t in targets if isinstance(t, Bundle) and sorted(map(str, t.ids)) == sorted(ids)]
     if len(mine) > 1:
         raise FrameError(
             f"topic {record.topic}: a tag with id {record.id} and no family could be "
