@@ -60,6 +60,7 @@ def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = N
     """
     rejected: FoundBoard | None = None
     there: list[Region] = []
+    larger: list[Array] = []  # middles of boards that go on: OpenCV need not read parts of them
     for level in LEVELS:
         found: FoundBoard | None = None
         for grid in _in_order(gray, board, level, there):
@@ -67,12 +68,16 @@ def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = N
                 tested = _tested(gray, grid, camera)
                 if tested.rejection is None:
                     found = tested
+                if tested.rejection is Rejection.OTHER_SIZE:
+                    rejected = tested
+                    larger.append(grid.reshape(-1, 2).mean(axis=0))
                 rejected = rejected or tested
             elif _is_apart(grid, found.corners_px) and _tested(gray, grid, camera).rejection is None:
                 return replace(found, rejection=Rejection.SEEN_TWICE)
         if found is not None:
             return found
-    for grid in _by_opencv(gray, board, there):
+    others = [region for region in there if not any(_holds(region, middle) for middle in larger)]
+    for grid in _by_opencv(gray, board, others):
         tested = _tested(gray, grid, camera)
         if tested.rejection is None:
             return tested
@@ -125,6 +130,12 @@ def _by_opencv(gray: Gray, board: Checkerboard, there: list[Region]) -> Iterator
                     yield corner + (seen if picture is part else 0.5 * seen - 0.25)
 
 
+def _holds(region: Region, place: Array) -> bool:
+    """Whether a place (x, y) is in a region."""
+    rows, columns = region.part
+    return bool(rows.start <= place[1] < rows.stop and columns.start <= place[0] < columns.stop)
+
+
 def _share_inside(region: tuple[slice, slice], other: tuple[slice, slice]) -> float:
     """The share of a region (rows, columns) that lies in another one."""
     share = 1.0
@@ -145,6 +156,8 @@ def _sector_based(gray: Gray, board: Checkerboard) -> Array | None:
 
 
 def _tested(gray: Gray, grid: Array, camera: Camera | None) -> FoundBoard:
+    if not ((grid >= 0.0) & (grid <= np.array(gray.shape[::-1]) - 1.0)).all():
+        return FoundBoard(grid.reshape(-1, 2), np.arange(grid.size // 2), Rejection.NOT_WHOLE)
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0.0:  # a mirror image: a board is not seen from behind
         grid = grid[::-1]

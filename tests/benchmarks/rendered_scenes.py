@@ -63,8 +63,24 @@ class Light:
     noise: float
 
 
-def random_pose(rng: np.random.Generator, outline: Array, element_m: float, sides_px: tuple[float, float]) -> Pose:
-    """A camera and a target whose elements' shorter sides are about as long; whole in the image if that comes out.
+def random_camera(rng: np.random.Generator) -> Camera:
+    """A lens between wide and long, with the distortion that goes with it."""
+    focal = np.exp(rng.uniform(np.log(450.0), np.log(1400.0)))
+    K = [
+        [focal, 0.0, WIDTH / 2 + rng.uniform(-15, 15)],
+        [0.0, focal * rng.uniform(0.995, 1.005), HEIGHT / 2],
+        [0, 0, 1],
+    ]
+    wide = (450.0 / focal) ** 2
+    k1 = rng.uniform(-0.25, 0.08) * wide
+    D = [k1, -0.3 * k1 * wide, *rng.uniform(-5e-4, 5e-4, 2)]
+    return Camera.of(WIDTH, HEIGHT, "plumb_bob", K, D, "rendered")
+
+
+def random_pose(
+    rng: np.random.Generator, camera: Camera, outline: Array, element_m: float, sides_px: tuple[float, float]
+) -> Pose:
+    """A target whose elements' shorter sides are about as long; whole in the image if that comes out.
 
     Parameters
     ----------
@@ -75,16 +91,7 @@ def random_pose(rng: np.random.Generator, outline: Array, element_m: float, side
     sides_px : pair of float
         The range of shorter projected sides.
     """
-    focal = np.exp(rng.uniform(np.log(450.0), np.log(1400.0)))
-    K = [
-        [focal, 0.0, WIDTH / 2 + rng.uniform(-15, 15)],
-        [0.0, focal * rng.uniform(0.995, 1.005), HEIGHT / 2],
-        [0, 0, 1],
-    ]
-    wide = (450.0 / focal) ** 2
-    k1 = rng.uniform(-0.25, 0.08) * wide
-    D = [k1, -0.3 * k1 * wide, *rng.uniform(-5e-4, 5e-4, 2)]
-    camera = Camera.of(WIDTH, HEIGHT, "plumb_bob", K, D, "rendered")
+    focal = float(camera.K[0, 0])
     for _ in range(TRIES):
         tilt = np.radians(rng.uniform(0.0, MOST_TILT_DEG))
         towards, turn = rng.uniform(0.0, 2.0 * np.pi, 2)

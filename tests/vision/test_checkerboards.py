@@ -142,3 +142,26 @@ def test_flat_images_and_tiny_ones_have_no_board() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
     found = find_checkerboard(noise, CHESS)
     assert found is None or found.rejection in set(Rejection)
+
+
+def test_of_two_boards_of_one_size_none_counts() -> None:
+    scene = [(printed(Checkerboard("c", 5, 4, 0.014)), pose((0.0, 10.0, 10.0), (x, 0.0, 0.3))) for x in (-0.08, 0.08)]
+    both = find_checkerboard(render(PINHOLE, scene, blur_px=0.5), CHESS)
+    assert both is not None
+    assert both.rejection is Rejection.SEEN_TWICE
+    assert len(corners_of(render(PINHOLE, scene[:1], blur_px=0.5))) == 20
+
+
+def test_a_board_with_a_column_more_than_stated_is_refused_for_that() -> None:
+    for other in (Checkerboard("wider", 6, 4, 0.025), Checkerboard("higher", 5, 5, 0.025)):
+        image = render(PINHOLE, [(printed(other), pose((15.0, 5.0, 25.0), (0.0, 0.0, 0.3)))])
+        found = find_checkerboard(image, CHESS)
+        assert found is not None
+        assert found.rejection is Rejection.OTHER_SIZE
+
+
+@pytest.mark.parametrize("x", [-0.11, 0.1, 0.12])
+def test_a_board_that_the_image_cuts_is_not_read(x: float) -> None:
+    image = render(PINHOLE, [(printed(CHESS), pose((0.0, 25.0, 5.0), (x, 0.0, 0.28)))])
+    found = find_checkerboard(image, CHESS, PINHOLE)
+    assert found is None or found.rejection is not None
