@@ -15,7 +15,7 @@ from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log
 from gtsam_rwhec.logs.message_kinds import schema_word
 from gtsam_rwhec.rig.field_types import is_text
 from gtsam_rwhec.vision.images import Gray, decode_gray
-from gtsam_rwhec.vision.tag_survey import BY_TRUST, tags_in_image
+from gtsam_rwhec.vision.tag_survey import BY_TRUST, SeenTag, tags_in_image
 
 #: This number of images of each topic, taken evenly from all, is searched for tags.
 IMAGES = 12
@@ -54,6 +54,7 @@ class ImageTopic:
     passed: int = 0
     pictures: list[Gray] = field(default_factory=list)
     places: list[int] = field(default_factory=list)
+    seen: list[list[SeenTag]] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
 
     def search(self, gray: Gray, place: int) -> None:
@@ -65,6 +66,7 @@ class ImageTopic:
         for family, number, is_double in {(tag.family, tag.id, tag.is_double) for tag in tags}:
             found = self.tags.setdefault(family, Tags())
             (found.double if is_double else found.single)[number] += 1
+        self.seen.append(tags)
         self.pictures.append(gray)
         self.places.append(place)
 

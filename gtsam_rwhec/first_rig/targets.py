@@ -5,19 +5,23 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.first_rig.boards_seen import BoardSeen
 from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic
+from gtsam_rwhec.first_rig.tag_layouts import Layout, layout_of
 from gtsam_rwhec.rig.target_sections import (
     AprilGridTarget,
     CharucoTarget,
     CheckerboardTarget,
     CircleGridTarget,
+    TagGridTarget,
     TagTarget,
     TargetSection,
 )
+from gtsam_rwhec.vision.tag_survey import SeenTag
 from gtsam_rwhec.vision.targets import FAMILIES, Checkerboard, family_named
 
 #: Metres. A tag's side has this value in a first rig file, until a person measures it.
@@ -52,19 +56,20 @@ def targets_seen(images: Iterable[ImageTopic], drivers: Iterable[DriverTopic]) -
     guesses, remarks = [], []
     for family in dict.fromkeys(family for topic in images for family in topic.tags):
         single, double = Counter[int](), Counter[int]()
+        views = [[tag for tag in tags if tag.family == family] for topic in images for tags in topic.seen]
         for topic in images:
             single.update(topic.tags[family].single if family in topic.tags else {})
             double.update(topic.tags[family].double if family in topic.tags else {})
         # A tag that was seen with both borders has the border with which it was seen more often.
         grid = sorted(i for i in double if double[i] > single[i])
         if len(grid) >= GRID:
-            guesses.append(_aprilgrid(family, grid))
+            guesses.append(_aprilgrid(family, grid, views))
         ids = {i: single[i] for i in sorted(single) if i not in grid}
         sure = {i: count for i, count in ids.items() if count >= least_sightings(family, looked_at)}
         doubtful = [i for i in ids if i not in sure]
         if doubtful:
             remarks.append(f"left out, seen too seldom to be sure: {family} {_listed(doubtful)}")
-        guesses += _of_family(_smallest(family, sure), sure, looked_at)
+        guesses += _of_family(_smallest(family, sure), sure, looked_at, views)
     guesses += _of_drivers(drivers, guesses)
     return guesses, remarks
 
@@ -122,10 +127,16 @@ def _smallest(family: str, ids: Collection[int]) -> str:
     return next(f"{stem[1]}_{size}" for size in sizes if FAMILIES[f"{stem[1]}_{size}"] > max(ids))
 
 
-def _of_family(family: str, ids: dict[int, int], looked_at: int) -> Iterator[Guess]:
-    """A ChArUco board if many ArUco markers have consecutive ids; otherwise single tags."""
+def _of_family(family: str, ids: dict[int, int], looked_at: int, views: Sequence[Sequence[SeenTag]]) -> Iterator[Guess]:
+    """A board if many tags have consecutive ids and lie as on a board, or are ArUco markers; otherwise single tags."""
     order = sorted(ids)
-    if family.startswith("aruco") and len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
+    is_aruco = family.startswith("aruco")
+    if len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
+        layout = layout_of(("charuco", "tag_grid") if is_aruco else ("tag_grid",), order, views)
+        if layout is not None:
+            yield _of_layout(family, order[0], layout)
+            return
+    if is_aruco and len(ids) >= BOARD and order[-1] - order[0] < 1.5 * len(ids):
         columns, rows = _squares(order[-1] - order[0] + 1)
         board = CharucoTarget(
             type="charuco", family=family, squares=(columns, rows), square_m=SQUARE_M, marker_m=MARKER_M,
@@ -139,7 +150,35 @@ def _of_family(family: str, ids: dict[int, int], looked_at: int) -> Iterator[Gue
         yield Guess(f"{family}_{i}", tag, f"{TODO}; seen in {ids[i]} of {looked_at} images")
 
 
-def _aprilgrid(family: str, ids: list[int]) -> Guess:
+def _of_layout(family: str, first: int, layout: Layout) -> Guess:
+    """A board whose columns and rows the images tell."""
+    counts = layout.columns, layout.rows
+    fits = (
+        f"the tags lie so in {layout.images} images, to {rounded(layout.off, 2)} of a tag's side; other columns and "
+        "rows do not fit"
+    )
+    if layout.kind == "charuco":
+        marker_m = float(f"{SQUARE_M * layout.share:.3g}")
+        section: TargetSection = CharucoTarget(
+            type="charuco", family=family, squares=counts, square_m=SQUARE_M, marker_m=marker_m, first_id=first
+        )
+        return Guess(f"board_{family.removeprefix('aruco_')}", section, f"{TODO} a square and a marker; {fits}")
+    gap = 1.0 / layout.share - 1.0
+    if layout.kind == "aprilgrid":
+        section = AprilGridTarget(
+            type="aprilgrid", family=family, tags=counts, tag_m=TAG_M, spacing=round(gap, 3), first_id=first
+        )
+        return Guess(f"grid_{family}", section, f"{TODO} a tag, and the gap over it (spacing); {fits}")
+    section = TagGridTarget(
+        type="tag_grid", family=family, tags=counts, tag_m=TAG_M, gap_m=float(f"{TAG_M * gap:.3g}"), first_id=first
+    )
+    return Guess(f"grid_{family}", section, f"{TODO} a tag and the gap; {fits}")
+
+
+def _aprilgrid(family: str, ids: list[int], views: Sequence[Sequence[SeenTag]]) -> Guess:
+    layout = layout_of(("aprilgrid",), ids, views)
+    if layout is not None:
+        return _of_layout(family, ids[0], layout)
     first, last = ids[0], ids[-1]
     side = math.isqrt(last - first + 1)
     columns = side if side * side == last - first + 1 else side + 1

@@ -37,6 +37,8 @@ class SeenTag:
         Mean of the corners, pixels.
     side_px : float
         Longest side, pixels.
+    corners_px : (4, 2) array
+        From the top left, clockwise, as printed; pixels.
     """
 
     family: str
@@ -44,6 +46,7 @@ class SeenTag:
     is_double: bool
     middle_px: Array
     side_px: float
+    corners_px: Array
 
 
 def tags_in_image(gray: Gray, families: Iterable[str] = BY_TRUST) -> list[SeenTag]:
@@ -68,7 +71,9 @@ def _of_family(gray: Gray, family: str, border_bits: int) -> list[SeenTag]:
     quads = np.reshape(corners, (-1, 4, 2)).astype(np.float32)
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).max(axis=1)
     return [
-        SeenTag(family, int(i), family == DOUBLE and _has_double_border(gray, quad), quad.mean(axis=0), float(side))
+        SeenTag(
+            family, int(i), family == DOUBLE and _has_double_border(gray, quad), quad.mean(axis=0), float(side), quad
+        )
         for i, quad, side in zip(np.ravel(ids), quads, sides, strict=True)
     ]
 

@@ -76,3 +76,5 @@ def test_the_shipped_logs() -> None:
     assert {target.family for target in rig.target_list} == {"tag36h11", "aruco_5x5_50"}
     assert {sensor.time_offset for sensor in rig.sensors.values()} == {"estimate"}  # both logs are in motion
     assert text.count("the length here is what the motion says") >= 3
+    assert "squares: [7, 5]" in text
+    assert "other columns and rows do not fit" in text
