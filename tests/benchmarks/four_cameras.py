@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from loky import ProcessPoolExecutor
 from numpy.typing import NDArray
-from rwhec_factors.se3 import inverse
+from rwhec_factors.se3 import expmap, inverse
 
 import gtsam_rwhec as rw
 
@@ -29,6 +29,8 @@ K = np.array([[1371.02278154, 0.0, 960.5], [0.0, 1371.02278154, 540.5], [0.0, 0.
 SAMPLES = 4
 #: A board that is seen at more than this angle is not drawn.
 STEEPEST_DEG = 75.0
+#: Renderings are as unsure as the real images, whose boards' poses err by this much about and along each axis.
+UNSURE_DEG, UNSURE_M = 0.1, 5e-4
 RIG = """\
 carriers: {{sensors: base, targets: hand, poses: {{frames: [base, hand]}}}}
 sensors:
@@ -91,7 +93,8 @@ def made_cell(folder: Path, each: int, seed: int = 0) -> Cell:
             if camera == REAL and k < len(names):
                 shutil.copyfile(workcell() / "image" / f"{names[k]}.png", path)
             else:
-                jobs.append((path, inverse(Y[camera]) @ T @ X))
+                off = expmap(rng.normal(size=(1, 6)) * np.repeat([np.radians(UNSURE_DEG), UNSURE_M], 3))[0]
+                jobs.append((path, inverse(Y[camera]) @ T @ X @ off))
     with ProcessPoolExecutor(2) as pool:
         list(pool.map(_draw, *zip(*jobs, strict=True), chunksize=16))
     (folder / "made").write_text(f"{each} {seed}")
