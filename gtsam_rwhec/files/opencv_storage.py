@@ -21,7 +21,7 @@ _ITEM = "_"
 _TAGS = (OPENCV_MATRIX, "tag:yaml.org,2002:opencv-nd-matrix")
 
 
-def parse_storage(text: str, where: str) -> YamlFile:
+def parse_storage(text: str, where: str, most_values: int = MOST_VALUES) -> YamlFile:
     """Parse a file in YAML, JSON, or OpenCV's XML; OpenCV's matrices are mappings with rows, cols, dt and data.
 
     Raises
@@ -31,18 +31,18 @@ def parse_storage(text: str, where: str) -> YamlFile:
     """
     bare = text.lstrip()
     if bare.startswith("<"):
-        return _Xml(where).parsed(text)
+        return _Xml(where, most_values).parsed(text)
     if bare.startswith(("{", "[")):  # JSON: tabs are blanks, which YAML does not have
         text = text.replace("\t", " ")
     # OpenCV begins with "%YAML:1.0", which is not valid YAML.
-    return parse_yaml(re.sub(r"\A%YAML:", "%YAML ", text), where, tags=_TAGS)
+    return parse_yaml(re.sub(r"\A%YAML:", "%YAML ", text), where, tags=_TAGS, most_values=most_values)
 
 
 class _Xml:
     """Reads the elements of one file in their order. Declarations of types and entities are refused."""
 
-    def __init__(self, where: str) -> None:
-        self.where = where
+    def __init__(self, where: str, most_values: int) -> None:
+        self.where, self.most_values = where, most_values
         self.lines: dict[KeyPath, int] = {}
         #: For each open element: its path, whether it is a matrix, its text, and what is in it.
         self.open: list[tuple[KeyPath, bool, list[str], dict[str, Any] | list[Any] | None]] = []
@@ -67,8 +67,10 @@ class _Xml:
 
     def _begin(self, name: str, attributes: dict[str, str]) -> None:
         self.count += 1
-        if self.count > MOST_VALUES or len(self.open) > DEEPEST:
-            self._refuse(f"more than {MOST_VALUES} values, or nested more deeply than {DEEPEST}; is it the right file?")
+        if self.count > self.most_values or len(self.open) > DEEPEST:
+            self._refuse(
+                f"more than {self.most_values} values, or nested more deeply than {DEEPEST}; is it the right file?"
+            )
         line = self.parser.CurrentLineNumber
         if not self.open:
             if name != _ROOT:
@@ -110,8 +112,8 @@ class _Xml:
             return text[1:-1]
         words = text.split()
         self.count += len(words)
-        if self.count > MOST_VALUES:
-            self._refuse(f"more than {MOST_VALUES} values; is it the right file?")
+        if self.count > self.most_values:
+            self._refuse(f"more than {self.most_values} values; is it the right file?")
         values = tuple(scalar(word) for word in words)
         are_numbers = all(isinstance(value, (int, float)) for value in values)
         if is_list or (len(values) > 1 and are_numbers):

@@ -96,7 +96,7 @@ def read_text(path: str | Path) -> str:
         raise FileFormatError(f"{path} is not a text file in UTF-8 (byte {error.start}); YAML was expected.") from error
 
 
-def parse_yaml(text: str, where: str, *, tags: Collection[str] = ()) -> YamlFile:
+def parse_yaml(text: str, where: str, *, tags: Collection[str] = (), most_values: int = MOST_VALUES) -> YamlFile:
     """Parse one document.
 
     Parameters
@@ -107,13 +107,15 @@ def parse_yaml(text: str, where: str, *, tags: Collection[str] = ()) -> YamlFile
         The file's name, for messages.
     tags : collection of str
         Tags that are ignored; any other tag is refused.
+    most_values : int
+        At most so many keys, values and items.
 
     Raises
     ------
     FileFormatError
         When the text is not YAML, is empty, or has what this module refuses. The message has the line.
     """
-    reader = _Reader(where, frozenset(tags), _events(text, where))
+    reader = _Reader(where, frozenset(tags), _events(text, where), most_values)
     return YamlFile(where, reader.document(), reader.lines)
 
 
@@ -175,6 +177,7 @@ class _Reader:
     where: str
     tags: frozenset[str]
     events: Iterator[Any]
+    most_values: int
     lines: dict[KeyPath, int] = field(default_factory=dict)
     nodes: int = 0
 
@@ -216,8 +219,8 @@ class _Reader:
         """The next event: a node without alias, anchor and tag, or the end of a list or mapping."""
         event = next(self.events)
         self.nodes += 1
-        if self.nodes > MOST_VALUES:
-            self._refuse(event, f"more than {MOST_VALUES} keys and values; is it the right file?")
+        if self.nodes > self.most_values:
+            self._refuse(event, f"more than {self.most_values} keys and values; is it the right file?")
         if isinstance(event, yaml.AliasEvent):
             self._refuse(event, f"the alias *{event.anchor}: aliases are not read; write the value out")
         if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):

@@ -45,7 +45,7 @@ def _stated(rig: Rig, name: str, source: Intrinsics) -> Camera:
     try:
         cameras = read_cameras(rig.folder / file, source.size)
     except FileFormatError as error:
-        raise FileFormatError(f"{error} ({place})") from error
+        raise FileFormatError(f"{error} ({place}; the path starts from {rig.folder})") from error
     if source.camera is not None:
         wanted = source.camera
     else:

@@ -276,3 +276,11 @@ def test_what_programs_print(tmp_path: Path, name: str) -> None:
         assert found.names == tuple(str(1_700_000_000 * 10**9 + i) for i in range(4))
     if name == "topic_echo.yaml":
         assert found.places[1] == f"{tmp_path / name}, line 15: [1].pose"
+
+
+def test_a_long_file_of_messages(tmp_path: Path) -> None:
+    """More values than a file that a person writes may have."""
+    count = 5500
+    pose = "---\npose: {{position: {{x: {}, y: 0, z: 0}}, orientation: {{x: 0, y: 0, z: 0, w: 1}}}}\n"
+    (tmp_path / "long.yaml").write_text("".join(pose.format(1e-3 * i) for i in range(count)))
+    assert read_poses(tmp_path / "long.yaml").T[:, 0, 3].tolist() == [1e-3 * i for i in range(count)]
