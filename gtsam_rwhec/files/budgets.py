@@ -91,9 +91,9 @@ PIXELS_FOR_A_BYTE = 256
 #: Bytes that decoding a compressed image may take; each byte of the image allows `DECODED_FOR_A_BYTE` more.
 DECODED = 160_000_000
 DECODED_FOR_A_BYTE = 4
-#: Pixels of the images that one thread decodes before it looks for targets: eight images of two megapixels. What is
+#: Pixels of the images that one thread decodes before it looks for targets: five images of two megapixels. What is
 #: found in them is kept together, so that a run that is killed loses no more.
-PIXELS_TOGETHER = 1 << 24
+PIXELS_TOGETHER = 1 << 23
 #: Scans of a JPEG. Encoders write up to 12; each takes a pass over all pixels, and needs 20 bytes of the file.
 SCANS = 64
 

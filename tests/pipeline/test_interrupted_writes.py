@@ -1,4 +1,4 @@
-"""A calibration that ends early leaves whole files or none, and goes on from them."""
+"""A calibration that ends early leaves whole files or none."""
 
 from __future__ import annotations
 
@@ -129,18 +129,3 @@ def test_a_calibration_that_ends_early_leaves_whole_files(
     assert earlier_run(tmp_path / "out") == ("raw.mcap", state)
     if name in before:
         assert (tmp_path / "out" / name).read_bytes() == before[name]
-
-
-def test_an_interrupted_calibration_goes_on(tmp_path: Path) -> None:
-    def interrupted(stage: str) -> None:
-        if stage == "writing pairs":
-            raise KeyboardInterrupt
-
-    log, out = made.write(tmp_path / "raw.mcap", RECORDED), tmp_path / "out"
-    with pytest.raises(KeyboardInterrupt):
-        calibrate_log(log, made.rig(), out, progress=interrupted)
-    assert {path.name for path in out.iterdir()} == {"detected.mcap", LIST_FILE}
-    check_whole(out)
-    calibrate_log(out / "detected.mcap", None, out)
-    check_whole(out)
-    assert {path.name for path in out.iterdir()} >= WRITTEN
