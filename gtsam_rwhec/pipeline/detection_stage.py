@@ -94,15 +94,17 @@ def detect_log(
             if source.detections is not None:
                 found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))
         report = detection_report(log, rig, found)
+        has_sheet = False
         if sheet is not None:
             tell("drawing the contact sheet")
-            write_contact_sheet(Path(sheet), log, rig, cameras, found)
+            has_sheet = write_contact_sheet(Path(sheet), log, rig, cameras, found)
         if draw is not None:
             draw_images(log, rig, cameras, {sensor: of.records for sensor, of in found.items()}, draw, tell)
         tell("looking for what hides targets")
         report = report.model_copy(update={"likely": likely_causes(log, rig, cameras, found)})
         if not any(track.used for track in report.tracks):
-            raise LogError(no_detections(log, report))
+            shown = f" {sheet} shows some of the images." if has_sheet else ""
+            raise LogError(f"{no_detections(log, report)}{shown}")
         tell("writing detections")
         with LogWriter(out_path) as out:
             out.copy(log, raw_topics(log), images)

@@ -17,11 +17,13 @@ from gtsam_rwhec.pipeline.image_names import image_name, image_names
 from gtsam_rwhec.pipeline.sensor_detections import SensorDetections
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.contact_sheet import WIDTH, Band, Outcome, Outline, Tile, contact_sheet
+from gtsam_rwhec.vision.contact_sheet import WIDTH, Band, Detail, Outcome, Outline, Tile, contact_sheet, detail_of
 from gtsam_rwhec.vision.images import Gray, decode_small
 
 #: A sheet has about this many images, of all sensors together, and of each sensor at least `LEAST`.
 MOST, LEAST = 60, 4
+#: Images are decoded at this many times the width of a small picture, for targets that are small in them.
+LARGE = 4
 #: Small pictures are decoded by this many threads.
 THREADS = 2
 #: Reasons are counted in a sensor's header up to this number.
@@ -47,14 +49,16 @@ def write_contact_sheet(
         records = _by_stamp(of_sensor.records)
         outcomes = {stamp: outcome_of(records[stamp], looked.fault) for stamp, looked in of_sensor.images.items()}
         shown = sample(outcomes, max(LEAST, MOST // len(sensors)))
-        small = _small_pictures(log, topic, {stamp: of_sensor.images[stamp].logged_ns for stamp in shown})
+        outlines = {stamp: _outlines(records[stamp], cameras[sensor]) for stamp in shown}
+        small = _small_pictures(log, topic, {stamp: of_sensor.images[stamp].logged_ns for stamp in shown}, outlines)
         tiles = tuple(
             Tile(
                 outcomes[stamp][0],
                 Path(image_name(names, topic, stamp)).name,
                 outcomes[stamp][1],
-                small.get(stamp),
-                _outlines(records[stamp], cameras[sensor]),
+                small[stamp][0] if stamp in small else None,
+                outlines[stamp],
+                small[stamp][1] if stamp in small else None,
             )
             for stamp in shown
         )
@@ -122,23 +126,28 @@ def _by_stamp(records: Sequence[DetectionRecord]) -> dict[int, list[DetectionRec
     return of_stamp
 
 
-def _small_pictures(log: Log, topic: str, logged_ns: Mapping[int, int]) -> dict[int, Gray]:
-    """Small pictures by stamp; those that cannot be decoded are missing."""
+def _small_pictures(
+    log: Log, topic: str, logged_ns: Mapping[int, int], outlines: Mapping[int, tuple[Outline, ...]]
+) -> dict[int, tuple[Gray, Detail | None]]:
+    """Small pictures by stamp, with the first target larger where it is small; what cannot be decoded is missing."""
     images = [
         record
         for record in log.records_logged_at([topic], logged_ns.values())
         if isinstance(record, ImageRecord) and record.stamp_ns in logged_ns
     ]
     with ThreadPoolExecutor(THREADS) as threads:
-        small = list(threads.map(_small_picture, images))
-    return {image.stamp_ns: gray for image, gray in zip(images, small, strict=True) if gray is not None}
+        small = list(threads.map(_small_picture, images, [outlines[image.stamp_ns] for image in images]))
+    return {image.stamp_ns: pictures for image, pictures in zip(images, small, strict=True) if pictures is not None}
 
 
-def _small_picture(image: ImageRecord) -> Gray | None:
+def _small_picture(image: ImageRecord, outlines: tuple[Outline, ...]) -> tuple[Gray, Detail | None] | None:
     try:
-        return decode_small(image, WIDTH)
+        large = decode_small(image, LARGE * WIDTH)
     except ImageError:
         return None  # the report names it, and the sheet says so
+    height = max(1, round(large.shape[0] / LARGE))
+    small = np.asarray(cv2.resize(large, (WIDTH, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return small, detail_of(large, outlines[0]) if outlines else None
 
 
 def _outlines(records: Sequence[DetectionRecord], camera: Camera) -> tuple[Outline, ...]:

@@ -28,6 +28,9 @@ TITLE, SMALL = 17, 12
 LINES = 3
 #: A small picture is at most this many times as high as wide.
 TALLEST = 1.4
+#: A target that is narrower and lower than this share of the image's width is shown larger in a corner, so many pixels
+#: wide and high, with this share of its size around it.
+SMALL_SHARE, DETAIL, AROUND = 0.3, 84, 0.4
 INK, GRAY, PAPER = (40, 40, 40), (150, 150, 150), (225, 225, 225)
 
 
@@ -59,6 +62,14 @@ class Outline:
 
 
 @dataclass(frozen=True, eq=False)
+class Detail:
+    """A target, larger: its pixels (DETAIL, DETAIL), and its corners (n, 2) in them."""
+
+    gray: Gray
+    corners: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Tile:
     """An image of the sheet.
 
@@ -72,6 +83,8 @@ class Tile:
     gray : (height, WIDTH) array or None
         The small picture; None where the image cannot be decoded.
     outlines : tuple of Outline
+    detail : Detail or None
+        The first target, larger, where it is small in the image.
     """
 
     outcome: Outcome
@@ -79,6 +92,7 @@ class Tile:
     words: str
     gray: Gray | None
     outlines: tuple[Outline, ...] = ()
+    detail: Detail | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +108,23 @@ def contact_sheet(bands: Sequence[Band]) -> Picture:
     """A picture (height, width, 3), blue, green, red, with a band for each sensor."""
     width = GAP + ACROSS * (WIDTH + GAP)
     return np.concatenate([_band(band, width) for band in bands] or [np.full((GAP, width, 3), 255, np.uint8)])
+
+
+def detail_of(gray: Gray, outline: Outline) -> Detail | None:
+    """A target as it is in an image of any size, if it is small in it: a square about it, `DETAIL` pixels wide."""
+    corners = outline.corners * gray.shape[1] - 0.5
+    if not np.isfinite(corners).all() or float(np.ptp(outline.corners, axis=0).max()) > SMALL_SHARE:
+        return None
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    half = 0.5 * (1.0 + 2.0 * AROUND) * float((high - low).max()) + 2.0
+    middle = np.clip(0.5 * (low + high), half, np.maximum(np.array(gray.shape[::-1]) - 1.0 - half, half))
+    left, top = np.maximum(np.rint(middle - half), 0).astype(int)
+    part = gray[top : top + round(2 * half), left : left + round(2 * half)]
+    if not part.size or min(part.shape) < 0.8 * max(part.shape):
+        return None
+    large = np.asarray(cv2.resize(part, (DETAIL, DETAIL), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    places = (corners - [left, top] + 0.5) * DETAIL / np.array(part.shape[::-1]) - 0.5
+    return Detail(large, np.asarray(places))
 
 
 def _band(band: Band, width: int) -> Picture:
@@ -144,7 +175,23 @@ def _small_picture(tile: Tile, height: int) -> Picture:
         first = np.rint(corners[0] * (1 << SHIFT)).astype(int).tolist()
         cv2.circle(picture, first, 4 << SHIFT, WHITE, -1, cv2.LINE_AA, SHIFT)
         cv2.circle(picture, first, 3 << SHIFT, colour, -1, cv2.LINE_AA, SHIFT)
+    if tile.detail is not None and min(height, len(gray)) > DETAIL + 4:
+        _draw_detail(picture, tile.detail, tile.outlines[0], min(height, len(gray)))
     return picture
+
+
+def _draw_detail(picture: Picture, detail: Detail, outline: Outline, height: int) -> None:
+    """Put a target's larger picture into the corner that is farthest from it, with a thin frame."""
+    middle = outline.corners.mean(axis=0) * WIDTH
+    left = 2 if middle[0] > 0.5 * WIDTH else WIDTH - DETAIL - 2
+    top = 2 if middle[1] > 0.5 * height else height - DETAIL - 2
+    cv2.rectangle(picture, (left - 2, top - 2), (left + DETAIL + 1, top + DETAIL + 1), WHITE, -1)
+    inside: Picture = np.asarray(cv2.cvtColor(detail.gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    colour = USED if outline.is_used else NOT_USED
+    for i, place in enumerate(np.rint(detail.corners * (1 << SHIFT)).astype(int).tolist()):
+        cv2.circle(inside, place, (5 if i == 0 else 3) << SHIFT, WHITE, -1, cv2.LINE_AA, SHIFT)
+        cv2.circle(inside, place, (4 if i == 0 else 2) << SHIFT, colour, -1, cv2.LINE_AA, SHIFT)
+    picture[top : top + DETAIL, left : left + DETAIL] = inside
 
 
 def _frame(picture: Picture, left: int, top: int, height: int, outcome: Outcome) -> None:

@@ -6,7 +6,19 @@ import cv2
 import numpy as np
 import pytest
 
-from gtsam_rwhec.vision.contact_sheet import ACROSS, GAP, HEADER, WIDTH, Band, Outcome, Outline, Tile, contact_sheet
+from gtsam_rwhec.vision.contact_sheet import (
+    ACROSS,
+    DETAIL,
+    GAP,
+    HEADER,
+    WIDTH,
+    Band,
+    Outcome,
+    Outline,
+    Tile,
+    contact_sheet,
+    detail_of,
+)
 from gtsam_rwhec.vision.picture_text import Words, fitted, width_of, wrapped, written
 
 GRAY = np.full((130, WIDTH), 90, dtype=np.uint8)
@@ -29,6 +41,29 @@ def test_every_outcome_is_told_without_colour() -> None:
             different = np.abs(one.astype(int) - other) > 60
             assert different[HEADER + 150 :].sum() > 40
             assert different[: HEADER + 150].sum() > 100
+
+
+def test_a_small_target_is_shown_larger_with_its_corners() -> None:
+    gray = np.full((520, 4 * WIDTH), 90, dtype=np.uint8)
+    gray[100:140, 200:260] = 250  # the target, 60 x 40 pixels
+    corners = np.array([[199.5, 99.5], [259.5, 99.5], [259.5, 139.5], [199.5, 139.5]])
+    outline = Outline((corners + 0.5) / gray.shape[1], is_used=True)
+    detail = detail_of(gray, outline)
+    assert detail is not None
+    assert detail.gray.shape == (DETAIL, DETAIL)
+    rows, columns = np.nonzero(detail.gray > 170)
+    np.testing.assert_allclose(
+        [columns.min() - 0.5, rows.min() - 0.5, columns.max() + 0.5, rows.max() + 0.5],
+        [*detail.corners[0], *detail.corners[2]],
+        atol=0.8,
+    )
+    assert detail_of(gray, Outline(3.5 * outline.corners, is_used=True)) is not None
+    assert detail_of(gray, Outline(np.array([[0.1, 0.1], [0.6, 0.1], [0.6, 0.5], [0.1, 0.5]]), is_used=True)) is None
+    assert detail_of(gray, Outline(np.full((4, 2), np.nan), is_used=True)) is None
+    edge = detail_of(gray, Outline(np.array([[0.0, 0.0], [0.05, 0.0], [0.05, 0.05]]), is_used=True))
+    assert edge is not None
+    plain, large = (Tile(Outcome.FOUND, "1.png", "", GRAY, (outline,), one) for one in (None, detail))
+    assert (contact_sheet([Band("a", "", (plain,))]) != contact_sheet([Band("a", "", (large,))])).any()
 
 
 def test_a_band_for_each_sensor() -> None:
