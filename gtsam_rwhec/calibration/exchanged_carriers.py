@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gtsam_rwhec.calibration.misreadings import Misreading, are_too_few_to_tell, is_plain
+from gtsam_rwhec.calibration.misreadings import Misreading, are_too_few_to_tell, is_plain, shares_of
 from gtsam_rwhec.calibration.readings import A_INVERTED
 from gtsam_rwhec.calibration.samples import Sampled
 from gtsam_rwhec.calibration.trial_fits import fitted, signal_of
@@ -24,6 +24,8 @@ from gtsam_rwhec.problem.problem import Problem
 SURELY = 15.0
 #: And its mean over blocks of neighbouring measurements must be above this many of its standard deviations.
 SIGMAS = 1.0
+#: A residual of the exchange must be below this share of what B varies by; else something else is wrong.
+EXPLAINED = 0.15
 #: Below this the measurements do not tell the two apart.
 ALIKE = 3.0
 
@@ -57,7 +59,9 @@ def exchange_of(problem: Problem) -> Exchange:
     gains = inverse.log_likelihoods - given.log_likelihoods
     sums = np.bincount(sampled.blocks(), gains)[np.unique(sampled.blocks())]
     gain, spread = float(gains.sum()), float(sums.std(ddof=1)) * math.sqrt(len(sums)) if len(sums) > 1 else math.inf
-    if gain > SURELY and gain > SIGMAS * spread:
+    signal = signal_of(sampled.as_read())
+    is_explained = max(shares_of(inverse.residual, signal)) < EXPLAINED
+    if gain > SURELY and gain > SIGMAS * spread and is_explained:
         before, after = given.residual, inverse.residual
         return Exchange(
             Misreading(
@@ -68,5 +72,5 @@ def exchange_of(problem: Problem) -> Exchange:
                 (1e3 * before.translation_m, 1e3 * after.translation_m),
             )
         )
-    is_small = is_plain(given.residual, signal_of(sampled.as_read()))
+    is_small = is_plain(given.residual, signal)
     return Exchange(is_open=are_too_few_to_tell(problem) and (gain > -ALIKE or not is_small))

@@ -171,11 +171,11 @@ def _rows_are_late(sampled: Sampled, solution: Solution) -> bool:
 
 def is_plain(residual: Spread, signal: Spread) -> bool:
     """Whether residuals are plainly those of a sensor: small beside what B varies by."""
-    shares = _shares(residual, signal)
+    shares = shares_of(residual, signal)
     return math.sqrt(shares[0] * shares[1]) < PLAIN_SHARE and max(shares) < LARGEST_PLAIN_SHARE
 
 
-def _shares(residual: Spread, signal: Spread) -> tuple[float, float]:
+def shares_of(residual: Spread, signal: Spread) -> tuple[float, float]:
     """The residuals as shares of what B varies by."""
     return (
         residual.rotation_rad / max(signal.rotation_rad, SMALLEST_RAD),
@@ -228,7 +228,7 @@ class _Trial:
     @property
     def is_strange(self) -> bool:
         """Whether the poses as read explain next to nothing."""
-        return max(_shares(self.base.residual, self.signal)) > UNEXPLAINED_SHARE
+        return max(shares_of(self.base.residual, self.signal)) > UNEXPLAINED_SHARE
 
     def shifts(self) -> list[Reading]:
         """Shifts of rows worth a look: rows that change slowly fit better by one row where they fit better by more."""
@@ -251,7 +251,7 @@ class _Trial:
         ratios = (before.rotation_rad / after.rotation_rad, before.translation_m / after.translation_m)
         # Angles in another unit change what B varies by.
         signal = signal_of(self.sampled.by(reading)) if reading.mistake is Mistake.ANGLE_UNIT else self.signal
-        for ratio, share in zip(ratios, _shares(after, signal), strict=True):
+        for ratio, share in zip(ratios, shares_of(after, signal), strict=True):
             if ratio < 1.0 / NOT_WORSE or (ratio > NOT_WORSE and share > EXPLAINED):
                 return 0.0
         gain = float(np.sum(np.log(ratios)))

@@ -170,6 +170,8 @@ def calibrate(
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
         return calibrate_log(source, rig, output, images=images, workers=workers, anyway=anyway, force=force)
+    if (words := other_than_csv(source)) is not None:
+        raise typer.BadParameter(words)
     refuse(context, NOT_CERTIFIED_ONLY if certified_only else NOT_WITH_ALL)
     is_samples = rw.logs.is_samples_file(source)
     if is_samples:
@@ -222,6 +224,22 @@ def calibrate(
 def is_log(source: Path) -> bool:
     """Whether this is a log, and not a folder of CSV files."""
     return source.suffix.lower() == ".mcap" or (source.is_dir() and any(source.glob("*.mcap")))
+
+
+def other_than_csv(source: Path) -> str | None:
+    """What to do with a bag, or with images, that were given without a rig file; None for anything else."""
+    if source.suffix.lower() == ".bag" or (source.is_dir() and any(source.glob("*.db3"))):
+        return (
+            f"{shown_path(source)} is a ROS bag. Convert it first: gtsam-rwhec convert {shown_path(source)} -o run.mcap"
+        )
+    if source.is_dir() and not any(source.glob("*.csv")):
+        inside = [source, *(path for path in (*source.glob("*"), *source.glob("*/*")) if path.is_dir())]
+        if any(map(rw.logs.is_image_folder, inside)):
+            return (
+                f"{shown_path(source)} has images. They need a rig file: --rig FILE. "
+                f"gtsam-rwhec init {shown_path(source)} -o rig.yaml writes a first one"
+            )
+    return None
 
 
 def calibrate_log(

@@ -111,7 +111,7 @@ def match(files: Sequence[Path], poses: NamedPoses, where: str) -> Matched:
     if any(poses.names) and pose_stamps(poses) is None and len(set(poses.names)) == len(poses.names) > 1:
         raise LogError(
             f"{where}: no pose has the name of an image. The first image is {files[0].name}, and the first pose is "
-            f"{poses.names[0]!r} ({poses.places[0]})"
+            f"{poses.names[0]!r} ({poses.places[0]}). Give both the same names or numbers"
         )
     if len(files) != len(poses.T):
         raise LogError(

@@ -137,7 +137,13 @@ def _of_quaternions(rows: list[PoseRow], stated: PoseStatement) -> Array:
         order = [4, 5, 6, 3]
     T, faults = transforms(numbers[:, :3], numbers[:, order])
     for i, fault in faults.items():
-        raise LogError(f"{rows[i].place}: {fault}.")
+        cure = ""
+        if "norm" in fault and rows[i].kind == "quaternion_of_any_order" and stated.euler is None:
+            cure = (
+                " If the numbers after the position are three angles, write euler: AXES (such as ZYX) and "
+                "angles: degrees or radians where the rig file has the frames."
+            )
+        raise LogError(f"{rows[i].place}: {fault}.{cure}")
     return T
 
 

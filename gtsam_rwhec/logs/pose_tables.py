@@ -226,6 +226,11 @@ def _row(path: str, line: Line, stated: PoseStatement) -> PoseRow:
             "numbers), a matrix (12 or 16 numbers), or a position and three angles with euler: stated; a name or a "
             "stamp may come first."
         )
+    if not has_name and count == 7 and stated.euler is None and _number(fields[0]) is None:
+        raise LogError(
+            f"{path}, line {number}: {brief(fields[0])} and six numbers. If they are a position and three angles, "
+            "write euler: AXES (such as ZYX) and angles: degrees or radians where the rig file has the frames"
+        )
     numbers = _numbers(path, number, fields[has_name:])
     if len(numbers) == 12:
         numbers = (*numbers, *_LAST)

@@ -71,6 +71,10 @@ def check_is_no_other_folder(path: object, rig: Rig | None) -> None:
     if rig is None or not isinstance(path, str | Path) or not Path(path).is_dir() or is_folder_of_images(path, rig):
         return
     if not any(Path(path).glob("*.mcap")):
+        if any(Path(path).glob("*.db3")):
+            raise LogError(
+                f"{path} is a ROS 2 bag of db3 files; convert it first: gtsam-rwhec convert {path} -o run.mcap"
+            )
         parent, child = rig.carriers.poses.parent_and_child
         raise LogError(
             f"{path} is a folder without MCAP files, and {rig.source.place(('carriers', 'poses'))} is of a log. For "

@@ -17,6 +17,13 @@ from gtsam_rwhec.rig import Rig
 
 #: A point that is known to this share of its distance only (with 95 %) is known to nothing.
 LARGEST_SHARE = 0.25
+#: Mistakes in rotations that angles of another convention look like, for poses without quaternions or matrices.
+OF_ROTATIONS = (Mistake.QUATERNION_ORDER, Mistake.TRANSPOSED, Mistake.HANDEDNESS)
+#: What to do about it.
+OTHER_ANGLES = (
+    "write the axes in the order of the turns, capitals for turning axes (ZYX: yaw, pitch, roll) and small letters for "
+    "fixed ones (xyz: roll, pitch, yaw), or rotation_vector"
+)
 #: Other sizes that are estimated, or other clocks, may look like these.
 NOT_OF_DIRECTIONS = (Mistake.UNIT, Mistake.SCALE, Mistake.ROWS_SHIFTED)
 
@@ -36,6 +43,9 @@ def in_rig_file(misreadings: Sequence[Misreading], rig: Rig) -> tuple[Misreading
     said = [replace(one, likely=_exchange(rig), cure=_unless_carried(rig)) for one in exchanged[:1]]
     is_B = [one.mistake is Mistake.INVERTED and bool(exchanged) for one in misreadings]
     others = [one for one, left_out in zip(misreadings, is_B, strict=True) if one not in exchanged and not left_out]
+    if rig.carriers.poses.euler is not None and any(one.mistake in OF_ROTATIONS for one in others):
+        of_angles = next(one for one in others if one.mistake in OF_ROTATIONS)
+        return (*said, replace(of_angles, likely=_other_angles(rig), cure=OTHER_ANGLES))
     return (*said, *(replace(one, cure=_cure(one, rig)) for one in others))
 
 
@@ -50,6 +60,11 @@ def _is_exchange(misreading: Misreading, rig: Rig) -> bool:
 def _exchange(rig: Rig) -> str:
     place = rig.source.place(("carriers", "sensors"), ("carriers", "targets"))
     return f"exchange `sensors` and `targets` in the rig file ({place})"
+
+
+def _other_angles(rig: Rig) -> str:
+    poses = rig.carriers.poses
+    return f"the files' angles are not euler: {poses.euler} ({rig.source.place(('carriers', 'poses', 'euler'))})"
 
 
 def _unless_carried(rig: Rig) -> str:

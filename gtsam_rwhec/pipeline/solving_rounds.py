@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.calibrating import calibrate
@@ -22,6 +24,7 @@ from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, problem_of
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.refining import refine
@@ -33,6 +36,10 @@ from gtsam_rwhec.solving.certified_solution import solve
 Pairs = dict[Pair, MeasuredPairs]
 #: A solution serves to find outliers, to estimate time offsets, as the answer, or for plots of what was misread.
 Purpose = Literal["outliers", "time offsets", "answer", "plots"]
+#: Reasons for which cleaning removes a measurement that does not agree with the carriers' motion.
+OF_THE_MOTION = (RemovalReason.NO_CONSENSUS, RemovalReason.ROTATION_OFF, RemovalReason.TRANSLATION_OFF)
+#: Words of a misreading of B alone, or of A and B.
+OF_B = re.compile(r"of B |of A and B |^B is |^A and B are")
 #: At most this many rounds estimate outliers and time offsets, and compute A again at the new time offsets.
 ROUNDS = 6
 #: Seconds. If no time offset changes by more than this, the rounds end.
@@ -87,16 +94,29 @@ class SolvingRounds:
         return marked
 
     def misreadings(self, given: SynchronisedPairs) -> tuple[Misreading, ...]:
-        """Likely misreadings of the poses of all measurements, before any is left out; at least exchanged carriers."""
-        problem = problem_of(given.pairs, self.rig, given.offsets_s)
+        """Likely misreadings of the poses, at least exchanged carriers, before any measurement is left out.
+
+        What cleaning removed because it does not agree with the carriers' motion counts: a misreading makes it so.
+        """
+        problem = problem_of(without_marks(given.pairs, OF_THE_MOTION), self.rig, given.offsets_s)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RwhecWarning)
             try:
-                found = reading_of(problem, solve(problem, progress=self.progress), self.progress).misreadings
+                found = self._misread(problem)
+                if found and self.rig.carriers.poses.parent_and_child[0] == self.rig.carriers.targets:
+                    # A is the inverse of the poses as they were written, and those were misread.
+                    found = min(found, self._misread(turned_round(problem)) or found, key=_is_left)
             except ScaleError:
                 return ()
             exchanged = exchange_of(problem).misreading if not found else None
             return found if exchanged is None else (exchanged,)
+
+    def _misread(self, problem: Problem) -> tuple[Misreading, ...]:
+        """Likely misreadings of a problem; what this library itself found in images was not misread."""
+        found = reading_of(problem, solve(problem, progress=self.progress), self.progress).misreadings
+        if any(sensor.images is None for sensor in self.rig.sensors.values()):
+            return found
+        return tuple(one for one in found if not OF_B.search(one.likely)) or found
 
     def may_be_exchanged(self, given: SynchronisedPairs) -> bool:
         """Whether the measurements are too few to tell that the carriers are not exchanged."""
@@ -220,9 +240,28 @@ def with_outliers_marked(pairs: Pairs, inliers: Mapping[Pair, np.ndarray]) -> Pa
     return result
 
 
-def without_outlier_marks(pairs: Pairs) -> Pairs:
-    """The pairs without marks of outliers: a log that was solved before is solved from the beginning."""
+def turned_round(problem: Problem) -> Problem:
+    """The same measurements with A and B inverted, and targets and sensors exchanged: B^-1 = X^-1 A^-1 Y."""
+    turned = Problem(problem.scale)
+    for target, sensor in problem.pairs:
+        measured = problem.measurements(target, sensor)
+        turned.add(sensor, target, se3.inverse(measured.A), se3.inverse(measured.B))
+    return turned
+
+
+def _is_left(misreadings: tuple[Misreading, ...]) -> float:
+    """The product of the residuals that the first reading leaves."""
+    return misreadings[0].rotation_deg[1] * misreadings[0].translation_mm[1]
+
+
+def without_marks(pairs: Pairs, reasons: Collection[str]) -> Pairs:
+    """The pairs with the measurements that these reasons removed."""
     return {
-        pair: replace(measured, reasons=tuple("" if why == RemovalReason.OUTLIER else why for why in measured.reasons))
+        pair: replace(measured, reasons=tuple("" if why in reasons else why for why in measured.reasons))
         for pair, measured in pairs.items()
     }
+
+
+def without_outlier_marks(pairs: Pairs) -> Pairs:
+    """The pairs without marks of outliers: a log that was solved before is solved from the beginning."""
+    return without_marks(pairs, (RemovalReason.OUTLIER,))

@@ -9,7 +9,7 @@ from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.choices import OUTLIERS, Choice
 from gtsam_rwhec.calibration.outliers import Outliers
 from gtsam_rwhec.calibration.reading import Reading
-from gtsam_rwhec.calibration.verdict import Judgement, Verdict
+from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Progress, silent
@@ -182,9 +182,10 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     if late:
         findings = not_of_late_clocks(findings, calibration.misreadings)
     findings = (*of_intrinsics, *findings, *late, *estimated_sizes(fields.sizes, rig))
-    if is_misread and not calibration.misreadings:
+    if is_misread:  # as the poses were written, which tells more than A
         found = Reading(in_rig_file(before, rig)).finding
-        findings = (*findings, *([found] if found is not None else []))
+        others = (one for one in findings if one.ground not in (Ground.MISREAD, Ground.IMPLAUSIBLE))
+        findings = (*([found] if found is not None else []), *others)
         calibration = replace(calibration, misreadings=before)
     if not is_misread:  # a misreading makes cleaning remove measurements that are right
         findings = (*findings, *short_of_measurements(fields, poses_used(settled.pairs.values())))

@@ -1,0 +1,429 @@
+"""Mistakes of a first user, each as it is made on the command line: exit status not 0, the fault and its cure in words.
+
+The cells are small: a board that is drawn into images of 320 x 240 pixels, and a log of detections. What a run draws
+(plots, contact sheet) is left out: it takes as long as all the rest, and has tests of its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from places import DEMO, REPOSITORY
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from gtsam_rwhec.cli.app import app
+from gtsam_rwhec.vision.targets import Checkerboard, Tag
+
+sys.path[:0] = [str(REPOSITORY / "tests" / part) for part in ("vision", "pipeline")]
+import rendered  # noqa: E402
+import synthetic_logs as made  # noqa: E402
+
+IMAGES = 12
+INTRINSICS = "{K: [300.0, 302.0, 157.0, 121.5], size: [320, 240]}"
+CELL = f"""\
+carriers: {{sensors: hand, targets: base, poses: {{frames: [base, hand]}}}}
+sensors:
+  left: {{images: left/image, poses: left/pose, intrinsics: {INTRINSICS}}}
+targets:
+  board: {{type: checkerboard, inner_corners: [5, 4], square_m: 0.03}}
+"""
+OF_A_FILE = CELL.replace("left/pose", "poses.txt")
+Change = Callable[[Path], object]
+
+
+@pytest.fixture(scope="session")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as a user has it: a board on a table, seen by a camera on a hand, and the hand's poses beside the images."""
+    folder, rng = tmp_path_factory.mktemp("mistakes") / "cell", np.random.default_rng(1)
+    for part in ("image", "pose"):
+        (folder / "left" / part).mkdir(parents=True)
+    board = rendered.printed(Checkerboard("board", 5, 4, 0.03))
+    X, Y = made.pose((0, 0, 10), (0.4, 0.1, 0.0)), made.pose((4, -6, 20), (0.06, 0.02, 0.04))
+    for i in range(IMAGES):
+        aside = rng.uniform((-0.02, -0.02, 0.42), (0.02, 0.02, 0.52))
+        seen = rendered.pose(tuple(rng.uniform((-35, -35, -70), (35, 35, 70))), tuple(aside))
+        cv2.imwrite(
+            str(folder / "left" / "image" / f"{i:04d}.png"), rendered.render(rendered.PINHOLE, [(board, seen)], seed=i)
+        )
+        np.savetxt(folder / "left" / "pose" / f"{i:04d}.csv", X @ np.linalg.inv(Y @ seen), delimiter=",")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of two cameras' detections of three tags."""
+    return made.write(tmp_path_factory.mktemp("mistakes") / "run.mcap", made.recording(4.0))
+
+
+@pytest.fixture(autouse=True)
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gtsam_rwhec.pipeline.all_stages.plot_all", lambda *_: [])
+
+
+def command(*arguments: object) -> tuple[int, str]:
+    """Exit status, and all that was said, on one line."""
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    said = " ".join((done.stdout + " " + done.stderr).replace("│", " ").split())
+    assert "Traceback" not in said
+    return done.exit_code, said
+
+
+def poses_of(folder: Path) -> list[Path]:
+    return sorted((folder / "left" / "pose").iterdir())
+
+
+def each_pose(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Other poses in the files of a folder."""
+
+    def changed(folder: Path) -> None:
+        for path in poses_of(folder):
+            np.savetxt(path, change(np.loadtxt(path, delimiter=",")), delimiter=",")
+
+    return changed
+
+
+def millimetres(T: np.ndarray) -> np.ndarray:
+    return T * np.array([[1.0, 1.0, 1.0, 1000.0]] * 3 + [[1.0] * 4])
+
+
+def one_file(rotation: Callable[[Rotation], np.ndarray], places: int = IMAGES) -> Change:
+    """All poses in one file of rows with a name, a position and a rotation."""
+
+    def written(folder: Path) -> None:
+        rows = []
+        for path in poses_of(folder)[:places]:
+            T = np.loadtxt(path, delimiter=",")
+            numbers = [*T[:3, 3].tolist(), *rotation(Rotation.from_matrix(T[:3, :3])).tolist()]
+            rows.append(f"{path.stem}.png {' '.join(map(repr, numbers))}")
+        (folder / "poses.txt").write_text("\n".join(rows))
+
+    return written
+
+
+def euler(**given: str) -> str:
+    """A rig file of one file of Euler angles."""
+    return OF_A_FILE.replace("hand]}", f"hand], {', '.join(f'{key}: {value}' for key, value in given.items())}}}")
+
+
+def image(change: Callable[[Path], object], number: int = 3) -> Change:
+    return lambda folder: change(folder / "left" / "image" / f"{number:04d}.png")
+
+
+def of_a_tag(folder: Path) -> None:
+    """Two of the images show a tag in place of the board."""
+    tag = rendered.printed(Tag("tag", "tag36h11", 3, 0.1))
+    for number in range(IMAGES):
+        picture = rendered.render(rendered.PINHOLE, [(tag, rendered.pose((10.0 * (number % 3), 0, 0), (0, 0, 0.5)))])
+        cv2.imwrite(str(folder / "left" / "image" / f"{number:04d}.png"), picture)
+
+
+def few_images(folder: Path) -> None:
+    for path in [*poses_of(folder)[3:], *sorted((folder / "left" / "image").iterdir())[3:]]:
+        path.unlink()
+
+
+def one_axis(folder: Path) -> None:
+    """The hand turns about the board's normal alone; the images are what the camera then sees."""
+    board, rng = rendered.printed(Checkerboard("board", 5, 4, 0.03)), np.random.default_rng(2)
+    X, Y = made.pose((0, 0, 10), (0.4, 0.1, 0.0)), made.pose((4, -6, 20), (0.06, 0.02, 0.04))
+    first = Y @ rendered.pose((10, -15, 0), (0, 0, 0.45)) @ np.linalg.inv(X)
+    for number, path in enumerate(poses_of(folder)):
+        A = first @ made.pose((0, 0, 14.0 * number), (0, 0, 0))
+        seen = np.linalg.inv(Y) @ A @ X
+        seen[:3, 3] = [*rng.uniform(-0.02, 0.02, 2), 0.47]
+        A = Y @ seen @ np.linalg.inv(X)
+        picture = rendered.render(rendered.PINHOLE, [(board, seen)], seed=number)
+        cv2.imwrite(str(folder / "left" / "image" / f"{number:04d}.png"), picture)
+        np.savetxt(path, np.linalg.inv(A), delimiter=",")
+
+
+def blank_camera(folder: Path) -> None:
+    shutil.copytree(folder / "left", folder / "right")
+    for path in (folder / "right" / "image").iterdir():
+        cv2.imwrite(str(path), np.full((240, 320), 128, dtype=np.uint8))
+
+
+def db3(folder: Path) -> None:
+    shutil.rmtree(folder)
+    folder.mkdir()
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 5}")
+    (folder / "run_0.db3").write_bytes(b"SQLite format 3\0")
+
+
+RIGHT = f"  right: {{images: right/image, poses: right/pose, intrinsics: {INTRINSICS}}}\ntargets:\n"
+OF_A_LOG = CELL.replace("frames:", "tf:").replace("poses: left/pose, ", "")
+
+
+@dataclasses.dataclass(frozen=True)
+class Mistake:
+    """A rig file, what is done to the folder, the exit status, and words that name the fault and the cure."""
+
+    rig: str
+    status: int
+    words: tuple[str, ...]
+    change: Change = lambda _: None
+
+
+FOLDERS = {
+    # The rig file
+    "carriers exchanged": Mistake(
+        CELL.replace("sensors: hand, targets: base", "sensors: base, targets: hand"), 6,
+        ("exchange `sensors` and `targets` in the rig file", "line 1: carriers.sensors and carriers.targets"),
+    ),
+    "board in millimetres": Mistake(
+        CELL.replace("0.03", "30"), 2, ("line 5: targets.board.square_m: 30 m", "if it is in millimetres, write 0.03"),
+    ),
+    "board 3 % too large": Mistake(
+        CELL.replace("0.03}", "0.0309}"), 6,
+        ("the stated size of board is 3", "% too large", "line 5", "measure the named targets again"),
+    ),
+    "columns and rows of before": Mistake(
+        CELL.replace("inner_corners: [5, 4]", "columns: 5, rows: 4"), 2, ("is now inner_corners: [5, 4]",),
+    ),
+    "a key that is misspelt": Mistake(
+        CELL.replace("intrinsics:", "intrinsic:"), 2, ("line 3: sensors.left.intrinsic: unknown key; did you mean",),
+    ),
+    "no intrinsics": Mistake(
+        CELL.replace(f", intrinsics: {INTRINSICS}", ""), 2, ("sensors.left: images without intrinsics; give FILE",),
+    ),
+    "a file of intrinsics that is not there": Mistake(
+        CELL.replace(INTRINSICS, "left.yaml"), 2, ("left.yaml", "line 3: sensors.left.intrinsics"),
+    ),
+    "intrinsics of twice the size": Mistake(
+        CELL.replace(INTRINSICS, "{K: [600.0, 604.0, 314.5, 243.5], size: [640, 480]}"), 2,
+        ("320 x 240 pixels, but the intrinsics are for 640 x 480", "Give the intrinsics of images of this size"),
+    ),
+    "the same images for two cameras": Mistake(
+        CELL.replace("targets:\n  board", RIGHT.replace("right/", "left/") + "  board"), 2,
+        ("left/image is also the topic or path of sensor left; each sensor needs its own",),
+    ),
+    "poses of another pair of frames": Mistake(
+        CELL.replace("[base, hand]", "[base, tool0]"), 2,
+        ("poses of tool0 in base are not poses of the carriers; name hand and base",),
+    ),
+    "no poses": Mistake(CELL.replace("poses: left/pose, ", ""), 2, ("sensors.left: no poses. Name the file or",)),
+    "poses that are not there": Mistake(CELL.replace("left/pose", "left/poses"), 2, ("left/poses", "sensors.left.poses")),
+    "a rig file of a log for a folder": Mistake(
+        OF_A_LOG, 2, ("carriers.poses is of a log", "write poses: {frames: [base, hand]}, and for each sensor"),
+    ),
+    "a bag for a folder": Mistake(OF_A_LOG, 2, ("is a ROS 2 bag of db3 files", "gtsam-rwhec convert"), db3),
+    # The poses
+    "poses in millimetres": Mistake(
+        CELL, 2, ("Are they millimetres? Write length: mm where the rig file has the frames",), each_pose(millimetres),
+    ),
+    "inverted poses": Mistake(
+        CELL, 6,
+        ("exchange `sensors` and `targets` in the rig file", "the files have T_hand_base: write frames: [hand, base]"),
+        each_pose(np.linalg.inv),
+    ),
+    "transposed matrices": Mistake(CELL, 2, ("has the position in the last row: transpose it",), each_pose(np.transpose)),
+    "quaternions w, x, y, z": Mistake(
+        OF_A_FILE, 6, ("the quaternions of A are wxyz, and were read as xyzw", "write quaternion: wxyz beside the frames"),
+        one_file(lambda R: R.as_quat()[[3, 0, 1, 2]]),
+    ),
+    "Euler angles without a convention": Mistake(
+        OF_A_FILE, 2, ("three angles", "euler:", "angles: degrees"), one_file(lambda R: R.as_euler("xyz")),
+    ),
+    "Euler angles of another convention": Mistake(
+        euler(euler="ZYX", angles="radians"), 6, ("Do not use these poses", "euler"),
+        one_file(lambda R: R.as_euler("xyz")),
+    ),
+    "degrees for radians": Mistake(
+        euler(euler="xyz", angles="radians"), 2, ("more than a turn in radians. Are they degrees? Write angles: degrees",),
+        one_file(lambda R: R.as_euler("xyz", degrees=True)),
+    ),
+    "radians for degrees": Mistake(
+        euler(euler="xyz", angles="degrees"), 6, ("the angles of A are in radians, and were read as degrees",),
+        one_file(lambda R: R.as_euler("xyz")),
+    ),
+    "poses of other names": Mistake(
+        CELL, 2, ("no pose has the name of an image", "Give both the same names or numbers"),
+        lambda folder: [path.rename(path.with_name(f"at_{chr(97 + i)}.csv")) for i, path in enumerate(poses_of(folder))],
+    ),
+    # The images and the motion
+    "a camera that saw nothing": Mistake(
+        CELL.replace("targets:\n  board", RIGHT + "  board"), 6,
+        ("right: 0 measurements (its 12 images show no target), at least 3 poses with two turning axes are needed",
+         "Not written, as the poses are not to be used: static_tf.launch.py"),
+        blank_camera,
+    ),
+    "too few images": Mistake(
+        CELL, 3, ("3 measurements are too few to tell", "measure at 10 poses or more"), few_images,
+    ),
+    "one axis only": Mistake(
+        CELL, 3, ("the measurements do not determine all poses", "turn the carriers about at least two different axes"),
+        one_axis,
+    ),
+    "a tag of another family": Mistake(
+        CELL.replace("checkerboard, inner_corners: [5, 4], square_m: 0.03", "tag, family: tag25h9, id: 3, size_m: 0.1"), 2,
+        ("tag36h11 3",), of_a_tag,
+    ),
+    "a tag of another number": Mistake(
+        CELL.replace("checkerboard, inner_corners: [5, 4], square_m: 0.03", "tag, family: tag36h11, id: 4, size_m: 0.1"), 2,
+        ("tag36h11 3",), of_a_tag,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_of_a_folder(name: str, cell: Path, tmp_path: Path) -> None:
+    mistake, folder = FOLDERS[name], tmp_path / "cell"
+    shutil.copytree(cell, folder)
+    (tmp_path / "rig.yaml").write_text(mistake.rig, encoding="utf-8")
+    mistake.change(folder)
+    status, said = command("calibrate", folder, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    assert status == mistake.status, said
+    for words in mistake.words:
+        assert words in said
+    if status == 2:  # nothing is left behind that looks like a result
+        assert not (tmp_path / "out" / "result.json").exists()
+
+
+def corrupt(path: Path) -> None:
+    path.write_bytes(b"not a picture")
+
+
+def mirrored(path: Path) -> None:
+    cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path)), 1))
+
+
+def test_one_bad_image_costs_one_image_and_is_named(cell: Path, tmp_path: Path) -> None:
+    """No mistake that ends a run: the others have the answer, so the exit status is 0, and the image is named."""
+    folder = shutil.copytree(cell, tmp_path / "cell")
+    corrupt(folder / "left" / "image" / "0003.png")
+    mirrored(folder / "left" / "image" / "0005.png")
+    (tmp_path / "rig.yaml").write_text(CELL, encoding="utf-8")
+    run = ("calibrate", folder, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    status, said = command(*run)
+    assert status == 0, said
+    assert "1 images of left could not be used. The first: left/image/0003.png" in said
+    assert "of board-left), because they are farther off than the noise of the others explains" in said
+
+    # And what is there is not replaced, unless that is said.
+    status, again = command(*run)
+    assert status == 2
+    assert "--force" in again
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "thesis.tex").write_text("text")
+    status, foreign = command(*run[:-1], out)
+    assert status == 2
+    assert "thesis.tex" in foreign
+    assert [path.name for path in out.iterdir()] == ["thesis.tex"]
+    assert command("export", tmp_path / "out" / "clean.mcap", "-o", tmp_path / "files", "--anyway")[0] == 0
+
+
+def test_images_without_a_rig_file(cell: Path, tmp_path: Path) -> None:
+    status, said = command("calibrate", cell, "-o", tmp_path / "out")
+    assert status == 2
+    assert "has images. They need a rig file: --rig FILE" in said
+    assert "gtsam-rwhec init" in said
+
+
+def moved(message: made.Message) -> made.Message:
+    """From the middle on tag 1 is 0.1 m aside, and turned."""
+    if "detections" not in message.content or message.logged_ns < made.BEGIN_NS + 2 * 10**9:
+        return message
+    parts = []
+    for part in message.content["detections"]:
+        if part["id"] == "1":
+            at, turn = part["pose"]["position"], part["pose"]["orientation"]
+            R = Rotation.from_quat([turn[key] for key in "xyzw"])
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = R.as_matrix(), [at[key] for key in "xyz"]
+            part = made.tag(1, T @ made.pose((0, 0, 25), (0.1, 0.03, 0.0)))
+        parts.append(part)
+    return dataclasses.replace(message, content=message.content | {"detections": parts})
+
+
+def test_a_tag_that_moved_half_way(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(made.RIG, encoding="utf-8")
+    log = made.write(tmp_path / "run.mcap", map(moved, made.recording(4.0)))
+    status, said = command("calibrate", log, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    assert status == 6, said
+    assert re.search(r"\d+ of 38 measurements of tag_1 contradict the answer", said)
+    assert "do not use the pose of the named target; check whether it has moved" in said
+
+
+LOGS = {
+    "a topic that is not there": (
+        made.rig_text(cam_1="detections: /cam_2/tags"), 2, ("/cam_2/tags", "has: /cam_0/tags"),
+    ),
+    "a frame that tf does not have": (
+        made.rig_text(poses="{tf: [base, hand_link]}").replace("sensors: hand", "sensors: hand_link"), 2,
+        ("hand_link", "there are: base, hand"),
+    ),
+    "carriers exchanged": (
+        made.RIG.replace("sensors: hand", "sensors: base").replace("targets: base", "targets: hand"), 6,
+        ("exchange `sensors` and `targets` in the rig file", "lines 2 and 3"),
+    ),
+    "a late clock": (
+        made.rig_text(cam_1="detections: /cam_1/tags\n    time_offset: 0.3"), 6,
+        ("the time offset of cam_1 is 0.3 s in the rig file", "write time_offset: estimate"),
+    ),
+    "a wrong number of a tag": (
+        made.rig_text(tag_1=f"{{type: tag, family: tag36h11, id: 7, size_m: {made.SIZE_M}}}"), 6,
+        ("tag_1: 0 measurements (no sensor saw it)", "tag36h11 1 (38 times)"),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_of_a_log(name: str, log: Path, tmp_path: Path) -> None:
+    rig, wanted, words = LOGS[name]
+    (tmp_path / "rig.yaml").write_text(rig, encoding="utf-8")
+    status, said = command("calibrate", log, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    assert status == wanted, said
+    for part in words:
+        assert part in said
+
+
+def rows(change: Callable[[np.ndarray], np.ndarray], side: str) -> Change:
+    """Other rows qw, qx, qy, qz, tx, ty, tz in the files of A or B."""
+
+    def changed(folder: Path) -> None:
+        for path in folder.glob(f"*_{side}.csv"):
+            np.savetxt(path, change(np.loadtxt(path, delimiter=",")), delimiter=",")
+
+    return changed
+
+
+def inverse(given: np.ndarray) -> np.ndarray:
+    R = Rotation.from_quat(given[:, [1, 2, 3, 0]]).inv()
+    return np.hstack([R.as_quat()[:, [3, 0, 1, 2]], -R.apply(given[:, 4:])])
+
+
+TABLES = {
+    "quaternions x, y, z, w": (rows(lambda row: row[:, [1, 2, 3, 0, 4, 5, 6]], "B"), (),
+                               ("the quaternions of B are xyzw, and were read as wxyz", "order='xyzw'")),
+    "A inverted": (rows(inverse, "A"), (), ("A is inverted", "give A = T_sensorcarrier_targetcarrier")),
+    "A in millimetres": (rows(lambda row: row * [1, 1, 1, 1, 1000, 1000, 1000], "A"), (),
+                         ("A", "millimetres", "0.001")),
+    "roles exchanged": (lambda _: None, ("--targets", "cam", "--sensors", "tag"),
+                        ("targets and sensors are exchanged", "name the targets as targets")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_of_csv_files(name: str, tmp_path: Path) -> None:
+    change, options, words = TABLES[name]
+    folder = Path(shutil.copytree(DEMO, tmp_path / "demo"))
+    change(folder)
+    if options:  # the same files, named the other way round
+        for path in [*folder.iterdir()]:
+            tag, cam = path.stem.split("_")[1::2][:2]
+            path.rename(folder / f"cam_{cam}_tag_{tag}_{path.stem[-1]}.csv")
+    status, said = command("calibrate", folder, *options)
+    assert status == 6, said
+    for part in words:
+        assert part in said
