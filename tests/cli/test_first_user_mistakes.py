@@ -27,7 +27,7 @@ sys.path[:0] = [str(REPOSITORY / "tests" / part) for part in ("vision", "pipelin
 import rendered  # noqa: E402
 import synthetic_logs as made  # noqa: E402
 
-IMAGES = 12
+IMAGES = 10
 INTRINSICS = "{K: [300.0, 302.0, 157.0, 121.5], size: [320, 240]}"
 CELL = f"""\
 carriers: {{sensors: hand, targets: base, poses: {{frames: [base, hand]}}}}
@@ -42,7 +42,7 @@ Change = Callable[[Path], object]
 
 @pytest.fixture(scope="session")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as a user has it: a board on a table, seen by a camera on a hand, and the hand's poses beside the images."""
+    """A folder as a user has it: a board on a table, seen by a camera on a hand, and the hand's poses."""
     folder, rng = tmp_path_factory.mktemp("mistakes") / "cell", np.random.default_rng(1)
     for part in ("image", "pose"):
         (folder / "left" / part).mkdir(parents=True)
@@ -61,7 +61,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of two cameras' detections of three tags."""
-    return made.write(tmp_path_factory.mktemp("mistakes") / "run.mcap", made.recording(4.0))
+    return made.write(tmp_path_factory.mktemp("mistakes") / "run.mcap", made.recording(3.0))
 
 
 @pytest.fixture(autouse=True)
@@ -178,7 +178,8 @@ FOLDERS = {
     # The rig file
     "carriers exchanged": Mistake(
         CELL.replace("sensors: hand, targets: base", "sensors: base, targets: hand"), 6,
-        ("exchange `sensors` and `targets` in the rig file", "line 1: carriers.sensors and carriers.targets"),
+        ("exchange `sensors` and `targets` in the rig file", "line 1: carriers.sensors and carriers.targets",
+         "or, if base does carry the sensors, the files have T_hand_base: write frames: [hand, base]"),
     ),
     "board in millimetres": Mistake(
         CELL.replace("0.03", "30"), 2, ("line 5: targets.board.square_m: 30 m", "if it is in millimetres, write 0.03"),
@@ -201,7 +202,7 @@ FOLDERS = {
     ),
     "intrinsics of twice the size": Mistake(
         CELL.replace(INTRINSICS, "{K: [600.0, 604.0, 314.5, 243.5], size: [640, 480]}"), 2,
-        ("320 x 240 pixels, but the intrinsics are for 640 x 480", "Give the intrinsics of images of this size"),
+        ("320 x 240 pixels, but the intrinsics are for 640 x 480", "line 3: sensors.left.intrinsics"),
     ),
     "the same images for two cameras": Mistake(
         CELL.replace("targets:\n  board", RIGHT.replace("right/", "left/") + "  board"), 2,
@@ -212,7 +213,9 @@ FOLDERS = {
         ("poses of tool0 in base are not poses of the carriers; name hand and base",),
     ),
     "no poses": Mistake(CELL.replace("poses: left/pose, ", ""), 2, ("sensors.left: no poses. Name the file or",)),
-    "poses that are not there": Mistake(CELL.replace("left/pose", "left/poses"), 2, ("left/poses", "sensors.left.poses")),
+    "poses that are not there": Mistake(
+        CELL.replace("left/pose", "left/poses"), 2, ("left/poses", "sensors.left.poses"),
+    ),
     "a rig file of a log for a folder": Mistake(
         OF_A_LOG, 2, ("carriers.poses is of a log", "write poses: {frames: [base, hand]}, and for each sensor"),
     ),
@@ -221,39 +224,35 @@ FOLDERS = {
     "poses in millimetres": Mistake(
         CELL, 2, ("Are they millimetres? Write length: mm where the rig file has the frames",), each_pose(millimetres),
     ),
-    "inverted poses": Mistake(
-        CELL, 6,
-        ("exchange `sensors` and `targets` in the rig file", "the files have T_hand_base: write frames: [hand, base]"),
-        each_pose(np.linalg.inv),
+    "transposed matrices": Mistake(
+        CELL, 2, ("has the position in the last row: transpose it",), each_pose(np.transpose),
     ),
-    "transposed matrices": Mistake(CELL, 2, ("has the position in the last row: transpose it",), each_pose(np.transpose)),
     "quaternions w, x, y, z": Mistake(
-        OF_A_FILE, 6, ("the quaternions of A are wxyz, and were read as xyzw", "write quaternion: wxyz beside the frames"),
+        OF_A_FILE, 6,
+        ("the quaternions of A are wxyz, and were read as xyzw", "write quaternion: wxyz beside the frames"),
         one_file(lambda R: R.as_quat()[[3, 0, 1, 2]]),
     ),
     "Euler angles without a convention": Mistake(
         OF_A_FILE, 2, ("three angles", "euler:", "angles: degrees"), one_file(lambda R: R.as_euler("xyz")),
     ),
     "Euler angles of another convention": Mistake(
-        euler(euler="ZYX", angles="radians"), 6, ("Do not use these poses", "euler"),
+        euler(euler="ZYX", angles="radians"), 6,
+        ("the files' angles are not euler: ZYX", "line 1: carriers.poses.euler", "write the axes in the order of the"),
         one_file(lambda R: R.as_euler("xyz")),
     ),
     "degrees for radians": Mistake(
-        euler(euler="xyz", angles="radians"), 2, ("more than a turn in radians. Are they degrees? Write angles: degrees",),
+        euler(euler="xyz", angles="radians"), 2,
+        ("more than a turn in radians. Are they degrees? Write angles: degrees",),
         one_file(lambda R: R.as_euler("xyz", degrees=True)),
-    ),
-    "radians for degrees": Mistake(
-        euler(euler="xyz", angles="degrees"), 6, ("the angles of A are in radians, and were read as degrees",),
-        one_file(lambda R: R.as_euler("xyz")),
     ),
     "poses of other names": Mistake(
         CELL, 2, ("no pose has the name of an image", "Give both the same names or numbers"),
-        lambda folder: [path.rename(path.with_name(f"at_{chr(97 + i)}.csv")) for i, path in enumerate(poses_of(folder))],
+        lambda folder: [path.rename(path.with_name(f"at_{chr(97 + int(path.stem))}.csv")) for path in poses_of(folder)],
     ),
     # The images and the motion
     "a camera that saw nothing": Mistake(
         CELL.replace("targets:\n  board", RIGHT + "  board"), 6,
-        ("right: 0 measurements (its 12 images show no target), at least 3 poses with two turning axes are needed",
+        ("right: 0 measurements (its 10 images show no target), at least 3 poses with two turning axes are needed",
          "Not written, as the poses are not to be used: static_tf.launch.py"),
         blank_camera,
     ),
@@ -265,12 +264,11 @@ FOLDERS = {
         one_axis,
     ),
     "a tag of another family": Mistake(
-        CELL.replace("checkerboard, inner_corners: [5, 4], square_m: 0.03", "tag, family: tag25h9, id: 3, size_m: 0.1"), 2,
-        ("tag36h11 3",), of_a_tag,
+        CELL.replace("checkerboard, inner_corners: [5, 4], square_m: 0.03", "tag, family: tag25h9, id: 3, size_m: 0.1"),
+        2, ("tags of tag36h11",), of_a_tag,
     ),
-    "a tag of another number": Mistake(
-        CELL.replace("checkerboard, inner_corners: [5, 4], square_m: 0.03", "tag, family: tag36h11, id: 4, size_m: 0.1"), 2,
-        ("tag36h11 3",), of_a_tag,
+    "squares counted for corners": Mistake(
+        CELL.replace("[5, 4]", "[6, 5]"), 2, ("inner_corners: [5, 4]",), few_images,
     ),
 }  # fmt: skip
 
@@ -332,7 +330,7 @@ def test_images_without_a_rig_file(cell: Path, tmp_path: Path) -> None:
 
 def moved(message: made.Message) -> made.Message:
     """From the middle on tag 1 is 0.1 m aside, and turned."""
-    if "detections" not in message.content or message.logged_ns < made.BEGIN_NS + 2 * 10**9:
+    if "detections" not in message.content or message.logged_ns < made.BEGIN_NS + 15 * 10**8:
         return message
     parts = []
     for part in message.content["detections"]:
@@ -348,10 +346,10 @@ def moved(message: made.Message) -> made.Message:
 
 def test_a_tag_that_moved_half_way(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text(made.RIG, encoding="utf-8")
-    log = made.write(tmp_path / "run.mcap", map(moved, made.recording(4.0)))
+    log = made.write(tmp_path / "run.mcap", map(moved, made.recording(3.0)))
     status, said = command("calibrate", log, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
     assert status == 6, said
-    assert re.search(r"\d+ of 38 measurements of tag_1 contradict the answer", said)
+    assert re.search(r"\d+ of 28 measurements of tag_1 contradict the answer", said)
     assert "do not use the pose of the named target; check whether it has moved" in said
 
 
@@ -363,17 +361,13 @@ LOGS = {
         made.rig_text(poses="{tf: [base, hand_link]}").replace("sensors: hand", "sensors: hand_link"), 2,
         ("hand_link", "there are: base, hand"),
     ),
-    "carriers exchanged": (
-        made.RIG.replace("sensors: hand", "sensors: base").replace("targets: base", "targets: hand"), 6,
-        ("exchange `sensors` and `targets` in the rig file", "lines 2 and 3"),
-    ),
     "a late clock": (
         made.rig_text(cam_1="detections: /cam_1/tags\n    time_offset: 0.3"), 6,
         ("the time offset of cam_1 is 0.3 s in the rig file", "write time_offset: estimate"),
     ),
     "a wrong number of a tag": (
         made.rig_text(tag_1=f"{{type: tag, family: tag36h11, id: 7, size_m: {made.SIZE_M}}}"), 6,
-        ("tag_1: 0 measurements (no sensor saw it)", "tag36h11 1 (38 times)"),
+        ("tag_1: 0 measurements (no sensor saw it)", "tag36h11 1 (28 times)"),
     ),
 }  # fmt: skip
 
