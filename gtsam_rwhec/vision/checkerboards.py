@@ -59,23 +59,26 @@ def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = N
     neither counts.
     """
     rejected: FoundBoard | None = None
+    found: FoundBoard | None = None
     there: list[Region] = []
     larger: list[Array] = []  # middles of boards that go on: OpenCV need not read parts of them
     for level in LEVELS:
-        found: FoundBoard | None = None
-        for grid in _in_order(gray, board, level, there):
-            if found is None:
-                tested = _tested(gray, grid, camera)
-                if tested.rejection is None:
-                    found = tested
-                if tested.rejection is Rejection.OTHER_SIZE:
-                    rejected = tested
-                    larger.append(grid.reshape(-1, 2).mean(axis=0))
-                rejected = rejected or tested
-            elif _is_apart(grid, found.corners_px) and _tested(gray, grid, camera).rejection is None:
-                return replace(found, rejection=Rejection.SEEN_TWICE)
-        if found is not None:
-            return found
+        for grid, goes_on in _in_order(gray, board, level, there):
+            if found is not None and not _is_apart(grid, found.corners_px):
+                continue
+            tested = _tested(gray, grid, camera)
+            if tested.rejection is None and goes_on:
+                tested = replace(tested, rejection=Rejection.OTHER_SIZE)
+            if tested.rejection is None:
+                if found is not None:
+                    return replace(found, rejection=Rejection.SEEN_TWICE)
+                found = tested
+            elif tested.rejection is Rejection.OTHER_SIZE:
+                rejected = tested
+                larger.append(grid.reshape(-1, 2).mean(axis=0))
+            rejected = rejected or tested
+    if found is not None:
+        return found
     others = [region for region in there if not any(_holds(region, middle) for middle in larger)]
     for grid in _by_opencv(gray, board, others):
         tested = _tested(gray, grid, camera)
@@ -92,17 +95,20 @@ def _is_apart(grid: Array, corners_px: Array) -> bool:
     return cv2.pointPolygonTest(hull, (float(middle[0]), float(middle[1])), False) < 0.0
 
 
-def _in_order(gray: Gray, board: Checkerboard, level: int, there: list[Region]) -> Iterator[Array]:
-    """Grids of corners (rows, columns, 2) that lattices of saddles give; the regions searched are added to `there`."""
+def _in_order(gray: Gray, board: Checkerboard, level: int, there: list[Region]) -> Iterator[tuple[Array, bool]]:
+    """Grids of corners (rows, columns, 2) that lattices of saddles give, and whether these go on beyond them.
+
+    The regions searched are added to `there`.
+    """
     found = saddles(scaled_down(gray, level))
     corners = board.columns * board.rows
     regions = regions_among(gray.shape, found.places, corners, level)[:MOST_REGIONS]
     there += regions
     for region in regions:
         for lattice in lattices(found, region.members, corners):
-            for grid in boards_in(lattice, found.places, board.rows, board.columns):
+            for grid, goes_on in boards_in(lattice, found.places, board.rows, board.columns):
                 # Pixel centres are at whole numbers: the first of the halved ones is at 1/2.
-                yield grid * 2**level + 0.5 * (2**level - 1)
+                yield grid * 2**level + 0.5 * (2**level - 1), goes_on
 
 
 def _by_opencv(gray: Gray, board: Checkerboard, there: list[Region]) -> Iterator[Array]:

@@ -29,6 +29,8 @@ LEAST_SHARE, LEAST_SADDLES = 0.7, 8
 STARTS, MOST_LATTICES = 6, 3
 #: A lattice of this share of a group's saddles is enough.
 ENOUGH = 0.9
+#: A board goes on if this share of a row of corners beyond it is there, and two of them.
+GOES_ON = 0.4
 #: Of a lattice that is larger than the board, at most this number of parts are tried.
 MOST_PARTS = 4
 
@@ -116,23 +118,29 @@ def _colour(light: Sequence[float], a: Sequence[float], b: Sequence[float]) -> f
     return (light[0] * b[1] - light[1] * b[0]) * (a[0] * light[1] - a[1] * light[0])
 
 
-def boards_in(lattice: Lattice, places: Array, rows: int, columns: int) -> Iterator[Array]:
-    """Grids (rows, columns, 2) of places that a lattice may show, the fullest first; a homography gives what lacks."""
+def boards_in(lattice: Lattice, places: Array, rows: int, columns: int) -> Iterator[tuple[Array, bool]]:
+    """Grids (rows, columns, 2) of places that a lattice may show, and whether the lattice goes on beyond each.
+
+    The fullest come first; a homography gives what lacks.
+    """
     least = max(LEAST_SHARE * rows * columns, 5)
     size = lattice.steps.max(axis=0) + 1
-    at = np.full(size + 2, -1)
-    at[lattice.steps[:, 0] + 1, lattice.steps[:, 1] + 1] = np.arange(len(lattice.members))
+    at = np.full(size + 4, -1)  # parts may reach a step beyond it, and are looked at a step beyond them
+    at[lattice.steps[:, 0] + 2, lattice.steps[:, 1] + 2] = np.arange(len(lattice.members))
     parts = []
     for turned in (False, True) if rows != columns else (False,):
         shape = (columns, rows) if turned else (rows, columns)
-        for i in range(max(at.shape[0] - shape[0] + 1, 0)):
-            for j in range(max(at.shape[1] - shape[1] + 1, 0)):
+        for i in range(1, at.shape[0] - shape[0]):
+            for j in range(1, at.shape[1] - shape[1]):
                 part = at[i : i + shape[0], j : j + shape[1]]
                 count = int((part >= 0).sum())
                 if count >= least:
-                    parts.append((count, part.T if turned else part))
-    parts.sort(key=lambda one: -one[0])
-    for _, part in parts[:MOST_PARTS]:
+                    beside = (at[k, j : j + shape[1]] for k in (i - 1, i + shape[0]))
+                    above = (at[i : i + shape[0], k] for k in (j - 1, j + shape[1]))
+                    goes_on = any((row >= 0).sum() >= max(2, GOES_ON * len(row)) for row in (*beside, *above))
+                    parts.append((count, part.T if turned else part, goes_on))
+    parts.sort(key=lambda one: (-one[0], one[2]))
+    for _, part, goes_on in parts[:MOST_PARTS]:
         there = part >= 0
         steps = np.argwhere(there)[:, ::-1].astype(float)
         seen = places[lattice.members[part[there]]]
@@ -143,4 +151,4 @@ def boards_in(lattice: Lattice, places: Array, rows: int, columns: int) -> Itera
         grid = np.asarray(cv2.perspectiveTransform(everywhere.reshape(-1, 1, 2), H), dtype=float)
         grid = grid.reshape(rows, columns, 2)
         grid[there] = seen
-        yield grid
+        yield grid, goes_on

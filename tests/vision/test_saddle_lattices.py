@@ -18,7 +18,7 @@ def grids(found: Saddles, rows: int = 4, columns: int = 5) -> list[np.ndarray]:
     return [
         grid
         for lattice in lattices(found, members, rows * columns)
-        for grid in boards_in(lattice, found.places, rows, columns)
+        for grid, _ in boards_in(lattice, found.places, rows, columns)
     ]
 
 
@@ -56,6 +56,9 @@ def test_a_larger_board_has_several_parts_and_a_smaller_one_none() -> None:
     T = pose((5.0, 5.0, 5.0), (0.0, 0.0, 0.3))
     larger = saddles(render(PINHOLE, [(printed(Checkerboard("larger", 7, 4, 0.025)), T)]))
     assert len(grids(larger)) >= 3
+    (lattice,) = lattices(larger, np.arange(len(larger.places)), 20)
+    assert all(goes_on for _, goes_on in boards_in(lattice, larger.places, 4, 5))
+    assert not any(goes_on for _, goes_on in list(boards_in(lattice, larger.places, 4, 7))[:1])
     smaller = saddles(render(PINHOLE, [(printed(Checkerboard("smaller", 4, 3, 0.03)), T)]))
     assert grids(smaller) == []
 
