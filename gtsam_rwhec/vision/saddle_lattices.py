@@ -26,7 +26,9 @@ OFF = 0.3
 #: A lattice has at least this share of a board's corners, and this number of them.
 LEAST_SHARE, LEAST_SADDLES = 0.7, 8
 #: A lattice is tried to start at this number of saddles of a group, and at most this number of boards are looked for.
-STARTS, MOST_LATTICES = 6, 3
+STARTS, MOST_LATTICES = 8, 4
+#: A start has as many neighbours as possible among this number of nearest saddles.
+NEIGHBOURS = 6
 #: A lattice of this share of a group's saddles is enough.
 ENOUGH = 0.9
 #: A board goes on if this share of a row of corners beyond it is there, and two of them.
@@ -55,9 +57,11 @@ def lattices(saddles: Saddles, members: np.ndarray, corners: int) -> Iterator[La
             return
         places = saddles.places[free]
         apart = np.linalg.norm(places[:, None] - places, axis=2)
+        beside = _neighbours(places, saddles.edges[free], saddles.light[free], apart)
         from_middle = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+        starts = np.lexsort((from_middle, -beside))[:STARTS]
         best: dict[tuple[int, int], int] = {}
-        for start in np.argsort(from_middle)[:STARTS].tolist():
+        for start in starts.tolist():
             best = max(best, _grown(saddles, free, apart, start), key=len)
             if len(best) >= min(corners, ENOUGH * len(free)):
                 break
@@ -67,6 +71,21 @@ def lattices(saddles: Saddles, members: np.ndarray, corners: int) -> Iterator[La
         steps = np.array(list(best))
         yield Lattice(free[chosen], steps - steps.min(axis=0))
         free = np.delete(free, chosen)
+
+
+def _neighbours(places: Array, edges: Array, light: Array, apart: Array) -> np.ndarray:
+    """How many (m,) of the nearest saddles are along an edge of both, with their light on the other side."""
+    nearest = np.argsort(apart, axis=1)[:, 1 : NEIGHBOURS + 1]
+    along = places[nearest] - places[:, None]
+    along /= np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-9)
+    ok: np.ndarray = np.ones(nearest.shape, dtype=bool)
+    sides = []
+    for of_edges, of_light in ((edges[:, None], light[:, None]), (edges[nearest], light[nearest])):
+        beside = np.abs(along[..., None, 0] * of_edges[..., 1] - along[..., None, 1] * of_edges[..., 0])
+        ok &= beside.min(axis=-1) < np.sin(BESIDE_RAD)
+        cross = along[..., 0] * of_light[..., 1] - along[..., 1] * of_light[..., 0]
+        sides.append(cross * (along * of_light).sum(axis=-1))
+    return np.asarray((ok & (sides[0] * sides[1] < 0.0)).sum(axis=1))
 
 
 def _grown(saddles: Saddles, members: np.ndarray, apart: Array, start: int) -> dict[tuple[int, int], int]:
