@@ -46,8 +46,8 @@ _HOLDERS = frozenset({
     "data", "poses", "pose", "frames", "transform", "transforms", "matrix", "samples", "robot", "tf", "entries",
     "images",
 })  # fmt: skip
-#: At most this many keys, values and items of a file of poses: some ten seconds' work. A pose has ten to sixty.
-MOST_VALUES = 400_000
+#: At most this many keys, values and items of a file of poses: some seconds' work. A pose has ten to sixty.
+MOST_VALUES = 200_000
 _LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 #: How many numbers a position has with a rotation in a list, and what the rotation is.
 _OF_LISTS: tuple[tuple[int, Kind], ...] = ((7, "quaternion_of_any_order"), (6, "angles"))

@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from strategies import damaged, tables
 
 from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.files import yaml_lines
+from gtsam_rwhec.logs import pose_trees
 from gtsam_rwhec.logs.pose_files import read_poses
 from gtsam_rwhec.logs.pose_rows import PoseStatement
 
@@ -278,9 +280,11 @@ def test_what_programs_print(tmp_path: Path, name: str) -> None:
         assert found.places[1] == f"{tmp_path / name}, line 15: [1].pose"
 
 
-def test_a_long_file_of_messages(tmp_path: Path) -> None:
-    """More values than a file that a person writes may have."""
-    count = 5500
-    pose = "---\npose: {{position: {{x: {}, y: 0, z: 0}}, orientation: {{x: 0, y: 0, z: 0, w: 1}}}}\n"
-    (tmp_path / "long.yaml").write_text("".join(pose.format(1e-3 * i) for i in range(count)))
-    assert read_poses(tmp_path / "long.yaml").T[:, 0, 3].tolist() == [1e-3 * i for i in range(count)]
+def test_how_long_a_tree_of_poses_may_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Longer than a file that a person writes, but not without a limit."""
+    assert pose_trees.MOST_VALUES > 3 * yaml_lines.MOST_VALUES
+    monkeypatch.setattr(pose_trees, "MOST_VALUES", 30)
+    for name in ("ros.yaml", "robot.json"):
+        (tmp_path / name).write_text(dict(TEXTS | PRINTED)[name][0])
+        with pytest.raises(LogError, match=r"more than 30 keys and values"):
+            read_poses(tmp_path / name)
