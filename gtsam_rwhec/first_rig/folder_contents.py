@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -183,28 +183,32 @@ def _poses(folder: Path, place: Path, files: list[Path], image_folders: Iterable
 
 
 def _fitting(folder: Path, files: list[Path], path: Path) -> FolderPoses | None:
-    """The poses of a file or a folder if they fit the images."""
-    for stated in STATEMENTS:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of what is left over: calibration says it
-                poses = read_poses(path, stated)
-                T = np.full((len(files), 4, 4), math.nan)
-                stamps, of_poses = image_stamps(files), pose_stamps(poses)
-                if stamps is not None and of_poses is not None:
-                    order = np.argsort(of_poses)
-                    at, wanted = np.array(of_poses)[order], np.array(stamps)
-                    near = np.clip(np.searchsorted(at, wanted), 1, len(at) - 1)
-                    near -= wanted - at[near - 1] < at[near] - wanted
-                    inside = (wanted >= at[0]) & (wanted <= at[-1])
-                    T[inside] = poses.T[order][near[inside]]
-                    return FolderPoses(_inside(folder, path), stated, T, wanted, poses) if inside.any() else None
-                matched = match(files, poses, str(path))
-                T[list(matched.images)] = poses.T[list(matched.poses)]
-                return FolderPoses(_inside(folder, path), stated, T, None, poses)
-        except (LogError, FileFormatError):
-            continue  # no file of poses, or one that needs another statement
-    return None
+    """The poses of a file or a folder if they fit the images, read as the first statement that reads them."""
+    found = (poses_read(folder, files, path, stated) for stated in STATEMENTS)
+    return next((poses for poses in found if poses is not None), None)
+
+
+def poses_read(folder: Path, files: Sequence[Path], path: Path, stated: PoseStatement) -> FolderPoses | None:
+    """The poses of a file or a folder for the images, read as stated; None if they cannot be, or fit no images."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what is left over: calibration says it
+            poses = read_poses(path, stated)
+            T = np.full((len(files), 4, 4), math.nan)
+            stamps, of_poses = image_stamps(files), pose_stamps(poses)
+            if stamps is not None and of_poses is not None:
+                order = np.argsort(of_poses)
+                at, wanted = np.array(of_poses)[order], np.array(stamps)
+                near = np.clip(np.searchsorted(at, wanted), 1, len(at) - 1)
+                near -= wanted - at[near - 1] < at[near] - wanted
+                inside = (wanted >= at[0]) & (wanted <= at[-1])
+                T[inside] = poses.T[order][near[inside]]
+                return FolderPoses(_inside(folder, path), stated, T, wanted, poses) if inside.any() else None
+            matched = match(files, poses, str(path))
+            T[list(matched.images)] = poses.T[list(matched.poses)]
+            return FolderPoses(_inside(folder, path), stated, T, None, poses)
+    except (LogError, FileFormatError):
+        return None  # no file of poses, or one that needs another statement
 
 
 def _intrinsics(

@@ -16,7 +16,8 @@ from gtsam_rwhec.first_rig.guessed_intrinsics import guessed_intrinsics
 from gtsam_rwhec.first_rig.log_contents import ImageTopic
 from gtsam_rwhec.first_rig.names import camera_name, free_name
 from gtsam_rwhec.first_rig.pose_origin import Rest, origin_of, rest_of
-from gtsam_rwhec.first_rig.roles import RoleEvidence, Seen, evidence_of_roles
+from gtsam_rwhec.first_rig.pose_reading import PoseReading, View, best_reading
+from gtsam_rwhec.first_rig.roles import RoleEvidence
 from gtsam_rwhec.first_rig.targets import Guess, boards_guessed, targets_seen, with_size
 from gtsam_rwhec.logs.matched_images import pose_stamps
 from gtsam_rwhec.rig.field_types import is_text
@@ -154,12 +155,14 @@ def _text(
             time_offset=0.0 if rest.at_rest else "estimate",
         )  # fmt: skip
     tell("solving with the cameras on either carrier")
-    evidence = _roles(cameras, topics, stated, [section.target(name) for name, section in targets.items()])
+    views = _views(cameras, topics, stated, [section.target(name) for name, section in targets.items()])
+    reading = best_reading(folder, cameras, views)
+    evidence = reading.evidence
     notes.append(f"{evidence.in_words(PARENT, CHILD)}: {_role_words(evidence)}")
     for name, factor in evidence.sizes.items():
         targets[name] = with_size(targets[name], factor)
         remarks["targets", name] += "; the length here is what the motion says"
-    carriers, remarks["carriers", "poses"] = _carriers(cameras, evidence)
+    carriers, remarks["carriers", "poses"] = _carriers(reading)
     origin = origin_of([f for camera in cameras if camera.poses for f in camera.poses.path.split("/")])
     notes.append(f"poses: {origin.words}; their noise is left out, and residuals tell it")
     rig = Rig(carriers=carriers, sensors=sensors, targets=targets)
@@ -182,19 +185,19 @@ def _rest(poses: FolderPoses) -> Rest:
     return rest_of(stamps, Trajectory(of_poses[order], poses.all.T[order], poses.path))
 
 
-def _roles(
+def _views(
     cameras: Sequence[ImageFolder],
     topics: Sequence[ImageTopic],
     stated: Sequence[tuple[str, Camera]],
     targets: Sequence[Target],
-) -> RoleEvidence:
-    seen = []
+) -> list[View]:
+    """The targets in the images that were searched."""
     by_name = {target.name: target for target in targets}
-    for camera, topic, (name, intrinsics) in zip(cameras, topics, stated, strict=True):
-        assert camera.poses is not None
+    views = []
+    for number, (topic, (name, intrinsics)) in enumerate(zip(topics, stated, strict=True)):
         for place, found in zip(topic.places, Detector(intrinsics, targets)(topic.pictures), strict=True):
-            seen += [Seen(name, by_name[d.target], d, camera.poses.T[place]) for d in found.detections]
-    return evidence_of_roles(seen)
+            views += [View(number, place, name, by_name[d.target], d) for d in found.detections]
+    return views
 
 
 def _role_words(evidence: RoleEvidence) -> str:
@@ -205,10 +208,11 @@ def _role_words(evidence: RoleEvidence) -> str:
     }[evidence.role]
 
 
-def _carriers(cameras: Sequence[ImageFolder], evidence: RoleEvidence) -> tuple[Carriers, str]:
-    statements = {camera.poses.stated for camera in cameras if camera.poses is not None}
-    said = next(iter(statements))
-    source = PoseSource(frames=(PARENT, CHILD), euler=said.euler, angles=said.angles, length=said.length)
+def _carriers(reading: PoseReading) -> tuple[Carriers, str]:
+    said, evidence = reading.stated, reading.evidence
+    source = PoseSource(
+        frames=(PARENT, CHILD), quaternion=said.quaternion, euler=said.euler, angles=said.angles, length=said.length
+    )  # fmt: skip
     if evidence.role is None:
         remark = (
             "TODO the images cannot tell what carries the sensors: exchange the two names for cameras beside the robot "
@@ -219,7 +223,13 @@ def _carriers(cameras: Sequence[ImageFolder], evidence: RoleEvidence) -> tuple[C
             f"a guess, as is that the files have T_{PARENT}_{CHILD}: {evidence.in_words(PARENT, CHILD)}. If the files "
             f"have T_{CHILD}_{PARENT}, exchange the two frames here, and sensors and targets above"
         )
-    if said.euler is not None:
+    if said.euler is not None and evidence.role is None:
         remark += f"; TODO the files have three angles, and {said.euler} in degrees is a guess"
+    elif said.euler is not None:
+        remark += f"; of the usual conventions of angles {said.euler} in {said.angles} explains the images best"
+    elif reading.otherwise is not None:
+        remark += f"; with quaternions as x, y, z, w {reading.otherwise.in_words(PARENT, CHILD)}"
+    if said.length is not None:
+        remark += "; positions are spread as millimetres are"
     sensors, targets = (PARENT, CHILD) if evidence.role == "parent" else (CHILD, PARENT)
     return Carriers(sensors=sensors, targets=targets, poses=source), remark

@@ -80,6 +80,22 @@ class RoleEvidence:
         tells = _product(worse) > FAR_BETTER * _product(better) and better.residual.rotation_rad < EXPLAINED_RAD
         return None if not tells else "child" if better is self.child else "parent"
 
+    def explains_far_better(self, other: RoleEvidence) -> bool:
+        """Whether one role explains these measurements, and far better than either does the other's."""
+        if self.role is None:
+            return False
+        fits = [fit for fit in (other.child, other.parent) if fit is not None]
+        mine = min(_product(fit) for fit in (self.child, self.parent) if fit is not None)
+        return all(_product(fit) > FAR_BETTER * mine for fit in fits)
+
+    def is_better_than(self, other: RoleEvidence) -> bool:
+        """Whether the better of both roles has smaller residuals than that of other measurements' roles."""
+        mine, theirs = (
+            min((_product(fit) for fit in (one.child, one.parent) if fit is not None), default=math.inf)
+            for one in (self, other)
+        )
+        return mine < theirs
+
     @property
     def sizes(self) -> dict[str, float]:
         """True lengths over guessed ones, by target, as the fit of the role says; empty where the data cannot tell."""
