@@ -39,12 +39,15 @@ class CornersCalibrated:
     refined : CornersRefined
         The answer.
     inliers : dict of (target, sensor) to (V,) booleans
-        Images whose pose agrees with the others; only these were refined from.
+        Images whose pose agrees with the others.
+    observations : Observations
+        What was refined from: the inliers, with first intrinsics in the place of unknown ones.
     """
 
     solution: Solution
     refined: CornersRefined
     inliers: dict[Pair, np.ndarray]
+    observations: Observations
 
 
 @one_blas_thread()
@@ -85,12 +88,13 @@ def calibrate_corners(
         problem = observations.poses(_predicted(observations, refined))
         refined = _refined(problem, robust, tell)
     views = {
-        pair: Views(view.A[kept], view.pixels[kept])
+        pair: Views(view.A[good], view.pixels[good])
         for pair, view in observations.views.items()
-        if (kept := refined.inliers[Pair(*pair)]).any()
+        if (good := refined.inliers[Pair(*pair)]).any()
     }
-    answer = refine_corners(replace(observations, views=views), refined.X, refined.Y, options, tell)
-    return CornersCalibrated(refined.solution, answer, dict(refined.inliers))
+    kept = replace(observations, views=views)
+    answer = refine_corners(kept, refined.X, refined.Y, options, tell)
+    return CornersCalibrated(refined.solution, answer, dict(refined.inliers), kept)
 
 
 def _refined(problem: Problem, options: RefineOptions, tell: Progress) -> Refined:

@@ -75,7 +75,7 @@ def held_out_errors(
     OptionError
         `folds` is not a whole number of 2 or more.
     CountError
-        There are fewer instants than folds; or without a block a frame has no image left.
+        There are fewer instants than folds; without a block a frame has no image left; or the observations are others.
     """
     options, tell = options or CornerOptions(), progress or silent
     if not is_whole(folds, 2):
@@ -130,6 +130,11 @@ def _of_sensor(length: Array, on_target: Array, pixels: Array, camera: Camera) -
 
 def _without(observations: Observations, refined: CornersRefined) -> Observations:
     """The observations without the corners that were left out."""
+    for pair, view in observations.views.items():
+        if pair not in refined.left_out or refined.left_out[pair].shape != view.pixels.shape[:2]:
+            raise CountError(
+                f"the images of {pair[0]} by {pair[1]} are not those that the refinement is from; give its observations"
+            )
     views = {
         pair: Views(view.A, np.where(refined.left_out[pair][..., None], np.nan, view.pixels))
         for pair, view in observations.views.items()

@@ -46,3 +46,5 @@ def test_what_cannot_be_left_out_is_refused() -> None:
         held_out_errors(given.observations, refined, folds=1)
     with pytest.raises(CountError, match="5 instants cannot be left out in 6 blocks"):
         held_out_errors(given.observations, refined, folds=6)
+    with pytest.raises(CountError, match="images of board by cam_0 are not those"):
+        held_out_errors(cell(0, images=6).observations, refined)
