@@ -16,7 +16,7 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.detections_in_images import draw_images
 from gtsam_rwhec.pipeline.driver_detections import read_driver_detections
-from gtsam_rwhec.pipeline.image_detections import detect_in_log
+from gtsam_rwhec.pipeline.image_detections import check_usable, detect_in_log
 from gtsam_rwhec.pipeline.image_options import check_drawable, check_image_options
 from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
 from gtsam_rwhec.pipeline.kept_detections import KeptDetections
@@ -100,6 +100,7 @@ def detect_log(
             has_sheet = write_contact_sheet(Path(sheet), log, rig, cameras, found)
         if draw is not None:
             draw_images(log, rig, cameras, {sensor: of.records for sensor, of in found.items()}, draw, tell)
+        check_usable(log, rig, found)  # after the pictures: they show what is wrong
         tell("looking for what hides targets")
         report = report.model_copy(update={"likely": likely_causes(log, rig, cameras, found)})
         if not any(track.used for track in report.tracks):

@@ -44,7 +44,7 @@ def detect_in_log(
 ) -> dict[str, SensorDetections]:
     """The detections of every sensor that has images; those that `kept` has are not detected again.
 
-    Raises `LogError` if a topic has no images, or if no image of a sensor can be used; `StampError` as `check_order`.
+    Raises `LogError` if a topic has other messages than images; `StampError` as `check_order`.
     """
     sensor_of = {source.images: name for name, source in rig.sensors.items() if source.images is not None}
     images: dict[str, list[DetectedImage]] = {topic: [] for topic in sensor_of}
@@ -109,6 +109,18 @@ def _detected(
         kept.finish()
 
 
+def check_usable(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) -> None:
+    """Raise `LogError` if no image of a sensor can be used, with what is wrong with the first, and what to do."""
+    for sensor, of_sensor in found.items():
+        topic, faults = rig.sensors[sensor].images, of_sensor.faults
+        if topic is not None and len(faults) == of_sensor.count:
+            why = f"the first: {faults[0]}" if faults else "none can be read as its schema says"
+            raise LogError(
+                f"{log.files[0].path}, topic {topic}: none of the {message_count(log, topic)} images of {sensor} can "
+                f"be used; {why}{of_size(rig, sensor, why)}"
+            )
+
+
 def _of_sensor(
     log: Log,
     rig: Rig,
@@ -118,13 +130,6 @@ def _of_sensor(
     upright: dict[str, Turns],
 ) -> SensorDetections:
     faults = _faults(log, images)
-    if len(faults) == len(images):
-        topic = rig.sensors[sensor].images
-        why = f"the first: {faults[0]}" if faults else "none can be read as its schema says"
-        raise LogError(
-            f"{log.files[0].path}, topic {topic}: none of the {message_count(log, topic)} images of {sensor} can "
-            f"be used; {why}{of_size(rig, sensor, why)}"
-        )
     strangers: Counter[tuple[str, str]] = Counter()
     tracks: dict[str, list[tuple[int, Detection]]] = defaultdict(list)
     for image in images:

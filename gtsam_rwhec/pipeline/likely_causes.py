@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.errors import ImageError
-from gtsam_rwhec.logs import ImageRecord, Log
+from gtsam_rwhec.logs import DetectionRecord, ImageRecord, Log
 from gtsam_rwhec.pipeline.causes_in_words import nothing_explains, of_rejections, sentence
 from gtsam_rwhec.pipeline.sensor_detections import SensorDetections
 from gtsam_rwhec.rig import Rig
@@ -45,7 +45,7 @@ def likely_causes(
 ) -> tuple[str, ...]:
     """A sentence or two for each target of which most detections were rejected, or that was not seen at all."""
     sensors = [sensor for sensor, of_sensor in found.items() if of_sensor.images]
-    doubted = [target for target in rig.target_list if _is_doubted(target, [found[sensor] for sensor in found])]
+    doubted = [target for target in rig.target_list if _is_doubted(target, found)]
     if not sensors or not doubted:
         return ()
     until_s = time.thread_time() + SECONDS
@@ -55,6 +55,7 @@ def likely_causes(
     }
     said: list[str] = []
     unexplained: list[Target] = []
+    is_any_used = any(not record.reason for of_sensor in found.values() for record in of_sensor.records)
     examined = doubted[:MOST_TARGETS]
     for number, target in enumerate(examined):
         now_s = time.thread_time()
@@ -63,8 +64,8 @@ def likely_causes(
         if not causes:
             seen = _look(rig, target, cameras, found, images, max(LEAST, MOST // len(examined)), ends_s)
             causes = _of_clues(rig, target, seen)
-            if not causes:
-                unexplained.append(target)
+            if not causes and (not is_any_used or _records_of(target, found)):
+                unexplained.append(target)  # else it may not be in the images: it is among those that no sensor saw
         said += causes
     if unexplained:
         said.append(nothing_explains(unexplained, found))
@@ -74,9 +75,13 @@ def likely_causes(
     return tuple(cause if cause.endswith("?") else f"{cause}." for cause in said)
 
 
-def _is_doubted(target: Target, found: Sequence[SensorDetections]) -> bool:
+def _records_of(target: Target, found: Mapping[str, SensorDetections]) -> list[DetectionRecord]:
+    return [record for of_sensor in found.values() for record in of_sensor.records if record.id == target.name]
+
+
+def _is_doubted(target: Target, found: Mapping[str, SensorDetections]) -> bool:
     """Whether more of a target's detections were rejected than not, or there are none."""
-    reasons = [record.reason for of_sensor in found for record in of_sensor.records if record.id == target.name]
+    reasons = [record.reason for record in _records_of(target, found)]
     return 2 * sum(not reason for reason in reasons) < len(reasons) or not reasons
 
 

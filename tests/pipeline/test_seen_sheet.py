@@ -114,6 +114,14 @@ def test_both_are_there_where_nothing_is_found(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_images_that_cannot_be_used_are_on_the_sheet(tmp_path: Path) -> None:
+    folder, out = folder_of(tmp_path / "cell", 2, None), tmp_path / "detected.mcap"
+    smaller = parse_rig(RIG.replace("size: [640, 480]", "size: [320, 240]"), "rig.yaml")
+    with pytest.raises(LogError, match=r"multiply fx, fy, cx and cy by 2 and write size: \[640, 480\]"):
+        detect_source(folder, smaller, out, workers=1)
+    assert sheet_beside(out).exists()
+
+
 def test_a_drivers_detections_have_no_sheet(tmp_path: Path) -> None:
     log = made.write(tmp_path / "raw.mcap", made.recording(2.0))
     detect_source(log, made.rig(), tmp_path / "detected.mcap")

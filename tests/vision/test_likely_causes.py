@@ -87,6 +87,15 @@ def test_a_target_that_is_read_has_no_likely_causes(tmp_path: Path) -> None:
     assert detect_source(folder, stated, tmp_path / "out.mcap", workers=1).likely == ()
 
 
+def test_a_target_that_is_in_no_image_is_not_explained(tmp_path: Path) -> None:
+    other = "other: {type: tag, family: tag36h11, id: 3, size_m: 0.1"
+    two = rig(f"type: checkerboard, inner_corners: [7, 4], square_m: 0.04}}\n  {other}")
+    folder = folder_of(tmp_path / "cell", Checkerboard("b", 7, 4, 0.04))
+    report = detect_source(folder, two, tmp_path / "out.mcap", workers=1)
+    assert report.unseen == ("other",)
+    assert report.likely == ()
+
+
 def rejected(reason: str, count: int = 10, side_px: float = 8.0, off_px: float = 2.5) -> dict[str, SensorDetections]:
     corners = np.array([[0.0, 0.0], [side_px, 0.0], [side_px, side_px], [0.0, side_px]])
     records = [
