@@ -120,6 +120,16 @@ class OutputFolder:
             self._kept.close()
         if isinstance(error, KeyboardInterrupt):
             error.add_note(self._how_to_go_on())
+        with suppress(
+            *(() if error is None else (OSError, RwhecError))
+        ):  # the error itself is said, not what follows it
+            self._bring_list_up_to_date(error)
+        if error is None:
+            for name in (DETECTED_LOG, DETECTIONS):
+                if not _is_one_of(self.path / name, sources):
+                    (self.path / name).unlink(missing_ok=True)
+
+    def _bring_list_up_to_date(self, error: BaseException | None) -> None:
         if self._has_begun:
             state: State = "finished" if error is None else "failed" if isinstance(error, RwhecError) else "unfinished"
             written = [name for name in WRITTEN if (self.path / name).is_file()]
@@ -128,10 +138,6 @@ class OutputFolder:
             else:
                 sums = {name: _sha256(self.path / name) for name in written}
                 _write_list(self.path, _Written(log=self.log, state=state, sha256=sums))
-        if error is None:
-            for name in (DETECTED_LOG, DETECTIONS):
-                if not _is_one_of(self.path / name, sources):
-                    (self.path / name).unlink(missing_ok=True)
 
     def _how_to_go_on(self) -> str:
         if self._kept is None or not self._kept.done:
@@ -250,11 +256,14 @@ def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[P
 def _names_in(folder: Path) -> list[str]:
     """The names of all that is in a folder, and in its folder of plots."""
     names = []
-    for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if entry.name == PLOTS_FOLDER and entry.is_dir() and not entry.is_symlink():
-            names += [f"{PLOTS_FOLDER}/{of_plots.name}" for of_plots in sorted(entry.iterdir())]
-        elif entry.name not in _OF_DESKTOPS:
-            names.append(entry.name)
+    try:
+        for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
+            if entry.name == PLOTS_FOLDER and entry.is_dir() and not entry.is_symlink():
+                names += [f"{PLOTS_FOLDER}/{of_plots.name}" for of_plots in sorted(entry.iterdir())]
+            elif entry.name not in _OF_DESKTOPS:
+                names.append(entry.name)
+    except OSError as error:
+        raise LogError(f"{folder} cannot be read: {error.strerror}. Give another folder") from error
     return names
 
 
@@ -271,7 +280,10 @@ def _is_one_of(path: Path, sources: Sequence[Path]) -> bool:
 
 
 def _is_as_written(path: Path, sha256: str | None) -> bool:
-    return path.is_file() and not path.is_symlink() and sha256 == _sha256(path)
+    try:
+        return path.is_file() and not path.is_symlink() and sha256 == _sha256(path)
+    except OSError:  # what cannot be read cannot be known as ours
+        return False
 
 
 def _named_log(log: str) -> str:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import FileFormatError, LogError
+from gtsam_rwhec.pipeline import earlier_output
 from gtsam_rwhec.pipeline.earlier_output import LIST_FILE, MOST_NAMED, earlier_run, list_written, output_folder
 
 LOG = "run.mcap"
@@ -142,6 +143,26 @@ def test_an_empty_folder_is_not_left_behind(error: BaseException, tmp_path: Path
     interrupted(tmp_path, ends_with=error)
     assert tmp_path.is_dir()  # it was there
     assert not list(tmp_path.iterdir())
+
+
+def test_the_error_is_said_and_not_what_follows_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk: nothing can be written any more, not the list either. The folder's run stays unfinished."""
+
+    def full(path: Path, content: bytes) -> None:
+        raise FileFormatError(f"{path} cannot be written: No space left on device.")
+
+    def fails() -> None:
+        with output_folder(tmp_path, LOG, replace=False) as output:
+            output.begin()
+            (tmp_path / "tf.yaml").write_bytes(b"output")
+            monkeypatch.setattr(earlier_output, "write_atomically", full)
+            raise LogError("the first error")
+
+    with pytest.raises(LogError, match="the first error"):
+        fails()
+    monkeypatch.undo()
+    assert earlier_run(tmp_path) == (LOG, "unfinished")
+    run(tmp_path, *ALL)
 
 
 def test_the_log_itself_is_not_foreign(tmp_path: Path) -> None:
