@@ -180,6 +180,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/vision": {
         "vision/test_ambiguity.py": "agreement",
         "vision/test_board_tags.py": "detected layout_cures sightings tag_agreement",
+        "vision/test_boards.py": "crossing_edges",
         "vision/test_camera.py": "distortion",
         "vision/test_circle_grids.py": "circle_centres circle_lattice",
         "vision/test_contact_sheet.py": "picture_text",

@@ -1,86 +1,203 @@
-"""Corners of boards, the points where two dark squares meet: blur does not move them."""
+"""Corners of boards, the points where two dark squares meet: blur and gamma do not move them.
+
+The tags that were read say where the board is. All of its corners are looked for at the places which that predicts,
+also those beside tags that could not be read. A corner counts if its four quadrants are dark and light as printed, and
+if it is at its place in the board's plane.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.vision.board_tags import charuco_board
+from gtsam_rwhec.vision.board_tags import BoardTags, tag_places
 from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.crossing_edges import Strips, crossings_of_edges
 from gtsam_rwhec.vision.images import Gray
+from gtsam_rwhec.vision.tag_agreement import largest_off
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco
 
 #: cornerSubPix ends after 30 rounds, or with a step of at most 1e-3 pixels.
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
-#: A corner that refinement moves by more than this share of its window is another corner, and is not used.
-MOST_MOVED = 0.8
-#: The half window that finds an AprilGrid's corner is this share of a tag's side. It is large because OpenCV's contours
-#: are wrong by pixels where black squares touch.
-FIND = 0.2
-#: The half window that finds a corner is at most this share of the gap between tags.
-FIND_GAP = 0.7
-#: The half window that measures a found corner is this share of a tag's side.
-MEASURE = 0.13
-#: The half window that measures a corner is at most this share of the gap between tags.
-MEASURE_GAP = 0.55
-#: A corner further than this (pixels) from the place that the other corners predict is not used.
+#: Blur and the gradient's window carry the edge of what is printed outwards by this many pixels.
+GRADIENT_PX = 2.0
+#: Corners nearer to the image's border than this are not measured, pixels.
+MARGIN_PX = 3.0
+#: Corners are looked for as far from known ones as this many squares, or tags with their gap.
+NEAR = 1.6
+#: A corner that is found further from where it is looked for than this share of the distance to the next thing printed,
+#: and than this many pixels, is another one.
+MOST_MOVED, LEAST_MOVED_PX = 0.7, 1.0
+#: A corner further than this (pixels) from the place that the other corners predict is not used,
 ASTRAY_PX = 1.5
-#: Blur and the gradient's window carry a marker's edge outwards by this many pixels.
-GRADIENT_PX = 0.5
+#: nor one that is further than this many standard deviations of the others, and than this (pixels).
+ASTRAY_SIGMA, ASTRAY_LEAST_PX = 5.0, 0.25
+#: The dark and the light quadrants at a corner differ by at least this share of the median over corners, and by this.
+LEAST_CONTRAST, LEAST_GRAY = 0.25, 6.0
 
 
-def charuco_corners(
-    gray: Gray, board: Charuco, ids: np.ndarray, markers_px: Array, *, is_legacy: bool = False
-) -> tuple[np.ndarray, Array]:
-    """Indices (n,) and places (n, 2) of a board's inner corners, from its markers' ids (m,) and corners (m, 4, 2).
+@dataclass(frozen=True, eq=False)
+class _Corners:
+    """Corners of a board in its plane, metres: (n, 2), and what is printed around each.
 
-    OpenCV's windows reach into the markers of a turned or slanted board, and its corners are wrong by tenths of a
-    pixel. The corners are therefore measured again in smaller windows.
+    `dark` and `light` (n, 2, 2) are offsets to points in the dark and in the light quadrants, `along` and
+    `across` how far along and across the edges that meet in a corner nothing else is printed.
     """
-    if len(ids) == 0:
-        return np.zeros(0, dtype=int), np.zeros((0, 2))
-    corners, indices, _, _ = cv2.aruco.CharucoDetector(charuco_board(board, is_legacy)).detectBoard(
-        gray, markerCorners=list(markers_px.astype(np.float32)[:, None]), markerIds=ids.astype(np.int32)[:, None]
-    )
-    if indices is None or len(indices) == 0:
-        return np.zeros(0, dtype=int), np.zeros((0, 2))
-    indices, found = np.ravel(indices).astype(int), np.reshape(corners, (-1, 2)).astype(float)
-    half = _to_the_markers(board, board.corners()[indices, :2], found) - GRADIENT_PX
-    return indices, refined_corners(gray, found, int(np.clip(half, 2, 8)))
+
+    places: Array
+    dark: Array
+    light: Array
+    along: float
+    across: float
 
 
-def _to_the_markers(board: Charuco, plane: Array, pixels: Array) -> float:
-    """The smallest distance between any corner (n, 2) and its nearest marker, in pixels along x or y."""
-    if len(plane) < 4:
-        return 0.0
-    H, _ = cv2.findHomography(plane, pixels)
-    if H is None:
-        return 0.0
+def _of_charuco(board: Charuco, is_legacy: bool) -> _Corners:
     gap = 0.5 * (board.square_m - board.marker_m)
-    around = plane[:, None] + gap * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-    there, here = (cv2.perspectiveTransform(p.reshape(-1, 1, 2), H).reshape(p.shape) for p in (around, plane))
-    return float(np.abs(there - here[:, None]).max(axis=2).min())
+    row, column = np.divmod(np.arange((board.columns - 1) * (board.rows - 1)), board.columns - 1)
+    first_is_dark = ((row + column) % 2 == 0) ^ (is_legacy and board.rows % 2 == 0)
+    falling, rising = np.array([[-1.0, 1.0], [1.0, -1.0]]), np.array([[1.0, 1.0], [-1.0, -1.0]])
+    dark = np.where(first_is_dark[:, None, None], falling, rising)
+    light = np.where(first_is_dark[:, None, None], rising, falling)
+    return _Corners(board.corners()[:, :2], 0.25 * board.square_m * dark, 0.55 * gap * light, 0.6 * board.square_m, gap)
 
 
-def aprilgrid_corners(gray: Gray, board: AprilGrid, ids: np.ndarray, tags_px: Array) -> tuple[np.ndarray, Array]:
-    """Indices (n,) and places (n, 2) of a grid's corners, from its tags' ids (m,) and corners (m, 4, 2).
+def _of_aprilgrid(board: AprilGrid) -> _Corners:
+    gap, border = board.spacing * board.tag_m, 0.2 * board.tag_m
+    outwards = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])  # of a tag's four corners
+    inside, outside = -0.5 * border * outwards, 0.5 * gap * outwards
+    dark = np.stack([inside, outside], axis=1)
+    light = np.stack([np.stack([a[:, 0], b[:, 1]], axis=1) for a, b in ((inside, outside), (outside, inside))], axis=1)
+    count = board.columns * board.rows
+    places = board.corners()[:, :2]
+    return _Corners(places, np.tile(dark, (count, 1, 1)), np.tile(light, (count, 1, 1)), 0.65 * gap, min(gap, border))
 
-    The corners are in the board's own order, as `board_tags` gives them.
-    """
-    if len(ids) == 0:
-        return np.zeros(0, dtype=int), np.zeros((0, 2))
-    indices = (4 * (ids - board.first_id)[:, None] + np.arange(4)).ravel()
-    corners = tags_px
-    side = float(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).min())
-    rough = corners.reshape(-1, 2)
-    # A window holds only the corner's two black squares: a tag's border is a fifth of its side.
-    half = int(np.clip(min(FIND, FIND_GAP * board.spacing) * side, 3, 12))
-    found = refined_corners(gray, rough, half)
-    moved = np.linalg.norm(found - rough, axis=1)
-    kept = (moved > 0.0) & (moved < MOST_MOVED * half)  # OpenCV returns its input if it does not converge
-    half = int(np.clip(min(MEASURE, MEASURE_GAP * board.spacing) * side, 2, 8))
-    return indices[kept], refined_corners(gray, found[kept], half)
+
+def board_corners(gray: Gray, board: Charuco | AprilGrid, tags: BoardTags, camera: Camera) -> tuple[np.ndarray, Array]:
+    """Indices (n,) and places (n, 2) of the corners that are seen of a board, from two of its tags and more."""
+    nothing = np.zeros(0, dtype=int), np.zeros((0, 2))
+    if len(tags.ids) < 2:
+        return nothing
+    corners = _of_charuco(board, tags.is_legacy) if isinstance(board, Charuco) else _of_aprilgrid(board)
+    number = {i: k for k, i in enumerate(board.ids)}
+    tag_plane = tag_places(board, tags.is_legacy)[[number[int(i)] for i in tags.ids], :, :2].reshape(-1, 2)
+    tags_px = tags.corners_px.reshape(-1, 2)
+    known, seen = tag_plane, tags_px
+    numbers, found = nothing
+    looked_for = np.zeros(len(corners.places), dtype=bool)
+    # A pattern repeats itself: what is known grows by one square or tag at a time.
+    pitch = board.square_m if isinstance(board, Charuco) else board.tag_m * (1.0 + board.spacing)
+    while True:
+        places = _Places.of(camera, known, seen)
+        if places is None:
+            return nothing
+        near = np.abs(corners.places[:, None] - known).max(axis=2).min(axis=1) < NEAR * pitch
+        new = np.flatnonzero(near & ~looked_for)
+        if not len(new):
+            break
+        looked_for[new] = True
+        more, more_px = _found(gray, corners, places, new)
+        numbers, found = np.append(numbers, more), np.concatenate([found, more_px])
+        kept = on_one_plane(camera, board.corners()[numbers], found)
+        numbers, found = numbers[kept], found[kept]
+        if len(numbers) < 4:
+            return nothing
+        known, seen = corners.places[numbers], found
+        if not _span_a_plane(known):
+            known, seen = np.concatenate([known, tag_plane]), np.concatenate([seen, tags_px])
+    order = np.argsort(numbers)
+    numbers, found = numbers[order], found[order]
+    places = _Places.of(camera, known, seen)
+    if places is None or not _are_there(places, tag_plane, tags_px):
+        return nothing
+    return numbers, found
+
+
+def _span_a_plane(points: Array) -> bool:
+    """Whether points (n, 2) are not all on one line, nor nearly."""
+    extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(extent[1] > 0.1 * extent[0])
+
+
+def _are_there(places: _Places, tag_plane: Array, tags_px: Array) -> bool:
+    """Whether the tags' corners (4 m, 2) are where the board's corners say."""
+    off = np.linalg.norm(places.pixels(tag_plane) - tags_px, axis=1).reshape(-1, 4).max(axis=1)
+    return bool(np.median(off / largest_off(tags_px.reshape(-1, 4, 2))) <= 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Where a plane's points are in the image, by a homography (3, 3) to a camera without distortion."""
+
+    H: Array
+    focal: float
+    camera: Camera
+
+    @staticmethod
+    def of(camera: Camera, plane: Array, pixels: Array) -> _Places | None:
+        """From points (n, 2) of the plane, seen at (n, 2)."""
+        focal = 0.5 * float(camera.K[0, 0] + camera.K[1, 1])
+        flat = camera.undistort(pixels) * focal
+        good = np.isfinite(flat).all(axis=1)
+        if good.sum() < 4:
+            return None
+        H, _ = cv2.findHomography(plane[good], flat[good], 0)
+        return None if H is None or not np.isfinite(H).all() else _Places(np.asarray(H), focal, camera)
+
+    def pixels(self, plane: Array) -> Array:
+        """Pixels (..., 2) of points (..., 2); nan where the camera does not see them."""
+        flat = np.asarray(cv2.perspectiveTransform(plane.reshape(-1, 1, 2), self.H)).reshape(plane.shape) / self.focal
+        within = np.linalg.norm(flat, axis=-1, keepdims=True) < self.camera.ring
+        return self.camera.pixels(np.where(within, flat, np.nan))
+
+
+def _found(gray: Gray, corners: _Corners, places: _Places, which: np.ndarray) -> tuple[np.ndarray, Array]:
+    """Numbers and places of those corners of `which` that look as printed."""
+    at = corners.places[which]
+    predicted = places.pixels(at)
+    nudge = 1e-3 * corners.along
+    # Pixels (n, 2, 2) of a step along the board's x and y.
+    steps = np.stack([places.pixels(at + nudge * axis) - predicted for axis in np.eye(2)], axis=1) / nudge
+    length = np.linalg.norm(steps, axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        directions = steps / length[..., None]
+        # From an edge to its parallels, pixels.
+        apart = np.abs(steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 0, 1] * steps[:, 1, 0])[:, None] / length
+    edge = np.array(gray.shape[::-1]) - 1.0 - MARGIN_PX
+    with np.errstate(invalid="ignore"):
+        inside = ((predicted >= MARGIN_PX) & (predicted <= edge)).all(axis=1) & np.isfinite(apart).all(axis=1)
+    which, predicted = which[inside], predicted[inside]
+    if not len(which):
+        return which, predicted
+    strips = Strips(
+        predicted,
+        directions[inside],
+        corners.along * length[inside] - GRADIENT_PX,
+        corners.across * apart[inside] - GRADIENT_PX,
+    )
+    refined = crossings_of_edges(gray, strips)
+    moved = np.linalg.norm(refined - predicted, axis=1)
+    with np.errstate(invalid="ignore"):
+        good = moved < np.maximum(MOST_MOVED * (corners.across * apart[inside]).min(axis=1), LEAST_MOVED_PX)
+    refined = np.where(good[:, None], refined, predicted)
+    off = refined - predicted
+    dark, light = (
+        _gray_at(gray, places.pixels(corners.places[which, None] + offsets[which]) + off[:, None])
+        for offsets in (corners.dark, corners.light)
+    )
+    contrast = light.min(axis=1) - dark.max(axis=1)
+    usual = float(np.median(contrast[good])) if good.any() else 0.0
+    good &= contrast >= max(LEAST_CONTRAST * usual, LEAST_GRAY)
+    return which[good], refined[good]
+
+
+def _gray_at(gray: Gray, pixels: Array) -> Array:
+    """Gray values (...) at the nearest pixels of (..., 2)."""
+    column, row = np.moveaxis(np.rint(np.nan_to_num(pixels)).astype(int), -1, 0)
+    height, width = gray.shape
+    return np.asarray(gray[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)], dtype=float)
 
 
 def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndarray:
@@ -90,8 +207,22 @@ def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndar
     if len(corners_m) < 6 or not np.isfinite(x).all():
         return everyone
     focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
-    H, agrees = cv2.findHomography(corners_m[:, :2], x * focal, cv2.RANSAC, ASTRAY_PX)
-    return everyone if H is None else agrees.ravel().astype(bool)
+    plane, flat = corners_m[:, :2], x * focal
+    H, agrees = cv2.findHomography(plane, flat, cv2.RANSAC, ASTRAY_PX)
+    if H is None:
+        return everyone
+    kept = agrees.ravel().astype(bool)
+    for _ in range(3):
+        if kept.sum() < 6:
+            break
+        H, _ = cv2.findHomography(plane[kept], flat[kept], 0)
+        if H is None:
+            break
+        off = np.linalg.norm(cv2.perspectiveTransform(plane[:, None], H)[:, 0] - flat, axis=1)
+        # The median length of an error along two axes is 1.18 standard deviations of one.
+        sigma = float(np.median(off[kept])) / 1.18
+        kept = off <= np.clip(ASTRAY_SIGMA * sigma, ASTRAY_LEAST_PX, ASTRAY_PX)
+    return kept
 
 
 def refined_corners(gray: Gray, corners: Array, half: int) -> Array:

@@ -85,16 +85,9 @@ def of_boards(seeing: Seeing, tag_boards: Iterable[TagBoard], found: Sequence[Ta
                 if len(tags.ids):
                     from_edges.append((k, board, tags))
             else:
-                gray = seeing.images[k]
-                if isinstance(board, Charuco):
-                    indices, seen = boards.charuco_corners(
-                        gray, board, tags.ids, tags.corners_px, is_legacy=tags.is_legacy
-                    )
-                else:
-                    indices, seen = boards.aprilgrid_corners(gray, board, tags.ids, tags.corners_px)
+                indices, seen = boards.board_corners(seeing.images[k], board, tags, seeing.camera)
                 if len(indices):
-                    kept = boards.on_one_plane(seeing.camera, board.corners()[indices], seen)
-                    yield k, Sighting(board, indices[kept], seen[kept], note=LEGACY if tags.is_legacy else "")
+                    yield k, Sighting(board, indices, seen, note=LEGACY if tags.is_legacy else "")
     yield from _by_edges(seeing, from_edges)
 
 
