@@ -1,8 +1,9 @@
-"""Checkerboards: found by OpenCV's two detectors where saddles show that one may be, tested, and measured.
+"""Checkerboards: saddles in order, or what OpenCV's two detectors find where saddles are; tested, and measured.
 
-OpenCV's classic detector with its fast check is asked first, its sector-based one (Duda and Frese 2018) where the
-classic one sees nothing or what it sees fails the test (`board_evidence`). On the 39 images of a workcell the first
-reads all 34 boards at a tenth of the second's time; the second reads more where blur or shade is strong.
+Of 54 rendered boards (whole, squares of 12 pixels and more, blur to 1.5 pixels, shade) lattices of saddles give 53 that
+pass the test (`board_evidence`), in 28 ms an image; OpenCV's sector-based detector (Duda and Frese 2018) 52, in 46 ms;
+its classic one with the fast check 46, in 52 ms; all together 54. So OpenCV is asked where the lattices give none: the
+classic detector, then the sector-based one. Corners are measured by a model of the edges (`saddle_fits`).
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ def find_checkerboard(gray: Gray, board: Checkerboard, camera: Camera | None = N
 
     The top is where the first corner's outer square is black; a board of two even or two odd numbers of corners looks
     the same turned by half a turn, and is read in one of these ways. Two such boards in one image are told by no sign:
-    neither counts.
+    neither counts. Nor can one image tell a board from its image in a mirror: its pattern is the same, turned, but for
+    two odd numbers of corners that differ (and then it is that of a board printed with its colours exchanged).
     """
     rejected: FoundBoard | None = None
     found: FoundBoard | None = None

@@ -399,7 +399,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, help="a folder for images that are misread or missed")
     arguments = parser.parse_args()
-    wanted = [name for name in KINDS if name.startswith(tuple(arguments.kinds.split(",")))]
+    given = arguments.kinds.split(",")
+    begins = tuple(one for one in given if one not in KINDS)
+    wanted = [name for name in KINDS if name in given or name.startswith(begins)]
     if not wanted:
         parser.error(f"no kind begins with {arguments.kinds!r}; there are {', '.join(KINDS)}")
     status = 0
