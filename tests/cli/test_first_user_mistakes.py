@@ -200,6 +200,18 @@ FOLDERS = {
     "a file of intrinsics that is not there": Mistake(
         CELL.replace(INTRINSICS, "left.yaml"), 2, ("left.yaml", "line 3: sensors.left.intrinsics"),
     ),
+    "intrinsics of a model that is not supported": Mistake(
+        CELL.replace(INTRINSICS, "cameras.txt"), 2,
+        ("cameras.txt, line 1: the model 'FOV' is not supported; supported are SIMPLE_PIN", "sensors.left.intrinsics"),
+        lambda folder: (folder / "cameras.txt").write_text("1 FOV 320 240 300 302 157 121 0.9\n"),
+    ),
+    "one of two cameras in a file, without its name": Mistake(
+        CELL.replace(INTRINSICS, "cameras.txt"), 2,
+        ("has no camera of the sensor's name, 'left'; it has 1, 2: write {file: cameras.txt, camera: '1'}",),
+        lambda folder: (folder / "cameras.txt").write_text(
+            "1 PINHOLE 320 240 300 302 157 121\n2 PINHOLE 320 240 300 302 157 121\n"
+        ),
+    ),
     "intrinsics of twice the size": Mistake(
         CELL.replace(INTRINSICS, "{K: [600.0, 604.0, 314.5, 243.5], size: [640, 480]}"), 2,
         ("320 x 240 pixels, but the intrinsics are for 640 x 480", "line 3: sensors.left.intrinsics"),
@@ -215,6 +227,17 @@ FOLDERS = {
     "no poses": Mistake(CELL.replace("poses: left/pose, ", ""), 2, ("sensors.left: no poses. Name the file or",)),
     "poses that are not there": Mistake(
         CELL.replace("left/pose", "left/poses"), 2, ("left/poses", "sensors.left.poses"),
+    ),
+    "a folder of images that is not there": Mistake(
+        CELL.replace("left/image", "left/images"), 2,
+        ("there is no such folder of images", "left has images in image", "line 3: sensors.left.images"),
+    ),
+    "an IMU's file for poses": Mistake(
+        CELL.replace("left/pose", "imu0.csv"), 2,
+        ("imu0.csv, line 1: ", "Are they the rates and accelerations of an IMU?", "line 3: sensors.left.poses"),
+        lambda folder: (folder / "imu0.csv").write_text(
+            "timestamp,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z\n" + "17,0,0,0,0,0,9.81\n" * 3
+        ),
     ),
     "a rig file of a log for a folder": Mistake(
         OF_A_LOG, 2, ("carriers.poses is of a log", "write poses: {frames: [base, hand]}, and for each sensor"),
@@ -421,3 +444,12 @@ def test_of_csv_files(name: str, tmp_path: Path) -> None:
     assert status == 6, said
     for part in words:
         assert part in said
+
+
+def test_joint_states_are_no_samples(tmp_path: Path) -> None:
+    """MoveIt's panel saves both, side by side."""
+    (tmp_path / "joints.yaml").write_text("joint_names: [a, b]\njoint_values:\n  - [0.1, 0.2]\n  - [0.3, 0.4]\n")
+    status, said = command("calibrate", tmp_path / "joints.yaml", "-o", tmp_path / "result.json")
+    assert status == 2
+    assert "has no hand-eye samples. Samples have, with names of MoveIt: effector_wrt_world" in said
+    assert not (tmp_path / "result.json").exists()
