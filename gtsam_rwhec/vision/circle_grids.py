@@ -47,8 +47,12 @@ LEAST_KEPT = 0.9
 SAME_SIZE = 0.75
 #: A circle has at least this share of the median contrast.
 LEAST_CONTRAST = 0.3
-#: A row of circles goes on beyond the board if its circles have their size and this share of the median contrast.
-GOES_ON = 0.5
+#: The light around circles, off a plane, is at most this share of their contrast (at the median; they have 0.01 to
+#: 0.05). Around the squares of a checkerboard it is 0.2 and more.
+CLEAR = 0.1
+#: A row of circles goes on beyond the board if its circles have their size and this share of the median contrast, and
+#: the light around them is off a plane by at most this share of it: the edge of a board is no row of circles.
+GOES_ON, GOES_ON_CLEAR = 0.5, 0.3
 #: Rounds in which the plane, the circles' sizes and the correction for perspective settle.
 ROUNDS = 3
 
@@ -125,6 +129,7 @@ def _tested(gray: Gray, board: CircleGrid, grid: Array, radii_px: Array, camera:
     elif (
         (radii < SAME_SIZE * usual).any()
         or (circles.contrasts * np.sign(contrast) < LEAST_CONTRAST * abs(contrast)).any()
+        or np.median(circles.uneven) > CLEAR * abs(contrast)
         or int(larger.sum()) != (1 if board.larger_dot else 0)
     ):
         rejection = Rejection.CIRCLES
@@ -167,6 +172,7 @@ def _goes_on(gray: Gray, plane: Plane, board: CircleGrid, radius: float, contras
         circles = measured_circles(gray, plane, places, plane.pixels(places), np.full(len(places), radius))
         ratio = circles.radii / radius
         alike = (circles.contrasts / contrast >= GOES_ON) & (ratio > SAME_SIZE) & (ratio < 1.0 / SAME_SIZE**2)
+        alike &= circles.uneven <= GOES_ON_CLEAR * np.abs(circles.contrasts)
         if (circles.seen & alike).sum() >= len(places) - (len(places) > 2):  # one of them may be a larger dot
             return True
     return False

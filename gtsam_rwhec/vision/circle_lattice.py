@@ -48,11 +48,11 @@ class Ellipses:
     shapes: Array
 
     def with_more(self, others: Ellipses) -> Ellipses:
-        """These, and those of the others that are elsewhere: not within the radius of one of these."""
+        """These, and those of the others that are elsewhere: not within the radii of one of these and of its own."""
         if not (len(self.places) and len(others.places)):
             return self if len(self.places) else others
         apart = np.linalg.norm(others.places[:, None] - self.places, axis=-1)
-        new = (apart > np.sqrt(self.areas)).all(axis=1)
+        new = (apart > np.sqrt(np.minimum(others.areas[:, None], self.areas))).all(axis=1)
         return Ellipses(
             np.concatenate([self.places, others.places[new]]), np.concatenate([self.shapes, others.shapes[new]])
         )

@@ -7,13 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rendered import BARREL, circles, pose, projected, render
+from rendered import BARREL, circles, pose, printed, projected, render
 
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.circle_grids import find_circle_grid
 from gtsam_rwhec.vision.detection import Detector
 from gtsam_rwhec.vision.rejection import Rejection
-from gtsam_rwhec.vision.targets import CORNERS, CircleGrid
+from gtsam_rwhec.vision.targets import CORNERS, AprilGrid, Checkerboard, CircleGrid, Target
 
 NOMINAL = Camera.of(640, 480, "", [[550.0, 0.0, 320.0], [0.0, 550.0, 240.0], [0.0, 0.0, 1.0]], (), "test")
 LONG = Camera.of(640, 480, "", [[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]], (), "test")
@@ -164,6 +164,16 @@ def test_large_images_are_searched_at_half_their_size() -> None:
     assert found is not None
     assert found.rejection is None
     assert np.abs(found.corners_px - projected(camera, GRID.corners(), FRONT)[found.indices]).max() < 0.1
+
+
+@pytest.mark.parametrize("target", [Checkerboard("c", 5, 4, 0.03), AprilGrid("a", "tag36h11", 3, 3, 0.03, 0.3)])
+def test_squares_are_no_circles(target: Target) -> None:
+    others = [CircleGrid("g", 3, 3, 0.03), CircleGrid("g", 3, 3, 0.03, asymmetric=True), CircleGrid("g", 4, 3, 0.03)]
+    for turn in (0.0, 20.0):
+        image = render(LONG, [(printed(target), pose((turn, -turn, 2.0 * turn), (0.0, 0.0, 0.33)))])
+        for other in others:
+            found = find_circle_grid(image, other, LONG)
+            assert found is None or found.rejection is not None
 
 
 def test_images_without_a_grid() -> None:
