@@ -9,14 +9,15 @@ in at least two images, the one that passes most often.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 
 import cv2
 import numpy as np
 
-from gtsam_rwhec.first_rig.lattice import lattice_size
+from gtsam_rwhec.first_rig.lattice import asymmetric_size, lattice_size
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.board_evidence import evidence
 from gtsam_rwhec.vision.camera import Camera
@@ -71,8 +72,14 @@ class BoardSeen:
 def boards_seen(images: Sequence[Gray]) -> list[BoardSeen]:
     """The checkerboard and the grid of circles in a camera's images: at most one of each."""
     found = []
-    for candidates, look in ((_checkerboards, _with_checkerboard), (_circle_grids, _with_circles)):
-        counted = Counter(size for gray in images for size in set(candidates(gray)))
+    kinds: tuple[tuple[Callable[[Gray], Iterator[tuple[int, int]]], Callable[..., BoardSeen]], ...] = (
+        (partial(_circle_grids, size_of=lattice_size), partial(_with_circles, asymmetric=False)),
+        (partial(_circle_grids, size_of=asymmetric_size), partial(_with_circles, asymmetric=True)),
+        (_checkerboards, _with_checkerboard),
+    )
+    taken: set[int] = set()  # images with a grid of circles: no checkerboard is looked for in them
+    for candidates, look in kinds:
+        counted = Counter(size for i, gray in enumerate(images) if i not in taken for size in set(candidates(gray)))
         best: BoardSeen | None = None
         least = LEAST_IMAGES if len(images) >= ENOUGH_IMAGES else 1
         for size in [size for size, times in counted.most_common(MOST_CANDIDATES) if times >= least]:
@@ -81,6 +88,7 @@ def boards_seen(images: Sequence[Gray]) -> list[BoardSeen]:
                 best = seen
         if best is not None:
             found.append(best)
+            taken |= set(best.images)
     return found
 
 
@@ -93,24 +101,33 @@ def _checkerboards(gray: Gray) -> Iterator[tuple[int, int]]:
     for level in (1, 2):
         for region in regions(gray, LEAST_CORNERS, level)[:MOST_REGIONS]:
             part = np.ascontiguousarray(gray[region])
-            enlarged = part.size <= ENLARGED_PX
-            if enlarged:
-                part = np.asarray(cv2.resize(part, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
-            found, corners, meta = cv2.findChessboardCornersSBWithMeta(part, (SMALLEST, SMALLEST), cv2.CALIB_CB_LARGER)
-            if not found or max(meta.shape) > LARGEST:
-                continue
-            grid = np.reshape(corners, (*meta.shape, 2)).astype(float)
             corner = np.array([region[1].start, region[0].start], dtype=float)
-            grid = corner + (0.5 * grid - 0.25 if enlarged else grid)
-            rows, columns = meta.shape
-            for top, bottom, left, right in product((0, 1), repeat=4):
-                trimmed = grid[top : rows - bottom, left : columns - right]
-                if min(trimmed.shape[:2]) >= SMALLEST and evidence(gray, trimmed, None).rejection is None:
-                    yield _larger_first(*trimmed.shape[:2])
+            for enlarged in (False, True) if part.size <= ENLARGED_PX else (False,):
+                sizes = list(_passing(gray, part, corner, enlarged=enlarged))
+                yield from sizes
+                if sizes:
+                    break
 
 
-def _circle_grids(gray: Gray) -> Iterator[tuple[int, int]]:
-    """Numbers of circles that an image's grid may have, the larger first."""
+def _passing(gray: Gray, part: Gray, corner: Array, *, enlarged: bool) -> Iterator[tuple[int, int]]:
+    """Sizes that pass the test of squares, of what the detector finds in a part of an image or in the part enlarged."""
+    if enlarged:
+        part = np.asarray(cv2.resize(part, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(part, (SMALLEST, SMALLEST), cv2.CALIB_CB_LARGER)
+    if not found or max(meta.shape) > LARGEST:
+        return
+    grid = np.reshape(corners, (*meta.shape, 2)).astype(float)
+    # Pixel centres are at whole numbers: the first of the enlarged ones is at -1/4.
+    grid = corner + (0.5 * grid - 0.25 if enlarged else grid)
+    rows, columns = meta.shape
+    for top, bottom, left, right in product((0, 1), repeat=4):
+        trimmed = grid[top : rows - bottom, left : columns - right]
+        if min(trimmed.shape[:2]) >= SMALLEST and evidence(gray, trimmed, None).rejection is None:
+            yield _larger_first(*trimmed.shape[:2])
+
+
+def _circle_grids(gray: Gray, size_of: Callable[[Array, Array], tuple[int, int] | None]) -> Iterator[tuple[int, int]]:
+    """Numbers of circles that a grid may have: in a row, and rows; the larger first where rows are not shifted."""
     wanted = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
     wanted.minThreshold, wanted.maxThreshold, wanted.thresholdStep = 20.0, 240.0, 20.0
     wanted.filterByCircularity, wanted.filterByArea, wanted.filterByColor = False, True, True
@@ -120,9 +137,9 @@ def _circle_grids(gray: Gray) -> Iterator[tuple[int, int]]:
         wanted.blobColor = colour
         blobs = cv2.SimpleBlobDetector.create(wanted).detect(gray)
         places = np.array([blob.pt for blob in blobs], dtype=float).reshape(-1, 2)
-        size = lattice_size(places, np.array([blob.size for blob in blobs], dtype=float))
+        size = size_of(places, np.array([blob.size for blob in blobs], dtype=float))
         if size is not None and min(size) >= SMALLEST and max(size) <= LARGEST:
-            yield _larger_first(*size)
+            yield size if size_of is asymmetric_size else _larger_first(*size)
 
 
 def _larger_first(first: int, second: int) -> tuple[int, int]:
@@ -144,11 +161,12 @@ def _with_checkerboard(images: Sequence[Gray], columns: int, rows: int) -> Board
     )
 
 
-def _with_circles(images: Sequence[Gray], columns: int, rows: int) -> BoardSeen:
+def _with_circles(images: Sequence[Gray], columns: int, rows: int, *, asymmetric: bool) -> BoardSeen:
     """The grid as it is in most images: without a larger dot, or with one."""
     best: BoardSeen | None = None
-    for dot in (False, True):
-        board = CircleGrid("grid", columns, rows, 1.0, larger_dot=CORNERS[0] if dot else False)
+    for dot in (False,) if asymmetric else (False, True):
+        corner = CORNERS[0] if dot else False
+        board = CircleGrid("grid", columns, rows, 1.0, larger_dot=corner, asymmetric=asymmetric)
         good = []
         for i, gray in enumerate(images):
             height, width = gray.shape

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import permutations
+
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
@@ -25,20 +28,53 @@ def lattice_size(points: Array, sizes: Array) -> tuple[int, int] | None:
     sizes : (n,) array
         What neighbours have about equal: diameters of blobs.
     """
+    return _largest(points, sizes, _rectangle)
+
+
+def asymmetric_size(points: Array, sizes: Array) -> tuple[int, int] | None:
+    """Points in a row, and rows, of the largest whole lattice whose every other row is shifted by half a step."""
+    return _largest(points, sizes, _shifted_rows)
+
+
+def _largest(points: Array, sizes: Array, shape: Callable[[Array], tuple[int, int] | None]) -> tuple[int, int] | None:
     best: tuple[int, int] | None = None
     if len(points) < 4:
         return None
     middle = np.argsort(np.linalg.norm(points - np.median(points, axis=0), axis=1))
     for start in middle[np.unique(np.linspace(0, len(points) - 1, STARTS).astype(int))]:
         cells = _grown(points, sizes, int(start))
-        if cells is None:
-            continue
-        at = np.array(list(cells))
-        size = at.max(axis=0) - at.min(axis=0) + 1
-        columns, rows = int(size[0]), int(size[1])
-        if columns * rows == len(cells) and (best is None or columns * rows > best[0] * best[1]):
-            best = columns, rows
+        size = None if cells is None else shape(np.array(list(cells)))
+        if size is not None and (best is None or size[0] * size[1] > best[0] * best[1]):
+            best = size
     return best
+
+
+def _rectangle(cells: Array) -> tuple[int, int] | None:
+    """The sides of a rectangle that these cells (n, 2) fill."""
+    columns, rows = (int(side) for side in np.ptp(cells, axis=0) + 1)
+    return (columns, rows) if columns * rows == len(cells) else None
+
+
+def _shifted_rows(cells: Array) -> tuple[int, int] | None:
+    """Points in a row, and rows, if these cells (n, 2) are rows that are shifted in turn.
+
+    The two steps of the lattice may be any two of those between neighbours, in half steps along a row and in rows.
+    """
+    for first, second in permutations(((1, 1), (1, -1), (2, 0), (0, 2)), 2):
+        x, row = (cells @ np.array([first, second])).T
+        x, row = x - x.min(), row - row.min()
+        starts = np.array([x[row == r].min(initial=99) for r in range(row.max() + 1)])
+        counts = np.bincount(row)
+        ends = np.array([x[row == r].max(initial=-99) for r in range(row.max() + 1)])
+        if (
+            (counts == counts[0]).all()
+            and (ends - starts == 2 * (counts - 1)).all()
+            and len(starts) > 1
+            and (np.abs(np.diff(starts)) == 1).all()
+            and starts.max() == 1
+        ):
+            return int(counts[0]), len(counts)
+    return None
 
 
 def _grown(points: Array, sizes: Array, start: int) -> dict[tuple[int, int], int] | None:

@@ -92,10 +92,15 @@ def boards_guessed(seen: Iterable[tuple[str, int, BoardSeen]]) -> list[Guess]:
             name, remark = "board", f"{TODO} a square; {passed} (inner corners, not squares)"
         else:
             section = CircleGridTarget(
-                type="circle_grid", circles=(across, down), spacing_m=SQUARE_M, larger_dot=bool(board.larger_dot)
+                type="circle_grid",
+                circles=(across, down),
+                spacing_m=SQUARE_M,
+                larger_dot=bool(board.larger_dot),
+                asymmetric=board.asymmetric,
             )
             dot = ", with one larger dot: at the lower left as printed, or name its corner" if board.larger_dot else ""
-            name, remark = "grid", f"{TODO} between centres of neighbours; {passed}{dot}"
+            what = "from one row to the next" if board.asymmetric else "between centres of neighbours"
+            name, remark = "grid", f"{TODO} {what}; {passed}{dot}"
         if images > guesses.get(family, (0, None))[0]:
             guesses[family] = images, Guess(name, section, remark)
     return [guess for _, guess in guesses.values()]

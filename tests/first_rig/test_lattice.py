@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gtsam_rwhec.first_rig.lattice import lattice_size
+from gtsam_rwhec.first_rig.lattice import asymmetric_size, lattice_size
 
 
 def lattice(columns: int, rows: int, tilt: float = 0.0) -> np.ndarray:
@@ -35,3 +35,14 @@ def test_no_whole_lattice() -> None:
     assert found is None or min(found) < 3
     points = np.delete(lattice(6, 5), 7, axis=0)  # one is missing
     assert lattice_size(points, np.full(len(points), 5.0)) is None
+
+
+@pytest.mark.parametrize(("columns", "rows", "tilt"), [(4, 11, 0.0), (4, 11, 0.5), (5, 7, 0.3)])
+def test_rows_that_are_shifted_in_turn(columns: int, rows: int, tilt: float) -> None:
+    points = np.array([(2 * x + y % 2, y) for y in range(rows) for x in range(columns)], dtype=float)
+    depth = 1.0 + tilt * (points[:, :1] + 0.5 * points[:, 1:]) / (2 * columns)
+    points = 100.0 + 30.0 * points @ np.array([[0.9, -0.4], [0.4, 0.9]]) / depth
+    assert asymmetric_size(points, np.full(len(points), 9.0)) == (columns, rows)
+    assert lattice_size(points, np.full(len(points), 9.0)) is None
+    square = lattice(6, 5)
+    assert asymmetric_size(square, np.full(len(square), 9.0)) is None
