@@ -70,6 +70,13 @@ class SolvingRounds:
 
         Each round finds outliers at the present time offsets, then time offsets without the outliers.
         """
+        return self._settled(given, free_sizes)[0]
+
+    def _settled(
+        self, given: SynchronisedPairs, free_sizes: Collection[str]
+    ) -> tuple[SynchronisedPairs, Refined | None]:
+        """As `settled`, with the refinement that says that no time offset changes; None where there is none."""
+        last: Refined | None = None
         outliers: dict[Pair, np.ndarray] = {}
         everything = marked = given
         for _ in range(ROUNDS):
@@ -83,15 +90,18 @@ class SolvingRounds:
                 outliers = inliers
                 marked = SynchronisedPairs(with_outliers_marked(everything.pairs, inliers), before)
             for _ in range(ROUNDS if self.estimated else 0):
-                change = self.refined(marked, free_sizes, "time offsets").time_offsets_s
+                found = self.refined(marked, free_sizes, "time offsets")
+                change = found.time_offsets_s
                 offsets = marked.offsets_s | {name: marked.offsets_s[name] + value for name, value in change.items()}
                 everything, marked = self.at(everything.pairs, offsets), self.at(marked.pairs, offsets)
                 if max(abs(value) for value in change.values()) < SETTLED_S:
+                    last = found
                     break
+                last = None
             moved = max((abs(marked.offsets_s[name] - before[name]) for name in self.estimated), default=0.0)
             if is_same or moved < SAME_OUTLIERS_S:
                 break
-        return marked
+        return marked, last
 
     def misreadings(self, given: SynchronisedPairs) -> tuple[Misreading, ...]:
         """Likely misreadings of the poses, at least exchanged carriers, before any measurement is left out.
@@ -189,8 +199,8 @@ class SolvingRounds:
             with warnings.catch_warnings():
                 if is_check:  # users get only the warnings of the answer
                     warnings.simplefilter("ignore", RwhecWarning)
-                marked = self.settled(given, self.rig.targets)
-                refined = self.refined(marked, self.rig.targets, "time offsets")
+                marked, last = self._settled(given, self.rig.targets)
+                refined = last or self.refined(marked, self.rig.targets, "time offsets")
         except ScaleError:
             if not is_check:
                 raise

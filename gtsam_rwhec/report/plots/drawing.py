@@ -63,10 +63,10 @@ def picture(
 
     with style.context(["default", STYLE]):
         figure = Figure(figsize=(width_in, height_in), layout=layout)
-        FigureCanvasAgg(figure)
+        canvas = FigureCanvasAgg(figure)
         yield figure
         content = io.BytesIO()
-        figure.savefig(content, format="png", metadata={"Software": None})
+        canvas.print_png(content, metadata={"Software": None})  # figure.savefig goes over everything twice
     write_atomically(path, content.getvalue())
 
 
