@@ -66,7 +66,8 @@ def picture(
         canvas = FigureCanvasAgg(figure)
         yield figure
         content = io.BytesIO()
-        canvas.print_png(content, metadata={"Software": None})  # figure.savefig goes over everything twice
+        # figure.savefig goes over everything twice.
+        canvas.print_png(content, metadata={"Software": None})  # type: ignore[no-untyped-call]
     write_atomically(path, content.getvalue())
 
 
