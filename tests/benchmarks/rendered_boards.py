@@ -32,6 +32,7 @@ from rendered_prints import Array, Print
 from rendered_scenes import BACKGROUNDS, Gray
 
 from gtsam_rwhec.vision.detection import Detection, Detector
+from gtsam_rwhec.vision.tag_boards import Bundle, BundleTag, TagGrid
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
 
 #: Shares of images: with something over the target, with shade over a part of it.
@@ -195,6 +196,18 @@ def of_tag() -> Kind:
     return Kind(tag, prints.single_tag, 0.01, 0.08, 24.0, (1.0, 3.0), (0.04, 0.04), _apriltags())
 
 
+def of_tag_grid(columns: int, rows: int) -> Kind:
+    grid = TagGrid("grid", "tag36h11", columns, rows, 0.04, 0.01)
+    half = (0.025 * columns - 0.005, 0.025 * rows - 0.005)
+    return Kind(grid, prints.tag_grid, 0.005, 0.04, 24.0, (1.0, 4.0), half, _apriltags())
+
+
+def of_flat_bundle() -> Kind:
+    places = ((-0.05, 0.05), (0.05, 0.05), (-0.05, -0.05), (0.05, -0.05), (0.0, 0.0))
+    bundle = Bundle("bundle", "tag36h11", tuple(BundleTag(i, 0.04, (x, y, 0.0)) for i, (x, y) in enumerate(places)))
+    return Kind(bundle, prints.flat_bundle, 0.005, 0.04, 24.0, (1.0, 4.0), (0.07, 0.07), _apriltags())
+
+
 def of_circles(
     columns: int, rows: int, *, larger_dot: bool = False, asymmetric: bool = False, light: bool = False
 ) -> Kind:
@@ -229,6 +242,8 @@ KINDS: dict[str, Callable[[], Kind]] = {
     "charuco": lambda: of_charuco(7, 5),
     "aprilgrid": lambda: of_aprilgrid(6, 6),
     "tag": of_tag,
+    "tag_grid": lambda: of_tag_grid(5, 7),
+    "bundle": of_flat_bundle,
     "circles": lambda: of_circles(9, 7),
     "circles_larger_dot": lambda: of_circles(10, 10, larger_dot=True),
     "circles_light": lambda: of_circles(9, 7, light=True),

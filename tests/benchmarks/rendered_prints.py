@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gtsam_rwhec.vision.dictionaries import dictionary
+from gtsam_rwhec.vision.tag_boards import Bundle, TagGrid
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, CircleGrid, Tag
 
 Array = npt.NDArray[np.float64]
@@ -69,6 +70,31 @@ def aprilgrid(grid: AprilGrid, per_unit: int, margin: float) -> Print:
         for column in range(grid.columns + 1):
             modules[row * pitch :, column * pitch :][:gap, :gap] = 0.0
     return drawn(modules, grid.tag_m / side, per_unit, margin)
+
+
+def tag_grid(grid: TagGrid, per_unit: int, margin: float) -> Print:
+    """The unit is a module of a tag; there is nothing in the gaps."""
+    side = int(dictionary(grid.family).markerSize) + 2 * BORDER
+    gap = round(grid.gap_m / grid.tag_m * side)
+    assert abs(gap - grid.gap_m / grid.tag_m * side) < 1e-9, "give a gap of whole modules"
+    modules = np.ones((grid.rows * (side + gap) - gap, grid.columns * (side + gap) - gap))
+    for k, number in enumerate(grid.ids):
+        row, column = divmod(k, grid.columns)
+        tag = tag_modules(grid.family, number, BORDER)
+        modules[row * (side + gap) :, column * (side + gap) :][:side, :side] = tag
+    return drawn(modules, grid.tag_m / side, per_unit, margin)
+
+
+def flat_bundle(bundle: Bundle, per_unit: int, margin: float) -> Print:
+    """Tags of one size on a sheet about the bundle's origin; the unit is a module."""
+    side = int(dictionary(bundle.family).markerSize) + 2 * BORDER
+    unit = bundle.tags[0].size_m / side
+    corners = np.rint(np.stack([tag.corners()[0, :2] for tag in bundle.tags]) / unit).astype(int)
+    half = int(np.abs(np.stack([tag.corners()[:, :2] for tag in bundle.tags])).max() / unit + 0.5)
+    modules = np.ones((2 * half, 2 * half))
+    for tag, (x, y) in zip(bundle.tags, corners, strict=True):
+        modules[half - y :, half + x :][:side, :side] = tag_modules(bundle.family, tag.id, BORDER)
+    return drawn(modules, unit, per_unit, margin)
 
 
 def charuco_unit(board: Charuco) -> tuple[int, int]:
