@@ -16,7 +16,6 @@ from typing import TypeAlias
 
 import numpy as np
 from rwhec_factors import se3
-from scipy.optimize import minimize
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.model import Model, Point
@@ -221,5 +220,7 @@ class Reduced:
             return value, gradient[:number]
 
         bounds = [(np.log(low), np.log(high)) for low, high in (CORNER_PX, CARRIER, CARRIER)[:number]]
+        from scipy.optimize import minimize  # here, since its import takes as long as the work of few poses
+
         found = minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11})
         return noise(found.x)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors import se3
-from scipy import stats
+from scipy.special import fdtrc
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
@@ -137,8 +137,8 @@ def _compared(camera: Camera, stated: _Fit, fitted: _Fit, n: int, corners: int) 
     of_corners = fitted.rms_px**2 * corners / freedom * back
     squared = [float(change @ np.linalg.solve(S + 1e-12 * np.eye(4), change)) for S in (of_views, of_corners)]
     probability = max(
-        float(stats.f.sf(squared[0] * (n - 4.0) / (4.0 * (n - 1.0)), 4, n - 4)),  # Hotelling's T^2
-        float(stats.f.sf(squared[1] / 4.0, 4, freedom)),
+        float(fdtrc(4, n - 4, squared[0] * (n - 4.0) / (4.0 * (n - 1.0)))),  # Hotelling's T^2
+        float(fdtrc(4, freedom, squared[1] / 4.0)),
     )
     sigma = np.sqrt(np.maximum(np.diag(of_views), np.diag(of_corners)))
     return IntrinsicsEvidence(camera, fitted.camera, sigma, stated.rms_px, fitted.rms_px, probability, n)
