@@ -79,7 +79,8 @@ def _candidates(gray: Gray, board: CircleGrid) -> Iterator[tuple[Array, Array]]:
             picture = np.asarray(cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), STEADY_PX), np.uint8)
         dark, light = NONE, NONE
-        for around in AROUND_PX:
+        large = max(picture.shape) > LARGE_PX  # its large circles were found, or not, at half its size
+        for around in AROUND_PX[:1] if large else AROUND_PX:
             dark = dark.with_more(ellipses(picture, around, light=False))
             light = light.with_more(ellipses(picture, around, light=True))
             for blobs in (dark, light):
