@@ -144,7 +144,12 @@ def _of_sensor(
         records += of_target
         if measured_px is not None:
             corner_px[f"{target.name}/{sensor}"] = measured_px
-    return SensorDetections(records, len(images), strangers, faults, corner_px)
+    remarks = tuple(
+        f"{name} is {note}."
+        for name, track in tracks.items()
+        for note in dict.fromkeys(d.note for _, d in track if d.note and d.rejection is None)
+    )
+    return SensorDetections(records, len(images), strangers, faults, corner_px, remarks=remarks)
 
 
 def _faults(log: Log, images: list[DetectedImage]) -> tuple[str, ...]:

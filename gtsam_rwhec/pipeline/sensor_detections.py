@@ -29,6 +29,7 @@ class SensorDetections:
     faults: tuple[str, ...] = ()  #: one sentence for each image that could not be used
     #: Measured standard deviation of a corner along each axis, pixels, by target/sensor.
     corner_px: Mapping[str, float] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()  #: what was found out about targets
     images: Mapping[int, LookedAt] = field(default_factory=dict)  #: every image, by stamp; none of a driver's
 
 
@@ -43,6 +44,7 @@ def detection_report(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) 
         tracks=tuple(count for sensor, of_sensor in found.items() for count in _counts(sensor, of_sensor.records)),
         strangers={f"{family} {number}": count for (family, number), count in sorted(strangers.items())},
         unseen=tuple(name for name in rig.targets if name not in seen),
+        remarks=tuple(dict.fromkeys(remark for of_sensor in found.values() for remark in of_sensor.remarks)),
         corner_px={key: value for of_sensor in found.values() for key, value in of_sensor.corner_px.items()},
     )
 

@@ -76,6 +76,7 @@ def log_advice(log: LogFields, judgement: Judgement | None = None) -> list[str]:
     said = judgement is not None and bool(SIZES.intersection(grounds))
     if Ground.INTRINSICS_DOUBTED not in grounds:  # with wrong focal lengths sizes say nothing
         advice += _sizes(log, judgement.reason if judgement is not None and said else "")
+    advice += log.detection.remarks
     if log.detection.strangers:
         names = [f"{name} ({count} times)" for name, count in list(log.detection.strangers.items())[:MOST_NAMED]]
         advice.append(f"The images show tags that the rig file does not name: {', '.join(names)}.")

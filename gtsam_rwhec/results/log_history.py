@@ -83,6 +83,7 @@ class DetectionReport(_Record):
     likely: tuple[str, ...] = Field(
         default=(), description="why targets were not read where most were not: what some of the images show, and cures"
     )
+    remarks: tuple[str, ...] = Field(default=(), description="what was found out about targets, in words")
     corner_px: dict[str, NotNegative] = Field(
         description="measured standard deviation of a corner along each axis, pixels, by target/sensor"
     )
