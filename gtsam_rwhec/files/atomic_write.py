@@ -1,4 +1,7 @@
-"""Files are written whole or not at all. Every file that this library writes goes through here."""
+"""Files are written whole or not at all. Every file that this library writes goes through here.
+
+The one file that grows while a run works has lines with checksums (`appending_stream`): a torn last one shows.
+"""
 
 from __future__ import annotations
 
@@ -48,6 +51,17 @@ def why_not_writable(path: str | Path) -> str:
     except OSError as error:
         return error.strerror or str(error)
     return ""
+
+
+def appending_stream(path: str | Path) -> BinaryIO:
+    """A stream that adds to the end of a file. What it is told must itself show whether it is whole.
+
+    Raises
+    ------
+    OSError
+        When the file cannot be written.
+    """
+    return open(path, "ab")
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.atomic_write import appending_stream, write_atomically
 from gtsam_rwhec.logs import ImageRecord
 from gtsam_rwhec.vision.detected import Detection, ImageDetections
 from gtsam_rwhec.vision.many_images import DetectedImage
@@ -114,7 +114,7 @@ class KeptDetections:
             if self._stream is None:
                 if not self.path.exists():
                     write_atomically(self.path, _line({"inputs": self.inputs}))
-                self._stream = self.path.open("ab")
+                self._stream = appending_stream(self.path)
             self._stream.write(line)
             self._stream.flush()  # a killed process loses nothing that is flushed
             return self._stream.tell() - len(line), len(line)
