@@ -15,7 +15,7 @@ class Rejection(StrEnum):
     BLURRED = "blurred"
     GRAZING = "grazing"
     FEW_CORNERS = "too few corners"
-    SEEN_TWICE = "id seen twice in one image"
+    SEEN_TWICE = "seen twice in one image"
     NO_EDGES = "edges not found"
     NO_POSE = "no pose"
     REPROJECTION = "reprojection error"

@@ -80,7 +80,7 @@ def test_the_demo_runs_from_it_and_meets_the_truth(unpacked_wheel: Path, tmp_pat
     for words in (
         "Certified globally optimal",
         "Outliers: ",
-        "id seen twice in one image: 6 ",
+        "seen twice in one image: 6 ",
         "Size of board: stated",
     ):
         assert words in done.stdout
@@ -112,5 +112,5 @@ def check_against_truth(out: Path) -> None:
     # JSON for people: what was removed, and why.
     said = json.loads((out / "result.json").read_text(encoding="utf-8"))["log"]
     twice = [track["removed"] for track in said["detection"]["tracks"] if track["target"] == "tag_2"]
-    assert {"id seen twice in one image": 6} in twice
+    assert {"seen twice in one image": 6} in twice
     assert [size["target"] for size in said["sizes"] if size["is_free"]] == ["board"]
