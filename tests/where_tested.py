@@ -148,9 +148,9 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/reprojection": {
         "methods/test_evangelista2023.py": "observations",
-        "reprojection/test_calibrating.py": "first_intrinsics",
-        "reprojection/test_graph.py": "model",
-        "reprojection/test_refining.py": "corner_outliers freedom intrinsics options refined stated_intrinsics",
+        "reprojection/test_calibrating_corners.py": "first_intrinsics",
+        "reprojection/test_corner_graph.py": "model",
+        "reprojection/test_refining_corners.py": "corner_outliers freedom intrinsics options refined stated_intrinsics",
     },
     "gtsam_rwhec/results": {
         "results/test_agreement.py": "covariance_agreement",

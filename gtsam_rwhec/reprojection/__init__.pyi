@@ -4,9 +4,9 @@ from .observations import Views as Views
 
 # Refine from it.
 from .options import CornerOptions as CornerOptions
-from .calibrating import CornersCalibrated as CornersCalibrated
-from .calibrating import calibrate_corners as calibrate_corners
-from .refining import refine_corners as refine_corners
+from .calibrating_corners import CornersCalibrated as CornersCalibrated
+from .calibrating_corners import calibrate_corners as calibrate_corners
+from .refining_corners import refine_corners as refine_corners
 
 # The result, and its parts.
 from .reduced import Noise as Noise

@@ -18,12 +18,12 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_whole
 from gtsam_rwhec.refinement.options import CarrierNoise
+from gtsam_rwhec.reprojection.corner_views import Stack, depths, pixel_errors, stacks_of
 from gtsam_rwhec.reprojection.lens import parameters_of
 from gtsam_rwhec.reprojection.observations import Observations, Views
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refined import CornersRefined
-from gtsam_rwhec.reprojection.refining import refine_corners
-from gtsam_rwhec.reprojection.views import Stack, depths, pixel_errors, stacks_of
+from gtsam_rwhec.reprojection.refining_corners import refine_corners
 from gtsam_rwhec.vision.camera import Camera
 
 #: The image is divided into so many columns and rows.

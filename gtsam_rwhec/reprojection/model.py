@@ -9,7 +9,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.refinement.options import About
-from gtsam_rwhec.reprojection.views import Linear, Stack, linearised, pixel_errors
+from gtsam_rwhec.reprojection.corner_views import Linear, Stack, linearised, pixel_errors
 
 #: A residual of this many deviations stands for a corner behind its camera: the step is refused, and stays finite.
 BEHIND = 1e6

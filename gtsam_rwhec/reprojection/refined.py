@@ -13,7 +13,7 @@ from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
-from gtsam_rwhec.reprojection.graph import CornerGraph
+from gtsam_rwhec.reprojection.corner_graph import CornerGraph
 from gtsam_rwhec.reprojection.model import Point
 from gtsam_rwhec.reprojection.reduced import Noise
 from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, held_by_prior

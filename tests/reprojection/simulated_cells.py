@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rwhec_factors import se3
 
+from gtsam_rwhec.reprojection.corner_views import shaped
 from gtsam_rwhec.reprojection.intrinsics import Stated, prior_of
 from gtsam_rwhec.reprojection.lens import camera_with, parameters_of, pixels_of
 from gtsam_rwhec.reprojection.observations import Observations
-from gtsam_rwhec.reprojection.views import shaped
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.targets import Checkerboard
 

@@ -12,7 +12,7 @@ from simulated_cells import cell
 import gtsam_rwhec as rw
 from gtsam_rwhec.refinement.optimisation import optimise
 from gtsam_rwhec.reprojection.consequences import consequences_of
-from gtsam_rwhec.reprojection.graph import CornerGraph
+from gtsam_rwhec.reprojection.corner_graph import CornerGraph
 from gtsam_rwhec.reprojection.lens import parameters_of
 
 EXACT = rw.CornerOptions(stated="calibration", carrier_noise="exact")

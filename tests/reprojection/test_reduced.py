@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from simulated_cells import cell
-from test_graph import model_and_point
+from simulated_models import model_and_point
 
 from gtsam_rwhec.reprojection.model import Point
 from gtsam_rwhec.reprojection.reduced import Noise, Reduced

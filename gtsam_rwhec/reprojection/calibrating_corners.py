@@ -20,7 +20,7 @@ from gtsam_rwhec.reprojection.first_intrinsics import first_intrinsics
 from gtsam_rwhec.reprojection.observations import Observations, Views
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refined import CornersRefined
-from gtsam_rwhec.reprojection.refining import refine_corners
+from gtsam_rwhec.reprojection.refining_corners import refine_corners
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
 

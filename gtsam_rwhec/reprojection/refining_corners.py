@@ -13,9 +13,10 @@ from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.refinement.options import CarrierNoise
+from gtsam_rwhec.reprojection.corner_graph import CornerGraph
 from gtsam_rwhec.reprojection.corner_outliers import weights_of
+from gtsam_rwhec.reprojection.corner_views import SHAPE, stacks_of
 from gtsam_rwhec.reprojection.freedom import degrees_of_freedom
-from gtsam_rwhec.reprojection.graph import CornerGraph
 from gtsam_rwhec.reprojection.intrinsics import free_model, prior_of
 from gtsam_rwhec.reprojection.lens import camera_with, parameters_of
 from gtsam_rwhec.reprojection.model import BEHIND, Model, Point
@@ -24,7 +25,6 @@ from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.reduced import Noise, Reduced
 from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
 from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, innovation_of
-from gtsam_rwhec.reprojection.views import SHAPE, stacks_of
 
 #: Rounds of noise, outliers and optimum in turns end when no deviation changes by more than this share.
 ROUNDS, SETTLED = 12, 1e-3
