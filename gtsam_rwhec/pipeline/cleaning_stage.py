@@ -110,7 +110,7 @@ def clean_log(
                 f"{log.files[0].path}: no measurement is left after cleaning. {'; '.join(map(str, report.tracks))}."
             )
         for why in unknown.values():
-            warnings.warn(f"{why}. None of its measurements is used", LogWarning, stacklevel=3)
+            warnings.warn(f"none of the measurements is used of {why}", LogWarning, stacklevel=3)
         tell("writing pairs")
         with LogWriter(out_path) as out:
             out.copy(log, topics_up_to_detection(log), images)

@@ -123,10 +123,9 @@ def _tested(gray: Gray, board: CircleGrid, grid: Array, radii_px: Array, camera:
     larger = radii * SAME_SIZE > usual
     rejection: Rejection | None = None
     at_place = off <= most_off
-    if not (at_place.mean() >= LEAST_KEPT and all((at_place.mean(axis=axis) > 0.5).all() for axis in (0, 1))):
+    is_grid = at_place.mean() >= LEAST_KEPT and all((at_place.mean(axis=axis) > 0.5).all() for axis in (0, 1))
+    if not is_grid or kept.mean() < 0.5:
         rejection, kept = Rejection.NOT_A_GRID, np.ones_like(kept)
-    elif kept.mean() < 0.5:
-        rejection, kept = Rejection.UNEVEN, np.ones_like(kept)
     elif (
         (radii < SAME_SIZE * usual).any()
         or (circles.contrasts * np.sign(contrast) < LEAST_CONTRAST * abs(contrast)).any()

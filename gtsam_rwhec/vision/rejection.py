@@ -26,4 +26,3 @@ class Rejection(StrEnum):
     SQUARES = "squares do not alternate as printed"
     CIRCLES = "circles not of the sizes as printed, or the larger dot not at its corner"
     OTHER_SIZE = "board goes on: other columns or rows"
-    UNEVEN = "shadows' edges across the board"

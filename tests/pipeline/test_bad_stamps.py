@@ -6,10 +6,11 @@ from pathlib import Path
 
 import cv2
 import pytest
-from bad_logs import MOVING, RECORDED, WITH_IMAGES, images, picture, refused, restamped, since_1970
+from bad_logs import MOVING, RECORDED, WITH_IMAGES, calibrate, images, picture, refused, restamped, since_1970
 from synthetic_logs import BEGIN_NS
 
-from gtsam_rwhec.errors import StampError
+from gtsam_rwhec.calibration.verdict import Ground
+from gtsam_rwhec.errors import LogWarning, StampError
 
 ESTIMATED = "detections: /cam_1/tags\n    time_offset: estimate"
 
@@ -53,9 +54,16 @@ def test_images_of_another_clock(tmp_path: Path) -> None:
 
 
 def test_no_time_offset_joins_clocks_of_different_years(tmp_path: Path) -> None:
+    """The other sensor keeps its answer."""
     messages = restamped(RECORDED, "/cam_1/tags", since_1970)
-    words = "cam_1: no offset of up to 1 s", "1.220 to 4.820 s", "1700000000.000", "another clock?"
-    refused(tmp_path, messages, StampError, *words, cam_1=ESTIMATED)
+    with pytest.warns(LogWarning) as said:
+        calibrated = calibrate(tmp_path, messages, cam_1=ESTIMATED)
+    (warning,) = [str(one.message) for one in said if issubclass(one.category, LogWarning)]
+    for words in ("cam_1: no offset of up to 1 s", "1.220 to 4.820 s", "1700000000.000", "another clock?"):
+        assert words in warning
+    assert calibrated.judgement.grounds == (Ground.NO_ANSWER,)
+    assert "the sensor's clock is not known: 57" in str(calibrated.judgement)
+    assert set(calibrated.refined.Y) == {"cam_0"}
 
 
 def test_no_overlap(tmp_path: Path) -> None:

@@ -164,7 +164,7 @@ def jpeg_that_claims(width: int, height: int, before: bytes = b"") -> bytes:
 @pytest.mark.parametrize(
     ("image", "words"),
     [
-        (compressed(b""), "0 bytes"),
+        (compressed(b""), "there are no bytes in it"),
         (compressed(encoded(GRAY, ".png")[:-40] + b"IEND", "png"), "of a PNG file that is cut short"),
         (compressed(b"\xff\xd8"), "2 bytes that begin with ffd8 and claim to be 'jpeg'"),
         (compressed(b"not an image at all", "png"), "19 bytes that begin with 6e6f7420616e2069 and claim to be 'png'"),
