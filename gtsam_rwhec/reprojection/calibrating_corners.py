@@ -16,6 +16,7 @@ from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.reprojection.determined import check_arguments
 from gtsam_rwhec.reprojection.first_intrinsics import first_intrinsics
 from gtsam_rwhec.reprojection.observations import Observations, Views
 from gtsam_rwhec.reprojection.options import CornerOptions
@@ -69,11 +70,14 @@ def calibrate_corners(
     ------
     CameraError
         Unknown intrinsics cannot be estimated, or an image has no pose.
+    OptionError
+        An argument is of another type.
     TargetError
         A target is not flat.
     RwhecError
         As ``solve``, ``refine`` and ``refine_corners`` do.
     """
+    check_arguments(observations, options)
     options, tell = options or CornerOptions(), progress or silent
     cameras = dict(observations.cameras)
     for sensor in observations.sensors:

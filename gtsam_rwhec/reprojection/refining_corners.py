@@ -16,6 +16,13 @@ from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.reprojection.corner_graph import CornerGraph
 from gtsam_rwhec.reprojection.corner_outliers import weights_of
 from gtsam_rwhec.reprojection.corner_views import SHAPE, stacks_of
+from gtsam_rwhec.reprojection.determined import (
+    check_arguments,
+    check_corners,
+    check_determined,
+    check_names,
+    told_where_it_fails,
+)
 from gtsam_rwhec.reprojection.freedom import degrees_of_freedom
 from gtsam_rwhec.reprojection.intrinsics import free_model, prior_of
 from gtsam_rwhec.reprojection.lens import camera_with, parameters_of
@@ -72,9 +79,20 @@ def refine_corners(
     ------
     CameraError
         The start puts a corner that was seen behind its camera.
+    FrameError
+        The start lacks a frame.
+    OptionError
+        An argument is of another type.
+    OutlierError
+        The corners are far from where the poses put them.
     PoseError
         A start is not a pose.
+    UnderdeterminedError
+        The images leave a frame's pose free.
     """
+    check_arguments(observations, options)
+    check_names(X, observations.targets, letter="X")
+    check_names(Y, observations.sensors, letter="Y")
     options, tell = options or CornerOptions(), progress or silent
     first = {name: options.camera_of(name) for name in observations.sensors}
     stated = {name: options.stated_of(first[name]) for name in observations.sensors}
@@ -153,7 +171,7 @@ def _settled(
     model: Model, point: Point, noise: Noise, options: CornerOptions, tell: Progress, iterations: int = 0
 ) -> _Settled:
     """Optimum, noise and outliers in turns, until the noise settles."""
-    is_first = iterations == 0
+    is_first, start = iterations == 0, point
     for number in range(ROUNDS):
         tell(f"refining from corners: round {number + 1} of at most {ROUNDS}")
         graph = CornerGraph(model, point)
@@ -162,10 +180,13 @@ def _settled(
         parameters.setRelativeErrorTol(1e-9)
         parameters.setAbsoluteErrorTol(1e-7)
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph.graph, graph.values(point), parameters)
-        values = optimiser.optimize()
+        with told_where_it_fails(model, point):
+            values = optimiser.optimize()
         point, iterations = graph.point(values), iterations + optimiser.iterations()
-        reduced, before = Reduced.of(model, point), noise
-        noise = reduced.likeliest(noise, carrier=options.carrier_noise == "estimate")
+        before = noise
+        with told_where_it_fails(model, point):
+            reduced = Reduced.of(model, point)
+            noise = reduced.likeliest(noise, carrier=options.carrier_noise == "estimate")
         weights = model.weights
         if options.outliers:
             weights = weights_of(model, point, noise.corner_px, first=number == 0 and is_first)
@@ -173,7 +194,10 @@ def _settled(
         if same and noise.change(before) < SETTLED:
             break
         model = replace(model, A_noise=noise.carrier, corner_px=noise.corner_px, weights=weights)
-    joint, last_step = graph.covariance(values, reduced.slots)
+    check_corners(model, point)
+    with told_where_it_fails(model, point):
+        joint, last_step = graph.covariance(values, reduced.slots)
+    check_determined(model, start, point, joint, reduced.slots)
     freedom = degrees_of_freedom(reduced, noise, carrier=options.carrier_noise == "estimate")
     return _Settled(model, point, noise, graph, joint, reduced.slots, freedom, iterations, last_step)
 

@@ -1,0 +1,143 @@
+"""Whether corners determine all poses: there is one optimum, the corners are near it, and every deviation is small."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import numpy as np
+
+from gtsam_rwhec.errors import FrameError, OptionError, OutlierError, UnderdeterminedError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.reprojection.corner_outliers import errors_px
+from gtsam_rwhec.reprojection.corner_views import depths
+from gtsam_rwhec.reprojection.model import Model, Point
+from gtsam_rwhec.reprojection.observations import Observations
+from gtsam_rwhec.reprojection.options import CornerOptions
+
+#: Corners whose median error is above this, pixels, do not belong to the poses.
+FARTHEST_PX = 30.0
+#: A frame with a larger deviation is not determined: rad, and times the largest distance of a corner from its camera.
+ROTATION_RAD, TRANSLATION_OF_DISTANCE = 0.5, 10.0
+
+CURE = (
+    "take more images, in which the carriers turn about two axes that are not parallel, by 30 degrees and more, and "
+    "give each image the pose A of its own instant"
+)
+
+
+def check_arguments(observations: object, options: object) -> None:
+    """OptionError for what is neither observations nor options."""
+    if not isinstance(observations, Observations):
+        raise OptionError(
+            f"observations={brief(observations)} are not Observations; make them by rw.Observations.of(cameras, "
+            "corners, views)"
+        )
+    if options is not None and not isinstance(options, CornerOptions):
+        raise OptionError(f"options={brief(options)} are not CornerOptions; give rw.CornerOptions(...), or None")
+
+
+def check_names(start: object, names: tuple[str, ...], *, letter: str) -> None:
+    """FrameError where a start X or Y lacks a frame that was seen, or that saw; OptionError where it is no dict."""
+    what, pose = {
+        "X": ("target", "T_targetcarrier_target"),
+        "Y": ("sensor", "T_sensorcarrier_sensor"),
+    }[letter]
+    if not isinstance(start, Mapping):
+        raise OptionError(f"{letter}={brief(start)} is not a dict; give {pose} of each {what} by its name")
+    missing = [name for name in names if name not in start]
+    if missing:
+        there = f"it has {', '.join(map(str, start))}" if start else "it is empty"
+        raise FrameError(
+            f"the start {letter} lacks the {what} {', '.join(missing)} ({there}); give {pose} of each {what}, such as "
+            "the certified answer's, or call rw.calibrate_corners, which needs no start"
+        )
+
+
+@contextmanager
+def told_where_it_fails(model: Model, point: Point) -> Iterator[None]:
+    """Linear systems without one solution become OutlierError or UnderdeterminedError."""
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except (RuntimeError, np.linalg.LinAlgError) as error:
+        if isinstance(error, RuntimeError) and "indetermina" not in str(error).lower():
+            raise
+        check_corners(model, point)
+        raise UnderdeterminedError(
+            f"the images do not determine {_frames(model)}: {_what_there_is(model)} leave their poses free; {CURE}"
+        ) from error
+
+
+def check_corners(model: Model, point: Point) -> None:
+    """OutlierError where half of the corners or more are far from where the poses put them."""
+    for stack, error in zip(model.stacks, errors_px(model, point), strict=True):
+        median = float(np.median(error[stack.known]))
+        if not median < FARTHEST_PX:
+            raise OutlierError(
+                f"the corners of {stack.target} in the images of {stack.sensor} do not belong to the poses: half of "
+                f"them are off by {min(median, 1e5):.0f} pixels or more ({_what_there_is(model)}); check that each "
+                "image has the pose A of its own instant, that corners have the target's order, and that A, the start "
+                "and the sizes are in metres"
+            )
+
+
+def check_determined(
+    model: Model, start: Point, point: Point, joint: Array, slots: Mapping[tuple[str, str], slice]
+) -> None:
+    """UnderdeterminedError where a frame's deviation is not finite, or so large that the images do not say its pose."""
+    distance = min(_farthest(model, start), _farthest(model, point))
+    limits = ROTATION_RAD, TRANSLATION_OF_DISTANCE * distance
+    faults = []
+    for (letter, name), at in slots.items():
+        if letter not in "xy":
+            continue
+        block = joint[at, at]
+        if not (np.isfinite(block).all() and (np.diagonal(block) > 0.0).all()):
+            faults.append(f"{name} (no finite deviation)")
+            continue
+        rotation, translation = (
+            float(np.sqrt(max(np.linalg.eigvalsh(part)[-1], 0.0))) for part in (block[:3, :3], block[3:, 3:])
+        )
+        if rotation > limits[0] or translation > limits[1]:
+            faults.append(f"{name} (deviation {np.degrees(rotation):.3g} degrees, {translation:.3g} m)")
+    if faults:
+        raise UnderdeterminedError(
+            f"the images do not determine the pose of {', '.join(faults)}: {_what_there_is(model)} are too few or too "
+            f"much alike; {CURE}"
+        )
+    if not (np.isfinite(joint).all() and (np.diagonal(joint) > 0.0).all()):
+        names = [
+            {"k": f"intrinsics of {name}", "b": f"shape of {name}"}[letter]
+            for (letter, name), at in slots.items()
+            if letter in "kb" and not (np.diagonal(joint)[at] > 0.0).all()
+        ]
+        raise UnderdeterminedError(
+            f"the images do not determine the {', the '.join(names) or 'unknowns together'}; state intrinsics "
+            f"(CornerOptions.stated) and sizes, or {CURE}"
+        )
+
+
+def _farthest(model: Model, point: Point) -> float:
+    """The largest depth of a corner that was seen, metres."""
+    return max(
+        float(
+            depths(stack, point.X[stack.target], point.Y[stack.sensor], point.A, point.shapes[stack.target])[
+                stack.known
+            ].max()
+        )
+        for stack in model.stacks
+    )
+
+
+def _frames(model: Model) -> str:
+    return ", ".join((*model.targets, *model.sensors))
+
+
+def _what_there_is(model: Model) -> str:
+    """How many images at how many different poses."""
+    images = sum(len(stack.instant) for stack in model.stacks)
+    poses = len(model.A)
+    at = "one pose" if poses == 1 else f"{poses} different poses"
+    return f"{images} image{'s' * (images != 1)} at {at} of the carriers"
