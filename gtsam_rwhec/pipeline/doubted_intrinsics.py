@@ -48,9 +48,13 @@ def doubted_intrinsics(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tup
 def _finding(sensor: str, found: IntrinsicsEvidence, rig: Rig) -> Finding:
     def numbers(camera: Camera) -> str:
         K = np.rint(camera.K).astype(int)
-        return f"fx, fy = {K[0, 0]}, {K[1, 1]} and cx, cy = {K[0, 2]}, {K[1, 2]}"
+        words = f"fx, fy = {K[0, 0]}, {K[1, 1]} and cx, cy = {K[0, 2]}, {K[1, 2]}"
+        if len(found.sigma) == 4 or not camera.D.any():
+            return words
+        k1, k2 = np.round(np.pad(camera.D, (0, 2))[:2], 3) + 0.0
+        return f"{words}, k1, k2 = {k1:g}, {k2:g}"
 
-    give_or_take = f"standard deviations {found.sigma[:2].max():.2g} and {found.sigma[2:].max():.2g} px"
+    give_or_take = f"standard deviations {found.sigma[:2].max():.2g} and {found.sigma[2:4].max():.2g} px"
     words = (
         f"the intrinsics of {sensor} ({rig.source.place(('sensors', sensor, 'intrinsics'))}) do not fit its corners: "
         f"{numbers(found.stated)}, as stated, leave {found.stated_px:.2f} px rms in {found.views} images, and "

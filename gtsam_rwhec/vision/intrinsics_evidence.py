@@ -1,9 +1,10 @@
-"""Whether the corners of a plane, seen from many sides, fit the stated intrinsics: Zhang's test, with known distortion.
+"""Whether the corners of a plane, seen from many sides, fit the stated intrinsics: Zhang's test.
 
 A view of a plane has eight numbers, and its pose takes six: two are left that say something of the intrinsics (Zhang
 2000, section 2.3). Focal lengths and principal point are estimated with all poses, from what is stated as a nominal
-prior (3 % and 30 pixels). The change counts by the scatter between the views too, since errors of one view's corners
-are alike where a board is bent or the lens has a distortion that was not stated.
+prior (3 % and 30 pixels), with the distortion as stated; then far from it, with two coefficients of distortion: a
+lens that nobody stated, or the intrinsics of another resolution. The change counts by the scatter between the views
+too, since errors of one view's corners are alike where a board is bent.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from rwhec_factors import se3
 from scipy.special import fdtrc
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.distortion import coefficient_jacobian
 
 #: With fewer views nothing is said; a view needs this number of corners.
 LEAST_VIEWS, LEAST_CORNERS = 8, 8
@@ -24,8 +27,8 @@ LEAST_VIEWS, LEAST_CORNERS = 8, 8
 MOST_VIEWS = 40
 #: Nominal intrinsics: the focal length's share, and pixels of the principal point.
 NOMINAL_SHARE, NOMINAL_PX = 0.03, 30.0
-#: Where the stated numbers contradict the corners, the prior is this many times as wide.
-WIDER = 10.0
+#: Far from what is stated, the prior is this many times as wide, and coefficients of distortion have this deviation.
+WIDER, DISTORTION = 20.0, 0.5
 #: Views are different if the board is turned by this angle (radians), or moved by this share of its distance.
 APART = 0.03
 #: Corners have at least this standard deviation, pixels.
@@ -37,6 +40,8 @@ SHARES = (1.0, 0.5, 0.25, 0.1, 0.02)
 #: The stated intrinsics do not fit if the scatter between views explains the change with at most this probability, and
 #: residuals are larger by at least this factor, and by this much (pixels, in squares).
 LEAST_PROBABILITY, LARGER, LARGER_PX = 1e-4, 1.08, 0.02
+#: The same with distortion, which a bent board may look like.
+LEAST_FAR, LARGER_FAR = 1e-6, 1.25
 #: A change by more than this share of the focal length, beyond two standard deviations, makes poses useless.
 USELESS = 0.01
 
@@ -57,14 +62,16 @@ class IntrinsicsEvidence:
     Attributes
     ----------
     stated, fitted : Camera
-        The distortion is the same.
-    sigma : (4,) array
-        Standard deviations of the fitted fx, fy, cx, cy, pixels.
+    sigma : (4,) or (6,) array
+        Standard deviations of the fitted fx, fy, cx, cy, pixels, and of two coefficients of distortion where they are
+        fitted too.
     stated_px, fitted_px : float
         Root mean squares of the reprojection errors, pixels, each with the poses that fit best.
     probability : float
         That right intrinsics lead to so large a change.
     views : int
+    reach : float
+        Largest normalised radius of a corner that was seen.
     """
 
     stated: Camera
@@ -74,24 +81,35 @@ class IntrinsicsEvidence:
     fitted_px: float
     probability: float
     views: int
+    reach: float
 
     @property
     def contradicts(self) -> bool:
         """Whether the stated intrinsics do not fit the corners."""
+        far = len(self.sigma) > 4
+        least, larger = (LEAST_FAR, LARGER_FAR) if far else (LEAST_PROBABILITY, LARGER)
         excess = self.stated_px**2 - self.fitted_px**2
-        return (
-            self.probability < LEAST_PROBABILITY and self.stated_px > LARGER * self.fitted_px and excess > LARGER_PX**2
-        )
+        return self.probability < least and self.stated_px > larger * self.fitted_px and excess > LARGER_PX**2
 
     @property
     def is_far_off(self) -> bool:
         """Whether a number is so far off that poses are wrong by more than `USELESS` of a distance."""
-        change = np.abs(_numbers(self.fitted) - _numbers(self.stated)) - 2.0 * self.sigma
-        return bool((change > USELESS * self.stated.K[0, 0]).any())
+        change = np.abs(_numbers(self.fitted)[:4] - _numbers(self.stated)[:4]) - 2.0 * self.sigma[:4]
+        return bool((change > USELESS * self.stated.K[0, 0]).any()) or self.bend > USELESS
+
+    @property
+    def bend(self) -> float:
+        """How far the fitted distortion moves the outermost corner that was seen, a share of the focal length."""
+        if len(self.sigma) == 4:
+            return 0.0
+        at = np.array([[self.reach, 0.0]])
+        moved = self.fitted.pixels(at) - self.fitted.K[:2, 2] - self.fitted.K[0, 0] * at
+        before = self.stated.pixels(at) - self.stated.K[:2, 2] - self.stated.K[0, 0] * at
+        return float(np.abs(moved / self.fitted.K[0, 0] - before / self.stated.K[0, 0]).max())
 
 
 def evidence_of_intrinsics(camera: Camera, views: Sequence[View]) -> IntrinsicsEvidence | None:
-    """Fit focal lengths and principal point to the views of planes; None if they are too few, or no fit is found."""
+    """Fit intrinsics to the views of planes; None if they are too few, or no fit is found."""
     views = _apart([view for view in views if len(view.corners_px) >= LEAST_CORNERS])
     if len(views) < LEAST_VIEWS:
         return None
@@ -103,14 +121,23 @@ def evidence_of_intrinsics(camera: Camera, views: Sequence[View]) -> IntrinsicsE
         p[i, :n], u[i, :n], known[i, :n] = view.corners_m, view.corners_px, True
     T = np.array([view.T for view in views])
     stated = _fitted(camera, T, p, u, known, free=0.0)
-    fitted = None if stated is None else _fitted(camera, stated.T, p, u, known, free=1.0)
-    if stated is None or fitted is None:
+    if stated is None:
         return None
-    found = _compared(camera, stated, fitted, len(views), int(known.sum()))
-    if found.contradicts:  # then the stated numbers are no prior for what fits
-        again = _fitted(camera, fitted.T, p, u, known, free=WIDER)
-        found = found if again is None else _compared(camera, stated, again, len(views), int(known.sum()))
-    return found
+    reach = float(np.linalg.norm(camera.undistort(u[known]), axis=1).max(initial=0.0))
+    near = _fitted(camera, stated.T, p, u, known, free=1.0)
+    found = None if near is None else _compared(camera, stated, near, known, reach)
+    if near is not None and found is not None and found.contradicts:  # then what is stated is no prior for what fits
+        again = _fitted(camera, near.T, p, u, known, free=WIDER)
+        found = found if again is None else _compared(camera, stated, again, known, reach)
+    lens = _with_distortion(camera)
+    start = _far_start(lens, p, u, known)
+    far = None if start is None else _fitted(lens, start[1], p, u, known, free=WIDER, lens=start[0])
+    elsewhere = None if far is None else _compared(lens, stated, far, known, reach)
+    if elsewhere is None or (found is not None and not elsewhere.contradicts):
+        return found
+    if found is not None and found.contradicts and elsewhere.fitted_px > LARGER * found.fitted_px:
+        return found
+    return elsewhere
 
 
 def _apart(views: Sequence[View]) -> list[View]:
@@ -128,25 +155,53 @@ def _apart(views: Sequence[View]) -> list[View]:
     return [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, MOST_VIEWS).astype(int))] if kept else []
 
 
-def _compared(camera: Camera, stated: _Fit, fitted: _Fit, n: int, corners: int) -> IntrinsicsEvidence:
-    """Test the change by the scatter between n views, and by that of all corners: the less sure of both counts."""
-    change, freedom = _numbers(fitted.camera) - _numbers(camera), max(2 * corners - 6 * n - 4, 1)
+def _with_distortion(camera: Camera) -> Camera:
+    """The camera with coefficients to be fitted: a pinhole has those of a lens that nobody stated, all zero."""
+    return replace(camera, model="radtan", D=np.zeros(4)) if camera.model == "pinhole" else camera
+
+
+def _far_start(camera: Camera, p: Array, u: Array, known: np.ndarray) -> tuple[Camera, Array] | None:
+    """Intrinsics and poses by OpenCV, which finds them from far away; None for a fisheye, or if it finds none."""
+    if camera.model != "radtan":
+        return None
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
+    points = [np.ascontiguousarray(q[k], dtype=np.float32) for q, k in zip(p, known, strict=True)]
+    pixels = [np.ascontiguousarray(q[k], dtype=np.float32) for q, k in zip(u, known, strict=True)]
+    try:
+        _, K, D, turns, t = cv2.calibrateCamera(
+            points, pixels, (camera.width, camera.height), camera.K.copy(), np.zeros(5), flags=flags
+        )
+    except cv2.error:
+        return None
+    D = np.concatenate([np.ravel(D)[:2], camera.D[2:]])
+    start = _with_numbers(camera, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *D[:2]]))
+    R = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
+    return start, se3.pose(R, np.reshape(t, (len(R), 3)))
+
+
+def _compared(camera: Camera, stated: _Fit, fitted: _Fit, known: np.ndarray, reach: float) -> IntrinsicsEvidence | None:
+    """Test the change by the scatter between the views, and by that of all corners: the less sure of both counts."""
+    n, corners, free = len(known), int(known.sum()), len(fitted.H)
+    if n <= free:
+        return None
+    change = (_numbers(fitted.camera) - _numbers(camera))[:free]
+    freedom = max(2 * corners - 6 * n - free, 1)
     back = np.linalg.inv(fitted.H)
     # Each view's part of the gradient: their scatter holds what is alike within a view (Liang and Zeger 1986).
     of_views = back @ (fitted.parts.T @ fitted.parts) @ back * n / (n - 1.0)
     of_corners = fitted.rms_px**2 * corners / freedom * back
-    squared = [float(change @ np.linalg.solve(S + 1e-12 * np.eye(4), change)) for S in (of_views, of_corners)]
+    squared = [float(change @ np.linalg.solve(S + 1e-12 * np.eye(free), change)) for S in (of_views, of_corners)]
     probability = max(
-        float(fdtrc(4, n - 4, squared[0] * (n - 4.0) / (4.0 * (n - 1.0)))),  # Hotelling's T^2
-        float(fdtrc(4, freedom, squared[1] / 4.0)),
+        float(fdtrc(free, n - free, squared[0] * (n - free) / (free * (n - 1.0)))),  # Hotelling's T^2
+        float(fdtrc(free, freedom, squared[1] / free)),
     )
     sigma = np.sqrt(np.maximum(np.diag(of_views), np.diag(of_corners)))
-    return IntrinsicsEvidence(camera, fitted.camera, sigma, stated.rms_px, fitted.rms_px, probability, n)
+    return IntrinsicsEvidence(camera, fitted.camera, sigma, stated.rms_px, fitted.rms_px, probability, n, reach)
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Intrinsics and poses at the minimum; H (4, 4) and gradients (views, 4) of the intrinsics, poses eliminated."""
+    """Intrinsics and poses at the minimum; H (q, q) and gradients (views, q) of q intrinsics, poses eliminated."""
 
     camera: Camera
     T: Array
@@ -155,31 +210,40 @@ class _Fit:
     parts: Array
 
 
-def _fitted(prior: Camera, T: Array, p: Array, u: Array, known: np.ndarray, *, free: float) -> _Fit | None:
-    """Gauss-Newton on all poses, and on focal lengths and principal point: as free as a nominal prior, times `free`."""
+def _fitted(
+    prior: Camera, T: Array, p: Array, u: Array, known: np.ndarray, *, free: float, lens: Camera | None = None
+) -> _Fit | None:
+    """Gauss-Newton on all poses, and on intrinsics: as free as a nominal prior, times `free`.
+
+    With a `lens`, which is the start then, two coefficients of distortion are free too.
+    """
     nominal = np.array([NOMINAL_SHARE * prior.K[0, 0], NOMINAL_SHARE * prior.K[1, 1], NOMINAL_PX, NOMINAL_PX])
     nominal *= free or 1.0
+    if lens is not None:
+        nominal = np.append(nominal, [DISTORTION, DISTORTION])
+    q = len(nominal)
     count = int(known.sum())
-    camera, (r, J, K) = prior, _linearised(prior, T, p, u, known)
+    camera = lens or prior
+    r, J, K = _linearised(camera, T, p, u, known, q)
     for _ in range(ROUNDS):
         if not np.isfinite(r).all():
             return None
-        Jt, Kt, from_prior = J.swapaxes(1, 2), K.swapaxes(1, 2), _numbers(camera) - _numbers(prior)
+        Jt, Kt, from_prior = J.swapaxes(1, 2), K.swapaxes(1, 2), (_numbers(camera) - _numbers(prior))[:q]
         H_pk = Jt @ K
         try:
             solved = np.linalg.solve(Jt @ J, np.concatenate([H_pk, Jt @ r[..., None]], axis=2))  # by intrinsics, and 1
         except np.linalg.LinAlgError:
             return None
         weight = max(float((r**2).sum()) / max(2 * count - 6 * len(T), 1), LEAST_PX**2) / nominal**2
-        parts = (Kt @ r[..., None])[..., 0] - np.einsum("vij,vi->vj", H_pk, solved[..., 4])
-        H = (Kt @ K - H_pk.swapaxes(1, 2) @ solved[..., :4]).sum(axis=0) + np.diag(weight)
-        step = -np.linalg.solve(H, parts.sum(axis=0) + weight * from_prior) if free else np.zeros(4)
-        motion = -(solved[..., 4] + solved[..., :4] @ step)
+        parts = (Kt @ r[..., None])[..., 0] - np.einsum("vij,vi->vj", H_pk, solved[..., q])
+        H = (Kt @ K - H_pk.swapaxes(1, 2) @ solved[..., :q]).sum(axis=0) + np.diag(weight)
+        step = -np.linalg.solve(H, parts.sum(axis=0) + weight * from_prior) if free else np.zeros(q)
+        motion = -(solved[..., q] + solved[..., :q] @ step)
         cost = float((r**2).sum() + weight @ from_prior**2)
         for share in SHARES:
-            T_next, next_ = T @ se3.expmap(share * motion), _with_numbers(camera, _numbers(camera) + share * step)
-            of_next = _linearised(next_, T_next, p, u, known)
-            if (of_next[0] ** 2).sum() + weight @ (_numbers(next_) - _numbers(prior)) ** 2 <= cost * (1.0 + 1e-9):
+            T_next, next_ = T @ se3.expmap(share * motion), _with_numbers(camera, _numbers(camera)[:q] + share * step)
+            of_next = _linearised(next_, T_next, p, u, known, q)
+            if (of_next[0] ** 2).sum() + weight @ (_numbers(next_) - _numbers(prior))[:q] ** 2 <= cost * (1.0 + 1e-9):
                 break
         T, camera, (r, J, K) = T_next, next_, of_next
         if max(np.abs(step).max(), np.abs(motion).max() * camera.K[0, 0]) < SETTLED_PX:
@@ -188,8 +252,8 @@ def _fitted(prior: Camera, T: Array, p: Array, u: Array, known: np.ndarray, *, f
     return _Fit(camera, T, of_corners, H, parts)
 
 
-def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray) -> tuple[Array, Array, Array]:
-    """Residuals (views, 2 n), and their derivatives by the poses (right perturbations) and by fx, fy, cx, cy."""
+def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, q: int) -> tuple[Array, Array, Array]:
+    """Residuals (views, 2 n), and their derivatives by the poses (right perturbations) and by q intrinsic numbers."""
     seen = p @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
     seen = np.where(known[..., None], seen, [0.0, 0.0, 1.0])
     x = seen[..., :2] / seen[..., 2:]
@@ -198,22 +262,27 @@ def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray)
     by_body = by_seen @ T[:, None, :3, :3]
     J = np.concatenate([-by_body @ se3.hat(p), by_body], axis=-1)
     bent = (pixels - camera.K[:2, 2]) / np.diagonal(camera.K)[:2]
-    K = np.zeros((*bent.shape, 4))
+    K = np.zeros((*bent.shape, q))
     K[..., 0, 0], K[..., 1, 1] = bent[..., 0], bent[..., 1]
     K[..., 0, 2] = K[..., 1, 3] = 1.0
+    if q > 4:
+        K[..., 4:] = np.diagonal(camera.K)[:2, None] * coefficient_jacobian(camera.model, camera.D, x)[..., : q - 4]
     on = known[..., None].astype(float)
     views, n = len(T), 2 * known.shape[1]
     return (
         ((pixels - u) * on).reshape(views, n),
         (J * on[..., None]).reshape(views, n, 6),
-        (K * on[..., None]).reshape(views, n, 4),
+        (K * on[..., None]).reshape(views, n, q),
     )
 
 
 def _numbers(camera: Camera) -> Array:
-    return np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]])
+    """fx, fy, cx, cy, and the first two coefficients of distortion."""
+    K = camera.K
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.pad(camera.D, (0, 2))[:2]])
 
 
 def _with_numbers(camera: Camera, numbers: Array) -> Camera:
-    fx, fy, cx, cy = numbers.tolist()
-    return replace(camera, K=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
+    fx, fy, cx, cy, *bent = numbers.tolist()
+    D = np.concatenate([bent, camera.D[len(bent) :]])
+    return replace(camera, K=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), D=D)

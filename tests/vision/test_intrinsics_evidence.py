@@ -91,8 +91,30 @@ def test_wrong_intrinsics_are_named_with_what_fits(
     assert found.contradicts
     assert found.is_far_off
     error = np.abs((found.fitted.K - camera.K)[[0, 1, 0, 1], [0, 1, 2, 2]])
-    assert (error < 4.0 * found.sigma + 0.03 * abs(share - 1.0) * 520.0).all()
+    assert (error < 4.0 * found.sigma[:4] + 0.03 * abs(share - 1.0) * 520.0).all()
     assert found.fitted_px < found.stated_px
+
+
+@pytest.mark.parametrize("board", [GRID, SMALL], ids=lambda board: board.name)
+@pytest.mark.parametrize("stated", [(), (0.25, 0.09, 8e-4, -5e-4)], ids=["left out", "of the wrong sign"])
+def test_a_wrong_distortion_is_named_with_what_fits(
+    board: CircleGrid | Checkerboard, stated: tuple[float, ...]
+) -> None:
+    camera = Camera.of(640, 480, "plumb_bob", K.tolist(), stated, "test")
+    found = evidence_of_intrinsics(camera, views(LENS, board, 25, 3))
+    assert found is not None
+    assert found.contradicts
+    assert found.is_far_off
+    assert np.abs(found.fitted.D[0] - LENS.D[0]) < 4.0 * found.sigma[4]
+
+
+def test_intrinsics_of_another_resolution_are_named_with_what_fits() -> None:
+    small = Camera.of(640, 480, "", (np.diag([2.0 / 3.0, 2.0 / 3.0, 1.0]) @ K).tolist(), (), "test")
+    found = evidence_of_intrinsics(small, views(TRUE, SMALL, 25, 4))
+    assert found is not None
+    assert found.is_far_off
+    assert found.contradicts
+    assert np.abs(found.fitted.K[0, 0] - 520.0) < 4.0 * found.sigma[0]
 
 
 def test_few_views_or_few_corners_say_nothing() -> None:
