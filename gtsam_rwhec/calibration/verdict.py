@@ -50,6 +50,8 @@ class Ground(StrEnum):
     MISREAD = "misread"
     #: The corners of a sensor's boards contradict its stated intrinsics, by so much that poses are wrong.
     INTRINSICS_DOUBTED = "intrinsics_doubted"
+    #: The tags of a board are not where the rig file has them, by so much that poses are wrong.
+    SHAPE_DOUBTED = "shape_doubted"
     #: The residuals are larger than any noise of measurement.
     IMPLAUSIBLE = "implausible"
     #: The scale at the optimum is not positive, so there is no answer.
@@ -76,6 +78,8 @@ class Ground(StrEnum):
     TARGET_CONTRADICTED = "target_contradicted"
     #: The corners of a sensor's boards fit its stated intrinsics badly.
     INTRINSICS_UNCERTAIN = "intrinsics_uncertain"
+    #: The tags or corners of a board fit the rig file badly, or some that it has are never seen.
+    SHAPE_UNCERTAIN = "shape_uncertain"
     #: The stated size of a target fits the motion badly.
     SIZE_UNCERTAIN = "size_uncertain"
     #: A stated pose fits the measurements badly.
@@ -113,6 +117,7 @@ class Ground(StrEnum):
 _CARE = (
     Ground.TARGET_CONTRADICTED,
     Ground.INTRINSICS_UNCERTAIN,
+    Ground.SHAPE_UNCERTAIN,
     Ground.SIZE_UNCERTAIN,
     Ground.POSE_UNCERTAIN,
     Ground.FEW_MEASUREMENTS,
@@ -150,9 +155,11 @@ _CALIBRATE_INTRINSICS = (
     "calibrate the intrinsics of the named sensor with its distortion (cv2.calibrateCamera, Kalibr, ROS's "
     "camera_calibration) at this resolution, and state them in place of the stated ones"
 )
+_MEASURE_BOARD = "measure the named board (sizes, gaps, and the place and turn of each tag), and correct the rig file"
 _ADVICE = {
     Ground.MISREAD: "correct how the file is read, and calibrate again",
     Ground.INTRINSICS_DOUBTED: _CALIBRATE_INTRINSICS,
+    Ground.SHAPE_DOUBTED: _MEASURE_BOARD,
     Ground.IMPLAUSIBLE: (
         "check that A = T_sensorcarrier_targetcarrier and B = T_sensor_target, the order of the quaternions, the "
         "units, and that A and B are of the same instants"
@@ -187,6 +194,7 @@ _ADVICE = {
         "do not use the pose of the named target; check whether it has moved, and measure it again"
     ),
     Ground.INTRINSICS_UNCERTAIN: _CALIBRATE_INTRINSICS,
+    Ground.SHAPE_UNCERTAIN: _MEASURE_BOARD,
     Ground.SIZE_UNCERTAIN: (
         'measure the named target with a caliper, or let its size be estimated: rw.Problem(scale="per_target") or '
         "--scale per_target (in a rig file: sizes: estimate)"

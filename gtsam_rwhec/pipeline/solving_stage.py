@@ -19,6 +19,7 @@ from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
 from gtsam_rwhec.pipeline.clocks_by_turning import late_clocks
 from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics
+from gtsam_rwhec.pipeline.doubted_shapes import doubted_shapes
 from gtsam_rwhec.pipeline.log_contract import CLEANING_METADATA
 from gtsam_rwhec.pipeline.log_findings import (
     estimated_sizes,
@@ -116,6 +117,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
             raise LogError(f"{clean_path}: it has no usable pair of measurements")
         motion = read_carrier_motion(log, rig)
         of_intrinsics = doubted_intrinsics(log, rig, metadata.cameras)
+        of_shapes = doubted_shapes(log, rig, metadata.cameras)
     estimated = tuple(
         name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used_sensors
     )
@@ -181,7 +183,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         findings = not_of_marked_outliers(findings)
     if late:
         findings = not_of_late_clocks(findings, calibration.misreadings)
-    findings = (*of_intrinsics, *findings, *late, *estimated_sizes(fields.sizes, rig))
+    findings = (*of_intrinsics, *of_shapes, *findings, *late, *estimated_sizes(fields.sizes, rig))
     if is_misread:  # as the poses were written, which tells more than A
         found = Reading(in_rig_file(before, rig)).finding
         others = (one for one in findings if one.ground not in (Ground.MISREAD, Ground.IMPLAUSIBLE))

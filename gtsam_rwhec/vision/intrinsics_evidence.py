@@ -110,7 +110,8 @@ class IntrinsicsEvidence:
 
 def evidence_of_intrinsics(camera: Camera, views: Sequence[View]) -> IntrinsicsEvidence | None:
     """Fit intrinsics to the views of planes; None if they are too few, or no fit is found."""
-    views = _apart([view for view in views if len(view.corners_px) >= LEAST_CORNERS])
+    views = [view for view in views if len(view.corners_px) >= LEAST_CORNERS]
+    views = [views[i] for i in different([view.T for view in views])]
     if len(views) < LEAST_VIEWS:
         return None
     most = max(len(view.corners_px) for view in views)
@@ -140,18 +141,17 @@ def evidence_of_intrinsics(camera: Camera, views: Sequence[View]) -> IntrinsicsE
     return elsewhere
 
 
-def _apart(views: Sequence[View]) -> list[View]:
-    """Views of different poses, evenly over the track: a camera at rest sees one view, however many images it takes."""
-    some = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, 4 * MOST_VIEWS).astype(int))] if views else []
-    kept: list[View] = []
-    for view in some:
+def different(poses: Sequence[Array]) -> list[int]:
+    """Numbers of different poses, evenly over the track: a camera at rest sees one view in however many images."""
+    kept: list[int] = []
+    for i in np.unique(np.linspace(0, len(poses) - 1, 4 * MOST_VIEWS).astype(int)) if len(poses) else ():
         if kept:
-            T = np.array([one.T for one in kept])
-            turned = np.linalg.norm(se3.so3_logmap(T[:, :3, :3].swapaxes(1, 2) @ view.T[:3, :3]), axis=1)
-            moved = np.linalg.norm(T[:, :3, 3] - view.T[:3, 3], axis=1) / np.linalg.norm(view.T[:3, 3])
+            T = np.array([poses[k] for k in kept])
+            turned = np.linalg.norm(se3.so3_logmap(T[:, :3, :3].swapaxes(1, 2) @ poses[i][:3, :3]), axis=1)
+            moved = np.linalg.norm(T[:, :3, 3] - poses[i][:3, 3], axis=1) / np.linalg.norm(poses[i][:3, 3])
             if (np.maximum(turned, moved) < APART).any():
                 continue
-        kept.append(view)
+        kept.append(int(i))
     return [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, MOST_VIEWS).astype(int))] if kept else []
 
 
