@@ -96,6 +96,8 @@ class CornersRefined:
         Levenberg-Marquardt steps, in all rounds together.
     last_step : float
         What one more Gauss-Newton step would move, in deviations: it is far below 1 at an optimum.
+    findings : tuple of str
+        What is doubtful, in words with the figures, the gravest first; empty where nothing is.
     """
 
     X: dict[str, gtsam.Pose3]
@@ -111,6 +113,7 @@ class CornersRefined:
     point: Point = field(repr=False)
     iterations: int
     last_step: float
+    findings: tuple[str, ...] = ()
 
     def covariance(self, *names: str) -> Array:
         """The joint covariance of frames (six rows each), ``intrinsics:SENSOR`` and ``shape:TARGET``, as given.

@@ -23,6 +23,7 @@ from gtsam_rwhec.reprojection.determined import (
     check_names,
     told_where_it_fails,
 )
+from gtsam_rwhec.reprojection.findings import findings_of
 from gtsam_rwhec.reprojection.freedom import degrees_of_freedom
 from gtsam_rwhec.reprojection.intrinsics import free_model, prior_of
 from gtsam_rwhec.reprojection.lens import camera_with, parameters_of
@@ -137,7 +138,7 @@ def refine_corners(
         )
     rms = _rms(settled)
     point = settled.point
-    return CornersRefined(
+    refined = CornersRefined(
         X={name: gtsam.Pose3(T) for name, T in point.X.items()},
         Y={name: gtsam.Pose3(T) for name, T in point.Y.items()},
         intrinsics={
@@ -165,6 +166,7 @@ def refine_corners(
         iterations=settled.iterations,
         last_step=settled.last_step,
     )
+    return replace(refined, findings=findings_of(refined, options))
 
 
 def _settled(

@@ -1,0 +1,103 @@
+"""What is doubtful in a refinement from corners, in words with the figures: noise, intrinsics, the optimiser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gtsam_rwhec.reprojection.options import CornerOptions
+from gtsam_rwhec.reprojection.reduced import CARRIER, CORNER_PX
+from gtsam_rwhec.reprojection.refined import CornersRefined
+
+#: Larger noise than any arm or tracker has: rad, m; than any detector has: pixels.
+CARRIER_RAD, CARRIER_M, DETECTOR_PX = np.radians(1.0), 0.01, 2.0
+#: A noise above this share of its bound is at it.
+AT_BOUND = 0.99
+#: An optimum is reached where one more step moves it by less than this, in deviations.
+LAST_STEP = 0.1
+#: More corners than this share left out are many.
+MANY = 0.2
+
+CAUSES = "poses of other images, a wrong size of a target, A of a wrong frame, direction or unit, or intrinsics far off"
+
+
+def findings_of(refined: CornersRefined, options: CornerOptions) -> tuple[str, ...]:
+    """What is doubtful, one sentence or two each, the gravest first; empty where nothing is."""
+    return (
+        *_of_carriers(refined, options),
+        *_of_corners(refined),
+        *_of_convergence(refined, options),
+        *_of_intrinsics(refined),
+    )
+
+
+def _of_convergence(refined: CornersRefined, options: CornerOptions) -> Iterator[str]:
+    if not refined.last_step <= LAST_STEP:
+        yield (
+            f"The optimiser has not converged: one more step would move the answer by {refined.last_step:.2g} of its "
+            f"deviations. Give more than max_iterations={options.max_iterations}, or a better start."
+        )
+
+
+def _of_carriers(refined: CornersRefined, options: CornerOptions) -> Iterator[str]:
+    """Of A's noise, where it was estimated."""
+    if options.carrier_noise != "estimate":
+        return
+    rad, m = refined.noise.carrier_rad, refined.noise.carrier_m
+    at_bound = [
+        words
+        for words, value in ((f"{CARRIER[1]:g} rad", rad), (f"{CARRIER[1]:g} m", m))
+        if value >= AT_BOUND * CARRIER[1]
+    ]
+    size = f"{np.degrees(rad):.2g} degrees and {1e3 * m:.2g} mm"
+    if at_bound:
+        yield (
+            f"The noise of A is at its bound ({' and '.join(at_bound)}), so it is larger still: the images contradict "
+            f"A. Do not use this answer. Likely causes: {CAUSES}."
+        )
+    elif rad > CARRIER_RAD or m > CARRIER_M:
+        yield (
+            f"The noise of A is estimated as {size}, more than an arm or tracker has: doubt this answer. Likely "
+            f"causes: {CAUSES}."
+        )
+
+
+def _of_corners(refined: CornersRefined) -> Iterator[str]:
+    px = refined.noise.corner_px
+    if px > DETECTOR_PX:
+        bound = " (its bound)" if px >= AT_BOUND * CORNER_PX[1] else ""
+        yield (
+            f"Corners are off by {px:.2g} pixels{bound}, more than a detector's noise: doubt this answer. Likely "
+            f"causes: noise of A that is not in the model, {CAUSES}."
+        )
+    for stack in refined.graph.model.stacks:
+        left_out, seen = int(refined.left_out[stack.target, stack.sensor].sum()), int(stack.known.sum())
+        if left_out > MANY * seen:
+            yield (
+                f"{left_out} of {seen} corners of {stack.target} by {stack.sensor} disagree with the others and are "
+                "left out: look at those images (left_out)."
+            )
+
+
+def _of_intrinsics(refined: CornersRefined) -> Iterator[str]:
+    """By camera: sensors that share one are named together."""
+    sensors: dict[str, list[str]] = {}
+    for sensor, camera in refined.graph.model.camera_of.items():
+        sensors.setdefault(camera, []).append(sensor)
+    for names in sensors.values():
+        intrinsics, of = refined.intrinsics[names[0]], ", ".join(names)
+        if intrinsics.innovation.is_contradicted:
+            widened = (
+                f", and its deviations were widened {intrinsics.widened:.3g} times" if intrinsics.widened > 1.0 else ""
+            )
+            yield (
+                f"The images contradict the stated intrinsics of {of} by {intrinsics.innovation.deviations:.2g} "
+                f"deviations: the estimated ones are used{widened}. Check which calibration they are from, and the "
+                "targets' sizes."
+            )
+        if intrinsics.held_by_prior:
+            yield (
+                f"The images do not tell {', '.join(intrinsics.held_by_prior)} of {of}: they stay about as stated. If "
+                "they matter, take images with the target at the borders, tilted, near and far."
+            )

@@ -1,0 +1,96 @@
+"""What is doubtful is said in words, with the figure; and nothing where nothing is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated_cells import Cell, cell
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.reprojection.findings import findings_of
+from gtsam_rwhec.reprojection.observations import Views
+
+EXACT = rw.CornerOptions(carrier_noise="exact")
+
+
+def refined(given: Cell, options: rw.CornerOptions | None = None) -> rw.CornersRefined:
+    X, Y = given.near(np.random.default_rng(9))
+    return rw.refine_corners(given.observations, X, Y, options)
+
+
+@pytest.fixture(scope="module")
+def good() -> Cell:
+    return cell(1, images=20)
+
+
+@pytest.mark.parametrize("options", [rw.CornerOptions(), EXACT], ids=["estimated", "exact"])
+def test_nothing_is_doubtful_in_a_good_cell(good: Cell, options: rw.CornerOptions) -> None:
+    assert refined(good, options).findings == ()
+
+
+def test_noise_of_a_good_arm_is_no_finding() -> None:
+    assert not any("noise of A" in words for words in refined(cell(2, images=30, carrier=(1e-3, 5e-4))).findings)
+
+
+def with_a_larger_board(given: Cell) -> Cell:
+    corners = {name: 1.1 * points for name, points in given.observations.corners.items()}
+    return replace(given, observations=replace(given.observations, corners=corners))
+
+
+def test_a_wrong_size_shows_as_noise_of_the_carriers(good: Cell) -> None:
+    result = refined(with_a_larger_board(good))
+    mm = 1e3 * result.noise.carrier_m
+    assert f"{mm:.2g} mm, more than an arm or tracker has" in result.findings[0]
+    assert "a wrong size of a target" in result.findings[0]
+
+
+def test_a_wrong_size_shows_as_errors_of_corners_where_a_is_exact(good: Cell) -> None:
+    result = refined(with_a_larger_board(good), EXACT)
+    assert f"Corners are off by {result.noise.corner_px:.2g} pixels" in result.findings[0]
+
+
+def test_images_shuffled_against_a_reach_the_bound() -> None:
+    given = cell(2, images=14, cameras=1)
+    views = {pair: Views(view.A, np.roll(view.pixels, 1, axis=0)) for pair, view in given.observations.views.items()}
+    shuffled = replace(given, observations=replace(given.observations, views=views))
+    result = refined(shuffled, rw.CornerOptions(stated="calibration"))
+    assert result.findings[0].startswith("The noise of A is at its bound (0.1 rad and 0.1 m)")
+    assert "Do not use this answer. Likely causes: poses of other images" in result.findings[0]
+    number = result.left_out["board", "cam_0"].sum()
+    assert any(f"{number} of 490 corners of board by cam_0 disagree" in words for words in result.findings)
+
+
+def test_a_calibration_that_is_contradicted_is_named_with_its_deviations() -> None:
+    given = cell(5, images=30, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
+    result = refined(given, replace(EXACT, stated="calibration"))
+    camera = result.intrinsics["cam_0"]
+    words = next(words for words in result.findings if "of cam_0 by" in words)
+    assert f"by {camera.innovation.deviations:.2g} deviations" in words
+    assert f"widened {camera.widened:.3g} times" in words
+
+
+def test_cameras_that_share_intrinsics_are_named_together(good: Cell) -> None:
+    options = rw.CornerOptions(stated="calibration", carrier_noise="exact", shared=(("cam_0", "cam_1"),))
+    off = cell(5, images=20, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
+    found = [words for words in refined(off, options).findings if "contradict" in words]
+    assert len(found) == 1
+    assert "of cam_0, cam_1 by" in found[0]
+
+
+def test_what_only_the_prior_holds_is_named() -> None:
+    result = refined(cell(7, images=3, cameras=1), replace(EXACT, stated="calibration"))
+    held = ", ".join(result.intrinsics["cam_0"].held_by_prior)
+    assert any(f"do not tell {held} of cam_0" in words for words in result.findings)
+
+
+def test_an_optimiser_that_stopped_early_is_named(good: Cell) -> None:
+    far = good.near(np.random.default_rng(9), 0.05)
+    once = rw.CornerOptions(carrier_noise=rw.CarrierNoise(1e-3, 1e-3), max_iterations=1)
+    result = rw.refine_corners(good.observations, *far, once)
+    assert findings_of(replace(result, last_step=0.05), once) == tuple(w for w in result.findings if "conv" not in w)
+    words = " ".join(findings_of(replace(result, last_step=0.37), once))
+    assert "The optimiser has not converged: one more step would move the answer by 0.37" in words
+    assert "max_iterations=1" in words
+    assert "not converged" in " ".join(findings_of(replace(result, last_step=float("nan")), once))
