@@ -43,7 +43,7 @@ def read_pose_table(path: str, text: str, *, stated: PoseStatement) -> list[Pose
     if not lines:
         raise LogError(f"{path} has no poses.")
     if header is not None and (columns := _columns(header)):
-        return _by_columns(path, columns, header, lines)
+        return _by_columns(path, columns, header, lines, stated)
     if header is not None and len(header) >= 7 and all(len(fields) == len(header) for _, fields in lines):
         _refuse_names(path, header)
     counts = {len(fields) for _, fields in lines}
@@ -156,7 +156,9 @@ def _role(word: str) -> str:
     return bare
 
 
-def _by_columns(path: str, columns: dict[str, int], header: Sequence[str], lines: list[Line]) -> list[PoseRow]:
+def _by_columns(
+    path: str, columns: dict[str, int], header: Sequence[str], lines: list[Line], stated: PoseStatement
+) -> list[PoseRow]:
     named = next((columns[name] for name in _NAMES if name in columns), None)
     if named is None:
         named = next((columns[name] for name in _STAMPS if name in columns), None)
@@ -164,6 +166,14 @@ def _by_columns(path: str, columns: dict[str, int], header: Sequence[str], lines
         named = next((i for i, word in enumerate(header) if "stamp" in word.lower() or "time" in word.lower()), None)
     parted = None if any(name in columns for name in _NAMES) else _seconds_and_nanoseconds(header)
     keys, kind = _wanted(columns)
+    if kind == "quaternion" and stated.quaternion is not None:
+        by_place = "".join(sorted("xyzw", key=lambda axis: columns[f"q{axis}"]))
+        if by_place != stated.quaternion:
+            raise LogError(
+                f"{path}, line {lines[0][0] - 1}: the columns are named {', '.join(header)}, and quaternion: "
+                f"{stated.quaternion} is stated. Names count before a statement: leave quaternion out, or rename the "
+                "columns if their names are wrong"
+            )
     unit_m = _unit_m(header[columns["tx"]]) if "tx" in columns else None
     rows = []
     for number, fields in lines:

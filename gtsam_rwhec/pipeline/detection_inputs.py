@@ -17,6 +17,11 @@ from gtsam_rwhec.vision.camera import Camera
 
 #: A message says at most this many differences, each value with at most this many characters.
 MOST_SAID, LONGEST = 5, 80
+#: The key that a rig file has for columns and rows, by target.
+COUNTED = {
+    "Checkerboard": "inner_corners", "CircleGrid": "circles", "Charuco": "squares", "AprilGrid": "tags",
+    "TagGrid": "tags",
+}  # fmt: skip
 #: Before the name of a file, and between its state and its stamp.
 _FILE, _STAMP = "file ", ", stamp "
 
@@ -80,4 +85,6 @@ def _state(path: Path) -> str:
 def _values(place: str, of: object) -> dict[str, str]:
     """The fields of a dataclass."""
     values = dataclasses.asdict(of)  # type: ignore[call-overload]
+    if (key := COUNTED.get(type(of).__name__)) is not None:
+        values[key] = [values.pop("columns"), values.pop("rows")]
     return {f"{place}.{name}": repr(value) for name, value in values.items()}

@@ -42,8 +42,9 @@ SHARES = (1.0, 0.5, 0.25, 0.1, 0.02)
 LEAST_PROBABILITY, LARGER, LARGER_PX = 1e-4, 1.08, 0.02
 #: The same with distortion, which a bent board may look like.
 LEAST_FAR, LARGER_FAR = 1e-6, 1.25
-#: A change by more than this share of the focal length, beyond two standard deviations, makes poses useless.
-USELESS = 0.01
+#: A change by more than this share of the focal length, beyond two standard deviations, makes poses useless; and a
+#: distortion that moves the outermost corner by more than that share.
+USELESS, USELESS_BEND = 0.01, 0.003
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +96,7 @@ class IntrinsicsEvidence:
     def is_far_off(self) -> bool:
         """Whether a number is so far off that poses are wrong by more than `USELESS` of a distance."""
         change = np.abs(_numbers(self.fitted)[:4] - _numbers(self.stated)[:4]) - 2.0 * self.sigma[:4]
-        return bool((change > USELESS * self.stated.K[0, 0]).any()) or self.bend > USELESS
+        return bool((change > USELESS * self.stated.K[0, 0]).any()) or self.bend > USELESS_BEND
 
     @property
     def bend(self) -> float:

@@ -259,6 +259,8 @@ def _matrix(file: YamlFile, key: str, count: int | None) -> Array:
         if isinstance(value, tuple) and value and all(isinstance(row, tuple) for row in value):
             value = tuple(number for row in value for number in row)
         return _numbers(file, path, value, count)
+    if "sizes" in value and "rows" not in value:  # OpenCV 5: a vector, or a matrix of more than two dimensions
+        return _numbers(file, (*path, "data"), value.get("data"), count)
     for part in ("rows", "cols", "data"):
         if part not in value:
             _refuse(file, (*path, part), "is missing; a matrix has rows, cols and data")

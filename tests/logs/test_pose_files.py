@@ -178,6 +178,15 @@ def test_any_file_gives_poses_or_an_error_of_ours(
         np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-9)
 
 
+def test_names_of_columns_and_a_stated_order_that_differ_are_refused(tmp_path: Path) -> None:
+    """The order that a rig file states had no effect then, and the cure was to state the other one, and back again."""
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,z,qx,qy,qz,qw\n0.1,0.2,0.3,0,0,0,1\n")
+    assert read_poses(path, PoseStatement(quaternion="xyzw")).T[0, 0, 3] == 0.1
+    with pytest.raises(LogError, match=r"a\.csv, line 1: .* Names count before a statement: leave quaternion out, or"):
+        read_poses(path, PoseStatement(quaternion="wxyz"))
+
+
 def test_names_of_columns_that_tell_no_pose_are_refused(tmp_path: Path) -> None:
     """An order that is guessed would give other poses."""
     (tmp_path / "imu0.csv").write_text(

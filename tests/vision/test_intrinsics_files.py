@@ -264,6 +264,15 @@ def test_opencv_in_any_form(tmp_path: Path, ending: str) -> None:
     assert camera.D.tolist() == [0.1, -0.2, 1e-3, 2e-3, 0.05]
 
 
+def test_vectors_of_opencv_5(path: Path) -> None:
+    """It writes a vector as an nd-matrix with sizes, and OpenCV 4 as a matrix of one column."""
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]]))
+    storage.write("distortion_coefficients", np.array([0.1, -0.2, 1e-3, 2e-3, 0.05]))
+    storage.release()
+    assert read_cameras(path, (640, 480))[""].D.tolist() == [0.1, -0.2, 1e-3, 2e-3, 0.05]
+
+
 def test_stereo_calibration(path: Path) -> None:
     """OpenCV's sample stereo_calib writes M1, D1, M2, D2."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
