@@ -43,6 +43,33 @@ def doubted_shapes(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tuple[F
     return tuple(findings)
 
 
+def continued_boards(strangers: Mapping[str, int], rig: Rig) -> tuple[Finding, ...]:
+    """ChArUco boards whose ids go on in tags that the rig file does not name: the printed board may have more rows.
+
+    `strangers` has how often each was seen, by its family and id ("aruco_5x5_100 14").
+    """
+    findings = []
+    for board in rig.target_list:
+        if not isinstance(board, Charuco):
+            continue
+        more = 0
+        while strangers.get(f"{board.family} {board.ids[-1] + 1 + more}", 0) >= LEAST_IMAGES:
+            more += 1
+        if not more:
+            continue
+        first, last = board.ids[-1] + 1, board.ids[-1] + more
+        seen = f"markers {first} to {last}" if more > 1 else f"marker {first}"
+        rows = -(-2 * (len(board.ids) + more) // board.columns)
+        squares = f"write squares: [{board.columns}, {max(rows, board.rows + 1)}]"
+        words = (
+            f"{LEAST_IMAGES} images or more show {seen} of {board.family}, which continue the ids of {board.name} "
+            f"({rig.source.place(('targets', board.name))}): if they are printed on it, it has more rows, and its "
+            f"middle is elsewhere ({squares}); if they are not, name them as a target of their own"
+        )
+        findings.append(Finding(Ground.SHAPE_UNCERTAIN, words))
+    return tuple(findings)
+
+
 def hypotheses_of(board: Target) -> dict[Key, Array]:
     """How corners (n, 3) move with each number of a hypothesis: arrays (n, 3, q), in metres, radians and shares.
 

@@ -19,7 +19,7 @@ from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
 from gtsam_rwhec.pipeline.clocks_by_turning import late_clocks
 from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics
-from gtsam_rwhec.pipeline.doubted_shapes import doubted_shapes
+from gtsam_rwhec.pipeline.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.pipeline.log_contract import CLEANING_METADATA
 from gtsam_rwhec.pipeline.log_findings import (
     estimated_sizes,
@@ -118,6 +118,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         motion = read_carrier_motion(log, rig)
         of_intrinsics = doubted_intrinsics(log, rig, metadata.cameras)
         of_shapes = doubted_shapes(log, rig, metadata.cameras)
+        of_shapes += continued_boards(metadata.detection.strangers, rig)
     estimated = tuple(
         name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used_sensors
     )

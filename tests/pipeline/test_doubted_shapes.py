@@ -10,7 +10,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
-from gtsam_rwhec.pipeline.doubted_shapes import doubted_shapes
+from gtsam_rwhec.pipeline.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.pipeline.log_contract import detections_topic
 from gtsam_rwhec.rig import Rig, parse_rig
 from gtsam_rwhec.vision.camera import Camera
@@ -76,6 +76,16 @@ def test_a_tag_that_is_never_seen_asks_for_care(tmp_path: Path) -> None:
     assert finding.ground is Ground.SHAPE_UNCERTAIN
     assert finding.words.startswith("camera never saw tag 1 of board (rig.yaml, line 5: targets.board)")
     assert found_in(tmp_path, rig, rig, first=4, reason="blurred") == ()
+
+
+def test_markers_that_continue_a_charuco_board_ask_for_care() -> None:
+    rig = rig_of("{type: charuco, family: aruco_5x5_100, squares: [7, 4], square_m: 0.03, marker_m: 0.022}")
+    (finding,) = continued_boards({f"aruco_5x5_100 {i}": 9 for i in (14, 15, 16)}, rig)
+    assert finding.ground is Ground.SHAPE_UNCERTAIN
+    assert "markers 14 to 16 of aruco_5x5_100, which continue the ids of board (rig.yaml, line 5" in finding.words
+    assert "write squares: [7, 5]" in finding.words
+    assert continued_boards({"aruco_5x5_100 14": 4}, rig) == ()  # too few
+    assert continued_boards({"aruco_5x5_100 20": 9, "aruco_4x4_50 14": 9}, rig) == ()
 
 
 def test_the_verdict_says_what_to_measure() -> None:
