@@ -35,8 +35,8 @@ LEAST_IMAGES = 6
 MOST_PAIRS = 12
 #: The product of the residuals' ratios, rotations and translations, must be at least this: one role fits far better.
 FAR_BETTER = 9.0
-#: And what fits better must explain the rotations to this (rad).
-EXPLAINED_RAD = math.radians(3.0)
+#: And what fits better must explain the rotations to this (rad), and the translations (m).
+EXPLAINED_RAD, EXPLAINED_M = math.radians(3.0), 0.05
 #: Corners have about this standard deviation where nobody has measured it, pixels.
 CORNER_PX = 0.3
 #: Images have stamps this far apart where they have none, nanoseconds.
@@ -77,7 +77,8 @@ class RoleEvidence:
         if self.child is None or self.parent is None:
             return None
         better, worse = sorted((self.child, self.parent), key=_product)
-        tells = _product(worse) > FAR_BETTER * _product(better) and better.residual.rotation_rad < EXPLAINED_RAD
+        explains = better.residual.rotation_rad < EXPLAINED_RAD and _translation_m(better) < EXPLAINED_M
+        tells = explains and _product(worse) > FAR_BETTER * _product(better)
         return None if not tells else "child" if better is self.child else "parent"
 
     def explains_far_better(self, other: RoleEvidence) -> bool:
@@ -130,13 +131,18 @@ def evidence_of_roles(seen: Iterable[Seen]) -> RoleEvidence:
 
 def _product(fit: TrialFit) -> float:
     """Of both residuals, the translations in true lengths."""
-    return max(fit.residual.rotation_rad, 1e-6) * max(fit.residual.translation_m / abs(fit.one_scale), 1e-9)
+    return max(fit.residual.rotation_rad, 1e-6) * max(_translation_m(fit), 1e-9)
+
+
+def _translation_m(fit: TrialFit) -> float:
+    """The residual in true lengths, metres."""
+    return fit.residual.translation_m / abs(fit.one_scale)
 
 
 def _figures(fit: TrialFit | None) -> str:
     if fit is None:
         return "none, for want of an answer,"
-    mm = 1e3 * fit.residual.translation_m / abs(fit.one_scale)
+    mm = 1e3 * _translation_m(fit)
     return f"{rounded(math.degrees(fit.residual.rotation_rad), 2)} deg and {rounded(mm, 2)} mm"
 
 

@@ -71,3 +71,16 @@ def test_moving_without_turning_tells_nothing() -> None:
     rng = np.random.default_rng(6)
     found = evidence_of_roles(seen(poses(rng, 12, turn_rad=0.0), True, rng))
     assert found.role is None
+
+
+def test_rotations_that_fit_without_the_positions_tell_nothing() -> None:
+    """Quaternions in another order turn all rotations alike, and the positions say so."""
+    rng = np.random.default_rng(6)
+    T = poses(rng, 16)
+    measured = seen(T, False, rng)
+    other = T.copy()
+    other[:, :3, 3] = rng.permutation(T[:, :3, 3])
+    found = evidence_of_roles(
+        [Seen(one.sensor, one.target, one.detection, A) for one, A in zip(measured, other, strict=True)]
+    )
+    assert found.role is None
