@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import cv2
-import numpy as np
-
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.first_rig.boards_seen import BoardSeen
 from gtsam_rwhec.rig.sections import Intrinsics
+from gtsam_rwhec.vision.zhang import fitted_to_planes
 
 #: A board's views determine a focal length with at least this number of images.
 LEAST_IMAGES = 6
@@ -37,21 +35,17 @@ def guessed_intrinsics(size: tuple[int, int], boards: Iterable[BoardSeen]) -> Gu
         if len(seen.images) < LEAST_IMAGES:
             continue
         corners = seen.board.corners()
-        points = [corners[indices].astype(np.float32) for indices in seen.indices]
-        pixels = [of_image.astype(np.float32)[:, None] for of_image in seen.corners_px]
-        flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-        try:
-            rms, fitted, *_ = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
-        except cv2.error:
+        fitted = fitted_to_planes([corners[indices] for indices in seen.indices], seen.corners_px, size, "none")
+        if fitted is None:
             continue
-        fx, fy, cx, cy = (float(fitted[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        fx, fy, cx, cy = (float(fitted.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         is_lens = all(SHORTEST * width < f < LONGEST * width for f in (fx, fy)) and 0 < cx < width and 0 < cy < height
-        if is_lens and rms < LARGEST_RMS_PX:
+        if is_lens and fitted.rms_px < LARGEST_RMS_PX:
             numbers = (round(fx, 1), round(fy, 1), round(cx, 1), round(cy, 1))
             return GuessedIntrinsics(
                 Intrinsics(K=numbers, size=size),
                 f"a guess: no file has them; a pinhole that fits {len(seen.images)} views of the board to "
-                f"{rounded(float(rms), 2)} px. A calibration of the camera is better",
+                f"{rounded(fitted.rms_px, 2)} px. A calibration of the camera is better",
             )
     K = (round(USUAL * width, 1), round(USUAL * width, 1), 0.5 * (width - 1), 0.5 * (height - 1))
     return GuessedIntrinsics(

@@ -17,11 +17,6 @@ from gtsam_rwhec.vision.camera import Camera
 
 #: A message says at most this many differences, each value with at most this many characters.
 MOST_SAID, LONGEST = 5, 80
-#: The key that a rig file has for columns and rows, by target.
-COUNTED = {
-    "Checkerboard": "inner_corners", "CircleGrid": "circles", "Charuco": "squares", "AprilGrid": "tags",
-    "TagGrid": "tags",
-}  # fmt: skip
 #: Before the name of a file, and between its state and its stamp.
 _FILE, _STAMP = "file ", ", stamp "
 
@@ -45,9 +40,8 @@ def inputs_of(log: Log, rig: Rig, cameras: Mapping[str, Camera], folder: Path | 
             inputs[f"{place}.images"] = sensor.images
             inputs[f"{place}.intrinsics"] = f"{camera.model} {camera.K.tolist()} {camera.D.tolist()}"
             inputs[f"{place}.size"] = f"{camera.width} x {camera.height}"
-    for target in rig.target_list:
-        inputs[f"targets.{target.name}"] = type(target).__name__
-        inputs |= _values(f"targets.{target.name}", target)
+    for name, section in rig.targets.items():
+        inputs |= {f"targets.{name}.{key}": repr(value) for key, value in section.model_dump().items()}
     return inputs | _values("detection", rig.detection_options)
 
 
@@ -85,6 +79,4 @@ def _state(path: Path) -> str:
 def _values(place: str, of: object) -> dict[str, str]:
     """The fields of a dataclass."""
     values = dataclasses.asdict(of)  # type: ignore[call-overload]
-    if (key := COUNTED.get(type(of).__name__)) is not None:
-        values[key] = [values.pop("columns"), values.pop("rows")]
     return {f"{place}.{name}": repr(value) for name, value in values.items()}

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
-from gtsam_rwhec.logs import DetectionRecord, Log
-from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
+from gtsam_rwhec.logs import Log
+from gtsam_rwhec.pipeline.seen_corners import seen_corners
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.intrinsics_evidence import (
@@ -31,13 +31,8 @@ def doubted_intrinsics(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tup
         if not boards or sensor not in rig.sensors:
             continue
         views = [
-            View(boards[record.id][list(record.corner_indices)], record.corners_px, record.T_camera_tag)
-            for record in records_of(log, [detections_topic(sensor)], DetectionRecord)
-            if not record.reason
-            and record.id in boards
-            and record.corners_px is not None
-            and record.corner_indices is not None
-            and record.T_camera_tag is not None
+            View(boards[seen.target][seen.indices], seen.corners_px, seen.T)
+            for seen in seen_corners(log, sensor, boards)
         ]
         found = evidence_of_intrinsics(camera, views)
         if found is not None and found.contradicts:

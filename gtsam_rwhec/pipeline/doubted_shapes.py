@@ -8,8 +8,8 @@ import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord, Log
-from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
+from gtsam_rwhec.logs import Log
+from gtsam_rwhec.pipeline.seen_corners import seen_corners
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.shape_evidence import BoardView, Key, ShapeEvidence, evidence_of_shape
@@ -28,16 +28,8 @@ def doubted_shapes(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tuple[F
         if not boards or sensor not in rig.sensors:
             continue
         views: dict[str, list[BoardView]] = {name: [] for name in boards}
-        for record in records_of(log, [detections_topic(sensor)], DetectionRecord):
-            if (
-                not record.reason
-                and record.id in boards
-                and record.corners_px is not None
-                and record.corner_indices is not None
-                and record.T_camera_tag is not None
-            ):
-                view = BoardView(np.array(record.corner_indices), record.corners_px, record.T_camera_tag)
-                views[record.id].append(view)
+        for seen in seen_corners(log, sensor, boards):
+            views[seen.target].append(BoardView(seen.indices, seen.corners_px, seen.T))
         for name, board in boards.items():
             findings += _of_board(board, sensor, camera, views[name], rig)
     return tuple(findings)

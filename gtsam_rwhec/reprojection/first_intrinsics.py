@@ -9,6 +9,7 @@ from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.observations import Observations, in_plane
 from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.zhang import fitted_to_planes
 
 #: Views with fewer corners, and cameras with fewer views, give no intrinsics.
 CORNERS, VIEWS = 6, 3
@@ -32,27 +33,31 @@ def first_intrinsics(observations: Observations, sensor: str) -> Camera:
     spread = np.unique(np.linspace(0, len(points) - 1, ENOUGH).round().astype(int))
     points, pixels = [points[i] for i in spread], [pixels[i] for i in spread]
     size = (stated.width, stated.height)
-    try:
-        if stated.model == "equidistant":
-            flags = _fisheye_flag("CALIB_RECOMPUTE_EXTRINSIC") | _fisheye_flag("CALIB_FIX_SKEW")
-            _, K, D, _, _ = cv2.fisheye.calibrate(
-                [p[None] for p in points], [u[None] for u in pixels], size, np.eye(3), np.zeros((4, 1)), flags=flags
-            )
-            coefficients, model = D.ravel()[:4], "equidistant"
-        else:
-            few = [p.astype(np.float32) for p in points], [u.astype(np.float32) for u in pixels]
-            K = cv2.initCameraMatrix2D(*few, size)
-            flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
-            _, K, D, _, _ = cv2.calibrateCamera(*few, size, K, np.zeros(5), flags=flags)
-            coefficients, model = D.ravel()[:4], "radtan"
-        K = np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
-        return Camera.of(*size, model, K, coefficients, f"the estimated intrinsics of {sensor}")
-    except (cv2.error, CameraError) as error:
+    found = _fisheye(points, pixels, size) if stated.model == "equidistant" else _radtan(points, pixels, size)
+    if found is None:
         raise CameraError(
-            f"the intrinsics of {sensor} could not be estimated from its {len(points)} views "
-            f"({' '.join(str(error).split())}); take images of the target at different tilts and distances, or state "
-            "intrinsics"
-        ) from error
+            f"the intrinsics of {sensor} could not be estimated from its {len(points)} views; take images of the "
+            "target at different tilts and distances, or state intrinsics"
+        )
+    model, K, D = found
+    upright = [[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]]
+    return Camera.of(*size, model, upright, D, f"the estimated intrinsics of {sensor}")
+
+
+def _radtan(points: list[Array], pixels: list[Array], size: tuple[int, int]) -> tuple[str, Array, Array] | None:
+    found = fitted_to_planes(points, pixels, size, "all")
+    return None if found is None else ("radtan", found.K, found.D)
+
+
+def _fisheye(points: list[Array], pixels: list[Array], size: tuple[int, int]) -> tuple[str, Array, Array] | None:
+    flags = _fisheye_flag("CALIB_RECOMPUTE_EXTRINSIC") | _fisheye_flag("CALIB_FIX_SKEW")
+    try:
+        _, K, D, _, _ = cv2.fisheye.calibrate(
+            [p[None] for p in points], [u[None] for u in pixels], size, np.eye(3), np.zeros((4, 1)), flags=flags
+        )
+    except cv2.error:
+        return None
+    return "equidistant", np.asarray(K, dtype=np.float64), np.asarray(D, dtype=np.float64).ravel()[:4]
 
 
 def _fisheye_flag(name: str) -> int:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from rwhec_factors import se3
 from scipy.special import fdtrc
@@ -20,6 +19,7 @@ from scipy.special import fdtrc
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.distortion import coefficient_jacobian
+from gtsam_rwhec.vision.zhang import fitted_to_planes
 
 #: With fewer views nothing is said; a view needs this number of corners.
 LEAST_VIEWS, LEAST_CORNERS = 8, 8
@@ -165,19 +165,17 @@ def _far_start(camera: Camera, p: Array, u: Array, known: np.ndarray) -> tuple[C
     """Intrinsics and poses by OpenCV, which finds them from far away; None for a fisheye, or if it finds none."""
     if camera.model != "radtan":
         return None
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
-    points = [np.ascontiguousarray(q[k], dtype=np.float32) for q, k in zip(p, known, strict=True)]
-    pixels = [np.ascontiguousarray(q[k], dtype=np.float32) for q, k in zip(u, known, strict=True)]
-    try:
-        _, K, D, turns, t = cv2.calibrateCamera(
-            points, pixels, (camera.width, camera.height), camera.K.copy(), np.zeros(5), flags=flags
-        )
-    except cv2.error:
+    found = fitted_to_planes(
+        [q[k] for q, k in zip(p, known, strict=True)],
+        [q[k] for q, k in zip(u, known, strict=True)],
+        (camera.width, camera.height),
+        "radial",
+        camera.K,
+    )
+    if found is None:
         return None
-    D = np.concatenate([np.ravel(D)[:2], camera.D[2:]])
-    start = _with_numbers(camera, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *D[:2]]))
-    R = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
-    return start, se3.pose(R, np.reshape(t, (len(R), 3)))
+    K = found.K
+    return _with_numbers(camera, np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *found.D[:2]])), found.T
 
 
 def _compared(camera: Camera, stated: _Fit, fitted: _Fit, known: np.ndarray, reach: float) -> IntrinsicsEvidence | None:
