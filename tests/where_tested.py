@@ -58,7 +58,8 @@ TABLE: dict[str, dict[str, str]] = {
         ),
     },
     "gtsam_rwhec/export": {
-        "export/test_exported_files.py": "camchain files overlaps static_tf tf_tree urdf written_poses",
+        "export/test_camchain.py": "overlaps",
+        "export/test_exported_files.py": "files static_tf tf_tree urdf written_poses",
     },
     "gtsam_rwhec/files": {
         "cli/test_stage_display.py": "progress",
@@ -116,6 +117,7 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_seen_sheet.py": "detected_source image_names",
         "pipeline/test_bad_logs.py": "no_detections",
         "pipeline/test_kept_detections.py": "detection_inputs",
+        "pipeline/test_doubted_intrinsics.py": "seen_corners",
         "pipeline/test_log_findings.py": "output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",
         "pipeline/test_same_log.py": "changed_rig log_metadata",

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from exported_rigs import ONE, camera, frames_of, on_random_poses, transforms
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -22,57 +23,8 @@ from gtsam_rwhec.export import camchain_yaml, export_all, static_tf_launch, tf_y
 from gtsam_rwhec.export.written_poses import fixed_axis_angles, number, quaternion_xyzw
 from gtsam_rwhec.rig import CameraLink, RigFrames
 from gtsam_rwhec.rig.camera_link import link_of_optical
-from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.intrinsics_files import read_kalibr_camchain
 
-K = np.array([[421.5, 0.0, 318.25], [0.0, 420.75, 241.125], [0.0, 0.0, 1.0]])
 XACRO = {"xacro": "http://www.ros.org/wiki/xacro"}
-ANGLES = st.one_of(
-    st.floats(-7.0, 7.0),
-    # Half turns, gimbal lock, and next to them.
-    st.builds(
-        lambda quarter, near: quarter * np.pi / 2 + near,
-        st.integers(-2, 2),
-        st.sampled_from([0.0, 1e-16, -1e-15, 1e-12, -1e-9, 1e-8, 1e-5]),
-    ),
-)
-LENGTHS = st.one_of(st.floats(-20.0, 20.0), st.sampled_from([0.0, -0.0, 1e-5, 1.0, 5e-324]))
-
-
-@st.composite
-def transforms(draw: st.DrawFn) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("ZYX", [draw(ANGLES), draw(ANGLES), draw(ANGLES)]).as_matrix()
-    T[:3, 3] = [draw(LENGTHS), draw(LENGTHS), draw(LENGTHS)]
-    return T
-
-
-def camera(model: str = "radtan", D: Any = (-0.28, 0.07, 1e-5, -2e-4), width: int = 640) -> Camera:
-    return Camera.of(width, 480, model, K, D, "test")
-
-
-def frames_of(poses: list[np.ndarray]) -> RigFrames:
-    """A rig of two cameras and two targets at four poses."""
-    return RigFrames(
-        sensor_carrier="arm/hand",
-        target_carrier="base",
-        sensors={"cam_left": poses[0], "rig/cam_right": poses[1]},
-        targets={"tag_0": poses[2], "board": poses[3]},
-        cameras={"cam_left": camera(), "rig/cam_right": camera("equidistant", (0.01, -2e-3, 3e-4, 1e-5), 1280)},
-        time_offsets_s={"rig/cam_right": 0.035},
-        topics={"cam_left": "/cam_left/image", "rig/cam_right": "it's: a #topic"},
-    )
-
-
-POSES = st.lists(transforms(), min_size=4, max_size=4).map(frames_of)
-ONE = frames_of([np.eye(4)] * 4)
-EACH_POSE = [settings(max_examples=60, deadline=None), given(POSES), example(ONE)]
-
-
-def on_random_poses(test: Any) -> Any:
-    for decorator in reversed(EACH_POSE):
-        test = decorator(test)
-    return test
 
 
 def expected(frames: RigFrames) -> dict[tuple[str, str], np.ndarray]:
@@ -322,101 +274,6 @@ def joint_of(joint: ElementTree.Element) -> tuple[tuple[str, str], np.ndarray]:
     T[:3, :3] = rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll)
     T[:3, 3] = [float(value) for value in origin.attrib["xyz"].split()]
     return (parent.attrib["link"], child.attrib["link"]), T
-
-
-# Kalibr's camchain
-
-
-@on_random_poses
-def test_the_camchain_has_every_camera(frames: RigFrames) -> None:
-    chain = yaml.safe_load(camchain_yaml(frames))
-    left, right = frames.sensors["cam_left"], frames.sensors["rig/cam_right"]
-    assert list(chain) == ["cam0", "cam1"]
-    for name, T in (("cam0", left), ("cam1", right)):
-        # T_cam_imu brings a point of the carrier into the camera.
-        np.testing.assert_allclose(np.linalg.inv(chain[name]["T_cam_imu"]), T, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(right @ np.array(chain["cam1"]["T_cn_cnm1"]), left, rtol=0.0, atol=1e-12)
-    assert "T_cn_cnm1" not in chain["cam0"]
-    # Kalibr's condition: the two ways to cam1 agree.
-    np.testing.assert_allclose(
-        np.array(chain["cam1"]["T_cn_cnm1"]) @ chain["cam0"]["T_cam_imu"],
-        chain["cam1"]["T_cam_imu"],
-        rtol=0.0,
-        atol=1e-12,
-    )
-
-
-def test_the_camchain_has_kalibrs_fields(tmp_path: Path) -> None:
-    text = camchain_yaml(ONE)
-    chain = yaml.safe_load(text)
-    assert chain["cam0"] | {"T_cam_imu": None} == {
-        "camera_model": "pinhole",
-        "intrinsics": [421.5, 420.75, 318.25, 241.125],
-        "distortion_model": "radtan",
-        "distortion_coeffs": [-0.28, 0.07, 1e-5, -2e-4],
-        "resolution": [640, 480],
-        "rostopic": "/cam_left/image",
-        "T_cam_imu": None,
-        "timeshift_cam_imu": 0.0,
-        "cam_overlaps": [1],
-    }
-    assert chain["cam1"]["distortion_model"] == "equidistant"
-    assert chain["cam1"]["distortion_coeffs"] == [0.01, -2e-3, 3e-4, 1e-5]
-    assert chain["cam1"]["timeshift_cam_imu"] == 0.035
-    assert chain["cam1"]["rostopic"] == "it's: a #topic"
-    # And as this library reads a camchain.
-    (tmp_path / "camchain.yaml").write_text(text)
-    for read, given_camera in zip(
-        read_kalibr_camchain(tmp_path / "camchain.yaml").values(), ONE.cameras.values(), strict=True
-    ):
-        np.testing.assert_array_equal(read.K, given_camera.K)
-        np.testing.assert_array_equal(read.D, given_camera.D)
-        assert (read.model, read.width, read.height) == (given_camera.model, given_camera.width, given_camera.height)
-
-
-def test_a_pinhole_is_radtan_with_zeros() -> None:
-    frames = RigFrames("hand", "base", {"cam": np.eye(4)}, {}, cameras={"cam": camera("pinhole", ())})
-    cam0 = yaml.safe_load(camchain_yaml(frames))["cam0"]
-    assert (cam0["distortion_model"], cam0["distortion_coeffs"]) == ("radtan", [0.0] * 4)
-    assert "rostopic" not in cam0
-
-
-@pytest.mark.parametrize(
-    ("model", "D", "is_written"),
-    [
-        ("radtan", (-0.3, 0.1, 0.001, 0.0, 0.0), True),
-        ("radtan", (-0.3, 0.1, 0.001, 0.0, -0.02), False),
-        ("rational_polynomial", (-0.3, 0.1, 0.001, 0.0, 0.0, 0.1, 0.0, 0.0), False),
-        ("rational_polynomial", (-0.3, 0.1, 0.001, 0.0, 0.0, 0.0, 0.0, 0.0), True),
-    ],
-)
-def test_distortion_that_kalibr_lacks_is_left_out_and_said(model: str, D: tuple[float, ...], is_written: bool) -> None:
-    sensors = {name: np.eye(4) for name in ("first", "lidar", "last")}
-    sensors["last"] = np.diag([-1.0, -1.0, 1.0, 1.0])
-    frames = RigFrames("hand", "base", sensors, {}, cameras={"first": camera(model, D), "last": camera()})
-    text = camchain_yaml(frames)
-    chain = yaml.safe_load(text)
-    assert list(chain) == (["cam0", "cam1"] if is_written else ["cam0"])
-    assert "# Left out: lidar, whose intrinsics are not known." in text
-    assert ("# Left out: first, whose distortion" in text) is not is_written
-    # A chain holds together across the sensor that is left out.
-    np.testing.assert_array_equal(chain[list(chain)[-1]]["T_cam_imu"], sensors["last"])
-    assert "T_cn_cnm1" not in chain["cam0"]
-
-
-def test_a_camchain_without_cameras_is_yaml() -> None:
-    assert yaml.safe_load(camchain_yaml(RigFrames("hand", "base", {"cam": np.eye(4)}, {}))) == {}
-
-
-def test_overlaps_are_of_cameras_that_can_see_the_same() -> None:
-    """Three in a ring: the first two look the same way, the third backwards."""
-    backwards = np.diag([-1.0, 1.0, -1.0, 1.0])
-    aside = np.eye(4)
-    aside[0, 3] = 0.3
-    sensors = {"a": np.eye(4), "b": aside, "c": backwards}
-    frames = RigFrames("rig", "world", sensors, {}, cameras={name: camera() for name in sensors})
-    chain = yaml.safe_load(camchain_yaml(frames))
-    assert [chain[f"cam{n}"]["cam_overlaps"] for n in range(3)] == [[1], [0], []]
 
 
 # All files

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cells_of_others import CIRCLES, WORKCELL
 from scipy.spatial.transform import Rotation
 
 import gtsam_rwhec as rw
@@ -153,22 +154,6 @@ def test_the_rig_file_of_a_folder() -> None:
         rig("a", more=", frame: f").model_validate(
             parse_rig(rw.rig.rig_text(rig("a")).replace("size: [6, 4]", "size: [6, 4], D: [0.1, 0, 0, 0]"), "rig.yaml")
         )
-
-
-WORKCELL = """\
-carriers: {sensors: base, targets: hand, poses: {frames: [base, hand]}}
-sensors:
-  camera2: {images: image, poses: pose, intrinsics: intrinsic_pars_file.yaml}
-targets:
-  board: {type: checkerboard, inner_corners: [3, 4], square_m: 0.05}
-"""
-CIRCLES = """\
-carriers: {sensors: wrist, targets: base, poses: {frames: [base, wrist]}}
-sensors:
-  camera: {images: images, poses: poses, intrinsics: {K: [550, 550, 320, 240], size: [640, 480]}}
-targets:
-  grid: {type: circle_grid, circles: [10, 10], spacing_m: 0.0254, larger_dot: true}
-"""
 
 
 def test_the_two_folders_of_other_people(workcell_camera2: Path, circle_grid_10x10: Path, tmp_path: Path) -> None:

@@ -13,19 +13,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from cells_of_others import WORKCELL
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.pipeline.all_stages import calibrate_log
 from gtsam_rwhec.pipeline.earlier_output import DETECTIONS, LIST_FILE
 from gtsam_rwhec.rig import parse_rig
 
-RIG = """\
-carriers: {sensors: base, targets: hand, poses: {frames: [base, hand]}}
-sensors:
-  camera2: {images: image, poses: pose, intrinsics: intrinsic_pars_file.yaml}
-targets:
-  board: {type: checkerboard, inner_corners: [3, 4], square_m: 0.05}
-"""
 NUMBERS = (1, 43, 61, 94, 112, 121, 208, 221, 233, 242)
 #: Instead of these of the workcell's images there are others: no picture, an empty file, a picture of another size, and
 #: a link to nothing.
@@ -103,7 +97,9 @@ def result(out: Path) -> Any:
     return timeless(json.loads((out / "result.json").read_text(encoding="utf-8")))
 
 
-def interrupted(folder: Path, out: Path, stage: str, text: str = RIG, *, replace: bool = True) -> tuple[list[str], str]:
+def interrupted(
+    folder: Path, out: Path, stage: str, text: str = WORKCELL, *, replace: bool = True
+) -> tuple[list[str], str]:
     """What a calibration told until it was interrupted when a stage began, and what it said then."""
     stages: list[str] = []
 
@@ -121,7 +117,7 @@ def interrupted(folder: Path, out: Path, stage: str, text: str = RIG, *, replace
 @pytest.mark.filterwarnings("ignore:.*(poses have no image|counts as an image)")
 def test_a_run_that_is_killed_again_and_again(cell: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    (tmp_path / "rig.yaml").write_text(RIG, encoding="utf-8")
+    (tmp_path / "rig.yaml").write_text(WORKCELL, encoding="utf-8")
     moments = (f"detecting: image {TOGETHER} of {IMAGES}", "clean.mcap")
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", SCRIPT, cell, tmp_path / "rig.yaml", out, *moments],
@@ -159,7 +155,7 @@ def test_an_unfinished_run_of_other_inputs_is_refused(cell: Path, tmp_path: Path
     assert said == f"The same command goes on from here: {done}, and kept in {out}."
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     (folder / "image" / "0020.png").write_bytes(b"another content")
-    changed = RIG.replace("square_m: 0.05", "square_m: 0.06")
+    changed = WORKCELL.replace("square_m: 0.05", "square_m: 0.06")
     for _ in range(2):  # refused once, it is refused again
         with pytest.raises(LogError, match=r"unfinished run of other inputs, and nothing was changed: ") as refused:
             interrupted(folder, out, "detecting: image", changed, replace=False)

@@ -5,27 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from cells_of_others import CIRCLES, WORKCELL
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.pipeline import clean_log, detect_log, read_corners, write_folder_log
 from gtsam_rwhec.reprojection import held_out_errors
 from gtsam_rwhec.rig.rig_file import parse_rig
-
-WORKCELL = """\
-carriers: {sensors: base, targets: hand, poses: {frames: [base, hand]}}
-sensors:
-  camera2: {images: image, poses: pose, intrinsics: intrinsic_pars_file.yaml}
-targets:
-  board: {type: checkerboard, inner_corners: [3, 4], square_m: 0.05}
-"""
-CIRCLES = """\
-carriers: {sensors: wrist, targets: base, poses: {frames: [base, wrist]}}
-sensors:
-  camera: {images: images, poses: poses, intrinsics: {K: [550, 550, 320, 240], size: [640, 480]}}
-targets:
-  grid: {type: circle_grid, circles: [10, 10], spacing_m: 0.0254, larger_dot: true}
-"""
 
 
 def corners_of(folder: Path, text: str, out: Path) -> rw.Observations:
