@@ -38,6 +38,13 @@ def check_arguments(observations: object, options: object) -> None:
         raise OptionError(f"options={brief(options)} are not CornerOptions; give rw.CornerOptions(...), or None")
 
 
+def check_shared(options: CornerOptions, sensors: tuple[str, ...]) -> None:
+    """FrameError where a group of sensors that share intrinsics names one that saw nothing."""
+    strange = [name for group in options.shared for name in group if name not in sensors]
+    if strange:
+        raise FrameError(f"CornerOptions.shared names {strange[0]!r}; the sensors are {', '.join(sensors)}")
+
+
 def check_names(start: object, names: tuple[str, ...], *, letter: str) -> None:
     """FrameError where a start X or Y lacks a frame that was seen, or that saw; OptionError where it is no dict."""
     what, pose = {

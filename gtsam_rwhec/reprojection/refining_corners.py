@@ -21,6 +21,7 @@ from gtsam_rwhec.reprojection.determined import (
     check_corners,
     check_determined,
     check_names,
+    check_shared,
     told_where_it_fails,
 )
 from gtsam_rwhec.reprojection.findings import findings_of
@@ -33,6 +34,7 @@ from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.reduced import Noise, Reduced
 from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
 from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, innovation_of
+from gtsam_rwhec.vision.camera import Camera
 
 #: Rounds of noise, outliers and optimum in turns end when no deviation changes by more than this share.
 ROUNDS, SETTLED = 12, 1e-3
@@ -95,31 +97,9 @@ def refine_corners(
     check_names(X, observations.targets, letter="X")
     check_names(Y, observations.sensors, letter="Y")
     options, tell = options or CornerOptions(), progress or silent
-    first = {name: options.camera_of(name) for name in observations.sensors}
-    stated = {name: options.stated_of(first[name]) for name in observations.sensors}
-    cameras = {name: free_model(observations.cameras[first[name]], stated[name]) for name in observations.sensors}
-    observations = replace(observations, cameras=cameras)
-    priors = {first[name]: prior_of(camera, stated[name]) for name, camera in cameras.items()}
-    stacks, A = stacks_of(observations)
-    given = options.carrier_noise
-    noise, about = ROUGH, options.about
-    if isinstance(given, CarrierNoise):
-        noise, about = Noise(ROUGH.corner_px, given.rotation_rad, given.translation_m), given.about
-    elif given == "exact":
-        noise = Noise(ROUGH.corner_px, 0.0, 0.0)
-    shape = np.array([options.size_share, options.warp_m, options.warp_m])
-    model = Model(
-        stacks, A, noise.carrier, about, first, priors,
-        dict.fromkeys(observations.targets, shape) if shape.any() else {},
-        noise.corner_px, tuple(stack.known.astype(float) for stack in stacks),
-    )  # fmt: skip
-    point = Point(
-        {name: one_transform(X[name], f"start of {name}") for name in observations.targets},
-        {name: one_transform(Y[name], f"start of {name}") for name in observations.sensors},
-        A,
-        {name: parameters_of(observations.cameras[name]) for name in priors},
-        {name: np.zeros(SHAPE) for name in observations.targets},
-    )
+    check_shared(options, observations.sensors)
+    model, point, noise, cameras = _stated(observations, X, Y, options)
+    priors, first = model.camera_priors, model.camera_of
     _check_start(model, point)
     settled = _settled(model, point, noise, options, tell)
     tests = _innovations(settled, priors)
@@ -159,7 +139,7 @@ def refine_corners(
         freedom=settled.freedom,
         left_out={
             (stack.target, stack.sensor): stack.known & (weights == 0.0)
-            for stack, weights in zip(stacks, settled.model.weights, strict=True)
+            for stack, weights in zip(model.stacks, settled.model.weights, strict=True)
         },
         graph=settled.graph,
         point=point,
@@ -167,6 +147,37 @@ def refine_corners(
         last_step=settled.last_step,
     )
     return replace(refined, findings=findings_of(refined, options))
+
+
+def _stated(
+    observations: Observations, X: Mapping[str, PoseLike], Y: Mapping[str, PoseLike], options: CornerOptions
+) -> tuple[Model, Point, Noise, dict[str, Camera]]:
+    """The model as it is stated, the start, rough noise, and the cameras with the lens models that are estimated."""
+    first = {name: options.camera_of(name) for name in observations.sensors}
+    stated = {name: options.stated_of(first[name]) for name in observations.sensors}
+    cameras = {name: free_model(observations.cameras[first[name]], stated[name]) for name in observations.sensors}
+    priors = {first[name]: prior_of(camera, stated[name]) for name, camera in cameras.items()}
+    stacks, A = stacks_of(replace(observations, cameras=cameras))
+    given = options.carrier_noise
+    noise, about = ROUGH, options.about
+    if isinstance(given, CarrierNoise):
+        noise, about = Noise(ROUGH.corner_px, given.rotation_rad, given.translation_m), given.about
+    elif given == "exact":
+        noise = Noise(ROUGH.corner_px, 0.0, 0.0)
+    shape = np.array([options.size_share, options.warp_m, options.warp_m])
+    model = Model(
+        stacks, A, noise.carrier, about, first, priors,
+        dict.fromkeys(observations.targets, shape) if shape.any() else {},
+        noise.corner_px, tuple(stack.known.astype(float) for stack in stacks),
+    )  # fmt: skip
+    point = Point(
+        {name: one_transform(X[name], f"start of {name}") for name in observations.targets},
+        {name: one_transform(Y[name], f"start of {name}") for name in observations.sensors},
+        A,
+        {name: parameters_of(cameras[name]) for name in priors},
+        {name: np.zeros(SHAPE) for name in observations.targets},
+    )
+    return model, point, noise, cameras
 
 
 def _settled(

@@ -125,6 +125,11 @@ def test_cameras_of_one_model_may_share_their_intrinsics() -> None:
     assert better.all()
 
 
+def test_a_shared_camera_must_be_one_of_the_sensors() -> None:
+    with pytest.raises(FrameError, match="shared names 'cam_9'; the sensors are cam_0, cam_1"):
+        refined(cell(0, images=5), rw.CornerOptions(shared=(("cam_9", "cam_0"),)))
+
+
 def test_a_tenth_of_misread_corners_is_left_out() -> None:
     given = cell(10, images=30, carrier=(1e-3, 5e-4))
     rng = np.random.default_rng(0)
