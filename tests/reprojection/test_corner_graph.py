@@ -1,9 +1,8 @@
-"""The GTSAM graph: its cost, its rows, and GTSAM's own factors as a peer."""
+"""The GTSAM graph: its cost and its rows."""
 
 from __future__ import annotations
 
 import gtsam
-import gtsam_unstable
 import numpy as np
 import pytest
 from rwhec_factors import se3
@@ -50,27 +49,6 @@ def test_linear_rows_have_the_cost_and_the_gradient_of_the_residuals(small: Cell
             numeric = (graph.graph.error(moved[0]) - graph.graph.error(moved[1])) / (2e-7)
             gradient = linear.gradientAtZero().at(key) @ (step / 1e-7)
             assert gradient == pytest.approx(numeric, rel=1e-4, abs=1e-4 * error)
-
-
-def test_gtsams_own_factors_have_the_same_cost(small: Cell) -> None:
-    """ProjectionFactorPPPC sees points of the board from the pose V = X^-1 A^-1, with Y as the sensor's transform."""
-    model, point = model_and_point(small, exact=True)
-    point = Point(point.X, point.Y, point.A, point.cameras, {"board": np.zeros(3)})
-    native, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    noise = gtsam.noiseModel.Isotropic.Sigma(2, CORNER_PX)
-    for j, p in enumerate(small.observations.corners["board"]):
-        values.insert(key_of("p", j), p)
-    for i, A in enumerate(point.A):
-        values.insert(key_of("v", i), gtsam.Pose3(se3.inverse(A @ point.X["board"])))
-    for s, stack in enumerate(model.stacks):
-        fx, fy, cx, cy, k1, k2, p1, p2 = point.cameras[stack.sensor]
-        values.insert(key_of("y", s), gtsam.Pose3(point.Y[stack.sensor]))
-        values.insert(key_of("k", s), gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, k1, k2, p1, p2))
-        for i, pixels in zip(stack.instant.tolist(), stack.pixels, strict=True):
-            for j, pixel in enumerate(pixels):
-                keys = (key_of("v", i), key_of("y", s), key_of("p", j), key_of("k", s))
-                native.add(gtsam_unstable.ProjectionFactorPPPCCal3DS2(pixel, noise, *keys))
-    assert native.error(values) == pytest.approx(0.5 * sum((error**2).sum() for error in model.errors(point)), rel=1e-9)
 
 
 @pytest.mark.parametrize("about", ["targetcarrier", "sensorcarrier"])
