@@ -107,6 +107,7 @@ TABLE: dict[str, dict[str, str]] = {
             "average_information drift eliminated_drift gradient measurements sparse_columns"
         ),
         "noise_model/test_stations.py": "rows",
+        "reprojection/test_as_refined.py": "in_corners",
         "noise_model/test_refining.py": (
             "agreement components drift_choice found mixture modelled options prior_knowledge reml settling typical"
         ),
@@ -138,6 +139,7 @@ TABLE: dict[str, dict[str, str]] = {
         "refinement/test_graduated.py": "admission truncated_least_squares",
         "refinement/test_refine.py": "chordal fit free_space geodesic optimisation options refined refining variables",
         "refinement/test_robust.py": "inliers weighting",
+        "reprojection/test_as_refined.py": "reprojection_found",
     },
     "gtsam_rwhec/report": {
         "calibration/test_cross_validation.py": "cross_validation_table",

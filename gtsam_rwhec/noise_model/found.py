@@ -69,6 +69,9 @@ class NoiseInData:
         Whether the covariance has a constant error of A, which no residual shows, tied to the part that varies.
     systematic_probability : float
         That such errors are there: the covariance averages over both.
+    constant_deviations : tuple of two tuples of six float
+        Of the constant errors that the covariance has, [omega, v] in rad and m: of the targets' carrier in its own
+        axes, A Expmap(c), and of the sensors', Expmap(c) A.
     """
 
     deviations: dict[Component, Deviation]
@@ -84,6 +87,7 @@ class NoiseInData:
     is_drift_untried: bool
     arms_assumed: bool
     systematic_probability: float
+    constant_deviations: tuple[tuple[float, ...], ...] = ((0.0,) * 6,) * 2
 
     @property
     def has_systematic(self) -> bool:

@@ -71,8 +71,8 @@ def settled(task: Task, start: State, tell: Progress, before: Settled | None = N
     return replace(best, white=white, drift_evidence=drift_evidence, systematic_evidence=systematic_evidence)
 
 
-def noise_in(task: Task, found: Settled, mixture: Mixture) -> NoiseInData:
-    """What the data say of their noise."""
+def noise_in(task: Task, found: Settled, mixture: Mixture, constant: tuple[Array, Array]) -> NoiseInData:
+    """What the data say of their noise; `constant` are the variances of `constant_variances`."""
     white = found.white or found
     middle, low, high = mixture.quantiles((0.5, 0.05, 0.95))
     active = found.fit.sizes.active
@@ -102,20 +102,25 @@ def noise_in(task: Task, found: Settled, mixture: Mixture) -> NoiseInData:
         is_drift_untried=is_drift_untried(task, found),
         arms_assumed=C.SYSTEMATIC_ROTATION in active,
         systematic_probability=_probability(task, found),
+        constant_deviations=tuple(tuple(np.sqrt(variances).tolist()) for variances in constant),
     )
 
 
-def mixed(task: Task, found: Settled) -> tuple[JointCovariance, Mixture]:
-    """The covariance, with the components' uncertainty mixed in, and the arm's constant error added."""
+def mixed(task: Task, found: Settled) -> tuple[JointCovariance, Mixture, tuple[Array, Array]]:
+    """The covariance, with the components' uncertainty mixed in, and the arm's constant error added; and its parts."""
     is_dense = task.instants.count > INSTANTS
     mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
     basis = found.model.basis
     state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
-    finite = basis @ mixture.covariance @ basis.T + constant_error(task, found, state, mixture)
+    constant = constant_variances(task, found, state, mixture)
+    finite = basis @ mixture.covariance @ basis.T
+    for poses, variances in zip((state.X, state.Y), constant, strict=True):
+        shift = _shifts(task, poses)
+        finite += (shift * variances) @ shift.T
     if is_drift_untried(task, found):
         wider = widening(task, found)
         finite = finite * wider[:, None] * wider
-    return replace(task.layout, finite=finite), mixture
+    return replace(task.layout, finite=finite), mixture, constant
 
 
 def is_drift_untried(task: Task, found: Settled) -> bool:
@@ -123,8 +128,8 @@ def is_drift_untried(task: Task, found: Settled) -> bool:
     return task.instants.chains > MOST_TRACKS and is_correlated(found, SURELY_CORRELATED)
 
 
-def constant_error(task: Task, found: Settled, state: State, mixture: Mixture) -> Array:
-    """The covariance (d, d) of what constant errors of A, of the hand and of the base, add to the frames there.
+def constant_variances(task: Task, found: Settled, state: State, mixture: Mixture) -> tuple[Array, Array]:
+    """Variances (6,) of constant errors of A: c of the hand, A Expmap(c), and of the base, Expmap(c) A.
 
     A Expmap(c) X = A X Expmap(Ad(X^-1) c), and Expmap(c) A X = Y B the same for Y: no residual shows c, since X or Y
     takes it up. It is tied to the part that varies with the configuration: `CONSTANT` times its deviations. (It is an
@@ -132,25 +137,33 @@ def constant_error(task: Task, found: Settled, state: State, mixture: Mixture) -
     hardly show the part that varies, it may not be there: the ellipsoid is that of the average over both models.
     """
     active = found.fit.sizes.active
-    size = len(task.layout.unit)
     if C.SYSTEMATIC_ROTATION not in active:
-        return np.zeros((size, size))
+        return np.zeros(6), np.zeros(6)
     places = [active.index(c) for c in (C.SYSTEMATIC_ROTATION, C.SYSTEMATIC_TRANSLATION)]
     deviations = CONSTANT * np.repeat(np.exp(mixture.logs[:, places]), 3, axis=1)  # (samples, 6)
     probability = _probability(task, found)
-    added = np.zeros((size, size))
-    for poses in (state.X, state.Y):
-        shift, shares = np.zeros((size, 6)), [0.0]
-        for name, pose in poses.items():
-            unknown = Unknown(UnknownKind.FRAME, name)
-            if unknown in task.layout.slots and name not in task.problem.priors:  # a prior is of the true pose
-                rows = task.layout.slots[unknown]
-                shift[rows] = pose.inverse().AdjointMap()
-                if not task.layout.free[rows].any():
-                    roots = shift[rows] * deviations[:, None, :]
-                    shares.append(mixture.share_of(found.model.basis[rows], roots, probability))
-        added += (shift * max(shares) * (mixture.weights @ deviations**2)) @ shift.T
-    return added
+
+    def of(poses: dict[str, gtsam.Pose3]) -> Array:
+        shift, shares = _shifts(task, poses), [0.0]
+        for name in poses:
+            rows = task.layout.slots.get(Unknown(UnknownKind.FRAME, name))
+            if rows is not None and shift[rows].any() and not task.layout.free[rows].any():
+                roots = shift[rows] * deviations[:, None, :]
+                shares.append(mixture.share_of(found.model.basis[rows], roots, probability))
+        variances: Array = max(shares) * (mixture.weights @ deviations**2)
+        return variances
+
+    return of(state.X), of(state.Y)
+
+
+def _shifts(task: Task, poses: dict[str, gtsam.Pose3]) -> Array:
+    """How a constant error of A moves the frames (d, 6) of one carrier."""
+    shift = np.zeros((len(task.layout.unit), 6))
+    for name, pose in poses.items():
+        unknown = Unknown(UnknownKind.FRAME, name)
+        if unknown in task.layout.slots and name not in task.problem.priors:  # a prior is of the true pose
+            shift[task.layout.slots[unknown]] = pose.inverse().AdjointMap()
+    return shift
 
 
 def _probability(task: Task, found: Settled) -> float:

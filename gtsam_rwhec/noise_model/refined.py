@@ -96,7 +96,7 @@ def refined_of(
         cost=optimum.cost,
         initial_cost=made.graph.error(start),
         iterations=optimum.iterations,
-        moved=movements(solution, state),
+        moved=movements(solution, state.X, state.Y),
         inlier_counts={pair: (int(kept.sum()), len(kept)) for pair, kept in inliers.items()},
         inliers=inliers,
         free_directions=task.free_directions,

@@ -66,7 +66,7 @@ class UnderNoise:
         """
         task, found = self.task, self.settled
         task.tell("covariances: with the uncertainty of the noise itself")
-        joint, mixture = mixed(task, found)
+        joint, mixture, constant = mixed(task, found)
         layout = task.layout
         frames = [
             layout.slots[unknown]
@@ -79,7 +79,7 @@ class UnderNoise:
         freedom = min(freedom, max(0.5 * spare, FEWEST))
         task.tell("covariances: the graph of the answer")
         refined = refined_of(task, found, joint, freedom, inliers or {}, self.solution, self.how)
-        noise = noise_in(task, found, mixture)
+        noise = noise_in(task, found, mixture, constant)
         return replace(refined, noise_sentences=noise.sentences), noise
 
 

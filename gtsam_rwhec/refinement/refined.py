@@ -21,6 +21,7 @@ from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.reprojection_found import Intrinsics, Reprojection
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.solving.solution import Solution
 
@@ -76,6 +77,10 @@ class RefinedPoses:
         Empty if everything is determined.
     joint : JointCovariance
         The covariance of all unknowns.
+    reprojection : Reprojection or None
+        Errors in pixels, and what was tried, where the refinement is from corners.
+    intrinsics : dict of str to Intrinsics
+        Of the sensors whose intrinsics were estimated with the poses; their covariance is that of "intrinsics:SENSOR".
     """
 
     X: dict[str, gtsam.Pose3]
@@ -92,6 +97,8 @@ class RefinedPoses:
     inlier_counts: dict[Pair, tuple[int, int]]
     free_directions: tuple[FreeDirection, ...]
     joint: JointCovariance = field(repr=False)
+    reprojection: Reprojection | None = field(default=None, kw_only=True, repr=False)
+    intrinsics: dict[str, Intrinsics] = field(default_factory=dict, kw_only=True, repr=False)
 
     def covariance(self, *names: str | Unknown) -> Array:
         """The joint covariance (m, m) of frames, scales and time offsets, in the order given.
@@ -115,7 +122,7 @@ class RefinedPoses:
         if not asked:  # everything is fixed
             return np.zeros((0, 0))
         covariance = self.joint.covariance_of(np.concatenate([self._rows_of(unknown) for unknown in asked]))
-        for unknown, (first, end) in zip(asked, pairwise(np.cumsum([0, *(u.dimension for u in asked)])), strict=True):
+        for unknown, (first, end) in zip(asked, pairwise(np.cumsum([0, *map(self._width_of, asked)])), strict=True):
             if unknown in self.joint.slots:
                 covariance[first:end, first:end] += self.joint.turned(unknown)
         return covariance
@@ -227,6 +234,11 @@ class RefinedPoses:
         if name not in self.names:
             return bool(np.abs(xi).max() < 1e-9)
         return bool(xi @ self.information(name) @ xi <= self.squared_radius(6, confidence))
+
+    def _width_of(self, unknown: Unknown) -> int:
+        """The number of an unknown's parameters."""
+        slot = self.joint.slots.get(unknown)
+        return unknown.dimension if slot is None else slot.stop - slot.start
 
     @staticmethod
     def _name(name: object) -> str:

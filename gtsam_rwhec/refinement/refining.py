@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 
 import gtsam
@@ -155,7 +156,7 @@ def refine(
         cost=settled.optimum.cost,
         initial_cost=settled.graph.error(model.values(variables.start(before))),
         iterations=settled.iterations,
-        moved=movements(before, state),
+        moved=movements(before, state.X, state.Y),
         inlier_counts={pair: (int(kept.sum()), len(kept)) for pair, kept in inliers.items()},
         inliers=inliers,
         free_directions=space.directions,
@@ -299,10 +300,10 @@ def _noise(model: Model, settled: SettledFit, options: RefineOptions, estimates:
     return result
 
 
-def movements(start: Solution, state: State) -> dict[str, Movement]:
+def movements(start: Solution, X: Mapping[str, gtsam.Pose3], Y: Mapping[str, gtsam.Pose3]) -> dict[str, Movement]:
     """How far each frame moved from a certified solution."""
     moved = {}
-    for before, after in ((start.X, state.X), (start.Y, state.Y)):
+    for before, after in ((start.X, X), (start.Y, Y)):
         for name, pose in after.items():
             difference = before[name].between(pose)
             angle = float(np.linalg.norm(gtsam.Rot3.Logmap(difference.rotation())))

@@ -18,10 +18,14 @@ class UnknownKind(Enum):
     FRAME = "frame"
     SCALE = "scale"
     TIME_OFFSET = "time_offset"
+    #: Of a camera: as many parameters as its lens has.
+    INTRINSICS = "intrinsics"
+    #: Of a board: what is free of its warp.
+    SHAPE = "shape"
 
 
 class Unknown(NamedTuple):
-    """The pose of a frame, a scale, or the time offset of a sensor's clock.
+    """The pose of a frame, a scale, the time offset of a sensor's clock, a camera's intrinsics, or a board's shape.
 
     ``owner`` is the frame, target or sensor that the unknown belongs to; empty for one scale that all targets share.
     """
@@ -31,7 +35,10 @@ class Unknown(NamedTuple):
 
     @staticmethod
     def of(name: object) -> Unknown:
-        """The unknown of a name: "cam_0", "scale", "scale:tag_0" or "time_offset:cam_0"; else a FrameError."""
+        """The unknown of a name: "cam_0", "scale", "scale:tag_0", "time_offset:cam_0", "intrinsics:cam_0", ...
+
+        Raises FrameError for what is no name.
+        """
         if isinstance(name, Unknown):
             return name
         if not isinstance(name, str):
@@ -39,8 +46,8 @@ class Unknown(NamedTuple):
         if name == UnknownKind.SCALE.value:
             return Unknown(UnknownKind.SCALE)
         word, separator, owner = name.partition(":")
-        for kind in (UnknownKind.SCALE, UnknownKind.TIME_OFFSET):
-            if separator and word == kind.value:
+        for kind in UnknownKind:
+            if separator and word == kind.value and kind is not UnknownKind.FRAME:
                 return Unknown(kind, owner)
         return Unknown(UnknownKind.FRAME, name)
 
@@ -52,7 +59,7 @@ class Unknown(NamedTuple):
 
     @property
     def dimension(self) -> int:
-        """The number of parameters: 6 of a frame, [omega, v]; else 1."""
+        """The number of parameters: 6 of a frame, [omega, v]; 1 of a scale or an offset. A lens says its own."""
         return 6 if self.kind is UnknownKind.FRAME else 1
 
 

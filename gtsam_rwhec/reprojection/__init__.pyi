@@ -15,7 +15,6 @@ from .refined import RefinedIntrinsics as RefinedIntrinsics
 from .stated_intrinsics import Innovation as Innovation
 
 # What it is worth: on images it has not seen, over the image, and where something stays as it is.
-from .consequences import Consequence as Consequence
 from .consequences import consequences_of as consequences_of
 from .held_out import HeldOut as HeldOut
 from .held_out import held_out_errors as held_out_errors

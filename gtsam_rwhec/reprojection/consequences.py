@@ -7,35 +7,17 @@ the covariance H^-1 (sum C_i' S C_i) H^-1 / s^4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.reprojection_found import Consequence
 from gtsam_rwhec.reprojection.reduced import Reduced
 from gtsam_rwhec.reprojection.refined import CornersRefined
 
 #: What is asked: pixels of the centre, a share of the focal length, radians of A's rotation about each axis.
 CENTRE_PX, FOCAL_SHARE, CARRIER_RAD = 1.0, 1e-3, np.radians(0.1)
-
-
-@dataclass(frozen=True)
-class Consequence:
-    """How far a frame would be off.
-
-    Attributes
-    ----------
-    frame : str
-    cause : str
-        In words, with its size.
-    rotation_deg, translation_mm : float
-        Of an error of A: one standard deviation, along the worst axis.
-    """
-
-    frame: str
-    cause: str
-    rotation_deg: float
-    translation_mm: float
 
 
 def consequences_of(refined: CornersRefined) -> tuple[Consequence, ...]:

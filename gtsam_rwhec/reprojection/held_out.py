@@ -1,8 +1,8 @@
 """How well corners are predicted in images that the calibration has not seen.
 
-Instants are left out in blocks of their order; poses and intrinsics are refined from the others, and predict the
-corners by the measured A. A refinement that frees the carriers' poses fits its own images to a tenth of a pixel,
-whatever is wrong with the arm: its residuals prove nothing, and this error decides.
+Instants are left out in blocks, each pair's images in their order; poses and intrinsics are refined from the others,
+and predict the corners by the measured A. A refinement that frees the carriers' poses fits its own images
+to a tenth of a pixel, whatever is wrong with the arm: its residuals prove nothing, and this error decides.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def held_out_errors(
     if noise is not None:
         about = refined.graph.model.about
         told = replace(told, carrier_noise=CarrierNoise(float(noise[0]), float(noise[3]), about=about))
-    block = np.arange(len(A)) * folds // len(A)
+    block = _blocks(stacks, len(A), folds)
     found: dict[str, list[tuple[Array, Array, Array]]] = {name: [] for name in observations.sensors}
     for fold in range(folds):
         tell(f"predicting images that were left out: block {fold + 1} of {folds}")
@@ -113,6 +113,17 @@ def held_out_errors(
         )
         for name, each in found.items()
     }
+
+
+def _blocks(stacks: tuple[Stack, ...], instants: int, folds: int) -> np.ndarray:
+    """The block (I,) of each instant: by its place among the images of the pairs that it is in, so that each block has
+    a part of every pair."""
+    place, count = np.zeros(instants), np.zeros(instants)
+    for stack in stacks:
+        number = len(stack.instant)
+        np.add.at(place, stack.instant, (np.arange(number) + 0.5) / number)
+        np.add.at(count, stack.instant, 1.0)
+    return np.minimum((folds * place / count).astype(np.int64), folds - 1)
 
 
 def _of_sensor(length: Array, on_target: Array, pixels: Array, camera: Camera) -> HeldOut:

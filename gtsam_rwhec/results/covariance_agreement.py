@@ -14,6 +14,7 @@ from gtsam_rwhec.geometry.pose_covariances import standard_deviations
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.refinement.reprojection_found import SIZE
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.schema import FrameFields, RefinedFields, SolutionFields
 
@@ -41,6 +42,7 @@ def check_joint(refined: RefinedFields, certified: SolutionFields) -> None:
     known = {Unknown(UnknownKind.FRAME, name) for name in names}
     known |= {Unknown(UnknownKind.TIME_OFFSET, name) for name in refined.time_offsets_s}
     known |= {Unknown(UnknownKind.SCALE, name) for name in owners if refined.scale_mode != "known"}
+    known |= {unknown for unknown in given if _is_of_corners(unknown, refined)}
     if given.keys() - known:
         raise ValueError(f"{place}: unknowns that have no value: {_names(given.keys() - known)}")
     missing = known - given.keys() - _fixed(refined, certified)
@@ -48,13 +50,31 @@ def check_joint(refined: RefinedFields, certified: SolutionFields) -> None:
         raise ValueError(f"{place}: unknowns that have no rows: {_names(missing)}")
     end = 0
     for unknown, rows in sorted(given.items(), key=lambda item: item[1].start):
-        if (rows.start, rows.stop) != (end, end + unknown.dimension):
+        width = _width_of(unknown, refined)
+        if (rows.start, rows.stop) != (end, end + width):
             raise ValueError(
-                f"{place}.{unknown}: must be [{end}, {end + unknown.dimension}], because rows may neither overlap nor "
+                f"{place}.{unknown}: must be [{end}, {end + width}], because rows may neither overlap nor "
                 f"be left out (found [{rows.start}, {rows.stop}])"
             )
         end = rows.stop
     _check_matrices(refined.joint, end)
+
+
+def _is_of_corners(unknown: Unknown, refined: RefinedFields) -> bool:
+    """Whether an unknown is one of a camera, or of a board, that the file tells of."""
+    boards = {} if refined.reprojection is None else refined.reprojection.boards
+    return (unknown.kind is UnknownKind.INTRINSICS and unknown.owner in refined.intrinsics) or (
+        unknown.kind is UnknownKind.SHAPE and unknown.owner in boards
+    )
+
+
+def _width_of(unknown: Unknown, refined: RefinedFields) -> int:
+    """The rows that an unknown must have."""
+    if unknown.kind is UnknownKind.INTRINSICS:
+        return len(refined.intrinsics[unknown.owner].names)
+    if unknown.kind is UnknownKind.SHAPE and refined.reprojection is not None:
+        return len([name for name in refined.reprojection.boards[unknown.owner].names if name != SIZE])
+    return unknown.dimension
 
 
 def _fixed(refined: RefinedFields, certified: SolutionFields) -> set[Unknown]:

@@ -40,7 +40,7 @@ MOST_FAULTS = 1_000
 INFINITIES = {
     **dict.fromkeys(("lower_bound", "float_bound", "min_eigenvalue"), -math.inf),
     **dict.fromkeys(("weakest", "degrees_of_freedom", "standard_deviations_deg", "standard_deviations_mm"), math.inf),
-    "radius_mm": math.inf,
+    **dict.fromkeys(("radius_mm", "stated_deviations", "innovation_deviations"), math.inf),
 }
 
 

@@ -1,0 +1,201 @@
+"""What a refinement from corners found besides poses: intrinsics, boards, and errors in pixels; as files keep it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.vision.camera import Camera
+
+#: The name of a board's size among its numbers: its covariance is that of the target's scale.
+SIZE = "size"
+#: By region of the image, rows from the top, columns from the left; None where no corner was seen.
+Regions = tuple[tuple[float | None, ...], ...]
+
+
+@dataclass(frozen=True)
+class SensorReprojection:
+    """Errors of a sensor's corners.
+
+    Attributes
+    ----------
+    images, corners, left_out : int
+        How many count, and corners that were left out because they disagree with all others.
+    rms_px : float
+        Root mean square of the corners that count, along each axis, pixels.
+    held_out_px, held_out_mm : float or None
+        Root mean square length of the error in images that were left out; in pixels, and on the target. None where
+        images are too few to leave some out.
+    regions_px : tuple of tuple of float or None
+        The former by region of the image, rows from the top; None where no corner was seen.
+    """
+
+    images: int
+    corners: int
+    left_out: int
+    rms_px: float
+    held_out_px: float | None = None
+    held_out_mm: float | None = None
+    regions_px: Regions = ()
+
+
+@dataclass(frozen=True)
+class TriedModel:
+    """A model that was tried.
+
+    Attributes
+    ----------
+    words : str
+        What it takes as known.
+    held_out_px, held_out_mm : float
+        How well it predicts images that were left out: in pixels, and on the target.
+    is_chosen : bool
+    """
+
+    words: str
+    held_out_px: float
+    held_out_mm: float
+    is_chosen: bool
+
+
+@dataclass(frozen=True)
+class Consequence:
+    """How far a frame would be off.
+
+    Attributes
+    ----------
+    frame : str
+    cause : str
+        In words, with its size.
+    rotation_deg, translation_mm : float
+        Of an error of A: one standard deviation, along the worst axis.
+    """
+
+    frame: str
+    cause: str
+    rotation_deg: float
+    translation_mm: float
+
+
+@dataclass(frozen=True)
+class BoardShape:
+    """What was estimated of a board.
+
+    Attributes
+    ----------
+    names : tuple of str
+        "size" (its size less the stated one, a share of 1), "warp_x" and "warp_y" (heights of its edge over its middle
+        along x and y, metres).
+    values, standard_deviations : tuple of float
+        In that order.
+    """
+
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+    standard_deviations: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Reprojection:
+    """A refinement from corners in numbers.
+
+    Attributes
+    ----------
+    rms_px : float
+        Root mean square of all corners that count, along each axis, pixels.
+    corner_px : float
+        Standard deviation of a corner along each axis, as estimated.
+    carrier_poses : "exact", "estimated" or "given"
+        Whether the carriers' poses A count as exact, or their noise was estimated or given.
+    carrier_rotation_rad, carrier_translation_m : float
+        A's noise about and along each axis; 0 where A is exact.
+    sensors : dict of str to SensorReprojection
+    boards : dict of str to BoardShape
+        By target, where something of it is free.
+    tried : tuple of TriedModel
+        The models that were compared, the best first.
+    consequences : tuple of Consequence
+        What errors of kept intrinsics, and of A, would do to each frame.
+    """
+
+    rms_px: float
+    corner_px: float
+    carrier_poses: Literal["exact", "estimated", "given"]
+    carrier_rotation_rad: float
+    carrier_translation_m: float
+    sensors: dict[str, SensorReprojection]
+    boards: dict[str, BoardShape]
+    tried: tuple[TriedModel, ...]
+    consequences: tuple[Consequence, ...]
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A sensor's intrinsics as they were estimated; its parameters are fx, fy, cx, cy and the lens's coefficients.
+
+    Attributes
+    ----------
+    model : str
+        As `Camera.model`.
+    width, height : int
+        Pixels.
+    shared_with : tuple of str
+        Other sensors with the same camera.
+    names : tuple of str
+        Of the parameters.
+    values, standard_deviations : tuple of float
+    stated : tuple of float
+        What was stated: the prior's mean.
+    stated_deviations : tuple of float
+        The prior's, as widened; infinite: no prior.
+    stated_as : "calibration", "nominal" or "unknown"
+    widened : float
+        By how much the prior was widened: 1 where the images do not contradict what was stated.
+    innovation_deviations : float
+        How far what was stated is from what the images say, in standard deviations.
+    held_by_prior : tuple of str
+        Parameters that the images do not determine.
+    rms_px : float
+        Of the corners that count, along each axis.
+    projection_px : tuple of tuple of float or None
+        Standard deviation of the projection of points at `projection_m` before the camera, pixels, by region of the
+        image.
+    projection_m : float
+    """
+
+    model: str
+    width: int
+    height: int
+    shared_with: tuple[str, ...]
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+    standard_deviations: tuple[float, ...]
+    stated: tuple[float, ...]
+    stated_deviations: tuple[float, ...]
+    stated_as: Literal["calibration", "nominal", "unknown"]
+    widened: float
+    innovation_deviations: float
+    held_by_prior: tuple[str, ...]
+    rms_px: float
+    projection_px: Regions = ()
+    projection_m: float = 0.0
+
+    @property
+    def camera(self) -> Camera:
+        """The camera with these intrinsics."""
+        return camera_of(self, self.values)
+
+    @property
+    def stated_camera(self) -> Camera:
+        """The camera as it was stated."""
+        return camera_of(self, self.stated)
+
+
+def camera_of(intrinsics: Intrinsics, values: tuple[float, ...]) -> Camera:
+    """The camera with some values of an intrinsics' parameters; CameraError where they are none."""
+    fx, fy, cx, cy, *D = values
+    K: Array = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Camera.of(intrinsics.width, intrinsics.height, intrinsics.model, K, np.array(D), "intrinsics of the result")

@@ -1,0 +1,168 @@
+"""A refinement from corners in the form of every refinement: poses, joint covariance, GTSAM graph; and in numbers.
+
+What the poses' noise model found beyond independent errors of A widens the covariance. Errors that vary with the
+configuration of the arm, and their constant part, go through the linear answer of the corners (`systematic`). Errors
+that are alike in neighbours in time make N images worth W: the covariance grows by N / W.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.refined import PairNoise, Refined
+from gtsam_rwhec.refinement.refining import movements
+from gtsam_rwhec.refinement.reprojection_found import SIZE, BoardShape, Intrinsics, Reprojection
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.reprojection.corner_views import SHAPE
+from gtsam_rwhec.reprojection.intrinsics import Stated
+from gtsam_rwhec.reprojection.refined import CornersRefined
+
+#: The numbers of a board's shape.
+SHAPE_NAMES = (SIZE, "warp_x", "warp_y")
+assert len(SHAPE_NAMES) == SHAPE
+
+
+def as_refined(
+    base: Refined,
+    corners: CornersRefined,
+    reprojection: Reprojection,
+    intrinsics: Mapping[str, Intrinsics],
+    more: Array | None = None,
+) -> Refined:
+    """The poses, covariances and graph of a refinement from corners, in the place of those from poses.
+
+    Parameters
+    ----------
+    base : Refined
+        The refinement from the same images' poses.
+    corners : CornersRefined
+    reprojection, intrinsics
+        The same in numbers.
+    more : (d, d) array, optional
+        Covariance of `corners`' unknowns beyond its own.
+    """
+    joint = _joint(base, corners, more)
+    freedom = min((value for (letter, _), value in corners.freedom.items() if letter in "xy"), default=np.inf)
+    cost = float(corners.graph.graph.error(corners.graph.values(corners.point)))
+    graph = corners.graph
+    keys = {name: key for keys in (graph.x, graph.y) for name, key in keys.items()}
+    keys |= {f"intrinsics:{name}": graph.k[graph.model.camera_of[name]] for name in corners.Y}
+    keys |= {f"shape:{name}": key for name, key in graph.b.items()}
+    return replace(
+        base,
+        X=corners.X,
+        Y=corners.Y,
+        scale=_scale(base, corners),
+        graph=graph.graph,
+        values=graph.values(corners.point),
+        keys=keys,
+        noise_source="estimated",
+        noise={
+            pair: PairNoise(noise.rotation_rad, noise.translation_m, (freedom, freedom))
+            for pair, noise in base.noise.items()
+        },
+        cost=cost,
+        initial_cost=cost,
+        iterations=corners.iterations,
+        moved=movements(base.solution, corners.X, corners.Y),
+        joint=joint,
+        reprojection=reprojection,
+        intrinsics=dict(intrinsics),
+    )
+
+
+def boards_of(corners: CornersRefined) -> dict[str, BoardShape]:
+    """What is free of each board, with its deviations."""
+    found = {}
+    for name in corners.X:
+        free = corners.graph.model.free_shape(name)
+        if len(free):
+            deviations = np.sqrt(np.diagonal(corners.covariance(f"shape:{name}")))
+            found[name] = BoardShape(
+                tuple(SHAPE_NAMES[i] for i in free),
+                tuple(corners.shapes[name][free].tolist()),
+                tuple(deviations.tolist()),
+            )
+    return found
+
+
+def intrinsics_of(corners: CornersRefined, stated: Mapping[str, Stated]) -> dict[str, Intrinsics]:
+    """Each sensor's intrinsics in numbers, without the projection's uncertainty; `stated` says where they are from."""
+    found = {}
+    camera_of = corners.graph.model.camera_of
+    for name, refined in corners.intrinsics.items():
+        camera, mean = refined.camera, corners.graph.model.camera_priors[camera_of[name]][0]
+        found[name] = Intrinsics(
+            model=camera.model,
+            width=camera.width,
+            height=camera.height,
+            shared_with=tuple(other for other in camera_of if other != name and camera_of[other] == camera_of[name]),
+            names=refined.names,
+            values=tuple(corners.point.cameras[camera_of[name]].tolist()),
+            standard_deviations=tuple(np.sqrt(np.diagonal(refined.covariance)).tolist()),
+            stated=tuple(mean.tolist()),
+            stated_deviations=tuple(refined.stated_deviations.tolist()),
+            stated_as=stated[name],
+            widened=refined.widened,
+            innovation_deviations=refined.innovation.deviations,
+            held_by_prior=refined.held_by_prior,
+            rms_px=refined.rms_px,
+        )
+    return found
+
+
+def _joint(base: Refined, corners: CornersRefined, more: Array | None) -> JointCovariance:
+    """The covariance of frames, scales, offsets, intrinsics and shapes, in GTSAM's order of the unknowns.
+
+    Sensors that share a camera have its rows each: the covariance is singular there, as it is.
+    """
+    covariance = corners.joint if more is None else corners.joint + more
+    parts: list[tuple[Unknown, slice, float | Array]] = []
+    for name, (letter, owner) in corners.names.items():
+        rows = corners.slots[letter, owner]
+        if letter in "xy":
+            parts.append((Unknown(UnknownKind.FRAME, owner), rows, 1.0))
+        elif letter == "b":
+            free = corners.graph.model.free_shape(owner)
+            first = rows.start
+            if free[0] == 0:  # the size: scale = stated / true = 1 / (1 + s)
+                by_s = -1.0 / (1.0 + corners.shapes[owner][0]) ** 2
+                parts.append((Unknown(UnknownKind.SCALE, owner), slice(first, first + 1), by_s))
+                first += 1
+            if first < rows.stop:
+                parts.append((Unknown(UnknownKind.SHAPE, owner), slice(first, rows.stop), 1.0))
+        elif letter == "k":
+            parts.append((Unknown(UnknownKind.INTRINSICS, name.partition(":")[2]), rows, 1.0))
+        else:
+            parts.append((Unknown(UnknownKind.TIME_OFFSET, owner), rows, 1.0))
+    slots: dict[Unknown, slice] = {}
+    index: list[int] = []
+    factors: list[Array] = []
+    end = 0
+    for unknown, rows, factor in parts:
+        width = rows.stop - rows.start
+        slots[unknown] = slice(end, end + width)
+        index += range(rows.start, rows.stop)
+        factors.append(np.full(width, factor))
+        end += width
+    scaling = np.concatenate(factors)
+    finite = covariance[np.ix_(index, index)] * np.outer(scaling, scaling)
+    length = float(base.joint.unit[base.joint.slots[Unknown(UnknownKind.FRAME, next(iter(corners.X)))]][3])
+    unit = np.ones(end)
+    for unknown, rows in slots.items():
+        if unknown.kind is UnknownKind.FRAME:
+            unit[rows.start + 3 : rows.stop] = length
+    return JointCovariance(slots, finite, np.zeros((end, 0)), unit)
+
+
+def _scale(base: Refined, corners: CornersRefined) -> float | dict[str, float]:
+    """Stated / true lengths: those that are free here, else as before."""
+    free = {name: 1.0 / (1.0 + float(shape[0])) for name, shape in corners.shapes.items()}
+    if isinstance(base.scale, float):
+        return base.scale
+    return base.scale | {name: value for name, value in free.items() if 0 in corners.graph.model.free_shape(name)}

@@ -1,0 +1,89 @@
+"""A refinement from corners in the form of every refinement."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from simulated_cells import Cell, cell
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.noise_choice import estimated
+from gtsam_rwhec.noise_model.found import NoiseInData
+from gtsam_rwhec.noise_model.in_corners import beyond_independent_errors
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.reprojection_found import Reprojection
+from gtsam_rwhec.reprojection.as_refined import as_refined, boards_of, intrinsics_of
+from gtsam_rwhec.reprojection.refined import CornersRefined
+
+
+@cache
+def made() -> tuple[Cell, Refined, NoiseInData, CornersRefined, Refined]:
+    """A cell, its refinement from poses with the noise, from corners, and the latter in the form of the former."""
+    given = cell(5, images=30, stated="calibration", carrier=(5e-4, 2e-4), shape=(0.01, 0.0, 0.0))
+    problem = given.observations.poses()
+    problem.scale = "per_target"
+    base, noise, _ = estimated(problem, rw.solve(problem), {}, rw.CalibrateOptions(), lambda _: None)
+    assert noise.model is not None
+    options = rw.CornerOptions(stated="calibration", size_share=0.05)
+    corners = rw.refine_corners(given.observations, base.X, base.Y, options)
+    intrinsics = intrinsics_of(corners, dict.fromkeys(corners.Y, "calibration"))
+    found = Reprojection(0.1, 0.1, "estimated", 5e-4, 2e-4, {}, boards_of(corners), (), ())
+    return given, base, noise.model, corners, as_refined(base, corners, found, intrinsics)
+
+
+def test_poses_covariances_and_names_are_those_of_the_corners() -> None:
+    _, _, _, corners, refined = made()
+    assert set(refined.names) == {
+        "board", "cam_0", "cam_1", "intrinsics:cam_0", "intrinsics:cam_1", "scale:board",
+    }  # fmt: skip
+    for name in ("board", "cam_0", "cam_1", "intrinsics:cam_1"):
+        np.testing.assert_allclose(refined.covariance(name), corners.covariance(name), rtol=1e-9)
+    together = refined.covariance("cam_0", "intrinsics:cam_0")
+    np.testing.assert_allclose(together, corners.covariance("cam_0", "intrinsics:cam_0"), rtol=1e-9)
+    assert refined.X["board"].equals(corners.X["board"], 0.0)
+    assert refined.graph.error(refined.values) == pytest.approx(refined.cost)
+    assert all(refined.values.exists(key) for key in refined.keys.values())
+    assert 5.0 < refined.degrees_of_freedom < 1e5
+
+
+def test_a_size_is_a_scale_as_everywhere() -> None:
+    given, _, _, corners, refined = made()
+    assert isinstance(refined.scale, dict)
+    true = 1.0 / (1.0 + given.shape[0])
+    sigma = float(np.sqrt(refined.covariance("scale:board")[0, 0]))
+    assert abs(refined.scale["board"] - true) < 4.0 * sigma
+    share = float(np.sqrt(corners.covariance("shape:board")[0, 0]))
+    assert sigma == pytest.approx(share * refined.scale["board"] ** 2)
+
+
+def test_intrinsics_are_in_numbers_that_make_the_camera_again() -> None:
+    given, _, _, corners, refined = made()
+    for name, intrinsics in refined.intrinsics.items():
+        np.testing.assert_array_equal(intrinsics.camera.K, corners.intrinsics[name].camera.K)
+        np.testing.assert_array_equal(intrinsics.camera.D, corners.intrinsics[name].camera.D)
+        np.testing.assert_allclose(intrinsics.stated_camera.K, given.observations.cameras[name].K)
+        assert intrinsics.names[:5] == ("fx", "fy", "cx", "cy", "k1")
+        assert intrinsics.stated_as == "calibration"
+        off = np.array(intrinsics.values)[:4] - given.cameras[name].K[[0, 1, 0, 1], [0, 1, 2, 2]]
+        assert (np.abs(off) < 4.0 * np.array(intrinsics.standard_deviations)[:4]).all()
+
+
+def test_what_the_poses_noise_model_found_widens_the_poses_alone() -> None:
+    _, base, noise, corners, _ = made()
+    more = beyond_independent_errors(corners, noise)
+    assert np.linalg.eigvalsh(corners.joint + more).min() > 0.0
+    wider = corners.joint + more
+    for letter, name in corners.slots:
+        rows = corners.slots[letter, name]
+        before, after = np.diagonal(corners.joint)[rows], np.diagonal(wider)[rows]
+        if letter in "xy":
+            assert (after > before).all()
+        else:
+            np.testing.assert_allclose(after, before)
+    # a constant error moves all frames of a carrier together: two cameras to each other are as before
+    both = as_refined(base, corners, Reprojection(0.1, 0.1, "estimated", 0.0, 0.0, {}, {}, (), ()), {}, more)
+    before_deg, _ = np.sqrt(np.diagonal(corners.covariance("cam_0"))[:2])
+    relative = np.sqrt(np.diagonal(both.relative("cam_0", "cam_1")[1]))
+    assert relative[0] < 20.0 * before_deg
