@@ -12,7 +12,7 @@ from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.first_rig.boards_seen import BoardSeen, boards_seen
 from gtsam_rwhec.first_rig.folder_contents import FolderPoses, ImageFolder, read_folder, read_gray
-from gtsam_rwhec.first_rig.guessed_intrinsics import guessed_intrinsics
+from gtsam_rwhec.first_rig.guessed_intrinsics import STATED, guessed_intrinsics
 from gtsam_rwhec.first_rig.log_contents import ImageTopic
 from gtsam_rwhec.first_rig.names import camera_name, free_name
 from gtsam_rwhec.first_rig.pose_origin import Rest, origin_of, rest_of
@@ -21,9 +21,10 @@ from gtsam_rwhec.first_rig.roles import RoleEvidence
 from gtsam_rwhec.first_rig.targets import Guess, boards_guessed, targets_seen, with_size
 from gtsam_rwhec.logs.matched_images import pose_stamps
 from gtsam_rwhec.rig.field_types import is_text
+from gtsam_rwhec.rig.intrinsics_section import Intrinsics
 from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.rig.sections import Carriers, Intrinsics, PoseSource, Sensor
+from gtsam_rwhec.rig.sections import Carriers, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
 from gtsam_rwhec.trajectories.trajectory import Trajectory
@@ -140,7 +141,8 @@ def _text(
     for name, camera, found in zip(names, cameras, boards, strict=True):
         assert camera.poses is not None
         if camera.camera is not None:
-            section = Intrinsics(file=camera.intrinsics, camera=camera.camera_name or None)
+            section = Intrinsics(file=camera.intrinsics, camera=camera.camera_name or None, stated="nominal")
+            remarks["sensors", name, "intrinsics"] = STATED
             stated.append((name, camera.camera))
         else:
             guess_ = guessed_intrinsics(camera.size, found)

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.first_rig.boards_seen import BoardSeen
-from gtsam_rwhec.rig.sections import Intrinsics
+from gtsam_rwhec.rig.intrinsics_section import Intrinsics
 from gtsam_rwhec.vision.zhang import fitted_to_planes
 
+#: Beside intrinsics that were found: who calibrated the camera says so.
+STATED = "stated: calibration if this camera was calibrated, with this lens and focus"
 #: A board's views determine a focal length with at least this number of images.
 LEAST_IMAGES = 6
 #: Focal lengths, over the images' width, that lenses on robots have.

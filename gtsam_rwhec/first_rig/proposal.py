@@ -9,6 +9,7 @@ from gtsam_rwhec.errors import RigError
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.first_rig.boards_seen import boards_seen
 from gtsam_rwhec.first_rig.carriers import MovingPair, moving_pairs
+from gtsam_rwhec.first_rig.guessed_intrinsics import STATED
 from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic, LogContents, read_contents
 from gtsam_rwhec.first_rig.log_evidence import evidence_of_log
 from gtsam_rwhec.first_rig.names import camera_name, free_name
@@ -18,9 +19,10 @@ from gtsam_rwhec.first_rig.targets import TODO as _TODO_SIZE
 from gtsam_rwhec.first_rig.targets import Guess, boards_guessed, targets_seen, with_size
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.rig.field_types import is_name, is_text
+from gtsam_rwhec.rig.intrinsics_section import Intrinsics
 from gtsam_rwhec.rig.rig import Rig
 from gtsam_rwhec.rig.rig_file import parse_rig
-from gtsam_rwhec.rig.sections import Carriers, Intrinsics, Sensor
+from gtsam_rwhec.rig.sections import Carriers, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
 
@@ -221,8 +223,8 @@ def _intrinsics(topic: str, frame: str, known: dict[str, str], sensors: int) -> 
     best = [name for name in candidates if shared[name] == most]
     if not best or (not same_frame and not most and (len(known), sensors) != (1, 1)):
         return None, ""
-    remark = f"TODO or {', '.join(best[1:])}" if len(best) > 1 else ""
-    return Intrinsics(topic=best[0]), remark
+    remark = f"TODO or {', '.join(best[1:])}; {STATED}" if len(best) > 1 else STATED
+    return Intrinsics(topic=best[0], stated="nominal"), remark
 
 
 def _shared(first: str, second: str) -> int:

@@ -9,6 +9,7 @@ from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.sections import Sensor
 
 #: Detection depends on these keys of a sensor's section.
 DETECTED_BY = ("images", "detections", "intrinsics")
@@ -23,7 +24,7 @@ class Changes:
     """Keys in which a rig file differs from the one that a log was made with, by the stage that must run again.
 
     Sensors and targets that the new rig file leaves out do not count. Keys that only solving depends on (sizes, noise,
-    robust) do not count either.
+    robust, stated) do not count either.
     """
 
     detection: tuple[str, ...]
@@ -75,11 +76,19 @@ def _of_detection(made_with: Rig, rig: Rig) -> Iterator[str]:
         if old is None:
             yield f"sensors.{name}"
         else:
-            yield from (f"sensors.{name}.{key}" for key in DETECTED_BY if getattr(old, key) != getattr(sensor, key))
+            before, now = _for_detection(old), _for_detection(sensor)
+            yield from (f"sensors.{name}.{key}" for key in DETECTED_BY if getattr(before, key) != getattr(now, key))
     if made_with.detection != rig.detection:
         yield "detection"
     if made_with.corner_px != rig.corner_px:
         yield "noise.corner_px"
+
+
+def _for_detection(sensor: Sensor) -> Sensor:
+    """The section without what only refinement asks: where the intrinsics come from."""
+    if sensor.intrinsics is None:
+        return sensor
+    return sensor.model_copy(update={"intrinsics": sensor.intrinsics.model_copy(update={"stated": None})})
 
 
 def _of_cleaning(made_with: Rig, rig: Rig) -> Iterator[str]:

@@ -6,7 +6,7 @@ from gtsam_rwhec.errors import CameraError, FileFormatError, LogError
 from gtsam_rwhec.logs import IntrinsicsRecord, Log
 from gtsam_rwhec.logs.message_kinds import INTRINSICS_SCHEMAS
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig.sections import Intrinsics
+from gtsam_rwhec.rig.intrinsics_section import Intrinsics
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.intrinsics_files import read_cameras
 

@@ -15,10 +15,10 @@ from .unfinished import TodoLine as TodoLine
 from .unfinished import todo_lines as todo_lines
 
 # The sections of a rig file.
+from .intrinsics_section import Intrinsics as Intrinsics
 from .sections import Carriers as Carriers
 from .sections import Cleaning as Cleaning
 from .sections import DetectionNoise as DetectionNoise
-from .sections import Intrinsics as Intrinsics
 from .sections import Link as Link
 from .sections import PoseNoise as PoseNoise
 from .sections import PoseSource as PoseSource

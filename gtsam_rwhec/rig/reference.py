@@ -9,9 +9,10 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from gtsam_rwhec.rig.field_types import in_yaml, unit_of
+from gtsam_rwhec.rig.intrinsics_section import Intrinsics
 from gtsam_rwhec.rig.json_schema import detection_keys, rig_file_schema
 from gtsam_rwhec.rig.rig import RigFile
-from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Intrinsics, Link, PoseNoise, PoseSource, Sensor
+from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Link, PoseNoise, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import BundleTagPlace, TargetSection
 from gtsam_rwhec.vision.targets import FAMILIES
 

@@ -15,7 +15,8 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from gtsam_rwhec.files.yaml_lines import KeyPath, dotted
 from gtsam_rwhec.rig.contradictions import contradictions
 from gtsam_rwhec.rig.field_types import Name
-from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Section, Sensor
+from gtsam_rwhec.rig.section import Section
+from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.targets import Target

@@ -12,7 +12,7 @@ from pydantic_core import ErrorDetails
 
 from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
-from gtsam_rwhec.rig import sections, target_sections
+from gtsam_rwhec.rig import intrinsics_section, sections, target_sections
 from gtsam_rwhec.rig.field_types import in_yaml, unit_of
 from gtsam_rwhec.rig.kalibr_targets import with_kalibr_targets
 from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
@@ -38,7 +38,7 @@ _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     ("carriers", "poses"): sections.PoseSource,
     ("carriers", "noise"): sections.PoseNoise,
     ("sensors", "*"): sections.Sensor,
-    ("sensors", "*", "intrinsics"): sections.Intrinsics,
+    ("sensors", "*", "intrinsics"): intrinsics_section.Intrinsics,
     ("sensors", "*", "link"): sections.Link,
     ("noise",): sections.DetectionNoise,
     ("cleaning",): sections.Cleaning,

@@ -1,4 +1,4 @@
-"""The sections of a rig file, field by field; `target_sections` has the sections of targets.
+"""The sections of a rig file, field by field; `target_sections` and `intrinsics_section` have the others.
 
 No value is converted, and an unknown key is an error. What a key is, its example, and its unit where its name does not
 end with it stand beside the field: the reference (`reference`) and the JSON Schema (`json_schema`) are made of them.
@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
+from gtsam_rwhec.reprojection.intrinsics import Stated
 from gtsam_rwhec.rig.camera_link import link_of_optical
 from gtsam_rwhec.rig.field_types import (
     EulerAxes,
@@ -21,28 +22,8 @@ from gtsam_rwhec.rig.field_types import (
     TimeOffset,
     list_of,
 )
-from gtsam_rwhec.vision.camera import Camera
-
-
-class Section(BaseModel):
-    """Rules for all sections: no unknown keys, no conversion, only finite numbers."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-    def _given(self, *names: str) -> list[str]:
-        """Those of these keys that the section has."""
-        return [name for name in names if getattr(self, name) is not None]
-
-
-def one_of(*choices: str | tuple[str, ...], together: tuple[tuple[str, ...], ...] = ()) -> ConfigDict:
-    """For the JSON Schema of a section: exactly one of these keys, or sets of keys, must be there.
-
-    Of each tuple in `together`, the first key needs the others.
-    """
-    said: dict[str, Any] = {"oneOf": [{"required": [keys] if isinstance(keys, str) else [*keys]} for keys in choices]}
-    if together:
-        said["dependencies"] = {first: others for first, *others in together}
-    return ConfigDict(json_schema_extra=said)
+from gtsam_rwhec.rig.intrinsics_section import IntrinsicsOrFile
+from gtsam_rwhec.rig.section import Section, one_of
 
 
 class PoseNoise(Section):
@@ -159,96 +140,6 @@ class Carriers(Section):
     )
 
 
-class Intrinsics(Section):
-    """Where a camera's intrinsics are: a topic, a Kalibr camchain, another file, or numbers in this section."""
-
-    model_config = one_of(
-        "topic", "kalibr", "file", "K",
-        together=(("width", "K"), ("height", "K"), ("model", "K"), ("D", "K")),
-    )  # fmt: skip
-
-    topic: Text | None = Field(
-        default=None, description="a topic of CameraInfo or CameraCalibration", examples=["/cam_left/camera_info"]
-    )
-    kalibr: Text | None = Field(
-        default=None,
-        description="Kalibr's camchain: the same as file",
-        examples=["camchain.yaml"],
-    )
-    camera: Text | None = Field(
-        default=None,
-        description="with a file of several cameras: the one; without it the one of the sensor's name",
-        examples=["cam0"],
-    )
-    file: Text | None = Field(
-        default=None,
-        description="a file of Kalibr, COLMAP, ROS, OpenCV or plain numbers; intrinsics: FILE is the same in short",
-        examples=["left.yaml"],
-    )
-    model: str | None = Field(
-        default=None,
-        description="with K: what D is: pinhole (no D), radtan (OpenCV, plumb_bob) or equidistant (fisheye)",
-        examples=["radtan"],
-    )
-    width: int | None = Field(
-        default=None, description="with K, in place of size", examples=[640], json_schema_extra={"unit": "pixels"}
-    )
-    height: int | None = Field(
-        default=None, description="with K, in place of size", examples=[480], json_schema_extra={"unit": "pixels"}
-    )
-    size: Annotated[tuple[int, int], list_of(2, "[width, height] in pixels")] | None = Field(
-        default=None,
-        description="[width, height], with K or with a file that lacks it",
-        examples=[[640, 480]],
-        json_schema_extra={"unit": "pixels"},
-    )
-    K: Annotated[tuple[float, float, float, float], list_of(4, "[fx, fy, cx, cy] in pixels")] | None = Field(
-        default=None,
-        description="[fx, fy, cx, cy]; the middle of the first pixel is at 0, 0",
-        examples=[[550.0, 550.0, 320.0, 240.0]],
-        json_schema_extra={"unit": "pixels"},
-    )
-    D: tuple[float, ...] | None = Field(
-        default=None, description="with model: coefficients in OpenCV's order", examples=[[-0.1, 0.02, 0.0, 0.0]]
-    )
-
-    @model_validator(mode="after")
-    def _is_one(self) -> Intrinsics:
-        of_file = self.file is not None or self.kalibr is not None
-        # A file of OpenCV may lack the size of the images.
-        numbers = self._given("model", "width", "height", "K", "D", *([] if of_file else ["size"]))
-        sources = self._given("topic", "kalibr", "file") + (["numbers"] if numbers else [])
-        if len(sources) != 1:
-            raise ValueError(
-                f"{' and '.join(sources) or 'nothing'} given; give one of topic, kalibr (with camera), file, or "
-                "numbers (K, size, and model and D with distortion)"
-            )
-        if self.camera is not None and not of_file:
-            raise ValueError("camera goes with a file: {file: camchain.yaml, camera: cam0}")
-        if numbers:
-            self.camera_of_numbers("these numbers")
-        return self
-
-    def camera_of_numbers(self, where: str) -> Camera:
-        """The camera of size, K, model and D; `ValueError` if a number is missing or absurd."""
-        if self.size is not None and self._given("width", "height"):
-            raise ValueError("size has the width and the height already; leave width and height out")
-        width, height = self.size or (self.width, self.height)
-        if width is None or height is None or self.K is None:
-            given = {"size: [width, height]": width is not None and height is not None, "K": self.K is not None}
-            raise ValueError(f"{' and '.join(name for name, there in given.items() if not there)} missing")
-        if self.model is None and self.D and any(self.D):
-            raise ValueError("D without model; say which coefficients these are: model: radtan or equidistant")
-        fx, fy, cx, cy = self.K
-        K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-        return Camera.of(width, height, self.model or "pinhole", K, self.D or (), where)
-
-
-def _file_or_section(given: Any) -> Any:
-    """A section of intrinsics; text alone is a file."""
-    return {"file": given} if isinstance(given, str) else given
-
-
 class Link(Section):
     """The frame of a camera's body, of which its driver publishes the optical frame: exported in its place."""
 
@@ -298,7 +189,7 @@ class Sensor(Section):
     detections: Text | None = Field(
         default=None, description="topic of a driver's detections, in place of images", examples=["/tag_detections"]
     )
-    intrinsics: Annotated[Intrinsics, BeforeValidator(_file_or_section), OrText("a file of intrinsics")] | None = Field(
+    intrinsics: IntrinsicsOrFile | None = Field(
         default=None,
         description="with images: a file, or a section; detections with poses need none",
         examples=["left.yaml", {"topic": "/cam_left/camera_info"}],
@@ -320,6 +211,11 @@ class Sensor(Section):
         description="the frame of a camera's body; it takes the optical frame's place in the files for ROS",
         examples=["camera_link"],
     )
+
+    @property
+    def stated(self) -> Stated:
+        """Where the stated intrinsics come from; "unknown" where none are stated."""
+        return "unknown" if self.intrinsics is None else self.intrinsics.stated_as
 
     @model_validator(mode="after")
     def _is_one(self) -> Sensor:

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 from pydantic import Field
 
 from gtsam_rwhec.rig.field_types import InSchema, Length, Positive, list_of
-from gtsam_rwhec.rig.sections import Section
+from gtsam_rwhec.rig.section import Section
 from gtsam_rwhec.vision.tag_boards import Bundle, BundleTag, TagGrid
 from gtsam_rwhec.vision.targets import FAMILIES, AprilGrid, Charuco, Checkerboard, CircleGrid, Tag, Target
 

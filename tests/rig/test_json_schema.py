@@ -82,6 +82,7 @@ def test_rig_files_of_the_pages_are_valid(text: str) -> None:
         (FULL, "sensors: hand", "sensors: 1hand"),
         (FULL, "time_offset: estimate", "time_offset: guess"),
         (FOLDER, "intrinsics: a.yaml", "frame: f"),
+        (FOLDER, "intrinsics: a.yaml", "intrinsics: {file: a.yaml, stated: factory}"),
         (FULL, "images: /cam_left/image", "images: /cam_left/image\n    detections: /tags"),
         (FULL, "sizes: check", "sizes: maybe"),
         (FULL, "noise: estimate", "noise: {rotation_deg: 1}"),

@@ -138,6 +138,25 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         read_rig(tmp_path / "rig.yaml")
 
 
+@pytest.mark.parametrize(
+    "source",
+    ["file: left.yaml", "kalibr: camchain.yaml, camera: cam0", "topic: /camera_info", "K: [9, 9, 4, 4], size: [9, 9]"],
+)
+def test_every_form_of_intrinsics_says_where_they_come_from(source: str) -> None:
+    def stated(intrinsics: str) -> str:
+        rig = parse_rig(MINIMAL.replace("detections: /tags", f"images: /image, intrinsics: {intrinsics}"), "rig.yaml")
+        assert parse_rig(rig_text(rig), "rig.yaml") == rig
+        return rig.sensors["cam"].stated
+
+    assert stated(f"{{{source}}}") == "nominal"
+    assert stated(f"{{{source}, stated: nominal}}") == "nominal"
+    assert stated(f"{{{source}, stated: calibration}}") == "calibration"
+    assert stated("left.yaml") == "nominal"
+    assert parse_rig(MINIMAL, "rig.yaml").sensors["cam"].stated == "unknown"  # a driver's detections
+    with pytest.raises(RigError, match=r"line 2: sensors.cam.intrinsics.stated: 'factory'; give 'calibration' or"):
+        stated(f"{{{source}, stated: factory}}")
+
+
 def test_lists_that_are_kept_elsewhere_too() -> None:
     assert get_args(Cleaning.model_fields["robust"].annotation) == get_args(Robust)
     options = asdict(DetectionOptions())
@@ -153,7 +172,10 @@ TOPICS = st.text(PRINTABLE, min_size=1, max_size=12) | st.sampled_from(["/a/b", 
 POSITIVE = st.floats(1e-300, 1e300)
 LENGTHS = st.floats(1e-9, 9.99)
 INTRINSICS = st.one_of(
-    st.builds(lambda topic: Intrinsics(topic=topic), TOPICS),
+    st.builds(
+        lambda topic, stated: Intrinsics(topic=topic, stated=stated),
+        TOPICS, st.sampled_from([None, "calibration", "nominal"]),
+    ),
     st.builds(lambda path, camera: Intrinsics(kalibr=path, camera=camera), TOPICS, TOPICS),
     st.builds(lambda path: Intrinsics(file=path), TOPICS),
     st.builds(
