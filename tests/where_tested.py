@@ -164,7 +164,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/rig": {
         "rig/test_rig_faults.py": "contradictions",
         "export/test_exported_files.py": "camera_link",
-        "rig/test_rig_file.py": "field_types rig sections target_sections written_rig",
+        "rig/test_rig_file.py": "field_types intrinsics_section rig section sections target_sections written_rig",
     },
     "gtsam_rwhec/simulate": {
         "simulate/test_paper_simulations.py": "camera_on_sphere fixed_cameras",
