@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -12,8 +13,11 @@ from rwhec_factors import se3
 from gtsam_rwhec.errors import LogError, StampError, TransformError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer, Topic
+from gtsam_rwhec.refinement.free_space import MOVED
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.trajectories.local_paths import WINDOW_S
+from gtsam_rwhec.trajectories.smooth_path import SmoothPath
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: Seconds. If stamps go back by more than this in the order of the log, a clock was set during the recording.
@@ -22,6 +26,8 @@ BACKWARDS_S = 1.0
 SAME_POSE = 1e-6
 #: Nanoseconds. Stamps must be below this (the year 2116), so that differences and time offsets fit into 64 bits.
 LATEST_NS = 1 << 62
+#: A velocity needs so many poses in all, and so many within half a second.
+FEWEST_POSES, FEWEST_NEAR = 8, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +41,25 @@ class CarrierMotion:
         """A (N, 4, 4) at stamps (N,). It is nan outside the trajectory and in gaps above `max_gap_s`."""
         A, gap_s = self.trajectory.at(stamps_ns)
         return np.where((gap_s > max_gap_s)[:, None, None], np.nan, A)
+
+    def velocities(self, stamps_ns: np.ndarray) -> Array | None:
+        """Velocities (N, 6) at stamps (N,), [omega rad/s, v m/s] in the target carrier's axes, from the poses nearby.
+
+        They are zero where the carriers stand still in all of them, as far as the poses' scatter tells. None where a
+        stamp has fewer than four poses within half a second: between stations nothing is known of the path.
+        """
+        path, window_ns = self.trajectory, round(WINDOW_S * 1e9)
+        near = np.searchsorted(path.stamps_ns, stamps_ns + window_ns, side="right")
+        near -= np.searchsorted(path.stamps_ns, stamps_ns - window_ns)
+        if len(path.T) < FEWEST_POSES or (near < FEWEST_NEAR).any():
+            return None
+        _, velocity, variance = self._smooth.at(stamps_ns)
+        squares, noise = (each.sum(axis=0).reshape(2, 3).sum(axis=1) for each in (velocity**2, variance))
+        return np.zeros_like(velocity) if (squares <= MOVED * noise).all() else velocity
+
+    @cached_property
+    def _smooth(self) -> SmoothPath:
+        return SmoothPath.of(self.trajectory)
 
 
 def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:

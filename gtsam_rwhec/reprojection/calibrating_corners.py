@@ -18,7 +18,7 @@ from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.refining import refine
 from gtsam_rwhec.reprojection.determined import check_arguments
 from gtsam_rwhec.reprojection.first_intrinsics import first_intrinsics
-from gtsam_rwhec.reprojection.observations import Observations, Views
+from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refined import CornersRefined
 from gtsam_rwhec.reprojection.refining_corners import refine_corners
@@ -92,7 +92,7 @@ def calibrate_corners(
         problem = observations.poses(_predicted(observations, refined))
         refined = _refined(problem, robust, tell)
     views = {
-        pair: Views(view.A[good], view.pixels[good])
+        pair: view.selected(good)
         for pair, view in observations.views.items()
         if (good := refined.inliers[Pair(*pair)]).any()
     }

@@ -2,12 +2,13 @@
 
 A corner p of a target's board is seen by a sensor at the pixel of P = Y^-1 A X p', by the camera's parameters. The
 board may be larger than stated, and bent: p' = (1 + s) p + (w_x (x / l)^2 + w_y (y / l)^2) e_z, l the largest distance
-of a corner from the board's origin. A is the carriers' pose at the instant of the image.
+of a corner from the board's origin. A is the carriers' pose at the instant of the image. Where the sensor's clock is
+off by d seconds, it is the pose at that time: A Expmap(d twist), with the carriers' velocity at the instant.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rwhec_factors import se3
@@ -39,6 +40,8 @@ class Stack:
     known : (V, n) booleans
     camera : Camera
         Its model; its parameters are a variable.
+    twist : (V, 6) array, optional
+        The carriers' velocity at each image, [omega rad/s, v m/s].
     """
 
     target: str
@@ -48,13 +51,22 @@ class Stack:
     pixels: Array
     known: np.ndarray
     camera: Camera
+    twist: Array | None = None
+
+    def selected(self, which: np.ndarray) -> Stack:
+        """The images that a mask or an index array selects."""
+        twist = None if self.twist is None else self.twist[which]
+        return replace(
+            self, instant=self.instant[which], pixels=self.pixels[which], known=self.known[which], twist=twist
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Linear:
     """Residuals of a stack (V, 2n), in pixels, and their derivatives (V, 2n, m) by each variable.
 
-    Poses move as T Expmap([omega, v]). A residual is infinite where a corner is behind its camera.
+    Poses move as T Expmap([omega, v]), A at its instant. Of a stack without velocities, those by the time offset are
+    zero. A residual is infinite where a corner is behind its camera.
     """
 
     residual: Array
@@ -63,6 +75,7 @@ class Linear:
     by_A: Array
     by_camera: Array
     by_shape: Array
+    by_time: Array
 
 
 def stacks_of(observations: Observations) -> tuple[tuple[Stack, ...], Array]:
@@ -87,6 +100,7 @@ def stacks_of(observations: Observations) -> tuple[tuple[Stack, ...], Array]:
                 np.where(known[:, :, None], view.pixels, 0.0),
                 known,
                 observations.cameras[sensor],
+                view.twist,
             )
         )
         begin = end
@@ -133,10 +147,12 @@ class _Seen:
         return error.reshape(len(error), -1)
 
 
-def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array) -> _Seen:
+def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float) -> _Seen:
     p, by_shape = shaped(stack.points, shape)
     q = p @ X[:3, :3].T + X[:3, 3]
     B = se3.inverse(Y) @ A[stack.instant]
+    if stack.twist is not None and offset_s != 0.0:
+        B = B @ se3.expmap(offset_s * stack.twist)
     R = B[:, :3, :3]
     P = q @ R.transpose(0, 2, 1) + B[:, None, :3, 3]
     behind = stack.known & (P[..., 2] < NEAREST_M)
@@ -145,22 +161,30 @@ def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array) -> _Seen:
     return _Seen(p, by_shape, q, R, P, z, x, behind)
 
 
-def pixel_errors(stack: Stack, X: Array, Y: Array, A: Array, parameters: Array, shape: Array) -> Array:
+def pixel_errors(
+    stack: Stack, X: Array, Y: Array, A: Array, parameters: Array, shape: Array, offset_s: float = 0.0
+) -> Array:
     """Errors (V, 2n) of a stack in pixels: as `linearised`, without derivatives."""
-    seen = _seen(stack, X, Y, A, shape)
+    seen = _seen(stack, X, Y, A, shape, offset_s)
     pixels = pixels_of(stack.camera, parameters, seen.x)
     return seen.errors(stack, pixels)
 
 
-def depths(stack: Stack, X: Array, Y: Array, A: Array, shape: Array) -> Array:
+def depths(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float = 0.0) -> Array:
     """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
-    return _seen(stack, X, Y, A, shape).z
+    return _seen(stack, X, Y, A, shape, offset_s).z
 
 
-def linearised(stack: Stack, X: Array, Y: Array, A: Array, parameters: Array, shape: Array) -> Linear:
-    """Residuals and derivatives of a stack at X, Y (4, 4), the instants' poses A (I, 4, 4), a camera and a shape."""
+def linearised(
+    stack: Stack, X: Array, Y: Array, A: Array, parameters: Array, shape: Array, offset_s: float = 0.0
+) -> Linear:
+    """Residuals and derivatives of a stack at X, Y (4, 4), the instants' poses A (I, 4, 4), a camera and a shape.
+
+    The images were taken `offset_s` after their instants: A Expmap(xi) Expmap(d w) = A Expmap(d w) Expmap(Ad xi) with
+    the adjoint of Expmap(-d w), and Expmap((d + e) w) = Expmap(d w) Expmap(e w).
+    """
     V, n = stack.known.shape
-    at = _seen(stack, X, Y, A, shape)
+    at = _seen(stack, X, Y, A, shape, offset_s)
     x, z, R, P, q, p = at.x, at.z, at.R, at.P, at.q, at.p
     pixels, by_x, by_parameters = pixels_and_derivatives(stack.camera, parameters, x)
     to_x = np.concatenate([np.broadcast_to(np.eye(2), (V, n, 2, 2)), -x[..., None]], axis=-1) / z[..., None, None]
@@ -173,11 +197,19 @@ def linearised(stack: Stack, X: Array, Y: Array, A: Array, parameters: Array, sh
     def rows(block: Array) -> Array:
         return np.ascontiguousarray(block.reshape(V, 2 * n, -1))
 
+    by_A = rows(np.concatenate([by_q @ minus_hat_q, by_q], axis=-1))
+    by_time = np.zeros((V, 2 * n, 1))
+    if stack.twist is not None:
+        by_time = by_A @ stack.twist[..., None]
+        if offset_s != 0.0:
+            by_A = by_A @ se3.adjoint(se3.expmap(-offset_s * stack.twist))
+
     return Linear(
         at.errors(stack, pixels),
         rows(np.concatenate([by_p @ -se3.hat(p), by_p], axis=-1)),
         rows(np.concatenate([by_P @ se3.hat(P.reshape(-1, 3)).reshape(V, n, 3, 3), -by_P], axis=-1)),
-        rows(np.concatenate([by_q @ minus_hat_q, by_q], axis=-1)),
+        by_A,
         rows(np.where(seen, by_parameters, 0.0)),
         rows(by_p @ at.by_shape),
+        by_time,
     )

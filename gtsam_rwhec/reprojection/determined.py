@@ -7,11 +7,10 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from gtsam_rwhec.errors import FrameError, OptionError, OutlierError, UnderdeterminedError
+from gtsam_rwhec.errors import CountError, FrameError, OptionError, OutlierError, UnderdeterminedError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.corner_outliers import errors_px
-from gtsam_rwhec.reprojection.corner_views import depths
 from gtsam_rwhec.reprojection.model import Model, Point
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
@@ -43,6 +42,22 @@ def check_shared(options: CornerOptions, sensors: tuple[str, ...]) -> None:
     strange = [name for group in options.shared for name in group if name not in sensors]
     if strange:
         raise FrameError(f"CornerOptions.shared names {strange[0]!r}; the sensors are {', '.join(sensors)}")
+
+
+def check_clocks(options: CornerOptions, observations: Observations) -> None:
+    """FrameError where a time offset is that of a sensor that saw nothing; CountError where velocities are missing."""
+    for name in options.time_offsets:
+        if name not in observations.sensors:
+            raise FrameError(
+                f"CornerOptions.time_offsets names {name!r}; the sensors are {', '.join(observations.sensors)}"
+            )
+        lacking = [pair[0] for pair, view in observations.views.items() if pair[1] == name and view.twist is None]
+        if lacking:
+            raise CountError(
+                f"the time offset of {name} needs the carriers' velocity at each of its images, and those of "
+                f"{', '.join(lacking)} have none: give views as (A, pixels, twist), with twist (N, 6) [omega rad/s, v "
+                f"m/s] in the target carrier's axes; or leave {name} out of CornerOptions.time_offsets"
+            )
 
 
 def check_names(start: object, names: tuple[str, ...], *, letter: str) -> None:
@@ -110,15 +125,19 @@ def check_determined(
         if rotation > limits[0] or translation > limits[1]:
             faults.append(f"{name} (deviation {np.degrees(rotation):.3g} degrees, {translation:.3g} m)")
     if faults:
+        alike = ""
+        if model.offset_priors:
+            clocks = ", ".join(model.offset_priors)
+            alike = f". Or leave {clocks} out of time_offsets: motion that is alike in all images hides them"
         raise UnderdeterminedError(
             f"the images do not determine the pose of {', '.join(faults)}: {_what_there_is(model)} are too few or too "
-            f"much alike; {CURE}"
+            f"much alike; {CURE}{alike}"
         )
     if not (np.isfinite(joint).all() and (np.diagonal(joint) > 0.0).all()):
         names = [
-            {"k": f"intrinsics of {name}", "b": f"shape of {name}"}[letter]
+            {"k": f"intrinsics of {name}", "b": f"shape of {name}", "t": f"time offset of {name}"}[letter]
             for (letter, name), at in slots.items()
-            if letter in "kb" and not (np.diagonal(joint)[at] > 0.0).all()
+            if letter in "kbt" and not (np.diagonal(joint)[at] > 0.0).all()
         ]
         raise UnderdeterminedError(
             f"the images do not determine the {', the '.join(names) or 'unknowns together'}; state intrinsics "
@@ -128,14 +147,7 @@ def check_determined(
 
 def _farthest(model: Model, point: Point) -> float:
     """The largest depth of a corner that was seen, metres."""
-    return max(
-        float(
-            depths(stack, point.X[stack.target], point.Y[stack.sensor], point.A, point.shapes[stack.target])[
-                stack.known
-            ].max()
-        )
-        for stack in model.stacks
-    )
+    return max(float(model.depths(stack, point)[stack.known].max()) for stack in model.stacks)
 
 
 def _frames(model: Model) -> str:

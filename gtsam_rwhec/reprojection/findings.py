@@ -1,4 +1,4 @@
-"""What is doubtful in a refinement from corners, in words with the figures: noise, intrinsics, the optimiser."""
+"""What is doubtful in a refinement from corners, in words with the figures: noise, clocks, intrinsics, optimiser."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.reduced import CARRIER, CORNER_PX
 from gtsam_rwhec.reprojection.refined import CornersRefined
+from gtsam_rwhec.reprojection.stated_intrinsics import HELD
 
 #: Larger noise than any arm or tracker has: rad, m; than any detector has: pixels.
 CARRIER_RAD, CARRIER_M, DETECTOR_PX = np.radians(1.0), 0.01, 2.0
@@ -16,6 +17,8 @@ CARRIER_RAD, CARRIER_M, DETECTOR_PX = np.radians(1.0), 0.01, 2.0
 AT_BOUND = 0.99
 #: An optimum is reached where one more step moves it by less than this, in deviations.
 LAST_STEP = 0.1
+#: Over a longer time than this, s, the carriers' velocity is not constant.
+CONSTANT_S = 0.02
 #: More corners than this share left out are many.
 MANY = 0.2
 
@@ -28,6 +31,7 @@ def findings_of(refined: CornersRefined, options: CornerOptions) -> tuple[str, .
         *_of_carriers(refined, options),
         *_of_corners(refined),
         *_of_convergence(refined, options),
+        *_of_clocks(refined),
         *_of_intrinsics(refined),
     )
 
@@ -77,6 +81,25 @@ def _of_corners(refined: CornersRefined) -> Iterator[str]:
             yield (
                 f"{left_out} of {seen} corners of {stack.target} by {stack.sensor} disagree with the others and are "
                 "left out: look at those images (left_out)."
+            )
+
+
+def _of_clocks(refined: CornersRefined) -> Iterator[str]:
+    model = refined.graph.model
+    for name, offset_s in refined.time_offsets_s.items():
+        deviation = float(np.sqrt(refined.covariance(f"time_offset:{name}")[0, 0]))
+        if deviation > HELD * model.offset_priors[name]:
+            moves = any(stack.twist is not None and stack.twist.any() for stack in model.stacks if stack.sensor == name)
+            why = "move alike" if moves else "stand still"
+            yield (
+                f"The images do not tell the time offset of {name}, since the carriers {why} in all of them: it is "
+                f"{offset_s:+.2g} s, with a deviation of {deviation:.2g} s. Leave {name} out of "
+                "CornerOptions.time_offsets, or take images in motion that speeds up, slows down and turns back."
+            )
+        elif abs(offset_s) > CONSTANT_S:
+            yield (
+                f"The images of {name} were taken {1e3 * offset_s:+.3g} ms from the times of their A, and the "
+                "carriers' velocity was taken as constant over that time. Give A at the new times, and refine again."
             )
 
 

@@ -99,10 +99,10 @@ def held_out_errors(
             X, Y = again.X[stack.target].matrix(), again.Y[stack.sensor].matrix()
             camera = again.intrinsics[stack.sensor].camera
             shape = again.shapes[stack.target]
-            seen = replace(stack, camera=camera)
-            errors = pixel_errors(seen, X, Y, A, parameters_of(camera), shape).reshape(*stack.known.shape, 2)
+            seen, late = replace(stack, camera=camera), again.time_offsets_s.get(stack.sensor, 0.0)
+            errors = pixel_errors(seen, X, Y, A, parameters_of(camera), shape, late).reshape(*stack.known.shape, 2)
             length = np.linalg.norm(errors, axis=2)[stack.known]
-            on_target = length * depths(seen, X, Y, A, shape)[stack.known] / camera.K[0, 0]
+            on_target = length * depths(seen, X, Y, A, shape, late)[stack.known] / camera.K[0, 0]
             found[stack.sensor].append((length, on_target, stack.pixels[stack.known]))
     return {
         name: _of_sensor(
@@ -147,7 +147,7 @@ def _without(observations: Observations, refined: CornersRefined) -> Observation
                 f"the images of {pair[0]} by {pair[1]} are not those that the refinement is from; give its observations"
             )
     views = {
-        pair: Views(view.A, np.where(refined.left_out[pair][..., None], np.nan, view.pixels))
+        pair: replace(view, pixels=np.where(refined.left_out[pair][..., None], np.nan, view.pixels))
         for pair, view in observations.views.items()
     }
     return replace(observations, views=views)
@@ -159,8 +159,7 @@ def _some(observations: Observations, stacks: tuple[Stack, ...], instants: np.nd
     for stack in stacks:
         kept = instants[stack.instant]
         if kept.any():
-            view = observations.views[stack.target, stack.sensor]
-            views[stack.target, stack.sensor] = Views(view.A[kept], view.pixels[kept])
+            views[stack.target, stack.sensor] = observations.views[stack.target, stack.sensor].selected(kept)
     some = replace(observations, views=views)
     for what, every, left in (
         ("target", observations.targets, some.targets), ("sensor", observations.sensors, some.sensors),
@@ -172,8 +171,4 @@ def _some(observations: Observations, stacks: tuple[Stack, ...], instants: np.nd
 
 
 def _some_stacks(stacks: tuple[Stack, ...], instants: np.ndarray) -> list[Stack]:
-    return [
-        replace(stack, instant=stack.instant[kept], pixels=stack.pixels[kept], known=stack.known[kept])
-        for stack in stacks
-        if (kept := instants[stack.instant]).any()
-    ]
+    return [stack.selected(kept) for stack in stacks if (kept := instants[stack.instant]).any()]

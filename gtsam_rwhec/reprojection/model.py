@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.refinement.options import About
-from gtsam_rwhec.reprojection.corner_views import Linear, Stack, linearised, pixel_errors
+from gtsam_rwhec.reprojection.corner_views import Linear, Stack, depths, linearised, pixel_errors
 
 #: A residual of this many deviations stands for a corner behind its camera: the step is refused, and stays finite.
 BEHIND = 1e6
@@ -17,13 +17,18 @@ BEHIND = 1e6
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Values of all variables: poses by name (4, 4), A (I, 4, 4), cameras' parameters and boards' shapes by name."""
+    """Values of all variables.
+
+    Poses by name (4, 4), A (I, 4, 4), cameras' parameters and boards' shapes by name, and clocks' offsets by sensor, in
+    seconds after the instants; a sensor that is missing has none.
+    """
 
     X: dict[str, Array]
     Y: dict[str, Array]
     A: Array
     cameras: dict[str, Array]
     shapes: dict[str, Array]
+    offsets_s: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +54,8 @@ class Model:
         Standard deviation of a corner along each axis.
     weights : tuple of (V, n) arrays
         Of each corner's squared residual, by stack.
+    offset_priors : dict of str to float
+        Deviations, s, of the clocks' offsets that are free, by sensor; their means are zero.
     """
 
     stacks: tuple[Stack, ...]
@@ -60,6 +67,7 @@ class Model:
     shape_priors: dict[str, Array]
     corner_px: float
     weights: tuple[Array, ...]
+    offset_priors: dict[str, float] = field(default_factory=dict)
 
     @property
     def to_right(self) -> Array:
@@ -90,9 +98,15 @@ class Model:
         rows = linearised(stack, *self._arguments(stack, point))
         return replace(rows, by_shape=rows.by_shape[..., self.free_shape(stack.target)])
 
-    def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array]:
+    def depths(self, stack: Stack, point: Point) -> Array:
+        """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
+        X, Y, A, _, shape, offset_s = self._arguments(stack, point)
+        return depths(stack, X, Y, A, shape, offset_s)
+
+    def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array, float]:
         camera = point.cameras[self.camera_of[stack.sensor]]
-        return point.X[stack.target], point.Y[stack.sensor], point.A, camera, point.shapes[stack.target]
+        poses = point.X[stack.target], point.Y[stack.sensor], point.A
+        return *poses, camera, point.shapes[stack.target], point.offsets_s.get(stack.sensor, 0.0)
 
     @property
     def _roots(self) -> list[Array]:
@@ -120,8 +134,12 @@ class Model:
         return np.flatnonzero(self.shape_priors.get(target, ()))
 
     def variables_of(self, stack: Stack) -> tuple[str, ...]:
-        """X, Y, camera, and A and shape where they are free."""
-        free = [("A", self.A_noise is not None), ("shape", stack.target in self.shape_priors)]
+        """X, Y, camera, and A, shape and time where they are free."""
+        free = [
+            ("A", self.A_noise is not None),
+            ("shape", stack.target in self.shape_priors),
+            ("time", stack.sensor in self.offset_priors),
+        ]
         return ("X", "Y", "camera", *(name for name, is_free in free if is_free))
 
 

@@ -20,15 +20,31 @@ FLAT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Images of one target by one camera: A (N, 4, 4), metres; pixels (N, n, 2), nan where a corner was not seen."""
+    """Images of one target by one camera.
+
+    Attributes
+    ----------
+    A : (N, 4, 4) array
+        T_sensorcarrier_targetcarrier of each image, metres.
+    pixels : (N, n, 2) array
+        nan where a corner was not seen.
+    twist : (N, 6) array, optional
+        The carriers' velocity at each image, [omega rad/s, v m/s] in the target carrier's axes: A(t + d) =
+        A Expmap(d twist). A time offset needs it.
+    """
 
     A: Array
     pixels: Array
+    twist: Array | None = None
 
     @property
     def known(self) -> np.ndarray:
         """(N, n) booleans: which corners were seen."""
         return np.asarray(np.isfinite(self.pixels).all(axis=2))
+
+    def selected(self, which: np.ndarray) -> Views:
+        """The images that a mask or an index array selects."""
+        return Views(self.A[which], self.pixels[which], None if self.twist is None else self.twist[which])
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +71,13 @@ class Observations:
     def of(
         cameras: Mapping[str, Camera],
         corners: Mapping[str, ArrayLike],
-        views: Mapping[tuple[str, str], tuple[PosesLike, ArrayLike]],
+        views: Mapping[tuple[str, str], tuple[PosesLike, ArrayLike] | tuple[PosesLike, ArrayLike, ArrayLike | None]],
         corner_px: float = 0.1,
     ) -> Observations:
-        """Make checked observations; views are given as A = T_sensorcarrier_targetcarrier and pixels of each image.
+        """Make checked observations.
+
+        Views are given as A = T_sensorcarrier_targetcarrier and pixels of each image, and the carriers' velocity there
+        (`Views.twist`) where it is known.
 
         Raises
         ------
@@ -72,7 +91,7 @@ class Observations:
             if p.ndim != 2 or p.shape[1] != 3 or len(p) < 4 or not np.isfinite(p).all():
                 raise TargetError(f"the corners of {name} have shape {p.shape}; give four or more finite (n, 3) points")
         checked = {}
-        for (target, sensor), (A, pixels) in views.items():
+        for (target, sensor), (A, pixels, *velocity) in views.items():
             where = f"the views of {target} by {sensor}"
             if target not in points or sensor not in cameras:
                 missing = f"corners of {target}" if target not in points else f"camera {sensor}"
@@ -88,7 +107,13 @@ class Observations:
             if fewest < 4:
                 raise CountError(f"{where}: an image has {fewest} corners; leave out images with fewer than 4")
             rows = checked_rows(transforms, 0, f"A of {where}").rows
-            checked[target, sensor] = Views(rows_to_transforms(rows), seen)
+            twist = None if not velocity or velocity[0] is None else np.asarray(velocity[0], dtype=float)
+            if twist is not None and not (twist.shape == (len(transforms), 6) and np.isfinite(twist).all()):
+                raise CountError(
+                    f"{where}: velocities have shape {twist.shape}, finite: {bool(np.isfinite(twist).all())}; give "
+                    f"({len(transforms)}, 6) finite numbers [omega rad/s, v m/s], or None"
+                )
+            checked[target, sensor] = Views(rows_to_transforms(rows), seen, twist)
         if not checked:
             raise CountError("there are no views; give images of a target by a camera")
         return Observations(dict(cameras), points, checked, float(corner_px))

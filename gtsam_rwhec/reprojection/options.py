@@ -37,6 +37,11 @@ class CornerOptions:
         The noise of the carriers' poses A: given (standard deviations), estimated, or none.
     about : "targetcarrier" or "sensorcarrier"
         The carrier whose axes and origin A's noise has, where it is estimated: the one that moves.
+    time_offsets : tuple of str
+        Sensors whose clock's offset is free: images were taken that long after the times of their A, at which the views
+        have the carriers' velocity (`Views.twist`). A prior of 1 s about no offset keeps it finite. Offsets above some
+        milliseconds want A taken at the new time, and another refinement. A rolling shutter, whose rows are seen one
+        after the other, is not modelled: an offset is that of the mean row.
     outliers : bool
         Leave corners out that disagree with all others.
     max_iterations : int
@@ -49,6 +54,7 @@ class CornerOptions:
     warp_m: float = 0.0
     carrier_noise: CarrierNoise | CarrierPoses = "estimate"
     about: About = "targetcarrier"
+    time_offsets: tuple[str, ...] = ()
     outliers: bool = True
     max_iterations: int = 100
 
@@ -74,6 +80,11 @@ class CornerOptions:
             )
         if isinstance(noise, CarrierNoise) and noise.covariances is not None:
             raise OptionError("CornerOptions.carrier_noise has covariances; give rotation_rad and translation_m")
+        offsets = self.time_offsets
+        if not (isinstance(offsets, tuple) and all(isinstance(name, str) for name in offsets)):
+            raise OptionError(
+                f"CornerOptions.time_offsets={brief(offsets)}; give a tuple of sensors' names, such as ('cam_0',)"
+            )
         if not is_whole(self.max_iterations, 1):
             raise OptionError(
                 f"CornerOptions.max_iterations={brief(self.max_iterations)}; give a whole number from 1 to "

@@ -70,7 +70,7 @@ class Reduced:
     Attributes
     ----------
     slots : dict of (letter, name) to slice
-        "x", "y", "k", "b" with the frame's name: its rows in theta.
+        "x", "y", "k", "b", "t" with the frame's name: its rows in theta.
     G, g : (d, d) and (d,) arrays
     C, M, b : (I, 6, d), (I, 6, 6) and (I, 6) arrays
     rr : float
@@ -110,6 +110,8 @@ class Reduced:
             add("k", name, len(mean))
         for name in model.shape_priors:
             add("b", name, len(model.free_shape(name)))
+        for name in model.offset_priors:
+            add("t", name, 1)
         count = len(model.A)
         G, g = np.zeros((size, size)), np.zeros(size)
         C, M, b = np.zeros((count, 6, size)), np.zeros((count, 6, 6)), np.zeros((count, 6))
@@ -122,6 +124,8 @@ class Reduced:
             parts["k", model.camera_of[stack.sensor]] = rows.by_camera
             if ("b", stack.target) in slots:
                 parts["b", stack.target] = rows.by_shape
+            if ("t", stack.sensor) in slots:
+                parts["t", stack.sensor] = rows.by_time
             where = np.concatenate([np.arange(slots[name].start, slots[name].stop) for name in parts])
             root = np.repeat(np.sqrt(weights), 2, axis=1)
             J = np.concatenate(list(parts.values()), axis=2) * root[..., None]
@@ -147,6 +151,9 @@ class Reduced:
             free = model.free_shape(name)
             prior[slots["b", name]] = deviation[free] ** -2.0
             off[slots["b", name]] = point.shapes[name][free]
+        for name, in_s in model.offset_priors.items():
+            prior[slots["t", name]] = in_s**-2.0
+            off[slots["t", name]] = point.offsets_s.get(name, 0.0)
         return Reduced(slots, G, g, C, M, b, rr, number, prior, off)
 
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:

@@ -81,6 +81,8 @@ class CornersRefined:
         By sensor.
     shapes : dict of str to (3,) array
         By target: its size less the stated one, a share; heights of its edge over its middle along x and y, metres.
+    time_offsets_s : dict of str to float
+        By sensor whose clock's offset was free: its images were taken that long after the times of their A.
     noise : Noise
     joint : (d, d) array
         Covariance of all unknowns; right perturbations [omega, v] of poses, rad and m.
@@ -104,6 +106,7 @@ class CornersRefined:
     Y: dict[str, gtsam.Pose3]
     intrinsics: dict[str, RefinedIntrinsics]
     shapes: dict[str, Array]
+    time_offsets_s: dict[str, float]
     noise: Noise
     joint: Array = field(repr=False)
     slots: Mapping[tuple[str, str], slice] = field(repr=False)
@@ -116,9 +119,10 @@ class CornersRefined:
     findings: tuple[str, ...] = ()
 
     def covariance(self, *names: str) -> Array:
-        """The joint covariance of frames (six rows each), ``intrinsics:SENSOR`` and ``shape:TARGET``, as given.
+        """The joint covariance of unknowns, in the order given; without names, of all.
 
-        Of a shape it has the numbers that are free: the size, and the two heights of its edge.
+        Frames have six rows each; ``intrinsics:SENSOR`` a camera's parameters; ``shape:TARGET`` the numbers that are
+        free of the size and the two heights of the edge; ``time_offset:SENSOR`` one row, s^2.
 
         Raises
         ------
@@ -156,4 +160,5 @@ class CornersRefined:
         """The unknowns' names."""
         frames = {name: (letter, name) for letter, name in self.slots if letter in "xy"}
         cameras = {f"intrinsics:{name}": ("k", self.graph.model.camera_of[name]) for name in self.Y}
-        return frames | cameras | {f"shape:{name}": ("b", name) for letter, name in self.slots if letter == "b"}
+        others = {"b": "shape", "t": "time_offset"}
+        return frames | cameras | {f"{others[at[0]]}:{at[1]}": at for at in self.slots if at[0] in others}

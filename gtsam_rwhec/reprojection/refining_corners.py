@@ -18,6 +18,7 @@ from gtsam_rwhec.reprojection.corner_outliers import weights_of
 from gtsam_rwhec.reprojection.corner_views import SHAPE, stacks_of
 from gtsam_rwhec.reprojection.determined import (
     check_arguments,
+    check_clocks,
     check_corners,
     check_determined,
     check_names,
@@ -42,6 +43,8 @@ ROUNDS, SETTLED = 12, 1e-3
 WIDER, WIDENINGS = 3.0, 6
 #: Deviations at the start: of a corner (pixels) and of the carriers' poses (rad, m).
 ROUGH = Noise(0.3, 1e-3, 1e-3)
+#: Deviation of a clock's offset before the images are looked at, s: weak, so that a carrier that stands still has one.
+OFFSET_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +85,8 @@ def refine_corners(
     ------
     CameraError
         The start puts a corner that was seen behind its camera.
+    CountError
+        A time offset is free, and its sensor's images have no velocity of the carriers.
     FrameError
         The start lacks a frame.
     OptionError
@@ -98,6 +103,7 @@ def refine_corners(
     check_names(Y, observations.sensors, letter="Y")
     options, tell = options or CornerOptions(), progress or silent
     check_shared(options, observations.sensors)
+    check_clocks(options, observations)
     model, point, noise, cameras = _stated(observations, X, Y, options)
     priors, first = model.camera_priors, model.camera_of
     _check_start(model, point)
@@ -133,6 +139,7 @@ def refine_corners(
             for name, camera in cameras.items()
         },
         shapes=point.shapes,
+        time_offsets_s={name: point.offsets_s[name] for name in settled.model.offset_priors},
         noise=settled.noise,
         joint=settled.joint,
         slots=settled.slots,
@@ -169,6 +176,7 @@ def _stated(
         stacks, A, noise.carrier, about, first, priors,
         dict.fromkeys(observations.targets, shape) if shape.any() else {},
         noise.corner_px, tuple(stack.known.astype(float) for stack in stacks),
+        dict.fromkeys(options.time_offsets, OFFSET_S),
     )  # fmt: skip
     point = Point(
         {name: one_transform(X[name], f"start of {name}") for name in observations.targets},
@@ -176,6 +184,7 @@ def _stated(
         A,
         {name: parameters_of(cameras[name]) for name in priors},
         {name: np.zeros(SHAPE) for name in observations.targets},
+        dict.fromkeys(options.time_offsets, 0.0),
     )
     return model, point, noise, cameras
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cells_of_others import CIRCLES, WORKCELL
+from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.pipeline import clean_log, detect_log, read_corners, write_folder_log
+from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion
 from gtsam_rwhec.reprojection import held_out_errors
 from gtsam_rwhec.rig.rig_file import parse_rig
+from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 
 def corners_of(folder: Path, text: str, out: Path) -> rw.Observations:
@@ -26,6 +30,7 @@ def test_a_workcell_of_other_people(workcell_camera2: Path, tmp_path: Path) -> N
     observations = corners_of(workcell_camera2, WORKCELL, tmp_path)
     view = observations.views["board", "camera2"]
     assert view.pixels.shape == (34, 12, 2)
+    assert view.twist is None  # between stations nothing is known of the path
     found = rw.calibrate_corners(observations, rw.CornerOptions(stated="calibration"))
     refined = found.refined
     assert refined.intrinsics["camera2"].rms_px < 0.07
@@ -45,6 +50,20 @@ def test_nominal_intrinsics_of_other_people(circle_grid_10x10: Path, tmp_path: P
     assert camera.K[0, 0] == pytest.approx(530.0, abs=20.0)
     assert found.refined.shapes["grid"][0] == pytest.approx(-0.02, abs=0.01)
     assert held_out_errors(found.observations, found.refined, options)["camera"].rms_mm < 0.7 * 4.6
+
+
+def test_velocities_are_those_of_the_path_where_it_moves() -> None:
+    rng = np.random.default_rng(0)
+    stamps = np.arange(400) * 10_000_000
+    twist = np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.1])
+    noise = se3.expmap(rng.normal(scale=1e-5, size=(400, 6)))
+    moving = CarrierMotion(Trajectory.of(stamps, se3.expmap(stamps[:, None] * 1e-9 * twist) @ noise), None)
+    at = np.array([1_234_000_000, 2_000_000_000])
+    assert moving.velocities(at) == pytest.approx(np.tile(twist, (2, 1)), abs=1e-3)
+    still = CarrierMotion(Trajectory.of(stamps, noise), None)
+    assert still.velocities(at) == pytest.approx(np.zeros((2, 6)), abs=0.0)
+    stations = CarrierMotion(Trajectory.of(100 * stamps, moving.trajectory.T), None)
+    assert stations.velocities(100 * at) is None
 
 
 def test_a_log_that_no_stage_wrote_has_no_corners(workcell_camera2: Path, tmp_path: Path) -> None:
