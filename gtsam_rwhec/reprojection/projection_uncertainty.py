@@ -15,19 +15,25 @@ from gtsam_rwhec.errors import FrameError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
+from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.refinement.reprojection_found import Regions
+from gtsam_rwhec.reprojection.held_out import REGIONS
 from gtsam_rwhec.reprojection.lens import parameters_of, pixels_and_derivatives
 from gtsam_rwhec.reprojection.refined import CornersRefined
+from gtsam_rwhec.vision.camera import Camera
 
 
 def projection_deviations(
-    refined: CornersRefined, sensor: str, distance_m: float, *, steps: int = 20
+    refined: CornersRefined | RefinedPoses, sensor: str, distance_m: float, *, steps: int = 20
 ) -> tuple[Array, Array]:
     """Standard deviations of the projection of points over a sensor's image.
 
     Parameters
     ----------
-    refined : CornersRefined
+    refined : CornersRefined or RefinedPoses
+        A refinement from corners, also as a result file has it.
     sensor : str
+        One whose intrinsics were estimated.
     distance_m : float
         Depth of the points in front of the sensor, metres.
     steps : int
@@ -43,18 +49,59 @@ def projection_deviations(
     Raises
     ------
     FrameError
-        There is no such sensor.
+        There is no such sensor, or its intrinsics were not estimated.
     OptionError
         The distance is not positive.
     """
     if sensor not in refined.intrinsics:
-        raise FrameError(f"{sensor!r} is no sensor; they are {', '.join(refined.intrinsics)}")
+        there = ", ".join(refined.intrinsics) or "none"
+        raise FrameError(f"{sensor!r} is no sensor whose intrinsics were estimated; they are {there}")
+    covariance = refined.covariance(sensor, f"intrinsics:{sensor}")
+    return deviations_over(refined.intrinsics[sensor].camera, covariance, distance_m, steps=steps)
+
+
+def deviations_over(camera: Camera, covariance: Array, distance_m: float, *, steps: int = 20) -> tuple[Array, Array]:
+    """The same, of a camera and the covariance (6 + m, 6 + m) of its pose's right perturbation and its m parameters."""
     if not (is_real(distance_m) and 0.0 < distance_m < np.inf):
         raise OptionError(f"distance_m={brief(distance_m)}; give metres, above 0")
-    camera = refined.intrinsics[sensor].camera
     step = max(camera.width, camera.height) / steps
     u, v = (np.arange(0.5 * step, size, step) - 0.5 for size in (camera.width, camera.height))
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    return pixels, _deviations_at(camera, covariance, pixels, distance_m)
+
+
+def by_region(camera: Camera, covariance: Array, distance_m: float) -> Regions:
+    """The deviation by region of the image, as errors of held-out corners are: root mean square over each region.
+
+    Parameters
+    ----------
+    camera : Camera
+        With the estimated intrinsics.
+    covariance : (6 + m, 6 + m) array
+        Of the sensor's pose and its intrinsics, as ``refined.covariance(sensor, f"intrinsics:{sensor}")`` has it.
+    distance_m : float
+        Depth of the points in front of the sensor, metres.
+
+    Returns
+    -------
+    tuple of tuple of float or None
+        Pixels, rows from the top; None where the lens has no ray.
+    """
+    pixels, deviations = deviations_over(camera, covariance, distance_m, steps=10 * REGIONS)
+    size = np.array([camera.width, camera.height])
+    at = np.minimum((REGIONS * (pixels + 0.5) / size).astype(int), REGIONS - 1)
+    seen = np.isfinite(deviations)
+    count, total = np.zeros((REGIONS, REGIONS)), np.zeros((REGIONS, REGIONS))
+    np.add.at(count, (at[seen][:, 1], at[seen][:, 0]), 1.0)
+    np.add.at(total, (at[seen][:, 1], at[seen][:, 0]), deviations[seen] ** 2)
+    return tuple(
+        tuple(float(np.sqrt(s / n)) if n else None for s, n in zip(*row, strict=True))
+        for row in zip(total, count, strict=True)
+    )
+
+
+def _deviations_at(camera: Camera, covariance: Array, pixels: Array, distance_m: float) -> Array:
+    """Deviations (...) of pixels (..., 2) along the worse direction; nan where the lens has no ray."""
     x = camera.undistort(pixels)
     seen = np.asarray(np.isfinite(x).all(axis=-1))
     x = np.where(seen[..., None], x, 0.0)
@@ -65,6 +112,5 @@ def projection_deviations(
     hat = se3.hat(P.reshape(-1, 3)).reshape(*P.shape, 3)
     by_xi = np.concatenate([hat, np.broadcast_to(-np.eye(3), hat.shape)], axis=-1)
     J = np.concatenate([by_x @ to_x @ by_xi, by_camera], axis=-1)
-    covariance = J @ refined.covariance(sensor, f"intrinsics:{sensor}") @ np.swapaxes(J, -1, -2)
-    worst = np.sqrt(np.linalg.eigvalsh(covariance)[..., -1])
-    return pixels, np.where(seen, worst, np.nan)
+    worst = np.sqrt(np.linalg.eigvalsh(J @ covariance @ np.swapaxes(J, -1, -2))[..., -1])
+    return np.where(seen, worst, np.nan)

@@ -11,7 +11,7 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FrameError, OptionError
-from gtsam_rwhec.reprojection.projection_uncertainty import projection_deviations
+from gtsam_rwhec.reprojection.projection_uncertainty import by_region, projection_deviations
 
 EXACT = rw.CornerOptions(carrier_noise="exact")
 
@@ -57,12 +57,17 @@ def test_a_camera_that_was_calibrated_from_a_corner_of_its_image_says_so() -> No
     far = (pixels > [CAMERA.width * 0.8, CAMERA.height * 0.8]).all(axis=-1)
     assert deviations[far].min() > 5.0 * np.median(deviations[seen])
     assert everywhere.max() < deviations[far].min()
+    regions = by_region(part.intrinsics["cam_0"].camera, part.covariance("cam_0", "intrinsics:cam_0"), 1.5)
+    found = np.array(regions, dtype=float)  # a region without a value would be nan
+    assert found.shape == (3, 3)
+    assert found[2, 2] > 5.0 * found[0, 0]
+    assert found[0, 0] == pytest.approx(float(np.sqrt((deviations[:4, :6] ** 2).mean())), rel=0.3)
 
 
 def test_what_is_asked_is_checked() -> None:
     given = cell(0, images=5)
     refined = rw.refine_corners(given.observations, given.X, given.Y, EXACT)
-    with pytest.raises(FrameError, match="'cam_7' is no sensor; they are cam_0, cam_1"):
+    with pytest.raises(FrameError, match="'cam_7' is no sensor whose intrinsics were estimated; they are cam_0, cam_1"):
         projection_deviations(refined, "cam_7", 1.0)
     with pytest.raises(OptionError, match="above 0"):
         projection_deviations(refined, "cam_0", -1.0)
