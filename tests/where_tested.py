@@ -97,9 +97,10 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/methods": {
         "methods/test_closed_forms.py": "absolute dornaika1998 li2010 linear_methods normal_equations zhuang1994",
         "methods/test_comparison.py": "comparison_file",
-        "methods/test_evangelista2023.py": "image_methods reprojection",
+        "methods/test_evangelista2023.py": "image_methods",
         "methods/test_heller2014.py": "quaternion_moments unit_weights",
         "methods/test_horn2023.py": "dual_quaternion_relaxation",
+        "methods/test_reprojection.py": "corner_costs",
         "methods/test_registry.py": "applicability certified estimate evaluation method",
     },
     "gtsam_rwhec/noise_model": {
@@ -151,7 +152,7 @@ TABLE: dict[str, dict[str, str]] = {
         "report/plots/test_plots.py": "coverage deviations frames plotted residuals",
     },
     "gtsam_rwhec/reprojection": {
-        "methods/test_evangelista2023.py": "observations",
+        "methods/test_reprojection.py": "observations",
         "reprojection/test_calibrating_corners.py": "first_intrinsics",
         "reprojection/test_corner_findings.py": "findings",
         "reprojection/test_corner_graph.py": "model",

@@ -17,3 +17,6 @@ from .comparison import Compared as Compared
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare
 from .comparison_file import write_comparison as write_comparison
+
+# Methods on corners in pixels: `reprojection.run` and `reprojection.compare`.
+from . import reprojection as reprojection

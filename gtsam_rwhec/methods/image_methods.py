@@ -1,7 +1,7 @@
 """The records of methods that minimise reprojection errors: Evangelista et al. 2023, Tabb and Ahmad Yousef's rp1 2017.
 
-They take corners in pixels, not measured poses, so they cannot solve a ``Problem``. ``reprojection.Observations`` holds
-the corners, and ``reprojection.calibrate`` solves for the poses.
+They take corners in pixels, not measured poses, so they cannot solve a ``Problem``. ``rw.Observations`` holds the
+corners, ``reprojection.run`` solves for the poses by a method's name, and ``reprojection.compare`` by all of them.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ def refuse_poses(problem: Problem, options: MethodOptions | None = None) -> NoRe
     """Refuse a problem of poses: always raises FrameError."""
     raise FrameError(
         f"this method minimises reprojection errors, and the problem's {problem.number_of_measurements} measurements "
-        "are poses; give corners in pixels, as gtsam_rwhec.methods.reprojection.Observations, to "
-        "gtsam_rwhec.methods.reprojection.calibrate"
+        "are poses; give corners in pixels, as rw.Observations, to gtsam_rwhec.methods.reprojection.run or compare"
     )
 
 
@@ -29,13 +28,14 @@ EVANGELISTA = Method(
     properties=Properties("SE(3)", multiple="Xs"),
     source="D. Evangelista, E. Olivastri, D. Allegri, E. Menegatti and A. Pretto, A graph-based optimization framework "
     "for hand-eye calibration for multi-camera setups, ICRA 2023",
-    assumes="Corners in pixels, equally accurate, of cameras whose intrinsics are known. A start near the answer.",
+    assumes="Corners in pixels, equally accurate, of cameras whose intrinsics are known. Deviations of the robot's "
+    "poses: by default a metre and two radians for each pixel. A start near the answer.",
     check=refuse_poses,
 )
 RP1 = Method(
     name="tabb2017_rp1",
     function=refuse_poses,
-    properties=Properties("rotation vectors", multiple="Xs or Ys"),
+    properties=Properties("Euler angles, rotation vectors or quaternions", multiple="Xs or Ys"),
     source=SOURCE,
     assumes="Corners in pixels, of cameras whose intrinsics are known. A start near the answer.",
     check=refuse_poses,

@@ -32,6 +32,12 @@ class Linearised:
     g: Array
     H: Array
 
+    def step(self, damping: float) -> Array:
+        """The step to the least value of the quadratic model, with damping times H's diagonal added to H."""
+        H = self.H + damping * np.diag(np.diagonal(self.H))
+        step: Array = -np.linalg.lstsq(H, self.g, rcond=1e-15)[0]  # a chart's H may be singular
+        return step
+
 
 @dataclass(frozen=True)
 class Descent(Generic[Point]):
@@ -53,8 +59,7 @@ def descend(
     point, here, damping = start, linearised(start), FIRST_DAMPING
     for iteration in range(1, max_iterations + 1):
         while True:
-            H = here.H + damping * np.diag(np.diagonal(here.H))
-            step = -np.linalg.lstsq(H, here.g, rcond=1e-15)[0]  # a chart's H may be singular
+            step = here.step(damping)
             length = float(np.abs(step).max())
             tried = moved(point, step)
             ahead = linearised(tried)

@@ -1,99 +1,275 @@
 """Calibration by reprojection errors: corners in pixels replace the measured poses of A X = Y B.
 
-A camera sees a target's corner p at the pixel of Y^-1 A X p, with the image's A. The cost is the sum of squared
-reprojection errors over all corners, images, cameras and targets. Evangelista et al. 2023 and, for known intrinsics,
-Tabb and Ahmad Yousef's rp1 minimise this cost over all X and Y.
+A camera sees a target's corner p at the pixel of Y^-1 A X p, with the image's A. ``run`` minimises a published method's
+cost, ``compare`` puts all of them and ``rw.refine_corners`` into one table, with one measure for all: the reprojection
+errors by the measured A.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import gtsam
 import numpy as np
-from rwhec_factors import se3
 
-from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.geometry.poses import (
-    Array,
-    one_transform,
-    to_pose3,
-)
+from gtsam_rwhec.errors import CameraError, OptionError, RwhecError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array, one_transform, to_pose3
+from gtsam_rwhec.methods import evangelista2023, tabb2017_rp1
+from gtsam_rwhec.methods.certified import quiet_solution
+from gtsam_rwhec.methods.corner_costs import Corners, Minimum
 from gtsam_rwhec.methods.estimate import Poses
-from gtsam_rwhec.methods.levenberg_marquardt import Linearised, descend
 from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import MethodOptions, checked_start
+from gtsam_rwhec.methods.registry import check_options
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.refinement.options import CarrierNoise
+from gtsam_rwhec.reprojection.determined import check_arguments
 from gtsam_rwhec.reprojection.observations import Observations
+from gtsam_rwhec.reprojection.options import CornerOptions
+from gtsam_rwhec.reprojection.refining_corners import refine_corners
 
 #: In this many rounds, the calibration of the round before chooses between a flat target's two poses.
 ROUNDS = 3
+#: The name of ``rw.refine_corners`` in tables.
+OURS = "refine_corners"
+#: The published methods.
+NAMES = ("evangelista2023", "tabb2017_rp1")
+#: A descent from a start (n, 4, 4) with at most so many steps.
+Descend = Callable[[Corners, Array, int], Minimum]
 
 
 @dataclass(frozen=True)
 class ReprojectionAnswer:
-    """Where the descent ended.
+    """A method's answer.
 
     Attributes
     ----------
+    method : str
     X, Y : dict of str to gtsam.Pose3
         T_targetcarrier_target and T_sensorcarrier_sensor, metres.
     cost : float
-        Half the sum of squared reprojection errors over corner_px^2.
+        The method's own, over corner_px^2, halved; of ``refine_corners`` with a noise of A, that of the graph.
+    reprojection_cost : float
+        Half the sum of squared reprojection errors by the measured A, over corner_px^2: the same for all methods.
+        Infinite where a corner that was seen is behind its camera.
     rms_px : float
-        Root mean square length of the corners' reprojection errors, pixels.
+        Root mean square length of these errors, pixels.
     iterations : int
     converged : bool
+    seconds : float
+        Of the descent, without the start.
     starts_from : str
-        What the descent started from.
     """
 
+    method: str
     X: dict[str, gtsam.Pose3]
     Y: dict[str, gtsam.Pose3]
     cost: float
+    reprojection_cost: float
     rms_px: float
     iterations: int
     converged: bool
+    seconds: float
     starts_from: str
 
 
-def calibrate(observations: Observations, options: MethodOptions | None = None) -> ReprojectionAnswer:
-    """Minimise the reprojection error over all X and Y, by Levenberg-Marquardt on the manifold.
+@dataclass(frozen=True)
+class ReprojectionRow:
+    """A method with its answer, or with the error for which it has none."""
+
+    method: str
+    answer: ReprojectionAnswer | None = None
+    error: RwhecError | None = None
+
+
+@dataclass(frozen=True)
+class ReprojectionTable:
+    """All methods' answers, those with an answer first, by the reprojection cost that all share."""
+
+    rows: tuple[ReprojectionRow, ...]
+
+    def __str__(self) -> str:
+        """A table with one line a method."""
+        lines = [f"{'method':17}{'rms px':>10}{'reprojection cost':>19}{'own cost':>14}{'steps':>7}{'s':>9}  start"]
+        for row in self.rows:
+            found = row.answer
+            if found is None:
+                lines.append(f"{row.method:17}{row.error}")
+                continue
+            steps = f"{found.iterations}" + ("" if found.converged else "+")
+            lines.append(
+                f"{row.method:17}{found.rms_px:10.4f}{found.reprojection_cost:19.3f}{found.cost:14.3f}{steps:>7}"
+                f"{found.seconds:9.3f}  {found.starts_from}"
+            )
+        return "\n".join(lines)
+
+
+@one_blas_thread()
+def run(
+    name: str,
+    observations: Observations,
+    options: MethodOptions | None = None,
+    *,
+    parameterisation: tabb2017_rp1.Parameterisation = "axis-angle",
+    carrier: CarrierNoise | None = None,
+) -> ReprojectionAnswer:
+    """Minimise a published method's reprojection cost over all X and Y.
 
     Without a start in the options, the descent starts at a closed form's answer (``linear_methods.start_of``) for the
     images' poses. A flat target has two poses in an image; this answer chooses between them.
+
+    Parameters
+    ----------
+    name : "evangelista2023" or "tabb2017_rp1"
+    observations : Observations
+    options : MethodOptions, optional
+    parameterisation : "axis-angle", "euler" or "quaternion"
+        Of rp1's rotations.
+    carrier : CarrierNoise, optional
+        Deviations of the robot's poses in Evangelista's graph; left out, its information matrices are the identity.
 
     Raises
     ------
     CameraError
         When the start puts a corner that was seen behind its camera.
+    OptionError
+        When the name is unknown, or an argument is of another type.
     UnderdeterminedError
         When the closed form finds that the motions do not determine the poses.
     """
+    check_arguments(observations, None)
+    check_options(options)
     options = options or MethodOptions()
-    targets, sensors = observations.targets, observations.sensors
+    descent = _descent(name, parameterisation, carrier)
     X, Y, starts_from = _start(observations, options)
-    starts = [(name, X[name]) for name in targets] + [(name, Y[name]) for name in sensors]
-    T = np.array([one_transform(pose, f"start of {name}") for name, pose in starts])
-    if not np.isfinite(linearised(observations, T).cost):
+    return _answer(name, descent, Corners.of(observations), X, Y, options, starts_from)
+
+
+@one_blas_thread()
+def compare(
+    observations: Observations,
+    options: MethodOptions | None = None,
+    *,
+    carrier: CarrierNoise | None = None,
+    methods: Iterable[str] = (*NAMES, OURS),
+) -> ReprojectionTable:
+    """All methods on corners from one start, and ``rw.refine_corners`` with the stated intrinsics.
+
+    Without a start in the options all start at the certified solution of the images' poses.
+
+    Parameters
+    ----------
+    observations : Observations
+    options : MethodOptions, optional
+    carrier : CarrierNoise, optional
+        The noise of A, for Evangelista's graph and for ours; left out, A is exact for ours.
+    methods : iterable of str
+
+    Raises
+    ------
+    OptionError
+        When a name is unknown, or an argument is of another type.
+    RwhecError
+        When there is no start, as ``rw.solve`` does.
+    """
+    check_arguments(observations, None)
+    check_options(options)
+    options = options or MethodOptions()
+    names = tuple(methods)
+    descents = {name: _ours(observations, carrier) if name == OURS else _descent(name, "axis-angle", carrier)
+                for name in names}  # fmt: skip
+    if options.start is None:
+        X, Y = certified_start(observations, options)
+        starts_from = "the certified solution of the images' poses"
+    else:
+        X, Y, starts_from = _start(observations, options)
+    corners, rows = Corners.of(observations), []
+    for name, descent in descents.items():
+        try:
+            rows.append(ReprojectionRow(name, _answer(name, descent, corners, X, Y, options, starts_from)))
+        except RwhecError as error:
+            rows.append(ReprojectionRow(name, error=error))
+    rows.sort(key=lambda row: np.inf if row.answer is None else row.answer.reprojection_cost)
+    return ReprojectionTable(tuple(rows))
+
+
+def certified_start(observations: Observations, options: MethodOptions | None = None) -> tuple[Poses, Poses]:
+    """X and Y of the certified solution of the images' poses, whose two candidates it chooses between."""
+    options = options or MethodOptions()
+    solution = quiet_solution(observations.poses(), options)
+    for _ in range(ROUNDS - 1):
+        solution = quiet_solution(observations.poses(_predicted(observations, solution.X, solution.Y)), options)
+    return solution.X, solution.Y
+
+
+def _descent(name: str, parameterisation: tabb2017_rp1.Parameterisation, carrier: CarrierNoise | None) -> Descend:
+    if name == "tabb2017_rp1":
+        return partial(tabb2017_rp1.minimum, parameterisation=parameterisation)
+    if name == "evangelista2023":
+        return partial(evangelista2023.minimum, carrier=_deviations(carrier))
+    raise OptionError(f"method {brief(name)} is not one of {', '.join((*NAMES, OURS))}")
+
+
+def _deviations(carrier: CarrierNoise | None) -> tuple[float, float] | None:
+    if carrier is None:
+        return None
+    if carrier.covariances is not None or carrier.about != "targetcarrier":
+        raise OptionError(
+            f"carrier={brief(carrier)}: the graph's edges take one rotation_rad and one translation_m about the target "
+            "carrier; give rw.CarrierNoise(rotation_rad=..., translation_m=...)"
+        )
+    return carrier.rotation_rad, carrier.translation_m
+
+
+def _ours(observations: Observations, carrier: CarrierNoise | None) -> Descend:
+    def descent(corners: Corners, start: Array, max_iterations: int) -> Minimum:
+        n = len(corners.targets)
+        told = CornerOptions(
+            stated="exact", carrier_noise=carrier or "exact", outliers=False, max_iterations=max_iterations
+        )
+        X, Y = dict(zip(corners.targets, start[:n], strict=True)), dict(zip(corners.sensors, start[n:], strict=True))
+        refined = refine_corners(observations, X, Y, told)
+        poses = [*(refined.X[name] for name in corners.targets), *(refined.Y[name] for name in corners.sensors)]
+        frames = np.array([pose.matrix() for pose in poses])
+        deviations = _deviations(carrier)
+        cost = corners.cost(frames)
+        if deviations is not None:
+            cost = evangelista2023.cost_at(corners, frames, refined.point.A, deviations)
+        return Minimum(frames, cost, refined.iterations, refined.last_step < 0.1)
+
+    return descent
+
+
+def _answer(
+    name: str, descent: Descend, corners: Corners, X: Poses, Y: Poses, options: MethodOptions, starts_from: str
+) -> ReprojectionAnswer:
+    starts = [(frame, X[frame]) for frame in corners.targets] + [(frame, Y[frame]) for frame in corners.sensors]
+    start = np.array([one_transform(pose, f"start of {frame}") for frame, pose in starts])
+    if not np.isfinite(corners.cost(start)):
         raise CameraError(
             f"the start ({starts_from}) puts a corner that was seen behind its camera; give a better start by "
             "MethodOptions.start"
         )
-    found = descend(
-        lambda poses: linearised(observations, poses),
-        lambda poses, step: poses @ se3.expmap(step.reshape(-1, 6)),
-        T,
-        options.max_iterations,
-    )
-    poses = [to_pose3(pose[:3, :3], pose[:3, 3]) for pose in found.point]
-    corners = sum(int(view.known.sum()) for view in observations.views.values())
+    begun = time.perf_counter()
+    found = descent(corners, start, options.max_iterations)
+    seconds = time.perf_counter() - begun
+    poses = [to_pose3(frame[:3, :3], frame[:3, 3]) for frame in found.frames]
+    cost, n = corners.cost(found.frames), len(corners.targets)
     return ReprojectionAnswer(
-        dict(zip(targets, poses[: len(targets)], strict=True)),
-        dict(zip(sensors, poses[len(targets) :], strict=True)),
+        name,
+        dict(zip(corners.targets, poses[:n], strict=True)),
+        dict(zip(corners.sensors, poses[n:], strict=True)),
         found.cost,
-        float(observations.corner_px * np.sqrt(2.0 * found.cost / corners)),
+        cost,
+        float(corners.corner_px * np.sqrt(2.0 * cost / corners.number)),
         found.iterations,
         found.converged,
+        seconds,
         starts_from,
     )
 
@@ -102,48 +278,17 @@ def _start(observations: Observations, options: MethodOptions) -> tuple[Poses, P
     if options.start is not None:
         X, Y, _ = checked_start(observations.targets, observations.sensors, options.start)
         return X, Y, "the given start"
-    problem = observations.poses()
+    problem: Problem = observations.poses()
     for _ in range(ROUNDS):
         X, Y, _, _ = start_of(problem, options)
-        predicted = {
-            (target, sensor): np.linalg.inv(np.asarray(Y[sensor])) @ view.A @ np.asarray(X[target])
-            for (target, sensor), view in observations.views.items()
-        }
-        problem = observations.poses(predicted)
+        problem = observations.poses(_predicted(observations, X, Y))
     X, Y, _, words = start_of(problem, options)
     return X, Y, f"{words} of the images' poses"
 
 
-def linearised(observations: Observations, T: Array) -> Linearised:
-    """Half the sum of squares over corner_px^2 at poses T (n_X + n_Y, 4, 4), for right perturbations [w, v] of each.
-
-    The cost is infinite where a corner that was seen is behind its camera.
-    """
-    targets, sensors = observations.targets, observations.sensors
-    H, g = np.zeros((6 * len(T), 6 * len(T))), np.zeros(6 * len(T))
-    cost = 0.0
-    for (target, sensor), view in observations.views.items():
-        i, j = targets.index(target), len(targets) + sensors.index(sensor)
-        camera, p = observations.cameras[sensor], observations.corners[target]
-        to_camera = np.linalg.inv(T[j]) @ view.A @ T[i]
-        R = to_camera[:, :3, :3]
-        seen = p @ R.transpose(0, 2, 1) + to_camera[:, None, :3, 3]
-        known = view.known
-        if (seen[known][:, 2] <= 1e-9).any():
-            return Linearised(np.inf, g, H)
-        z = np.where(known, seen[:, :, 2], 1.0)
-        x = np.where(known[:, :, None], seen[:, :, :2] / z[:, :, None], 0.0)
-        pixels, D = camera.pixel_jacobian(x)
-        # d(x, y) / d(X, Y, Z) = [I, -x] / Z
-        to_x = np.concatenate([np.broadcast_to(np.eye(2), (*x.shape, 2)), -x[..., None]], axis=-1) / z[..., None, None]
-        by_point = np.where(known[:, :, None, None], D @ to_x, 0.0) / observations.corner_px
-        error = np.where(known[:, :, None], pixels - view.pixels, 0.0) / observations.corner_px
-        # X Expmap([w, v]) moves the point by R (w x p + v), Y Expmap([w, v]) by -(w x P + v).
-        J_X = by_point @ (R[:, None] @ np.concatenate([-se3.hat(p), np.tile(np.eye(3), (len(p), 1, 1))], axis=2))
-        at_P = np.concatenate([se3.hat(seen), np.broadcast_to(-np.eye(3), (*seen.shape, 3))], axis=-1)
-        rows, e = np.concatenate([J_X, by_point @ at_P], axis=-1).reshape(-1, 12), error.ravel()
-        at = np.r_[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
-        H[np.ix_(at, at)] += rows.T @ rows
-        g[at] += rows.T @ e
-        cost += 0.5 * float(e @ e)
-    return Linearised(cost, g, H)
+def _predicted(observations: Observations, X: Poses, Y: Poses) -> dict[tuple[str, str], Array]:
+    """T_camera_target of each image by a calibration."""
+    return {
+        (target, sensor): np.linalg.inv(one_transform(Y[sensor], sensor)) @ view.A @ one_transform(X[target], target)
+        for (target, sensor), view in observations.views.items()
+    }

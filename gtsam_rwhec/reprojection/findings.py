@@ -32,7 +32,7 @@ def findings_of(refined: CornersRefined, options: CornerOptions) -> tuple[str, .
         *_of_corners(refined),
         *_of_convergence(refined, options),
         *_of_clocks(refined),
-        *_of_intrinsics(refined),
+        *_of_intrinsics(refined, options),
     )
 
 
@@ -103,13 +103,16 @@ def _of_clocks(refined: CornersRefined) -> Iterator[str]:
             )
 
 
-def _of_intrinsics(refined: CornersRefined) -> Iterator[str]:
+def _of_intrinsics(refined: CornersRefined, options: CornerOptions) -> Iterator[str]:
     """By camera: sensors that share one are named together."""
     sensors: dict[str, list[str]] = {}
     for sensor, camera in refined.graph.model.camera_of.items():
         sensors.setdefault(camera, []).append(sensor)
     for names in sensors.values():
         intrinsics, of = refined.intrinsics[names[0]], ", ".join(names)
+        if options.stated_of(options.camera_of(names[0])) == "exact":
+            yield f"The intrinsics of {of} are held as stated (exact): how far off they are is in no deviation."
+            continue
         if intrinsics.innovation.is_contradicted:
             widened = (
                 f", and its deviations were widened {intrinsics.widened:.3g} times" if intrinsics.widened > 1.0 else ""

@@ -4,7 +4,8 @@ Intrinsics are stated by a calibration, or they are nominal: from a data sheet, 
 kind. A calibration without a covariance is taken to be right to 0.3 % of the focal length and 3 pixels of the centre;
 nominal intrinsics to 3 %, and to 30 pixels or 2 % of the image's width, whichever is more. Coefficients of the
 lens model move the image's corner by a calibration's 3 pixels, or by a nominal 5 % of the focal length. Unknown ones
-are right to the focal length itself and half the width: the images must say them.
+are right to the focal length itself and half the width: the images must say them. Exact ones are held: their
+deviations are so small that no number of corners tells anything of them.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from gtsam_rwhec.reprojection.lens import PINHOLE, parameters_of
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.distortion import coefficient_jacobian
 
-Stated = Literal["calibration", "nominal", "unknown"]
+Stated = Literal["exact", "calibration", "nominal", "unknown"]
 
 #: Deviation of the focal length (a share), of the centre (pixels), and of the coefficients (pixels at the corner of
 #: the image, or a share of the focal length).
-FOCAL = {"calibration": 0.003, "nominal": 0.03, "unknown": 1.0}
-CENTRE_PX = {"calibration": 3.0, "nominal": 30.0, "unknown": 30.0}
-CENTRE_OF_WIDTH = {"calibration": 0.0, "nominal": 0.02, "unknown": 0.5}
-LENS_PX = 3.0
+FOCAL = {"exact": 1e-8, "calibration": 0.003, "nominal": 0.03, "unknown": 1.0}
+CENTRE_PX = {"exact": 1e-5, "calibration": 3.0, "nominal": 30.0, "unknown": 30.0}
+CENTRE_OF_WIDTH = {"exact": 0.0, "calibration": 0.0, "nominal": 0.02, "unknown": 0.5}
+LENS_PX = {"exact": 1e-5, "calibration": 3.0}
 LENS_OF_FOCAL = {"nominal": 0.05, "unknown": 0.5}
 #: fx and fy differ by no more than a tenth of what both may be off by.
 UNEQUAL = 0.1
@@ -33,7 +34,7 @@ UNEQUAL = 0.1
 
 def free_model(camera: Camera, stated: Stated) -> Camera:
     """The camera with the lens model that is estimated: a nominal pinhole may have distortion that nobody stated."""
-    if camera.model == "pinhole" and stated != "calibration":
+    if camera.model == "pinhole" and stated not in LENS_PX:
         return Camera(camera.width, camera.height, "radtan", camera.K, np.zeros(4))
     return camera
 
@@ -42,7 +43,7 @@ def prior_of(camera: Camera, stated: Stated) -> tuple[Array, Array]:
     """Mean (m,) and standard deviation (m,) of a camera's parameters."""
     mean = parameters_of(camera)
     f, c = mean[:2], max(CENTRE_PX[stated], CENTRE_OF_WIDTH[stated] * camera.width)
-    lens_px = LENS_PX if stated == "calibration" else LENS_OF_FOCAL[stated] * float(f.mean())
+    lens_px = LENS_PX[stated] if stated in LENS_PX else LENS_OF_FOCAL[stated] * float(f.mean())
     corner = 0.5 * np.array([camera.width, camera.height]) / f
     moved = np.linalg.norm(coefficient_jacobian(camera.model, camera.D, corner) * f[:, None], axis=0)
     deviation = np.concatenate([FOCAL[stated] * f, [c, c], lens_px / moved])

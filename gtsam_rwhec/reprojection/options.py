@@ -23,10 +23,11 @@ class CornerOptions:
 
     Attributes
     ----------
-    stated : "calibration", "nominal" or "unknown", or a dict of them by sensor
+    stated : "exact", "calibration", "nominal" or "unknown", or a dict of them by sensor
         Where the stated intrinsics come from. A calibration's are right to 0.3 % of f and 3 pixels of c, nominal ones
-        to 3 % and to 30 pixels or 2 % of the width; the images alone say unknown ones. Sensors that a dict lacks are
-        nominal. Where the images contradict it, the deviation is widened, and the result says so.
+        to 3 % and to 30 pixels or 2 % of the width; the images alone say unknown ones, and exact ones are held. Sensors
+        that a dict lacks are nominal. Where the images contradict what is stated, the deviation is widened, and the
+        result says so.
     shared : tuple of tuple of str
         Groups of sensors whose intrinsics are the same: those of the group's first sensor are stated.
     size_share : float

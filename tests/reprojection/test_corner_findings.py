@@ -62,6 +62,16 @@ def test_images_shuffled_against_a_reach_the_bound() -> None:
     assert any(f"{number} of 490 corners of board by cam_0 disagree" in words for words in result.findings)
 
 
+def test_exact_intrinsics_are_held_and_it_is_said(good: Cell) -> None:
+    off = np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0])
+    given = cell(1, images=20, stated_off=off)
+    result = refined(given, replace(EXACT, stated="exact"))
+    for name, camera in given.observations.cameras.items():
+        np.testing.assert_allclose(result.intrinsics[name].camera.K, camera.K, atol=1e-2)
+        assert result.intrinsics[name].widened == 1.0
+    assert any(words.startswith("The intrinsics of cam_0 are held as stated (exact)") for words in result.findings)
+
+
 def test_a_calibration_that_is_contradicted_is_named_with_its_deviations() -> None:
     given = cell(5, images=30, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
     result = refined(given, replace(EXACT, stated="calibration"))
