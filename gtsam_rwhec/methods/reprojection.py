@@ -26,6 +26,7 @@ from gtsam_rwhec.methods.estimate import Poses
 from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import MethodOptions, checked_start
 from gtsam_rwhec.methods.registry import check_options
+from gtsam_rwhec.methods.tabb2017 import Parameterisation
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.reprojection.determined import check_arguments
@@ -115,7 +116,7 @@ def run(
     observations: Observations,
     options: MethodOptions | None = None,
     *,
-    parameterisation: tabb2017_rp1.Parameterisation = "axis-angle",
+    parameterisation: Parameterisation = "axis-angle",
     carrier: CarrierNoise | None = None,
 ) -> ReprojectionAnswer:
     """Minimise a published method's reprojection cost over all X and Y.
@@ -207,7 +208,7 @@ def certified_start(observations: Observations, options: MethodOptions | None = 
     return solution.X, solution.Y
 
 
-def _descent(name: str, parameterisation: tabb2017_rp1.Parameterisation, carrier: CarrierNoise | None) -> Descend:
+def _descent(name: str, parameterisation: Parameterisation, carrier: CarrierNoise | None) -> Descend:
     if name == "tabb2017_rp1":
         return partial(tabb2017_rp1.minimum, parameterisation=parameterisation)
     if name == "evangelista2023":

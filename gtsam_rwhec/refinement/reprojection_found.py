@@ -151,7 +151,7 @@ class Intrinsics:
         What was stated: the prior's mean.
     stated_deviations : tuple of float
         The prior's, as widened; infinite: no prior.
-    stated_as : "calibration", "nominal" or "unknown"
+    stated_as : "exact", "calibration", "nominal" or "unknown"
     widened : float
         By how much the prior was widened: 1 where the images do not contradict what was stated.
     innovation_deviations : float
@@ -175,7 +175,7 @@ class Intrinsics:
     standard_deviations: tuple[float, ...]
     stated: tuple[float, ...]
     stated_deviations: tuple[float, ...]
-    stated_as: Literal["calibration", "nominal", "unknown"]
+    stated_as: Literal["exact", "calibration", "nominal", "unknown"]
     widened: float
     innovation_deviations: float
     held_by_prior: tuple[str, ...]
