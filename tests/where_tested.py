@@ -159,8 +159,9 @@ TABLE: dict[str, dict[str, str]] = {
         "reprojection/test_refining_corners.py": "corner_outliers freedom intrinsics options refined stated_intrinsics",
     },
     "gtsam_rwhec/results": {
+        "reprojection/test_corners_in_files.py": "corners_agreement",
         "results/test_agreement.py": "covariance_agreement",
-        "results/test_result_file.py": "json_tree schema written_result",
+        "results/test_result_file.py": "conventions json_tree schema written_result",
     },
     "gtsam_rwhec/rig": {
         "rig/test_rig_faults.py": "contradictions",

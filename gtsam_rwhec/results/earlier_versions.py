@@ -3,8 +3,8 @@
 In these versions ``sensors`` and ``targets`` at the top were the certified poses; ``refined`` had the refined poses.
 Version 1 had no ``refined``, version 2 had no ``log``, and no version had a verdict.
 
-Versions 4 and 5 need no conversion: the fields of certificates that version 4 lacks have defaults, which claim less,
-and both lack what ``calibrate`` found.
+Versions 4 to 6 need no conversion: the fields of certificates that version 4 lacks have defaults, which claim less,
+versions 4 and 5 lack what ``calibrate`` found, and all lack what a refinement from corners found.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ FIRST_VERSION = 1
 FIRST_WITH_VERDICT = 4
 #: From this version on a certificate says what its bound is about.
 FIRST_WITH_REGION = 5
+#: From this version on a file has what ``calibrate`` found, also where there is no answer.
+FIRST_WITH_CALIBRATION = 6
 
 _RESIDUAL = ("translation_rms_m", "rotation_rms_rad")
 

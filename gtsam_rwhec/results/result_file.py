@@ -27,8 +27,15 @@ from gtsam_rwhec.results.agreement import (
     check_verdict,
 )
 from gtsam_rwhec.results.calibration_fields import CalibrationFields
+from gtsam_rwhec.results.corners_agreement import check_corners
 from gtsam_rwhec.results.covariance_agreement import check_frames, check_joint
-from gtsam_rwhec.results.earlier_versions import FIRST_VERSION, FIRST_WITH_REGION, FIRST_WITH_VERDICT, as_version_4
+from gtsam_rwhec.results.earlier_versions import (
+    FIRST_VERSION,
+    FIRST_WITH_CALIBRATION,
+    FIRST_WITH_REGION,
+    FIRST_WITH_VERDICT,
+    as_version_4,
+)
 from gtsam_rwhec.results.json_text import MOST_BYTES, parse_json
 from gtsam_rwhec.results.json_tree import POSED, from_json, in_words
 from gtsam_rwhec.results.judging import judge
@@ -130,7 +137,7 @@ def parse_result(content: bytes, path: str | Path) -> Result:
             f"{path} has version {number} of the result format (written by {shown(header.written_by)}); this "
             f"gtsam-rwhec reads versions {FIRST_VERSION} to {FORMAT_VERSION}. {remedy}."
         )
-    if number == FORMAT_VERSION and "certified" not in raw and raw.get("verdict") == Verdict.DO_NOT_USE.value:
+    if number >= FIRST_WITH_CALIBRATION and "certified" not in raw and raw.get("verdict") == Verdict.DO_NOT_USE.value:
         why = shown(str(raw.get("verdict_reason")))
         raise FileFormatError(f"{path} has no poses, because the calibration has no answer: {why}")
     try:
@@ -187,4 +194,5 @@ def checked_file(tree: dict[str, Any], version: int) -> ResultFile:
         check_scale(file.refined, "$.scale")
         check_joint(file.refined, file.certified)
         check_frames(file.refined, _of_class(RefinedPoses, file.refined))
+        check_corners(file.refined)
     return file

@@ -30,33 +30,7 @@ from gtsam_rwhec.solving.solution import Solution
 
 FORMAT: Final = "gtsam-rwhec result"
 #: It grows whenever a reader of the version before would misread or refuse the file.
-FORMAT_VERSION: Final = 6
-
-CONVENTIONS = {
-    "poses": (
-        "sensors and targets at the top are the poses to use: the refined poses if the answer was refined, otherwise "
-        "the certified poses; certified has the certified poses in either case"
-    ),
-    "pose": (
-        "T_parent_child is the pose of frame child in frame parent: p_parent = T_parent_child p_child. "
-        "quaternion_wxyz is scalar first, of unit norm, and the same rotation as rotation_matrix (rows)."
-    ),
-    "model": (
-        "T_sensorcarrier_targetcarrier T_targetcarrier_target = T_sensorcarrier_sensor T_sensor_target (A X = Y B); "
-        "X are the targets' poses and Y the sensors'."
-    ),
-    "scale": "length of the measured translation of T_sensor_target = scale * true length",
-    "units": "m, rad, s; sigma in m, kappa in 1/rad^2 (1/(2 s^2) for a standard deviation of s about each axis)",
-    "covariance": (
-        "of xi in T_parent_child Expmap(xi), xi = [omega (rad), v (m)], rotation first, in the axes and about the "
-        "origin of child (GTSAM's right perturbation)"
-    ),
-    "infinity": (
-        "null means an infinite number: minus infinity in lower_bound, float_bound and min_eigenvalue (no bound was "
-        "found), infinity of either sign in a covariance, and plus infinity elsewhere"
-    ),
-    "sentence": "the meaning of a record in words; not read back",
-}
+FORMAT_VERSION: Final = 7
 
 #: Name of the frame that carries the sensors, if no rig file names it.
 SENSOR_CARRIER = "sensorcarrier"
@@ -255,7 +229,7 @@ class ResultFile(BaseModel):
     model_config = CONFIG
 
     format: Literal["gtsam-rwhec result"] = Field(description="what kind of file this is")
-    format_version: Literal[6] = Field(description="the version of these fields")
+    format_version: Literal[7] = Field(description="the version of these fields")
     written_by: str = Field(description="the library and its version")
     verdict: Verdict = Field(description="use, care or do_not_use")
     verdict_reason: str = Field(description="the reasons as a sentence")

@@ -21,12 +21,12 @@ from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.results.calibration_fields import CalibrationFields
+from gtsam_rwhec.results.conventions import CONVENTIONS
 from gtsam_rwhec.results.json_tree import POSED, in_words, to_json
 from gtsam_rwhec.results.judging import contradicted_names, judge
 from gtsam_rwhec.results.log_history import LogFields
 from gtsam_rwhec.results.result_file import checked_file
 from gtsam_rwhec.results.schema import (
-    CONVENTIONS,
     FORMAT,
     FORMAT_VERSION,
     SENSOR_CARRIER,

@@ -199,6 +199,24 @@ def test_version_5_had_not_what_calibrate_found(tmp_path: Path) -> None:
         read_result(changed(raw, tmp_path))
 
 
+def test_version_6_had_nothing_from_corners(tmp_path: Path) -> None:
+    path, raw = stored(6)
+    result = read_result(path)
+    assert result.judgement.verdict is rw.Verdict.USE
+    assert result.calibration is not None
+    assert result.refined is not None
+    assert_poses(result.refined.Y, raw["sensors"])
+    assert result.refined.reprojection is None
+    assert result.refined.intrinsics == {}
+    assert result.refined.names == tuple(raw["refined"]["joint"]["slots"])
+    for name, frame in raw["refined"]["frames"].items():
+        np.testing.assert_allclose(result.refined.covariance(name), frame["covariance"], rtol=1e-12)
+    without_answer = {"verdict": "do_not_use", "verdict_reason": "no scale fits"}
+    del raw["certified"]
+    with pytest.raises(rw.errors.FileFormatError, match="has no poses, because the calibration has no answer: no scal"):
+        read_result(changed({**raw, **without_answer}, tmp_path))
+
+
 @pytest.mark.parametrize(
     ("stated", "grounds", "now"),
     [

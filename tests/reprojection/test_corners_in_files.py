@@ -1,0 +1,182 @@
+"""Result files of refinements from corners: intrinsics come back bit for bit, and damage is refused with its place."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_as_refined import made
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.refinement.reprojection_found import Consequence, Reprojection, SensorReprojection, TriedModel
+from gtsam_rwhec.results.result_file import read_result
+
+
+@cache
+def refined() -> rw.Refined:
+    """A refinement with everything that files keep, also what is infinite or was not seen."""
+    *_, found = made()
+    assert found.reprojection is not None
+    intrinsics = dict(found.intrinsics)
+    first = intrinsics["cam_0"]
+    width = len(first.names)
+    intrinsics["cam_0"] = replace(
+        first,
+        stated_as="unknown",
+        stated_deviations=(float("inf"),) * width,
+        innovation_deviations=float("inf"),
+        projection_px=((0.1, None), (1e-3, 0.30000000000000004)),
+        projection_m=1.5,
+    )
+    reprojection: Reprojection = replace(
+        found.reprojection,
+        sensors={
+            name: SensorReprojection(30, 720, 3, one.rms_px, 0.1, 0.07, ((None, 0.1), (0.2, 0.3)))
+            for name, one in intrinsics.items()
+        },
+        tried=(TriedModel("intrinsics free", 0.1, 0.07, True), TriedModel("as stated", 0.4, 0.3, False)),
+        consequences=(Consequence("cam_1", "cx off by 1 px", 0.04, 0.9),),
+    )
+    return replace(found, reprojection=reprojection, intrinsics=intrinsics)
+
+
+@pytest.fixture(scope="module")
+def text(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("good") / "refined.json"
+    rw.write_refined(refined(), path)
+    return path.read_text(encoding="utf-8")
+
+
+def test_cameras_boards_and_errors_in_pixels_come_back_to_the_last_bit(text: str, tmp_path: Path) -> None:
+    (tmp_path / "refined.json").write_text(text, encoding="utf-8")
+    back, given = rw.read_refined(tmp_path / "refined.json"), refined()
+    assert back.reprojection == given.reprojection
+    assert back.intrinsics == given.intrinsics
+    assert back.names == given.names
+    np.testing.assert_array_equal(back.covariance(), given.covariance())
+    np.testing.assert_array_equal(back.intrinsics["cam_1"].camera.K, given.intrinsics["cam_1"].camera.K)
+    deviations = np.sqrt(np.diagonal(back.covariance("intrinsics:cam_1")))
+    np.testing.assert_allclose(deviations, back.intrinsics["cam_1"].standard_deviations, rtol=1e-12)
+
+
+def test_the_file_says_it_in_its_own_words(text: str) -> None:
+    raw = json.loads(text)
+    assert raw["format_version"] == 7
+    assert raw["refined"]["reprojection"]["rms_px"] == 0.1
+    assert raw["refined"]["intrinsics"]["cam_0"]["names"][:5] == ["fx", "fy", "cx", "cy", "k1"]
+    assert raw["refined"]["intrinsics"]["cam_0"]["stated_deviations"] == [None] * 8  # no prior: infinite
+    assert raw["refined"]["intrinsics"]["cam_0"]["innovation_deviations"] is None
+    assert "upper left pixel at (0, 0)" in raw["conventions"]["intrinsics"]
+
+
+def test_an_error_of_no_number_is_not_written(tmp_path: Path) -> None:
+    given = refined()
+    assert given.reprojection is not None
+    wrong = replace(given, reprojection=replace(given.reprojection, rms_px=float("nan")))
+    with pytest.raises(FileFormatError, match=r"\$\.refined\.reprojection\.rms_px: must be finite \(found nan\)"):
+        rw.write_refined(wrong, tmp_path / "refined.json")
+    wrong = replace(given, reprojection=None)
+    with pytest.raises(FileFormatError, match=r"intrinsics: has cam_0, cam_1, but \$\.refined\.reprojection is null"):
+        rw.write_refined(wrong, tmp_path / "refined.json")
+    assert not (tmp_path / "refined.json").exists()
+
+
+def camera(raw: Any, name: str = "cam_1") -> Any:
+    return raw["refined"]["intrinsics"][name]
+
+
+def found(raw: Any) -> Any:
+    return raw["refined"]["reprojection"]
+
+
+CASES: dict[str, tuple[Callable[[Any], object], str]] = {
+    "a number is missing": (lambda raw: camera(raw)["values"].pop(), r"cam_1\.values: 7 numbers for 8 names"),
+    "no focal length": (lambda raw: camera(raw)["names"].__setitem__(0, "f"), r"cam_1\.names: fx, fy, cx, cy and then"),
+    "no camera": (lambda raw: camera(raw)["values"].__setitem__(0, -5.0), r"cam_1\.values: no camera has .* fx = -5"),
+    "no model": (lambda raw: camera(raw).update(model="tilted"), r"cam_1\.values: no camera .* 'tilted' is not supp"),
+    "no size": (lambda raw: camera(raw).update(width=0), r"cam_1\.values: no camera .* image size is 0 x 1080"),
+    "no sensor": (
+        lambda raw: raw["refined"]["intrinsics"].update(moon=camera(raw)),
+        r"refined\.intrinsics: has moon, but the sensors are cam_0, cam_1",
+    ),
+    "another deviation": (
+        lambda raw: camera(raw)["standard_deviations"].__setitem__(2, 1.0),
+        r"cam_1\.standard_deviations: must be \[.*\], by \$\.refined\.joint",
+    ),
+    "a negative deviation": (
+        lambda raw: camera(raw)["stated_deviations"].__setitem__(2, -1.0),
+        r"cam_1\.stated_deviations: must not be negative",
+    ),
+    "no rows": (
+        lambda raw: raw["refined"]["joint"]["slots"].pop("intrinsics:cam_1"),
+        r"rows may neither overlap nor be left out|slots have",
+    ),
+    "rows without values": (
+        lambda raw: raw["refined"]["intrinsics"].pop("cam_1"),
+        r"unknowns that have no value: intrinsics:cam_1",
+    ),
+    "narrower": (lambda raw: camera(raw).update(widened=0.5), r"cam_1\.widened: must be at least 1 \(found 0\.5\)"),
+    "held": (lambda raw: camera(raw).update(held_by_prior=["k9"]), r"held_by_prior: has k9, but the parameters are fx"),
+    "shared": (lambda raw: camera(raw).update(shared_with=["cam_0"]), r"shared_with: cam_0 has not the same camera"),
+    "rms of a sensor": (
+        lambda raw: camera(raw).update(rms_px=3.0),
+        r"cam_1\.rms_px: must be .*, as in \$\.refined\.re",
+    ),
+    "rms of all": (lambda raw: found(raw).update(rms_px=3.0), r"reprojection\.rms_px: must be between the sensors'"),
+    "no rms": (lambda raw: found(raw).pop("rms_px"), r"refined\.reprojection\.rms_px: Field required"),
+    "a negative size": (
+        lambda raw: found(raw).update(corner_px=-0.1),
+        r"corner_px: must not be negative \(found -0\.1",
+    ),
+    "exact": (
+        lambda raw: found(raw).update(carrier_poses="exact"),
+        r"carrier_poses: 'exact', but the noise of A is 0\.0",
+    ),
+    "no target": (
+        lambda raw: found(raw)["boards"].update(moon=found(raw)["boards"]["board"]),
+        r"reprojection\.boards: has moon, but the targets are board",
+    ),
+    "another size": (
+        lambda raw: found(raw)["boards"]["board"].update(values=[0.02]),
+        r"boards\.board\.values: a size of 0\.02 is not that of the scale",
+    ),
+    "another deviation of the size": (
+        lambda raw: found(raw)["boards"]["board"].update(standard_deviations=[0.02]),
+        r"boards\.board\.standard_deviations: must be \[",
+    ),
+    "uneven regions": (
+        lambda raw: found(raw)["sensors"]["cam_1"]["regions_px"][1].pop(),
+        r"sensors\.cam_1\.regions_px: rows of different lengths",
+    ),
+    "a negative region": (
+        lambda raw: camera(raw, "cam_0")["projection_px"].__setitem__(1, [-1.0, None]),
+        r"cam_0\.projection_px: must not be negative",
+    ),
+    "nothing chosen": (
+        lambda raw: found(raw)["tried"][0].update(is_chosen=False),
+        r"reprojection\.tried: one model is chosen, and here are 0",
+    ),
+    "of no frame": (
+        lambda raw: found(raw)["consequences"][0].update(frame="moon"),
+        r"consequences\[0\]\.frame: has moon, but the frames are",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_damage_is_refused_with_its_place(case: str, text: str, tmp_path: Path) -> None:
+    change, said = CASES[case]
+    raw = json.loads(text)
+    change(raw)
+    path = tmp_path / "refined.json"
+    path.write_text(json.dumps(raw), encoding="utf-8")
+    with pytest.raises(FileFormatError, match=said) as caught:
+        read_result(path)
+    assert str(path) in str(caught.value)
