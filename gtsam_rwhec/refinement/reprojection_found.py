@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 
 #: The name of a board's size among its numbers: its covariance is that of the target's scale.
 SIZE = "size"
+#: The names of a board's warp, by its axis.
+WARPS = {"x": "warp_x", "y": "warp_y"}
 #: By region of the image, rows from the top, columns from the left; None where no corner was seen.
 Regions = tuple[tuple[float | None, ...], ...]
 
@@ -60,6 +64,11 @@ class TriedModel:
     held_out_mm: float
     is_chosen: bool
 
+    def __str__(self) -> str:
+        """One line: the error, then the model."""
+        chosen = " (chosen)" if self.is_chosen else ""
+        return f"{self.held_out_mm:.3f} mm, {self.held_out_px:.3f} px: {self.words}{chosen}"
+
 
 @dataclass(frozen=True)
 class Consequence:
@@ -79,6 +88,13 @@ class Consequence:
     rotation_deg: float
     translation_mm: float
 
+    def __str__(self) -> str:
+        """One sentence, without its full stop."""
+        return (
+            f"{self.cause} would move {self.frame} by {rounded(self.translation_mm)} mm and "
+            f"{rounded(self.rotation_deg)} degrees"
+        )
+
 
 @dataclass(frozen=True)
 class BoardShape:
@@ -96,6 +112,19 @@ class BoardShape:
     names: tuple[str, ...]
     values: tuple[float, ...]
     standard_deviations: tuple[float, ...]
+
+    def __str__(self) -> str:
+        """What was found, in percent and millimetres."""
+        found = {name: at for at, name in enumerate(self.names)}
+        said = []
+        if SIZE in found:
+            off, deviation = (100.0 * each[found[SIZE]] for each in (self.values, self.standard_deviations))
+            said.append(f"{abs(off):.3f} ± {rounded(deviation)} % {'larger' if off > 0.0 else 'smaller'} than stated")
+        for axis, name in WARPS.items():
+            if name in found:
+                height, deviation = (1e3 * each[found[name]] for each in (self.values, self.standard_deviations))
+                said.append(f"its edge along {axis} is {height:+.3f} ± {rounded(deviation)} mm above its middle")
+        return "; ".join(said)
 
 
 @dataclass(frozen=True)
@@ -130,6 +159,22 @@ class Reprojection:
     boards: dict[str, BoardShape]
     tried: tuple[TriedModel, ...]
     consequences: tuple[Consequence, ...]
+
+    def __str__(self) -> str:
+        """What was refined, and how well it fits, in two sentences."""
+        corners = sum(of.corners for of in self.sensors.values())
+        images = sum(of.images for of in self.sensors.values())
+        rotation, translation = math.degrees(self.carrier_rotation_rad), 1e3 * self.carrier_translation_m
+        noise = f"{rounded(rotation)}° and {rounded(translation)} mm for each axis"
+        of_A = {
+            "exact": "The carriers' poses A count as exact.",
+            "estimated": f"The carriers' poses A were refined too; their noise, as the corners show it: {noise}.",
+            "given": f"The carriers' poses A were refined too, within the noise that was given: {noise}.",
+        }[self.carrier_poses]
+        return (
+            f"The poses are refined from {corners} corners in {images} images: rms {self.rms_px:.3f} px along each "
+            f"axis, where the noise of a corner is {self.corner_px:.3f} px. {of_A}"
+        )
 
 
 @dataclass(frozen=True)
@@ -182,6 +227,25 @@ class Intrinsics:
     rms_px: float
     projection_px: Regions = ()
     projection_m: float = 0.0
+
+    def __str__(self) -> str:
+        """How they were stated, whether the images agree, and what the images do not determine."""
+        if self.stated_as == "unknown":
+            said = ["none were stated, so the images alone tell them"]
+        else:
+            origin = "a calibration's" if self.stated_as == "calibration" else "nominal ones"
+            said = [f"estimated, with a prior from what was stated ({origin})"]
+            if self.widened > 1.0:
+                said.append(
+                    f"the images contradict that by {rounded(self.innovation_deviations)} deviations, so the prior was "
+                    f"widened {rounded(self.widened)} times"
+                )
+            else:
+                said.append(f"the images agree with it ({rounded(self.innovation_deviations)} deviations off)")
+        if self.held_by_prior:
+            held = ", ".join(self.held_by_prior)
+            said.append(f"the images do not determine {held}, which only the prior holds")
+        return "; ".join(said)
 
     @property
     def camera(self) -> Camera:

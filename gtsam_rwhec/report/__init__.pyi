@@ -1,5 +1,6 @@
 from .calibration_report import print_calibration as print_calibration
 from .comparison_report import print_comparison as print_comparison
+from .corner_report import print_corners as print_corners
 from .covariance_report import print_refined as print_refined
 from .cross_validation_table import print_cross_validation as print_cross_validation
 from .demo_report import print_demo as print_demo

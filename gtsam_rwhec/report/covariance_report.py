@@ -16,6 +16,7 @@ from gtsam_rwhec.refinement.options import About
 from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.refinement.unknowns import UnknownKind
 from gtsam_rwhec.report.advice import print_advice
+from gtsam_rwhec.report.corner_report import print_corners
 from gtsam_rwhec.report.log_report import print_log
 from gtsam_rwhec.report.pose_table import POSE_HEADINGS, RESIDUAL_LEGEND, FrameTable, pose_cells, residual_table
 from gtsam_rwhec.report.printing import print_heading, print_sentence, print_tables, print_verdict, report_console
@@ -32,6 +33,11 @@ CARRIERS: dict[About, str] = {"targetcarrier": "target carrier", "sensorcarrier"
 NOISE_LEGEND = (
     "This is the noise of the median measurement, before any fit. Residuals are weighted: far and oblique measurements "
     "are noisier and count less, so the residuals' root mean square can be far smaller."
+)
+#: Of a log whose corners were not used.
+NOT_FROM_CORNERS = (
+    "The answer is from the poses of targets in the images: the intrinsics by which these were measured count as "
+    "exact, and their errors are not in the standard deviations."
 )
 LEGEND = (
     "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation, along "
@@ -79,6 +85,9 @@ def print_refined_body(
         print_sentence(console, f"{MARK}: do not use this pose; {counts}.", "bold")
     for sentence in scale_and_offset_sentences(refined):
         print_sentence(console, sentence)
+    if refined.reprojection is None and log is not None:
+        print_sentence(console, NOT_FROM_CORNERS)
+    print_corners(refined, console)
     print_heading(console, "Details")
     if log is not None:
         print_log(log, console)
@@ -118,7 +127,7 @@ def scale_and_offset_sentences(refined: Refined) -> list[str]:
     """The scales and time offsets, with their standard deviations."""
     sentences = []
     for unknown in refined.unknowns:
-        if unknown.kind is UnknownKind.FRAME:
+        if unknown.kind not in (UnknownKind.SCALE, UnknownKind.TIME_OFFSET):
             continue
         deviation = math.sqrt(refined.covariance(unknown)[0, 0])
         owner = unknown.owner

@@ -20,6 +20,20 @@ from gtsam_rwhec.reprojection.refined import CornersRefined
 CENTRE_PX, FOCAL_SHARE, CARRIER_RAD = 1.0, 1e-3, np.radians(0.1)
 
 
+#: The cause of A's, in words.
+OF_CARRIERS = f"{np.degrees(CARRIER_RAD):.1f} degrees of A's noise about each axis"
+
+
+def centre_causes(sensor: str) -> tuple[str, str]:
+    """Errors of a camera's centre, in words."""
+    return f"{CENTRE_PX:g} pixel of {sensor}'s cx", f"{CENTRE_PX:g} pixel of {sensor}'s cy"
+
+
+def focal_cause(sensor: str) -> str:
+    """An error of a camera's focal length, in words."""
+    return f"{FOCAL_SHARE:.1%} of {sensor}'s focal length"
+
+
 def consequences_of(refined: CornersRefined) -> tuple[Consequence, ...]:
     """What one pixel of c, one part in a thousand of f and 0.1 degrees of A's noise would do to each frame."""
     slots = refined.slots
@@ -31,10 +45,11 @@ def consequences_of(refined: CornersRefined) -> tuple[Consequence, ...]:
         if letter != "k":
             continue
         focal = refined.intrinsics[name].camera.K[[0, 1], [0, 1]]
+        of_cx, of_cy = centre_causes(name)
         steps: dict[str, tuple[int | slice, float | Array]] = {
-            f"{CENTRE_PX:g} pixel of {name}'s cx": (2, CENTRE_PX),
-            f"{CENTRE_PX:g} pixel of {name}'s cy": (3, CENTRE_PX),
-            f"{FOCAL_SHARE:.1%} of {name}'s focal length": (slice(0, 2), FOCAL_SHARE * focal),
+            of_cx: (2, CENTRE_PX),
+            of_cy: (3, CENTRE_PX),
+            focal_cause(name): (slice(0, 2), FOCAL_SHARE * focal),
         }
         for cause, (which, size) in steps.items():
             dk = np.zeros(at.stop - at.start)
@@ -43,11 +58,10 @@ def consequences_of(refined: CornersRefined) -> tuple[Consequence, ...]:
             moved[rest] = -np.linalg.solve(information[np.ix_(rest, rest)], information[rest, at] @ dk)
             result += [_moved(frame, cause, moved[rows]) for frame, rows in poses.items()]
     covariance = _of_carrier_noise(refined)
-    cause = f"{np.degrees(CARRIER_RAD):.1f} degrees of A's noise about each axis"
     for frame, rows in poses.items():
         block = covariance[rows, rows]
         worst = [np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (block[:3, :3], block[3:, 3:])]
-        result.append(Consequence(frame, cause, float(np.degrees(worst[0])), float(1e3 * worst[1])))
+        result.append(Consequence(frame, OF_CARRIERS, float(np.degrees(worst[0])), float(1e3 * worst[1])))
     return tuple(result)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
@@ -21,6 +22,10 @@ from gtsam_rwhec.reprojection.held_out import REGIONS
 from gtsam_rwhec.reprojection.lens import parameters_of, pixels_and_derivatives
 from gtsam_rwhec.reprojection.refined import CornersRefined
 from gtsam_rwhec.vision.camera import Camera
+
+#: A part of the image is said to be uncertain where projections are so many times as uncertain as in the best part,
+#: and by more than this: what was learnt in one part is extrapolated.
+TIMES, LEAST_PX = 5.0, 1.0
 
 
 def projection_deviations(
@@ -97,6 +102,32 @@ def by_region(camera: Camera, covariance: Array, distance_m: float) -> Regions:
     return tuple(
         tuple(float(np.sqrt(s / n)) if n else None for s, n in zip(*row, strict=True))
         for row in zip(total, count, strict=True)
+    )
+
+
+def uneven_words(projection_px: Regions, corners: Regions = ()) -> str:
+    """What to say of a camera that was calibrated from a part of its image; empty where it knows all parts alike.
+
+    Parameters
+    ----------
+    projection_px : tuple of tuple of float or None
+        As `by_region` gives it.
+    corners : tuple of tuple of float or None
+        Anything by the same regions that is None where no corner was seen.
+    """
+    known = [px for row in projection_px for px in row if px is not None]
+    if not known:
+        return ""
+    best, limit = min(known), max(TIMES * min(known), LEAST_PX)
+    far = {(v, u) for v, row in enumerate(projection_px) for u, px in enumerate(row) if px is not None and px > limit}
+    if not far:
+        return ""
+    unseen = sum((v, u) in far for v, row in enumerate(corners) for u, of in enumerate(row) if of is None)
+    seen = f"; no corner was seen in {unseen} of these" if unseen else ""
+    return (
+        f"projections are uncertain by up to {rounded(max(known))} px in {len(far)} of {len(known)} parts of the "
+        f"image, and by {rounded(best)} px in the best part{seen}: take images with a target there, or do not use "
+        "these parts"
     )
 
 

@@ -1,0 +1,161 @@
+"""What a person reads about a refinement from corners: errors, intrinsics, boards, and what errors would do."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import re
+
+import numpy as np
+import pytest
+from refined_corners import two_cameras
+from rich.console import Console
+
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.reprojection_found import Consequence, Intrinsics
+from gtsam_rwhec.report import print_corners, print_refined
+from gtsam_rwhec.report.corner_report import (
+    consequences_table,
+    errors_table,
+    intrinsics_sentences,
+    intrinsics_table,
+)
+from gtsam_rwhec.report.covariance_report import scale_and_offset_sentences
+from gtsam_rwhec.reprojection.consequences import OF_CARRIERS, centre_causes, focal_cause
+
+
+@pytest.fixture(scope="module")
+def refined() -> Refined:
+    return two_cameras()[2]
+
+
+def printed(refined: Refined, width: int = 160, *, terminal: bool = False) -> str:
+    stream = io.StringIO()
+    print_corners(refined, Console(file=stream, width=width, force_terminal=terminal, color_system=None))
+    return re.sub(r"\x1b\[[0-9;]*m", "", stream.getvalue())
+
+
+def changed(refined: Refined, **of_cam_0: object) -> Refined:
+    cam_0: Intrinsics = dataclasses.replace(refined.intrinsics["cam_0"], **of_cam_0)  # type: ignore[arg-type]
+    return dataclasses.replace(refined, intrinsics={**refined.intrinsics, "cam_0": cam_0})
+
+
+def test_the_section_stands_between_poses_and_details(refined: Refined) -> None:
+    stream = io.StringIO()
+    print_refined(refined, Console(file=stream, width=160, color_system=None))
+    text = stream.getvalue()
+    places = [text.index(words) for words in ("Poses\n", "Corners and intrinsics\n", "Details\n")]
+    assert places == sorted(places)
+    assert str(refined.reprojection) in text
+    (scale,) = scale_and_offset_sentences(refined)  # intrinsics and shapes have a section of their own
+    assert scale.startswith("Scale of board")
+    assert printed(dataclasses.replace(refined, reprojection=None)) == ""
+
+
+@pytest.mark.parametrize("width", [50, 80, 160])
+def test_nothing_is_cut_and_nothing_sticks_out(refined: Refined, width: int) -> None:
+    text = printed(refined, width, terminal=True)
+    assert max(map(len, text.splitlines())) <= width
+    assert "…" not in text
+    words = re.sub(r"[\s,]+", " ", text)
+    for name in ("cam_0 fx", "cam_1 p2", "0.612 px: A's noise estimated and sizes as stated (chosen)"):
+        assert name in words
+
+
+def test_errors_and_numbers_are_those_of_the_result(refined: Refined) -> None:
+    assert refined.reprojection is not None
+    cells = errors_table(refined.reprojection).rows["cam_1"]
+    of = refined.reprojection.sensors["cam_1"]
+    assert cells[:3] == (str(of.images), str(of.corners), "0")
+    assert [float(cell) for cell in cells[3:]] == pytest.approx([of.rms_px, of.held_out_px, of.held_out_mm], abs=6e-4)
+    alone = dataclasses.replace(of, held_out_px=None, held_out_mm=None)
+    without = dataclasses.replace(refined.reprojection, sensors={"cam_1": alone})
+    assert errors_table(without).rows["cam_1"][4:] == ("-", "-")
+    rows = intrinsics_table(refined).rows
+    assert len(rows) == 16
+    cam = refined.intrinsics["cam_0"]
+    found, deviation, stated, known = (float(cell) for cell in rows["cam_0 fx"][:4])
+    assert found == pytest.approx(cam.values[0], abs=0.06)
+    assert deviation == pytest.approx(cam.standard_deviations[0], rel=0.06)
+    assert (stated, known) == pytest.approx((cam.stated[0], cam.stated_deviations[0]), abs=0.06)
+
+
+def test_intrinsics_say_how_they_were_stated_and_what_the_images_do_not_tell(refined: Refined) -> None:
+    agree = intrinsics_sentences(changed(refined, innovation_deviations=0.81, held_by_prior=()))[0]
+    assert agree == (
+        "cam_0: estimated, with a prior from what was stated (nominal ones); the images agree with it (0.81 deviations "
+        "off)."
+    )
+    held = changed(refined, stated_as="calibration", widened=3.2, innovation_deviations=7.0, held_by_prior=("k2", "p1"))
+    assert intrinsics_sentences(held)[0] == (
+        "cam_0: estimated, with a prior from what was stated (a calibration's); the images contradict that by 7 "
+        "deviations, so the prior was widened 3.2 times; the images do not determine k2, p1, which only the prior "
+        "holds."
+    )
+    assert intrinsics_table(held).rows["cam_0 k2"][-1] == "stated"
+    assert intrinsics_table(held).rows["cam_0 k1"][-1] == "images"
+    unknown = changed(refined, stated_as="unknown", stated_deviations=(np.inf,) * 8, held_by_prior=())
+    assert intrinsics_sentences(unknown)[0] == "cam_0: none were stated, so the images alone tell them."
+    assert intrinsics_table(unknown).rows["cam_0 fx"][3] == "unknown"
+
+
+def test_a_camera_is_told_once_and_one_that_was_kept_is_told_too(refined: Refined) -> None:
+    shared = changed(refined, shared_with=("cam_1",))
+    assert [s.partition(":")[0] for s in intrinsics_sentences(shared) if "prior" in s] == ["cam_0, cam_1"]
+    assert len(intrinsics_table(shared).rows) == 8
+    kept = dataclasses.replace(refined, intrinsics={"cam_0": refined.intrinsics["cam_0"]})
+    said = "cam_1: the intrinsics count as exact, as stated; they were not estimated."
+    assert said in intrinsics_sentences(kept)
+
+
+def test_a_camera_that_was_calibrated_from_a_corner_of_its_image_says_so(refined: Refined) -> None:
+    assert refined.reprojection is not None
+    seen = ((0.2, None, None),) + ((None,) * 3,) * 2
+    sensors = {"cam_0": dataclasses.replace(refined.reprojection.sensors["cam_0"], regions_px=seen)}
+    part = dataclasses.replace(refined, reprojection=dataclasses.replace(refined.reprojection, sensors=sensors))
+    far = ((0.2, 0.4, 0.9), (0.3, 0.8, 2.0), (0.9, 2.0, 14.2))
+    assert (
+        "cam_0: projections are uncertain by up to 14 px in 3 of 9 parts of the image, and by 0.2 px in the best part; "
+        "no corner was seen in 3 of these: take images with a target there, or do not use these parts."
+    ) in intrinsics_sentences(changed(part, projection_px=far))
+    for even in ((0.2, 0.4, 0.99), (0.3, 1.2, 1.4), (None, None, None)):
+        said = intrinsics_sentences(changed(part, projection_px=(even,)))
+        assert not any("uncertain" in sentence for sentence in said)
+
+
+def test_consequences_have_a_row_for_each_frame_and_the_worst_of_many_cameras(refined: Refined) -> None:
+    assert refined.reprojection is not None
+    table = consequences_table(refined.reprojection, ["cam_0", "cam_1"])
+    assert table.headings == (
+        "1 px of c, cam_0", "0.1% of f, cam_0", "1 px of c, cam_1", "0.1% of f, cam_1", "0.1° of A",
+    )  # fmt: skip
+    assert list(table.rows) == ["board", "cam_0", "cam_1"]
+    by = {(of.frame, of.cause): of for of in refined.reprojection.consequences}
+    of_cx, of_cy = (by["cam_0", cause] for cause in centre_causes("cam_0"))
+    mm, degrees = (float(number) for number in table.rows["cam_0"][0].split(" / "))
+    assert mm == pytest.approx(max(of_cx.translation_mm, of_cy.translation_mm), abs=0.0051)
+    assert degrees == pytest.approx(max(of_cx.rotation_deg, of_cy.rotation_deg), abs=0.00051)
+    names = [f"cam_{k}" for k in range(9)]
+    many = tuple(Consequence("hand", focal_cause(name), 0.01 * k, float(k)) for k, name in enumerate(names))
+    every = dataclasses.replace(refined.reprojection, consequences=(*many, Consequence("hand", OF_CARRIERS, 0.3, 1.2)))
+    table = consequences_table(every, names)
+    assert table.headings == ("1 px of c", "0.1% of f", "0.1° of A")
+    assert table.rows["hand"] == ("-", "8.00 / 0.080", "1.20 / 0.300")
+
+
+def test_records_are_sentences(refined: Refined) -> None:
+    assert refined.reprojection is not None
+    text = str(refined.reprojection)
+    number = sum(of.corners for of in refined.reprojection.sensors.values())
+    assert text.startswith(f"The poses are refined from {number} corners in ")
+    assert "The carriers' poses A were refined too; their noise, as the corners show it: " in text
+    exact = dataclasses.replace(refined.reprojection, carrier_poses="exact")
+    assert str(exact).endswith("The carriers' poses A count as exact.")
+    board = str(refined.reprojection.boards["board"])
+    assert re.fullmatch(
+        r"\d\.\d{3} ± \S+ % (larger|smaller) than stated; its edge along x is [+-]\d\.\d{3} ± \S+ mm above its middle; "
+        r"its edge along y is [+-]\d\.\d{3} ± \S+ mm above its middle",
+        board,
+    )
+    moved = Consequence("cam_0", "1 pixel of cam_0's cx", 0.0351, 0.213)
+    assert str(moved) == "1 pixel of cam_0's cx would move cam_0 by 0.21 mm and 0.035 degrees"
