@@ -153,7 +153,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/reprojection": {
         "methods/test_reprojection.py": "observations",
-        "reprojection/test_calibrating_corners.py": "first_intrinsics",
+        "reprojection/test_calibrating_corners.py": "chosen_poses first_intrinsics",
         "reprojection/test_corner_findings.py": "findings",
         "reprojection/test_corner_graph.py": "model",
         "reprojection/test_refining_corners.py": "corner_outliers freedom intrinsics options refined stated_intrinsics",

@@ -27,15 +27,13 @@ from gtsam_rwhec.methods.linear_methods import start_of
 from gtsam_rwhec.methods.method import MethodOptions, checked_start
 from gtsam_rwhec.methods.registry import check_options
 from gtsam_rwhec.methods.tabb2017 import Parameterisation
-from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise
+from gtsam_rwhec.reprojection.chosen_poses import solved_with_chosen_poses
 from gtsam_rwhec.reprojection.determined import check_arguments
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refining_corners import refine_corners
 
-#: In this many rounds, the calibration of the round before chooses between a flat target's two poses.
-ROUNDS = 3
 #: The name of ``rw.refine_corners`` in tables.
 OURS = "refine_corners"
 #: The published methods.
@@ -202,9 +200,9 @@ def compare(
 def certified_start(observations: Observations, options: MethodOptions | None = None) -> tuple[Poses, Poses]:
     """X and Y of the certified solution of the images' poses, whose two candidates it chooses between."""
     options = options or MethodOptions()
-    solution = quiet_solution(observations.poses(), options)
-    for _ in range(ROUNDS - 1):
-        solution = quiet_solution(observations.poses(_predicted(observations, solution.X, solution.Y)), options)
+    solution = solved_with_chosen_poses(
+        observations, lambda problem: quiet_solution(problem, options), lambda answer: (answer.X, answer.Y)
+    )
     return solution.X, solution.Y
 
 
@@ -279,17 +277,7 @@ def _start(observations: Observations, options: MethodOptions) -> tuple[Poses, P
     if options.start is not None:
         X, Y, _ = checked_start(observations.targets, observations.sensors, options.start)
         return X, Y, "the given start"
-    problem: Problem = observations.poses()
-    for _ in range(ROUNDS):
-        X, Y, _, _ = start_of(problem, options)
-        problem = observations.poses(_predicted(observations, X, Y))
-    X, Y, _, words = start_of(problem, options)
+    X, Y, _, words = solved_with_chosen_poses(
+        observations, lambda problem: start_of(problem, options), lambda answer: answer[:2]
+    )
     return X, Y, f"{words} of the images' poses"
-
-
-def _predicted(observations: Observations, X: Poses, Y: Poses) -> dict[tuple[str, str], Array]:
-    """T_camera_target of each image by a calibration."""
-    return {
-        (target, sensor): np.linalg.inv(one_transform(Y[sensor], sensor)) @ view.A @ one_transform(X[target], target)
-        for (target, sensor), view in observations.views.items()
-    }

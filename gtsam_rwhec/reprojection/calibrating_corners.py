@@ -10,12 +10,12 @@ import numpy as np
 from gtsam_rwhec.errors import RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
-from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import RefineOptions
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.refining import refine
+from gtsam_rwhec.reprojection.chosen_poses import solved_with_chosen_poses
 from gtsam_rwhec.reprojection.determined import check_arguments
 from gtsam_rwhec.reprojection.first_intrinsics import first_intrinsics
 from gtsam_rwhec.reprojection.observations import Observations
@@ -24,9 +24,6 @@ from gtsam_rwhec.reprojection.refined import CornersRefined
 from gtsam_rwhec.reprojection.refining_corners import refine_corners
 from gtsam_rwhec.solving.certified_solution import solve
 from gtsam_rwhec.solving.solution import Solution
-
-#: In so many rounds the calibration of the round before chooses between a flat target's two poses.
-ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +83,9 @@ def calibrate_corners(
             cameras[sensor] = first_intrinsics(observations, sensor)
     observations = replace(observations, cameras=cameras)
     robust = RefineOptions(noise="estimate", robust="gnc")
-    problem = observations.poses()
-    refined = _refined(problem, robust, tell)
-    for _ in range(ROUNDS - 1):
-        problem = observations.poses(_predicted(observations, refined))
-        refined = _refined(problem, robust, tell)
+    refined = solved_with_chosen_poses(
+        observations, lambda problem: _refined(problem, robust, tell), lambda answer: (answer.X, answer.Y)
+    )
     views = {
         pair: view.selected(good)
         for pair, view in observations.views.items()
@@ -106,11 +101,3 @@ def _refined(problem: Problem, options: RefineOptions, tell: Progress) -> Refine
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RwhecWarning)
         return refine(problem, solve(problem, progress=tell), options, progress=tell)
-
-
-def _predicted(observations: Observations, refined: Refined) -> dict[tuple[str, str], Array]:
-    """T_camera_target of each image by a calibration."""
-    return {
-        (target, sensor): np.linalg.inv(refined.Y[sensor].matrix()) @ view.A @ refined.X[target].matrix()
-        for (target, sensor), view in observations.views.items()
-    }

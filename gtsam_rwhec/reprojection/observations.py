@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -135,9 +136,34 @@ class Observations:
         a flat target's two poses. Left out, each image takes the pose with less reprojection error. Raises TargetError
         when a target is not flat, and CameraError when an image's corners have no pose.
         """
+        problem = Problem()
+        choices = self.choices(predicted)
+        for (target, sensor), view in self.views.items():
+            T, covariance = self._candidates[target, sensor]
+            at, choice = np.arange(len(T)), choices[target, sensor]
+            lost = np.flatnonzero(~np.isfinite(T[at, choice]).all(axis=(1, 2)))
+            if lost.size:
+                raise CameraError(f"image {lost[0]} of {target} by {sensor} has no pose: are its corners on one line?")
+            problem.add(target, sensor, view.A, T[at, choice], covariances=covariance[at, choice])
+        return problem
+
+    def choices(self, predicted: Mapping[tuple[str, str], Array] | None = None) -> dict[tuple[str, str], np.ndarray]:
+        """Which of its two poses (N,) each image takes in `poses`: 0 is the one with less reprojection error."""
+        found = {}
+        for pair in self.views:
+            T, _ = self._candidates[pair]
+            found[pair] = np.zeros(len(T), dtype=int)
+            if predicted is not None:
+                off = np.linalg.norm(T[:, :, :3, :3] - predicted[pair][:, None, :3, :3], axis=(2, 3))
+                found[pair] = np.where(np.isnan(off[:, 1]), 0, np.argmin(np.nan_to_num(off, nan=np.inf), axis=1))
+        return found
+
+    @cached_property
+    def _candidates(self) -> dict[tuple[str, str], tuple[Array, Array]]:
+        """Each image's two poses (N, 2, 4, 4), nan where there is none, and their covariances (N, 2, 6, 6)."""
         from gtsam_rwhec.vision.pose import plane_poses
 
-        problem = Problem()
+        result = {}
         for (target, sensor), view in self.views.items():
             flat, T_target_flat = in_plane(self.corners[target], target)
             known = view.known
@@ -147,20 +173,11 @@ class Observations:
                 [pixels[seen] for pixels, seen in zip(view.pixels, known, strict=True)],
                 corner_px=self.corner_px,
             )
-            T = found.T @ np.linalg.inv(T_target_flat)
-            choice = np.zeros(len(T), dtype=int)
-            if predicted is not None:
-                off = np.linalg.norm(T[:, :, :3, :3] - predicted[target, sensor][:, None, :3, :3], axis=(2, 3))
-                choice = np.where(np.isnan(off[:, 1]), 0, np.argmin(np.nan_to_num(off, nan=np.inf), axis=1))
-            at = np.arange(len(T))
-            lost = np.flatnonzero(~np.isfinite(T[at, choice]).all(axis=(1, 2)))
-            if lost.size:
-                raise CameraError(f"image {lost[0]} of {target} by {sensor} has no pose: are its corners on one line?")
             # right perturbations of the flat frame become right perturbations of the target's frame by the adjoint
-            ad = se3.adjoint(np.broadcast_to(T_target_flat, (len(T), 4, 4)))
-            covariance = ad @ found.covariance[at, choice] @ ad.mT
-            problem.add(target, sensor, view.A, T[at, choice], covariances=0.5 * (covariance + covariance.mT))
-        return problem
+            ad = se3.adjoint(T_target_flat[None])[0]
+            covariance = ad @ found.covariance @ ad.T
+            result[target, sensor] = found.T @ se3.inverse(T_target_flat), 0.5 * (covariance + covariance.mT)
+        return result
 
 
 def in_plane(points: Array, name: str) -> tuple[Array, Array]:

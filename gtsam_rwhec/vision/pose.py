@@ -137,56 +137,60 @@ def _refined(
     camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, corner_px: float
 ) -> tuple[Array, Array, Array, Array]:
     """Refine T by damped Gauss-Newton; return T, sums of squares, covariances, and errors (N, 2, n, 2)."""
-    T = T.copy()
-    errors, J = _linearised(camera, T, p, u, known)
-    cost = np.einsum("ncki,ncki->nc", errors, errors)
-    damping = np.full(cost.shape, 1e-9)
+    shape = T.shape[:2]
+    T = T.reshape(-1, 4, 4).copy()
+    target = np.repeat(np.arange(shape[0]), shape[1])  # of each candidate
+    damping = np.full(len(T), 1e-9)
     with np.errstate(invalid="ignore"):
+        errors, H, g = _normal_equations(camera, T, p[target], u[target], known[target])
+        cost = (errors**2).sum(axis=(1, 2))
+        left = np.arange(len(T))  # candidates that still move
         for _ in range(STEPS):
-            H = np.einsum("nckia,nckib->ncab", J, J)
-            g = np.einsum("nckia,ncki->nca", J, errors)[..., None]
-            diagonal = np.einsum("ncaa->nca", H)
-            step = _solved(H + np.eye(6) * (damping[..., None] * diagonal + 1e-12)[..., None, :], g)
-            tried = T @ se3.expmap(np.nan_to_num(step).reshape(-1, 6)).reshape(T.shape)
-            new_errors, new_J = _linearised(camera, tried, p, u, known)
-            new_cost = np.einsum("ncki,ncki->nc", new_errors, new_errors)
-            better = new_cost <= cost
-            T, errors, J = (
-                np.where(better.reshape(better.shape + (1,) * (a.ndim - 2)), b, a)
-                for a, b in ((T, tried), (errors, new_errors), (J, new_J))
-            )
+            diagonal = np.einsum("naa->na", H[left])
+            step = _solved(H[left] + np.eye(6) * (damping[left, None] * diagonal + 1e-12)[:, None], g[left][..., None])
+            tried = T[left] @ se3.expmap(np.nan_to_num(step[..., 0]))
+            of = target[left]
+            new_errors, new_H, new_g = _normal_equations(camera, tried, p[of], u[of], known[of])
+            before, new_cost = cost[left], (new_errors**2).sum(axis=(1, 2))
+            better = new_cost <= before
+            taken = left[better]
+            T[taken], errors[taken], H[taken] = tried[better], new_errors[better], new_H[better]
+            g[taken], cost[taken] = new_g[better], new_cost[better]
+            damping[left] = np.where(better, damping[left] * 0.1, np.maximum(damping[left], 1e-6) * 100.0)
             # A change within rounding is settled, for the better or for the worse.
-            moved = np.abs(cost - new_cost) > SETTLED * (1e-6 + cost)
-            cost = np.where(better, new_cost, cost)
-            damping = np.where(better, damping * 0.1, np.maximum(damping, 1e-6) * 100.0)
-            if not (moved & (better | (damping < 1.0))).any():
+            moved = np.abs(before - new_cost) > SETTLED * (1e-6 + before)
+            left = left[moved & (better | (damping[left] < 1.0))]
+            if not len(left):
                 break
-    H = np.einsum("nckia,nckib->ncab", J, J) / corner_px**2
+    H /= corner_px**2
     covariance = _solved(H, np.broadcast_to(np.eye(6), H.shape))
     covariance = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
     cost = np.where(np.isfinite(T).all(axis=(-1, -2)) & np.isfinite(covariance).all(axis=(-1, -2)), cost, np.nan)
-    return T, cost, covariance, errors
+    return (
+        T.reshape(*shape, 4, 4), cost.reshape(shape), covariance.reshape(*shape, 6, 6),
+        errors.reshape(*shape, *errors.shape[1:]),
+    )  # fmt: skip
 
 
-def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray) -> tuple[Array, Array]:
-    """Errors (N, 2, n, 2), seen minus predicted, and the derivatives (N, 2, n, 2, 6) of the predictions.
+def _normal_equations(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray) -> tuple[Array, Array, Array]:
+    """Errors (M, n, 2), seen minus predicted, and J'J (M, 6, 6) and J'e (M, 6) of the predictions' derivatives J.
 
     A right perturbation [omega, v] moves a point of the target by R (omega x p + v) in the camera's frame.
     """
-    R, t = T[..., :3, :3], T[..., :3, 3]
-    seen = np.einsum("ncij,nkj->ncki", R, p) + t[:, :, None]
+    R, t, rows = T[:, :3, :3], T[:, :3, 3], 2 * known.shape[1]
+    seen = p @ R.transpose(0, 2, 1) + t[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         z = np.where(seen[..., 2] > 1e-9, seen[..., 2], np.nan)
         x = seen[..., :2] / z[..., None]
         pixels, D = camera.pixel_jacobian(x)
         # d(x, y)/d(X, Y, Z) = [I, -x] / Z
-        to_x = np.concatenate([np.broadcast_to(np.eye(2), (*x.shape, 2)), -x[..., None]], axis=-1) / z[..., None, None]
-        DR = D @ to_x @ R[:, :, None]
-    moved = np.concatenate([-se3.hat(p), np.broadcast_to(np.eye(3), (*p.shape, 3))], axis=-1)
-    J = DR @ moved[:, None]
-    errors = u[:, None] - pixels
-    mask = known[:, None, :, None]
-    return np.where(mask, errors, 0.0), np.where(mask[..., None], J, 0.0)
+        by_seen = np.concatenate([D, -(D @ x[..., None])], axis=-1) / z[..., None, None]
+        by_point = (by_seen.reshape(len(T), rows, 3) @ R).reshape(*known.shape, 2, 3)
+    by_turn = np.cross(p[:, :, None], by_point)  # row' (omega x p) = omega' (p x row)
+    J = np.where(known[..., None, None], np.concatenate([by_turn, by_point], axis=-1), 0.0).reshape(len(T), rows, 6)
+    errors = np.where(known[..., None], u - pixels, 0.0)
+    Jt = J.transpose(0, 2, 1)
+    return errors, Jt @ J, (Jt @ errors.reshape(len(T), rows, 1))[..., 0]
 
 
 def _solved(H: Array, g: Array) -> Array:
