@@ -7,6 +7,7 @@ from .problem import Prior as Prior
 from .problem import Problem as Problem
 from .problem import ScaleMode as ScaleMode
 from .problem import read_csv as read_csv
+from .vision import Camera as Camera
 
 # Solve it, or certify somebody's answer.
 from .identifiability import FreeDirection as FreeDirection

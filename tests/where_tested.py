@@ -129,8 +129,9 @@ TABLE: dict[str, dict[str, str]] = {
         ),
     },
     "gtsam_rwhec/problem": {
+        "problem/test_corners.py": "corner_poses nearer_poses",
         "problem/test_moments.py": "accumulation",
-        "problem/test_problem.py": "knowledge long_translations measurements",
+        "problem/test_problem.py": "contents knowledge long_translations measurements",
         "problem/test_selection.py": "variance_factors",
     },
     "gtsam_rwhec/refinement": {

@@ -8,11 +8,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError
+from gtsam_rwhec.errors import FrameError, OptionError, PriorError, ScaleError, TargetError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.geometry.real_numbers import is_between, is_one_of
+from gtsam_rwhec.problem.corners import check_camera, check_corner_px, same_board
 from gtsam_rwhec.problem.measurements import LARGEST_WEIGHT, SMALLEST_WEIGHT, positive_weights
+from gtsam_rwhec.vision.camera import Camera
 
 ScaleMode = Literal["known", "shared", "per_target"]
 #: Scales below this are refused, as weights are: no target has them, and their squares overflow.
@@ -89,7 +91,9 @@ class Knowledge:
     """Frames and scales that are known exactly or by a prior; the part of a `Problem` that is not measured.
 
     ``fixed`` has poses (4, 4) of frames on their carriers, metres, and ``priors`` has priors, both by the frame's name;
-    ``fixed_scales`` has measured over true length by target (or by sensor for motions).
+    ``fixed_scales`` has measured over true length by target (or by sensor for motions). Where corners were added,
+    ``cameras`` has the sensors' cameras, ``boards`` the targets' corners (n, 3), metres, in their own frames, and
+    ``corner_px`` the standard deviation of a corner, pixels.
     """
 
     def __init__(self, scale: ScaleMode) -> None:
@@ -99,6 +103,9 @@ class Knowledge:
         self.fixed: dict[str, Array] = {}
         self.priors: dict[str, list[Prior]] = {}
         self.fixed_scales: dict[str, float] = {}
+        self.cameras: dict[str, Camera] = {}
+        self.boards: dict[str, Array] = {}
+        self.corner_px: float | None = None
 
     def fix(self, name: str, T_carrier_frame: PoseLike) -> None:
         """Say that a frame's pose on its carrier is known exactly.
@@ -181,9 +188,19 @@ class Knowledge:
                 self.add_prior(name, prior.transform, prior.sigma, prior.kappa)
         for name, scale in other.fixed_scales.items():
             self.fix_scale(name, scale)
+        for name, camera in other.cameras.items():
+            self.cameras[name] = check_camera(camera, self.cameras.get(name), name, name)
+        for name, board in other.boards.items():
+            if not same_board(self.boards.setdefault(name, board), board):
+                raise TargetError(f"{name} has other board_points in one problem than in the other; rename one of them")
+        if other.corner_px is not None:
+            self.corner_px = check_corner_px(other.corner_px, self.corner_px, "a problem that is joined")
 
     def _take_knowledge(self, other: Knowledge, *, frames: Collection[str] = (), scales: Collection[str] = ()) -> None:
         """Copy the knowledge of another problem, without the frames and scales named."""
         self.fixed = {name: T for name, T in other.fixed.items() if name not in frames}
         self.priors = {name: list(priors) for name, priors in other.priors.items() if name not in frames}
         self.fixed_scales = {name: scale for name, scale in other.fixed_scales.items() if name not in scales}
+        self.cameras = {name: camera for name, camera in other.cameras.items() if name not in frames}
+        self.boards = {name: board for name, board in other.boards.items() if name not in frames}
+        self.corner_px = other.corner_px

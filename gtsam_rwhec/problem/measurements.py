@@ -39,6 +39,9 @@ class Measurements:
         Integer nanoseconds.
     covariances : (N, 6, 6) array or None
         Covariances of B, rotation first, right perturbation.
+    pixels : (N, n, 2) array or None
+        The target's corners in the images that B is from; nan where one was not seen. None, or all nan, where B was
+        given as a pose.
     """
 
     A: Array
@@ -47,6 +50,7 @@ class Measurements:
     kappa: Array
     stamps_ns: np.ndarray | None = None
     covariances: Array | None = None
+    pixels: Array | None = None
 
     def covariance_of_B(self) -> Array:
         """(N, 6, 6), rotation first: as given, or diagonal with 1 / (2 kappa) and sigma^2."""
@@ -105,6 +109,17 @@ class KeptMeasurements:
             np.concatenate([b.kappa for b in batches]),
             np.concatenate(stamps) if len(stamps) == len(batches) else None,
             np.concatenate([b.covariance_of_B() for b in batches]) if self.has_covariances else None,
+            self._pixels(),
+        )
+
+    def _pixels(self) -> Array | None:
+        """Corners of all batches; nan for those that were given as poses."""
+        shapes = {b.pixels.shape[1:] for b in self.batches if b.pixels is not None}
+        if not shapes:
+            return None
+        (shape,) = shapes  # a target has one board
+        return np.concatenate(
+            [np.full((len(b.A), *shape), np.nan) if b.pixels is None else b.pixels for b in self.batches]
         )
 
 
@@ -120,6 +135,7 @@ class GivenMeasurements:
     stamps_ns: ArrayLike | None
     covariances: ArrayLike | None
     source: str | None
+    pixels: Array | None = None
 
     @property
     def has_noise(self) -> bool:
@@ -156,6 +172,7 @@ class GivenMeasurements:
             positive_weights(kappa, len(A), "kappa", where),
             stamps_ns,
             covariances,
+            self.pixels,
         )
 
 

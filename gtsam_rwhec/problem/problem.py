@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Mapping
-from typing import Literal
+from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
 
 from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError, RotationsProjectedWarning
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder
+from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder, as_transforms
 from gtsam_rwhec.problem.accumulation import Accumulator, Batch
-from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
+from gtsam_rwhec.problem.contents import Contents
+from gtsam_rwhec.problem.corner_poses import candidates_of
+from gtsam_rwhec.problem.corners import EachImage, check_camera, check_corner_px, check_in_image, seen_corners
+from gtsam_rwhec.problem.knowledge import ScaleMode, check_name
 from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
 from gtsam_rwhec.problem.measurements import GivenMeasurements, KeptMeasurements, Measurements
-from gtsam_rwhec.problem.moments import Gauge, Moments
+from gtsam_rwhec.problem.moments import Moments
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.vision.camera import Camera
 
 
-class Problem(Knowledge):
+class Problem(Contents):
     """A calibration problem: A_i X_j = Y_k B_i for targets j, sensors k and measurements i.
 
     A = T_sensorcarrier_targetcarrier (known: kinematics, motion capture, SLAM), B = T_sensor_target (measured),
@@ -47,7 +50,7 @@ class Problem(Knowledge):
         sensor_carrier: str | None = None,
         target_carrier: str | None = None,
     ) -> None:
-        super().__init__(scale)
+        super().__init__(scale, keep_measurements)
         for name, what in ((sensor_carrier, "sensor_carrier"), (target_carrier, "target_carrier")):
             if name is not None:
                 check_name(name, what)
@@ -55,95 +58,7 @@ class Problem(Knowledge):
             raise FrameError(f"both carriers are named {brief(sensor_carrier)}; give each its own name")
         self.sensor_carrier = sensor_carrier
         self.target_carrier = target_carrier
-        self.keep_measurements = keep_measurements
-        self.is_relative = False
-        self._kind: dict[str, Literal["target", "sensor"]] = {}
-        self._kept: dict[Pair, KeptMeasurements] = {}
-        self._accumulator = Accumulator()
         self._long: frozenset[str] = frozenset()  # of "A" and "B", those whose millimetres were warned of
-
-    # -- contents -----------------------------------------------------------------------------------------------
-
-    @property
-    def targets(self) -> tuple[str, ...]:
-        """Names of the targets, in order of first appearance."""
-        return tuple(name for name, kind in self._kind.items() if kind == "target")
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Names of the sensors, in order of first appearance."""
-        return tuple(name for name, kind in self._kind.items() if kind == "sensor")
-
-    @property
-    def pairs(self) -> tuple[Pair, ...]:
-        """The pairs that have measurements, in order of first appearance."""
-        return tuple(self._kept)
-
-    @property
-    def number_of_measurements(self) -> int:
-        """The number of measurements of all pairs."""
-        return sum(moments.count for moments in self._accumulator.moments.values())
-
-    @property
-    def has_covariances(self) -> bool:
-        """Whether any measurement has a full covariance (refinement alone uses it)."""
-        return any(kept.has_covariances for kept in self._kept.values())
-
-    @property
-    def has_measurements(self) -> bool:
-        """Whether every raw measurement was kept."""
-        return sum(kept.count for kept in self._kept.values()) == self.number_of_measurements
-
-    def require_pairs(self) -> None:
-        """Raise a CountError where the problem has no measurements."""
-        if not self._kept:
-            raise CountError("the problem is empty; add measurements with problem.add(target, sensor, A, B, ...)")
-
-    def require_raw_measurements(self, what: str) -> None:
-        """Raise a MeasurementsNotKeptError where raw measurements, which ``what`` needs, were not kept."""
-        if not self.has_measurements:
-            raise MeasurementsNotKeptError(
-                f"{what} needs the raw measurements, and they were not kept (keep_measurements=False); make the "
-                "problem with keep_measurements=True"
-            )
-
-    @property
-    def gauge(self) -> Gauge:
-        """The reference points that the moments are summed about."""
-        return self._accumulator.gauge
-
-    def moments(self, target: str, sensor: str) -> Moments:
-        """Moments of a pair, about ``gauge``."""
-        return self._accumulator.moments[self._pair(target, sensor)]
-
-    def measurements(self, target: str, sensor: str) -> Measurements:
-        """Raw measurements of a pair, in the order in which they were added.
-
-        Raises
-        ------
-        MeasurementsNotKeptError
-            The problem was made with ``keep_measurements=False``.
-        """
-        pair = self._pair(target, sensor)
-        kept = self._kept[pair]
-        if kept.count != self._accumulator.moments[pair].count:
-            raise MeasurementsNotKeptError(
-                f"the raw measurements of {pair} were not kept (keep_measurements=False); "
-                "make the problem with keep_measurements=True"
-            )
-        return kept.joined()
-
-    def batches(self, target: str, sensor: str) -> tuple[Measurements, ...]:
-        """Raw measurements of a pair as they were added, batch by batch, without a copy; only what was kept."""
-        return self._kept[self._pair(target, sensor)].batches
-
-    def _pair(self, target: str, sensor: str) -> Pair:
-        check_name(target, "the target's name")
-        check_name(sensor, "the sensor's name")
-        pair = Pair(target, sensor)
-        if pair not in self._kept:
-            raise FrameError(f"no measurements of {pair}; there are {', '.join(map(str, self.pairs))}")
-        return pair
 
     # -- measurements -------------------------------------------------------------------------------------------
 
@@ -188,12 +103,83 @@ class Problem(Knowledge):
         PoseError, CountError, NoiseError, FrameError, StampError
             A name, pose, weight, stamp or covariance is not valid; nothing of the batch is added then.
         """
-        check_name(target, "the target's name")
-        check_name(sensor, "the sensor's name")
-        pair = Pair(target, sensor)
-        if pair.is_motion:
-            raise FrameError(f"{target!r} is given as target and as sensor; names are unique across both")
-        self.add_batch(pair, GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source))
+        given = GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source)
+        self.add_batch(_seen_pair(target, sensor), given)
+
+    def add_corners(
+        self,
+        target: str,
+        sensor: str,
+        A: PosesLike,
+        image_points: EachImage,
+        board_points: EachImage | None = None,
+        camera: Camera | None = None,
+        *,
+        corner_ids: Sequence[ArrayLike] | None = None,
+        corner_px: float | None = None,
+        order: QuaternionOrder | None = None,
+        stamps_ns: ArrayLike | None = None,
+        source: str | None = None,
+    ) -> None:
+        """Add images of a target: its corners in pixels, from which a refinement may start again.
+
+        Each image is a measurement too: B is the target's pose by its corners alone, with its covariance. Of the two
+        poses that a flat board nearly has in an image, all images of a call choose those that agree with A: give all
+        images of a pair at once. Corners are kept with the raw measurements, where these are selected or joined.
+
+        Parameters
+        ----------
+        target, sensor : str
+            Names, unique across targets and sensors.
+        A : (N, 4, 4) array, list of gtsam.Pose3, or (N, 7) rows of quaternion and translation
+            T_sensorcarrier_targetcarrier at each image; metres.
+        image_points : (N, n, 2) array, or a list of N arrays (n_i, 2)
+            Pixels, x to the right and y down, the middle of the first pixel at 0; nan where a corner was not seen.
+        board_points : (n, 3) array, or a list of N arrays (n_i, 3)
+            The target's corners in its own frame, metres; or those of each image (OpenCV's object points). Left out:
+            those that the target has already.
+        camera : Camera, optional
+            The sensor's intrinsics. Left out: those that it has already.
+        corner_ids : list of N arrays (n_i,), optional
+            Which of the board's corners each image has.
+        corner_px : float, optional
+            Standard deviation of a corner along each axis, pixels; 0.1 if left out. One for all corners of a problem.
+        order, stamps_ns, source
+            As in ``add``.
+
+        Raises
+        ------
+        CameraError
+            There is no camera, the sensor has another one, or images of another size; a corner is outside the image, or
+            where the lens model has no ray; an image has no pose.
+        CountError
+            An image has fewer than four corners, or poses, images and corners are not as many.
+        MeasurementsNotKeptError
+            The problem keeps moments only.
+        TargetError
+            There is no board, the target has another one, or the corners do not belong to it.
+        PoseError, NoiseError, FrameError, StampError
+            As in ``add``; nothing of the images is added then.
+        """
+        pair = _seen_pair(target, sensor)
+        where = f"{pair} ({source})" if source else pair.label
+        self._check_names(pair, where)
+        if not self.keep_measurements:
+            raise MeasurementsNotKeptError(
+                f"{where}: corners are kept with the raw measurements, and this problem keeps none "
+                "(keep_measurements=False); make it with keep_measurements=True, or add poses"
+            )
+        camera = check_camera(camera, self.cameras.get(sensor), sensor, where)
+        corner_px = check_corner_px(corner_px, self.corner_px, where)
+        seen = seen_corners(image_points, board_points, corner_ids, self.boards.get(target), where)
+        T = as_transforms(A, order, f"A of {where}")
+        if len(T) != len(seen.pixels):
+            raise CountError(f"{where}: {len(T)} poses in A and {len(seen.pixels)} images; give one A for each image")
+        check_in_image(seen.pixels, camera, where)
+        both = candidates_of(camera, seen.board, seen.pixels, corner_px, where)
+        B, covariances = both.chosen(both.by_carriers(T))
+        self.add_batch(pair, GivenMeasurements(A, B, None, None, order, stamps_ns, covariances, source, seen.pixels))
+        self.cameras[sensor], self.boards[target], self.corner_px = camera, seen.board, corner_px
 
     def add_motion(
         self,
@@ -325,6 +311,15 @@ class Problem(Knowledge):
             f"Problem({len(self.targets)} targets, {len(self.sensors)} sensors, {len(self._kept)} pairs, "
             f"{self.number_of_measurements} measurements, scale={self.scale!r})"
         )
+
+
+def _seen_pair(target: str, sensor: str) -> Pair:
+    """A target and the sensor that saw it; a FrameError where their names are none, or one."""
+    check_name(target, "the target's name")
+    check_name(sensor, "the sensor's name")
+    if target == sensor:
+        raise FrameError(f"{target!r} is given as target and as sensor; names are unique across both")
+    return Pair(target, sensor)
 
 
 def _check_measurements(measurements: object) -> None:

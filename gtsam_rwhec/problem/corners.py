@@ -1,0 +1,285 @@
+"""Corners of a target in a sensor's images, as users give them to ``Problem.add_corners``, and the checks of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from gtsam_rwhec.errors import CameraError, CountError, NoiseError, TargetError
+from gtsam_rwhec.files.terminal_text import brief
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.real_numbers import is_real, real_array
+from gtsam_rwhec.vision.camera import Camera
+
+#: Corners of an image, fewer of which determine no pose.
+FEWEST = 4
+#: Two corners are one where they are nearer than this share of the board's size: single precision is enough.
+SAME = 1e-5
+#: Corners on one line: the board's second largest extent is below this share of its largest.
+LINE = 1e-6
+#: A corner may be outside its image by this share of the larger side.
+OUTSIDE = 0.01
+
+#: One array for all images, or one for each.
+EachImage: TypeAlias = ArrayLike | Sequence[ArrayLike]
+
+
+@dataclass(frozen=True, eq=False)
+class SeenCorners:
+    """Corners of a target in N images of a sensor: the board (n, 3), metres, and pixels (N, n, 2), nan if not seen."""
+
+    board: Array
+    pixels: Array
+
+
+def seen_corners(
+    image_points: EachImage,
+    board_points: EachImage | None,
+    corner_ids: Sequence[ArrayLike] | None,
+    known_board: Array | None,
+    where: str,
+) -> SeenCorners:
+    """Corners as arrays, in the order of the board that is known already, if there is one.
+
+    Raises
+    ------
+    CountError
+        An image has fewer than four corners, one of them twice, or pixels and corners are not as many.
+    TargetError
+        There is no board, or it is not that of the corners before.
+    """
+    views = [_rows(view, 2, f"{where}: image_points of image {i}") for i, view in enumerate(_each(image_points, where))]
+    if not views:
+        raise CountError(f"{where}: there are no images; leave the pair out instead")
+    per_image = _is_per_image(board_points)
+    if per_image and corner_ids is not None:
+        raise CountError(f"{where}: board_points has the corners of each image, which corner_ids say too; give one")
+    if per_image:
+        board, ids = _by_points(views, board_points, known_board, where)
+    else:
+        board = _whole_board(board_points, known_board, where)
+        ids = _by_ids(views, corner_ids, len(board), where)
+    return SeenCorners(board, _scattered(views, ids, len(board), where))
+
+
+def check_camera(camera: object, known: Camera | None, sensor: str, where: str) -> Camera:
+    """The sensor's camera; a CameraError where there is none, or another one was given before."""
+    if camera is None and known is not None:
+        return known
+    if not isinstance(camera, Camera):
+        raise CameraError(
+            f"{where}: camera is a {type(camera).__name__}; give {sensor} intrinsics: rw.Camera.of(width, height, "
+            "'radtan', K, D, 'its name')"
+        )
+    if known is None:
+        return camera
+    size, before = (camera.width, camera.height), (known.width, known.height)
+    if size != before:
+        raise CameraError(
+            f"{where}: the camera has images of {size[0]} x {size[1]} pixels, and {sensor} had images of {before[0]} x "
+            f"{before[1]} before; a sensor has one size of image: give each size a sensor of its own, or scale the "
+            "corners and K"
+        )
+    same = (
+        camera.model == known.model
+        and np.array_equal(camera.K, known.K)
+        and camera.D.shape == known.D.shape
+        and np.array_equal(camera.D, known.D)
+    )
+    if not same:
+        raise CameraError(
+            f"{where}: {sensor} had other intrinsics before ({known.model}, K {known.K[[0, 1, 0, 1], [0, 1, 2, 2]]} "
+            f"then, {camera.model}, K {camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]} now: fx, fy, cx, cy); give the same "
+            "camera, or leave camera out"
+        )
+    return known
+
+
+def check_in_image(pixels: Array, camera: Camera, where: str) -> None:
+    """A CameraError where corners (N, n, 2) are not in the camera's images."""
+    size = np.array([camera.width, camera.height])
+    margin = OUTSIDE * size.max()
+    with np.errstate(invalid="ignore"):
+        out = ((pixels < -margin) | (pixels > size + margin)).any(axis=2)
+    if out.any():
+        image, corner = np.argwhere(out)[0]
+        x, y = pixels[image, corner]
+        raise CameraError(
+            f"{where}: corner {corner} of image {image} is at ({x:.6g}, {y:.6g}), outside images of {camera.width} x "
+            f"{camera.height} pixels ({int(out.sum())} corners are); are the images of another size than the camera's, "
+            "or are rows and columns exchanged? Give (x, y), x to the right"
+        )
+
+
+def check_corner_px(value: object, known: float | None, where: str) -> float:
+    """The deviation of a corner; a NoiseError where it is no positive number, or another one than before."""
+    if value is None:
+        return 0.1 if known is None else known
+    if not (is_real(value) and 0.0 < value < np.inf):
+        raise NoiseError(f"{where}: corner_px is {brief(value)}; give a positive number of pixels")
+    if known is not None and value != known:
+        raise NoiseError(
+            f"{where}: corner_px is {value:g}, and it was {known:g} before; give one deviation for all corners of a "
+            "problem (a refinement from corners estimates it)"
+        )
+    return float(value)
+
+
+def same_board(one: Array, other: Array) -> bool:
+    """Whether two boards (n, 3) have the same corners in the same order."""
+    return one.shape == other.shape and float(np.abs(one - other).max()) <= SAME * _size(one)
+
+
+def _each(image_points: Any, where: str) -> list[Any]:
+    if isinstance(image_points, np.ndarray) and image_points.ndim not in (3, 4):
+        raise CountError(
+            f"{where}: image_points has shape {image_points.shape}; give (N, n, 2), or a list of one (n, 2) an image"
+        )
+    try:
+        return list(image_points)
+    except TypeError as error:
+        raise CountError(
+            f"{where}: image_points is a {type(image_points).__name__}; give (N, n, 2), or a list of one (n, 2) an "
+            "image"
+        ) from error
+
+
+def _rows(values: Any, width: int, what: str) -> Array:
+    """(n, width) numbers; OpenCV's (n, 1, width) and (1, n, width) too."""
+    try:
+        array = np.array(real_array(values))
+    except ValueError as error:
+        raise CountError(f"{what} cannot be read as numbers ({error}); give (n, {width})") from error
+    if array.ndim == 3 and 1 in array.shape[:2]:
+        array = array.reshape(-1, array.shape[2])
+    if array.ndim != 2 or array.shape[1] != width:
+        raise CountError(f"{what} has shape {array.shape}; give (n, {width})")
+    return array
+
+
+def _is_per_image(board_points: Any) -> bool:
+    if board_points is None:
+        return False
+    if isinstance(board_points, np.ndarray):
+        return board_points.ndim > 3 or (board_points.ndim == 3 and 1 not in board_points.shape[:2])
+    return isinstance(board_points, list | tuple) and len(board_points) > 0 and np.ndim(board_points[0]) > 1
+
+
+def _checked_board(points: Array, where: str) -> Array:
+    if len(points) < FEWEST or not np.isfinite(points).all():
+        raise TargetError(
+            f"{where}: board_points has {len(points)} corners, finite: {bool(np.isfinite(points).all())}; give four or "
+            "more finite points, in metres"
+        )
+    extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if extent[1] <= LINE * extent[0]:
+        raise TargetError(f"{where}: board_points lie on one line, which determines no pose; give corners in a plane")
+    pairs = cKDTree(points).query_pairs(SAME * _size(points))
+    if pairs:
+        i, j = min(pairs)
+        raise TargetError(f"{where}: corners {i} and {j} of board_points are one point, {points[i].tolist()}")
+    return points
+
+
+def _whole_board(board_points: Any, known: Array | None, where: str) -> Array:
+    if board_points is None:
+        if known is None:
+            raise TargetError(
+                f"{where}: corners without a model of the board; give board_points, (n, 3) in metres in the target's "
+                "frame, such as rw.vision.Checkerboard(...).corners()"
+            )
+        return known
+    points = _checked_board(_rows(board_points, 3, f"{where}: board_points"), where)
+    if known is not None and not same_board(known, points):
+        raise TargetError(
+            f"{where}: board_points are not those that the target had before ({_words(points)} now, {_words(known)} "
+            "before); give each board a name of its own, or leave board_points out"
+        )
+    return points if known is None else known
+
+
+def _words(board: Array) -> str:
+    return f"{len(board)} corners over {_size(board):.4g} m"
+
+
+def _size(board: Array) -> float:
+    return float(np.linalg.norm(np.ptp(board, axis=0)))
+
+
+def _by_points(
+    views: list[Array], board_points: Any, known: Array | None, where: str
+) -> tuple[Array, list[np.ndarray]]:
+    """The board and each image's numbers of corners, where each image has its own points (cv2's object points)."""
+    points = [_rows(p, 3, f"{where}: board_points of image {i}") for i, p in enumerate(board_points)]
+    _check_as_many(views, points, "board_points", where)
+    every = np.concatenate(points)
+    if not np.isfinite(every).all():
+        raise TargetError(f"{where}: board_points of the images are not all finite; give metres")
+    board = known
+    if board is None:
+        _, first = np.unique(every, axis=0, return_index=True)
+        board = _checked_board(every[np.sort(first)], where)
+    off, nearest = (np.asarray(each) for each in cKDTree(board).query(every))
+    lost = np.flatnonzero(~(off <= SAME * _size(board)))
+    if lost.size:
+        raise TargetError(
+            f"{where}: the corner {every[lost[0]].tolist()} of board_points is not on the board that the target had "
+            f"before ({_words(board)}); give the whole board as board_points (n, 3) at the first call, with corner_ids"
+        )
+    ends = np.cumsum([len(p) for p in points])
+    return board, np.split(nearest, ends[:-1])
+
+
+def _by_ids(views: list[Array], corner_ids: Any, n: int, where: str) -> list[np.ndarray]:
+    if corner_ids is None:
+        for i, view in enumerate(views):
+            if len(view) != n:
+                raise CountError(
+                    f"{where}: image {i} has {len(view)} pixels for {n} corners; give nan for corners that were not "
+                    "seen, or corner_ids or board_points for each image"
+                )
+        return [np.arange(n)] * len(views)
+    try:
+        ids = [np.asarray(each).ravel() for each in corner_ids]
+    except (TypeError, ValueError) as error:
+        raise CountError(f"{where}: corner_ids={brief(corner_ids)}; give a list of one (n,) an image") from error
+    _check_as_many(views, ids, "corner_ids", where)
+    for i, each in enumerate(ids):
+        if not np.issubdtype(each.dtype, np.integer) or each.min(initial=0) < 0 or each.max(initial=0) >= n:
+            raise CountError(
+                f"{where}: corner_ids of image {i} are {brief(each.tolist())}; give whole numbers from 0 to {n - 1}"
+            )
+    return ids
+
+
+def _check_as_many(views: list[Array], others: Sequence[np.ndarray], name: str, where: str) -> None:
+    if len(others) != len(views):
+        raise CountError(f"{where}: {name} has {len(others)} images and image_points {len(views)}")
+    for i, (view, other) in enumerate(zip(views, others, strict=True)):
+        if len(view) != len(other):
+            raise CountError(f"{where}: image {i} has {len(view)} pixels and {len(other)} in {name}; give one for each")
+
+
+def _scattered(views: list[Array], ids: list[np.ndarray], n: int, where: str) -> Array:
+    image, corner = np.repeat(np.arange(len(views)), [len(v) for v in views]), np.concatenate(ids)
+    every = np.concatenate(views)
+    if np.isinf(every).any():
+        at = int(np.flatnonzero(np.isinf(every).any(axis=1))[0])
+        raise CountError(f"{where}: a corner of image {image[at]} is at {every[at].tolist()}; give nan if not seen")
+    place, counts = np.unique(image * n + corner, return_counts=True)
+    if (counts > 1).any():
+        twice = int(place[np.argmax(counts)])
+        raise CountError(f"{where}: image {twice // n} has corner {twice % n} twice; leave one of the two out")
+    pixels = np.full((len(views), n, 2), np.nan)
+    pixels[image, corner] = np.where(np.isnan(every).any(axis=1, keepdims=True), np.nan, every)
+    seen = np.isfinite(pixels[..., 0]).sum(axis=1)
+    if seen.min() < FEWEST:
+        raise CountError(
+            f"{where}: image {int(seen.argmin())} has {seen.min()} corners; leave out images with fewer than {FEWEST}"
+        )
+    return pixels

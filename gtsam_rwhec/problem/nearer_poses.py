@@ -1,0 +1,61 @@
+"""The choice between a flat board's two poses in an image, again: by an answer that all measurements have together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.problem.corner_poses import candidates_of
+from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+
+#: Entries of two rotations that are one pose of an image.
+SAME_POSE = 1e-3
+
+
+def nearer_poses(problem: Problem, X: Mapping[str, gtsam.Pose3], Y: Mapping[str, gtsam.Pose3]) -> tuple[Problem, int]:
+    """The problem in which each image has the pose that is nearer to an answer's, and how many images changed.
+
+    Parameters
+    ----------
+    problem : Problem
+        Measurements that were added as poses stay.
+    X, Y : dict of str to gtsam.Pose3
+        The answer's T_targetcarrier_target and T_sensorcarrier_sensor.
+    """
+    if not problem.boards or not problem.has_measurements:
+        return problem, 0
+    every: dict[Pair, Measurements] = {}
+    number = 0
+    for pair in problem.pairs:
+        raw = every[pair] = problem.measurements(*pair)
+        if raw.pixels is None or raw.covariances is None:
+            continue
+        rows = np.flatnonzero(np.isfinite(raw.pixels).any(axis=(1, 2)))
+        both = candidates_of(
+            problem.cameras[pair.sensor],
+            problem.boards[pair.target],
+            raw.pixels[rows],
+            problem.corner_px or 0.1,
+            pair.label,
+        )
+        predicted = np.linalg.inv(Y[pair.sensor].matrix()) @ raw.A[rows] @ X[pair.target].matrix()
+        T, covariance = both.chosen(both.nearer(predicted))
+        turned = np.abs(T[:, :3, :3] - raw.B[rows, :3, :3]).max(axis=(1, 2)) > SAME_POSE
+        if turned.any():
+            B, covariances = raw.B.copy(), raw.covariances.copy()
+            B[rows[turned]], covariances[rows[turned]] = T[turned], covariance[turned]
+            spread = np.einsum("nii->ni", covariances)
+            every[pair] = replace(
+                raw,
+                B=B,
+                sigma=np.sqrt(spread[:, 3:].mean(axis=1)),
+                kappa=0.5 / spread[:, :3].mean(axis=1),
+                covariances=covariances,
+            )
+            number += int(turned.sum())
+    return (problem.with_measurements(every), number) if number else (problem, 0)
