@@ -33,8 +33,8 @@ UNEQUAL = 0.1
 
 
 def free_model(camera: Camera, stated: Stated) -> Camera:
-    """The camera with the lens model that is estimated: a nominal pinhole may have distortion that nobody stated."""
-    if camera.model == "pinhole" and stated not in LENS_PX:
+    """The camera with the lens model that is estimated: a pinhole may have distortion that nobody stated."""
+    if camera.model == "pinhole" and stated != "exact":
         return Camera(camera.width, camera.height, "radtan", camera.K, np.zeros(4))
     return camera
 

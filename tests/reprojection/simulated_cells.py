@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,8 +61,12 @@ def cell(
     carrier: tuple[float, float] = (0.0, 0.0),
     corner_px: float = 0.1,
     shape: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    facing: Callable[[Array, np.random.Generator], Array] | None = None,
 ) -> Cell:
     """A cell of fixed cameras in a ring about the arm; the board turns to one of them at each instant.
+
+    `facing` draws T_base_board for a camera's T_base_camera; left out, the board is near the middle, tilted, and turned
+    about its normal (`placements.py` has others).
 
     Stated intrinsics are off by a draw of the prior of `stated`, or by `stated_off` (m,). `carrier` and `shape` are
     standard deviations: of A (rad, m), and of the board's size and warp.
@@ -78,7 +83,7 @@ def cell(
     seen: dict[str, tuple[list[Array], list[Array]]] = {name: ([], []) for name in Y}
     done = 0
     while done < images:
-        A = _facing(Y[f"cam_{rng.integers(cameras)}"], rng) @ se3.inverse(X)
+        A = (facing or _facing)(Y[f"cam_{rng.integers(cameras)}"], rng) @ se3.inverse(X)
         measured = A @ se3.expmap(rng.normal(size=(1, 6)) * np.repeat(carrier, 3))[0]
         any_seen = False
         for name, T_base_cam in Y.items():
