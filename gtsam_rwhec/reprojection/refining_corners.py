@@ -34,13 +34,13 @@ from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.reduced import Noise, Reduced
 from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
-from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, innovation_of
+from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, innovation_of, wider
 from gtsam_rwhec.vision.camera import Camera
 
 #: Rounds of noise, outliers and optimum in turns end when no deviation changes by more than this share.
 ROUNDS, SETTLED = 12, 1e-3
-#: A contradicted prior is widened by this factor, at most so many times.
-WIDER, WIDENINGS = 3.0, 6
+#: Doubted priors are widened at most so many times.
+WIDENINGS = 6
 #: Deviations at the start: of a corner (pixels) and of the carriers' poses (rad, m).
 ROUGH = Noise(0.3, 1e-3, 1e-3)
 #: Deviation of a clock's offset before the images are looked at, s: weak, so that a carrier that stands still has one.
@@ -109,18 +109,15 @@ def refine_corners(
     _check_start(model, point)
     settled = _settled(model, point, noise, options, tell)
     tests = _innovations(settled, priors)
-    widened = dict.fromkeys(priors, 1.0)
     for _ in range(WIDENINGS):
-        contradicted = [
-            name for name, test in _innovations(settled, settled.model.camera_priors).items() if test.is_contradicted
-        ]
-        if not contradicted:
+        before = settled.model.camera_priors
+        now = {
+            name: (before[name][0], wider(before[name][1], test)) for name, test in _innovations(settled, before).items()
+        }
+        if all(np.array_equal(now[name][1], before[name][1]) for name in now):
             break
-        for name in contradicted:
-            widened[name] *= WIDER
-        wider = {name: (mean, deviation * widened[name]) for name, (mean, deviation) in priors.items()}
         settled = _settled(
-            replace(settled.model, camera_priors=wider), settled.point, settled.noise, options, tell, settled.iterations
+            replace(settled.model, camera_priors=now), settled.point, settled.noise, options, tell, settled.iterations
         )
     rms = _rms(settled)
     point = settled.point
@@ -132,7 +129,7 @@ def refine_corners(
                 camera_with(camera, point.cameras[first[name]]),
                 _block(settled, ("k", first[name])),
                 settled.model.camera_priors[first[name]][1],
-                widened[first[name]],
+                float((settled.model.camera_priors[first[name]][1] / priors[first[name]][1]).max()),
                 tests[first[name]],
                 rms[name],
             )
