@@ -112,7 +112,8 @@ def refine_corners(
     for _ in range(WIDENINGS):
         before = settled.model.camera_priors
         now = {
-            name: (before[name][0], wider(before[name][1], test)) for name, test in _innovations(settled, before).items()
+            name: (before[name][0], wider(before[name][1], test))
+            for name, test in _innovations(settled, before).items()
         }
         if all(np.array_equal(now[name][1], before[name][1]) for name in now):
             break

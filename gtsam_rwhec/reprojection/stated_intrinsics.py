@@ -75,11 +75,7 @@ def innovation_of(off: Array, prior: Array, posterior: Array) -> Innovation:
     """The test of estimated less stated parameters (m,), with the prior's deviations (m,) and the posterior (m, m)."""
     return Innovation(
         off,
-        {
-            part: _probability(off[at], prior[at], posterior[at, at])
-            for part, at in PARTS.items()
-            if len(off[at])
-        },
+        {part: _probability(off[at], prior[at], posterior[at, at]) for part, at in PARTS.items() if len(off[at])},
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulated_cells import Cell, cell
+from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.reprojection.findings import findings_of
@@ -76,9 +76,33 @@ def test_a_calibration_that_is_contradicted_is_named_with_its_deviations() -> No
     given = cell(5, images=30, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
     result = refined(given, replace(EXACT, stated="calibration"))
     camera = result.intrinsics["cam_0"]
-    words = next(words for words in result.findings if "of cam_0 by" in words)
-    assert f"by {camera.innovation.deviations:.2g} deviations" in words
+    words = next(words for words in result.findings if "of cam_0: the focal" in words)
+    off = camera.innovation.off
+    assert f"the focal length is off by {100 * off[:2].mean() / camera.camera.K[0, 0]:+.2g} % (" in words
+    assert f"the centre is off by ({off[2]:+.3g}, {off[3]:+.3g}) pixels (" in words
+    assert f"({camera.innovation.deviations:.2g} deviations)" in words
     assert f"widened {camera.widened:.3g} times" in words
+
+
+@pytest.mark.parametrize("stated", ["nominal", "calibration"])
+def test_a_lens_that_was_left_out_is_named_with_the_k1_that_fits(good: Cell, stated: str) -> None:
+    pinhole = rw.vision.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
+    without = replace(good.observations, cameras=dict.fromkeys(good.observations.cameras, pinhole))
+    result = refined(replace(good, observations=without), replace(EXACT, stated=stated))
+    lens = [words for words in result.findings if "have no distortion" in words]
+    assert len(lens) == 2
+    assert (
+        f"of cam_0 have no distortion, and the images show one: k1 = {result.intrinsics['cam_0'].camera.D[0]:.3g}"
+        in lens[0]
+    )
+    assert result.intrinsics["cam_0"].camera.D[0] == pytest.approx(CAMERA.D[0], abs=0.01)
+    assert not any("contradict" in words for words in result.findings)
+
+
+def test_a_lens_without_distortion_is_none(good: Cell) -> None:
+    bare = rw.vision.Camera(1920, 1080, "pinhole", CAMERA.K, np.zeros(0))
+    given = cell(1, images=20, camera=bare)
+    assert refined(given, EXACT).findings == ()
 
 
 def test_cameras_that_share_intrinsics_are_named_together(good: Cell) -> None:
@@ -86,7 +110,7 @@ def test_cameras_that_share_intrinsics_are_named_together(good: Cell) -> None:
     off = cell(5, images=20, stated_off=np.array([28.0, 28.0, 25.0, -20.0, 0.0, 0.0, 0.0, 0.0]))
     found = [words for words in refined(off, options).findings if "contradict" in words]
     assert len(found) == 1
-    assert "of cam_0, cam_1 by" in found[0]
+    assert "of cam_0, cam_1: the focal" in found[0]
 
 
 def test_what_only_the_prior_holds_is_named() -> None:

@@ -15,7 +15,7 @@ from simulated_cells import CAMERA, Cell, cell
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError, FrameError, OptionError
 from gtsam_rwhec.reprojection.lens import parameters_of
-from gtsam_rwhec.reprojection.stated_intrinsics import innovation_of
+from gtsam_rwhec.reprojection.stated_intrinsics import innovation_of, wider
 
 Array = NDArray[np.float64]
 
@@ -208,3 +208,15 @@ def test_an_innovation_counts_only_what_the_images_tell() -> None:
     assert innovation_of(np.array([5.0, 0.0]), prior, posterior).deviations == pytest.approx(
         5.0 / np.sqrt(0.99), rel=1e-3
     )
+
+
+def test_a_centre_that_is_off_does_not_drown_among_other_parameters() -> None:
+    off, prior = np.array([0.0, 0.0, 3.5, 1.5, *np.zeros(8)]), np.ones(12)
+    found = innovation_of(off, prior, np.diag(np.full(12, 0.01)))
+    assert found.contradicted == ("centre",)
+    assert found.probability == pytest.approx(3.0 * chi2.sf((3.5**2 + 1.5**2) / 0.99, 2))
+    assert chi2.sf(off @ off / 0.99, 12) > 0.2
+    assert wider(prior, found).tolist() == [1.0, 1.0, 10.0, 10.0, *np.ones(8)]
+    doubted = innovation_of(0.7 * off, prior, np.diag(np.full(12, 0.01)))
+    assert not doubted.is_contradicted
+    assert wider(prior, doubted).tolist() == [1.0, 1.0, 3.0, 3.0, *np.ones(8)]
