@@ -11,8 +11,7 @@ from gtsam_rwhec.reprojection.lens import PINHOLE
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.reduced import CARRIER, CORNER_PX
 from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
-from gtsam_rwhec.reprojection.stated_intrinsics import PARTS, deviations_of
-from gtsam_rwhec.reprojection.stated_intrinsics import HELD
+from gtsam_rwhec.reprojection.stated_intrinsics import HELD, PARTS, deviations_of
 
 #: Larger noise than any arm or tracker has: rad, m; than any detector has: pixels.
 CARRIER_RAD, CARRIER_M, DETECTOR_PX = np.radians(1.0), 0.01, 2.0
@@ -168,6 +167,6 @@ def _lens_that_was_left_out(refined: CornersRefined, sensors: list[str]) -> str:
     if bend_px < BEND_PX:
         return ""
     return (
-        f"k1 = {D[0]:.3g} +- {np.sqrt(covariance[0, 0]):.1g} fits, and moves corners by up to {bend_px:.2g} pixels. The "
-        "estimated distortion is used"
+        f"k1 = {D[0]:.3g} +- {np.sqrt(covariance[0, 0]):.1g} fits, and moves corners by up to {bend_px:.2g} pixels. "
+        "The estimated distortion is used"
     )

@@ -6,8 +6,8 @@ Simulated cells (`tests/reprojection/simulated_cells.py`): two fixed cameras, a 
 pixels of noise. Strong geometry is a board of 7 x 5 corners, 1.5 m away, tilted by 20 degrees and more, in 30 images;
 weak geometry a board of 4 x 3 corners, 2 m away, tilted by 6 degrees, at the middle of 40 images. The stated centre
 is off by 0, 10 or 30 pixels in a random direction, the focal length by 0 or 2 % either way, or the lens's distortion
-(k1 = -0.1, k2 = 0.05: 50 pixels at the corner of the image) is left out. Stated intrinsics are told to be nominal; or from a
-calibration, which must then be flagged as wrong where the images tell, or be named as held by the prior.
+(k1 = -0.1, k2 = 0.05: 50 pixels at the corner of the image) is left out. Stated intrinsics are told to be nominal; or
+from a calibration, which must then be flagged as wrong where the images tell, or be named as held by the prior.
 
 How far off stated intrinsics are in innovation deviations is told by the truth: an offset d of a part of the parameters
 with the prior P and the posterior C would, without noise, show as m = (P - C) P^-1 d, which has sqrt(m' (P - C)^-1 m).
@@ -38,7 +38,7 @@ from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.targets import Checkerboard
 
 LEVEL, LEAST = 0.95, 0.93
-#: Beyond so many innovation deviations a contradiction must be flagged, in this share of runs; falsely in at most so many.
+#: Beyond so many innovation deviations a contradiction must be flagged in this share of runs; falsely in so many.
 FAR, FLAGGED, FALSELY = 5.0, 0.95, 0.01
 SMALL_BOARD = Checkerboard("board", 4, 3, 0.03)
 
