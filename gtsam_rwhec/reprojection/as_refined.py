@@ -138,7 +138,7 @@ def _joint(base: Refined, corners: CornersRefined, more: Array | None) -> JointC
                 parts.append((Unknown(UnknownKind.SHAPE, owner), slice(first, rows.stop), 1.0))
         elif letter == "k":
             parts.append((Unknown(UnknownKind.INTRINSICS, name.partition(":")[2]), rows, 1.0))
-        else:
+        elif letter == "t":
             parts.append((Unknown(UnknownKind.TIME_OFFSET, owner), rows, 1.0))
     slots: dict[Unknown, slice] = {}
     index: list[int] = []

@@ -6,6 +6,7 @@ Variables
     a      the carriers' pose A at an instant, held by its measurement and its noise; absent where A is exact
     k      a camera's parameters, held by a prior; sensors may share a camera
     b      a board's shape, held by a prior; absent where it is not free
+    p      how far a board's corners are off their places, held by a prior; absent where they are not free
     t      the offset of a sensor's clock, held by a weak prior; absent where it is not free
 
 GTSAM asks each factor by itself, in any order. All rows are computed when the first factor is asked at new values.
@@ -54,10 +55,11 @@ class CornerGraph:
         self.k = {name: key_of("k", i) for i, name in enumerate(model.camera_priors)}
         self.b = {name: key_of("b", i) for i, name in enumerate(model.shape_priors)}
         self.t = {name: key_of("t", i) for i, name in enumerate(model.offset_priors)}
+        self.p = {name: key_of("p", i) for i, name in enumerate(model.corner_priors)}
         carriers = range(len(model.A)) if model.A_noise is not None else ()
         self._keys = [
             *self.x.values(), *self.y.values(), *self.k.values(), *self.b.values(), *self.t.values(),
-            *(key_of("a", i) for i in carriers),
+            *self.p.values(), *(key_of("a", i) for i in carriers),
         ]  # fmt: skip
         self.graph = gtsam.NonlinearFactorGraph()
         self._add_priors()
@@ -80,6 +82,8 @@ class CornerGraph:
             values.insert(key, point.shapes[name][self.model.free_shape(name)])
         for name, key in self.t.items():
             values.insert(key, np.array([point.offsets_s.get(name, 0.0)]))
+        for name, key in self.p.items():
+            values.insert(key, point.corners[name].ravel())
         return values
 
     def point(self, values: gtsam.Values) -> Point:
@@ -94,6 +98,7 @@ class CornerGraph:
             {name: values.atVector(key) for name, key in self.k.items()},
             {name: self._shape(values, name) for name in self.start.shapes},
             self.start.offsets_s | {name: float(values.atVector(key)[0]) for name, key in self.t.items()},
+            {name: values.atVector(key).reshape(-1, 3) for name, key in self.p.items()},
         )
 
     def _shape(self, values: gtsam.Values, name: str) -> Array:
@@ -106,10 +111,10 @@ class CornerGraph:
         """The covariance (d, d) of the unknowns in `slots`, all else eliminated; and how far off the optimum is.
 
         That is the length of one more Gauss-Newton step in deviations. Slots have ("x", target), ("y", sensor),
-        ("k", camera), ("b", target) and ("t", sensor).
+        ("k", camera), ("b", target), ("t", sensor) and ("p", target).
         """
         linear = self.graph.linearize(values)
-        of_letter = {"x": self.x, "y": self.y, "k": self.k, "b": self.b, "t": self.t}
+        of_letter = {"x": self.x, "y": self.y, "k": self.k, "b": self.b, "t": self.t, "p": self.p}
         keys = [of_letter[letter][name] for letter, name in slots]
         marginal = linear.marginal(keys)
         ordering = gtsam.Ordering()
@@ -139,6 +144,10 @@ class CornerGraph:
         for name, key in self.t.items():
             noise = gtsam.noiseModel.Isotropic.Sigma(1, model.offset_priors[name])
             self.graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))
+        for name, key in self.p.items():
+            number = self.start.corners[name].size
+            noise = gtsam.noiseModel.Isotropic.Sigma(number, model.corner_priors[name])
+            self.graph.add(gtsam.PriorFactorVector(key, np.zeros(number), noise))
 
     def _add_view(self, s: int, v: int) -> None:
         stack = self.model.stacks[s]
@@ -149,10 +158,12 @@ class CornerGraph:
             "A": key_of("a", int(stack.instant[v])),
             "shape": self.b.get(stack.target, 0),
             "time": self.t.get(stack.sensor, 0),
+            "corners": self.p.get(stack.target, 0),
         }
         variables = self.model.variables_of(stack)
         width = 12 + len(self.start.cameras[self.model.camera_of[stack.sensor]])
         width += 6 * ("A" in variables) + len(self.model.free_shape(stack.target)) + ("time" in variables)
+        width += 3 * len(stack.points) * ("corners" in variables)
         size = min(2 * stack.known.shape[1], width + 1)
         keys = [key_of_variable[name] for name in variables]
 
@@ -184,7 +195,7 @@ class CornerGraph:
 
 
 def _value(values: gtsam.Values, key: int) -> Array:
-    if gtsam.symbolChr(key) in (ord("k"), ord("b"), ord("t")):
+    if gtsam.symbolChr(key) in (ord("k"), ord("b"), ord("t"), ord("p")):
         vector: Array = values.atVector(key)
         return vector
     pose: Array = values.atPose3(key).matrix()

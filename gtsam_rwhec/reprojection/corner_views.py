@@ -2,8 +2,9 @@
 
 A corner p of a target's board is seen by a sensor at the pixel of P = Y^-1 A X p', by the camera's parameters. The
 board may be larger than stated, and bent: p' = (1 + s) p + (w_x (x / l)^2 + w_y (y / l)^2) e_z, l the largest distance
-of a corner from the board's origin. A is the carriers' pose at the instant of the image. Where the sensor's clock is
-off by d seconds, it is the pose at that time: A Expmap(d twist), with the carriers' velocity at the instant.
+of a corner from the board's origin; and each corner may be off its place: p' + d. A is the carriers' pose at the
+instant of the image. Where the sensor's clock is off by t seconds, it is the pose at that time: A Expmap(t twist), with
+the carriers' velocity at the instant.
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ class Linear:
     """Residuals of a stack (V, 2n), in pixels, and their derivatives (V, 2n, m) by each variable.
 
     Poses move as T Expmap([omega, v]), A at its instant. Of a stack without velocities, those by the time offset are
-    zero. A residual is infinite where a corner is behind its camera.
+    zero. Each corner's residuals have derivatives (V, n, 2, 3) by its own place. A residual is infinite where a corner
+    is behind its camera.
     """
 
     residual: Array
@@ -76,6 +78,7 @@ class Linear:
     by_camera: Array
     by_shape: Array
     by_time: Array
+    by_corners: Array
 
 
 def stacks_of(observations: Observations) -> tuple[tuple[Stack, ...], Array]:
@@ -147,8 +150,10 @@ class _Seen:
         return error.reshape(len(error), -1)
 
 
-def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float) -> _Seen:
+def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float, moved: Array | None) -> _Seen:
     p, by_shape = shaped(stack.points, shape)
+    if moved is not None:
+        p = p + moved
     q = p @ X[:3, :3].T + X[:3, 3]
     B = se3.inverse(Y) @ A[stack.instant]
     if stack.twist is not None and offset_s != 0.0:
@@ -162,29 +167,46 @@ def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: fl
 
 
 def pixel_errors(
-    stack: Stack, X: Array, Y: Array, A: Array, parameters: Array, shape: Array, offset_s: float = 0.0
+    stack: Stack,
+    X: Array,
+    Y: Array,
+    A: Array,
+    parameters: Array,
+    shape: Array,
+    offset_s: float = 0.0,
+    moved: Array | None = None,
 ) -> Array:
     """Errors (V, 2n) of a stack in pixels: as `linearised`, without derivatives."""
-    seen = _seen(stack, X, Y, A, shape, offset_s)
+    seen = _seen(stack, X, Y, A, shape, offset_s, moved)
     pixels = pixels_of(stack.camera, parameters, seen.x)
     return seen.errors(stack, pixels)
 
 
-def depths(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float = 0.0) -> Array:
+def depths(
+    stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float = 0.0, moved: Array | None = None
+) -> Array:
     """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
-    return _seen(stack, X, Y, A, shape, offset_s).z
+    return _seen(stack, X, Y, A, shape, offset_s, moved).z
 
 
 def linearised(
-    stack: Stack, X: Array, Y: Array, A: Array, parameters: Array, shape: Array, offset_s: float = 0.0
+    stack: Stack,
+    X: Array,
+    Y: Array,
+    A: Array,
+    parameters: Array,
+    shape: Array,
+    offset_s: float = 0.0,
+    moved: Array | None = None,
 ) -> Linear:
     """Residuals and derivatives of a stack at X, Y (4, 4), the instants' poses A (I, 4, 4), a camera and a shape.
 
-    The images were taken `offset_s` after their instants: A Expmap(xi) Expmap(d w) = A Expmap(d w) Expmap(Ad xi) with
-    the adjoint of Expmap(-d w), and Expmap((d + e) w) = Expmap(d w) Expmap(e w).
+    `moved` (n, 3) is how far corners are off their places on the board, metres. The images were taken t = `offset_s`
+    after their instants: A Expmap(xi) Expmap(t w) = A Expmap(t w) Expmap(Ad xi) with the adjoint of Expmap(-t w), and
+    Expmap((t + e) w) = Expmap(t w) Expmap(e w).
     """
     V, n = stack.known.shape
-    at = _seen(stack, X, Y, A, shape, offset_s)
+    at = _seen(stack, X, Y, A, shape, offset_s, moved)
     x, z, R, P, q, p = at.x, at.z, at.R, at.P, at.q, at.p
     pixels, by_x, by_parameters = pixels_and_derivatives(stack.camera, parameters, x)
     to_x = np.concatenate([np.broadcast_to(np.eye(2), (V, n, 2, 2)), -x[..., None]], axis=-1) / z[..., None, None]
@@ -212,4 +234,5 @@ def linearised(
         rows(np.where(seen, by_parameters, 0.0)),
         rows(by_p @ at.by_shape),
         by_time,
+        by_p,
     )

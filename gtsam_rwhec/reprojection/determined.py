@@ -134,10 +134,11 @@ def check_determined(
             f"much alike; {CURE}{alike}"
         )
     if not (np.isfinite(joint).all() and (np.diagonal(joint) > 0.0).all()):
+        words = {"k": "intrinsics", "b": "shape", "t": "time offset", "p": "corners"}
         names = [
-            {"k": f"intrinsics of {name}", "b": f"shape of {name}", "t": f"time offset of {name}"}[letter]
+            f"{words[letter]} of {name}"
             for (letter, name), at in slots.items()
-            if letter in "kbt" and not (np.diagonal(joint)[at] > 0.0).all()
+            if letter in words and not (np.diagonal(joint)[at] > 0.0).all()
         ]
         raise UnderdeterminedError(
             f"the images do not determine the {', the '.join(names) or 'unknowns together'}; state intrinsics "

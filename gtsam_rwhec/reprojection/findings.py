@@ -11,7 +11,7 @@ from gtsam_rwhec.reprojection.lens import PINHOLE
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.reduced import CARRIER, CORNER_PX
 from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
-from gtsam_rwhec.reprojection.stated_intrinsics import HELD, PARTS, deviations_of
+from gtsam_rwhec.reprojection.stated_intrinsics import HELD, PARTS, deviations_of, innovation_of
 
 #: Larger noise than any arm or tracker has: rad, m; than any detector has: pixels.
 CARRIER_RAD, CARRIER_M, DETECTOR_PX = np.radians(1.0), 0.01, 2.0
@@ -37,6 +37,7 @@ def findings_of(refined: CornersRefined, options: CornerOptions) -> tuple[str, .
         *_of_corners(refined),
         *_of_convergence(refined, options),
         *_of_clocks(refined),
+        *_of_boards(refined),
         *_of_intrinsics(refined, options),
     )
 
@@ -105,6 +106,20 @@ def _of_clocks(refined: CornersRefined) -> Iterator[str]:
             yield (
                 f"The images of {name} were taken {1e3 * offset_s:+.3g} ms from the times of their A, and the "
                 "carriers' velocity was taken as constant over that time. Give A at the new times, and refine again."
+            )
+
+
+def _of_boards(refined: CornersRefined) -> Iterator[str]:
+    for name, deviation in refined.graph.model.corner_priors.items():
+        off = refined.point.corners[name]
+        posterior = refined.covariance(f"corners:{name}")
+        if innovation_of(off.ravel(), np.full(off.size, deviation), posterior).is_contradicted:
+            length = np.linalg.norm(off, axis=1)
+            worst = int(np.argmax(length))
+            yield (
+                f"The corners of {name} are farther from their places than corners_m={deviation:g} explains (corner "
+                f"{worst} by {1e3 * length[worst]:.2g} mm): check the board's sizes and the order of its corners, or "
+                "give a larger corners_m."
             )
 
 

@@ -99,10 +99,11 @@ def held_out_errors(
             X, Y = again.X[stack.target].matrix(), again.Y[stack.sensor].matrix()
             camera = again.intrinsics[stack.sensor].camera
             shape = again.shapes[stack.target]
-            seen, late = replace(stack, camera=camera), again.time_offsets_s.get(stack.sensor, 0.0)
-            errors = pixel_errors(seen, X, Y, A, parameters_of(camera), shape, late).reshape(*stack.known.shape, 2)
+            off = again.time_offsets_s.get(stack.sensor, 0.0), again.point.corners.get(stack.target)
+            seen = replace(stack, camera=camera)
+            errors = pixel_errors(seen, X, Y, A, parameters_of(camera), shape, *off).reshape(*stack.known.shape, 2)
             length = np.linalg.norm(errors, axis=2)[stack.known]
-            on_target = length * depths(seen, X, Y, A, shape, late)[stack.known] / camera.K[0, 0]
+            on_target = length * depths(stack, X, Y, A, shape, *off)[stack.known] / camera.K[0, 0]
             found[stack.sensor].append((length, on_target, stack.pixels[stack.known]))
     return {
         name: _of_sensor(

@@ -19,8 +19,9 @@ BEHIND = 1e6
 class Point:
     """Values of all variables.
 
-    Poses by name (4, 4), A (I, 4, 4), cameras' parameters and boards' shapes by name, and clocks' offsets by sensor, in
-    seconds after the instants; a sensor that is missing has none.
+    Poses by name (4, 4), A (I, 4, 4), cameras' parameters and boards' shapes by name; clocks' offsets by sensor, in
+    seconds after the instants; how far corners (n, 3) are off their places by target, metres. Sensors and targets that
+    are missing have none.
     """
 
     X: dict[str, Array]
@@ -29,6 +30,7 @@ class Point:
     cameras: dict[str, Array]
     shapes: dict[str, Array]
     offsets_s: dict[str, float] = field(default_factory=dict)
+    corners: dict[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,8 @@ class Model:
         Of each corner's squared residual, by stack.
     offset_priors : dict of str to float
         Deviations, s, of the clocks' offsets that are free, by sensor; their means are zero.
+    corner_priors : dict of str to float
+        Deviations, metres, of corners from their places along each axis, by target whose corners are free.
     """
 
     stacks: tuple[Stack, ...]
@@ -68,6 +72,7 @@ class Model:
     corner_px: float
     weights: tuple[Array, ...]
     offset_priors: dict[str, float] = field(default_factory=dict)
+    corner_priors: dict[str, float] = field(default_factory=dict)
 
     @property
     def to_right(self) -> Array:
@@ -100,13 +105,14 @@ class Model:
 
     def depths(self, stack: Stack, point: Point) -> Array:
         """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
-        X, Y, A, _, shape, offset_s = self._arguments(stack, point)
-        return depths(stack, X, Y, A, shape, offset_s)
+        X, Y, A, _, shape, offset_s, moved = self._arguments(stack, point)
+        return depths(stack, X, Y, A, shape, offset_s, moved)
 
-    def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array, float]:
+    def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array, float, Array | None]:
         camera = point.cameras[self.camera_of[stack.sensor]]
         poses = point.X[stack.target], point.Y[stack.sensor], point.A
-        return *poses, camera, point.shapes[stack.target], point.offsets_s.get(stack.sensor, 0.0)
+        of_board = point.shapes[stack.target], point.offsets_s.get(stack.sensor, 0.0), point.corners.get(stack.target)
+        return *poses, camera, *of_board
 
     @property
     def _roots(self) -> list[Array]:
@@ -122,11 +128,15 @@ class Model:
         for stack, root in zip(self.stacks, self._roots, strict=True):
             rows = self.linearised(stack, point)
             residual = _finite(rows.residual, root)
-            blocks = {name: getattr(rows, f"by_{name}") * root[..., None] for name in self.variables_of(stack)}
+            dense = {name: getattr(rows, f"by_{name}") for name in self.variables_of(stack)}
+            if "corners" in dense:
+                dense["corners"] = _by_all_corners(rows.by_corners)
+            blocks = {name: block * root[..., None] for name, block in dense.items()}
             ends = np.cumsum([block.shape[2] for block in blocks.values()]).tolist()
             columns = {name: slice(a, b) for name, a, b in zip(blocks, [0, *ends], ends, strict=False)}
             stacked = np.concatenate([*blocks.values(), residual[..., None]], axis=2)
-            result.append((np.asarray(np.linalg.qr(stacked, mode="r")), columns))
+            is_tall = stacked.shape[1] > stacked.shape[2]
+            result.append((np.asarray(np.linalg.qr(stacked, mode="r")) if is_tall else stacked, columns))
         return result
 
     def free_shape(self, target: str) -> np.ndarray:
@@ -134,13 +144,23 @@ class Model:
         return np.flatnonzero(self.shape_priors.get(target, ()))
 
     def variables_of(self, stack: Stack) -> tuple[str, ...]:
-        """X, Y, camera, and A, shape and time where they are free."""
+        """X, Y, camera, and A, shape, time and corners where they are free."""
         free = [
             ("A", self.A_noise is not None),
             ("shape", stack.target in self.shape_priors),
             ("time", stack.sensor in self.offset_priors),
+            ("corners", stack.target in self.corner_priors),
         ]
         return ("X", "Y", "camera", *(name for name, is_free in free if is_free))
+
+
+def _by_all_corners(by_corners: Array) -> Array:
+    """Derivatives (V, 2n, 3n) by all corners' places, from those of each corner by its own (V, n, 2, 3)."""
+    V, n = by_corners.shape[:2]
+    dense = np.zeros((V, n, 2, n, 3))
+    each = np.arange(n)
+    dense[:, each, :, each] = by_corners.transpose(1, 0, 2, 3)
+    return dense.reshape(V, 2 * n, 3 * n)
 
 
 def _finite(error: Array, root: Array) -> Array:

@@ -34,6 +34,9 @@ class CornerOptions:
         Standard deviation of the targets' sizes, a share of 1; 0: they are exactly as stated.
     warp_m : float
         Standard deviation of the height of a bent board's edge over its middle, metres; 0: boards are flat.
+    corners_m : float
+        Standard deviation of each corner's place on its board along each axis, metres, such as a printer's 1e-4; 0:
+        they are where the board has them. With n corners there are 3n more unknowns: time grows with their square.
     carrier_noise : CarrierNoise, "estimate" or "exact"
         The noise of the carriers' poses A: given (standard deviations), estimated, or none.
     about : "targetcarrier" or "sensorcarrier"
@@ -53,6 +56,7 @@ class CornerOptions:
     shared: tuple[tuple[str, ...], ...] = field(default=())
     size_share: float = 0.0
     warp_m: float = 0.0
+    corners_m: float = 0.0
     carrier_noise: CarrierNoise | CarrierPoses = "estimate"
     about: About = "targetcarrier"
     time_offsets: tuple[str, ...] = ()
@@ -69,7 +73,7 @@ class CornerOptions:
                 raise OptionError(
                     f"CornerOptions.{words}={brief(value)} is not one of {', '.join(map(repr, get_args(choices)))}"
                 )
-        for name in ("size_share", "warp_m"):
+        for name in ("size_share", "warp_m", "corners_m"):
             value = getattr(self, name)
             if not (is_real(value) and 0.0 <= value < np.inf):
                 raise OptionError(f"CornerOptions.{name}={brief(value)}; give a standard deviation, or 0")

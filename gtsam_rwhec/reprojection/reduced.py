@@ -70,7 +70,7 @@ class Reduced:
     Attributes
     ----------
     slots : dict of (letter, name) to slice
-        "x", "y", "k", "b", "t" with the frame's name: its rows in theta.
+        "x", "y", "k", "b", "t", "p" with the frame's name: its rows in theta.
     G, g : (d, d) and (d,) arrays
     C, M, b : (I, 6, d), (I, 6, 6) and (I, 6) arrays
     rr : float
@@ -112,6 +112,8 @@ class Reduced:
             add("b", name, len(model.free_shape(name)))
         for name in model.offset_priors:
             add("t", name, 1)
+        for name in model.corner_priors:
+            add("p", name, point.corners[name].size)
         count = len(model.A)
         G, g = np.zeros((size, size)), np.zeros(size)
         C, M, b = np.zeros((count, 6, size)), np.zeros((count, 6, 6)), np.zeros((count, 6))
@@ -140,6 +142,14 @@ class Reduced:
             J_At = J_A.transpose(0, 2, 1)
             of_view = np.zeros((len(stack.instant), 6, size))
             of_view[:, :, where] = J_At @ J
+            if ("p", stack.target) in slots:
+                own = slots["p", stack.target]
+                sums = _of_corners(rows.by_corners * np.sqrt(weights)[..., None, None], J, J_A, r)
+                G[own, own] += sums.G
+                G[own, where] += sums.by_others
+                G[where, own] += sums.by_others.T
+                g[own] += sums.g
+                of_view[:, :, own] = sums.C
             np.add.at(C, stack.instant, of_view)
             np.add.at(M, stack.instant, J_At @ J_A)
             np.add.at(b, stack.instant, (J_At @ r[..., None])[..., 0])
@@ -154,6 +164,9 @@ class Reduced:
         for name, in_s in model.offset_priors.items():
             prior[slots["t", name]] = in_s**-2.0
             off[slots["t", name]] = point.offsets_s.get(name, 0.0)
+        for name, in_m in model.corner_priors.items():
+            prior[slots["p", name]] = in_m**-2.0
+            off[slots["p", name]] = point.corners[name].ravel()
         return Reduced(slots, G, g, C, M, b, rr, number, prior, off)
 
     def minus_two_log_likelihood(self, noise: Noise) -> tuple[float, Array]:
@@ -231,3 +244,37 @@ class Reduced:
 
         found = minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11})
         return noise(found.x)
+
+
+@dataclass(frozen=True, eq=False)
+class _OfCorners:
+    """Sums of a stack's rows by its board's corners: G (3n, 3n), by the others (3n, m), g (3n,) and C (V, 6, 3n)."""
+
+    G: Array
+    by_others: Array
+    g: Array
+    C: Array
+
+
+def _of_corners(B: Array, J: Array, J_A: Array, r: Array) -> _OfCorners:
+    """The sums, from rows by each corner's own place (V, n, 2, 3), by the others (V, 2n, m) and by A (V, 2n, 6).
+
+    A corner moves its own two residuals alone: no row of 3n columns is made.
+    """
+    V, n = B.shape[:2]
+
+    def of_corner(rows: Array) -> Array:
+        """(n, 2V, columns)."""
+        each: Array = rows.reshape(V, n, 2, -1).transpose(1, 0, 2, 3).reshape(n, 2 * V, -1)
+        return each
+
+    Bt = of_corner(B).transpose(0, 2, 1)
+    G = np.zeros((n, 3, n, 3))
+    G[np.arange(n), :, np.arange(n)] = Bt @ of_corner(B)
+    C = J_A.reshape(V, n, 2, 6).transpose(0, 1, 3, 2) @ B  # (V, n, 6, 3)
+    return _OfCorners(
+        G.reshape(3 * n, 3 * n),
+        (Bt @ of_corner(J)).reshape(3 * n, -1),
+        (Bt @ of_corner(r)).ravel(),
+        C.transpose(0, 2, 1, 3).reshape(V, 6, 3 * n),
+    )

@@ -81,6 +81,8 @@ class CornersRefined:
         By sensor.
     shapes : dict of str to (3,) array
         By target: its size less the stated one, a share; heights of its edge over its middle along x and y, metres.
+    corners : dict of str to (n, 3) array
+        By target: its corners in its frame, with its size, its bend and what each is off its place, metres.
     time_offsets_s : dict of str to float
         By sensor whose clock's offset was free: its images were taken that long after the times of their A.
     noise : Noise
@@ -106,6 +108,7 @@ class CornersRefined:
     Y: dict[str, gtsam.Pose3]
     intrinsics: dict[str, RefinedIntrinsics]
     shapes: dict[str, Array]
+    corners: dict[str, Array]
     time_offsets_s: dict[str, float]
     noise: Noise
     joint: Array = field(repr=False)
@@ -122,7 +125,8 @@ class CornersRefined:
         """The joint covariance of unknowns, in the order given; without names, of all.
 
         Frames have six rows each; ``intrinsics:SENSOR`` a camera's parameters; ``shape:TARGET`` the numbers that are
-        free of the size and the two heights of the edge; ``time_offset:SENSOR`` one row, s^2.
+        free of the size and the two heights of the edge; ``time_offset:SENSOR`` one row, s^2; ``corners:TARGET`` three
+        rows a corner, m^2.
 
         Raises
         ------
@@ -160,5 +164,5 @@ class CornersRefined:
         """The unknowns' names."""
         frames = {name: (letter, name) for letter, name in self.slots if letter in "xy"}
         cameras = {f"intrinsics:{name}": ("k", self.graph.model.camera_of[name]) for name in self.Y}
-        others = {"b": "shape", "t": "time_offset"}
+        others = {"b": "shape", "t": "time_offset", "p": "corners"}
         return frames | cameras | {f"{others[at[0]]}:{at[1]}": at for at in self.slots if at[0] in others}

@@ -15,7 +15,7 @@ from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.reprojection.corner_graph import CornerGraph
 from gtsam_rwhec.reprojection.corner_outliers import weights_of
-from gtsam_rwhec.reprojection.corner_views import SHAPE, stacks_of
+from gtsam_rwhec.reprojection.corner_views import SHAPE, shaped, stacks_of
 from gtsam_rwhec.reprojection.determined import (
     check_arguments,
     check_clocks,
@@ -137,6 +137,10 @@ def refine_corners(
             for name, camera in cameras.items()
         },
         shapes=point.shapes,
+        corners={
+            stack.target: shaped(stack.points, point.shapes[stack.target])[0] + point.corners.get(stack.target, 0.0)
+            for stack in model.stacks
+        },
         time_offsets_s={name: point.offsets_s[name] for name in settled.model.offset_priors},
         noise=settled.noise,
         joint=settled.joint,
@@ -175,6 +179,7 @@ def _stated(
         dict.fromkeys(observations.targets, shape) if shape.any() else {},
         noise.corner_px, tuple(stack.known.astype(float) for stack in stacks),
         dict.fromkeys(options.time_offsets, OFFSET_S),
+        dict.fromkeys(observations.targets, options.corners_m) if options.corners_m else {},
     )  # fmt: skip
     point = Point(
         {name: one_transform(X[name], f"start of {name}") for name in observations.targets},
@@ -183,6 +188,7 @@ def _stated(
         {name: parameters_of(cameras[name]) for name in priors},
         {name: np.zeros(SHAPE) for name in observations.targets},
         dict.fromkeys(options.time_offsets, 0.0),
+        {name: np.zeros_like(observations.corners[name]) for name in observations.targets if options.corners_m},
     )
     return model, point, noise, cameras
 

@@ -11,6 +11,7 @@ from hypothesis import given as for_any
 from hypothesis import settings
 from hypothesis import strategies as st
 from rwhec_factors import se3
+from scipy.stats import chi2
 from simulated_cells import CAMERA, Cell, cell
 from simulated_clocks import moving
 from simulated_models import A_NOISE, CORNER_PX, model_and_point
@@ -121,6 +122,19 @@ def test_offsets_are_found_with_everything_else(late: Cell, noise: rw.refinement
     kept = replace(options, time_offsets=())
     without = rw.refine_corners(late.observations, X, Y, kept)
     assert held_out_errors(late.observations, without, kept, folds=2)["cam_0"].rms_px > 0.5
+
+
+def test_errors_of_offsets_are_as_large_as_their_deviations() -> None:
+    """Over ten cells whose A is noisy: the squares are chi-square's."""
+    rng, squares = np.random.default_rng(4), 0.0
+    for seed in range(10):
+        truth = dict(zip(LATE, rng.normal(scale=5e-3, size=2).tolist(), strict=True))
+        given = moving(cell(100 + seed, images=15, stated="calibration", carrier=(1e-3, 5e-4)), seed, truth)
+        X, Y = given.near(rng)
+        refined = rw.refine_corners(given.observations, X, Y, OPTIONS)
+        off = np.array([refined.time_offsets_s[name] - truth[name] for name in LATE])
+        squares += float(off @ np.linalg.solve(refined.covariance("time_offset:cam_0", "time_offset:cam_1"), off))
+    assert chi2.ppf(1e-3, 20) < squares < chi2.ppf(0.999, 20)
 
 
 def test_a_carrier_that_stands_still_tells_no_offset() -> None:

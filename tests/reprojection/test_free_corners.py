@@ -1,0 +1,117 @@
+"""Boards whose corners are off their places: each corner is an unknown with a prior."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from rwhec_factors import se3
+from scipy.stats import chi2
+from simulated_boards import misprinted
+from simulated_cells import BOARD, CAMERA, Cell, cell
+from simulated_models import A_NOISE, CORNER_PX, model_and_point
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.reprojection.corner_graph import CornerGraph
+from gtsam_rwhec.reprojection.corner_views import linearised, pixel_errors, stacks_of
+from gtsam_rwhec.reprojection.held_out import held_out_errors
+from gtsam_rwhec.reprojection.lens import parameters_of
+from gtsam_rwhec.reprojection.model import Model, Point
+from gtsam_rwhec.reprojection.reduced import Reduced
+
+MISPRINT_M = 2e-4
+OPTIONS = rw.CornerOptions(stated="calibration", corners_m=MISPRINT_M)
+
+
+@pytest.fixture(scope="module")
+def small() -> Cell:
+    return cell(3, images=6)
+
+
+def model_with_corners(small: Cell) -> tuple[Model, Point]:
+    model, point = model_and_point(small)
+    off = np.random.default_rng(2).normal(scale=1e-4, size=(35, 3))
+    return replace(model, corner_priors={"board": 1e-3}), replace(point, corners={"board": off})
+
+
+def test_derivatives_by_a_corners_place(small: Cell) -> None:
+    (stack, *_), A = stacks_of(small.observations)
+    at = small.X["board"], small.Y["cam_0"], A, parameters_of(CAMERA), np.full(3, 1e-3), 0.0
+    off = np.random.default_rng(2).normal(scale=1e-3, size=(35, 3))
+    by_corners = linearised(stack, *at, off).by_corners
+    for i, step in enumerate(1e-7 * np.eye(3)):
+        above, below = (pixel_errors(stack, *at, off + sign * step) for sign in (1.0, -1.0))
+        numeric = ((above - below) / 2e-7).reshape(by_corners.shape[:3])
+        assert by_corners[..., i] == pytest.approx(numeric, rel=1e-5, abs=1e-3)
+
+
+def test_linear_rows_have_the_gradient_of_the_cost(small: Cell) -> None:
+    model, point = model_with_corners(small)
+    graph = CornerGraph(model, point)
+    values = graph.values(point)
+    assert graph.point(values).corners["board"] == pytest.approx(point.corners["board"], abs=0.0)
+    gradient = graph.graph.linearize(values).gradientAtZero().at(graph.p["board"])
+    for i in (0, 52, 104):
+        moved = [gtsam.Values(values), gtsam.Values(values)]
+        for to, sign in zip(moved, (1.0, -1.0), strict=True):
+            to.update(graph.p["board"], point.corners["board"].ravel() + sign * 1e-7 * (np.arange(105) == i))
+        numeric = (graph.graph.error(moved[0]) - graph.graph.error(moved[1])) / 2e-7
+        assert gradient[i] == pytest.approx(numeric, rel=1e-4, abs=1e-5 * np.abs(gradient).max())
+
+
+def test_the_sums_by_instant_have_the_graphs_information(small: Cell) -> None:
+    model, point = model_with_corners(small)
+    point = replace(point, A=model.A)
+    graph, reduced = CornerGraph(model, point), Reduced.of(model, point)
+    joint, _ = graph.covariance(graph.values(point), reduced.slots)
+    H = reduced.information(rw.reprojection.Noise(CORNER_PX, float(A_NOISE[0]), float(A_NOISE[3])))
+    size = np.sqrt(np.diagonal(joint))
+    assert joint / np.outer(size, size) == pytest.approx(np.linalg.inv(H) / np.outer(size, size), abs=1e-6)
+
+
+def test_a_misprinted_board_is_found_with_everything_else() -> None:
+    given, off = misprinted(3, MISPRINT_M, images=60, cameras=3, stated="calibration", carrier=(1e-3, 5e-4))
+    X, Y = given.near(np.random.default_rng(0))
+    refined = rw.refine_corners(given.observations, X, Y, OPTIONS)
+    assert refined.noise.corner_px == pytest.approx(0.1, rel=0.05)
+    error = (BOARD.corners() + off - refined.corners["board"]).ravel()
+    covariance = refined.covariance("corners:board")
+    assert np.sqrt((error**2).mean()) < 0.5 * MISPRINT_M
+    assert chi2.ppf(1e-3, 105) < error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, 105)
+    for name in ("board", "cam_0", "cam_1", "cam_2"):
+        pose, truth = (refined.X[name], given.X[name]) if name in given.X else (refined.Y[name], given.Y[name])
+        xi = se3.logmap((se3.inverse(pose.matrix()) @ truth)[None])[0]
+        assert xi @ np.linalg.solve(refined.covariance(name), xi) < chi2.ppf(0.999, 6)
+    assert not any("corners of board" in words for words in refined.findings)
+
+
+def test_images_that_were_left_out_are_predicted_better() -> None:
+    given, _ = misprinted(4, MISPRINT_M, images=30)
+    X, Y = given.near(np.random.default_rng(0))
+    rms = []
+    for corners_m in (0.0, MISPRINT_M):
+        options = replace(OPTIONS, corners_m=corners_m, carrier_noise="exact")
+        refined = rw.refine_corners(given.observations, X, Y, options)
+        rms.append(held_out_errors(given.observations, refined, options, folds=2)["cam_0"].rms_px)
+    assert rms[1] < 0.7 * rms[0]
+
+
+def test_corners_far_from_their_places_are_named() -> None:
+    given, _ = misprinted(5, 3e-4, images=30)
+    X, Y = given.near(np.random.default_rng(0))
+    refined = rw.refine_corners(given.observations, X, Y, replace(OPTIONS, corners_m=1e-4))
+    said = [words for words in refined.findings if "corners of board are farther" in words]
+    assert len(said) == 1
+    assert "than corners_m=0.0001 explains (corner " in said[0]
+
+
+def test_a_board_as_stated_has_its_corners_where_they_are_stated(small: Cell) -> None:
+    X, Y = small.near(np.random.default_rng(0))
+    refined = rw.refine_corners(small.observations, X, Y, rw.CornerOptions(carrier_noise="exact"))
+    assert refined.corners["board"] == pytest.approx(BOARD.corners(), abs=0.0)
+    assert "corners:board" not in refined.names
+    with pytest.raises(OptionError, match=r"corners_m=-1\.0; give a standard deviation, or 0"):
+        rw.CornerOptions(corners_m=-1.0)
