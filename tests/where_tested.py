@@ -196,6 +196,7 @@ TABLE: dict[str, dict[str, str]] = {
         "vision/test_detection.py": "options rejection",
         "vision/test_edges.py": "edge_geometry edge_profiles",
         "vision/test_images.py": "image_sizes",
+        "vision/test_intrinsics_files.py": "intrinsics_numbers",
         "vision/test_targets.py": "dictionaries tag_boards target_checks",
     },
     "factors": {

@@ -43,11 +43,12 @@ def camchain_yaml(frames: RigFrames) -> str:
     meeting = overlaps(cameras, T_rig_camera)
     sections = []
     for n, (name, camera) in enumerate(zip(names, cameras, strict=True)):
-        D = camera.D if camera.model == "equidistant" else _four(camera)
+        is_unified, K = camera.model == "unified", camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+        xi, D = (camera.D[:1], camera.D[1:]) if is_unified else (camera.D[:0], _four(camera))
         lines = [
             f"cam{n}:  # {name}",
-            "  camera_model: pinhole",
-            f"  intrinsics: {_row(camera.K[[0, 1, 0, 1], [0, 1, 2, 2]])}",
+            f"  camera_model: {'omni' if is_unified else 'pinhole'}",
+            f"  intrinsics: {_row([*xi, *K])}",
             f"  distortion_model: {'equidistant' if camera.model == 'equidistant' else 'radtan'}",
             f"  distortion_coeffs: {_row(D)}",
             f"  resolution: [{camera.width}, {camera.height}]",

@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 
 from gtsam_rwhec.files.rounded_numbers import rounded
-from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import Camera
 
 #: The name of a board's size among its numbers: its covariance is that of the target's scale.
@@ -179,7 +178,7 @@ class Reprojection:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A sensor's intrinsics as they were estimated; its parameters are fx, fy, cx, cy and the lens's coefficients.
+    """A sensor's intrinsics as they were estimated; its parameters are `Camera.parameters`.
 
     Attributes
     ----------
@@ -258,8 +257,12 @@ class Intrinsics:
         return camera_of(self, self.stated)
 
 
+def lens_of(intrinsics: Intrinsics) -> Camera:
+    """A camera of the same model and size, without numbers."""
+    return Camera(intrinsics.width, intrinsics.height, intrinsics.model, np.eye(3), np.zeros(0))  # type: ignore[arg-type]
+
+
 def camera_of(intrinsics: Intrinsics, values: tuple[float, ...]) -> Camera:
     """The camera with some values of an intrinsics' parameters; CameraError where they are none."""
-    fx, fy, cx, cy, *D = values
-    K: Array = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return Camera.of(intrinsics.width, intrinsics.height, intrinsics.model, K, np.array(D), "intrinsics of the result")
+    camera = lens_of(intrinsics).with_parameters(np.array(values))
+    return Camera.of(camera.width, camera.height, camera.model, camera.K, camera.D, "intrinsics of the result")

@@ -153,7 +153,7 @@ def _of_intrinsics(refined: CornersRefined, options: CornerOptions) -> Iterator[
 
 def _off(intrinsics: RefinedIntrinsics, part: str) -> str:
     """How far off a part of the stated intrinsics is: the focal length is off by 1.2 % (8.1 deviations)."""
-    off, f = intrinsics.innovation.off[PARTS[part]], intrinsics.camera.K[0, 0]
+    off, f = intrinsics.innovation.off[PARTS[part]], intrinsics.camera.focal_px
     size = {
         "focal length": f"{100 * off.mean() / f:+.2g} %",
         "centre": f"({', '.join(f'{value:+.3g}' for value in off)}) pixels",

@@ -103,7 +103,7 @@ def held_out_errors(
             seen = replace(stack, camera=camera)
             errors = pixel_errors(seen, X, Y, A, parameters_of(camera), shape, *off).reshape(*stack.known.shape, 2)
             length = np.linalg.norm(errors, axis=2)[stack.known]
-            on_target = length * depths(stack, X, Y, A, shape, *off)[stack.known] / camera.K[0, 0]
+            on_target = length * depths(stack, X, Y, A, shape, *off)[stack.known] / camera.focal_px
             found[stack.sensor].append((length, on_target, stack.pixels[stack.known]))
     return {
         name: _of_sensor(

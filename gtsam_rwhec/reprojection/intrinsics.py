@@ -15,9 +15,8 @@ from typing import Literal
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.reprojection.lens import PINHOLE, parameters_of
+from gtsam_rwhec.reprojection.lens import PINHOLE, parameters_of, pixels_and_derivatives
 from gtsam_rwhec.vision.camera import Camera
-from gtsam_rwhec.vision.distortion import coefficient_jacobian
 
 Stated = Literal["exact", "calibration", "nominal", "unknown"]
 
@@ -45,7 +44,7 @@ def prior_of(camera: Camera, stated: Stated) -> tuple[Array, Array]:
     f, c = mean[:2], max(CENTRE_PX[stated], CENTRE_OF_WIDTH[stated] * camera.width)
     lens_px = LENS_PX[stated] if stated in LENS_PX else LENS_OF_FOCAL[stated] * float(f.mean())
     corner = 0.5 * np.array([camera.width, camera.height]) / f
-    moved = np.linalg.norm(coefficient_jacobian(camera.model, camera.D, corner) * f[:, None], axis=0)
-    deviation = np.concatenate([FOCAL[stated] * f, [c, c], lens_px / moved])
+    by_lens = pixels_and_derivatives(camera, mean, corner)[2][:, PINHOLE:]
+    deviation = np.concatenate([FOCAL[stated] * f, [c, c], lens_px / np.linalg.norm(by_lens, axis=0)])
     assert len(deviation) == PINHOLE + len(camera.D)
     return mean, deviation

@@ -19,17 +19,6 @@ from gtsam_rwhec.reprojection.reduced import Noise
 from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, held_by_prior
 from gtsam_rwhec.vision.camera import Camera
 
-#: Names of a camera's parameters by its number of coefficients and its model.
-_PINHOLE = ("fx", "fy", "cx", "cy")
-_RADTAN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
-_EQUIDISTANT = ("k1", "k2", "k3", "k4")
-
-
-def parameter_names(camera: Camera) -> tuple[str, ...]:
-    """fx, fy, cx, cy and the coefficients' names."""
-    coefficients = _EQUIDISTANT if camera.model == "equidistant" else _RADTAN
-    return _PINHOLE + coefficients[: len(camera.D)]
-
 
 @dataclass(frozen=True, eq=False)
 class RefinedIntrinsics:
@@ -39,7 +28,7 @@ class RefinedIntrinsics:
     ----------
     camera : Camera
     covariance : (m, m) array
-        Of fx, fy, cx, cy (pixels) and the coefficients.
+        Of `Camera.parameters`: fx, fy, cx, cy (pixels) and the coefficients.
     stated_deviations : (m,) array
         Of the prior, as widened.
     widened : float
@@ -60,7 +49,7 @@ class RefinedIntrinsics:
     @property
     def names(self) -> tuple[str, ...]:
         """Of the parameters."""
-        return parameter_names(self.camera)
+        return self.camera.parameter_names
 
     @property
     def held_by_prior(self) -> tuple[str, ...]:

@@ -15,14 +15,12 @@ import numpy as np
 from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.reprojection_found import SIZE, BoardShape, Intrinsics, Regions, Reprojection
+from gtsam_rwhec.refinement.reprojection_found import SIZE, BoardShape, Intrinsics, Regions, Reprojection, lens_of
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.reprojection.as_refined import SHAPE_NAMES
 from gtsam_rwhec.results.covariance_agreement import TWICE
 from gtsam_rwhec.results.schema import RefinedFields
 
-#: The first parameters of every camera; the lens's coefficients follow.
-PINHOLE = ("fx", "fy", "cx", "cy")
 #: Fields of an `Intrinsics` with a number for each of its names.
 _BY_NAME = ("values", "standard_deviations", "stated", "stated_deviations")
 
@@ -77,9 +75,10 @@ def _check_reprojection(found: Reprojection, refined: RefinedFields, place: str)
 
 def _check_intrinsics(name: str, intrinsics: Intrinsics, refined: RefinedFields, place: str) -> None:
     width = len(intrinsics.names)
-    if intrinsics.names[:4] != PINHOLE or len(set(intrinsics.names)) != width:
+    first = lens_of(intrinsics).parameter_names
+    if intrinsics.names[:4] != first or len(set(intrinsics.names)) != width:
         raise ValueError(
-            f"{place}.names: fx, fy, cx, cy and then the lens's coefficients, each once (found "
+            f"{place}.names: {', '.join(first)} and then the lens's coefficients, each once (found "
             f"{', '.join(map(shown, intrinsics.names)) or 'none'})"
         )
     for what in _BY_NAME:

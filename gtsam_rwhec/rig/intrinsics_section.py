@@ -40,7 +40,8 @@ class Intrinsics(Section):
     )
     model: str | None = Field(
         default=None,
-        description="with K: what D is: pinhole (no D), radtan (OpenCV, plumb_bob) or equidistant (fisheye)",
+        description="with K: what D is: pinhole (no D), radtan (OpenCV, plumb_bob), equidistant (fisheye) or "
+        "unified (omni, D is [xi, k1, k2, p1, p2])",
         examples=["radtan"],
     )
     width: int | None = Field(
@@ -103,7 +104,7 @@ class Intrinsics(Section):
             given = {"size: [width, height]": width is not None and height is not None, "K": self.K is not None}
             raise ValueError(f"{' and '.join(name for name, there in given.items() if not there)} missing")
         if self.model is None and self.D and any(self.D):
-            raise ValueError("D without model; say which coefficients these are: model: radtan or equidistant")
+            raise ValueError("D without model; say which coefficients these are: model: radtan, equidistant or unified")
         fx, fy, cx, cy = self.K
         K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
         return Camera.of(width, height, self.model or "pinhole", K, self.D or (), where)

@@ -87,7 +87,7 @@ def plane_through(
     """
     rows, columns = grid.shape[:2]
     squares: Array = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(float)
-    focal = 1.0 if camera is None else 0.5 * float(camera.K[0, 0] + camera.K[1, 1])
+    focal = 1.0 if camera is None else camera.focal_px
     flat = grid[good] if camera is None else camera.undistort(grid[good]) * focal
     if len(flat) < 4 or not np.isfinite(flat).all():
         return None

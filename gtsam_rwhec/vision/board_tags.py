@@ -76,7 +76,7 @@ def tag_places(board: TagBoard, is_legacy: bool = False) -> Array:
 def tags_of_board(board: TagBoard, ids: np.ndarray, corners_px: Array, camera: Camera) -> BoardTags:
     """Test tags (m,) of a board, seen at (m, 4, 2); the returned ones agree, unless the board is contradicted."""
     x = camera.undistort(corners_px)
-    focal = 0.5 * float(camera.K[0, 0] + camera.K[1, 1])
+    focal = camera.focal_px
     number = {i: k for k, i in enumerate(board.ids)}
     of_board = np.array([number[int(i)] for i in ids], dtype=int)
     is_legacy = False

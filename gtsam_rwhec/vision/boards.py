@@ -138,7 +138,7 @@ class _Places:
     @staticmethod
     def of(camera: Camera, plane: Array, pixels: Array) -> _Places | None:
         """From points (n, 2) of the plane, seen at (n, 2)."""
-        focal = 0.5 * float(camera.K[0, 0] + camera.K[1, 1])
+        focal = camera.focal_px
         flat = camera.undistort(pixels) * focal
         good = np.isfinite(flat).all(axis=1)
         if good.sum() < 4:
@@ -206,7 +206,7 @@ def on_one_plane(camera: Camera, corners_m: Array, corners_px: Array) -> np.ndar
     x = camera.undistort(corners_px)
     if len(corners_m) < 6 or not np.isfinite(x).all():
         return everyone
-    focal = 0.5 * (camera.K[0, 0] + camera.K[1, 1])
+    focal = camera.focal_px
     plane, flat = corners_m[:, :2], x * focal
     H, agrees = cv2.findHomography(plane, flat, cv2.RANSAC, ASTRAY_PX)
     if H is None:

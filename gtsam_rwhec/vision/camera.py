@@ -1,4 +1,4 @@
-"""Cameras with OpenCV's models: pinhole with radial-tangential distortion, or equidistant (fisheye).
+"""Cameras with OpenCV's models: pinhole with radial-tangential distortion, equidistant (fisheye), or unified (omnidir).
 
 A point in the camera's optical frame (z forward, x right, y down) has normalised coordinates x = (X / Z, Y / Z) and
 pixels u = f x_distorted + c. Pixel centres are at whole numbers.
@@ -21,9 +21,18 @@ MODELS: dict[str, Model] = {
     "": "pinhole", "none": "pinhole", "pinhole": "pinhole",
     "plumb_bob": "radtan", "radtan": "radtan", "rational_polynomial": "radtan", "thin_prism": "radtan",
     "equidistant": "equidistant", "equi": "equidistant", "fisheye": "equidistant", "kannala_brandt": "equidistant",
+    "unified": "unified",
 }  # fmt: skip
 #: OpenCV takes these numbers of distortion coefficients for each model.
-COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5, 8, 12, 14), "equidistant": (4,)}
+COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5, 8, 12, 14), "equidistant": (4,), "unified": (5,)}
+#: Names of the coefficients.
+NAMES = {
+    "radtan": "k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4",
+    "equidistant": "k1 k2 k3 k4",
+    "unified": "xi k1 k2 p1 p2",
+}
+#: The unified model of a pinhole has xi = 0, of a parabolic mirror 1, of fisheye lenses up to about 3.
+XI_RANGE = (-0.9, 20.0)
 #: The focal length over the image's larger side must be within this range. For a pinhole, 0.05 is a field of view of
 #: over 160 degrees, and 50 is one of one degree.
 FOCAL_RANGE = (0.05, 50.0)
@@ -40,12 +49,12 @@ class Camera:
     width, height : int
         Size of the images, pixels.
     model : str
-        "pinhole", "radtan" or "equidistant" (OpenCV's fisheye).
+        "pinhole", "radtan", "equidistant" (OpenCV's fisheye) or "unified" (OpenCV's omnidir, Kalibr's omni-radtan).
     K : (3, 3) array
         Camera matrix, pixels.
     D : (n,) array
         OpenCV's distortion coefficients. "radtan": k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4]]]; "equidistant":
-        k1, k2, k3, k4.
+        k1, k2, k3, k4; "unified": xi, k1, k2, p1, p2.
     """
 
     width: int
@@ -81,6 +90,8 @@ class Camera:
                 f"{where}: distortion model {model!r} is not supported; supported are "
                 f"{', '.join(repr(name) for name in MODELS if name)}"
             )
+        if MODELS[word] == "unified" and not np.size(D):
+            raise CameraError(f"{where}: a unified camera needs xi, the first of D: [xi, k1, k2, p1, p2]")
         matrix, coefficients = np.array(K, dtype=float), np.trim_zeros(np.array(D, dtype=float).ravel(), "b")
         camera = Camera(int(width), int(height), MODELS[word], matrix, coefficients)
         fault = camera._fault()
@@ -101,7 +112,7 @@ class Camera:
         if not K.any():
             return "K is all zeros: the camera was not calibrated (this is how ROS says it). Calibrate it"
         if K[0, 1] != 0.0 or K[1, 0] != 0.0 or K[2].tolist() != [0.0, 0.0, 1.0]:
-            return f"K is {K.tolist()}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+            return f"K is {K.tolist()}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew"
         image = f"image of {width} x {height} pixels"
         for name, f in (("fx", K[0, 0]), ("fy", K[1, 1])):
             if not FOCAL_RANGE[0] <= f / max(width, height) <= FOCAL_RANGE[1]:
@@ -115,6 +126,8 @@ class Camera:
             return f"a tilted sensor (coefficients 13 and 14 are {D[12:].tolist()}) is not supported"
         if self.model == "pinhole" and len(D):
             return f"coefficients {D.tolist()} without a distortion model; give 'plumb_bob' or 'equidistant'"
+        if self.model == "unified" and not XI_RANGE[0] <= np.append(D, 0.0)[0] <= XI_RANGE[1]:
+            return f"xi = {D[0]:g}, the first of D, must be between {XI_RANGE[0]:g} and {XI_RANGE[1]:g}"
         if len(D) > COEFFICIENTS[self.model][-1]:
             return f"{len(D)} coefficients are too many for the model {self.model}: {D.tolist()}"
         return ""
@@ -150,6 +163,37 @@ class Camera:
     def ring(self) -> float:
         """Normalised radius at which the radial distortion folds back or has a pole; infinite if it does neither."""
         return folding_radius(self.model, self.D)
+
+    @property
+    def parameters(self) -> Array:
+        """Its numbers (4 + n,): fx, fy, cx, cy and D; of a unified camera fx / (1 + xi), fy / (1 + xi), cx, cy and D.
+
+        These are the pixels of one rad at the optical axis, which images tell; f and xi alone move together.
+        """
+        K = self.K
+        return np.concatenate([self._focal / self._zoom, [K[0, 2], K[1, 2]], self.D])
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Of `parameters`."""
+        of_f = ("fx/(1+xi)", "fy/(1+xi)") if self.model == "unified" else ("fx", "fy")
+        return (*of_f, "cx", "cy", *NAMES.get(self.model, "").split()[: len(self.D)])
+
+    def with_parameters(self, parameters: Array) -> Camera:
+        """The camera with other numbers, unchecked."""
+        fx, fy, cx, cy, *D = parameters.tolist()
+        changed = replace(self, K=np.eye(3), D=np.array(D))
+        zoom = changed._zoom
+        return replace(changed, K=np.array([[zoom * fx, 0.0, cx], [0.0, zoom * fy, cy], [0.0, 0.0, 1.0]]))
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels of one rad at the optical axis, the mean of both directions."""
+        return float(self._focal.mean()) / self._zoom
+
+    @property
+    def _zoom(self) -> float:
+        return 1.0 + float(self.D[0]) if self.model == "unified" else 1.0
 
     def inside(self, pixels: Array) -> np.ndarray:
         """Whether pixels (..., 2) are in the image; booleans (...)."""

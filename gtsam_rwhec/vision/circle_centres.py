@@ -41,7 +41,7 @@ class Plane:
     @staticmethod
     def through(steps: Array, pixels: Array, camera: Camera) -> Plane | None:
         """The plane that fits pixels (..., 2) of places (..., 2) best; None where there is none."""
-        focal = 0.5 * float(camera.K[0, 0] + camera.K[1, 1])
+        focal = camera.focal_px
         flat = camera.undistort(pixels.reshape(-1, 2)) * focal
         H = cv2.findHomography(steps.reshape(-1, 2), flat, 0)[0] if np.isfinite(flat).all() else None
         if H is None or not np.isfinite(H).all():

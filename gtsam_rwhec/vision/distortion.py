@@ -9,7 +9,7 @@ from numpy.polynomial import Polynomial
 
 from gtsam_rwhec.geometry.poses import Array
 
-Model = Literal["pinhole", "radtan", "equidistant"]
+Model = Literal["pinhole", "radtan", "equidistant", "unified"]
 
 #: Newton's method takes at most this many steps.
 STEPS = 30
@@ -23,6 +23,10 @@ def distorted(model: Model, D: Array, x: Array) -> tuple[Array, Array]:
         return _equidistant(x, D)
     if model == "radtan":
         return _radtan(x, D)
+    if model == "unified":
+        m, by_x, _ = _from_sphere(x, D[0])
+        bent, by_m = _radtan(m, D[1:])
+        return bent, by_m @ by_x
     return x, np.broadcast_to(np.eye(2), (*x.shape[:-1], 2, 2))
 
 
@@ -32,6 +36,8 @@ def undistorted(model: Model, D: Array, wanted: Array, ring: float) -> Array:
         return wanted
     if model == "equidistant":
         return _undistorted_fisheye(D, wanted, ring)
+    if model == "unified":
+        return _to_rays(undistorted("radtan", D[1:], wanted, folding_radius("radtan", D[1:])), D[0], ring)
     x = wanted.copy()
     with np.errstate(all="ignore"):
         for _ in range(STEPS):
@@ -77,6 +83,11 @@ def folding_radius(model: Model, D: Array) -> float:
         # d theta_d / d theta, in theta^2
         squared = _first_root(Polynomial([1.0, *(D * [3.0, 5.0, 7.0, 9.0])]))
         return float(np.tan(np.sqrt(squared))) if squared < (0.5 * np.pi) ** 2 else float("inf")
+    if model == "unified":
+        xi, folds = float(D[0]), folding_radius("radtan", D[1:])
+        pole = float(np.sqrt(xi**-2 - 1.0)) if -1.0 < xi < 0.0 else float("inf")
+        ray = float(_to_rays(np.array([folds, 0.0]), xi, pole)[0]) if np.isfinite(folds) else float("nan")
+        return pole if np.isnan(ray) else ray
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(D, (0, 8))[:8]
     above, below = Polynomial([1.0, k1, k2, k3]), Polynomial([1.0, k4, k5, k6])
     # d(r above / below) / dr, times below^2, in r^2
@@ -137,6 +148,24 @@ def _equidistant(x: Array, D: Array) -> tuple[Array, Array]:
     return x * g[..., None], J
 
 
+def _from_sphere(x: Array, xi: float) -> tuple[Array, Array, Array]:
+    """Mei and Rives 2007, (7): m = x / (1 + xi s), s = sqrt(1 + r^2); its derivatives by x (..., 2, 2) and by xi."""
+    s = np.sqrt(1.0 + np.einsum("...i,...i->...", x, x))[..., None]
+    below = 1.0 + xi * s
+    m = x / below
+    by_x = (np.eye(2) - xi * (m / s)[..., :, None] * x[..., None, :]) / below[..., None]
+    return m, by_x, -s * m / below
+
+
+def _to_rays(m: Array, xi: float, ring: float) -> Array:
+    """x (..., 2) of m (..., 2), Mei and Rives 2007, (8); nan where the ray is not in front, or not within `ring`."""
+    r2 = np.einsum("...i,...i->...", m, m)[..., None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = (xi + np.sqrt(1.0 + (1.0 - xi * xi) * r2)) / (1.0 + r2)
+        x = m * scale / (scale - xi)
+        return np.where((scale > xi) & (np.linalg.norm(x, axis=-1, keepdims=True) < ring), x, np.nan)
+
+
 def coefficient_jacobian(model: Model, D: Array, x: Array) -> Array:
     """Derivatives (..., 2, n) of the distorted coordinates of x (..., 2) by the n coefficients."""
     r2 = np.einsum("...i,...i->...", x, x)
@@ -149,6 +178,10 @@ def coefficient_jacobian(model: Model, D: Array, x: Array) -> Array:
         return along
     if model == "pinhole":
         return np.zeros((*x.shape, 0))
+    if model == "unified":
+        m, _, by_xi = _from_sphere(x, D[0])
+        by_m = _radtan(m, D[1:])[1]
+        return np.concatenate([by_m @ by_xi[..., None], coefficient_jacobian("radtan", D[1:], m)], axis=-1)
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(D, (0, 14))[:8]
     a, b = x[..., 0], x[..., 1]
     above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
-from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.opencv_storage import parse_storage
-from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, read_text, read_yaml, shown
+from gtsam_rwhec.files.yaml_lines import YamlFile, read_text, read_yaml, shown
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.vision.camera import MODELS, Camera
 from gtsam_rwhec.vision.colmap_cameras import is_colmap, read_colmap_cameras
+from gtsam_rwhec.vision.intrinsics_numbers import matrix_of, numbers_of, pixels_of, refuse
 
-#: Kalibr combines its camera model pinhole with these distortion models.
-KALIBR_DISTORTIONS = ("none", "radtan", "equidistant")
+#: Kalibr's camera models that are supported, with the distortion models that go with them.
+KALIBR_MODELS = {"pinhole": ("none", "radtan", "equidistant"), "omni": ("none", "radtan")}
 _KALIBR_CAMERA = re.compile(r"cam\d+")
 #: ROS, OpenCV's samples and people write these keys of intrinsics; here they have lower case and no underscores.
 _WIDTH, _HEIGHT = ("imagewidth", "width", "imgwidth", "w"), ("imageheight", "height", "imgheight", "h")
@@ -28,6 +27,8 @@ _COEFFICIENTS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "di
 #: Plain numbers, as RealSense and NeRF name them too.
 _PLAIN = (("fx", "flx"), ("fy", "fly"), ("cx", "ppx"), ("cy", "ppy"))
 _MODEL = ("distortionmodel", "cameramodel")
+#: OpenCV's omnidir writes this beside the matrix and four coefficients.
+_XI = ("xi",)
 #: Messages give the needed fields these names.
 _FIELDS = {
     _WIDTH: "image_width", _HEIGHT: "image_height", _MATRIX: "camera_matrix", _COEFFICIENTS: "distortion_coefficients",
@@ -40,8 +41,9 @@ def read_kalibr_camchain(path: str | Path) -> dict[str, Camera]:
     Parameters
     ----------
     path
-        Each camera has camera_model (pinhole), intrinsics [fu, fv, pu, pv], distortion_model (none, radtan or
-        equidistant), distortion_coeffs and resolution [width, height]. Poses and time shifts are not read.
+        Each camera has camera_model (pinhole or omni), intrinsics [fu, fv, pu, pv], or [xi, fu, fv, pu, pv] of omni,
+        distortion_model (none, radtan, and equidistant of a pinhole), distortion_coeffs and resolution [width, height].
+        Poses and time shifts are not read.
 
     Returns
     -------
@@ -63,31 +65,32 @@ def _kalibr_cameras(file: YamlFile) -> dict[str, Camera]:
     names = [name for name in chain if _KALIBR_CAMERA.fullmatch(name)]
     if not names:
         other = " (it has a camera matrix: is it a calibration of ROS or OpenCV?)" if _found(chain, _MATRIX) else ""
-        _refuse(file, (), f"no cameras cam0, cam1, ...{other}; a Kalibr camchain was expected")
+        refuse(file, (), f"no cameras cam0, cam1, ...{other}; a Kalibr camchain was expected")
     return {name: _kalibr_camera(file, name) for name in names}
 
 
 def _kalibr_camera(file: YamlFile, name: str) -> Camera:
     section = file.data[name]
     if not isinstance(section, dict):
-        _refuse(file, (name,), f"{shown(section)}; a camera's section was expected")
+        refuse(file, (name,), f"{shown(section)}; a camera's section was expected")
     for key in ("camera_model", "intrinsics", "distortion_model", "resolution"):
         if key not in section:
-            _refuse(file, (name, key), "is missing")
-    if section["camera_model"] != "pinhole":
-        advice = "calibrate with Kalibr's pinhole-radtan or, for wide lenses, pinhole-equi"
-        words = f"{shown(section['camera_model'])} is not supported, only pinhole is; {advice}"
-        _refuse(file, (name, "camera_model"), words)
-    model = section["distortion_model"]
-    if model not in KALIBR_DISTORTIONS:
-        _refuse(file, (name, "distortion_model"), _unsupported(model, KALIBR_DISTORTIONS))
-    fu, fv, pu, pv = _numbers(file, (name, "intrinsics"), section["intrinsics"], 4)
-    resolution = _numbers(file, (name, "resolution"), section["resolution"], 2)
-    width, height = (_pixels(file, (name, "resolution"), float(side)) for side in resolution)
+            refuse(file, (name, key), "is missing")
+    camera_model, model = section["camera_model"], section["distortion_model"]
+    if camera_model not in KALIBR_MODELS:
+        advice = "calibrate with Kalibr's pinhole-radtan or, for wide lenses, pinhole-equi or omni-radtan"
+        words = f"{shown(camera_model)} is not supported, only {' and '.join(KALIBR_MODELS)} are; {advice}"
+        refuse(file, (name, "camera_model"), words)
+    if model not in KALIBR_MODELS[camera_model]:
+        refuse(file, (name, "distortion_model"), _unsupported(model, KALIBR_MODELS[camera_model]))
+    is_omni = camera_model == "omni"
+    *xi, fu, fv, pu, pv = numbers_of(file, (name, "intrinsics"), section["intrinsics"], 5 if is_omni else 4)
+    resolution = numbers_of(file, (name, "resolution"), section["resolution"], 2)
+    width, height = (pixels_of(file, (name, "resolution"), float(side)) for side in resolution)
     coefficients = section.get("distortion_coeffs", () if model == "none" else None)
-    D = _numbers(file, (name, "distortion_coeffs"), coefficients, None if model == "none" else 4)
+    D = numbers_of(file, (name, "distortion_coeffs"), coefficients, None if model == "none" else 4)
     K = np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
-    return Camera.of(width, height, model, K, D, file.place((name,)))
+    return Camera.of(width, height, "unified" if is_omni else model, K, [*xi, *D], file.place((name,)))
 
 
 def read_calibration_yaml(path: str | Path) -> Camera:
@@ -99,7 +102,7 @@ def read_calibration_yaml(path: str | Path) -> Camera:
         YAML, JSON or OpenCV's XML. Has image_width, image_height, camera_matrix, distortion_coefficients, and
         distortion_model; or the plain numbers fx, fy, cx, cy with the size, and coefficients k1, k2, p1, p2, k3 by
         name. Other tools' names of these keys are read too (K, D, mtx, dist, image_size). Without a distortion_model,
-        fisheye_model (of OpenCV's sample) tells the model; five coefficients or more are radtan.
+        fisheye_model (of OpenCV's sample) or xi (of its omnidir) tells the model; five coefficients or more are radtan.
 
     Raises
     ------
@@ -112,7 +115,7 @@ def read_calibration_yaml(path: str | Path) -> Camera:
     file = parse_storage(read_text(path), str(path))
     fields = file.data if isinstance(file.data, dict) else {}
     if any(_KALIBR_CAMERA.fullmatch(name) for name in fields):
-        _refuse(file, (), "a Kalibr camchain; give it in the rig file as {kalibr: FILE, camera: cam0}")
+        refuse(file, (), "a Kalibr camchain; give it in the rig file as {kalibr: FILE, camera: cam0}")
     return _calibrated(file, "", None)
 
 
@@ -161,12 +164,29 @@ def _calibrated(file: YamlFile, number: str, size: tuple[int, int] | None) -> Ca
     key = _key(file, _MATRIX, number)
     value = fields[key]
     if isinstance(value, tuple) and len(value) == 4:
-        fx, fy, cx, cy = _matrix(file, key, 4)
+        fx, fy, cx, cy = matrix_of(file, key, 4)
         K = np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
     else:
-        K = _matrix(file, key, 9)
-    D = _matrix(file, _key(file, _COEFFICIENTS, number), None)
-    return Camera.of(width, height, _model(file, D, number), K.reshape(3, 3), D, file.place((key,)))
+        K = matrix_of(file, key, 9)
+    D = matrix_of(file, _key(file, _COEFFICIENTS, number), None)
+    xi = _xi(file, number)
+    model = "unified" if xi else _model(file, D, number)
+    return Camera.of(width, height, model, K.reshape(3, 3), [*xi, *D], file.place((key,)))
+
+
+def _xi(file: YamlFile, number: str = "") -> list[float]:
+    """The xi of OpenCV's omnidir, a number or a matrix of one; empty for other models."""
+    fields = file.data
+    key, model = _found(fields, _XI, number), _found(fields, _MODEL)
+    if key is None:
+        return []
+    if model is not None and MODELS.get(str(fields[model]).strip().lower(), "radtan") == "equidistant":
+        refuse(
+            file, (model,), f"{shown(fields[model])}, and xi, which only the unified model has; take one of both out"
+        )
+    if isinstance(fields[key], (dict, tuple)):
+        return [float(matrix_of(file, key, 1)[0])]
+    return [float(numbers_of(file, (key,), (fields[key],), 1)[0])]
 
 
 def _image_size(file: YamlFile, size: tuple[int, int] | None) -> tuple[int, int]:
@@ -174,13 +194,15 @@ def _image_size(file: YamlFile, size: tuple[int, int] | None) -> tuple[int, int]
     fields = file.data if isinstance(file.data, dict) else {}
     whole, wide = _found(fields, _SIZE), _found(fields, _WIDTH)
     if whole is not None and wide is None:
-        width, height = (_pixels(file, (whole,), float(side)) for side in _numbers(file, (whole,), fields[whole], 2))
+        width, height = (
+            pixels_of(file, (whole,), float(side)) for side in numbers_of(file, (whole,), fields[whole], 2)
+        )
     elif wide is None and size is not None:
         return size
     else:
-        width, height = (_pixels(file, (key,), fields[key]) for key in (_key(file, _WIDTH), _key(file, _HEIGHT)))
+        width, height = (pixels_of(file, (key,), fields[key]) for key in (_key(file, _WIDTH), _key(file, _HEIGHT)))
     if size not in (None, (width, height)):
-        _refuse(file, (whole or wide or "",), f"{width} x {height} pixels, and size: {list(size or ())} was stated")
+        refuse(file, (whole or wide or "",), f"{width} x {height} pixels, and size: {list(size or ())} was stated")
     return width, height
 
 
@@ -195,8 +217,8 @@ def _of_plain_numbers(file: YamlFile, size: tuple[int, int] | None) -> Camera:
     def number(names: tuple[str, ...]) -> float:
         key = _found(fields, names)
         if key is None:
-            _refuse(file, (), f"no {names[0]}; plain intrinsics have fx, fy, cx and cy")
-        return float(_numbers(file, (key,), (fields[key],), 1)[0])
+            refuse(file, (), f"no {names[0]}; plain intrinsics have fx, fy, cx and cy")
+        return float(numbers_of(file, (key,), (fields[key],), 1)[0])
 
     fx, fy, cx, cy = map(number, _PLAIN)
     from_zero = _found(fields, ("distk0", "k0")) is not None
@@ -207,6 +229,9 @@ def _of_plain_numbers(file: YamlFile, size: tuple[int, int] | None) -> Camera:
     if has is not None and not fields[has]:
         D = []
     model = _model(file, np.array([])) if _found(fields, _MODEL) is not None else "radtan" if any(D) else "pinhole"
+    xi = _xi(file)
+    if xi:
+        model, D = "unified", [*xi, *D]
     K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
     return Camera.of(width, height, model, K, D, file.place(()))
 
@@ -217,17 +242,17 @@ def _model(file: YamlFile, D: Array, number: str = "") -> str:
     if key is not None:
         word = fields[key]
         if not isinstance(word, str) or word.strip().lower() not in MODELS:
-            _refuse(file, (key,), _unsupported(word, filter(None, MODELS)))
+            refuse(file, (key,), _unsupported(word, filter(None, MODELS)))
         return word
     fisheye = _found(fields, ("fisheyemodel",))
     if fisheye is not None:
         if fields[fisheye] not in (0, 1):
-            _refuse(file, (fisheye,), f"{shown(fields[fisheye])}; give 0 or 1")
+            refuse(file, (fisheye,), f"{shown(fields[fisheye])}; give 0 or 1")
         return "fisheye" if fields[fisheye] else "radtan"
     if len(D) == 4 and D.any():
         words = "four coefficients can be of OpenCV's fisheye model or of its radtan model; add a line "
         words += "distortion_model: fisheye, or distortion_model: radtan"
-        _refuse(file, (_key(file, _COEFFICIENTS, number),), words)
+        refuse(file, (_key(file, _COEFFICIENTS, number),), words)
     return "radtan"
 
 
@@ -244,50 +269,9 @@ def _key(file: YamlFile, names: tuple[str, ...], number: str = "") -> str:
         words += "OpenCV's samples have it"
         if names in (_WIDTH, _HEIGHT):
             words += "; or state the size in the rig file, intrinsics: {file: FILE, size: [width, height]}"
-        _refuse(file, (), words)
+        refuse(file, (), words)
     return key
 
 
 def _unsupported(value: Any, supported: Iterable[str]) -> str:
     return f"{shown(value)} is not supported; supported are {', '.join(supported)}"
-
-
-def _matrix(file: YamlFile, key: str, count: int | None) -> Array:
-    """The numbers of a matrix, given as {rows, cols, data}, as a list, or as a list of rows."""
-    value, path = file.data[key], (key,)
-    if not isinstance(value, dict):
-        if isinstance(value, tuple) and value and all(isinstance(row, tuple) for row in value):
-            value = tuple(number for row in value for number in row)
-        return _numbers(file, path, value, count)
-    if "sizes" in value and "rows" not in value:  # OpenCV 5: a vector, or a matrix of more than two dimensions
-        return _numbers(file, (*path, "data"), value.get("data"), count)
-    for part in ("rows", "cols", "data"):
-        if part not in value:
-            _refuse(file, (*path, part), "is missing; a matrix has rows, cols and data")
-    numbers = _numbers(file, (*path, "data"), value["data"], count)
-    rows, cols = value["rows"], value["cols"]
-    if not isinstance(rows, int) or not isinstance(cols, int) or rows * cols != len(numbers):
-        _refuse(file, (*path, "data"), f"{len(numbers)} numbers for {shown(rows)} rows and {shown(cols)} columns")
-    return numbers
-
-
-def _numbers(file: YamlFile, path: KeyPath, value: Any, count: int | None) -> Array:
-    if value is None:
-        _refuse(file, path, "is missing" if path not in file.lines else "is empty")
-    if not isinstance(value, tuple) or (count is not None and len(value) != count):
-        many = f"a list of {count} numbers" if count is not None else "a list of numbers"
-        _refuse(file, path, f"{shown(value)}; {many} was expected")
-    for i, number in enumerate(value):
-        if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
-            _refuse(file, (*path, i), f"{shown(number)}; a finite number was expected")
-    return np.array(value, dtype=float)
-
-
-def _pixels(file: YamlFile, path: KeyPath, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value % 1:
-        _refuse(file, path, f"{shown(value)}; a whole number of pixels was expected")
-    return int(value)
-
-
-def _refuse(file: YamlFile, path: KeyPath, words: str) -> NoReturn:
-    raise FileFormatError(file.fault(path, words) + ".")

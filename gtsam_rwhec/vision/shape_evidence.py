@@ -158,7 +158,7 @@ def _tested(
     sigma = np.sqrt(np.maximum(np.diag(of_views), np.diag(of_corners)))
     surely = np.sign(fitted.theta) * np.maximum(np.abs(fitted.theta) - 2.0 * sigma, 0.0)
     moved = float(np.linalg.norm(G @ surely, axis=1).max())
-    px_per_m = float(camera.K[0, 0]) / float(np.median(T[:, 2, 3]))
+    px_per_m = camera.focal_px / float(np.median(T[:, 2, 3]))
     extent = float(np.ptp(corners, axis=0).max())
     moved_px = px_per_m * (abs(float(surely[0])) if key[0] == "gap" else moved)
     return ShapeEvidence(

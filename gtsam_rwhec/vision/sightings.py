@@ -126,7 +126,7 @@ def _of_edges(seeing: Seeing, board: Bundle | TagGrid, ids: np.ndarray, sharp: A
     if isinstance(board, TagGrid):
         kept = boards.on_one_plane(seeing.camera, board.corners()[indices], corners)
     elif len(ids) > 2 and plane_coordinates(places) is None:
-        x, focal = seeing.camera.undistort(sharp), 0.5 * float(seeing.camera.K[0, 0] + seeing.camera.K[1, 1])
+        x, focal = seeing.camera.undistort(sharp), seeing.camera.focal_px
         agrees = np.repeat(agreeing_in_space(places, x, np.full(len(ids), boards.ASTRAY_PX / focal)), 4)
         kept = agrees if agrees.sum() >= 8 else kept
     usual = float(np.median(blur[good]))

@@ -61,6 +61,16 @@ def test_the_camchain_has_kalibrs_fields(tmp_path: Path) -> None:
         assert (read.model, read.width, read.height) == (given_camera.model, given_camera.width, given_camera.height)
 
 
+def test_a_unified_camera_is_kalibrs_omni(tmp_path: Path) -> None:
+    given = camera("unified", (1.3, -0.28, 0.07, 1e-5, -2e-4))
+    path = tmp_path / "camchain.yaml"
+    path.write_text(camchain_yaml(RigFrames("hand", "base", {"cam": np.eye(4)}, {}, cameras={"cam": given})))
+    assert yaml.safe_load(path.read_text())["cam0"]["intrinsics"] == [1.3, 421.5, 420.75, 318.25, 241.125]
+    read = read_kalibr_camchain(path)["cam0"]
+    assert read.model == "unified"
+    np.testing.assert_array_equal(np.append(read.K, read.D), np.append(given.K, given.D))
+
+
 def test_a_pinhole_is_radtan_with_zeros() -> None:
     frames = RigFrames("hand", "base", {"cam": np.eye(4)}, {}, cameras={"cam": camera("pinhole", ())})
     cam0 = yaml.safe_load(camchain_yaml(frames))["cam0"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cv2
+import gtsam
 import numpy as np
 import pytest
 
@@ -17,6 +18,7 @@ LENSES = {
     "rational": ("radtan", (-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02, 0.03, 0.01)),
     "thin prism": ("radtan", (-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02, 0.03, 0.01, 1e-3, 2e-3, -1e-3, 1e-3)),
     "equidistant": ("equidistant", (-0.02, 0.006, -0.004, 0.001)),
+    "unified": ("unified", (1.2, -0.2, 0.05, 1e-3, -2e-3)),
 }
 
 
@@ -28,17 +30,21 @@ def camera(request: pytest.FixtureRequest) -> Camera:
 
 def test_parameters_are_those_of_the_camera(camera: Camera) -> None:
     again = camera_with(camera, parameters_of(camera))
-    assert np.array_equal(again.K, camera.K)
+    np.testing.assert_allclose(again.K, camera.K, rtol=1e-15)
     assert np.array_equal(again.D, camera.D)
     assert again.model == camera.model
 
 
-def test_pixels_are_opencvs(camera: Camera) -> None:
+def test_pixels_are_opencvs_and_gtsams(camera: Camera) -> None:
     x = np.random.default_rng(0).uniform(-0.4, 0.4, size=(20, 2))
     points = np.column_stack([x, np.ones(len(x))])[:, None]
     zero = np.zeros(3)
     if camera.model == "equidistant":
         expected, _ = cv2.fisheye.projectPoints(points, zero, zero, camera.K, camera.D)
+    elif camera.model == "unified":
+        xi, *bent = camera.D
+        model = gtsam.Cal3Unified(500.0, 510.0, 0.0, 320.0, 240.0, *bent, xi)
+        expected = np.array([[model.uncalibrate(each)] for each in x])
     else:
         expected, _ = cv2.projectPoints(points, zero, zero, camera.K, camera.D)
     assert pixels_of(camera, parameters_of(camera), x) == pytest.approx(expected[:, 0], abs=1e-9)

@@ -22,6 +22,8 @@ K_LONG, K_SHORT, K_FISH = (
 )
 PINHOLE = Camera.of(320, 240, "", K_LONG, (), "test")
 BARREL = Camera.of(320, 240, "plumb_bob", K_SHORT, (-0.28, 0.09, 8e-4, -5e-4), "test")
+#: Without distortion, so that its rays have a closed form.
+OMNI = Camera.of(320, 240, "unified", [[310.0, 0.0, 161.0], [0.0, 308.0, 118.5], [0.0, 0.0, 1.0]], (1.1,), "test")
 FISHEYE = Camera.of(320, 240, "equidistant", K_FISH, (-0.02, 6e-3, -4e-3, 8e-4), "test")
 
 
@@ -136,8 +138,12 @@ def _aprilgrid(grid: AprilGrid, quarter_turns: int) -> Print:
 
 
 def projected(camera: Camera, points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Pixels (n, 2) of points (n, 3) of a target, by OpenCV."""
+    """Pixels (n, 2) of points (n, 3) of a target, by OpenCV, which has no unified model in its main modules."""
     turn = cv2.Rodrigues(T[:3, :3])[0]
+    if camera.model == "unified":
+        seen = points @ T[:3, :3].T + T[:3, 3]
+        seen[:, 2] += camera.D[0] * np.linalg.norm(seen, axis=1)
+        return seen[:, :2] / seen[:, 2:] @ camera.K[:2, :2] + camera.K[:2, 2]
     if camera.model == "equidistant":
         pixels, _ = cv2.fisheye.projectPoints(points[:, None], turn, T[:3, 3], camera.K, camera.D)
     else:
@@ -155,6 +161,10 @@ def _rays(camera: Camera) -> np.ndarray:
     else:
         x0 = (pixels[:, 0] - camera.K[:2, 2]) / np.diagonal(camera.K)[:2]
         x = x0.copy()
+        if camera.model == "unified":  # the far crossing of the line from (0, 0, -xi) with the unit sphere
+            xi, r2 = camera.D[0], (x * x).sum(axis=1)
+            far = (xi + np.sqrt(np.maximum(1.0 + (1.0 - xi * xi) * r2, 0.0))) / (1.0 + r2)
+            x *= (far / np.maximum(far - xi, 1e-9))[:, None]
         for _ in range(20 if camera.model == "radtan" else 0):
             k1, k2, p1, p2 = camera.D[:4]
             r2, ab = (x * x).sum(axis=1), x.prod(axis=1)

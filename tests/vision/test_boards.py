@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from rendered import BARREL, FISHEYE, PINHOLE, Print, pose, printed, projected, render
+from rendered import BARREL, FISHEYE, OMNI, PINHOLE, Print, pose, printed, projected, render
 
 from gtsam_rwhec.vision import boards
 from gtsam_rwhec.vision.camera import Camera
@@ -16,7 +16,9 @@ BOARD = Charuco("board", "aruco_5x5_100", 6, 4, 0.03, 0.0225, first_id=7)
 GRID = AprilGrid("grid", "tag36h11", 3, 2, 0.05, 0.3, first_id=11)
 CHESS = Checkerboard("chess", 5, 4, 0.03)
 CAMERAS = pytest.mark.parametrize(
-    ("camera", "far"), [(PINHOLE, 0.30), (BARREL, 0.27), (FISHEYE, 0.18)], ids=["pinhole", "barrel", "fisheye"]
+    ("camera", "far"),
+    [(PINHOLE, 0.30), (BARREL, 0.27), (FISHEYE, 0.18), (OMNI, 0.18)],
+    ids=["pinhole", "barrel", "fisheye", "omni"],
 )
 TURNS = (-170.0, -100.0, -35.0, 10.0, 80.0, 155.0)
 

@@ -22,6 +22,7 @@ LENSES = {
     "pincushion": ("plumb_bob", (0.11, 0.04, -0.0006, 0.0004)),
     "fisheye": ("equidistant", (-0.02, 0.006, -0.004, 0.0008)),
     "wide fisheye": ("fisheye", (0.06, -0.01, 0.002, -0.0003)),
+    "unified": ("unified", (0.6, -0.1, 0.05, 1e-3, -5e-4)),
 }
 EVERY = pytest.mark.parametrize("lens", LENSES)
 
@@ -126,6 +127,31 @@ def test_a_fisheye_sees_nearly_to_the_side() -> None:
     np.testing.assert_allclose(camera.undistort(camera.pixels(x)), x, rtol=1e-8)
 
 
+@pytest.mark.parametrize(("xi", "k1"), [(-0.5, 0.0), (1e-9, 0.0), (0.8, 0.0), (1.0, -0.1), (2.5, -0.2)])
+def test_a_unified_camera_sees_points_on_the_unit_sphere_from_behind_its_middle(xi: float, k1: float) -> None:
+    camera = Camera.of(640, 480, "unified", K, (xi, k1), "test")
+    furthest = np.arctan(min(camera.ring, 1e6))
+    assert furthest == pytest.approx(np.pi / 3 if xi < 0.0 else furthest)  # its pole: cos(theta) = -xi
+    theta = np.linspace(0.0, 0.98 * furthest, 30)
+    rays = np.stack([0.6 * np.sin(theta), 0.8 * np.sin(theta), np.cos(theta)], axis=1)
+    m = rays[:, :2] / (rays[:, 2:] + xi)
+    bent = m * (1.0 + k1 * np.einsum("ni,ni->n", m, m))[:, None]
+    pixels = bent * [420.0, 431.0] + [322.5, 236.0]
+    np.testing.assert_allclose(camera.project(3.0 * rays), pixels, atol=1e-5)
+    np.testing.assert_allclose(camera.undistort(pixels), rays[:, :2] / rays[:, 2:], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize(("xi", "k1"), [(1.0, 0.0), (1.0, -0.6), (2.5, 0.0), (-0.5, -0.1)])
+def test_a_unified_camera_has_rays_in_front_and_within_its_ring_only(xi: float, k1: float) -> None:
+    camera = Camera.of(640, 480, "unified", K, (xi, k1), "test")
+    m = np.sqrt(1.0 / (3.0 * -k1)) if k1 < 0.0 else np.inf  # where m (1 + k1 m^2) is largest
+    last = min(m, 1.0 / xi) if xi > 0.0 else m  # at 1 / xi rays are square to the axis
+    furthest = 420.0 * last * (1.0 + k1 * last**2)
+    found = camera.undistort(np.array([[322.5 + share * furthest, 236.0] for share in (0.9, 0.999, 1.001, 1.5, 5.0)]))
+    assert np.isfinite(found).all(axis=1).tolist() == [True, True, False, False, False]
+    assert camera.focal_px == pytest.approx(425.5 / (1.0 + xi))
+
+
 def test_behind_the_camera_nothing_is_seen() -> None:
     points = np.array([[0.1, 0.2, 1.0], [0.1, 0.2, -1.0], [0.1, 0.2, 0.0], [0.0, 0.0, 0.0]])
     for lens in LENSES:
@@ -223,6 +249,9 @@ def changed(row: int, column: int, value: float) -> np.ndarray:
         ((640, 480), "omnidirectional", K, (0.1, 0.0, 0.0, 0.0), "'omnidirectional' is not supported.*'plumb_bob'"),
         ((640, 480), "rational_polynomial", K, (*[0.01] * 12, 0.02, 0.0), "tilted sensor"),
         ((640, 480), "equidistant", K, (0.01, 0.0, 0.0, 0.0, 0.02), "5 coefficients are too many"),
+        ((640, 480), "unified", K, (), "needs xi, the first of D"),
+        ((640, 480), "unified", K, (-2.0, 0.1), "xi = -2, the first of D, must be between"),
+        ((640, 480), "unified", K, (1.0, *[0.01] * 5), "6 coefficients are too many for the model unified"),
         ((640, 480), "", K, (0.1, 0.0, 0.0, 0.0), "without a distortion model"),
         ((640, 480), "pinhole", K, (0.1, 0.0, 0.0, 0.0), "without a distortion model"),
     ],

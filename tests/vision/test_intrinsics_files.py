@@ -41,8 +41,8 @@ def test_camchain_without_distortion(path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("camera_model: pinhole", "camera_model: omni", "line 3: cam0.camera_model: 'omni' is not supported, only"),
-        ("camera_model: pinhole", "camera_model: ds", "line 3: cam0.camera_model: 'ds' is not supported"),
+        ("camera_model: pinhole", "camera_model: omni", "line 6: cam0.intrinsics: [458.6, 457.3, 367.2, 248.4]; a"),
+        ("camera_model: pinhole", "camera_model: ds", "line 3: cam0.camera_model: 'ds' is not supported, only"),
         ("camera_model: pinhole", "camera_model: eucm", "line 3: cam0.camera_model: 'eucm' is not supported"),
         ("distortion_model: radtan", "distortion_model: fov", "line 5: cam0.distortion_model: 'fov' is not supported"),
         ("  distortion_model: radtan\n", "", "line 1: cam0.distortion_model: is missing"),

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rendered import BARREL, FISHEYE, PINHOLE, pose, projected
+from rendered import BARREL, FISHEYE, OMNI, PINHOLE, pose, projected
 from rwhec_factors import se3
 
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.pose import PlanePoses, plane_poses
 from gtsam_rwhec.vision.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
 
-CAMERAS = (PINHOLE, BARREL, FISHEYE)
+CAMERAS = (PINHOLE, BARREL, FISHEYE, OMNI)
 TAG = Tag("tag", "tag36h11", 0, 0.1)
 BOARD = Charuco("board", "aruco_5x5_100", 6, 4, 0.03, 0.02)
 TARGETS: tuple[Target, ...] = (TAG, BOARD, AprilGrid("g", "tag36h11", 2, 2, 0.04, 0.3), Checkerboard("c", 4, 3, 0.03))
