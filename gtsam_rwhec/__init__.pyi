@@ -46,7 +46,7 @@ from .refinement import CarrierNoise as CarrierNoise
 from .refinement import RefineOptions as RefineOptions
 from .refinement import Refined as Refined
 from .refinement import RefinedPoses as RefinedPoses
-from .refinement import refine as refine
+from .reprojection import refine as refine
 
 # Refine it from the corners in the images, with the cameras' intrinsics.
 from . import reprojection as reprojection

@@ -20,6 +20,8 @@ def check_inputs(problem: Problem, solution: Solution | None, options: RefineOpt
         )
     if not isinstance(options, RefineOptions):
         raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.RefineOptions")
+    if options.observations == "corners":
+        raise OptionError("observations='corners': call gtsam_rwhec.refine, which refines on from here by the corners")
     problem.require_pairs()
     if solution is not None:
         _check_solution(problem, solution)

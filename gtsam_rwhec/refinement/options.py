@@ -20,6 +20,7 @@ ResidualKind = Literal["geodesic", "chordal"]
 Robust = Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "gnc"]
 CarrierModel = Literal["auto", "propagated", "variables"]
 About = Literal["targetcarrier", "sensorcarrier"]
+ObservationKind = Literal["poses", "corners"]
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,10 @@ class RefineOptions:
         along this path. Without it the measurements' own A give the carriers' motion.
     max_iterations : int
         Largest number of Levenberg-Marquardt steps.
+    observations : "poses" or "corners"
+        What is refined from: the measured poses B, or, from there on, the corners of the images that the problem holds
+        (``problem.add_corners``). The other options are then those of the poses, of which outliers among images are
+        left out too (``robust="gnc"``); ``rw.CornerOptions`` has those of the corners.
     """
 
     noise: NoiseSource = "auto"
@@ -110,6 +115,7 @@ class RefineOptions:
     time_offsets: bool | tuple[str, ...] = False
     carrier_path: Trajectory | None = None
     max_iterations: int = 100
+    observations: ObservationKind = "poses"
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -157,4 +163,5 @@ _CHOICES = {
     "residual": ResidualKind,
     "robust": Robust,
     "carrier_model": CarrierModel,
+    "observations": ObservationKind,
 }

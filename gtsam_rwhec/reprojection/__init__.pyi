@@ -6,6 +6,8 @@ from .observations import Views as Views
 from .options import CornerOptions as CornerOptions
 from .calibrating_corners import CornersCalibrated as CornersCalibrated
 from .calibrating_corners import calibrate_corners as calibrate_corners
+from .problem_corners import observations_of as observations_of
+from .refining import refine as refine
 from .refining_corners import refine_corners as refine_corners
 
 # The result, and its parts.
