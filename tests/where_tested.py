@@ -150,7 +150,7 @@ TABLE: dict[str, dict[str, str]] = {
         "report/test_solution_report.py": "pose_table printing sentences",
     },
     "gtsam_rwhec/report/plots": {
-        "report/plots/test_plots.py": "coverage deviations frames plotted residuals",
+        "report/plots/test_plots.py": "coverage deviations frames intrinsics plotted residuals",
     },
     "gtsam_rwhec/reprojection": {
         "methods/test_reprojection.py": "observations",

@@ -1,32 +1,32 @@
-"""Pictures of a solved log: frames, residuals over time, corners in images, standard deviations."""
+"""Pictures of a solved log: frames, residuals over time, corners in images, cameras, standard deviations."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import DetectionRecord, Log, open_log
-from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
-from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
+from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs
+from gtsam_rwhec.pipeline.plotted_corners import plotted_corners, plotted_intrinsics, seen_views
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solving_stage import Solved
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.report.plots import (
-    PlottedCorners,
     PlottedMeasurement,
     plot_coverage,
     plot_deviations,
     plot_frames,
+    plot_intrinsics,
     plot_residuals,
 )
 
 #: The pictures' files have these names.
 FRAMES, RESIDUALS, COVERAGE, DEVIATIONS = "frames.png", "residuals.png", "coverage.png", "deviations.png"
+#: Of intrinsics that were estimated.
+INTRINSICS = "intrinsics.png"
 
 
 def plot_all(solved: Solved, solved_path: str | Path, folder: Path) -> list[Path]:
@@ -39,10 +39,15 @@ def plot_all(solved: Solved, solved_path: str | Path, folder: Path) -> list[Path
     plot_residuals(plotted_residuals(solved), folder / RESIDUALS)
     written = [folder / FRAMES, folder / DEVIATIONS, folder / RESIDUALS]
     with open_log(solved_path) as log:
-        corners = plotted_corners(solved, log)
-    if corners:
+        seen = seen_views(solved, log)
+    if seen:
+        corners = plotted_corners(solved, seen)
         plot_coverage(corners, {name: solved.cameras[name] for name in corners}, folder / COVERAGE)
         written.append(folder / COVERAGE)
+    cameras = plotted_intrinsics(solved, seen)
+    if cameras:
+        plot_intrinsics(cameras, folder / INTRINSICS)
+        written.append(folder / INTRINSICS)
     return written
 
 
@@ -84,30 +89,3 @@ def scale_of(solved: Solved, target: str) -> float:
     """Stated / true length of a target."""
     scale = solved.refined.scale
     return scale if isinstance(scale, float) else scale[target]
-
-
-def plotted_corners(solved: Solved, log: Log) -> dict[str, PlottedCorners]:
-    """The corners of used detections, and their reprojection errors under the calibration, by camera."""
-    path = read_carrier_motion(log, solved.rig).trajectory
-    targets = {target.name: target for target in solved.rig.target_list}
-    offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
-    seen: dict[str, list[Array]] = defaultdict(list)
-    errors: dict[str, list[Array]] = defaultdict(list)
-    used = {
-        (pair, int(stamp))
-        for pair, measured in solved.pairs.items()
-        for stamp in measured.stamps_ns[measured.used].tolist()
-    }
-    for sensor, camera in solved.cameras.items():
-        if sensor not in solved.refined.Y:
-            continue
-        for record in records_of(log, [detections_topic(sensor)], DetectionRecord):
-            pair = Pair(record.id, sensor)
-            if record.corners_px is None or record.corner_indices is None or (pair, record.stamp_ns) not in used:
-                continue
-            A, _ = path.at(np.array([record.stamp_ns + round(1e9 * offsets.get(sensor, 0.0))]))
-            T = predicted_B(solved, pair, A)[0]
-            points = targets[record.id].corners()[list(record.corner_indices)] / scale_of(solved, record.id)
-            seen[sensor].append(record.corners_px)
-            errors[sensor].append(record.corners_px - camera.project(points @ T[:3, :3].T + T[:3, 3]))
-    return {sensor: PlottedCorners(np.concatenate(seen[sensor]), np.concatenate(errors[sensor])) for sensor in seen}

@@ -229,6 +229,8 @@ class Intrinsics:
 
     def __str__(self) -> str:
         """How they were stated, whether the images agree, and what the images do not determine."""
+        if self.stated_as == "exact":
+            return "they count as exact, as was said: their errors are not in the standard deviations"
         if self.stated_as == "unknown":
             said = ["none were stated, so the images alone tell them"]
         else:

@@ -69,8 +69,9 @@ def deviations_over(camera: Camera, covariance: Array, distance_m: float, *, ste
     """The same, of a camera and the covariance (6 + m, 6 + m) of its pose's right perturbation and its m parameters."""
     if not (is_real(distance_m) and 0.0 < distance_m < np.inf):
         raise OptionError(f"distance_m={brief(distance_m)}; give metres, above 0")
-    step = max(camera.width, camera.height) / steps
-    u, v = (np.arange(0.5 * step, size, step) - 0.5 for size in (camera.width, camera.height))
+    sides = (camera.width, camera.height)
+    numbers = [max(round(steps * side / max(sides)), 1) for side in sides]
+    u, v = ((np.arange(number) + 0.5) * side / number - 0.5 for number, side in zip(numbers, sides, strict=True))
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
     return pixels, _deviations_at(camera, covariance, pixels, distance_m)
 

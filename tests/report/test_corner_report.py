@@ -97,6 +97,10 @@ def test_intrinsics_say_how_they_were_stated_and_what_the_images_do_not_tell(ref
     unknown = changed(refined, stated_as="unknown", stated_deviations=(np.inf,) * 8, held_by_prior=())
     assert intrinsics_sentences(unknown)[0] == "cam_0: none were stated, so the images alone tell them."
     assert intrinsics_table(unknown).rows["cam_0 fx"][3] == "unknown"
+    exact = changed(refined, stated_as="exact", held_by_prior=refined.intrinsics["cam_0"].names)
+    assert intrinsics_sentences(exact)[0] == (
+        "cam_0: they count as exact, as was said: their errors are not in the standard deviations."
+    )
 
 
 def test_a_camera_is_told_once_and_one_that_was_kept_is_told_too(refined: Refined) -> None:

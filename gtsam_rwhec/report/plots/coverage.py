@@ -125,13 +125,13 @@ def _colours() -> Colormap:
 
 def _share(pixels: Array, size: tuple[float, float]) -> float:
     """The share of the image's cells that contain corners."""
-    cells, count = _cells(pixels, size, COVERAGE_CELLS)
+    cells, count = cells_of(pixels, size, COVERAGE_CELLS)
     return len(np.unique(cells)) / count
 
 
 def _draw_means(axes: Axes, seen: PlottedCorners, size: tuple[float, float]) -> str:
     """Draw mean errors of cells as arrows; return their scale for the title. Wrong intrinsics do not average out."""
-    cells, _ = _cells(seen.pixels, size, MEAN_CELLS)
+    cells, _ = cells_of(seen.pixels, size, MEAN_CELLS)
     means = []
     for cell in np.unique(cells):
         at = cells == cell
@@ -151,7 +151,7 @@ def _draw_means(axes: Axes, seen: PlottedCorners, size: tuple[float, float]) -> 
     return f"; arrows {times:,g}x"
 
 
-def _cells(pixels: Array, size: tuple[float, float], along: int) -> tuple[np.ndarray, int]:
+def cells_of(pixels: Array, size: tuple[float, float], along: int) -> tuple[np.ndarray, int]:
     """Index (N,) of each pixel's cell, and the number of cells; cells are nearly square."""
     side = max(size) / along
     columns, rows = (max(int(np.ceil(length / side - 1e-9)), 1) for length in size)

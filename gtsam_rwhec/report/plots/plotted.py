@@ -9,6 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.refinement.reprojection_found import Regions
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,3 +71,31 @@ class PlottedCorners:
         shapes = np.shape(self.pixels), np.shape(self.errors_px)
         if shapes[0] != shapes[1] or shapes[0][1:] != (2,):
             raise CountError(f"corners and their errors must both be (N, 2); they are {shapes[0]} and {shapes[1]}")
+
+
+@dataclass(frozen=True, eq=False)
+class PlottedIntrinsics:
+    """A camera whose intrinsics were estimated from corners.
+
+    Attributes
+    ----------
+    size : (int, int)
+        Width and height of its images, pixels.
+    corners : PlottedCorners
+        Errors that stay in the refinement, with A of each image as it is there: what the lens model or the board lacks.
+    grid : (h, w, 2) array
+        Pixels over the image.
+    deviations_px : (h, w) array
+        Standard deviation of the projection of points at `distance_m` before the camera; nan where the lens has no ray.
+    distance_m : float
+    held_out_px : tuple of tuple of float or None
+        Error of corners in images that were left out, by region, rows from the top; None where no corner was seen.
+        Empty where no images were left out.
+    """
+
+    size: tuple[int, int]
+    corners: PlottedCorners
+    grid: Array
+    deviations_px: Array
+    distance_m: float
+    held_out_px: Regions = ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gtsam_rwhec.report.plots import PlottedCorners, PlottedMeasurement
+from gtsam_rwhec.report.plots import PlottedCorners, PlottedIntrinsics, PlottedMeasurement
 from gtsam_rwhec.rig import RigFrames
 from gtsam_rwhec.vision.camera import Camera
 
@@ -108,4 +108,17 @@ def corners(frames: RigFrames, each: int = 1500, seed: int = 3) -> dict[str, Plo
         if k == 0:
             errors += 6e-7 * (pixels - (640.0, 480.0)) * np.linalg.norm(pixels - (640.0, 480.0), axis=1)[:, None]
         result[sensor] = PlottedCorners(pixels, errors)
+    return result
+
+
+def intrinsics(frames: RigFrames, seen: dict[str, PlottedCorners]) -> dict[str, PlottedIntrinsics]:
+    """Projections that are more uncertain from the middle outwards, and errors of images that were left out."""
+    result = {}
+    for sensor, camera in frames.cameras.items():
+        u, v = (np.linspace(0.0, size - 1.0, 20) for size in (camera.width, camera.height))
+        grid = np.stack(np.meshgrid(u, v), axis=-1)
+        radius = np.linalg.norm(grid - (640.0, 480.0), axis=-1) / 800.0
+        held_out = ((0.41, 0.3, None), (0.33, 0.28, 0.35), (0.5, 0.31, 0.47))
+        size = (camera.width, camera.height)
+        result[sensor] = PlottedIntrinsics(size, seen[sensor], grid, 0.05 + 2.0 * radius**4, 1.2, held_out)
     return result

@@ -6,13 +6,14 @@ import io
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 import pytest
-from made_up import corners, covariances, measurements, rig
+from made_up import corners, covariances, intrinsics, measurements, rig
 from matplotlib.image import imread
 
 from gtsam_rwhec.errors import CountError, FileFormatError, NoiseError
@@ -22,6 +23,7 @@ from gtsam_rwhec.report.plots import (
     plot_coverage,
     plot_deviations,
     plot_frames,
+    plot_intrinsics,
     plot_residuals,
 )
 from gtsam_rwhec.report.plots.frames import _Scene
@@ -31,6 +33,7 @@ FRAMES = rig(2)
 COVARIANCES = covariances(FRAMES)
 MEASUREMENTS = measurements(FRAMES, 20)
 CORNERS = corners(FRAMES, 200)
+INTRINSICS = intrinsics(rig(1), corners(rig(1), 200))
 EMPTY = RigFrames("hand", "base", {}, {})
 
 DRAWN: dict[str, Callable[[Path], None]] = {
@@ -38,6 +41,7 @@ DRAWN: dict[str, Callable[[Path], None]] = {
     "residuals": lambda path: plot_residuals(MEASUREMENTS, path),
     "coverage": lambda path: plot_coverage(CORNERS, FRAMES.cameras, path),
     "deviations": lambda path: plot_deviations(FRAMES, COVARIANCES, path),
+    "intrinsics": lambda path: plot_intrinsics(INTRINSICS, path),
 }
 
 
@@ -71,7 +75,7 @@ def test_equal_input_gives_equal_bytes(name: str, tmp_path: Path) -> None:
     assert paths[0].read_bytes() == paths[1].read_bytes()
     assert dict(matplotlib.rcParams) == before
     pixels = np.asarray(imread(str(paths[0])))
-    assert 0.01 < ink(pixels) < 0.5
+    assert 0.01 < ink(pixels) < 0.8
     assert min(pixels.shape[:2]) > 300
 
 
@@ -113,6 +117,7 @@ def test_an_empty_picture_says_so(tmp_path: Path) -> None:
         (plot_deviations, (EMPTY, {})),
         (plot_residuals, ({},)),
         (plot_coverage, ({}, {})),
+        (plot_intrinsics, ({},)),
     ):
         assert 0.0 < ink(drawn(tmp_path, draw, *arguments)) < 0.05
 
@@ -179,6 +184,28 @@ def test_a_sensor_without_corners_or_intrinsics(tmp_path: Path) -> None:
     odd = PlottedCorners(np.array([[10.0, 20.0], [np.nan, 3.0]]), np.array([[0.1, 0.2], [0.1, np.inf]]))
     assert ink(drawn(tmp_path, plot_coverage, {"a": none, "b": exact, "c": odd}, {})) > 0.001
     assert ink(drawn(tmp_path, plot_coverage, {"a": none}, {})) > 0.001
+
+
+def test_mean_errors_beyond_chance_have_a_colour_of_their_own(tmp_path: Path) -> None:
+    """Where the errors of neighbours are alike, the lens model lacks something."""
+    rng, (name, of) = np.random.default_rng(3), next(iter(INTRINSICS.items()))
+    pixels = rng.uniform(0.0, 900.0, size=(2000, 2))
+    chance = rng.normal(scale=0.2, size=pixels.shape)
+    blue = "#0072B2"
+
+    def panel(errors: np.ndarray) -> np.ndarray:
+        return drawn(tmp_path, plot_intrinsics, {name: replace(of, corners=PlottedCorners(pixels, errors))})[60:-60]
+
+    assert not has_colour(panel(chance), blue)
+    assert has_colour(panel(chance + np.where(pixels > 600.0, 0.2, 0.0)), blue)
+
+
+def test_cameras_with_little_to_say(tmp_path: Path) -> None:
+    none = PlottedCorners(np.zeros((0, 2)), np.zeros((0, 2)))
+    of = next(iter(INTRINSICS.values()))
+    unknown = replace(of, corners=none, deviations_px=np.full(of.deviations_px.shape, np.nan), held_out_px=())
+    alike = replace(of, deviations_px=np.ones(of.deviations_px.shape), held_out_px=((0.0, None),))
+    assert ink(drawn(tmp_path, plot_intrinsics, {"a": unknown, "b": alike})) > 0.01
 
 
 def test_eight_sensors(tmp_path: Path) -> None:
