@@ -59,6 +59,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/export": {
         "export/test_camchain.py": "overlaps",
+        "export/test_camera_files.py": "camera_info camera_words colmap opencv_cameras",
         "export/test_exported_files.py": "files static_tf tf_tree urdf written_poses",
     },
     "gtsam_rwhec/files": {
@@ -168,6 +169,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/rig": {
         "rig/test_rig_faults.py": "contradictions",
         "export/test_exported_files.py": "camera_link",
+        "reprojection/test_corners_in_files.py": "refined_frames",
         "rig/test_rig_file.py": "field_types intrinsics_section rig section sections target_sections written_rig",
     },
     "gtsam_rwhec/simulate": {

@@ -160,7 +160,7 @@ def calibrate(
     """Calibrate from a log or from a folder of CSV files; print the verdict, what to do, and how far off a point is.
 
     A log needs a rig file, which states the sizes of the targets. Its calibration writes clean.mcap, result.json,
-    static_tf.launch.py, tf.yaml, rig.urdf.xacro, camchain.yaml and plots.
+    static_tf.launch.py, tf.yaml, rig.urdf.xacro, the cameras for Kalibr, ROS, OpenCV and COLMAP, and plots.
     """
     if rig is not None or is_log(source):
         refuse(context, NOT_FOR_A_LOG)

@@ -19,7 +19,7 @@ def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write to.")],
     anyway: AnywayOption = False,
 ) -> ExitStatus:
-    """Last stage: write a launch file, tf, URDF, a Kalibr camchain and plots from a solved log."""
+    """Last stage: write a launch file, tf, URDF, cameras (Kalibr, ROS, OpenCV, COLMAP) and plots from a solved log."""
     with StageDisplay() as stage:
         for path in rw.pipeline.export_solved(solved, output, anyway=anyway, progress=stage):
             say(shown_path(path))

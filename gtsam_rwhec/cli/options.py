@@ -80,7 +80,7 @@ def say_exported(solved: rw.pipeline.Solved, *, anyway: bool) -> None:
     """Say that files of poses that are not to be used were written, or that they were not."""
     if solved.judgement.verdict is not rw.Verdict.DO_NOT_USE:
         return
-    names = ", ".join(rw.export.FILES)
+    names = ", ".join([*rw.export.FILES, *(f"{folder}/" for folder in rw.export.FOLDERS)])
     if anyway:
         say(f"Written although the poses are not to be used, and marked so in the head: {names}.", to_errors=True)
     else:

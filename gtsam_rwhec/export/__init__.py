@@ -1,4 +1,4 @@
-"""A calibration in files for other programs: ROS 2 launch file, tf YAML, URDF, Kalibr's camchain."""
+"""A calibration in files for other programs: ROS 2 launch file, tf YAML, URDF, camera_info; Kalibr, OpenCV, COLMAP."""
 
 import lazy_loader
 

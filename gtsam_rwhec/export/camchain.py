@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 from rwhec_factors.se3 import inverse
 
+from gtsam_rwhec.export.camera_words import NOT_KNOWN, lacks, origin, row, sorted_out
 from gtsam_rwhec.export.overlaps import overlaps
 from gtsam_rwhec.export.written_poses import number
 from gtsam_rwhec.geometry.poses import Array
@@ -22,19 +21,18 @@ _HEAD = """\
 """
 #: Kalibr's radial-tangential distortion has four coefficients: k1, k2, p1, p2.
 RADTAN = 4
+_MODELS = ("pinhole", "radtan", "equidistant", "unified")
 
 
 def camchain_yaml(frames: RigFrames) -> str:
     """The text of ``camchain.yaml``: cam0, cam1, ... in the order of the sensors.
 
-    Two kinds of sensors are left out, and a comment names each one: sensors without intrinsics, and sensors with
+    Sensors are left out, and a comment names each one, that have no intrinsics, a lens model that Kalibr lacks, or
     radial-tangential distortion beyond k1, k2, p1, p2. Without these coefficients, points near the edges of the images
     would be off by pixels.
     """
-    left_out = {name: _reason(frames.cameras.get(name)) for name in frames.sensors}
-    names = [name for name, reason in left_out.items() if not reason]
-    head = _HEAD.format(carrier=frames.sensor_carrier)
-    head += "".join(f"# Left out: {name}, {reason}\n" for name, reason in left_out.items() if reason)
+    names, comments = sorted_out({name: _reason(frames.cameras.get(name)) for name in frames.sensors})
+    head = _HEAD.format(carrier=frames.sensor_carrier) + comments
     if not names:
         return f"{head}# No camera is left.\n{{}}\n"
     T_rig_camera = [frames.sensors[name] for name in names]
@@ -47,10 +45,11 @@ def camchain_yaml(frames: RigFrames) -> str:
         xi, D = (camera.D[:1], camera.D[1:]) if is_unified else (camera.D[:0], _four(camera))
         lines = [
             f"cam{n}:  # {name}",
+            f"  # {origin(frames, name)}",
             f"  camera_model: {'omni' if is_unified else 'pinhole'}",
-            f"  intrinsics: {_row([*xi, *K])}",
+            f"  intrinsics: {row([*xi, *K])}",
             f"  distortion_model: {'equidistant' if camera.model == 'equidistant' else 'radtan'}",
-            f"  distortion_coeffs: {_row(D)}",
+            f"  distortion_coeffs: {row(D)}",
             f"  resolution: [{camera.width}, {camera.height}]",
         ]
         if name in frames.topics:
@@ -67,11 +66,13 @@ def camchain_yaml(frames: RigFrames) -> str:
 def _reason(camera: Camera | None) -> str:
     """Say why a camchain cannot have a sensor; the text is empty if it can."""
     if camera is None:
-        return "whose intrinsics are not known."
+        return NOT_KNOWN
+    if camera.model not in _MODELS:
+        return lacks(camera, "Kalibr")
     more = camera.D[RADTAN:] if camera.model == "radtan" else np.zeros(0)
     if more.any():
         return (
-            f"whose distortion has coefficients that Kalibr's radtan (k1, k2, p1, p2) lacks: {_row(more)} "
+            f"whose distortion has coefficients that Kalibr's radtan (k1, k2, p1, p2) lacks: {row(more)} "
             "from the fifth on. Calibrate its intrinsics with four (k3 = 0), or with Kalibr itself."
         )
     return ""
@@ -83,11 +84,7 @@ def _four(camera: Camera) -> Array:
 
 
 def _matrix(key: str, T: Array) -> list[str]:
-    return [f"  {key}:"] + [f"  - {_row(row)}" for row in T]
-
-
-def _row(values: Iterable[float]) -> str:
-    return f"[{', '.join(number(value) for value in values)}]"
+    return [f"  {key}:"] + [f"  - {row(line)}" for line in T]
 
 
 def _quoted(text: str) -> str:

@@ -6,27 +6,35 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.export.camchain import camchain_yaml
+from gtsam_rwhec.export.camera_info import camera_info_yaml
+from gtsam_rwhec.export.camera_words import comment
+from gtsam_rwhec.export.colmap import colmap_cameras_txt
+from gtsam_rwhec.export.opencv_cameras import FIRST_LINES, opencv_yaml
 from gtsam_rwhec.export.static_tf import static_tf_launch
 from gtsam_rwhec.export.tf_tree import tf_yaml
 from gtsam_rwhec.export.urdf import urdf_xacro
 from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.rig.calibrated_frames import RigFrames
 
-#: A remark in a file has at most this many characters.
-LONGEST_COMMENT = 2_000
 #: These functions give the text of each file, by its name.
 FILES: dict[str, Callable[[RigFrames], str]] = {
     "static_tf.launch.py": static_tf_launch,
     "tf.yaml": tf_yaml,
     "rig.urdf.xacro": urdf_xacro,
     "camchain.yaml": camchain_yaml,
+    "cameras.opencv.yaml": opencv_yaml,
+    "cameras.txt": colmap_cameras_txt,
 }
+#: These functions give the texts of a folder's files, by the files' names: one for each camera.
+FOLDERS: dict[str, Callable[[RigFrames], dict[str, str]]] = {"camera_info": camera_info_yaml}
+#: Files in these folders have this ending.
+SUFFIX = ".yaml"
 
 
 def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
-    """Write ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro`` and ``camchain.yaml``.
+    """Write the files of `FILES`, and ``camera_info/NAME.yaml`` for each camera.
 
     Parameters
     ----------
@@ -47,9 +55,20 @@ def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
     # All texts come first: if one of them fails, no file is written.
     remarks = (*frames.warnings, *(f"Left out, because it has no answer: {why}" for why in frames.left_out.values()))
     texts = {Path(folder) / name: _with_head(text(frames), remarks, name) for name, text in FILES.items()}
+    of_cameras = {
+        Path(folder) / inside / name: _with_head(text, remarks, name)
+        for inside, made in FOLDERS.items()
+        for name, text in made(frames).items()
+    }
     for path, text in texts.items():
         write_atomically(path, text.encode())
-    return list(texts)
+    for path, text in of_cameras.items():
+        try:
+            path.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            raise FileFormatError(f"{path.parent} cannot be made a folder: {error.strerror or error}.") from error
+        write_atomically(path, text.encode())
+    return [*texts, *of_cameras]
 
 
 def _with_head(text: str, remarks: tuple[str, ...], name: str) -> str:
@@ -58,11 +77,7 @@ def _with_head(text: str, remarks: tuple[str, ...], name: str) -> str:
         return text
     if name.endswith(".xacro"):
         declaration, rest = text.split("\n", 1)  # the first line of XML is its declaration
-        comment = re.sub("-(?=-)", "- ", "\n".join(map(_comment, remarks)))  # XML's comments hold no "--"
-        return f"{declaration}\n<!--\n{comment}\n-->\n{rest}"
-    return "".join(f"# {_comment(remark)}\n" for remark in remarks) + text
-
-
-def _comment(remark: str) -> str:
-    """A remark on one line: names in it come from a log, and a line break would end the comment."""
-    return shown(remark, LONGEST_COMMENT)
+        joined = re.sub("-(?=-)", "- ", "\n".join(map(comment, remarks)))  # XML's comments hold no "--"
+        return f"{declaration}\n<!--\n{joined}\n-->\n{rest}"
+    before = FIRST_LINES if text.startswith(FIRST_LINES) else ""
+    return before + "".join(f"# {comment(remark)}\n" for remark in remarks) + text.removeprefix(before)

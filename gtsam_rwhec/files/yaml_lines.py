@@ -75,6 +75,14 @@ class YamlFile:
         """``FILE, line N: a.b[0]: words``."""
         return f"{self.place(path)}: {words}"
 
+    def section(self, path: KeyPath) -> YamlFile:
+        """A mapping of the file as if it were alone, with the lines that it has in the file."""
+        data, depth = self.data, len(path)
+        for key in path:
+            data = data[key]
+        lines = {place[depth:]: line for place, line in self.lines.items() if place[:depth] == path}
+        return YamlFile(self.where, data, lines)
+
 
 def read_yaml(path: str | Path, *, tags: Collection[str] = ()) -> YamlFile:
     """Read a file, with the errors of `read_text` and `parse_yaml`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export import export_all
-from gtsam_rwhec.export.files import FILES
+from gtsam_rwhec.export.files import FILES, FOLDERS
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import Log, open_log
@@ -17,7 +17,13 @@ from gtsam_rwhec.pipeline.changed_rig import changes
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_inputs import inputs_of
 from gtsam_rwhec.pipeline.detection_stage import detect_log
-from gtsam_rwhec.pipeline.earlier_output import OutputFolder, list_written, log_name, output_folder
+from gtsam_rwhec.pipeline.earlier_output import (
+    OutputFolder,
+    list_written,
+    log_name,
+    output_folder,
+    remove_unchanged,
+)
 from gtsam_rwhec.pipeline.folder_log import check_is_no_other_folder, is_folder_of_images, write_folder_log
 from gtsam_rwhec.pipeline.image_detections import image_count
 from gtsam_rwhec.pipeline.image_options import check_image_options
@@ -45,7 +51,7 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.vision.camera import Camera
 
 #: Names of all that `calibrate_log` leaves in its folder, beside the list of them.
-OUTPUTS = tuple(dict.fromkeys(name.partition("/")[0] for name in LEFT))
+OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in LEFT), *FOLDERS]))
 
 
 @one_blas_thread()
@@ -63,8 +69,9 @@ def calibrate_log(
     """Detect, clean, solve and export: from a log and a rig file to a folder with the calibration.
 
     The folder gets ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``,
-    ``camchain.yaml``, ``seen.png`` (a contact sheet of the images) and ``plots/``. For a log that a stage wrote, only
-    the stages after it run. A cleaned log is cleaned again if the settings for cleaning in `rig` differ from those that
+    ``camchain.yaml``, ``cameras.opencv.yaml``, ``cameras.txt`` (COLMAP's), ``camera_info/`` (ROS's, one file a camera),
+    ``seen.png`` (a contact sheet of the images) and ``plots/``. For a log that a stage wrote, only the stages after it
+    run. A cleaned log is cleaned again if the settings for cleaning in `rig` differ from those that
     the log was cleaned with.
 
     During the work the folder has the detections so far. A run that was interrupted, or killed, goes on from them when
@@ -278,6 +285,7 @@ def export_solved(
             (out / name).unlink(missing_ok=True)
     else:
         written = export_all(frames_of(solved), out)
+    remove_unchanged(out, FOLDERS, keep=written)
     tell("plotting")
     written += plot_all(solved, solved_path, made_folder(out / PLOTS_FOLDER))
     list_written(out, solved.log.detection.sources, written)

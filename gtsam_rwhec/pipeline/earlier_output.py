@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -26,8 +26,8 @@ from gtsam_rwhec.errors import LogError, RwhecError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.pipeline.detection_inputs import differences
 from gtsam_rwhec.pipeline.kept_detections import KeptDetections, kept_inputs
-from gtsam_rwhec.pipeline.log_contract import DETECTED_LOG, PLOTS_FOLDER, RECORDED_LOG
-from gtsam_rwhec.pipeline.output_paths import WRITTEN, made_output_folder
+from gtsam_rwhec.pipeline.log_contract import DETECTED_LOG, RECORDED_LOG
+from gtsam_rwhec.pipeline.output_paths import INSIDE, is_written, made_output_folder
 
 try:
     import fcntl
@@ -132,7 +132,7 @@ class OutputFolder:
     def _bring_list_up_to_date(self, error: BaseException | None) -> None:
         if self._has_begun:
             state: State = "finished" if error is None else "failed" if isinstance(error, RwhecError) else "unfinished"
-            written = [name for name in WRITTEN if (self.path / name).is_file()]
+            written = [name for name in _names_in(self.path) if is_written(name) and (self.path / name).is_file()]
             if error is not None and not written and self._before is None and not (self.path / DETECTIONS).exists():
                 (self.path / LIST_FILE).unlink(missing_ok=True)
             else:
@@ -209,6 +209,21 @@ def list_written(folder: Path, sources: Sequence[str], files: Iterable[Path]) ->
         _write_list(folder, before.model_copy(update={"sha256": before.sha256 | sums}))
 
 
+def remove_unchanged(folder: Path, inside: Collection[str], keep: Iterable[Path] = ()) -> None:
+    """Remove what a calibration wrote into some folders of a folder, where it is as it was written, but for `keep`.
+
+    A camera that has another name now has another file; and no file of others is removed.
+    """
+    written = _read_list(folder)
+    kept = {file.relative_to(folder).as_posix() for file in keep}
+    for name, sha256 in () if written is None else written.sha256.items():
+        if name.rpartition("/")[0] in inside and name not in kept and _is_as_written(folder / name, sha256):
+            (folder / name).unlink()
+    for name in inside:
+        with suppress(OSError):  # what has files in it stays
+            (folder / name).rmdir()
+
+
 def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[Path]) -> _Written | None:
     """Refuse a folder that is not free for a calibration; return the list of what was written into it before."""
     before = _read_list(folder)
@@ -219,9 +234,10 @@ def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[P
             "(--force; in Python replace=True), or give another folder"
         )
     is_going_on = before is not None and before.state != "finished"
-    ours = {*WRITTEN, LIST_FILE, DETECTIONS, PLOTS_FOLDER}
+    others_of_ours = {LIST_FILE, DETECTIONS, *INSIDE}
     if before is not None and is_going_on and before.log.endswith(RECORDED_LOG):
-        ours.add(before.log)
+        others_of_ours.add(before.log)
+    ours = {name for name in there if is_written(name) or name in others_of_ours}
     own = {name for name in there if name in ours or _is_part(name, log) or _is_one_of(folder / name, sources)}
     others = [name for name in there if name not in own]
     if others and (before is None or not replace):
@@ -254,12 +270,12 @@ def _check_is_free(folder: Path, log: str, *, replace: bool, sources: Sequence[P
 
 
 def _names_in(folder: Path) -> list[str]:
-    """The names of all that is in a folder, and in its folder of plots."""
+    """The names of all that is in a folder, and in its folders of ours."""
     names = []
     try:
         for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
-            if entry.name == PLOTS_FOLDER and entry.is_dir() and not entry.is_symlink():
-                names += [f"{PLOTS_FOLDER}/{of_plots.name}" for of_plots in sorted(entry.iterdir())]
+            if entry.name in INSIDE and entry.is_dir() and not entry.is_symlink():
+                names += [f"{entry.name}/{inside.name}" for inside in sorted(entry.iterdir())]
             elif entry.name not in _OF_DESKTOPS:
                 names.append(entry.name)
     except OSError as error:
@@ -271,7 +287,8 @@ def _is_part(name: str, log: str) -> bool:
     """Whether a file is what a killed run of ours left half written."""
     folder, _, file = name.rpartition("/")
     part = _PART.fullmatch(file)
-    return part is not None and f"{folder}/{part[1]}".lstrip("/") in (*WRITTEN, LIST_FILE, DETECTIONS, log)
+    whole = "" if part is None else f"{folder}/{part[1]}".lstrip("/")
+    return is_written(whole) or whole in (LIST_FILE, DETECTIONS, log)
 
 
 def _is_one_of(path: Path, sources: Sequence[Path]) -> bool:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.export.files import FILES
+from gtsam_rwhec.export.files import FILES, FOLDERS, SUFFIX
 from gtsam_rwhec.files.atomic_write import why_not_writable
 from gtsam_rwhec.logs import Log
 from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, PLOTS_FOLDER, RESULT_FILE, SEEN_SHEET
@@ -22,6 +22,14 @@ LEFT = (
 )
 #: With the log that it has during the work.
 WRITTEN = (*LEFT, DETECTED_LOG)
+#: Folders in the output folder. Those of the export have one file a camera.
+INSIDE = (PLOTS_FOLDER, *FOLDERS)
+
+
+def is_written(name: str) -> bool:
+    """Whether a calibration writes a file of this name, relative to its folder."""
+    folder, _, file = name.rpartition("/")
+    return name in WRITTEN or (folder in FOLDERS and file.endswith(SUFFIX) and not file.startswith("."))
 
 
 def check_writable(path: str | Path) -> None:
@@ -54,9 +62,9 @@ def made_output_folder(path: str | Path) -> Path:
     for name in WRITTEN:
         if "/" not in name:
             check_writable(path / name)
-    plots = path / PLOTS_FOLDER
-    if plots.is_dir():
-        check_writable(plots / CLEAN_LOG)
-    elif os.path.lexists(plots):
-        raise LogError(f"{plots} cannot be made a folder: it is a file.")
+    for inside in (path / name for name in INSIDE):
+        if inside.is_dir():
+            check_writable(inside / CLEAN_LOG)
+        elif os.path.lexists(inside):
+            raise LogError(f"{inside} cannot be made a folder: it is a file.")
     return path

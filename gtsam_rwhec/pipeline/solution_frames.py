@@ -8,19 +8,22 @@ from gtsam_rwhec.pipeline.solving_stage import Solved
 from gtsam_rwhec.results.unanswered import shortage
 from gtsam_rwhec.rig import CameraLink, RigFrames
 from gtsam_rwhec.rig.camera_link import link_of_optical
+from gtsam_rwhec.rig.refined_frames import known_cameras
 
 
 def frames_of(solved: Solved) -> RigFrames:
-    """The calibrated frames; a sensor has the name of its frame."""
+    """The calibrated frames; a sensor has the name of its frame, and estimated intrinsics if there are any."""
     rig, refined = solved.rig, solved.refined
     missing = [name for name in (*rig.sensors, *rig.targets) if name not in refined.X and name not in refined.Y]
     frame = {name: rig.frame_of(name) for name in refined.Y}
+    cameras, origins = known_cameras(solved.cameras, refined.intrinsics)
     return RigFrames(
         sensor_carrier=rig.carriers.sensors,
         target_carrier=rig.carriers.targets,
         sensors={frame[name]: pose.matrix() for name, pose in refined.Y.items()},
         targets={name: pose.matrix() for name, pose in refined.X.items()},
-        cameras={frame[name]: camera for name, camera in solved.cameras.items() if name in frame},
+        cameras={frame[name]: camera for name, camera in cameras.items() if name in frame},
+        camera_origins={frame[name]: words for name, words in origins.items() if name in frame},
         time_offsets_s={frame[o.sensor]: o.offset_s for o in solved.log.time_offsets if o.sensor in frame},
         topics={frame[n]: s.images for n, s in rig.sensors.items() if s.images is not None and n in frame},
         links={

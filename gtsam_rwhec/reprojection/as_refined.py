@@ -104,7 +104,7 @@ def intrinsics_of(corners: CornersRefined, stated: Mapping[str, Stated]) -> dict
             shared_with=tuple(other for other in camera_of if other != name and camera_of[other] == camera_of[name]),
             names=refined.names,
             values=tuple(corners.point.cameras[camera_of[name]].tolist()),
-            standard_deviations=tuple(np.sqrt(np.diagonal(refined.covariance)).tolist()),
+            standard_deviations=refined.standard_deviations,
             stated=tuple(mean.tolist()),
             stated_deviations=tuple(refined.stated_deviations.tolist()),
             stated_as=stated[name],

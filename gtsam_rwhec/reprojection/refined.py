@@ -52,6 +52,11 @@ class RefinedIntrinsics:
         return self.camera.parameter_names
 
     @property
+    def standard_deviations(self) -> tuple[float, ...]:
+        """Of the parameters."""
+        return tuple(np.sqrt(np.diagonal(self.covariance)).tolist())
+
+    @property
     def held_by_prior(self) -> tuple[str, ...]:
         """Parameters that the images do not determine: what is known of them is what was stated."""
         held = held_by_prior(self.stated_deviations, self.covariance)

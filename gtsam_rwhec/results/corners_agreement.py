@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from gtsam_rwhec.reprojection.as_refined import SHAPE_NAMES
 from gtsam_rwhec.results.covariance_agreement import TWICE
 from gtsam_rwhec.results.schema import RefinedFields
 
+#: Focal lengths and principal point: the parameters of a camera without distortion.
+LEAST = 4
 #: Fields of an `Intrinsics` with a number for each of its names.
 _BY_NAME = ("values", "standard_deviations", "stated", "stated_deviations")
 
@@ -75,12 +77,8 @@ def _check_reprojection(found: Reprojection, refined: RefinedFields, place: str)
 
 def _check_intrinsics(name: str, intrinsics: Intrinsics, refined: RefinedFields, place: str) -> None:
     width = len(intrinsics.names)
-    first = lens_of(intrinsics).parameter_names
-    if intrinsics.names[:4] != first or len(set(intrinsics.names)) != width:
-        raise ValueError(
-            f"{place}.names: {', '.join(first)} and then the lens's coefficients, each once (found "
-            f"{', '.join(map(shown, intrinsics.names)) or 'none'})"
-        )
+    if width < LEAST:
+        raise ValueError(f"{place}.names: a camera has at least {LEAST} parameters (found {width})")
     for what in _BY_NAME:
         if len(getattr(intrinsics, what)) != width:
             raise ValueError(f"{place}.{what}: {len(getattr(intrinsics, what))} numbers for {width} names")
@@ -90,6 +88,11 @@ def _check_intrinsics(name: str, intrinsics: Intrinsics, refined: RefinedFields,
         except CameraError as error:
             values = "stated" if what == "stated_camera" else "values"
             raise ValueError(f"{place}.{values}: no camera has them: {error}") from error
+    wanted = replace(lens_of(intrinsics), D=np.zeros(width - LEAST)).parameter_names
+    if intrinsics.names != wanted:
+        raise ValueError(
+            f"{place}.names: must be {', '.join(wanted)} (found {', '.join(map(shown, intrinsics.names))})"
+        )
     _check_not_negative(intrinsics, place)
     for what in ("standard_deviations", "stated_deviations"):
         if min(getattr(intrinsics, what)) < 0.0:

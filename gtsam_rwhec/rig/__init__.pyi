@@ -3,6 +3,7 @@
 from .calibrated_frames import CalibratedFrame as CalibratedFrame
 from .calibrated_frames import CameraLink as CameraLink
 from .calibrated_frames import RigFrames as RigFrames
+from .refined_frames import frames_of_refined as frames_of_refined
 from .rig import Rig as Rig
 from .rig_file import parse_rig as parse_rig
 from .rig_file import read_rig as read_rig

@@ -47,6 +47,9 @@ class RigFrames:
         T_targetcarrier_target, metres.
     cameras : dict of str to Camera
         Intrinsics by sensor; may lack a sensor.
+    camera_origins : dict of str to str
+        Where the intrinsics of a sensor are from, in words that are written beside them; may lack a sensor, whose
+        intrinsics are as stated.
     time_offsets_s : dict of str to float
         Time offsets by sensor, seconds: the sensor's stamp t is the carriers' t + offset. A missing offset is 0.
     topics : dict of str to str
@@ -73,6 +76,7 @@ class RigFrames:
     sensors: Mapping[str, Array]
     targets: Mapping[str, Array]
     cameras: Mapping[str, Camera] = field(default_factory=dict)
+    camera_origins: Mapping[str, str] = field(default_factory=dict)
     time_offsets_s: Mapping[str, float] = field(default_factory=dict)
     topics: Mapping[str, str] = field(default_factory=dict)
     links: Mapping[str, CameraLink] = field(default_factory=dict)
@@ -92,7 +96,7 @@ class RigFrames:
                 raise FrameError(
                     f"{name} is the name of two frames; rename one (each carrier, sensor and target needs its own name)"
                 )
-        for what in ("cameras", "time_offsets_s", "topics", "links"):
+        for what in ("cameras", "camera_origins", "time_offsets_s", "topics", "links"):
             for name in getattr(self, what):
                 if name not in self.sensors:
                     sensors = ", ".join(self.sensors) or "none"

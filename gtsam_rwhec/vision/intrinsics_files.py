@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -126,14 +126,15 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
     ----------
     path
         As `read_kalibr_camchain`, `read_colmap_cameras` or `read_calibration_yaml`; or a file of OpenCV's stereo
-        calibration, with M1, D1, M2, D2.
+        calibration, with M1, D1, M2, D2; or of this library's ``cameras.opencv.yaml``.
     size : (int, int), optional
         Width and height in pixels, for files of OpenCV that do not have them.
 
     Returns
     -------
     dict of str to Camera
-        By the file's names: ``cam0`` of Kalibr, ``1`` of COLMAP and of stereo files; the name of one alone is empty.
+        By the file's names: ``cam0`` of Kalibr, ``1`` of COLMAP and of stereo files, the sensors' of this library; the
+        name of one alone is empty.
 
     Raises
     ------
@@ -147,12 +148,25 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
     fields = file.data if isinstance(file.data, dict) else {}
     if any(_KALIBR_CAMERA.fullmatch(name) for name in fields):
         return _kalibr_cameras(file)
+    if isinstance(fields.get("cameras"), dict):
+        return dict(_by_name(file, size))
     numbered = [
         number for number in ("1", "2") if isinstance(fields.get(_found(fields, _MATRIX, number)), (dict, tuple))
     ]
     if numbered and _found(fields, _MATRIX) is None:
         return {number: _calibrated(file, number, size) for number in numbered}
     return {"": _calibrated(file, "", size)}
+
+
+def _by_name(file: YamlFile, size: tuple[int, int] | None) -> Iterator[tuple[str, Camera]]:
+    """The cameras of `cameras`, each a calibration with its name in it, or else as its key."""
+    if not file.data["cameras"]:
+        _refuse(file, ("cameras",), "no camera is in it")
+    for key, section in file.data["cameras"].items():
+        path = ("cameras", key)
+        if not isinstance(section, dict):
+            _refuse(file, path, f"{shown(section)}; a camera's section was expected")
+        yield str(section.get("name", key)), _calibrated(file.section(path), "", size)
 
 
 def _calibrated(file: YamlFile, number: str, size: tuple[int, int] | None) -> Camera:

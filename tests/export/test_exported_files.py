@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -23,6 +24,7 @@ from gtsam_rwhec.export import camchain_yaml, export_all, static_tf_launch, tf_y
 from gtsam_rwhec.export.written_poses import fixed_axis_angles, number, quaternion_xyzw
 from gtsam_rwhec.rig import CameraLink, RigFrames
 from gtsam_rwhec.rig.camera_link import link_of_optical
+from gtsam_rwhec.vision.colmap_cameras import read_colmap_cameras
 
 XACRO = {"xacro": "http://www.ros.org/wiki/xacro"}
 
@@ -281,14 +283,20 @@ def joint_of(joint: ElementTree.Element) -> tuple[tuple[str, str], np.ndarray]:
 
 def test_all_files_are_written(tmp_path: Path) -> None:
     paths = export_all(ONE, tmp_path)
-    assert [path.name for path in paths] == ["static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml"]
-    assert sorted(paths) == sorted(tmp_path.iterdir())
+    assert [path.relative_to(tmp_path).as_posix() for path in paths] == [
+        "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml", "cameras.opencv.yaml", "cameras.txt",
+        "camera_info/cam_left.yaml", "camera_info/rig_cam_right.yaml",
+    ]  # fmt: skip
+    assert sorted(paths) == sorted(path for path in tmp_path.rglob("*") if path.is_file())
     assert paths[3].read_text() == camchain_yaml(ONE)
 
 
 def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"static_tf\.launch\.py cannot be written: No such file"):
         export_all(ONE, tmp_path / "nowhere")
+    (tmp_path / "camera_info").write_text("mine", encoding="utf-8")
+    with pytest.raises(FileFormatError, match=r"camera_info cannot be made a folder: File exists"):
+        export_all(ONE, tmp_path)
 
 
 def test_warnings_are_in_every_file(tmp_path: Path) -> None:
@@ -300,8 +308,12 @@ def test_warnings_are_in_every_file(tmp_path: Path) -> None:
         assert "Do not use: cam: 9 of its 10 measurements contradict" in text
         if path.suffix == ".py":
             ast.parse(text)
+        elif path.name == "cameras.opencv.yaml":
+            assert not cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ).getNode("cameras").empty()
         elif path.suffix == ".yaml":
             yaml.safe_load(text)
+        elif path.suffix == ".txt":
+            assert set(read_colmap_cameras(path)) == {"1", "2"}
         else:
             assert ElementTree.fromstring(text.encode()).tag == "robot"
     for path in export_all(replace(frames, warnings=()), tmp_path):

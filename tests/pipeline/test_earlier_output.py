@@ -8,11 +8,19 @@ import pytest
 
 from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.pipeline import earlier_output
-from gtsam_rwhec.pipeline.earlier_output import LIST_FILE, MOST_NAMED, earlier_run, list_written, output_folder
+from gtsam_rwhec.pipeline.earlier_output import (
+    LIST_FILE,
+    MOST_NAMED,
+    earlier_run,
+    list_written,
+    output_folder,
+    remove_unchanged,
+)
 
 LOG = "run.mcap"
 ALL = (
     "result.json", "clean.mcap", "detected.mcap", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
+    "cameras.opencv.yaml", "cameras.txt", "camera_info/cam_0.yaml",
     "plots/frames.png", "plots/residuals.png", "plots/coverage.png", "plots/deviations.png",
 )  # fmt: skip
 
@@ -79,8 +87,10 @@ def test_other_files_beside_a_calibration_stay(tmp_path: Path) -> None:
     assert (tmp_path / "notes.txt").read_text(encoding="utf-8") == "mine"
     interrupted(tmp_path / "unfinished", "tf.yaml")
     (tmp_path / "unfinished" / "plots").mkdir()
+    (tmp_path / "unfinished" / "camera_info").mkdir()
+    (tmp_path / "unfinished" / "camera_info" / "notes.txt").write_bytes(b"mine")
     (tmp_path / "unfinished" / "plots" / "mine.png").write_bytes(b"mine")
-    with pytest.raises(LogError, match=r"not of a calibration.*plots/mine\.png"):
+    with pytest.raises(LogError, match=r"not of a calibration.*camera_info/notes\.txt, plots/mine\.png"):
         run(tmp_path / "unfinished")
 
 
@@ -97,6 +107,7 @@ def test_what_cannot_be_recognised_is_never_replaced(name: str, tmp_path: Path) 
 @pytest.mark.parametrize("name", ALL)
 def test_a_foreign_or_changed_file_beside_known_ones_is_never_replaced(name: str, tmp_path: Path) -> None:
     run(tmp_path, *(other for other in ALL if other != name))
+    (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_bytes(b"somebody else's")
     with pytest.raises(LogError, match=f"was changed: {name}. Give"):
         run(tmp_path, replace=True)
@@ -178,6 +189,23 @@ def test_files_of_single_stages_are_listed(tmp_path: Path) -> None:
     list_written(tmp_path, ["a.mcap", "b.mcap"], [tmp_path / "tf.yaml", tmp_path / "not_written"])
     assert earlier_run(tmp_path) == ("a.mcap, b.mcap", "finished")
     run(tmp_path, "tf.yaml", replace=True)
+
+
+def test_files_of_cameras_that_are_gone_are_removed_and_nobody_elses(tmp_path: Path) -> None:
+    names = [f"camera_info/{name}.yaml" for name in ("kept", "gone", "changed")]
+    run(tmp_path, *ALL, *names)
+    (tmp_path / "camera_info" / "changed.yaml").write_bytes(b"changed")
+    (tmp_path / "camera_info" / "mine.yaml").write_bytes(b"output")
+    remove_unchanged(tmp_path, ["camera_info"], keep=[tmp_path / "camera_info" / "kept.yaml"])
+    assert {path.name for path in (tmp_path / "camera_info").iterdir()} == {"kept.yaml", "changed.yaml", "mine.yaml"}
+    assert (tmp_path / "tf.yaml").exists()
+    with pytest.raises(LogError, match=r"was changed: camera_info/changed\.yaml, camera_info/mine\.yaml\. Give"):
+        run(tmp_path, *ALL, replace=True)
+    for name in ("changed", "mine"):
+        (tmp_path / "camera_info" / f"{name}.yaml").unlink()
+    remove_unchanged(tmp_path, ["camera_info"])
+    assert not (tmp_path / "camera_info").exists()
+    remove_unchanged(tmp_path / "nothing", ["camera_info"])
 
 
 def test_two_runs_at_once_are_refused(tmp_path: Path) -> None:

@@ -142,7 +142,7 @@ def test_names_of_a_log(tmp_path: Path) -> None:
     rig.write_text(made.rig_text(), encoding="utf-8")
     out = tmp_path / "out"
     run("calibrate", log, "--rig", rig, "-o", out, status=0)
-    assert {path.name for path in out.iterdir()} == {*rw.pipeline.OUTPUTS, LIST_FILE} - {SEEN_SHEET}
+    assert {path.name for path in out.iterdir()} == {*rw.pipeline.OUTPUTS, LIST_FILE} - {SEEN_SHEET, "camera_info"}
     rig.write_text(made.rig_text(cam_0="detections: /nowhere"), encoding="utf-8")
     assert "characters ...]" in run("calibrate", log, "--rig", rig, "-o", out, "--force", status=2)
     rig.write_text(made.rig_text(poses="{tf: [base, arm]}"), encoding="utf-8")

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 from made_as_refined import made
+from simulated_cells import CAMERA
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.refinement.reprojection_found import Consequence, Reprojection, SensorReprojection, TriedModel
 from gtsam_rwhec.results.result_file import read_result
+from gtsam_rwhec.vision.intrinsics_files import read_calibration_yaml, read_cameras
 
 
 @cache
@@ -88,6 +90,27 @@ def test_an_error_of_no_number_is_not_written(tmp_path: Path) -> None:
     assert not (tmp_path / "refined.json").exists()
 
 
+def test_files_for_others_have_the_estimated_intrinsics(text: str, tmp_path: Path) -> None:
+    (tmp_path / "refined.json").write_text(text, encoding="utf-8")
+    *_, corners, _ = made()
+    wide = replace(CAMERA, width=640)
+    texts = []
+    for answer in (refined(), rw.read_refined(tmp_path / "refined.json"), corners):
+        frames = rw.rig.frames_of_refined(answer, {"cam_0": wide}, sensor_carrier="base", target_carrier="hand")
+        texts.append([path.read_text(encoding="utf-8") for path in rw.export.export_all(frames, tmp_path)])
+    assert texts[0] == texts[1] == texts[2]
+    read = read_cameras(tmp_path / "cameras.opencv.yaml")
+    for name, intrinsics in refined().intrinsics.items():
+        np.testing.assert_array_equal(read[name].K, intrinsics.camera.K)
+        np.testing.assert_array_equal(read[name].D, intrinsics.camera.D)
+        of_ros = (tmp_path / "camera_info" / f"{name}.yaml").read_text(encoding="utf-8")
+        fx, k1 = intrinsics.standard_deviations[0], intrinsics.standard_deviations[4]
+        assert f"# {name}, on base: intrinsics estimated from the corners, standard deviations fx {fx:.2g}, " in of_ros
+        assert f" px, k1 {k1:.2g}, " in of_ros
+        assert read_calibration_yaml(tmp_path / "camera_info" / f"{name}.yaml").width == 1920
+    assert "what was stated holds k2, not the images" in of_ros
+
+
 def camera(raw: Any, name: str = "cam_1") -> Any:
     return raw["refined"]["intrinsics"][name]
 
@@ -98,7 +121,10 @@ def found(raw: Any) -> Any:
 
 CASES: dict[str, tuple[Callable[[Any], object], str]] = {
     "a number is missing": (lambda raw: camera(raw)["values"].pop(), r"cam_1\.values: 7 numbers for 8 names"),
-    "no focal length": (lambda raw: camera(raw)["names"].__setitem__(0, "f"), r"cam_1\.names: fx, fy, cx, cy and then"),
+    "no focal length": (
+        lambda raw: camera(raw)["names"].__setitem__(0, "f"),
+        r"cam_1\.names: must be fx, fy, .* \(found f, fy",
+    ),
     "no camera": (lambda raw: camera(raw)["values"].__setitem__(0, -5.0), r"cam_1\.values: no camera has .* fx = -5"),
     "no model": (lambda raw: camera(raw).update(model="tilted"), r"cam_1\.values: no camera .* 'tilted' is not supp"),
     "no size": (lambda raw: camera(raw).update(width=0), r"cam_1\.values: no camera .* image size is 0 x 1080"),
