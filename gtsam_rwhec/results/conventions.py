@@ -24,8 +24,8 @@ CONVENTIONS = {
     "intrinsics": (
         "of refined.intrinsics: fx, fy, cx, cy in pixels, with the middle of the upper left pixel at (0, 0), and the "
         "coefficients of the model, as OpenCV has them: radtan k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 (4, 5, 8 "
-        "or 12 of them), equidistant k1, k2, k3, k4 of the fisheye model, pinhole none, unified "
-        "xi, k1, k2, p1, p2 of the omnidir model, whose fx and fy are divided by 1 + xi here. Their covariance is that of "
+        "or 12 of them), equidistant k1, k2, k3, k4 of the fisheye model, pinhole none, unified xi, k1, "
+        "k2, p1, p2 of the omnidir model, whose fx and fy are divided by 1 + xi here. Their covariance is that of "
         "intrinsics:SENSOR in refined.joint, in the order of names"
     ),
     "shape": (

@@ -161,11 +161,11 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
 def _by_name(file: YamlFile, size: tuple[int, int] | None) -> Iterator[tuple[str, Camera]]:
     """The cameras of `cameras`, each a calibration with its name in it, or else as its key."""
     if not file.data["cameras"]:
-        _refuse(file, ("cameras",), "no camera is in it")
+        refuse(file, ("cameras",), "no camera is in it")
     for key, section in file.data["cameras"].items():
         path = ("cameras", key)
         if not isinstance(section, dict):
-            _refuse(file, path, f"{shown(section)}; a camera's section was expected")
+            refuse(file, path, f"{shown(section)}; a camera's section was expected")
         yield str(section.get("name", key)), _calibrated(file.section(path), "", size)
 
 
