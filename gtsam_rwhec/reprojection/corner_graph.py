@@ -1,4 +1,4 @@
-"""The GTSAM graph of corners: one factor an image, whose rows are computed for all images at once.
+"""The GTSAM graph of corners: a factor an image, and one for all images of a pair, computed for all of them at once.
 
 Variables
 
@@ -9,7 +9,9 @@ Variables
     p      how far a board's corners are off their places, held by a prior; absent where they are not free
     t      the offset of a sensor's clock, held by a weak prior; absent where it is not free
 
-GTSAM asks each factor by itself, in any order. All rows are computed when the first factor is asked at new values.
+An image's factor has the six linear rows in which its A is; what the other rows say has no A, and is summed over all
+images of a target by a sensor (`row_sums`). GTSAM asks each factor by itself, in any order: all rows are computed when
+the first factor is asked at new values.
 """
 
 from __future__ import annotations
@@ -23,7 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.reprojection.model import Model, Point
+from gtsam_rwhec.reprojection.model import FewRows, Model, Point
+
+#: Letters of the variables that are vectors; the others are poses.
+_VECTORS = frozenset(map(ord, "kbtp"))
 
 
 def key_of(letter: str, number: int) -> int:
@@ -36,17 +41,17 @@ def key_of(letter: str, number: int) -> int:
 class CornerGraph:
     """The graph of a model, with its variables' keys.
 
-    A factor's vector is not the pixel errors but a turn of them, which has the same length: the linear rows of an image
-    are as few as its variables have columns.
+    A factor's vector is not the pixel errors but a turn of them: all factors together have their length, and the linear
+    rows are as few as can be. Asked without derivatives, the pair's factor has the whole length.
     """
 
     model: Model
     start: Point
     graph: gtsam.NonlinearFactorGraph = field(init=False)
-    _at: dict[int, Array] = field(init=False, default_factory=dict)
+    _at: dict[int, bytes] = field(init=False, default_factory=dict)
     _point: Point = field(init=False)
     _errors: list[Array] = field(init=False, default_factory=list)
-    _triangles: list[tuple[Array, dict[str, slice]]] = field(init=False, default_factory=list)
+    _rows: list[FewRows] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         model = self.model
@@ -64,8 +69,9 @@ class CornerGraph:
         self.graph = gtsam.NonlinearFactorGraph()
         self._add_priors()
         for s, stack in enumerate(model.stacks):
-            for v in range(len(stack.instant)):
-                self._add_view(s, v)
+            self._add_pair(s)
+            for v in range(len(stack.instant) if model.A_noise is not None else 0):
+                self._add_image(s, v)
 
     def values(self, point: Point) -> gtsam.Values:
         """A point as GTSAM's values."""
@@ -149,54 +155,82 @@ class CornerGraph:
             noise = gtsam.noiseModel.Isotropic.Sigma(number, model.corner_priors[name])
             self.graph.add(gtsam.PriorFactorVector(key, np.zeros(number), noise))
 
-    def _add_view(self, s: int, v: int) -> None:
+    def _variables_of(self, s: int) -> dict[str, int]:
+        """The keys of a stack's variables by their names in `Model`, without A."""
         stack = self.model.stacks[s]
-        key_of_variable = {
+        keys = {
             "X": self.x[stack.target],
             "Y": self.y[stack.sensor],
             "camera": self.k[self.model.camera_of[stack.sensor]],
-            "A": key_of("a", int(stack.instant[v])),
             "shape": self.b.get(stack.target, 0),
             "time": self.t.get(stack.sensor, 0),
             "corners": self.p.get(stack.target, 0),
         }
-        variables = self.model.variables_of(stack)
-        width = 12 + len(self.start.cameras[self.model.camera_of[stack.sensor]])
-        width += 6 * ("A" in variables) + len(self.model.free_shape(stack.target)) + ("time" in variables)
-        width += 3 * len(stack.points) * ("corners" in variables)
-        size = min(2 * stack.known.shape[1], width + 1)
-        keys = [key_of_variable[name] for name in variables]
+        return {name: keys[name] for name in self.model.variables_of(stack) if name != "A"}
+
+    def _add_pair(self, s: int) -> None:
+        """What a stack's rows say without A. Where A is free, its images' factors have the cost."""
+        variables = self._variables_of(s)
+        size = self._columns(s) + 1
+        exact = self.model.A_noise is None
+
+        def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any | None) -> NDArray[np.float64]:
+            self._come_to(self._keys, values)
+            if jacobians is None:
+                length = np.zeros(size)
+                length[0] = np.linalg.norm(self._errors[s]) if exact else 0.0
+                return length
+            rows = self._rows_there()[s]
+            for i, name in enumerate(variables):
+                jacobians[i] = rows.together[:, rows.columns[name]]
+            return np.asarray(rows.together[:, -1])
+
+        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), list(variables.values()), error))
+
+    def _add_image(self, s: int, v: int) -> None:
+        variables = self._variables_of(s)
+        keys = [*variables.values(), key_of("a", int(self.model.stacks[s].instant[v]))]
 
         def error(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: Any | None) -> NDArray[np.float64]:
             self._come_to(keys, values)
             if jacobians is None:
-                length = np.zeros(size)
+                length = np.zeros(6)
                 length[0] = np.linalg.norm(self._errors[s][v])
                 return length
-            if not self._triangles:
-                self._triangles = self.model.triangles(self._point)
-            R, columns = self._triangles[s]
+            rows = self._rows_there()[s]
             for i, name in enumerate(variables):
-                jacobians[i] = R[v][:, columns[name]]
-            residual: NDArray[np.float64] = R[v][:, -1]
-            return residual
+                jacobians[i] = rows.of_images[v][:, rows.columns[name]]
+            jacobians[len(variables)] = rows.by_A[v]
+            return np.asarray(rows.of_images[v][:, -1])
 
-        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error))
+        self.graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, error))
+
+    def _columns(self, s: int) -> int:
+        """How many columns a stack's variables have without A."""
+        stack, start = self.model.stacks[s], self.start
+        numbers = {
+            "camera": len(start.cameras[self.model.camera_of[stack.sensor]]),
+            "shape": len(self.model.free_shape(stack.target)),
+            "time": 1,
+            "corners": 3 * len(stack.points),
+        }
+        return sum(numbers.get(name, 6) for name in self._variables_of(s))
+
+    def _rows_there(self) -> list[FewRows]:
+        """The linear rows at the values that were come to."""
+        if not self._rows:
+            self._rows = self.model.few_rows(self._point)
+        return self._rows
 
     def _come_to(self, keys: list[int], values: gtsam.Values) -> None:
         """Compute all residuals at the values anew, if one of the variables with these keys has changed."""
-        for key in keys:
-            known = self._at.get(key)
-            if known is None or not np.array_equal(known, _value(values, key)):
-                self._point = self.point(values)
-                self._at = {key: _value(values, key) for key in self._keys}
-                self._errors, self._triangles = self.model.errors(self._point), []
-                break
+        if any(self._at.get(key) != _value(values, key) for key in keys):
+            self._point = self.point(values)
+            self._at = {key: _value(values, key) for key in self._keys}
+            self._errors, self._rows = self.model.errors(self._point), []
 
 
-def _value(values: gtsam.Values, key: int) -> Array:
-    if gtsam.symbolChr(key) in (ord("k"), ord("b"), ord("t"), ord("p")):
-        vector: Array = values.atVector(key)
-        return vector
-    pose: Array = values.atPose3(key).matrix()
-    return pose
+def _value(values: gtsam.Values, key: int) -> bytes:
+    if gtsam.symbolChr(key) in _VECTORS:
+        return bytes(values.atVector(key).tobytes())
+    return bytes(values.atPose3(key).matrix().tobytes())

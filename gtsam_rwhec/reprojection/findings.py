@@ -11,7 +11,7 @@ from gtsam_rwhec.reprojection.lens import PINHOLE
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.reduced import CARRIER, CORNER_PX
 from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
-from gtsam_rwhec.reprojection.stated_intrinsics import HELD, PARTS, deviations_of, innovation_of
+from gtsam_rwhec.reprojection.stated_intrinsics import CONTRADICTED, HELD, PARTS, chance_of, deviations_of
 
 #: Larger noise than any arm or tracker has: rad, m; than any detector has: pixels.
 CARRIER_RAD, CARRIER_M, DETECTOR_PX = np.radians(1.0), 0.01, 2.0
@@ -113,7 +113,7 @@ def _of_boards(refined: CornersRefined) -> Iterator[str]:
     for name, deviation in refined.graph.model.corner_priors.items():
         off = refined.point.corners[name]
         posterior = refined.covariance(f"corners:{name}")
-        if innovation_of(off.ravel(), np.full(off.size, deviation), posterior).is_contradicted:
+        if chance_of(off.ravel(), np.full(off.size, deviation), posterior) < CONTRADICTED:
             length = np.linalg.norm(off, axis=1)
             worst = int(np.argmax(length))
             yield (

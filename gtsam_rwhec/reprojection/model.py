@@ -10,6 +10,7 @@ from rwhec_factors import se3
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.refinement.options import About
 from gtsam_rwhec.reprojection.corner_views import Linear, Stack, depths, linearised, pixel_errors
+from gtsam_rwhec.reprojection.row_sums import Rows, few_rows
 
 #: A residual of this many deviations stands for a corner behind its camera: the step is refused, and stays finite.
 BEHIND = 1e6
@@ -118,25 +119,21 @@ class Model:
     def _roots(self) -> list[Array]:
         return [np.repeat(np.sqrt(weights), 2, axis=1) / self.corner_px for weights in self.weights]
 
-    def triangles(self, point: Point) -> list[tuple[Array, dict[str, slice]]]:
-        """The rows of every image, turned into at most as many as there are columns: Q of [J, r] = Q R is left out.
-
-        They have the same cost and the same information. By stack: R (V, m, columns), whose last column is the
-        residual, and the columns of each variable.
-        """
+    def few_rows(self, point: Point) -> list[FewRows]:
+        """Rows of every stack with the same cost and the same information as all of them, by stack."""
         result = []
         for stack, root in zip(self.stacks, self._roots, strict=True):
             rows = self.linearised(stack, point)
-            residual = _finite(rows.residual, root)
-            dense = {name: getattr(rows, f"by_{name}") for name in self.variables_of(stack)}
-            if "corners" in dense:
-                dense["corners"] = _by_all_corners(rows.by_corners)
-            blocks = {name: block * root[..., None] for name, block in dense.items()}
-            ends = np.cumsum([block.shape[2] for block in blocks.values()]).tolist()
-            columns = {name: slice(a, b) for name, a, b in zip(blocks, [0, *ends], ends, strict=False)}
-            stacked = np.concatenate([*blocks.values(), residual[..., None]], axis=2)
-            is_tall = stacked.shape[1] > stacked.shape[2]
-            result.append((np.asarray(np.linalg.qr(stacked, mode="r")) if is_tall else stacked, columns))
+            variables = self.variables_of(stack)
+            blocks = {name: getattr(rows, f"by_{name}") for name in variables if name not in ("corners", "A")}
+            has = {name: name in variables for name in ("corners", "A")}
+            number = [block.shape[2] for block in blocks.values()] + [3 * len(stack.points)] * has["corners"]
+            ends = np.cumsum(number).tolist()
+            columns = {name: slice(a, b) for name, a, b in zip(variables, [0, *ends], ends, strict=False)}
+            J = np.concatenate(list(blocks.values()), axis=2) * root[..., None]
+            B = rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if has["corners"] else None
+            J_A = rows.by_A * root[..., None] if has["A"] else None
+            result.append(FewRows(*few_rows(Rows(J, B, _finite(rows.residual, root)), J_A), columns))
         return result
 
     def free_shape(self, target: str) -> np.ndarray:
@@ -144,23 +141,35 @@ class Model:
         return np.flatnonzero(self.shape_priors.get(target, ()))
 
     def variables_of(self, stack: Stack) -> tuple[str, ...]:
-        """X, Y, camera, and A, shape, time and corners where they are free."""
+        """X, Y, camera, and shape, time, corners and A where they are free, in this order."""
         free = [
-            ("A", self.A_noise is not None),
             ("shape", stack.target in self.shape_priors),
             ("time", stack.sensor in self.offset_priors),
             ("corners", stack.target in self.corner_priors),
+            ("A", self.A_noise is not None),
         ]
         return ("X", "Y", "camera", *(name for name, is_free in free if is_free))
 
 
-def _by_all_corners(by_corners: Array) -> Array:
-    """Derivatives (V, 2n, 3n) by all corners' places, from those of each corner by its own (V, n, 2, 3)."""
-    V, n = by_corners.shape[:2]
-    dense = np.zeros((V, n, 2, n, 3))
-    each = np.arange(n)
-    dense[:, each, :, each] = by_corners.transpose(1, 0, 2, 3)
-    return dense.reshape(V, 2 * n, 3 * n)
+@dataclass(frozen=True, eq=False)
+class FewRows:
+    """The rows of a stack's images that have A, and one triangle of the rest for all of them.
+
+    Attributes
+    ----------
+    of_images : (V, 6, columns) array
+        Of each image, by all unknowns but A; the last column is the residual. V = 0 where A is exact.
+    by_A : (V, 6, 6) array
+    together : (columns, columns) array
+        Of all images.
+    columns : dict of str to slice
+        Of each variable but A.
+    """
+
+    of_images: Array
+    by_A: Array
+    together: Array
+    columns: dict[str, slice]
 
 
 def _finite(error: Array, root: Array) -> Array:

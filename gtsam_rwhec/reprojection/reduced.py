@@ -19,6 +19,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.model import Model, Point
+from gtsam_rwhec.reprojection.row_sums import Rows
 
 Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
 
@@ -128,31 +129,27 @@ class Reduced:
                 parts["b", stack.target] = rows.by_shape
             if ("t", stack.sensor) in slots:
                 parts["t", stack.sensor] = rows.by_time
-            where = np.concatenate([np.arange(slots[name].start, slots[name].stop) for name in parts])
+            names = list(parts) + [("p", stack.target)] * (("p", stack.target) in slots)
+            where = np.concatenate([np.arange(slots[name].start, slots[name].stop) for name in names])
             root = np.repeat(np.sqrt(weights), 2, axis=1)
-            J = np.concatenate(list(parts.values()), axis=2) * root[..., None]
             by_A = rows.by_A @ to_right[stack.instant]
             off_A = np.einsum("vni,vi->vn", by_A, at[stack.instant])
-            J_A, r = by_A * root[..., None], (rows.residual - off_A) * root
-            flat = J.reshape(-1, J.shape[2])
-            G[np.ix_(where, where)] += flat.T @ flat
-            g[where] += flat.T @ r.ravel()
-            rr += float(r.ravel() @ r.ravel())
+            of_stack = Rows(
+                np.concatenate(list(parts.values()), axis=2) * root[..., None],
+                rows.by_corners * root.reshape(*stack.known.shape, 2, 1) if len(names) > len(parts) else None,
+                (rows.residual - off_A) * root,
+            )
+            J_A = by_A * root[..., None]
+            squares, of_A = of_stack.squares(), of_stack.times(J_A)
+            G[np.ix_(where, where)] += squares[:-1, :-1]
+            g[where] += squares[:-1, -1]
+            rr += float(squares[-1, -1])
             number += 2.0 * float(weights[stack.known].sum())
-            J_At = J_A.transpose(0, 2, 1)
             of_view = np.zeros((len(stack.instant), 6, size))
-            of_view[:, :, where] = J_At @ J
-            if ("p", stack.target) in slots:
-                own = slots["p", stack.target]
-                sums = _of_corners(rows.by_corners * np.sqrt(weights)[..., None, None], J, J_A, r)
-                G[own, own] += sums.G
-                G[own, where] += sums.by_others
-                G[where, own] += sums.by_others.T
-                g[own] += sums.g
-                of_view[:, :, own] = sums.C
+            of_view[:, :, where] = of_A[..., :-1]
             np.add.at(C, stack.instant, of_view)
-            np.add.at(M, stack.instant, J_At @ J_A)
-            np.add.at(b, stack.instant, (J_At @ r[..., None])[..., 0])
+            np.add.at(M, stack.instant, J_A.transpose(0, 2, 1) @ J_A)
+            np.add.at(b, stack.instant, of_A[..., -1])
         prior, off = np.zeros(size), np.zeros(size)
         for name, (mean, deviation) in model.camera_priors.items():
             prior[slots["k", name]] = deviation**-2.0
@@ -244,37 +241,3 @@ class Reduced:
 
         found = minimize(cost, begin, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-11})
         return noise(found.x)
-
-
-@dataclass(frozen=True, eq=False)
-class _OfCorners:
-    """Sums of a stack's rows by its board's corners: G (3n, 3n), by the others (3n, m), g (3n,) and C (V, 6, 3n)."""
-
-    G: Array
-    by_others: Array
-    g: Array
-    C: Array
-
-
-def _of_corners(B: Array, J: Array, J_A: Array, r: Array) -> _OfCorners:
-    """The sums, from rows by each corner's own place (V, n, 2, 3), by the others (V, 2n, m) and by A (V, 2n, 6).
-
-    A corner moves its own two residuals alone: no row of 3n columns is made.
-    """
-    V, n = B.shape[:2]
-
-    def of_corner(rows: Array) -> Array:
-        """(n, 2V, columns)."""
-        each: Array = rows.reshape(V, n, 2, -1).transpose(1, 0, 2, 3).reshape(n, 2 * V, -1)
-        return each
-
-    Bt = of_corner(B).transpose(0, 2, 1)
-    G = np.zeros((n, 3, n, 3))
-    G[np.arange(n), :, np.arange(n)] = Bt @ of_corner(B)
-    C = J_A.reshape(V, n, 2, 6).transpose(0, 1, 3, 2) @ B  # (V, n, 6, 3)
-    return _OfCorners(
-        G.reshape(3 * n, 3 * n),
-        (Bt @ of_corner(J)).reshape(3 * n, -1),
-        (Bt @ of_corner(r)).ravel(),
-        C.transpose(0, 2, 1, 3).reshape(V, 6, 3 * n),
-    )

@@ -75,12 +75,15 @@ def innovation_of(off: Array, prior: Array, posterior: Array) -> Innovation:
     """The test of estimated less stated parameters (m,), with the prior's deviations (m,) and the posterior (m, m)."""
     return Innovation(
         off,
-        {part: _probability(off[at], prior[at], posterior[at, at]) for part, at in PARTS.items() if len(off[at])},
+        {part: chance_of(off[at], prior[at], posterior[at, at]) for part, at in PARTS.items() if len(off[at])},
     )
 
 
-def _probability(off: Array, prior: Array, posterior: Array) -> float:
-    """Before the images, `off` has the covariance prior^2 - posterior: z^2 of its principal parts is chi-square."""
+def chance_of(off: Array, prior: Array, posterior: Array) -> float:
+    """The probability that chance gives as much; `off` (m,), the prior's deviations (m,) and the posterior (m, m).
+
+    Before the images, `off` has the covariance prior^2 - posterior: z^2 of its principal parts is chi-square.
+    """
     covariance = np.eye(len(off)) - posterior / np.outer(prior, prior)
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     told = values > TOLD
