@@ -1,12 +1,10 @@
-"""Refinement from corners: time and memory of a large cell, and the answer against other ways to it.
+"""Refinement from corners: time and memory of a large cell.
 
-    python tests/benchmarks/corner_times.py [--views 250] [--simulations 200] [--store]
+    python tests/benchmarks/corner_times.py [--views 250] [--store]
 
 Four cameras with 250 images each of a board of 70 corners; intrinsics, the board's size and warp, and the carriers'
 poses are all free, the noise is estimated; the joint covariance is part of it. Then the same with every tenth corner
 misread. Times are on the clock; the processor's own are in brackets.
-Beside it ``cv2.calibrateCamera`` alone on the corners of one camera, in simulations whose nominal intrinsics are off:
-the mean squared error of f and c.
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from bars import Row, benchmark_parser, print_rows
 
@@ -25,7 +22,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "reprojection"))
 import simulated_cells
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.reprojection.lens import parameters_of
 from gtsam_rwhec.reprojection.observations import Views
 from gtsam_rwhec.vision.targets import Checkerboard
 
@@ -72,32 +68,10 @@ def timed(given: simulated_cells.Cell) -> tuple[float, float, rw.CornersRefined]
     return time.perf_counter() - begun, time.process_time() - own, refined
 
 
-def intrinsics_errors(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors of fx, fy, cx, cy: ours with A known, ours with the noise of A estimated, OpenCV's."""
-    errors = []
-    truth = parameters_of(simulated_cells.CAMERA)[:4]
-    given = simulated_cells.cell(seed, cameras=1, images=20, stated="nominal")
-    for carrier in ("exact", "estimate"):
-        X, Y = given.near(np.random.default_rng(seed))
-        refined = rw.refine_corners(given.observations, X, Y, rw.CornerOptions(carrier_noise=carrier))
-        errors.append(parameters_of(refined.intrinsics["cam_0"].camera)[:4] - truth)
-    view = given.observations.views["board", "cam_0"]
-    points = [given.observations.corners["board"].astype(np.float32)] * len(view.A)
-    stated = given.observations.cameras["cam_0"]
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
-    _, K, _, _, _ = cv2.calibrateCamera(
-        points, list(view.pixels.astype(np.float32)), (stated.width, stated.height), stated.K.copy(),
-        np.pad(stated.D, (0, 1)), flags=flags,
-    )  # fmt: skip
-    errors.append(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) - truth)
-    return errors[0], errors[1], errors[2]
-
-
 def main() -> int:
     """Run, and print a table."""
     parser = benchmark_parser(__doc__)
     parser.add_argument("--views", type=int, default=250)
-    parser.add_argument("--simulations", type=int, default=200)
     given = parser.parse_args()
     large = large_cell(given.views)
     clock, own, refined = timed(large)
@@ -114,10 +88,6 @@ def main() -> int:
         ),
         Row("  left out", f"{left_out} of {sum(view.known.sum() for view in large.observations.views.values())}"),
     ]  # fmt: skip
-    exact, noisy, theirs = (np.array(e) for e in zip(*map(intrinsics_errors, range(given.simulations)), strict=True))
-    for name, ours in (("A known", exact), ("the noise of A estimated", noisy)):
-        ratio = np.sqrt((ours**2).sum() / (theirs**2).sum())
-        rows.append(Row(f"error of f and c over OpenCV's, {name}", f"{ratio:.2f}", "<= 1", bool(ratio <= 1.0)))
     return print_rows("refinement from corners", rows, store=given.store)
 
 

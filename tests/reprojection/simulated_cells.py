@@ -62,6 +62,8 @@ def cell(
     corner_px: float = 0.1,
     shape: tuple[float, float, float] = (0.0, 0.0, 0.0),
     facing: Callable[[Array, np.random.Generator], Array] | None = None,
+    distance: float = 1.5,
+    tilt: float = 0.35,
 ) -> Cell:
     """A cell of fixed cameras in a ring about the arm; the board turns to one of them at each instant.
 
@@ -69,21 +71,23 @@ def cell(
     about its normal (`placements.py` has others).
 
     Stated intrinsics are off by a draw of the prior of `stated`, or by `stated_off` (m,). `carrier` and `shape` are
-    standard deviations: of A (rad, m), and of the board's size and warp.
+    standard deviations: of A (rad, m), and of the board's size and warp. `distance` is the ring's radius, metres, and
+    `tilt` how far the board's normal is off the camera's direction, a share of it about each axis.
     """
     rng = np.random.default_rng(seed)
     X = se3.expmap(np.array([[0.1, 0.2, -0.3, 0.05, 0.02, 0.1]]))[0]
     Y = {}
     for k in range(cameras):
         angle = 2.0 * np.pi * k / cameras
-        at = np.array([1.5 * np.cos(angle), 1.5 * np.sin(angle), 0.8]) + rng.normal(scale=0.1, size=3)
+        at = distance / 1.5 * np.array([1.5 * np.cos(angle), 1.5 * np.sin(angle), 0.8]) + rng.normal(scale=0.1, size=3)
         Y[f"cam_{k}"] = _looking(MIDDLE, at) @ se3.expmap(rng.normal(scale=0.05, size=(1, 6)))[0]
     true_shape = rng.normal(size=3) * shape
     points, _ = shaped(board.corners(), true_shape)
     seen: dict[str, tuple[list[Array], list[Array]]] = {name: ([], []) for name in Y}
     done = 0
     while done < images:
-        A = (facing or _facing)(Y[f"cam_{rng.integers(cameras)}"], rng) @ se3.inverse(X)
+        towards = Y[f"cam_{rng.integers(cameras)}"]
+        A = (_facing(towards, rng, tilt) if facing is None else facing(towards, rng)) @ se3.inverse(X)
         measured = A @ se3.expmap(rng.normal(size=(1, 6)) * np.repeat(carrier, 3))[0]
         any_seen = False
         for name, T_base_cam in Y.items():
@@ -116,11 +120,11 @@ def _looking(at: Array, place: Array) -> Array:
     return se3.pose(np.stack([x, np.cross(z, x), z], axis=1), place)
 
 
-def _facing(T_base_camera: Array, rng: np.random.Generator) -> Array:
+def _facing(T_base_camera: Array, rng: np.random.Generator, tilt: float) -> Array:
     """T_base_board of a board near the middle that faces a camera more or less, turned about its normal."""
     place = MIDDLE + rng.normal(scale=0.15, size=3)
     z = T_base_camera[:3, 3] - place
-    z = z / np.linalg.norm(z) + rng.normal(scale=0.35, size=3)
+    z = z / np.linalg.norm(z) + rng.normal(scale=tilt, size=3)
     z /= np.linalg.norm(z)
     x = np.cross(rng.normal(size=3), z)
     x /= np.linalg.norm(x)
