@@ -8,6 +8,7 @@ from simulated_cells import Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.noise_choice import estimated
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.reprojection_found import Reprojection
@@ -16,6 +17,7 @@ from gtsam_rwhec.reprojection.refined import CornersRefined
 
 
 @cache
+@one_blas_thread()
 def made() -> tuple[Cell, Refined, NoiseInData, CornersRefined, Refined]:
     """A cell, its refinement from poses with the noise, from corners, and the latter in the form of the former."""
     given = cell(5, images=30, stated="calibration", carrier=(5e-4, 2e-4), shape=(0.01, 0.0, 0.0))
