@@ -39,6 +39,8 @@ NOT_FROM_CORNERS = (
     "The answer is from the poses of targets in the images: the intrinsics by which these were measured count as "
     "exact, and their errors are not in the standard deviations."
 )
+#: Of an answer from corners, before the noise of B.
+FROM_POSES = "The refinement from corners started at one from the poses of targets in the images, whose noise is this."
 LEGEND = (
     "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation, along "
     "and about the axes of the frame itself; free: infinite, because the measurements leave a direction free. moved: "
@@ -113,6 +115,8 @@ def legend(refined: Refined) -> str:
     has_offsets = any(unknown.kind is UnknownKind.TIME_OFFSET for unknown in refined.unknowns)
     has_carrier_noise = refined.options.carrier_noise is not None or bool(refined.noise_sentences)
     added = ["clock offsets"] * has_offsets + ["the noise of A"] * has_carrier_noise
+    if refined.reprojection is not None:
+        return f"{LEGEND}; it adds {', '.join(['corners', *added])} and intrinsics."
     return f"{LEGEND}; it adds {' and '.join(added)}." if added else f"{LEGEND}."
 
 
@@ -146,8 +150,13 @@ def scale_and_offset_sentences(refined: Refined) -> list[str]:
 
 def refined_sentences(refined: Refined) -> list[str]:
     """The noise and the cost, which decide the standard deviations."""
-    sentences = [_noise_sentence(refined), NOISE_LEGEND]
-    sentences += refined.noise_sentences or (_carrier_noise_sentence(refined),)
+    from_corners = refined.reprojection is not None
+    sentences = [FROM_POSES] if from_corners else []
+    sentences += [_noise_sentence(refined), NOISE_LEGEND]
+    sentences += refined.noise_sentences or (() if from_corners else (_carrier_noise_sentence(refined),))
+    if from_corners:
+        steps = f"{refined.iterations} iteration{'' if refined.iterations == 1 else 's'}"
+        return [*sentences, f"Cost of the refinement from corners: {refined.cost:.6g} after {steps}."]
     loss = "" if refined.options.robust in ("none", "gnc") else f", {refined.options.robust} loss"
     steps = f"{refined.iterations} iteration{'' if refined.iterations == 1 else 's'}"
     sentences.append(

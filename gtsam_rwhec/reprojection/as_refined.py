@@ -18,8 +18,9 @@ from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.refinement.refining import movements
 from gtsam_rwhec.refinement.reprojection_found import SIZE, BoardShape, Intrinsics, Reprojection
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
-from gtsam_rwhec.reprojection.corner_views import SHAPE
+from gtsam_rwhec.reprojection.corner_views import SHAPE, depths
 from gtsam_rwhec.reprojection.intrinsics import Stated
+from gtsam_rwhec.reprojection.projection_uncertainty import by_region
 from gtsam_rwhec.reprojection.refined import CornersRefined
 
 #: The numbers of a board's shape.
@@ -53,7 +54,7 @@ def as_refined(
     keys = {name: key for keys in (graph.x, graph.y) for name, key in keys.items()}
     keys |= {f"intrinsics:{name}": graph.k[graph.model.camera_of[name]] for name in corners.Y}
     keys |= {f"shape:{name}": key for name, key in graph.b.items()}
-    return replace(
+    refined = replace(
         base,
         X=corners.X,
         Y=corners.Y,
@@ -74,6 +75,20 @@ def as_refined(
         reprojection=reprojection,
         intrinsics=dict(intrinsics),
     )
+    return replace(refined, intrinsics={name: _projected(refined, corners, name) for name in refined.intrinsics})
+
+
+def _projected(refined: Refined, corners: CornersRefined, sensor: str) -> Intrinsics:
+    """A sensor's intrinsics with how sure projections are at the depth where it saw its corners."""
+    seen = []
+    for stack in corners.graph.model.stacks:
+        if stack.sensor == sensor:
+            X, Y = corners.X[stack.target].matrix(), corners.Y[sensor].matrix()
+            seen.append(depths(stack, X, Y, corners.point.A, corners.shapes[stack.target])[stack.known])
+    distance_m = float(np.median(np.concatenate(seen)))
+    intrinsics, covariance = refined.intrinsics[sensor], refined.covariance(sensor, f"intrinsics:{sensor}")
+    regions = by_region(intrinsics.camera, covariance, distance_m)
+    return replace(intrinsics, projection_px=regions, projection_m=distance_m)
 
 
 def boards_of(corners: CornersRefined) -> dict[str, BoardShape]:

@@ -20,7 +20,12 @@ from gtsam_rwhec.report.corner_report import (
     intrinsics_sentences,
     intrinsics_table,
 )
-from gtsam_rwhec.report.covariance_report import scale_and_offset_sentences
+from gtsam_rwhec.report.covariance_report import (
+    FROM_POSES,
+    legend,
+    refined_sentences,
+    scale_and_offset_sentences,
+)
 from gtsam_rwhec.reprojection.consequences import OF_CARRIERS, centre_causes, focal_cause
 
 
@@ -49,6 +54,8 @@ def test_the_section_stands_between_poses_and_details(refined: Refined) -> None:
     assert str(refined.reprojection) in text
     (scale,) = scale_and_offset_sentences(refined)  # intrinsics and shapes have a section of their own
     assert scale.startswith("Scale of board")
+    assert "it adds corners and intrinsics." in legend(refined)
+    assert refined_sentences(refined)[0] == FROM_POSES
     assert printed(dataclasses.replace(refined, reprojection=None)) == ""
 
 
