@@ -9,6 +9,7 @@ from made_as_refined import made
 from gtsam_rwhec.noise_model.in_corners import beyond_independent_errors
 from gtsam_rwhec.refinement.reprojection_found import Reprojection
 from gtsam_rwhec.reprojection.as_refined import as_refined
+from gtsam_rwhec.reprojection.projection_uncertainty import projection_deviations
 
 
 def test_poses_covariances_and_names_are_those_of_the_corners() -> None:
