@@ -8,24 +8,34 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.corner_poses import candidates_of
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.vision.camera import Camera
 
 #: Entries of two rotations that are one pose of an image.
 SAME_POSE = 1e-3
 
 
-def nearer_poses(problem: Problem, X: Mapping[str, gtsam.Pose3], Y: Mapping[str, gtsam.Pose3]) -> tuple[Problem, int]:
+def nearer_poses(
+    problem: Problem,
+    X: Mapping[str, gtsam.Pose3],
+    Y: Mapping[str, gtsam.Pose3],
+    cameras: Mapping[str, Camera] | None = None,
+) -> tuple[Problem, int]:
     """The problem in which each image has the pose that is nearer to an answer's, and how many images changed.
 
     Parameters
     ----------
     problem : Problem
-        Measurements that were added as poses stay.
+        Measurements that were added as poses stay, and so do those of frames that the answer lacks.
     X, Y : dict of str to gtsam.Pose3
         The answer's T_targetcarrier_target and T_sensorcarrier_sensor.
+    cameras : dict of str to Camera, optional
+        Other intrinsics by sensor, by which the poses of all their images are computed; the problem's own stay as
+        they were stated.
     """
     if not problem.boards or not problem.has_measurements:
         return problem, 0
@@ -33,11 +43,12 @@ def nearer_poses(problem: Problem, X: Mapping[str, gtsam.Pose3], Y: Mapping[str,
     number = 0
     for pair in problem.pairs:
         raw = every[pair] = problem.measurements(*pair)
-        if raw.pixels is None or raw.covariances is None:
+        if raw.pixels is None or raw.covariances is None or pair.target not in X or pair.sensor not in Y:
             continue
+        camera = (cameras or {}).get(pair.sensor)
         rows = np.flatnonzero(np.isfinite(raw.pixels).any(axis=(1, 2)))
         both = candidates_of(
-            problem.cameras[pair.sensor],
+            camera or problem.cameras[pair.sensor],
             problem.boards[pair.target],
             raw.pixels[rows],
             problem.corner_px or 0.1,
@@ -45,17 +56,25 @@ def nearer_poses(problem: Problem, X: Mapping[str, gtsam.Pose3], Y: Mapping[str,
         )
         predicted = np.linalg.inv(Y[pair.sensor].matrix()) @ raw.A[rows] @ X[pair.target].matrix()
         T, covariance = both.chosen(both.nearer(predicted))
-        turned = np.abs(T[:, :3, :3] - raw.B[rows, :3, :3]).max(axis=(1, 2)) > SAME_POSE
-        if turned.any():
-            B, covariances = raw.B.copy(), raw.covariances.copy()
-            B[rows[turned]], covariances[rows[turned]] = T[turned], covariance[turned]
-            spread = np.einsum("nii->ni", covariances)
-            every[pair] = replace(
-                raw,
-                B=B,
-                sigma=np.sqrt(spread[:, 3:].mean(axis=1)),
-                kappa=0.5 / spread[:, :3].mean(axis=1),
-                covariances=covariances,
-            )
-            number += int(turned.sum())
-    return (problem.with_measurements(every), number) if number else (problem, 0)
+        changed = np.abs(T[:, :3, :3] - raw.B[rows, :3, :3]).max(axis=(1, 2)) > SAME_POSE
+        number += int(changed.sum())
+        if camera is not None:
+            changed[:] = True
+        if changed.any():
+            every[pair] = _with_poses(raw, rows[changed], T[changed], covariance[changed])
+    return (problem.with_measurements(every), number) if number or cameras else (problem, 0)
+
+
+def _with_poses(raw: Measurements, rows: np.ndarray, T: Array, covariance: Array) -> Measurements:
+    """Measurements with other poses and covariances in some rows."""
+    assert raw.covariances is not None
+    B, covariances = raw.B.copy(), raw.covariances.copy()
+    B[rows], covariances[rows] = T, covariance
+    spread = np.einsum("nii->ni", covariances)
+    return replace(
+        raw,
+        B=B,
+        sigma=np.sqrt(spread[:, 3:].mean(axis=1)),
+        kappa=0.5 / spread[:, :3].mean(axis=1),
+        covariances=covariances,
+    )

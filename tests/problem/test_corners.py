@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -137,6 +138,20 @@ def test_a_far_board_takes_the_poses_that_agree_with_the_carriers() -> None:
     again, none = nearer_poses(problem, solution.X, solution.Y)
     assert none == 0
     assert again is problem
+
+
+def test_poses_by_other_intrinsics_take_the_place_of_all() -> None:
+    A, B, pixels = images(8)
+    stated = rw.Camera.of(1280, 960, "radtan", [[880, 0, 655], [0, 880, 470], [0, 0, 1]], CAMERA.D, "stated")
+    problem = rw.Problem()
+    problem.add_corners("board", "cam", A, pixels, BOARD, stated)
+    off = np.linalg.norm(se3.logmap(se3.inverse(problem.measurements("board", "cam").B) @ B), axis=1)
+    poses = ({"board": gtsam.Pose3(X)}, {"cam": gtsam.Pose3(Y)})
+    better, _ = nearer_poses(problem, *poses, {"cam": CAMERA})
+    np.testing.assert_array_less(
+        np.linalg.norm(se3.logmap(se3.inverse(better.measurements("board", "cam").B) @ B), axis=1), 0.5 * off
+    )
+    assert better.cameras["cam"] is stated
 
 
 def test_corners_in_millimetres_warn_as_poses_do() -> None:
