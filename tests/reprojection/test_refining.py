@@ -7,10 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 from problems_of_cells import problem_of
+from rwhec_factors import se3
 from simulated_cells import Cell, cell
+from simulated_clocks import moving
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CountError, MeasurementsNotKeptError, OptionError
+from gtsam_rwhec.reprojection.corner_views import stacks_of
+from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: Covariances of poses are those of corners alone: the noise of A is more.
 pytestmark = pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.WeightsWarning")
@@ -130,3 +134,28 @@ def test_what_cannot_be_refined_from_corners_is_said() -> None:
     moments.add("board", "cam_0", view.A[:2], poses.measurements("board", "cam_0").B[:2], 1e-3, 1e5)
     with pytest.raises(MeasurementsNotKeptError, match="corners"):
         rw.refine(moments, solution, CORNERS)
+
+
+def test_clocks_are_unknowns_of_the_corners_too() -> None:
+    given, late_s = cell(8, images=16, stated="calibration"), {"cam_0": 0.03, "cam_1": -0.012}
+    moved = moving(given, 1, late_s)
+    stacks, A = stacks_of(given.observations)
+    at_ns = 10_000_000_000 * (1 + np.arange(len(A)))
+    twist, near_s = np.zeros((len(A), 6)), 0.05 * np.arange(-6, 7)
+    problem = rw.Problem()
+    for stack in stacks:
+        view, sensor = moved.observations.views[stack.target, stack.sensor], stack.sensor
+        assert view.twist is not None
+        twist[stack.instant] = view.twist
+        stamps = at_ns[stack.instant] - round(1e9 * late_s[sensor])
+        camera = given.observations.cameras[sensor]
+        problem.add_corners(stack.target, sensor, view.A, view.pixels, stack.points, camera, stamps_ns=stamps)
+    steps = np.einsum("k,ni->nki", near_s, twist).reshape(-1, 6)
+    poses = np.repeat(A, len(near_s), axis=0) @ se3.expmap(steps)
+    path = Trajectory.of((at_ns[:, None] + np.round(1e9 * near_s).astype(int)).ravel(), poses, "the arm")
+    options = rw.RefineOptions(observations="corners", time_offsets=True, carrier_path=path)
+    refined = rw.refine(problem, rw.solve(problem), options, corners=CALIBRATION)
+    for sensor, offset_s in late_s.items():
+        sigma = float(np.sqrt(refined.covariance(f"time_offset:{sensor}")[0, 0]))
+        assert abs(refined.time_offsets_s[sensor] - offset_s) < 4.0 * sigma < 4e-3
+        assert refined.contains(sensor, given.Y[sensor], 0.999)
