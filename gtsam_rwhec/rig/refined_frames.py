@@ -12,6 +12,8 @@ from gtsam_rwhec.vision.camera import Camera
 
 #: Parameters that are focal lengths and principal points, in pixels; coefficients follow them.
 IN_PIXELS = 4
+#: Pixels. A focal length that counts as exact has a smaller deviation.
+EXACT_PX = 1e-3
 
 
 def frames_of_refined(
@@ -62,6 +64,8 @@ def known_cameras(
 
 
 def _origin(intrinsics: Intrinsics | RefinedIntrinsics) -> str:
+    if max(intrinsics.standard_deviations[:IN_PIXELS]) < EXACT_PX:
+        return "as stated, which count as exact"
     deviations = [
         f"{name} {sigma:.2g}" for name, sigma in zip(intrinsics.names, intrinsics.standard_deviations, strict=True)
     ]

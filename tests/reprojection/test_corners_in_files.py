@@ -111,6 +111,14 @@ def test_files_for_others_have_the_estimated_intrinsics(text: str, tmp_path: Pat
     assert "what was stated holds k2, not the images" in of_ros
 
 
+def test_exact_intrinsics_are_not_called_estimated() -> None:
+    one = refined().intrinsics["cam_1"]
+    exact = replace(one, standard_deviations=(1e-5,) * 8, stated_as="exact")
+    frames = rw.rig.frames_of_refined(replace(refined(), intrinsics={"cam_1": exact}), {"cam_0": CAMERA})
+    assert frames.camera_origins == {"cam_1": "as stated, which count as exact"}
+    assert frames.cameras["cam_0"] is CAMERA
+
+
 def camera(raw: Any, name: str = "cam_1") -> Any:
     return raw["refined"]["intrinsics"][name]
 
