@@ -17,6 +17,7 @@ from gtsam_rwhec.calibration.disagreement import HALF, NEARLY_HALF
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
 from gtsam_rwhec.files.terminal_text import brief, shown
 from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.refinement.reprojection_found import SIZE
 from gtsam_rwhec.results.json_tree import POSED
 from gtsam_rwhec.results.log_history import LogFields, contradictions
 from gtsam_rwhec.results.schema import RefinedFields, SolutionFields
@@ -98,7 +99,10 @@ def check_says_what_it_is_about(raw: dict[str, Any]) -> None:
 
 
 def check_sizes(solution: SolutionFields, refined: RefinedFields | None) -> None:
-    """Root mean squares, counts, movements and costs are not negative, and no more are inliers than there are."""
+    """Root mean squares, counts, movements and costs are not negative, and no more are inliers than there are.
+
+    Scales are of one kind, but that corners may estimate sizes that count as known before.
+    """
     for pair, residual in solution.residuals.items():
         place = f"$.certified.residuals[{shown(pair)}]"
         _check_least(residual.number_of_measurements, 1, f"{place}.number_of_measurements")
@@ -124,7 +128,10 @@ def check_sizes(solution: SolutionFields, refined: RefinedFields | None) -> None
     for pair, (inliers, number) in refined.inlier_counts.items():
         if not 0 <= inliers <= number:
             raise ValueError(f"$.refined.inlier_counts[{shown(pair)}]: {inliers} inliers of {number} measurements")
-    if refined.scale_mode != solution.scale_mode:
+    found = refined.reprojection
+    are_of_corners = refined.scale_mode == "per_target" and solution.scale_mode == "known"
+    are_of_corners &= found is not None and any(SIZE in board.names for board in found.boards.values())
+    if refined.scale_mode != solution.scale_mode and not are_of_corners:
         raise ValueError(
             f"$.scale_mode: must be '{solution.scale_mode}', as in $.certified (found '{refined.scale_mode}')"
         )

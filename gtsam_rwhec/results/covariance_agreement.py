@@ -81,8 +81,9 @@ def _fixed(refined: RefinedFields, certified: SolutionFields) -> set[Unknown]:
     """Frames whose covariance is zero, and scales that refinement did not change: they may be known."""
     frames = (name for name, frame in refined.frames.items() if not any(map(any, frame.covariance)))
     scales: Iterable[str] = ()
-    if isinstance(refined.scale, dict) and isinstance(certified.scale, dict):
-        scales = (name for name, scale in refined.scale.items() if scale == certified.scale.get(name))
+    if isinstance(refined.scale, dict):
+        before = certified.scale if isinstance(certified.scale, dict) else dict.fromkeys(refined.scale, certified.scale)
+        scales = (name for name, scale in refined.scale.items() if scale == before.get(name))
     return {Unknown(UnknownKind.FRAME, name) for name in frames} | {Unknown(UnknownKind.SCALE, name) for name in scales}
 
 

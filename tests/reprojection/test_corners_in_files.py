@@ -119,6 +119,20 @@ def test_exact_intrinsics_are_not_called_estimated() -> None:
     assert frames.cameras["cam_0"] is CAMERA
 
 
+def test_corners_may_estimate_a_size_that_was_known_before(text: str, tmp_path: Path) -> None:
+    raw, path = json.loads(text), tmp_path / "refined.json"
+    assert raw["scale_mode"] == "per_target"
+    raw["certified"].update(scale=1.0, scale_mode="known")
+    path.write_text(json.dumps(raw), encoding="utf-8")
+    assert rw.read_refined(path).scale == refined().scale
+    found(raw).update(boards={})
+    path.write_text(json.dumps(raw), encoding="utf-8")
+    with pytest.raises(
+        FileFormatError, match=r"scale_mode: must be 'known', as in \$\.certified \(found 'per_target'\)"
+    ):
+        rw.read_refined(path)
+
+
 def camera(raw: Any, name: str = "cam_1") -> Any:
     return raw["refined"]["intrinsics"][name]
 
