@@ -88,6 +88,8 @@ class Ground(StrEnum):
     FEW_MEASUREMENTS = "few_measurements"
     #: The stated size of a target does not fit the motion, while others do; it was estimated in its place.
     SIZE_ESTIMATED = "size_estimated"
+    #: The stated intrinsics of a sensor do not fit its corners; they were estimated in their place.
+    INTRINSICS_ESTIMATED = "intrinsics_estimated"
     #: Errors of neighbouring measurements are alike, beyond what the model of the noise holds.
     CORRELATED = "correlated"
     #: Errors depend on the configuration: an arm's kinematics, intrinsics, a board that is not flat.
@@ -122,6 +124,7 @@ _CARE = (
     Ground.POSE_UNCERTAIN,
     Ground.FEW_MEASUREMENTS,
     Ground.SIZE_ESTIMATED,
+    Ground.INTRINSICS_ESTIMATED,
     Ground.CORRELATED,
     Ground.SYSTEMATIC,
     Ground.OUTLIERS_KEPT,
@@ -204,6 +207,10 @@ _ADVICE = {
     ),
     Ground.FEW_MEASUREMENTS: "measure each named frame at three poses or more, or do not use its pose",
     Ground.SIZE_ESTIMATED: "measure the named target again, and correct its size",
+    Ground.INTRINSICS_ESTIMATED: (
+        "check which calibration the stated intrinsics of the named sensor are from (its resolution, its lens), and "
+        "state the estimated ones (camchain.yaml, result.json) if they hold in another run"
+    ),
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
     Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",
     Ground.MANY_OUTLIERS: (

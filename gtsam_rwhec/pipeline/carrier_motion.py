@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from rwhec_factors import se3
@@ -14,7 +13,7 @@ from gtsam_rwhec.errors import LogError, StampError, TransformError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import Log, PoseRecord, TfBuffer, Topic
 from gtsam_rwhec.refinement.free_space import MOVED
-from gtsam_rwhec.refinement.options import CarrierNoise
+from gtsam_rwhec.refinement.options import About, CarrierNoise
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.local_paths import WINDOW_S
 from gtsam_rwhec.trajectories.smooth_path import SmoothPath
@@ -32,10 +31,14 @@ FEWEST_POSES, FEWEST_NEAR = 8, 4
 
 @dataclass(frozen=True, eq=False)
 class CarrierMotion:
-    """The carriers' motion: A = T_sensorcarrier_targetcarrier over time, and its noise if the rig file states it."""
+    """The carriers' motion: A = T_sensorcarrier_targetcarrier over time, and its noise if the rig file states it.
+
+    `about` is the carrier that the source says where it is: in its axes, and about its origin, A is noisy.
+    """
 
     trajectory: Trajectory
     noise: CarrierNoise | None
+    about: About = "targetcarrier"
 
     def A_where_known(self, stamps_ns: np.ndarray, max_gap_s: float) -> Array:
         """A (N, 4, 4) at stamps (N,). It is nan outside the trajectory and in gaps above `max_gap_s`."""
@@ -86,13 +89,13 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     if len(log.files) > 1:
         _check_one_pose_a_stamp(log, source.topic)
     # The pose of a child frame is noisy about and along the child's own axes.
-    about: Literal["sensorcarrier", "targetcarrier"] = "targetcarrier"
+    about: About = "targetcarrier"
     if child == rig.carriers.sensors:  # the log has T_targetcarrier_sensorcarrier
         about, T = "sensorcarrier", se3.inverse(T)
     carrier_noise = None
     if noise is not None:
         carrier_noise = CarrierNoise(float(np.radians(noise.rotation_deg)), 1e-3 * noise.translation_mm, about=about)
-    return CarrierMotion(Trajectory.of(stamps, T, where), carrier_noise)
+    return CarrierMotion(Trajectory.of(stamps, T, where), carrier_noise, about)
 
 
 def _from_tf(log: Log, parent: str, child: str, of_sensors: str) -> tuple[str, str, np.ndarray, Array]:

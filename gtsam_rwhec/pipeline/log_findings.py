@@ -149,11 +149,11 @@ def _cure_of_files(mistake: Mistake, rig: Rig) -> str:
     return ""
 
 
-def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig) -> list[Finding]:
+def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig, *, with_intrinsics: bool) -> list[Finding]:
     """Stated sizes that were to be checked, that the motion contradicts, and that were estimated in their place.
 
     Where another stated size fits the motion, the carriers' unit and the focal lengths are right, and the poses rest
-    on it. Where none does, any of the three may be wrong.
+    on it. Where none does, any of the three may be wrong; the focal lengths only where they were not estimated too.
     """
     if rig.sizes != "check":
         return []
@@ -169,9 +169,8 @@ def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig) -> list[Finding]:
     if len(doubted) == len(told):
         said = "the stated size of" if len(doubted) == 1 else "no stated size fits the motion:"
         why = "the poses use the sizes that the motion gives, and nothing tells whether the sizes are wrong or the "
-        return [
-            Finding(Ground.SIZE_DOUBTED, f"{said} {words}; {why}carriers' unit of length or the focal lengths")
-        ]  # fmt: skip
+        others = "carriers' unit of length" if with_intrinsics else "carriers' unit of length or the focal lengths"
+        return [Finding(Ground.SIZE_DOUBTED, f"{said} {words}; {why}{others}")]
     return [Finding(Ground.SIZE_ESTIMATED, f"the stated size of {words}; the poses use the size that the motion gives")]
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.choices import OUTLIERS, Choice
+from gtsam_rwhec.calibration.corner_stage import CornersFound
 from gtsam_rwhec.calibration.outliers import Outliers
 from gtsam_rwhec.calibration.reading import Reading
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
@@ -18,9 +19,11 @@ from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
 from gtsam_rwhec.pipeline.clocks_by_turning import late_clocks
+from gtsam_rwhec.pipeline.corner_answer import corner_answer
 from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics
 from gtsam_rwhec.pipeline.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.pipeline.log_contract import CLEANING_METADATA
+from gtsam_rwhec.pipeline.log_corners import LogCorners
 from gtsam_rwhec.pipeline.log_findings import (
     estimated_sizes,
     in_rig_file,
@@ -33,7 +36,8 @@ from gtsam_rwhec.pipeline.log_findings import (
 )
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, poses_used, read_pairs
-from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, sigma_of, without_outlier_marks
+from gtsam_rwhec.pipeline.settled_poses import SettledPoses, settled_poses
+from gtsam_rwhec.pipeline.solving_rounds import Pairs, Purpose, SolvingRounds, sigma_of, without_outlier_marks
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.judging import judge
@@ -116,6 +120,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         if not used_sensors:
             raise LogError(f"{clean_path}: it has no usable pair of measurements")
         motion = read_carrier_motion(log, rig)
+        logged = LogCorners.of(log, rig, metadata.cameras)
         of_intrinsics = doubted_intrinsics(log, rig, metadata.cameras)
         of_shapes = doubted_shapes(log, rig, metadata.cameras)
         of_shapes += continued_boards(metadata.detection.strangers, rig)
@@ -130,23 +135,22 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     stated = [name for name in rig.sensors if name in used_sensors and name not in estimated]
     stated_s = {name: given.offsets_s.get(name, 0.0) for name in stated}
     late = late_clocks(given.pairs, motion.trajectory, rig, stated_s)
-    sizes: tuple[SizeFields, ...] = ()
-    free: set[str] = set()
     before = rounds.misreadings(given)
     is_misread = is_of_the_poses(before)
-    if is_misread or late:
-        settled = given  # outliers and sizes mean nothing where poses were misread, or are of another time
-    else:
-        if rig.sizes != "known":
-            sizes, given = rounds.sizes(given)
-        if any(size.is_free for size in sizes):
-            free = set(rig.targets) - {size.target for size in sizes if not size.is_free}
-        settled = rounds.settled(given, free)
-        if rig.sizes == "known":
-            sizes = rounds.sizes_as_seen(settled)
-    calibration = rounds.calibrated(settled, free, is_late=bool(late))
+    # Outliers, sizes and corners mean nothing where poses were misread, or are of another time.
+    poses, of_corners = SettledPoses(given), CornersFound.none("the measurements look misread, or are of another time")
+    if not (is_misread or late):
+        poses = settled_poses(rounds, given)
+        poses, of_corners = corner_answer(poses, given, rounds, logged, metadata.cameras)
+    settled, sizes = poses.pairs, poses.sizes
+    calibration = rounds.calibrated(settled, poses.free, is_late=bool(late))
     # Without a refined calibration (the measurements look misread) the poses are refined all the same, for the plots.
-    refined = calibration.refined or rounds.refined(settled, free, "plots" if is_misread or late else "answer")
+    purpose: Purpose = "plots" if is_misread or late else "answer"
+    refined = calibration.refined or rounds.refined(settled, poses.free, purpose)
+    if calibration.refined is not None and not refined.free_directions:
+        refined = of_corners.refined(refined, calibration.noise.model)
+    if refined.intrinsics:  # estimated from the same corners
+        of_intrinsics = ()
     offsets = settled.offsets_s | {n: settled.offsets_s[n] + value for n, value in refined.time_offsets_s.items()}
     outliers = tuple(_outlier_count(measured) for measured in settled.pairs.values())
     refined = replace(
@@ -164,7 +168,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         detection=metadata.detection,
         cleaning=cleaning,
         outliers=outliers,
-        sizes=tuple(_in_the_answer(size, refined) if size.is_free else size for size in sizes),
+        sizes=tuple(_in_the_answer(size, refined) for size in sizes),
         time_offsets=tuple(
             TimeOffsetFields(
                 sensor=name,
@@ -184,7 +188,10 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         findings = not_of_marked_outliers(findings)
     if late:
         findings = not_of_late_clocks(findings, calibration.misreadings)
-    findings = (*of_intrinsics, *of_shapes, *findings, *late, *estimated_sizes(fields.sizes, rig))
+    findings = (*of_intrinsics, *of_shapes, *findings, *late)
+    findings = (*findings, *estimated_sizes(fields.sizes, rig, with_intrinsics=bool(refined.intrinsics)))
+    if refined.intrinsics:
+        findings = (*findings, *of_corners.findings)
     if is_misread:  # as the poses were written, which tells more than A
         found = Reading(in_rig_file(before, rig)).finding
         others = (one for one in findings if one.ground not in (Ground.MISREAD, Ground.IMPLAUSIBLE))
@@ -202,10 +209,17 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         findings=findings,
         misreadings=in_rig_file(calibration.misreadings, rig),
         refined=refined,
+        X=refined.X,
+        Y=refined.Y,
+        scale=refined.scale,
         time_offsets_s=refined.time_offsets_s,
         judgement=judgement,
         outliers=left_out,
-        choices=(*_choices_before(rig, estimated, left_out), *_made_in_the_answer(calibration.choices)),
+        choices=(
+            *_choices_before(rig, estimated, left_out),
+            *_made_in_the_answer(calibration.choices),
+            *of_corners.choices,
+        ),
     )
     solution, cameras = refined.solution, dict(metadata.cameras)
     return Calibrated(refined, solution, settled.pairs, fields, cameras, rig, judgement, calibration)
@@ -242,9 +256,11 @@ def _made_in_the_answer(choices: tuple[Choice, ...]) -> tuple[Choice, ...]:
 
 def _in_the_answer(size: SizeFields, refined: Refined) -> SizeFields:
     """A free size as the answer has it. The answer takes the sizes that are not free as known."""
-    assert not isinstance(refined.scale, float)
-    scale = refined.scale[size.target]
-    return size.model_copy(update={"scale": scale, "sigma": sigma_of(refined, Unknown(UnknownKind.SCALE, size.target))})
+    unknown = Unknown(UnknownKind.SCALE, size.target)
+    if isinstance(refined.scale, float) or unknown not in refined.joint.slots:
+        return size
+    found = {"scale": refined.scale[size.target], "sigma": sigma_of(refined, unknown), "is_free": True}
+    return size.model_copy(update=found)
 
 
 def _outlier_count(measured: MeasuredPairs) -> OutlierCount:

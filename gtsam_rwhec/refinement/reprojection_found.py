@@ -32,8 +32,10 @@ class SensorReprojection:
     held_out_px, held_out_mm : float or None
         Root mean square length of the error in images that were left out; in pixels, and on the target. None where
         images are too few to leave some out.
+    expected_px : float or None
+        What the covariances say of `held_out_px`: errors that are larger by far show what the model lacks.
     regions_px : tuple of tuple of float or None
-        The former by region of the image, rows from the top; None where no corner was seen.
+        `held_out_px` by region of the image, rows from the top; None where no corner was seen.
     """
 
     images: int
@@ -43,6 +45,7 @@ class SensorReprojection:
     held_out_px: float | None = None
     held_out_mm: float | None = None
     regions_px: Regions = ()
+    expected_px: float | None = None
 
 
 @dataclass(frozen=True)

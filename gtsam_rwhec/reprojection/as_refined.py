@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.knowledge import ScaleMode
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
 from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.refinement.refining import movements
@@ -54,11 +55,14 @@ def as_refined(
     keys = {name: key for keys in (graph.x, graph.y) for name, key in keys.items()}
     keys |= {f"intrinsics:{name}": graph.k[graph.model.camera_of[name]] for name in corners.Y}
     keys |= {f"shape:{name}": key for name, key in graph.b.items()}
+    keys |= {f"time_offset:{name}": key for name, key in graph.t.items()}
     refined = replace(
         base,
         X=corners.X,
         Y=corners.Y,
         scale=_scale(base, corners),
+        scale_mode=_scale_mode(base, corners),
+        time_offsets_s=base.time_offsets_s | corners.time_offsets_s,
         graph=graph.graph,
         values=graph.values(corners.point),
         keys=keys,
@@ -177,7 +181,14 @@ def _joint(base: Refined, corners: CornersRefined, more: Array | None) -> JointC
 
 def _scale(base: Refined, corners: CornersRefined) -> float | dict[str, float]:
     """Stated / true lengths: those that are free here, else as before."""
-    free = {name: 1.0 / (1.0 + float(shape[0])) for name, shape in corners.shapes.items()}
+    model = corners.graph.model
+    free = {
+        name: 1.0 / (1.0 + float(shape[0])) for name, shape in corners.shapes.items() if 0 in model.free_shape(name)
+    }
     if isinstance(base.scale, float):
-        return base.scale
-    return base.scale | {name: value for name, value in free.items() if 0 in corners.graph.model.free_shape(name)}
+        return dict.fromkeys(corners.X, base.scale) | free if free else base.scale
+    return base.scale | free
+
+
+def _scale_mode(base: Refined, corners: CornersRefined) -> ScaleMode:
+    return "known" if isinstance(_scale(base, corners), float) else "per_target"

@@ -30,6 +30,17 @@ MANY = 0.2
 CAUSES = "poses of other images, a wrong size of a target, A of a wrong frame, direction or unit, or intrinsics far off"
 
 
+def is_doubtful(refined: CornersRefined) -> bool:
+    """Whether the answer is not to be used: larger noise than any detector, arm or tracker has, or no optimum."""
+    noise = refined.noise
+    return not (
+        noise.corner_px <= DETECTOR_PX
+        and noise.carrier_rad <= CARRIER_RAD
+        and noise.carrier_m <= CARRIER_M
+        and refined.last_step <= LAST_STEP
+    )
+
+
 def findings_of(refined: CornersRefined, options: CornerOptions) -> tuple[str, ...]:
     """What is doubtful, one sentence or two each, the gravest first; empty where nothing is."""
     return (

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CountError, OptionError
 from gtsam_rwhec.files.progress import Progress, silent
@@ -18,8 +19,7 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_whole
 from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.reprojection.corner_views import Stack, depths, pixel_errors, stacks_of
-from gtsam_rwhec.reprojection.lens import parameters_of
+from gtsam_rwhec.reprojection.corner_views import Stack, stacks_of
 from gtsam_rwhec.reprojection.observations import Observations, Views
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refined import CornersRefined
@@ -39,6 +39,8 @@ class HeldOut:
     rms_px, rms_mm : float
         Root mean square length of the error, in pixels, and on the target: pixels by depth over focal length.
     corners : int
+    expected_px : float
+        What the covariances say of `rms_px`: errors that are larger by far show what the model lacks.
     regions_px : (3, 3) array
         The same in pixels by region of the image, rows from the top; nan where no corner was seen.
     """
@@ -46,6 +48,7 @@ class HeldOut:
     rms_px: float
     rms_mm: float
     corners: int
+    expected_px: float
     regions_px: Array
 
 
@@ -90,30 +93,52 @@ def held_out_errors(
         about = refined.graph.model.about
         told = replace(told, carrier_noise=CarrierNoise(float(noise[0]), float(noise[3]), about=about))
     block = _blocks(stacks, len(A), folds)
-    found: dict[str, list[tuple[Array, Array, Array]]] = {name: [] for name in observations.sensors}
+    found: dict[str, list[tuple[Array, Array, Array, Array]]] = {name: [] for name in observations.sensors}
     for fold in range(folds):
         tell(f"predicting images that were left out: block {fold + 1} of {folds}")
         rest = _some(counted, stacks, block != fold)
         again = refine_corners(rest, refined.X, refined.Y, told)
         for stack in _some_stacks(stacks, block == fold):
-            X, Y = again.X[stack.target].matrix(), again.Y[stack.sensor].matrix()
-            camera = again.intrinsics[stack.sensor].camera
-            shape = again.shapes[stack.target]
-            off = again.time_offsets_s.get(stack.sensor, 0.0), again.point.corners.get(stack.target)
-            seen = replace(stack, camera=camera)
-            errors = pixel_errors(seen, X, Y, A, parameters_of(camera), shape, *off).reshape(*stack.known.shape, 2)
-            length = np.linalg.norm(errors, axis=2)[stack.known]
-            on_target = length * depths(stack, X, Y, A, shape, *off)[stack.known] / camera.focal_px
-            found[stack.sensor].append((length, on_target, stack.pixels[stack.known]))
+            found[stack.sensor].append(_predicted(stack, A, again))
     return {
         name: _of_sensor(
-            np.concatenate([length for length, _, _ in each]),
-            np.concatenate([on_target for _, on_target, _ in each]),
-            np.concatenate([pixels for _, _, pixels in each]),
-            observations.cameras[name],
+            *(np.concatenate(values) for values in zip(*each, strict=True)), camera=observations.cameras[name]
         )
         for name, each in found.items()
     }
+
+
+def _predicted(stack: Stack, A: Array, refined: CornersRefined) -> tuple[Array, Array, Array, Array]:
+    """Lengths of a stack's errors (m,), in pixels and on the target, m; the squares that are expected; and the pixels.
+
+    The measured A of the stack's instants predicts them. A corner's square is expected to be the traces of its noise,
+    of the unknowns' covariance, and of A's noise.
+    """
+    model, known = refined.graph.model, stack.known
+    camera = refined.intrinsics[stack.sensor].camera
+    seen, point = replace(stack, camera=camera), replace(refined.point, A=A)
+    rows = model.linearised(seen, point)
+    length = np.linalg.norm(rows.residual.reshape(*known.shape, 2), axis=2)[known]
+    on_target = length * model.depths(seen, point)[known] / camera.focal_px
+    blocks = {
+        ("x", stack.target): rows.by_X,
+        ("y", stack.sensor): rows.by_Y,
+        ("k", model.camera_of[stack.sensor]): rows.by_camera,
+        ("b", stack.target): rows.by_shape,
+        ("t", stack.sensor): rows.by_time,
+    }
+    there = {name: block for name, block in blocks.items() if name in refined.slots}
+    J = np.concatenate(list(there.values()), axis=2)
+    index = np.concatenate([np.arange(refined.slots[name].start, refined.slots[name].stop) for name in there])
+    squares = np.einsum("vri,ij,vrj->vr", J, refined.joint[np.ix_(index, index)], J, optimize=True)
+    noise = refined.noise.carrier
+    if noise is not None:
+        by_A = rows.by_A
+        if model.about == "sensorcarrier":
+            by_A = by_A @ se3.adjoint(se3.inverse(A))[stack.instant]
+        squares += np.einsum("vri,i->vr", by_A**2, noise**2)
+    expected = 2.0 * refined.noise.corner_px**2 + squares.reshape(*known.shape, 2).sum(axis=2)[known]
+    return length, on_target, expected, stack.pixels[known]
 
 
 def _blocks(stacks: tuple[Stack, ...], instants: int, folds: int) -> np.ndarray:
@@ -127,7 +152,7 @@ def _blocks(stacks: tuple[Stack, ...], instants: int, folds: int) -> np.ndarray:
     return np.minimum((folds * place / count).astype(np.int64), folds - 1)
 
 
-def _of_sensor(length: Array, on_target: Array, pixels: Array, camera: Camera) -> HeldOut:
+def _of_sensor(length: Array, on_target: Array, expected: Array, pixels: Array, *, camera: Camera) -> HeldOut:
     size = np.array([camera.width, camera.height])
     at = np.clip((REGIONS * (pixels + 0.5) / size).astype(int), 0, REGIONS - 1)
     count, total = np.zeros((REGIONS, REGIONS)), np.zeros((REGIONS, REGIONS))
@@ -136,7 +161,11 @@ def _of_sensor(length: Array, on_target: Array, pixels: Array, camera: Camera) -
     regions = np.full((REGIONS, REGIONS), np.nan)
     regions[count > 0] = np.sqrt(total[count > 0] / count[count > 0])
     return HeldOut(
-        float(np.sqrt((length**2).mean())), float(1e3 * np.sqrt((on_target**2).mean())), len(length), regions
+        float(np.sqrt((length**2).mean())),
+        float(1e3 * np.sqrt((on_target**2).mean())),
+        len(length),
+        float(np.sqrt(expected.mean())),
+        regions,
     )
 
 

@@ -30,8 +30,9 @@ class CornerOptions:
         result says so.
     shared : tuple of tuple of str
         Groups of sensors whose intrinsics are the same: those of the group's first sensor are stated.
-    size_share : float
-        Standard deviation of the targets' sizes, a share of 1; 0: they are exactly as stated.
+    size_share : float, or dict of str to float
+        Standard deviation of the targets' sizes, a share of 1; 0: they are exactly as stated, as are those of targets
+        that a dict lacks.
     warp_m : float
         Standard deviation of the height of a bent board's edge over its middle, metres; 0: boards are flat.
     corners_m : float
@@ -54,7 +55,7 @@ class CornerOptions:
 
     stated: Stated | Mapping[str, Stated] = "nominal"
     shared: tuple[tuple[str, ...], ...] = field(default=())
-    size_share: float = 0.0
+    size_share: float | Mapping[str, float] = 0.0
     warp_m: float = 0.0
     corners_m: float = 0.0
     carrier_noise: CarrierNoise | CarrierPoses = "estimate"
@@ -73,10 +74,11 @@ class CornerOptions:
                 raise OptionError(
                     f"CornerOptions.{words}={brief(value)} is not one of {', '.join(map(repr, get_args(choices)))}"
                 )
-        for name in ("size_share", "warp_m", "corners_m"):
-            value = getattr(self, name)
-            if not (is_real(value) and 0.0 <= value < np.inf):
-                raise OptionError(f"CornerOptions.{name}={brief(value)}; give a standard deviation, or 0")
+        shares = self.size_share.values() if isinstance(self.size_share, Mapping) else (self.size_share,)
+        others = (("warp_m", self.warp_m), ("corners_m", self.corners_m))
+        for name, deviation in (*(("size_share", each) for each in shares), *others):
+            if not (is_real(deviation) and 0.0 <= deviation < np.inf):
+                raise OptionError(f"CornerOptions.{name}={brief(deviation)}; give a standard deviation, or 0")
         noise = self.carrier_noise
         if not isinstance(noise, CarrierNoise) and not is_one_of(noise, get_args(CarrierPoses)):
             raise OptionError(
@@ -99,6 +101,10 @@ class CornerOptions:
     def stated_of(self, sensor: str) -> Stated:
         """Where a sensor's intrinsics come from."""
         return self.stated.get(sensor, "nominal") if isinstance(self.stated, Mapping) else self.stated
+
+    def size_share_of(self, target: str) -> float:
+        """The standard deviation of a target's size, a share of 1."""
+        return self.size_share.get(target, 0.0) if isinstance(self.size_share, Mapping) else self.size_share
 
     def camera_of(self, sensor: str) -> str:
         """The sensor whose intrinsics this sensor has: its own, or the first one's of its group."""

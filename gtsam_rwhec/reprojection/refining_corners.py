@@ -173,10 +173,12 @@ def _stated(
         noise, about = Noise(ROUGH.corner_px, given.rotation_rad, given.translation_m), given.about
     elif given == "exact":
         noise = Noise(ROUGH.corner_px, 0.0, 0.0)
-    shape = np.array([options.size_share, options.warp_m, options.warp_m])
+    shapes = {
+        name: np.array([options.size_share_of(name), options.warp_m, options.warp_m]) for name in observations.targets
+    }
     model = Model(
         stacks, A, noise.carrier, about, first, priors,
-        dict.fromkeys(observations.targets, shape) if shape.any() else {},
+        {name: shape for name, shape in shapes.items() if shape.any()},
         noise.corner_px, tuple(stack.known.astype(float) for stack in stacks),
         dict.fromkeys(options.time_offsets, OFFSET_S),
         dict.fromkeys(observations.targets, options.corners_m) if options.corners_m else {},

@@ -1,0 +1,199 @@
+"""The stage that refines from corners: which model of A and of sizes predicts images best, and what comes out.
+
+Poses of boards come first: they give the certified start, the outliers among images, the noise in time and over the
+configuration. The corners then give the answer, with the cameras' intrinsics as variables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gtsam_rwhec.calibration.choices import Choice
+from gtsam_rwhec.calibration.corner_choice import Tried, chosen_model
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.noise_model.found import NoiseInData
+from gtsam_rwhec.noise_model.in_corners import beyond_independent_errors
+from gtsam_rwhec.refinement.options import CarrierNoise
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.reprojection_found import Intrinsics, Reprojection, SensorReprojection, TriedModel
+from gtsam_rwhec.reprojection.as_refined import as_refined, boards_of, intrinsics_of
+from gtsam_rwhec.reprojection.consequences import consequences_of
+from gtsam_rwhec.reprojection.findings import is_doubtful
+from gtsam_rwhec.reprojection.held_out import HeldOut
+from gtsam_rwhec.reprojection.observations import Observations
+from gtsam_rwhec.reprojection.options import CornerOptions
+from gtsam_rwhec.reprojection.refined import CornersRefined
+from gtsam_rwhec.reprojection.refining_corners import refine_corners
+
+#: What is chosen: the measurements that the answer is from.
+MEASUREMENTS = "refinement"
+#: Standard deviation of a size that is estimated, a share of 1.
+SIZE_SHARE = 0.2
+#: Images that were left out are off by more than this times what covariances say, where the model lacks something.
+UNEXPLAINED = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class CornersFound:
+    """What the corners gave.
+
+    Attributes
+    ----------
+    corners : CornersRefined or None
+        None where they give no better answer than the poses.
+    intrinsics : dict of str to Intrinsics
+    reprojection : Reprojection or None
+    choices : tuple of Choice
+    findings : tuple of Finding
+    """
+
+    corners: CornersRefined | None
+    intrinsics: dict[str, Intrinsics]
+    reprojection: Reprojection | None
+    choices: tuple[Choice, ...]
+    findings: tuple[Finding, ...]
+
+    @staticmethod
+    def none(why: str) -> CornersFound:
+        """Nothing, and why."""
+        return CornersFound(None, {}, None, (Choice(MEASUREMENTS, "from the poses of targets in the images", why),), ())
+
+    @property
+    def contradicted(self) -> tuple[str, ...]:
+        """Sensors whose stated intrinsics the corners contradict."""
+        corners = self.corners
+        if corners is None:
+            return ()
+        return tuple(name for name, one in corners.intrinsics.items() if one.innovation.is_contradicted)
+
+    def refined(self, base: Refined, noise: NoiseInData | None) -> Refined:
+        """The answer: from the corners, with what the poses (`base`) say of their noise; `base` where there is none."""
+        if self.corners is None or self.reprojection is None:
+            return base
+        more = None if noise is None else beyond_independent_errors(self.corners, noise)
+        return as_refined(base, self.corners, self.reprojection, self.intrinsics, more)
+
+
+def corners_found(
+    X: Mapping[str, PoseLike],
+    Y: Mapping[str, PoseLike],
+    observations: Observations,
+    options: CornerOptions,
+    tell: Progress,
+) -> CornersFound:
+    """Refine from corners under the options, or with A as exact where that predicts images better.
+
+    Parameters
+    ----------
+    X, Y : dict of str to pose
+        The start: the answer from the poses of the same images.
+    observations : Observations
+    options : CornerOptions
+    tell : callable
+    """
+    try:
+        tried = chosen_model(observations, X, Y, options, tell)
+        tell("refining from corners")
+        corners = refine_corners(observations, X, Y, tried.options, tell)
+    except RwhecError as error:
+        return CornersFound.none(f"the corners give none: {error}")
+    if is_doubtful(corners):
+        return CornersFound.none(f"the corners do not fit together: {' '.join(corners.findings)}")
+    intrinsics = intrinsics_of(corners, {name: options.stated_of(options.camera_of(name)) for name in corners.Y})
+    return CornersFound(
+        corners,
+        intrinsics,
+        _numbers(observations, corners, tried),
+        tuple(_choices(observations, corners, tried, intrinsics)),
+        tuple(_findings(corners, tried, intrinsics)),
+    )
+
+
+def _numbers(observations: Observations, corners: CornersRefined, tried: Tried) -> Reprojection:
+    exact = corners.noise.carrier is None
+    given = isinstance(tried.options.carrier_noise, CarrierNoise)
+    sensors = {}
+    squares = count = 0.0
+    for name in corners.Y:
+        views = {pair: view for pair, view in observations.views.items() if pair[1] == name}
+        left_out = sum(int(corners.left_out[pair].sum()) for pair in views)
+        number = sum(int(view.known.sum()) for view in views.values()) - left_out
+        rms = corners.intrinsics[name].rms_px
+        squares, count = squares + number * rms**2, count + number
+        held_out = tried.held_out.get(name)
+        sensors[name] = SensorReprojection(
+            images=sum(len(view.A) for view in views.values()),
+            corners=number,
+            left_out=left_out,
+            rms_px=rms,
+            held_out_px=None if held_out is None else held_out.rms_px,
+            held_out_mm=None if held_out is None else held_out.rms_mm,
+            expected_px=None if held_out is None else held_out.expected_px,
+            regions_px=() if held_out is None else _regions(held_out),
+        )
+    return Reprojection(
+        rms_px=float(np.sqrt(squares / max(count, 1.0))),
+        corner_px=corners.noise.corner_px,
+        carrier_poses="exact" if exact else "given" if given else "estimated",
+        carrier_rotation_rad=corners.noise.carrier_rad,
+        carrier_translation_m=corners.noise.carrier_m,
+        sensors=sensors,
+        boards=boards_of(corners),
+        tried=tuple(
+            TriedModel(one.words, one.px, one.mm, one is tried.scores[0]) for one in tried.scores if np.isfinite(one.px)
+        ),
+        consequences=consequences_of(corners),
+    )
+
+
+def _regions(held_out: HeldOut) -> tuple[tuple[float | None, ...], ...]:
+    rows: Array = held_out.regions_px
+    return tuple(tuple(None if np.isnan(value) else float(value) for value in row) for row in rows)
+
+
+def _choices(
+    observations: Observations, corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, Intrinsics]
+) -> Iterator[Choice]:
+    number = sum(int(view.known.sum()) for view in observations.views.values())
+    number -= sum(int(mask.sum()) for mask in corners.left_out.values())
+    chosen = f"from {number} corners ({corners.noise.corner_px:.2g} px), with {tried.words}"
+    yield Choice(MEASUREMENTS, chosen, tried.evidence)
+    for name, one in intrinsics.items():
+        f, c = max(one.standard_deviations[:2]), max(one.standard_deviations[2:4])
+        known = {
+            "calibration": "a calibration states them, and may be off by as much as calibrations are",
+            "nominal": "the stated ones count as nominal (write stated: calibration where a calibration states them)",
+            "unknown": "none are stated",
+        }[one.stated_as]
+        found = f"estimated with the poses, to {rounded(f)} px of f and {rounded(c)} px of c"
+        if one.held_by_prior:
+            found += f"; {', '.join(one.held_by_prior)} about as stated, since the images do not tell them"
+        yield Choice(f"intrinsics of {name}", found, known)
+
+
+def _findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, Intrinsics]) -> Iterator[Finding]:
+    for name, one in intrinsics.items():
+        innovation = corners.intrinsics[name].innovation
+        if innovation.is_contradicted:
+            before, after = (np.rint(camera.K).astype(int) for camera in (one.stated_camera, one.camera))
+            stated, found = (f"fx, fy = {K[0, 0]}, {K[1, 1]}; cx, cy = {K[0, 2]}, {K[1, 2]}" for K in (before, after))
+            words = (
+                f"the intrinsics of {name}, as stated ({stated}), do not fit its corners ({innovation.deviations:.2g} "
+                f"deviations off); the estimated ones ({found}) are used"
+            )
+            yield Finding(Ground.INTRINSICS_ESTIMATED, words)
+    for score in tried.scores[:1]:
+        times = score.px / score.expected_px
+        if times > UNEXPLAINED:
+            words = (
+                f"images that were left out are predicted to {score.mm:.2g} mm on the target, {times:.2g} times as far "
+                "off as the noise of corners and of A explains: the arm's poses, or the target, have systematic errors"
+            )
+            yield Finding(Ground.SYSTEMATIC, words)
