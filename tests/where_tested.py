@@ -37,6 +37,7 @@ TABLE: dict[str, dict[str, str]] = {
             "calibrated choices clock_stage disagreement noise_choice noise_found noise_stage options "
             "outliers run statement_stage"
         ),
+        "calibration/test_corner_stage.py": "corner_choice",
         "calibration/test_cross_validation.py": "folds prediction_errors",
         "calibration/test_task_units.py": "point_uncertainty seen_from",
         "calibration/test_misreadings.py": "reading readings samples trial_fits wrong_units",
@@ -120,13 +121,14 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_seen_sheet.py": "detected_source image_names",
         "pipeline/test_bad_logs.py": "no_detections",
         "pipeline/test_kept_detections.py": "detection_inputs",
+        "pipeline/test_log_corners.py": "corner_answer",
         "pipeline/test_doubted_intrinsics.py": "seen_corners",
         "pipeline/test_log_findings.py": "output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",
         "pipeline/test_same_log.py": "log_metadata",
         "pipeline/test_synthetic_calibration.py": (
             "carrier_motion cleaning_stage detection_stage detections_in_images image_detections measured_pairs "
-            "sensor_detections solution_frames solution_plots solved_log solving_rounds solving_stage"
+            "sensor_detections settled_poses solution_frames solution_plots solved_log solving_rounds solving_stage"
         ),
     },
     "gtsam_rwhec/problem": {

@@ -25,7 +25,7 @@ from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.reprojection_found import Intrinsics, Reprojection, SensorReprojection, TriedModel
 from gtsam_rwhec.reprojection.as_refined import as_refined, boards_of, intrinsics_of
 from gtsam_rwhec.reprojection.consequences import consequences_of
-from gtsam_rwhec.reprojection.findings import is_doubtful
+from gtsam_rwhec.reprojection.findings import is_doubtful, lens_that_was_left_out
 from gtsam_rwhec.reprojection.held_out import HeldOut
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
@@ -166,12 +166,15 @@ def _choices(
     chosen = f"from {number} corners ({corners.noise.corner_px:.2g} px), with {tried.words}"
     yield Choice(MEASUREMENTS, chosen, tried.evidence)
     for name, one in intrinsics.items():
+        if one.stated_as == "exact":
+            yield Choice(f"intrinsics of {name}", "as stated, which count as exact", "an option says so")
+            continue
         f, c = max(one.standard_deviations[:2]), max(one.standard_deviations[2:4])
         known = {
             "calibration": "a calibration states them, and may be off by as much as calibrations are",
             "nominal": "the stated ones count as nominal (write stated: calibration where a calibration states them)",
             "unknown": "none are stated",
-        }[one.stated_as]
+        }.get(one.stated_as, "")
         found = f"estimated with the poses, to {rounded(f)} px of f and {rounded(c)} px of c"
         if one.held_by_prior:
             found += f"; {', '.join(one.held_by_prior)} about as stated, since the images do not tell them"
@@ -189,6 +192,10 @@ def _findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, In
                 f"deviations off); the estimated ones ({found}) are used"
             )
             yield Finding(Ground.INTRINSICS_ESTIMATED, words)
+        lens = lens_that_was_left_out(corners, [name])
+        if lens:
+            words = f"the intrinsics of {name} are stated without distortion, and its corners show one: {lens}"
+            yield Finding(Ground.INTRINSICS_ESTIMATED, f"{words}; the estimated ones are used")
     for score in tried.scores[:1]:
         times = score.px / score.expected_px
         if times > UNEXPLAINED:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 
 from gtsam_rwhec.calibration.corner_stage import SIZE_SHARE, CornersFound, corners_found
@@ -86,24 +87,39 @@ def _from_corners(
 def _with_estimated(
     given: SynchronisedPairs, logged: LogCorners, cameras: Mapping[str, Camera], found: CornersFound
 ) -> SynchronisedPairs:
-    """The pairs with B by the estimated intrinsics: of a plane's two poses, the one near the answer's."""
+    """The pairs with B by the estimated intrinsics."""
     assert found.corners is not None
-    X, Y = found.corners.X, found.corners.Y
     estimated = {**cameras, **{name: one.camera for name, one in found.intrinsics.items()}}
-    pairs: Pairs = dict(given.pairs)
-    for pair, measured in given.pairs.items():
+    corners = found.corners
+    pairs = with_intrinsics(given.pairs, logged, estimated, corners.X, corners.Y, corners.noise.corner_px)
+    return replace(given, pairs=pairs)
+
+
+def with_intrinsics(
+    pairs: Pairs,
+    logged: LogCorners,
+    cameras: Mapping[str, Camera],
+    X: Mapping[str, gtsam.Pose3],
+    Y: Mapping[str, gtsam.Pose3],
+    corner_px: float,
+) -> Pairs:
+    """The pairs with B of their corners by some intrinsics: of a plane's two poses, the one near Y^-1 A X.
+
+    Raises TargetError for a target that is not flat: it has no pose in an image alone.
+    """
+    changed = dict(pairs)
+    for pair, measured in pairs.items():
         seen, pixels = logged.seen(measured)
         if not len(seen) or pair.target not in X or pair.sensor not in Y:
             continue
         A = measured.A[seen]
         predicted: Array = np.linalg.inv(Y[pair.sensor].matrix()) @ A @ X[pair.target].matrix()
-        observations = logged.of_views({pair: (A, pixels, None)}, estimated)
-        observations = replace(observations, corner_px=found.corners.noise.corner_px)
+        observations = replace(logged.of_views({pair: (A, pixels, None)}, cameras), corner_px=corner_px)
         poses = observations.poses({pair: predicted}).measurements(*pair)
         B = measured.B.copy()
         B[seen] = poses.B
         covariance = None if measured.covariance is None else measured.covariance.copy()
         if covariance is not None and poses.covariances is not None:
             covariance[seen] = poses.covariances
-        pairs[pair] = replace(measured, B=B, covariance=covariance)
-    return replace(given, pairs=pairs)
+        changed[pair] = replace(measured, B=B, covariance=covariance)
+    return changed

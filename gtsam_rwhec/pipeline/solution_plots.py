@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rwhec_factors import se3
 
+from gtsam_rwhec.errors import TargetError
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.logs import Log, open_log
+from gtsam_rwhec.pipeline.corner_answer import with_intrinsics
+from gtsam_rwhec.pipeline.log_corners import LogCorners
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs
 from gtsam_rwhec.pipeline.plotted_corners import plotted_corners, plotted_intrinsics, seen_views
 from gtsam_rwhec.pipeline.solution_frames import frames_of
@@ -36,10 +40,10 @@ def plot_all(solved: Solved, solved_path: str | Path, folder: Path) -> list[Path
     covariances = {frame: solved.refined.covariance(name) for name, frame in names.items()}
     plot_frames(frames, covariances, folder / FRAMES)
     plot_deviations(frames, covariances, folder / DEVIATIONS)
-    plot_residuals(plotted_residuals(solved), folder / RESIDUALS)
-    written = [folder / FRAMES, folder / DEVIATIONS, folder / RESIDUALS]
     with open_log(solved_path) as log:
         seen = seen_views(solved, log)
+        plot_residuals(plotted_residuals(by_estimated_intrinsics(solved, log)), folder / RESIDUALS)
+    written = [folder / FRAMES, folder / DEVIATIONS, folder / RESIDUALS]
     if seen:
         corners = plotted_corners(solved, seen)
         plot_coverage(corners, {name: solved.cameras[name] for name in corners}, folder / COVERAGE)
@@ -49,6 +53,20 @@ def plot_all(solved: Solved, solved_path: str | Path, folder: Path) -> list[Path
         plot_intrinsics(cameras, folder / INTRINSICS)
         written.append(folder / INTRINSICS)
     return written
+
+
+def by_estimated_intrinsics(solved: Solved, log: Log) -> Solved:
+    """The same with poses of targets by the estimated intrinsics, if there are any; the log has those by the stated."""
+    refined = solved.refined
+    if refined.reprojection is None:
+        return solved
+    cameras = {**solved.cameras, **{name: one.camera for name, one in refined.intrinsics.items()}}
+    corners = LogCorners.of(log, solved.rig, cameras)
+    try:
+        pairs = with_intrinsics(solved.pairs, corners, cameras, refined.X, refined.Y, refined.reprojection.corner_px)
+    except TargetError:  # a bundle that is not flat has no pose by the corners of one image
+        return solved
+    return replace(solved, pairs=pairs)
 
 
 def plotted_residuals(solved: Solved) -> dict[Pair, PlottedMeasurement]:

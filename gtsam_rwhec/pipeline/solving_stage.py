@@ -222,7 +222,11 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         ),
     )
     solution, cameras = refined.solution, dict(metadata.cameras)
-    return Calibrated(refined, solution, settled.pairs, fields, cameras, rig, judgement, calibration)
+    # With B by the stated intrinsics, as it was read: a log that is solved again begins where it began.
+    pairs = {
+        pair: replace(one, B=pairs[pair].B, covariance=pairs[pair].covariance) for pair, one in settled.pairs.items()
+    }
+    return Calibrated(refined, solution, pairs, fields, cameras, rig, judgement, calibration)
 
 
 def _outliers(counts: tuple[OutlierCount, ...], *, looked_for: bool) -> Outliers:

@@ -138,7 +138,8 @@ def intrinsics_of(corners: CornersRefined, stated: Mapping[str, Stated]) -> dict
 def _joint(base: Refined, corners: CornersRefined, more: Array | None) -> JointCovariance:
     """The covariance of frames, scales, offsets, intrinsics and shapes, in GTSAM's order of the unknowns.
 
-    Sensors that share a camera have its rows each: the covariance is singular there, as it is.
+    Sensors that share a camera have its rows each: the covariance is singular there, as it is. Places of single corners
+    are left out: they are unknowns of the graph, and of no interest beside a board's.
     """
     covariance = corners.joint if more is None else corners.joint + more
     parts: list[tuple[Unknown, slice, float | Array]] = []

@@ -144,7 +144,7 @@ def _of_intrinsics(refined: CornersRefined, options: CornerOptions) -> Iterator[
         if options.stated_of(options.camera_of(names[0])) == "exact":
             yield f"The intrinsics of {of} are held as stated (exact): how far off they are is in no deviation."
             continue
-        lens = _lens_that_was_left_out(refined, names)
+        lens = lens_that_was_left_out(refined, names)
         if lens:
             yield f"The stated intrinsics of {of} have no distortion, and the images show one: {lens}."
         contradicted = [part for part in intrinsics.innovation.contradicted if not (lens and part == "distortion")]
@@ -176,7 +176,7 @@ def _off(intrinsics: RefinedIntrinsics, part: str) -> str:
     return f"the {part} is off by {size} ({deviations:.2g} deviations)"
 
 
-def _lens_that_was_left_out(refined: CornersRefined, sensors: list[str]) -> str:
+def lens_that_was_left_out(refined: CornersRefined, sensors: list[str]) -> str:
     """The distortion of sensors that share a camera, which was stated without; empty where there is none."""
     model, intrinsics = refined.graph.model, refined.intrinsics[sensors[0]]
     mean, _ = model.camera_priors[model.camera_of[sensors[0]]]

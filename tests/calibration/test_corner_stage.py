@@ -38,7 +38,7 @@ def with_bent_arm(given: Cell) -> rw.Observations:
 
 
 def test_exact_and_noisy_poses_are_told_apart_by_images_that_were_left_out() -> None:
-    exact, noisy = cell(3, images=40), cell(3, images=40, carrier=(2e-3, 1e-3))
+    exact, noisy = cell(3, images=24), cell(3, images=24, carrier=(2e-3, 1e-3))
     for given, px in ((exact, 0.3), (noisy, 6.0)):
         tried = chosen_model(given.observations, *start(given), rw.CornerOptions(), silent)
         assert {score.words for score in tried.scores} == {
@@ -51,30 +51,34 @@ def test_exact_and_noisy_poses_are_told_apart_by_images_that_were_left_out() -> 
 
 
 def test_what_is_chosen_and_found_is_said() -> None:
-    given = cell(4, images=40, carrier=(5e-4, 2e-4), stated="calibration")
+    given = cell(4, images=24, carrier=(5e-4, 2e-4), stated="calibration")
     found = corners_found(*start(given), given.observations, rw.CornerOptions(stated="calibration"), silent)
-    assert found.corners is not None and found.reprojection is not None
-    assert found.findings == () and found.contradicted == ()
+    assert found.corners is not None
+    assert found.reprojection is not None
+    assert found.findings == ()
+    assert found.contradicted == ()
     assert [choice.what for choice in found.choices] == [MEASUREMENTS, "intrinsics of cam_0", "intrinsics of cam_1"]
     assert "a calibration states them" in str(found.choices[1])
     sensors = found.reprojection.sensors
     assert sum(one.images for one in sensors.values()) == sum(len(view.A) for view in given.observations.views.values())
     assert all(one.held_out_px is not None and one.expected_px is not None for one in sensors.values())
-    assert found.reprojection.rms_px < 0.12 and found.reprojection.carrier_poses == "estimated"
+    assert found.reprojection.rms_px < 0.12
+    assert found.reprojection.carrier_poses == "estimated"
     assert {one.frame for one in found.reprojection.consequences} == {"board", "cam_0", "cam_1"}
 
 
 def test_stated_intrinsics_that_are_off_are_named() -> None:
     off = np.array([0.0, 0.0, 25.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    given = cell(5, images=40, stated_off=off)
+    given = cell(5, images=24, stated_off=off)
     found = corners_found(*start(given), given.observations, rw.CornerOptions(stated="calibration"), silent)
     assert set(found.contradicted) == {"cam_0", "cam_1"}
     assert {one.ground for one in found.findings} == {Ground.INTRINSICS_ESTIMATED}
-    assert "cx, cy = 985, 540" in found.findings[0].words and "960, 540" in found.findings[0].words
+    assert "cx, cy = 985, 540" in found.findings[0].words
+    assert "cx, cy = 960" in found.findings[0].words
 
 
 def test_a_bent_arm_is_named() -> None:
-    given = cell(6, images=40)
+    given = cell(6, images=24)
     found = corners_found(*start(given), with_bent_arm(given), rw.CornerOptions(carrier_noise="exact"), silent)
     assert Ground.SYSTEMATIC in {one.ground for one in found.findings}
 
@@ -82,12 +86,14 @@ def test_a_bent_arm_is_named() -> None:
 def test_few_images_are_not_left_out_and_nonsense_gives_nothing() -> None:
     few = cell(7, cameras=1, images=7)
     found = corners_found(*start(few), few.observations, rw.CornerOptions(carrier_noise="exact"), silent)
-    assert found.reprojection is not None and found.reprojection.tried == ()
+    assert found.reprojection is not None
+    assert found.reprojection.tried == ()
     assert "no other was tried: 7 instants cannot be left out in 8 blocks" in str(found.choices[0])
     X, Y = start(few)
     turned = {name: T @ np.diag([1.0, -1.0, -1.0, 1.0]) for name, T in Y.items()}
     nothing = corners_found(X, turned, few.observations, rw.CornerOptions(), silent)
-    assert nothing.corners is None and "behind" in str(nothing.choices[0])
+    assert nothing.corners is None
+    assert "behind" in str(nothing.choices[0])
 
 
 def test_many_images_are_thinned_evenly() -> None:

@@ -11,8 +11,10 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import LogError
-from gtsam_rwhec.pipeline import clean_log, detect_log, read_corners, write_folder_log
+from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.pipeline import clean_log, detect_log, read_corners, solve_log, write_folder_log
 from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion
+from gtsam_rwhec.pipeline.measured_pairs import read_pairs
 from gtsam_rwhec.reprojection import held_out_errors
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
@@ -41,6 +43,25 @@ def test_a_workcell_of_other_people(workcell_camera2: Path, tmp_path: Path) -> N
     assert held_out_errors(found.observations, refined)["camera2"].rms_mm < 0.2
 
 
+def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_camera2: Path, tmp_path: Path) -> None:
+    """Nominal intrinsics in its rig file: the simulator's own are within what the corners say of theirs."""
+    corners_of(workcell_camera2, WORKCELL, tmp_path)
+    solved = solve_log(tmp_path / "clean.mcap")
+    assert solved.judgement.verdict is rw.Verdict.USE
+    found = solved.refined.intrinsics["camera2"]
+    assert found.stated_as == "nominal"
+    assert found.values[2] == pytest.approx(959.5, abs=4.0)
+    assert solved.refined.reprojection is not None
+    sensor = solved.refined.reprojection.sensors["camera2"]
+    assert sensor.held_out_mm is not None
+    assert sensor.held_out_mm < 0.2
+    # the log keeps the poses by the stated intrinsics: it can be solved again
+    with open_log(tmp_path / "clean.mcap") as log:
+        read = read_pairs(log, solved.rig)
+    for pair, measured in solved.pairs.items():
+        np.testing.assert_array_equal(measured.B, read[pair].B)
+
+
 def test_nominal_intrinsics_of_other_people(circle_grid_10x10: Path, tmp_path: Path) -> None:
     """With f, c and the spacing as stated the corners of images that are left out are predicted to 4.6 mm."""
     observations = corners_of(circle_grid_10x10, CIRCLES, tmp_path)
@@ -50,6 +71,22 @@ def test_nominal_intrinsics_of_other_people(circle_grid_10x10: Path, tmp_path: P
     assert camera.K[0, 0] == pytest.approx(530.0, abs=20.0)
     assert found.refined.shapes["grid"][0] == pytest.approx(-0.02, abs=0.01)
     assert held_out_errors(found.observations, found.refined, options)["camera"].rms_mm < 0.7 * 4.6
+
+
+def test_the_log_road_chooses_what_predicts_left_out_images_of_other_people(
+    circle_grid_10x10: Path, tmp_path: Path
+) -> None:
+    """Freeing the errors of A predicts them to 10 mm, A as exact to 2; and the arm's errors are named."""
+    corners_of(circle_grid_10x10, CIRCLES, tmp_path)
+    solved = solve_log(tmp_path / "clean.mcap")
+    reprojection = solved.refined.reprojection
+    assert reprojection is not None
+    assert reprojection.carrier_poses == "exact"
+    held_out = reprojection.sensors["camera"].held_out_mm
+    assert held_out is not None
+    assert held_out < 0.7 * 4.6
+    assert held_out == min(one.held_out_mm for one in reprojection.tried)
+    assert any("Systematic errors: found" in str(choice) for choice in solved.calibration.choices)
 
 
 def test_velocities_are_those_of_the_path_where_it_moves() -> None:
