@@ -66,19 +66,72 @@ class Stack:
 class Linear:
     """Residuals of a stack (V, 2n), in pixels, and their derivatives (V, 2n, m) by each variable.
 
-    Poses move as T Expmap([omega, v]), A at its instant. Of a stack without velocities, those by the time offset are
-    zero. Each corner's residuals have derivatives (V, n, 2, 3) by its own place. A residual is infinite where a corner
-    is behind its camera.
+    Poses move as T Expmap([omega, v]), A at its instant. All of them move the target's pose in the sensor's frame, B =
+    Y^-1 A Expmap(t w) X, so the derivatives by B turn into theirs by adjoints, when they are asked for. A residual is
+    infinite where a corner is behind its camera.
+
+    Attributes
+    ----------
+    residual : (V, 2n) array
+    by_B : (V, 2n, 6) array
+    by_camera : (V, 2n, m) array
+    B : (V, 4, 4) array
+    X : (4, 4) array
+    shapes : (n, 3, k) array
+        Derivatives of the corners' places by the numbers of the shape.
+    twist : (V, 6) array, optional
+    offset_s : float
     """
 
     residual: Array
-    by_X: Array
-    by_Y: Array
-    by_A: Array
+    by_B: Array
     by_camera: Array
-    by_shape: Array
-    by_time: Array
-    by_corners: Array
+    B: Array
+    X: Array
+    shapes: Array
+    twist: Array | None
+    offset_s: float
+
+    @property
+    def by_X(self) -> Array:
+        """By X: B Expmap(xi)."""
+        return self.by_B
+
+    @property
+    def by_Y(self) -> Array:
+        """By Y: Expmap(-xi) B = B Expmap(-Ad(B^-1) xi)."""
+        return -(self.by_B @ se3.adjoint(se3.inverse(self.B)))
+
+    @property
+    def by_A(self) -> Array:
+        """By A at its instant: A Expmap(xi) Expmap(t w) = A Expmap(t w) Expmap(Ad xi), the adjoint of Expmap(-t w)."""
+        later = self._by_later_A
+        if self.twist is None or self.offset_s == 0.0:
+            return later
+        return later @ se3.adjoint(se3.expmap(-self.offset_s * self.twist))
+
+    @property
+    def by_time(self) -> Array:
+        """By the time offset (V, 2n, 1): Expmap((t + e) w) = Expmap(t w) Expmap(e w). Zero of a stack without w."""
+        if self.twist is None:
+            return np.zeros((*self.residual.shape, 1))
+        return self._by_later_A @ self.twist[..., None]
+
+    @property
+    def by_corners(self) -> Array:
+        """Each corner's residuals by its own place (V, n, 2, 3)."""
+        V, n = len(self.residual), len(self.shapes)
+        return self.by_B[..., 3:].reshape(V, n, 2, 3)
+
+    @property
+    def by_shape(self) -> Array:
+        """By the numbers of the shape."""
+        return (self.by_corners @ self.shapes).reshape(*self.residual.shape, -1)
+
+    @property
+    def _by_later_A(self) -> Array:
+        """By A at the image's own time."""
+        return self.by_B @ se3.adjoint(se3.inverse(self.X)[None])
 
 
 def stacks_of(observations: Observations) -> tuple[tuple[Stack, ...], Array]:
@@ -125,10 +178,10 @@ class _Seen:
 
     Attributes
     ----------
-    p, q : (n, 3) arrays
-        In the target's frame, shaped, and in its carrier's; `by_shape` (n, 3, 3) are derivatives of `p`.
-    R : (V, 3, 3) array
-        Rotations T_sensor_targetcarrier.
+    p : (n, 3) array
+        In the target's frame, shaped; `by_shape` (n, 3, 3) are its derivatives.
+    B : (V, 4, 4) array
+        Poses T_sensor_target.
     P, z, x : (V, n, 3), (V, n) and (V, n, 2) arrays
         In the sensor's frame, their depths, and normalised coordinates; 1 and 0 for corners that were not seen.
     behind : (V, n) booleans
@@ -137,8 +190,7 @@ class _Seen:
 
     p: Array
     by_shape: Array
-    q: Array
-    R: Array
+    B: Array
     P: Array
     z: Array
     x: Array
@@ -154,16 +206,15 @@ def _seen(stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: fl
     p, by_shape = shaped(stack.points, shape)
     if moved is not None:
         p = p + moved
-    q = p @ X[:3, :3].T + X[:3, 3]
     B = se3.inverse(Y) @ A[stack.instant]
     if stack.twist is not None and offset_s != 0.0:
         B = B @ se3.expmap(offset_s * stack.twist)
-    R = B[:, :3, :3]
-    P = q @ R.transpose(0, 2, 1) + B[:, None, :3, 3]
+    B = B @ X
+    P = p @ B[:, :3, :3].transpose(0, 2, 1) + B[:, None, :3, 3]
     behind = stack.known & (P[..., 2] < NEAREST_M)
     z = np.where(stack.known & ~behind, P[..., 2], 1.0)
     x = np.where(stack.known[..., None], P[..., :2] / z[..., None], 0.0)
-    return _Seen(p, by_shape, q, R, P, z, x, behind)
+    return _Seen(p, by_shape, B, P, z, x, behind)
 
 
 def pixel_errors(
@@ -201,38 +252,31 @@ def linearised(
 ) -> Linear:
     """Residuals and derivatives of a stack at X, Y (4, 4), the instants' poses A (I, 4, 4), a camera and a shape.
 
-    `moved` (n, 3) is how far corners are off their places on the board, metres. The images were taken t = `offset_s`
-    after their instants: A Expmap(xi) Expmap(t w) = A Expmap(t w) Expmap(Ad xi) with the adjoint of Expmap(-t w), and
-    Expmap((t + e) w) = Expmap(t w) Expmap(e w).
+    `moved` (n, 3) is how far corners are off their places on the board, metres. The images were taken `offset_s` after
+    their instants.
     """
     V, n = stack.known.shape
     at = _seen(stack, X, Y, A, shape, offset_s, moved)
-    x, z, R, P, q, p = at.x, at.z, at.R, at.P, at.q, at.p
+    x, z = at.x, at.z
     pixels, by_x, by_parameters = pixels_and_derivatives(stack.camera, parameters, x)
-    to_x = np.concatenate([np.broadcast_to(np.eye(2), (V, n, 2, 2)), -x[..., None]], axis=-1) / z[..., None, None]
-    seen = stack.known[:, :, None, None]
-    by_P = np.where(seen, by_x @ to_x, 0.0)
-    by_q = by_P @ R[:, None]  # (V, n, 2, 3)
-    minus_hat_q = -se3.hat(q)
-    by_p = by_q @ X[:3, :3]
-
-    def rows(block: Array) -> Array:
-        return np.ascontiguousarray(block.reshape(V, 2 * n, -1))
-
-    by_A = rows(np.concatenate([by_q @ minus_hat_q, by_q], axis=-1))
-    by_time = np.zeros((V, 2 * n, 1))
-    if stack.twist is not None:
-        by_time = by_A @ stack.twist[..., None]
-        if offset_s != 0.0:
-            by_A = by_A @ se3.adjoint(se3.expmap(-offset_s * stack.twist))
-
+    by_P = np.empty((V, n, 2, 3))  # d x / d P = [I, -x] / z
+    by_P[..., :2] = by_x
+    by_P[..., 2] = -(by_x[..., 0] * x[..., :1] + by_x[..., 1] * x[..., 1:])
+    by_P *= (stack.known / z)[..., None, None]
+    by_B = np.empty((V, n, 2, 6))
+    by_p = (by_P.reshape(V, 2 * n, 3) @ at.B[:, :3, :3]).reshape(V, n, 2, 3)
+    by_B[..., 3:] = by_p
+    p = at.p[:, None]  # row' (omega x p) = omega' (p x row)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        by_B[..., i] = p[..., j] * by_p[..., k] - p[..., k] * by_p[..., j]
+    by_parameters *= stack.known[..., None, None]
     return Linear(
         at.errors(stack, pixels),
-        rows(np.concatenate([by_p @ -se3.hat(p), by_p], axis=-1)),
-        rows(np.concatenate([by_P @ se3.hat(P.reshape(-1, 3)).reshape(V, n, 3, 3), -by_P], axis=-1)),
-        by_A,
-        rows(np.where(seen, by_parameters, 0.0)),
-        rows(by_p @ at.by_shape),
-        by_time,
-        by_p,
+        by_B.reshape(V, 2 * n, 6),
+        by_parameters.reshape(V, 2 * n, -1),
+        at.B,
+        X,
+        at.by_shape,
+        stack.twist,
+        offset_s,
     )

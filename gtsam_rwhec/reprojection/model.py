@@ -102,7 +102,7 @@ class Model:
     def linearised(self, stack: Stack, point: Point) -> Linear:
         """Rows of a stack, in pixels; by the numbers of the board's shape that are free."""
         rows = linearised(stack, *self._arguments(stack, point))
-        return replace(rows, by_shape=rows.by_shape[..., self.free_shape(stack.target)])
+        return replace(rows, shapes=rows.shapes[..., self.free_shape(stack.target)])
 
     def depths(self, stack: Stack, point: Point) -> Array:
         """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
