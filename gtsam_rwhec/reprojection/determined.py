@@ -109,7 +109,7 @@ def check_determined(
     model: Model, start: Point, point: Point, joint: Array, slots: Mapping[tuple[str, str], slice]
 ) -> None:
     """UnderdeterminedError where a frame's deviation is not finite, or so large that the images do not say its pose."""
-    distance = min(_farthest(model, start), _farthest(model, point))
+    distance = min(farthest(model, start), farthest(model, point))
     limits = ROTATION_RAD, TRANSLATION_OF_DISTANCE * distance
     faults = []
     for (letter, name), at in slots.items():
@@ -146,7 +146,7 @@ def check_determined(
         )
 
 
-def _farthest(model: Model, point: Point) -> float:
+def farthest(model: Model, point: Point) -> float:
     """The largest depth of a corner that was seen, metres."""
     return max(float(model.depths(stack, point)[stack.known].max()) for stack in model.stacks)
 

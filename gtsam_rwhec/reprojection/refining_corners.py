@@ -23,12 +23,14 @@ from gtsam_rwhec.reprojection.determined import (
     check_determined,
     check_names,
     check_shared,
+    farthest,
     told_where_it_fails,
 )
 from gtsam_rwhec.reprojection.findings import findings_of
 from gtsam_rwhec.reprojection.freedom import degrees_of_freedom
 from gtsam_rwhec.reprojection.intrinsics import free_model, prior_of
 from gtsam_rwhec.reprojection.lens import camera_with, parameters_of
+from gtsam_rwhec.reprojection.leverage import check_motion
 from gtsam_rwhec.reprojection.model import BEHIND, Model, Point
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
@@ -120,8 +122,9 @@ def refine_corners(
         settled = _settled(
             replace(settled.model, camera_priors=now), settled.point, settled.noise, options, tell, settled.iterations
         )
-    rms = _rms(settled)
     point = settled.point
+    check_motion(settled.model, point, settled.noise, settled.joint, settled.slots, farthest(settled.model, point))
+    rms = _rms(settled)
     refined = CornersRefined(
         X={name: gtsam.Pose3(T) for name, T in point.X.items()},
         Y={name: gtsam.Pose3(T) for name, T in point.Y.items()},
