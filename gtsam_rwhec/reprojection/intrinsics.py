@@ -27,8 +27,6 @@ CENTRE_PX = {"exact": 1e-5, "calibration": 3.0, "nominal": 30.0, "unknown": 30.0
 CENTRE_OF_WIDTH = {"exact": 0.0, "calibration": 0.0, "nominal": 0.02, "unknown": 0.5}
 LENS_PX = {"exact": 1e-5, "calibration": 3.0}
 LENS_OF_FOCAL = {"nominal": 0.05, "unknown": 0.5}
-#: fx and fy differ by no more than a tenth of what both may be off by.
-UNEQUAL = 0.1
 
 
 def free_model(camera: Camera, stated: Stated) -> Camera:

@@ -102,5 +102,14 @@ def wider(deviation: Array, innovation: Innovation) -> Array:
 
 
 def held_by_prior(prior: Array, posterior: Array) -> np.ndarray:
-    """Which parameters (m,) only the prior holds."""
-    return np.asarray(np.sqrt(np.diagonal(posterior)) > HELD * prior)
+    """Which parameters (m,) only the prior holds: alone, or in a direction that the images do not tell.
+
+    A focal length that only the prior holds leaves fx and fy each a deviation that is smaller than the prior's, since
+    the images tell that they are equal. So principal directions are asked, in the prior's deviations; a direction
+    names the parameters that have half of its largest part and more.
+    """
+    scaled = posterior / np.outer(prior, prior)
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    parts = np.abs(vectors[:, values > HELD**2])
+    of_directions = (parts >= 0.5 * parts.max(axis=0, initial=0.0)).any(axis=1)
+    return np.asarray(of_directions | (np.diagonal(scaled) > HELD**2))

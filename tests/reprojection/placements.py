@@ -47,8 +47,8 @@ WEAK = Placement(depth_m=(2.0, 0.1), tilt=0.1, spread=(0.05, 0.05))
 #: What determines no intrinsics, or only some. Boards that are fronto-parallel to the last milliradian determine no
 #: poses either.
 UNDETERMINED = {
-    "nearly fronto-parallel": Placement(tilt=0.02),
-    "nearly fronto-parallel at one depth": Placement(depth_m=(1.5, 0.0), tilt=0.02),
+    "nearly fronto-parallel": Placement(tilt=0.005),
+    "nearly fronto-parallel at one depth": Placement(depth_m=(1.5, 0.0), tilt=0.005),
     "at one depth": Placement(depth_m=(1.5, 0.0)),
     "in a corner of the image": Placement(depth_m=(2.5, 0.2), aim=(0.5, 0.28), spread=(0.02, 0.015)),
 }

@@ -24,7 +24,9 @@ def refined(given: Cell, options: rw.CornerOptions) -> rw.CornersRefined:
 def test_boards_that_face_the_camera_straight_determine_no_place_along_its_axis(stated: str) -> None:
     # they turn about the camera's axis only; measured, about axes that are a milliradian apart
     given = cell(0, images=12, facing=Placement(tilt=0.0), carrier=NOISE)
-    with pytest.raises(UnderdeterminedError, match=r"pose of board, cam_0, cam_1: .* noise of A .* turn about two axes"):
+    with pytest.raises(
+        UnderdeterminedError, match=r"pose of board, cam_0, cam_1: .* noise of A .* turn about two axes"
+    ):
         refined(given, rw.CornerOptions(stated=stated))  # type: ignore[arg-type]
 
 
@@ -32,9 +34,7 @@ def test_tilts_of_more_than_the_noise_determine_it() -> None:
     given = cell(0, images=12, facing=Placement(tilt=0.01), carrier=NOISE)
     result = refined(given, rw.CornerOptions(stated="calibration"))
     model = result.graph.model
-    grows = grows_by_noise(
-        model, result.point, result.noise, result.joint, result.slots, farthest(model, result.point)
-    )
+    grows = grows_by_noise(model, result.point, result.noise, result.joint, result.slots, farthest(model, result.point))
     assert sorted(grows) == ["board", "cam_0", "cam_1"]
     assert max(grows.values()) < 0.5 * (1.0 + GROWS)
 
