@@ -73,7 +73,8 @@ def _reason(camera: Camera | None) -> str:
     if more.any():
         return (
             f"whose distortion has coefficients that Kalibr's radtan (k1, k2, p1, p2) lacks: {row(more)} "
-            "from the fifth on. Calibrate its intrinsics with four (k3 = 0), or with Kalibr itself."
+            "from the fifth on. Calibrate its intrinsics with four (k3 = 0), or with Kalibr itself; where corners "
+            "estimate them, state four."
         )
     return ""
 
