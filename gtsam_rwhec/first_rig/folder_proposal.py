@@ -147,7 +147,7 @@ def _text(
         else:
             guess_ = guessed_intrinsics(camera.size, found)
             section, remarks["sensors", name, "intrinsics"] = guess_.section, guess_.words
-            stated.append((name, section.camera_of_numbers("a first guess")))
+            stated.append((name, guess_.camera))
         rest = _rest(camera.poses)
         remarks["sensors", name, "time_offset"] = (
             f"s; {rest.words}, so no clock is estimated" if rest.at_rest else f"in motion: {rest.words}; or seconds"

@@ -25,7 +25,10 @@ from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.rig.sections import Carriers, Sensor
 from gtsam_rwhec.rig.target_sections import TagTarget, TargetSection
 from gtsam_rwhec.rig.written_rig import rig_text
+from gtsam_rwhec.vision.unknown_intrinsics import CORNERS
 
+#: Written where a log has none, for a person to replace.
+_NO_INTRINSICS = Intrinsics(file="camera.yaml")
 #: Comment on a sensor's time offset.
 _TIME_OFFSET = "or seconds, 0.0 for one clock (estimate needs rotation that speeds up and slows down)"
 
@@ -110,12 +113,16 @@ def _text(
     for guess in guesses:
         name = free_name(guess.name, taken)
         targets[name], remarks["targets", name] = guess.section, guess.remark
+    has_board = any(len(section.target(name).corners()) >= CORNERS for name, section in targets.items())
     for camera in cameras:
         name = names[camera.name]
         frame = camera.frame if is_name(camera.frame) and camera.frame not in taken else None
         taken |= {frame} if frame else set()
         sensors[name] = camera.section.model_copy(update={"frame": frame, "time_offset": "estimate"})
         remarks |= {("sensors", name, key): words for key, words in camera.remarks.items()}
+        if camera.section.images is not None and camera.section.intrinsics == _NO_INTRINSICS and has_board:
+            sensors[name] = sensors[name].model_copy(update={"intrinsics": Intrinsics(estimate="any")})
+            remarks["sensors", name, "intrinsics"] = "no topic has them: a board's images say them; a file is better"
     of_log = evidence_of_log(log, contents, pair.source, sensors, [s.target(name) for name, s in targets.items()])
     for name, sensor in sensors.items():
         rest = of_log.rest.get(sensor.images or "")
@@ -176,7 +183,7 @@ def _cameras(contents: LogContents, notes: list[str]) -> list[_Camera]:
         """Add a sensor, with the comment `missing` if the log lacks the intrinsics that it needs; return its name."""
         intrinsics, remark = _intrinsics(source.topic, source.frame, contents.intrinsics, sources)
         if intrinsics is None and missing:
-            intrinsics, remark = Intrinsics(file="camera.yaml"), missing
+            intrinsics, remark = _NO_INTRINSICS, missing
         name = free_name(camera_name(source.topic, source.frame), taken)
         section = Sensor.model_validate({key: source.topic, "intrinsics": intrinsics})
         cameras.append(_Camera(name, section, source.frame, {"intrinsics": remark} if remark else {}))

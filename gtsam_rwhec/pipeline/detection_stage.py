@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from gtsam_rwhec.logs.mcap_writer import Images
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.detections_in_images import draw_images
 from gtsam_rwhec.pipeline.driver_detections import read_driver_detections
+from gtsam_rwhec.pipeline.estimated_intrinsics import estimate_intrinsics, in_words, refuse_not_estimated
 from gtsam_rwhec.pipeline.image_detections import check_usable, detect_in_log
 from gtsam_rwhec.pipeline.image_options import check_drawable, check_image_options
 from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
@@ -74,6 +76,8 @@ def detect_log(
     ------
     OptionError
         `workers` or `draw` is given, and no sensor has images; or ``images="copy"``, and the log has none.
+    CameraError
+        Intrinsics are to be estimated (``intrinsics: estimate``), and the images determine none.
     LogError, StampError, TransformError, CameraError, FrameError
         The log lacks a topic of the rig file or the carriers' poses, or no target was detected.
     """
@@ -88,8 +92,14 @@ def detect_log(
         cameras = read_intrinsics(log, rig)
         tell("reading the carriers' poses")  # before the images: a log without poses is refused at once
         motion = read_carrier_motion(log, rig)
+        estimated, failed = estimate_intrinsics(log, rig, workers=workers, progress=tell)
+        if failed:
+            refuse_not_estimated(log, rig, failed, motion, sheet)
+        cameras |= {sensor: of_sensor.camera for sensor, of_sensor in estimated.items()}
         kept = None if keep is None else keep(log, cameras)
         found = detect_in_log(log, rig, cameras, motion, workers=workers, progress=tell, kept=kept)
+        for sensor, of_camera in estimated.items():
+            found[sensor] = replace(found[sensor], remarks=(in_words(sensor, of_camera), *found[sensor].remarks))
         for sensor, source in rig.sensors.items():
             if source.detections is not None:
                 found[sensor] = read_driver_detections(log, rig, sensor, cameras.get(sensor))

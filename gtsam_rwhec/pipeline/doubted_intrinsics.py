@@ -22,13 +22,13 @@ from gtsam_rwhec.vision.intrinsics_evidence import (
 def doubted_intrinsics(log: Log, rig: Rig, cameras: Mapping[str, Camera]) -> tuple[Finding, ...]:
     """What the corners of the detections in a log say against the intrinsics of its sensors.
 
-    Sensors without intrinsics, and those whose targets have few corners (single tags), are not judged.
+    Sensors that state no intrinsics, and those whose targets have few corners (single tags), are not judged.
     """
     corners = {target.name: target.corners() for target in rig.target_list}
     boards = {name: points for name, points in corners.items() if len(points) >= LEAST_CORNERS}
     findings = []
     for sensor, camera in cameras.items():
-        if not boards or sensor not in rig.sensors:
+        if not boards or sensor not in rig.sensors or rig.sensors[sensor].stated == "unknown":
             continue
         views = [
             View(boards[seen.target][seen.indices], seen.corners_px, seen.T)

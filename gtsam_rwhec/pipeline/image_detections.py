@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -53,10 +52,7 @@ def detect_in_log(
     upright: dict[str, Turns] = {}
     found = {}
     for topic, sensor in sensor_of.items():
-        in_order = sorted(images[topic], key=lambda image: image.stamp_ns)
-        of_sensor = _of_sensor(log, rig, sensor, in_order, motion, upright)
-        looked_at = {image.stamp_ns: LookedAt(image.logged_ns, image.fault) for image in in_order}
-        found[sensor] = replace(of_sensor, images=looked_at)
+        found[sensor] = detections_of_sensor(log, rig, sensor, images[topic], motion, upright)
     return found
 
 
@@ -121,14 +117,20 @@ def check_usable(log: Log, rig: Rig, found: Mapping[str, SensorDetections]) -> N
             )
 
 
-def _of_sensor(
+def detections_of_sensor(
     log: Log,
     rig: Rig,
     sensor: str,
     images: list[DetectedImage],
     motion: CarrierMotion,
-    upright: dict[str, Turns],
+    upright: dict[str, Turns] | None = None,
 ) -> SensorDetections:
+    """The detections in a sensor's images, in any order, each with the pose that its whole track supports.
+
+    `upright` has the first track of each board that looks the same turned, and gets this one if there is none.
+    """
+    images = sorted(images, key=lambda image: image.stamp_ns)
+    upright = {} if upright is None else upright
     faults = _faults(log, images)
     strangers: Counter[tuple[str, str]] = Counter()
     tracks: dict[str, list[tuple[int, Detection]]] = defaultdict(list)
@@ -149,7 +151,8 @@ def _of_sensor(
         for name, track in tracks.items()
         for note in dict.fromkeys(d.note for _, d in track if d.note and d.rejection is None)
     )
-    return SensorDetections(records, len(images), strangers, faults, corner_px, remarks=remarks)
+    looked_at = {image.stamp_ns: LookedAt(image.logged_ns, image.fault) for image in images}
+    return SensorDetections(records, len(images), strangers, faults, corner_px, remarks=remarks, images=looked_at)
 
 
 def _faults(log: Log, images: list[DetectedImage]) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from gtsam_rwhec.vision.intrinsics_files import read_cameras
 
 
 def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
-    """Read the intrinsics of every sensor that has them. A sensor with images always has them.
+    """Read the intrinsics of every sensor that has them; `estimated_intrinsics` has those that are to be estimated.
 
     Raises `CameraError` if the intrinsics change within the log, or if no camera can have them; `LogError` or
     `FileFormatError` if a topic or file is missing or cannot be read.
@@ -20,7 +20,7 @@ def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
     cameras = {}
     for name, sensor in rig.sensors.items():
         source = sensor.intrinsics
-        if source is None:
+        if source is None or source.estimate is not None:
             continue
         if source.topic is not None:
             cameras[name] = _from_topic(log, source.topic, name)
@@ -32,8 +32,9 @@ def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
 def check_intrinsics_files(rig: Rig) -> None:
     """Read the intrinsics that are in files, with the errors of `read_intrinsics`, before a log is there."""
     for name, sensor in rig.sensors.items():
-        if sensor.intrinsics is not None and sensor.intrinsics.topic is None:
-            _stated(rig, name, sensor.intrinsics)
+        source = sensor.intrinsics
+        if source is not None and source.topic is None and source.estimate is None:
+            _stated(rig, name, source)
 
 
 def _stated(rig: Rig, name: str, source: Intrinsics) -> Camera:

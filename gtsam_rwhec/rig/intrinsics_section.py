@@ -10,13 +10,20 @@ from gtsam_rwhec.reprojection.intrinsics import Stated
 from gtsam_rwhec.rig.field_types import OrText, Text, list_of
 from gtsam_rwhec.rig.section import Section, one_of
 from gtsam_rwhec.vision.camera import Camera
+from gtsam_rwhec.vision.unknown_intrinsics import Lens
+
+#: The word for intrinsics that nobody states; a file of this name is {file: estimate}.
+ESTIMATE = "estimate"
 
 
 class Intrinsics(Section):
-    """Where a camera's intrinsics are: a topic, a Kalibr camchain, another file, or numbers in this section."""
+    """Where a camera's intrinsics are: a topic, a Kalibr camchain, another file, numbers in this section, or nowhere.
+
+    `intrinsics: estimate` needs no calibration: they come from the images of a board, and are refined with the poses.
+    """
 
     model_config = one_of(
-        "topic", "kalibr", "file", "K",
+        "topic", "kalibr", "file", "K", "estimate",
         together=(("width", "K"), ("height", "K"), ("model", "K"), ("D", "K")),
     )  # fmt: skip
 
@@ -65,6 +72,12 @@ class Intrinsics(Section):
     D: tuple[float, ...] | None = Field(
         default=None, description="with model: coefficients in OpenCV's order", examples=[[-0.1, 0.02, 0.0, 0.0]]
     )
+    estimate: Lens | None = Field(
+        default=None,
+        description="no calibration is there: from the images, with this lens model (any: the one that fits); "
+        "intrinsics: estimate is {estimate: any} in short. It takes images of a board at different tilts",
+        examples=["equidistant"],
+    )
     stated: Literal["calibration", "nominal"] | None = Field(
         default=None,
         description="where they come from, however they are given: calibration (of this camera, with this lens and "
@@ -75,20 +88,22 @@ class Intrinsics(Section):
 
     @property
     def stated_as(self) -> Stated:
-        """Where they come from; nominal unless the rig file says otherwise."""
-        return self.stated or "nominal"
+        """Where they come from: nominal unless the rig file says otherwise, unknown if they are to be estimated."""
+        return "unknown" if self.estimate is not None else self.stated or "nominal"
 
     @model_validator(mode="after")
     def _is_one(self) -> Intrinsics:
         of_file = self.file is not None or self.kalibr is not None
         # A file of OpenCV may lack the size of the images.
         numbers = self._given("model", "width", "height", "K", "D", *([] if of_file else ["size"]))
-        sources = self._given("topic", "kalibr", "file") + (["numbers"] if numbers else [])
+        sources = self._given("topic", "kalibr", "file", "estimate") + (["numbers"] if numbers else [])
         if len(sources) != 1:
             raise ValueError(
-                f"{' and '.join(sources) or 'nothing'} given; give one of topic, kalibr (with camera), file, or "
-                "numbers (K, size, and model and D with distortion)"
+                f"{' and '.join(sources) or 'nothing'} given; give one of topic, kalibr (with camera), file, numbers "
+                "(K, size, and model and D with distortion), or estimate alone: the images say the rest"
             )
+        if self.estimate is not None and self.stated is not None:
+            raise ValueError(f"stated: {self.stated}, and they are to be estimated; leave stated or estimate out")
         if self.camera is not None and not of_file:
             raise ValueError("camera goes with a file: {file: camchain.yaml, camera: cam0}")
         if numbers:
@@ -111,9 +126,13 @@ class Intrinsics(Section):
 
 
 def _as_section(given: Any) -> Any:
-    """A section of intrinsics; text alone is a file."""
+    """A section of intrinsics; text alone is a file, or the word estimate."""
+    if given == ESTIMATE:
+        return {"estimate": "any"}
     return {"file": given} if isinstance(given, str) else given
 
 
-#: A section, or text alone: a file.
-IntrinsicsOrFile: TypeAlias = Annotated[Intrinsics, BeforeValidator(_as_section), OrText("a file of intrinsics")]
+#: A section, or text alone: a file, or the word estimate.
+IntrinsicsOrText: TypeAlias = Annotated[
+    Intrinsics, BeforeValidator(_as_section), OrText("a file of intrinsics, or the word estimate")
+]

@@ -22,7 +22,7 @@ from gtsam_rwhec.rig.field_types import (
     TimeOffset,
     list_of,
 )
-from gtsam_rwhec.rig.intrinsics_section import IntrinsicsOrFile
+from gtsam_rwhec.rig.intrinsics_section import IntrinsicsOrText
 from gtsam_rwhec.rig.section import Section, one_of
 
 
@@ -189,10 +189,11 @@ class Sensor(Section):
     detections: Text | None = Field(
         default=None, description="topic of a driver's detections, in place of images", examples=["/tag_detections"]
     )
-    intrinsics: IntrinsicsOrFile | None = Field(
+    intrinsics: IntrinsicsOrText | None = Field(
         default=None,
-        description="with images: a file, or a section; detections with poses need none",
-        examples=["left.yaml", {"topic": "/cam_left/camera_info"}],
+        description="with images: a file, a section, or the word estimate, which needs no calibration but images of a "
+        "board; detections with poses need none",
+        examples=["left.yaml", {"topic": "/cam_left/camera_info"}, "estimate"],
     )
     time_offset: TimeOffset = Field(
         default=0.0,
@@ -214,7 +215,7 @@ class Sensor(Section):
 
     @property
     def stated(self) -> Stated:
-        """Where the stated intrinsics come from; "unknown" where none are stated."""
+        """Where the stated intrinsics come from; "unknown" where none are stated, or they are to be estimated."""
         return "unknown" if self.intrinsics is None else self.intrinsics.stated_as
 
     @model_validator(mode="after")
@@ -230,7 +231,11 @@ class Sensor(Section):
         if self.images is not None and self.intrinsics is None:
             raise ValueError(
                 "images without intrinsics; give FILE, {topic: ...}, {kalibr: ..., camera: ...} or numbers, "
-                "{K: [fx, fy, cx, cy], size: [width, height]}"
+                "{K: [fx, fy, cx, cy], size: [width, height]}; or the word estimate, if the camera sees a board"
+            )
+        if self.images is None and self.intrinsics is not None and self.intrinsics.estimate is not None:
+            raise ValueError(
+                "intrinsics: estimate needs images, and a driver's detections do not say their size; state intrinsics"
             )
         return self
 

@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.rig.intrinsics_section import ESTIMATE, Intrinsics
 from gtsam_rwhec.rig.rig import RigFile
 
 #: Every YAML reader reads these strings as strings without quotes.
@@ -73,6 +74,8 @@ def _lines(items: Iterable[tuple[str, Any]], path: KeyPath = ()) -> Iterator[tup
 
 
 def _value(value: Any) -> str:
+    if isinstance(value, Intrinsics) and value.estimate == "any":
+        return ESTIMATE
     if isinstance(value, BaseModel):  # in one line, without what is not given
         return "{" + ", ".join(f"{key}: {_value(item)}" for key, item in value if item is not None) + "}"
     if isinstance(value, tuple):

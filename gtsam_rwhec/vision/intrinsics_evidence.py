@@ -223,7 +223,7 @@ def _fitted(
     q = len(nominal)
     count = int(known.sum())
     camera = lens or prior
-    r, J, K = _linearised(camera, T, p, u, known, q)
+    r, J, K = linearised(camera, T, p, u, known, q)
     for _ in range(ROUNDS):
         if not np.isfinite(r).all():
             return None
@@ -241,7 +241,7 @@ def _fitted(
         cost = float((r**2).sum() + weight @ from_prior**2)
         for share in SHARES:
             T_next, next_ = T @ se3.expmap(share * motion), _with_numbers(camera, _numbers(camera)[:q] + share * step)
-            of_next = _linearised(next_, T_next, p, u, known, q)
+            of_next = linearised(next_, T_next, p, u, known, q)
             if (of_next[0] ** 2).sum() + weight @ (_numbers(next_) - _numbers(prior))[:q] ** 2 <= cost * (1.0 + 1e-9):
                 break
         T, camera, (r, J, K) = T_next, next_, of_next
@@ -251,7 +251,7 @@ def _fitted(
     return _Fit(camera, T, of_corners, H, parts)
 
 
-def _linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, q: int) -> tuple[Array, Array, Array]:
+def linearised(camera: Camera, T: Array, p: Array, u: Array, known: np.ndarray, q: int) -> tuple[Array, Array, Array]:
     """Residuals (views, 2 n), and their derivatives by the poses (right perturbations) and by q intrinsic numbers."""
     seen = p @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
     seen = np.where(known[..., None], seen, [0.0, 0.0, 1.0])

@@ -157,6 +157,18 @@ def test_every_form_of_intrinsics_says_where_they_come_from(source: str) -> None
         stated(f"{{{source}, stated: factory}}")
 
 
+def test_intrinsics_may_be_estimated() -> None:
+    def sensor(intrinsics: str) -> Sensor:
+        rig = parse_rig(MINIMAL.replace("detections: /tags", f"images: /image, intrinsics: {intrinsics}"), "rig.yaml")
+        assert parse_rig(rig_text(rig), "rig.yaml") == rig
+        return rig.sensors["cam"]
+
+    assert sensor("estimate").intrinsics == Intrinsics(estimate="any")
+    assert sensor("estimate").stated == "unknown"
+    assert sensor("{estimate: equidistant}").intrinsics == Intrinsics(estimate="equidistant")
+    assert sensor("{file: estimate}").stated == "nominal"  # a file of this name
+
+
 def test_lists_that_are_kept_elsewhere_too() -> None:
     assert get_args(Cleaning.model_fields["robust"].annotation) == get_args(Robust)
     options = asdict(DetectionOptions())
@@ -185,6 +197,10 @@ INTRINSICS = st.one_of(
     ),
 )  # fmt: skip
 
+ESTIMATED = st.builds(
+    lambda lens: Intrinsics(estimate=lens), st.sampled_from(["any", "pinhole", "radtan", "equidistant"])
+)
+
 
 @st.composite
 def rigs(draw: st.DrawFn) -> Rig:
@@ -202,7 +218,7 @@ def rigs(draw: st.DrawFn) -> Rig:
     sensors = {}
     for _ in range(draw(st.integers(1, 3))):
         source: dict[str, Any] = {draw(st.sampled_from(["images", "detections"])): next(topics)}
-        intrinsics = draw(INTRINSICS if "images" in source else st.none() | INTRINSICS)
+        intrinsics = draw(INTRINSICS | ESTIMATED if "images" in source else st.none() | INTRINSICS)
         offset = draw(st.just("estimate") | st.floats(-1e9, 1e9))
         frame = next(names) if draw(st.booleans()) else None
         sensors[next(names)] = Sensor(**source, intrinsics=intrinsics, time_offset=offset, frame=frame)

@@ -1,0 +1,115 @@
+"""Logs of a camera that nobody calibrated: intrinsics from its images, and what is said where they do not tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from cells_of_others import CIRCLES, WORKCELL
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.errors import CameraError, LogWarning
+from gtsam_rwhec.files.progress import silent
+from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.pipeline import detect_source
+from gtsam_rwhec.pipeline.detection_inputs import inputs_of
+from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics
+from gtsam_rwhec.pipeline.estimated_intrinsics import estimate_intrinsics
+from gtsam_rwhec.pipeline.folder_log import write_folder_log
+from gtsam_rwhec.pipeline.log_metadata import read_cameras, read_embedded_rig
+from gtsam_rwhec.rig import parse_rig
+
+UNKNOWN = CIRCLES.replace("{K: [550, 550, 320, 240], size: [640, 480]}", "estimate")
+BLANK = """\
+carriers: {sensors: hand, targets: base, poses: {frames: [base, hand]}}
+sensors:
+  camera: {images: images, poses: poses.csv, intrinsics: estimate}
+targets:
+  board: {type: checkerboard, inner_corners: [5, 4], square_m: 0.05}
+"""
+
+
+def part_of(folder: Path, cell: Path, numbers: list[int]) -> Path:
+    """A folder with some of the images of a cell, and all of its poses."""
+    images = sorted((cell / "images").glob("*.png"))
+    (folder / "images").mkdir(parents=True)
+    for number in numbers:
+        (folder / "images" / images[number].name).symlink_to(images[number])
+    (folder / "poses").symlink_to(cell / "poses")
+    return folder
+
+
+def test_images_alone_give_a_camera_that_the_log_records(circle_grid_10x10: Path, tmp_path: Path) -> None:
+    folder, out = part_of(tmp_path / "cell", circle_grid_10x10, [0, 3, 6, 9, 12, 14]), tmp_path / "detected.mcap"
+    with pytest.warns(LogWarning, match="poses have no image"):
+        report = detect_source(folder, parse_rig(UNKNOWN, "rig.yaml"), out, workers=1)
+    assert [track.used for track in report.tracks] == [6]
+    (words,) = report.remarks
+    assert words.startswith("The intrinsics of camera are estimated from 6 views of boards in its images of 640 x 480")
+    with open_log(out) as log:
+        camera, rig = read_cameras(log)["camera"], read_embedded_rig(log)
+        assert doubted_intrinsics(log, rig, {"camera": camera}) == ()  # nobody stated them
+    assert (camera.width, camera.height, camera.model) == (640, 480, "radtan")
+    assert camera.K[[0, 1], [0, 1]] == pytest.approx(542.0, abs=8.0)  # of all 15 images together
+    assert rig.sensors["camera"].stated == "unknown"
+
+
+def test_the_same_images_give_the_same_camera(circle_grid_10x10: Path, tmp_path: Path) -> None:
+    folder = part_of(tmp_path / "cell", circle_grid_10x10, [0, 6, 9, 14])
+    rig = parse_rig(UNKNOWN, "rig.yaml")
+    with pytest.warns(LogWarning, match="poses have no image"):
+        write_folder_log(folder, rig, tmp_path / "log.mcap")
+    inputs = []
+    with open_log(tmp_path / "log.mcap") as log:
+        for workers in (1, 2):
+            found, failed = estimate_intrinsics(log, rig, workers=workers, progress=silent)
+            assert not failed
+            inputs.append(inputs_of(log, rig, {name: of.camera for name, of in found.items()}))
+    assert inputs[0] == inputs[1]  # an interrupted run goes on
+
+
+def blank_cell(folder: Path, targets: str = "") -> None:
+    (folder / "images").mkdir(parents=True)
+    rows = ["name,x,y,z,qx,qy,qz,qw"]
+    for i in range(4):
+        cv2.imwrite(str(folder / "images" / f"{i}.png"), np.full((48, 64), 200, np.uint8))
+        rows.append(f"{i}.png,0,0,{i},0,0,0,1")
+    (folder / "poses.csv").write_text("\n".join(rows) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        (None, "Does an image show it, whole and in focus"),
+        ("tag: {type: tag, family: tag36h11, id: 0, size_m: 0.1}", "The rig file has only single tags"),
+    ],
+    ids=["no board", "single tags"],
+)
+def test_images_that_show_no_board_are_refused_with_what_to_do(target: str | None, said: str, tmp_path: Path) -> None:
+    blank_cell(tmp_path)
+    text = BLANK if target is None else BLANK.partition("  board:")[0] + f"  {target}\n"
+    with pytest.raises(CameraError) as caught:
+        detect_source(tmp_path, parse_rig(text, "rig.yaml"), tmp_path / "detected.mcap", workers=1)
+    words = str(caught.value)
+    assert words.startswith("rig.yaml, line 3: sensors.camera.intrinsics: the intrinsics of camera cannot be estimated")
+    assert "from 0 views of a flat target with 6 corners and more; at least 3 are needed" in words
+    assert "4 of its 4 images were searched. Or state intrinsics" in words
+    assert said in words
+    assert (tmp_path / "detected.seen.png").is_file()
+    assert not (tmp_path / "detected.mcap").exists()
+
+
+@pytest.mark.slow
+def test_a_workcell_of_other_people_from_images_and_poses_alone(workcell_camera2: Path, tmp_path: Path) -> None:
+    rig = parse_rig(WORKCELL.replace("intrinsic_pars_file.yaml", "estimate"), "rig.yaml")
+    calibrated = rw.calibrate_log(workcell_camera2, rig, tmp_path / "out", workers=1)
+    x, y, z = calibrated.refined.Y["camera2"].translation()
+    assert (x, y, z) == pytest.approx((1.767, 2.062, 1.156), abs=0.02)
+    refined = rw.calibrate_corners(
+        rw.pipeline.read_corners(tmp_path / "out" / "clean.mcap"), rw.CornerOptions(stated="unknown")
+    ).refined
+    K = refined.intrinsics["camera2"].camera.K
+    # as the people who made the set state them, half a pixel off
+    assert K[[0, 1, 0, 1], [0, 1, 2, 2]] == pytest.approx([1371.0, 1371.0, 959.5, 539.5], abs=5.0)
