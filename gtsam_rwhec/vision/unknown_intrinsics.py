@@ -30,7 +30,7 @@ ENOUGH = 40
 WIDE_DEG, BADLY_PX, CLEARLY_LESS = 40.0, 0.3, 0.8
 #: The kinds of distortion that are tried, with their numbers of coefficients, and these numbers for a fisheye.
 USUAL: tuple[tuple[Distortion, int], ...] = (("none", 0), ("radial", 2), ("all", 4))
-FISHEYE = (0, 2, 4)
+FISHEYE = (2, 4)
 #: Corners that fit better than this (pixels) say nothing more about the lens.
 FINEST_PX = 0.01
 #: A view whose corners are off by more than this multiple of the median view's, and by a pixel, was misread.
