@@ -135,5 +135,9 @@ class NotConvergedWarning(RwhecWarning):
     """An iteration stopped at its limit."""
 
 
+class CameraWarning(RwhecWarning):
+    """A lens model has no ray for a part of the image."""
+
+
 class RotationsProjectedWarning(RwhecWarning):
     """Matrices that were not quite rotations were projected to the nearest rotation."""

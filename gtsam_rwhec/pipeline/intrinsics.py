@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.errors import CameraError, FileFormatError, LogError
+import warnings
+
+from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, LogError
 from gtsam_rwhec.logs import IntrinsicsRecord, Log
 from gtsam_rwhec.logs.message_kinds import INTRINSICS_SCHEMAS
 from gtsam_rwhec.rig import Rig
@@ -10,9 +12,14 @@ from gtsam_rwhec.rig.intrinsics_section import Intrinsics
 from gtsam_rwhec.vision.camera import Camera
 from gtsam_rwhec.vision.intrinsics_files import read_cameras
 
+#: Lens models without rays for more than this share of the image are warned of.
+FOLDED = 0.01
+
 
 def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
     """Read the intrinsics of every sensor that has them; `estimated_intrinsics` has those that are to be estimated.
+
+    Warns with `CameraWarning` of a lens model that folds back within the image.
 
     Raises `CameraError` if the intrinsics change within the log, or if no camera can have them; `LogError` or
     `FileFormatError` if a topic or file is missing or cannot be read.
@@ -26,6 +33,7 @@ def read_intrinsics(log: Log, rig: Rig) -> dict[str, Camera]:
             cameras[name] = _from_topic(log, source.topic, name)
         else:
             cameras[name] = _stated(rig, name, source)
+        _warn_of_a_fold(cameras[name], name)
     return cameras
 
 
@@ -83,6 +91,19 @@ def _from_topic(log: Log, topic: str, sensor: str) -> Camera:
     if first is None:
         raise CameraError(f"sensor {sensor}: topic {topic} has no message that can be read")
     return first
+
+
+def _warn_of_a_fold(camera: Camera, sensor: str) -> None:
+    share = camera.share_beyond_fold
+    if share > FOLDED:
+        warnings.warn(
+            f"sensor {sensor}: the distortion ({camera.model}, D = {camera.D.tolist()}) folds back "
+            f"{camera.reach_px:.0f} pixels from the centre: {100.0 * share:.0f} % of the image has no ray, and targets "
+            "that reach into it are rejected. Check D, its order and its model, or calibrate with a board at the "
+            "image's borders",
+            CameraWarning,
+            stacklevel=3,
+        )
 
 
 def _numbers(camera: Camera) -> tuple[object, ...]:

@@ -20,6 +20,7 @@ from gtsam_rwhec.reprojection.determined import check_arguments
 from gtsam_rwhec.reprojection.first_intrinsics import first_intrinsics
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
+from gtsam_rwhec.reprojection.rays import findings_of_images_left_out
 from gtsam_rwhec.reprojection.refined import CornersRefined
 from gtsam_rwhec.reprojection.refining_corners import refine_corners
 from gtsam_rwhec.solving.certified_solution import solve
@@ -93,6 +94,8 @@ def calibrate_corners(
     }
     kept = replace(observations, views=views)
     answer = refine_corners(kept, refined.X, refined.Y, options, tell)
+    lenses = findings_of_images_left_out(observations, refined.inliers)
+    answer = replace(answer, findings=(*answer.findings, *lenses))
     return CornersCalibrated(refined.solution, answer, dict(refined.inliers), kept)
 
 

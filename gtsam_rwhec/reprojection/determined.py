@@ -11,6 +11,7 @@ from gtsam_rwhec.errors import CountError, FrameError, OptionError, OutlierError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.corner_outliers import errors_px
+from gtsam_rwhec.reprojection.intrinsics import CENTRE_PX
 from gtsam_rwhec.reprojection.model import Model, Point
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
@@ -160,4 +161,16 @@ def _what_there_is(model: Model) -> str:
     images = sum(len(stack.instant) for stack in model.stacks)
     poses = len(model.A)
     at = "one pose" if poses == 1 else f"{poses} different poses"
-    return f"{images} image{'s' * (images != 1)} at {at} of the carriers"
+    few = few_corners(model)
+    return f"{images} image{'s' * (images != 1)} at {at} of the carriers{few and f' ({few})'}"
+
+
+def few_corners(model: Model) -> str:
+    """In words that the corners give no more numbers than there are unknowns; empty where they give more."""
+    numbers = 2 * sum(int(stack.known.sum()) for stack in model.stacks)
+    cameras = sum(len(mean) for mean, off in model.camera_priors.values() if off[2] > CENTRE_PX["exact"])
+    boards = sum(len(model.free_shape(name)) for name in model.targets)
+    corners = {stack.target: 3 * len(stack.points) for stack in model.stacks if stack.target in model.corner_priors}
+    unknowns = 6 * (len(model.targets) + len(model.sensors)) + cameras + boards + sum(corners.values())
+    unknowns += len(model.offset_priors)
+    return "" if numbers > unknowns else f"{numbers} coordinates of corners for {unknowns} unknowns"

@@ -7,8 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import chdtrc
 
+from gtsam_rwhec.reprojection.determined import few_corners
 from gtsam_rwhec.reprojection.lens import PINHOLE
 from gtsam_rwhec.reprojection.options import CornerOptions
+from gtsam_rwhec.reprojection.rays import findings_of_rays
 from gtsam_rwhec.reprojection.reduced import CARRIER, CORNER_PX
 from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
 from gtsam_rwhec.reprojection.stated_intrinsics import CONTRADICTED, HELD, PARTS, chance_of, deviations_of
@@ -47,6 +49,7 @@ def findings_of(refined: CornersRefined, options: CornerOptions) -> tuple[str, .
         *_of_carriers(refined, options),
         *_of_corners(refined),
         *_of_convergence(refined, options),
+        *findings_of_rays(refined),
         *_of_clocks(refined),
         *_of_boards(refined),
         *_of_intrinsics(refined, options),
@@ -85,7 +88,12 @@ def _of_carriers(refined: CornersRefined, options: CornerOptions) -> Iterator[st
 
 
 def _of_corners(refined: CornersRefined) -> Iterator[str]:
-    px = refined.noise.corner_px
+    px, few = refined.noise.corner_px, few_corners(refined.graph.model)
+    if few:
+        yield (
+            f"There are {few}, which therefore rest on their priors, and on corners that are taken to be right to "
+            f"{px:.2g} pixels, as stated (corner_px) or worse: take more images."
+        )
     if px > DETECTOR_PX:
         bound = " (its bound)" if px >= AT_BOUND * CORNER_PX[1] else ""
         yield (

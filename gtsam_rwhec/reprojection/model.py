@@ -61,6 +61,8 @@ class Model:
         Deviations, s, of the clocks' offsets that are free, by sensor; their means are zero.
     corner_priors : dict of str to float
         Deviations, metres, of corners from their places along each axis, by target whose corners are free.
+    stated_px : float
+        Standard deviation of a corner as it was stated: it counts where corners are too few to tell theirs.
     """
 
     stacks: tuple[Stack, ...]
@@ -74,6 +76,7 @@ class Model:
     weights: tuple[Array, ...]
     offset_priors: dict[str, float] = field(default_factory=dict)
     corner_priors: dict[str, float] = field(default_factory=dict)
+    stated_px: float = 0.1
 
     @property
     def to_right(self) -> Array:

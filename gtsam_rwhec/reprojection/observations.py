@@ -12,6 +12,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, TargetError
 from gtsam_rwhec.geometry.poses import Array, PosesLike, as_transforms, checked_rows, rows_to_transforms
+from gtsam_rwhec.problem.corners import check_in_image
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.vision.camera import Camera
 
@@ -82,8 +83,9 @@ class Observations:
 
         Raises
         ------
-        CountError, FrameError, NoiseError, PoseError, TargetError
-            When shapes do not fit, a name has no camera or target, or a matrix is not a pose.
+        CameraError, CountError, FrameError, NoiseError, PoseError, TargetError
+            When shapes do not fit, a name has no camera or target, a corner is outside its image, or a matrix is not a
+            pose.
         """
         if not (np.isfinite(corner_px) and corner_px > 0.0):
             raise NoiseError(f"corner_px is {corner_px!r}; give a positive number of pixels")
@@ -95,8 +97,13 @@ class Observations:
         for (target, sensor), (A, pixels, *velocity) in views.items():
             where = f"the views of {target} by {sensor}"
             if target not in points or sensor not in cameras:
-                missing = f"corners of {target}" if target not in points else f"camera {sensor}"
-                raise FrameError(f"{where}: there are no {missing}")
+                missing = (
+                    f"are no corners of {target}; give its board in corners, (n, 3) points in its frame, metres, such "
+                    "as rw.vision.Checkerboard(...).corners()"
+                    if target not in points
+                    else f"is no camera {sensor}; give its intrinsics in cameras"
+                )
+                raise FrameError(f"{where}: there {missing}")
             transforms = as_transforms(A, None, f"A of {where}")
             seen = np.asarray(pixels, dtype=float)
             if seen.shape != (len(transforms), len(points[target]), 2) or not len(seen):
@@ -107,6 +114,7 @@ class Observations:
             fewest = int(np.isfinite(seen).all(axis=2).sum(axis=1).min())
             if fewest < 4:
                 raise CountError(f"{where}: an image has {fewest} corners; leave out images with fewer than 4")
+            check_in_image(seen, cameras[sensor], where)
             rows = checked_rows(transforms, 0, f"A of {where}").rows
             twist = None if not velocity or velocity[0] is None else np.asarray(velocity[0], dtype=float)
             if twist is not None and not (twist.shape == (len(transforms), 6) and np.isfinite(twist).all()):
@@ -143,7 +151,10 @@ class Observations:
             at, choice = np.arange(len(T)), choices[target, sensor]
             lost = np.flatnonzero(~np.isfinite(T[at, choice]).all(axis=(1, 2)))
             if lost.size:
-                raise CameraError(f"image {lost[0]} of {target} by {sensor} has no pose: are its corners on one line?")
+                raise CameraError(
+                    f"image {lost[0]} of {target} by {sensor} has no pose: "
+                    + _why_no_pose(self.cameras[sensor], view.pixels[lost[0]], sensor)
+                )
             problem.add(target, sensor, view.A, T[at, choice], covariances=covariance[at, choice])
         return problem
 
@@ -166,7 +177,7 @@ class Observations:
         result = {}
         for (target, sensor), view in self.views.items():
             flat, T_target_flat = in_plane(self.corners[target], target)
-            known = view.known
+            known = view.known & self.cameras[sensor].has_ray(view.pixels)
             found = plane_poses(
                 self.cameras[sensor],
                 [flat[seen] for seen in known],
@@ -178,6 +189,18 @@ class Observations:
             covariance = ad @ found.covariance @ ad.T
             result[target, sensor] = found.T @ se3.inverse(T_target_flat), 0.5 * (covariance + covariance.mT)
         return result
+
+
+def _why_no_pose(camera: Camera, pixels: Array, sensor: str) -> str:
+    """Why the corners (n, 2) of an image have no pose."""
+    dark = int((~camera.has_ray(pixels)).sum())
+    if not dark:
+        return "are its corners on one line?"
+    return (
+        f"the lens model of {sensor} ({camera.model}) has no ray for {dark} of its {np.isfinite(pixels[:, 0]).sum()} "
+        "corners, since its distortion folds back; check D, its order and its model, or state the intrinsics as "
+        "'unknown'"
+    )
 
 
 def in_plane(points: Array, name: str) -> tuple[Array, Array]:

@@ -24,6 +24,7 @@ from gtsam_rwhec.reprojection.determined import (
     check_names,
     check_shared,
     farthest,
+    few_corners,
     told_where_it_fails,
 )
 from gtsam_rwhec.reprojection.findings import findings_of
@@ -34,6 +35,7 @@ from gtsam_rwhec.reprojection.leverage import check_motion
 from gtsam_rwhec.reprojection.model import BEHIND, Model, Point
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
+from gtsam_rwhec.reprojection.rays import check_rays
 from gtsam_rwhec.reprojection.reduced import Noise, Reduced
 from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
 from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, innovation_of, wider
@@ -86,7 +88,8 @@ def refine_corners(
     Raises
     ------
     CameraError
-        The start puts a corner that was seen behind its camera.
+        The start puts a corner that was seen behind its camera, or intrinsics that are held as stated have no ray for
+        one.
     CountError
         A time offset is free, and its sensor's images have no velocity of the carriers.
     FrameError
@@ -108,6 +111,7 @@ def refine_corners(
     check_clocks(options, observations)
     model, point, noise, cameras = _stated(observations, X, Y, options)
     priors, first = model.camera_priors, model.camera_of
+    check_rays(model.stacks, options)
     _check_start(model, point)
     settled = _settled(model, point, noise, options, tell)
     tests = _innovations(settled, priors)
@@ -185,6 +189,7 @@ def _stated(
         noise.corner_px, tuple(stack.known.astype(float) for stack in stacks),
         dict.fromkeys(options.time_offsets, OFFSET_S),
         dict.fromkeys(observations.targets, options.corners_m) if options.corners_m else {},
+        observations.corner_px,
     )  # fmt: skip
     point = Point(
         {name: one_transform(X[name], f"start of {name}") for name in observations.targets},
@@ -218,6 +223,8 @@ def _settled(
         with told_where_it_fails(model, point):
             reduced = Reduced.of(model, point)
             noise = reduced.likeliest(noise, carrier=options.carrier_noise == "estimate")
+        if few_corners(model):
+            noise = replace(noise, corner_px=max(noise.corner_px, model.stated_px))
         weights = model.weights
         if options.outliers:
             weights = weights_of(model, point, noise.corner_px, first=number == 0 and is_first)

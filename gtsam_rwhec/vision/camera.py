@@ -159,6 +159,26 @@ class Camera:
         wanted = (np.asarray(pixels, dtype=float) - self._centre) / self._focal
         return undistorted(self.model, self.D, wanted, self.ring)
 
+    def has_ray(self, pixels: Array) -> np.ndarray:
+        """Whether a ray leads to pixels (..., 2); booleans (...), true where a pixel is nan."""
+        found = np.isfinite(self.undistort(pixels)) | np.isnan(pixels)
+        return np.asarray(found.all(axis=-1))
+
+    @property
+    def reach_px(self) -> float:
+        """How far from the principal point rays lead to pixels, along x."""
+        with np.errstate(over="ignore"):
+            furthest = self.pixels(np.array([min((1.0 - 1e-9) * self.ring, 1e9), 0.0]))
+        return float(np.linalg.norm(furthest - self._centre))
+
+    @property
+    def share_beyond_fold(self) -> float:
+        """Which share of the image's pixels has no ray because the distortion folds back; 0 where it does not."""
+        if not np.isfinite(self.ring):
+            return 0.0
+        u, v = ((np.arange(40.0) + 0.5) * size / 40.0 - 0.5 for size in (self.width, self.height))
+        return 1.0 - float(self.has_ray(np.stack(np.meshgrid(u, v), axis=-1)).mean())
+
     @cached_property
     def ring(self) -> float:
         """Normalised radius at which the radial distortion folds back or has a pole; infinite if it does neither."""

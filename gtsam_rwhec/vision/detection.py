@@ -138,10 +138,13 @@ class Detector:
         """The detection of a sighting, whose pose is number k of `poses`."""
         T, rms = poses.T[k], poses.reprojection_px[k]
         side = _shortest_side(sighting.target, sighting.corners_px)
+        rejection = sighting.rejection or self._rejection(sighting, side, T[0], float(rms[0]))
+        if rejection and not self.camera.has_ray(sighting.corners_px).all():  # which explains all other reasons
+            rejection = Rejection.NO_RAY
         return Detection(
             sighting.target.name, sighting.corners_px, sighting.indices, T, poses.squared_px[k], rms,
             poses.covariance[k], side, float(sighting.blur_px),
-            sighting.rejection or self._rejection(sighting, side, T[0], float(rms[0])), sighting.note,
+            rejection, sighting.note,
         )  # fmt: skip
 
     def _rejection(self, sighting: Sighting, side_px: float, T: Array, rms_px: float) -> Rejection | None:

@@ -18,6 +18,7 @@ class Rejection(StrEnum):
     SEEN_TWICE = "seen twice in one image"
     NO_EDGES = "edges not found"
     NO_POSE = "no pose"
+    NO_RAY = "the intrinsics have no ray for a corner: their distortion folds back"
     REPROJECTION = "reprojection error"
     AMBIGUOUS = "ambiguous"
     NOT_A_GRID = "corners not on one plane's grid"

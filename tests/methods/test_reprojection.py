@@ -88,14 +88,17 @@ def test_what_cannot_be_observed_is_refused_in_words() -> None:
     square = {"tag": SQUARE}
     with pytest.raises(NoiseError, match="corner_px"):
         Observations.of(CAMERAS, square, {("tag", "left"): (A, pixels)}, 0.0)
-    with pytest.raises(FrameError, match="camera middle"):
+    with pytest.raises(FrameError, match="there is no camera middle; give"):
         Observations.of(CAMERAS, square, {("tag", "middle"): (A, pixels)})
-    with pytest.raises(FrameError, match="corners of board"):
+    with pytest.raises(FrameError, match="there are no corners of board; give its board in corners"):
         Observations.of(CAMERAS, square, {("board", "left"): (A, pixels)})
     with pytest.raises(CountError, match=r"\(3, 4, 2\)"):
         Observations.of(CAMERAS, square, {("tag", "left"): (A, pixels[:2])})
     with pytest.raises(CountError, match="no views"):
         Observations.of(CAMERAS, square, {})
+    larger = pixels + np.array([2.0 * CAMERAS["left"].width, 10.0])
+    with pytest.raises(CameraError, match=r"corner 0 of image 0 is at .* outside images of .* of another size than"):
+        Observations.of(CAMERAS, square, {("tag", "left"): (A, larger)})
     hidden = pixels.copy()
     hidden[1, 0] = np.nan
     with pytest.raises(CountError, match="3 corners"):

@@ -10,7 +10,7 @@ import pytest
 from intrinsics_samples import CAMCHAIN, ROS
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import CameraError, FileFormatError, RwhecError
+from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, RwhecError
 from gtsam_rwhec.pipeline.folder_log import write_folder_log
 from gtsam_rwhec.pipeline.intrinsics import check_intrinsics_files, read_intrinsics
 from gtsam_rwhec.rig.rig_file import parse_rig
@@ -71,6 +71,13 @@ def test_what_a_calibration_wrote_is_read_again(tmp_path: Path, log: rw.logs.Log
             given = parse_rig(RIG.format(source=source), "rig.yaml", tmp_path)
             read = read_intrinsics(log, given)["cam1"]
             assert (read.K.tolist(), read.D.tolist()) == (K, camera.D.tolist())
+
+
+def test_a_lens_that_folds_back_within_the_image_is_warned_of(tmp_path: Path, log: rw.logs.Log) -> None:
+    source = "{size: [640, 480], K: [500, 500, 320, 240], model: radtan, D: [-0.9, 0, 0, 0]}"
+    words = r"sensor cam1: the distortion \(radtan, D = \[-0.9, .*\) folds back 203 pixels .*: 5\d % of the image"
+    with log, pytest.warns(CameraWarning, match=words):
+        read_intrinsics(log, rig(tmp_path, source))
 
 
 @pytest.mark.parametrize(

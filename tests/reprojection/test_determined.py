@@ -106,3 +106,24 @@ def test_other_failures_stay_what_they_are(given: Cell) -> None:
     found = rw.refine_corners(given.observations, X, Y)
     with pytest.raises(RuntimeError, match=r"out of paper"), told_where_it_fails(found.graph.model, found.point):
         raise RuntimeError("out of paper")
+
+
+def test_fewer_corners_than_unknowns() -> None:
+    """Two images of four corners; and three, where the board's corners are free too: noise is not told by them."""
+    given, four = cell(1, cameras=1, images=12), [0, 6, 28, 34]
+    given = replace(given, observations=replace(given.observations, corner_px=0.2))
+
+    def some(view: Views, images: int) -> Views:
+        pixels = np.full_like(view.pixels[:images], np.nan)
+        pixels[:, four] = view.pixels[:images, four]
+        return Views(view.A[:images], pixels)
+
+    exact = rw.CornerOptions(carrier_noise="exact")
+    with pytest.raises(UnderdeterminedError, match=r"\(16 coordinates of corners for 20 unknowns\) are too few"):
+        refined(given, lambda view: some(view, 2), exact)
+    result = refined(given, lambda view: some(view, 3), exact)  # 24 for 20
+    assert not any("coordinates of corners" in words for words in result.findings)
+    result = refined(given, lambda view: some(view, 3), replace(exact, corners_m=1e-3))
+    (words,) = (words for words in result.findings if "coordinates of corners" in words)
+    assert words.startswith("There are 24 coordinates of corners for 125 unknowns, which therefore rest on their")
+    assert result.noise.corner_px == 0.2

@@ -179,6 +179,15 @@ def test_no_ray_leads_beyond_the_ring(model: str, D: tuple[float], ring: float) 
         assert np.isnan(camera.undistort(pixels)).all(), share
 
 
+def test_the_share_of_the_image_beyond_the_fold() -> None:
+    folded = Camera.of(640, 480, "plumb_bob", K, (-0.9, 0.0, 0.0, 0.0), "test")
+    radius = np.sqrt(1.0 / 2.7) * 2.0 / 3.0
+    assert folded.reach_px == pytest.approx(420.0 * radius, rel=1e-6)
+    ellipse = np.pi * radius**2 * 420.0 * 431.0 / (640 * 480)  # wholly inside the image
+    assert folded.share_beyond_fold == pytest.approx(1.0 - ellipse, abs=0.03)
+    assert camera_of("four").share_beyond_fold == camera_of("wide fisheye").share_beyond_fold == 0.0
+
+
 def test_a_pixel_without_a_ray_does_not_change_the_others() -> None:
     camera = Camera.of(640, 480, "plumb_bob", K, (-0.28, 0.0, 0.0, 0.0), "test")
     x = np.array([[0.1, 0.2], [0.3, -0.1]])

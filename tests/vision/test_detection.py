@@ -108,6 +108,16 @@ def test_corners_on_a_line_have_no_pose() -> None:
     assert np.isnan(detection.T).all()
 
 
+def test_a_lens_that_folds_back_before_a_corner() -> None:
+    folded = Camera.of(320, 240, "plumb_bob", PINHOLE.K, (-1.0, 0.0, 0.0, 0.0), "test")
+    assert folded.reach_px == pytest.approx(300.0 * np.sqrt(1.0 / 3.0) * 2.0 / 3.0)
+    for target, aside in ((GRID, -0.105), (Checkerboard("chess", 5, 4, 0.03), -0.09)):
+        near, far = (picture((target, pose((10.0, 10.0, 0.0), (x, 0.02, 0.35)))) for x in (0.0, aside))
+        assert only(seen_in(near, target)).rejection is None
+        assert only(seen_in(far, target)).rejection is None
+        assert only(seen_in(far, target, camera=folded)).rejection == Rejection.NO_RAY
+
+
 def test_reprojection_error() -> None:
     image = picture((BOARD, NEAR))
     other = Camera.of(320, 240, "", [[300.0, 0.0, 157.0], [0.0, 420.0, 121.5], [0.0, 0.0, 1.0]], (), "test")
@@ -142,7 +152,7 @@ def test_every_reason_has_its_test() -> None:
         Rejection.SMALL, Rejection.BLURRED, Rejection.GRAZING, Rejection.FEW_CORNERS, Rejection.NO_POSE,
         Rejection.REPROJECTION, Rejection.SEEN_TWICE, Rejection.NO_EDGES, Rejection.AMBIGUOUS,
         Rejection.NOT_A_GRID, Rejection.NOT_WHOLE, Rejection.SQUARES, Rejection.OTHER_SIZE,
-        Rejection.CIRCLES, Rejection.LAYOUT,
+        Rejection.CIRCLES, Rejection.LAYOUT, Rejection.NO_RAY,
     }  # fmt: skip
     assert tested == set(Rejection)
 
