@@ -75,13 +75,13 @@ class YamlFile:
         """``FILE, line N: a.b[0]: words``."""
         return f"{self.place(path)}: {words}"
 
-    def section(self, path: KeyPath) -> YamlFile:
-        """A mapping of the file as if it were alone, with the lines that it has in the file."""
-        data, depth = self.data, len(path)
-        for key in path:
-            data = data[key]
-        lines = {place[depth:]: line for place, line in self.lines.items() if place[:depth] == path}
-        return YamlFile(self.where, data, lines)
+    def sections(self, key: str) -> dict[str, YamlFile]:
+        """The values of a mapping at the top, each as a file of its own, with the lines that it has in this one."""
+        lines: dict[str, dict[KeyPath, int]] = {name: {} for name in self.data[key]}
+        for path, line in self.lines.items():
+            if len(path) > 1 and path[0] == key:
+                lines[str(path[1])][path[2:]] = line
+        return {name: YamlFile(self.where, value, lines[name]) for name, value in self.data[key].items()}
 
 
 def read_yaml(path: str | Path, *, tags: Collection[str] = ()) -> YamlFile:

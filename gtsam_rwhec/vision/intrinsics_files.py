@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +149,7 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
     if any(_KALIBR_CAMERA.fullmatch(name) for name in fields):
         return _kalibr_cameras(file)
     if isinstance(fields.get("cameras"), dict):
-        return dict(_by_name(file, size))
+        return _by_name(file, size)
     numbered = [
         number for number in ("1", "2") if isinstance(fields.get(_found(fields, _MATRIX, number)), (dict, tuple))
     ]
@@ -158,15 +158,19 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
     return {"": _calibrated(file, "", size)}
 
 
-def _by_name(file: YamlFile, size: tuple[int, int] | None) -> Iterator[tuple[str, Camera]]:
+def _by_name(file: YamlFile, size: tuple[int, int] | None) -> dict[str, Camera]:
     """The cameras of `cameras`, each a calibration with its name in it, or else as its key."""
     if not file.data["cameras"]:
         refuse(file, ("cameras",), "no camera is in it")
-    for key, section in file.data["cameras"].items():
-        path = ("cameras", key)
-        if not isinstance(section, dict):
-            refuse(file, path, f"{shown(section)}; a camera's section was expected")
-        yield str(section.get("name", key)), _calibrated(file.section(path), "", size)
+    cameras: dict[str, Camera] = {}
+    for key, section in file.sections("cameras").items():
+        if not isinstance(section.data, dict):
+            refuse(file, ("cameras", key), f"{shown(section.data)}; a camera's section was expected")
+        name = str(section.data.get("name", key))
+        if name in cameras:
+            refuse(file, ("cameras", key), f"the name {shown(name)} is there twice; keep one")
+        cameras[name] = _calibrated(section, "", size)
+    return cameras
 
 
 def _calibrated(file: YamlFile, number: str, size: tuple[int, int] | None) -> Camera:

@@ -171,6 +171,11 @@ def test_files_without_cameras_are_files(tmp_path: Path) -> None:
     [
         ("image_width: 640", "image_width: wide", r"line 11: image_width: 'wide'; a whole number of pixels"),
         ("rows: 3", "rows: 4", r"line 18: camera_matrix\.data: 9 numbers for 4 rows and 3 columns"),
+        (
+            '"rig/cam_right"',
+            '"cam_left"',
+            r"line \d+: cameras\.rig_cam_right: the name 'cam_left' is there twice; keep one",
+        ),
         ("cameras:\n", "cameras:\n   other: 3\n", r"line 8: cameras\.other: 3; a camera's section was expected"),
     ],
 )

@@ -49,5 +49,10 @@ def seeds() -> Iterable[bytes]:
     )
     yield b"R" + eight_coefficients.replace("-2.e-4, 0]", "-2.e-4, 0, 0, 0, 0]").encode()
 
+    yield b"C%YAML:1.0\n---\ncameras:\n" + b"".join(
+        f"   {name}:\n".encode() + b"".join(b"      " + line + b"\n" for line in OPENCV.encode().splitlines()[2:])
+        for name in ("left", "right")
+    )
+
 
 HARNESS = Harness(read, seeds, mutate)
