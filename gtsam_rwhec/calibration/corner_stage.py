@@ -17,16 +17,13 @@ from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.rounded_numbers import rounded
-from gtsam_rwhec.geometry.poses import Array, PoseLike
+from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.noise_model.in_corners import beyond_independent_errors
-from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.refinement.refined import Refined
-from gtsam_rwhec.refinement.reprojection_found import Intrinsics, Reprojection, SensorReprojection, TriedModel
-from gtsam_rwhec.reprojection.as_refined import as_refined, boards_of, intrinsics_of
-from gtsam_rwhec.reprojection.consequences import consequences_of
+from gtsam_rwhec.refinement.reprojection_found import Intrinsics, Reprojection, TriedModel
+from gtsam_rwhec.reprojection.as_refined import as_refined, intrinsics_of
 from gtsam_rwhec.reprojection.findings import is_doubtful, lens_that_was_left_out
-from gtsam_rwhec.reprojection.held_out import HeldOut
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refined import CornersRefined
@@ -36,6 +33,8 @@ from gtsam_rwhec.reprojection.refining_corners import refine_corners
 MEASUREMENTS = "refinement"
 #: Standard deviation of a size that is estimated, a share of 1.
 SIZE_SHARE = 0.2
+#: A growth of standard deviations below this is not said.
+SEEN_GROWTH = 1.05
 #: Images that were left out are off by more than this times what covariances say, where the model lacks something.
 UNEXPLAINED = 1.5
 
@@ -110,52 +109,16 @@ def corners_found(
     return CornersFound(
         corners,
         intrinsics,
-        _numbers(observations, corners, tried),
+        numbers_of(observations, corners, tried.options, tried.held_out, _tried(tried)),
         tuple(_choices(observations, corners, tried, intrinsics)),
         tuple(_findings(corners, tried, intrinsics)),
     )
 
 
-def _numbers(observations: Observations, corners: CornersRefined, tried: Tried) -> Reprojection:
-    exact = corners.noise.carrier is None
-    given = isinstance(tried.options.carrier_noise, CarrierNoise)
-    sensors = {}
-    squares = count = 0.0
-    for name in corners.Y:
-        views = {pair: view for pair, view in observations.views.items() if pair[1] == name}
-        left_out = sum(int(corners.left_out[pair].sum()) for pair in views)
-        number = sum(int(view.known.sum()) for view in views.values()) - left_out
-        rms = corners.intrinsics[name].rms_px
-        squares, count = squares + number * rms**2, count + number
-        held_out = tried.held_out.get(name)
-        sensors[name] = SensorReprojection(
-            images=sum(len(view.A) for view in views.values()),
-            corners=number,
-            left_out=left_out,
-            rms_px=rms,
-            held_out_px=None if held_out is None else held_out.rms_px,
-            held_out_mm=None if held_out is None else held_out.rms_mm,
-            expected_px=None if held_out is None else held_out.expected_px,
-            regions_px=() if held_out is None else _regions(held_out),
-        )
-    return Reprojection(
-        rms_px=float(np.sqrt(squares / max(count, 1.0))),
-        corner_px=corners.noise.corner_px,
-        carrier_poses="exact" if exact else "given" if given else "estimated",
-        carrier_rotation_rad=corners.noise.carrier_rad,
-        carrier_translation_m=corners.noise.carrier_m,
-        sensors=sensors,
-        boards=boards_of(corners),
-        tried=tuple(
-            TriedModel(one.words, one.px, one.mm, one is tried.scores[0]) for one in tried.scores if np.isfinite(one.px)
-        ),
-        consequences=consequences_of(corners),
-    )
-
-
-def _regions(held_out: HeldOut) -> tuple[tuple[float | None, ...], ...]:
-    rows: Array = held_out.regions_px
-    return tuple(tuple(None if np.isnan(value) else float(value) for value in row) for row in rows)
+def _tried(tried: Tried) -> tuple[TriedModel, ...]:
+    """The models in numbers; without those that put a target behind its camera."""
+    best = tried.scores[:1]
+    return tuple(TriedModel(one.words, one.px, one.mm, one in best) for one in tried.scores if np.isfinite(one.px))
 
 
 def _choices(
@@ -165,6 +128,7 @@ def _choices(
     number -= sum(int(mask.sum()) for mask in corners.left_out.values())
     chosen = f"from {number} corners ({corners.noise.corner_px:.2g} px), with {tried.words}"
     yield Choice(MEASUREMENTS, chosen, tried.evidence)
+    growth = growth_by_intrinsics(corners)
     for name, one in intrinsics.items():
         if one.stated_as == "exact":
             yield Choice(f"intrinsics of {name}", "as stated, which count as exact", "an option says so")
@@ -176,9 +140,31 @@ def _choices(
             "unknown": "none are stated",
         }.get(one.stated_as, "")
         found = f"estimated with the poses, to {rounded(f)} px of f and {rounded(c)} px of c"
+        if growth[name] > SEEN_GROWTH:
+            found += f", which makes standard deviations of {name} up to {growth[name]:.2g} times those of exact ones"
         if one.held_by_prior:
             found += f"; {', '.join(one.held_by_prior)} about as stated, since the images do not tell them"
         yield Choice(f"intrinsics of {name}", found, known)
+
+
+def growth_by_intrinsics(corners: CornersRefined) -> dict[str, float]:
+    """By sensor: the largest ratio of a standard deviation of its pose to that with exact intrinsics.
+
+    With exact intrinsics k the covariance of the rest e is C_ee - C_ek C_kk^-1 C_ke.
+    """
+    held = [np.arange(at.start, at.stop) for (letter, _), at in corners.slots.items() if letter == "k"]
+    if not held:
+        return dict.fromkeys(corners.Y, 1.0)
+    k, C = np.concatenate(held), corners.joint
+    size = np.sqrt(np.diagonal(C)[k])
+    found = {}
+    for name in corners.Y:
+        e = np.arange(corners.slots["y", name].start, corners.slots["y", name].stop)
+        across = C[np.ix_(e, k)] / size
+        by_k = across @ np.linalg.solve(C[np.ix_(k, k)] / np.outer(size, size), across.T)
+        known = np.diagonal(C)[e] - np.diagonal(by_k)
+        found[name] = float(np.sqrt((np.diagonal(C)[e] / np.maximum(known, 1e-300)).max()))
+    return found
 
 
 def _findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, Intrinsics]) -> Iterator[Finding]:

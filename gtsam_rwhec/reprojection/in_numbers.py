@@ -65,6 +65,7 @@ def _of_sensor(
         held_out_px=None if held_out is None else held_out.rms_px,
         held_out_mm=None if held_out is None else held_out.rms_mm,
         regions_px=() if held_out is None else _regions(held_out),
+        expected_px=None if held_out is None else held_out.expected_px,
     )
 
 

@@ -6,11 +6,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.calibration.corner_choice import chosen_model, thinned
-from gtsam_rwhec.calibration.corner_stage import MEASUREMENTS, corners_found
+from gtsam_rwhec.calibration.corner_stage import MEASUREMENTS, corners_found, growth_by_intrinsics
 from gtsam_rwhec.calibration.verdict import Ground
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "reprojection"))
@@ -65,6 +66,19 @@ def test_what_is_chosen_and_found_is_said() -> None:
     assert found.reprojection.rms_px < 0.12
     assert found.reprojection.carrier_poses == "estimated"
     assert {one.frame for one in found.reprojection.consequences} == {"board", "cam_0", "cam_1"}
+
+
+def test_the_growth_by_free_intrinsics_is_that_against_exact_ones() -> None:
+    given = cell(4, images=24)
+    options = rw.CornerOptions(stated="calibration", carrier_noise="exact")
+    free, exact = (rw.refine_corners(given.observations, *start(given), each) for each in (
+        options, rw.CornerOptions(stated="exact", carrier_noise="exact"),
+    ))  # fmt: skip
+    for name, growth in growth_by_intrinsics(free).items():
+        before, after = (np.sqrt(np.diagonal(each.covariance(name))) / each.noise.corner_px for each in (exact, free))
+        assert growth == pytest.approx((after / before).max(), rel=0.02)
+        assert growth > 1.5
+    assert growth_by_intrinsics(exact) == pytest.approx({"cam_0": 1.0, "cam_1": 1.0})
 
 
 def test_stated_intrinsics_that_are_off_are_named() -> None:
