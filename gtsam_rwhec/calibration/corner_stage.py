@@ -24,6 +24,7 @@ from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.reprojection_found import Intrinsics, Reprojection, TriedModel
 from gtsam_rwhec.reprojection.as_refined import as_refined, intrinsics_of
 from gtsam_rwhec.reprojection.findings import is_doubtful, lens_that_was_left_out
+from gtsam_rwhec.reprojection.in_numbers import numbers_of
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refined import CornersRefined
