@@ -56,6 +56,7 @@ def as_refined(
     keys |= {f"intrinsics:{name}": graph.k[graph.model.camera_of[name]] for name in corners.Y}
     keys |= {f"shape:{name}": key for name, key in graph.b.items()}
     keys |= {f"time_offset:{name}": key for name, key in graph.t.items()}
+    keys |= {f"corners:{name}": key for name, key in graph.p.items()}
     refined = replace(
         base,
         X=corners.X,
