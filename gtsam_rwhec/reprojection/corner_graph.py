@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.model import FewRows, Model, Point
 
+#: A symbol's letter is in the bits of its key from this one on.
+LETTER = 56
 #: Letters of the variables that are vectors; the others are poses.
 _VECTORS = frozenset(map(ord, "kbtp"))
 
@@ -224,13 +226,19 @@ class CornerGraph:
 
     def _come_to(self, keys: list[int], values: gtsam.Values) -> None:
         """Compute all residuals at the values anew, if one of the variables with these keys has changed."""
-        if any(self._at.get(key) != _value(values, key) for key in keys):
-            self._point = self.point(values)
-            self._at = {key: _value(values, key) for key in self._keys}
-            self._errors, self._rows = self.model.errors(self._point), []
+        at = self._at
+        for key in keys:
+            if key not in at or at[key] != _value(values, key):
+                self._point = self.point(values)
+                self._at = {key: _value(values, key) for key in self._keys}
+                self._errors, self._rows = self.model.errors(self._point), []
+                break
 
 
 def _value(values: gtsam.Values, key: int) -> bytes:
-    if gtsam.symbolChr(key) in _VECTORS:
-        return bytes(values.atVector(key).tobytes())
-    return bytes(values.atPose3(key).matrix().tobytes())
+    """A variable's value: this is asked a hundred thousand times."""
+    if key >> LETTER in _VECTORS:
+        value: bytes = values.atVector(key).tobytes()
+    else:
+        value = values.atPose3(key).matrix().tobytes()
+    return value
