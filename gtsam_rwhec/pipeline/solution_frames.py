@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.pipeline.solving_stage import Solved
 from gtsam_rwhec.results.unanswered import shortage
-from gtsam_rwhec.rig import CameraLink, RigFrames
+from gtsam_rwhec.rig import CameraLink, Rig, RigFrames
 from gtsam_rwhec.rig.camera_link import link_of_optical
 from gtsam_rwhec.rig.refined_frames import known_cameras
+
+#: Of intrinsics that were estimated before detection, and that no refinement from corners made better.
+BOARDS_ALONE = "estimated from views of boards alone, before the poses; standard deviations are not known"
 
 
 def frames_of(solved: Solved) -> RigFrames:
@@ -16,7 +21,8 @@ def frames_of(solved: Solved) -> RigFrames:
     rig, refined = solved.rig, solved.refined
     missing = [name for name in (*rig.sensors, *rig.targets) if name not in refined.X and name not in refined.Y]
     frame = {name: rig.frame_of(name) for name in refined.Y}
-    cameras, origins = known_cameras(solved.cameras, refined.intrinsics)
+    cameras, of_corners = known_cameras(solved.cameras, refined.intrinsics)
+    origins = origins_before_corners(rig, cameras) | of_corners
     return RigFrames(
         sensor_carrier=rig.carriers.sensors,
         target_carrier=rig.carriers.targets,
@@ -34,6 +40,11 @@ def frames_of(solved: Solved) -> RigFrames:
         warnings=warnings_of(solved),
         left_out={name: shortage(solved.log, name) for name in missing},
     )
+
+
+def origins_before_corners(rig: Rig, sensors: Iterable[str]) -> dict[str, str]:
+    """Where the intrinsics of sensors are from that state none, as detection used them; the others' are as stated."""
+    return {name: BOARDS_ALONE for name in sensors if rig.sensors[name].stated == "unknown"}
 
 
 def warnings_of(solved: Solved) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError, CameraWarning, FileFormatError, RwhecError
 from gtsam_rwhec.pipeline.folder_log import write_folder_log
 from gtsam_rwhec.pipeline.intrinsics import check_intrinsics_files, read_intrinsics
+from gtsam_rwhec.pipeline.solution_frames import BOARDS_ALONE, origins_before_corners
 from gtsam_rwhec.rig.rig_file import parse_rig
 
 FILES = {
@@ -78,6 +79,11 @@ def test_a_lens_that_folds_back_within_the_image_is_warned_of(tmp_path: Path, lo
     words = r"sensor cam1: the distortion \(radtan, D = \[-0.9, .*\) folds back 203 pixels .*: 5\d % of the image"
     with log, pytest.warns(CameraWarning, match=words):
         read_intrinsics(log, rig(tmp_path, source))
+
+
+def test_intrinsics_that_nobody_stated_are_not_said_to_be_stated(tmp_path: Path) -> None:
+    assert origins_before_corners(rig(tmp_path, "estimate"), ["cam1"]) == {"cam1": BOARDS_ALONE}
+    assert origins_before_corners(rig(tmp_path, "ost.yaml"), ["cam1"]) == {}
 
 
 @pytest.mark.parametrize(
