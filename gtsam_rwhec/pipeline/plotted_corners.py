@@ -18,7 +18,7 @@ from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.refinement.reprojection_found import SIZE, WARPS, Reprojection
 from gtsam_rwhec.report.plots import PlottedCorners, PlottedIntrinsics
 from gtsam_rwhec.reprojection.corner_views import shaped
-from gtsam_rwhec.reprojection.projection_uncertainty import projection_deviations
+from gtsam_rwhec.reprojection.projection_uncertainty import lens_deviations_over
 from gtsam_rwhec.vision.camera import Camera
 
 #: Fewer corners than this in an image say nothing beside its pose.
@@ -110,28 +110,32 @@ def plotted_intrinsics(solved: Solved, seen: dict[str, list[SeenView]]) -> dict[
         return result
     for sensor, found in solved.refined.intrinsics.items():
         views = seen.get(sensor, [])
-        depths = [float(np.median(view.points[:, 2])) for view in views]
-        distance_m = found.projection_m or (float(np.median(depths)) if depths else 0.0)
-        if not distance_m > 0.0:
+        if not views:
             continue
-        grid, deviations = projection_deviations(solved.refined, sensor, distance_m, steps=40)
+        points = np.concatenate([view.points for view in views])
+        distance_m = found.projection_m or float(np.median(points[:, 2]))
+        covariance = solved.refined.covariance(f"intrinsics:{sensor}")
+        grid, deviations = lens_deviations_over(found.camera, covariance, points, distance_m, steps=40)
+        corners, image = residuals_of(found.camera, views, numbers)
         result[sensor] = PlottedIntrinsics(
-            (found.width, found.height), residuals_of(found.camera, views, numbers), grid, deviations, distance_m,
+            (found.width, found.height), corners, image, grid, deviations, distance_m,
             numbers.sensors[sensor].regions_px,
         )  # fmt: skip
     return result
 
 
-def residuals_of(camera: Camera, views: list[SeenView], found: Reprojection) -> PlottedCorners:
-    """Errors of corners at the optimum, where A of each image is off by what its noise and its corners together say.
+def residuals_of(camera: Camera, views: list[SeenView], found: Reprojection) -> tuple[PlottedCorners, np.ndarray]:
+    """Errors of corners at the optimum, and the image (N,) of each.
 
+    A of each image is off there by what its noise and its corners together say.
     With the derivatives J of the pixels by A's errors over their deviations, and residuals r over the corners' noise:
     r - J (J' J + I)^-1 J' r, to first order. Corners that are far off do not count.
     """
     deviations = np.repeat([found.carrier_rotation_rad, found.carrier_translation_m], 3)
     pixels: list[Array] = [np.zeros((0, 2))]
     errors: list[Array] = [np.zeros((0, 2))]
-    for view in views:
+    image: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
+    for i, view in enumerate(views):
         P = view.points
         x = P[:, :2] / P[:, 2:]
         predicted, by_x = camera.pixel_jacobian(x)
@@ -145,7 +149,8 @@ def residuals_of(camera: Camera, views: list[SeenView], found: Reprojection) -> 
         if kept.sum() >= FEWEST:
             pixels.append(view.pixels[kept])
             errors.append(_at_optimum(J[kept], off[kept]))
-    return PlottedCorners(np.concatenate(pixels), np.concatenate(errors))
+            image.append(np.full(len(pixels[-1]), i))
+    return PlottedCorners(np.concatenate(pixels), np.concatenate(errors)), np.concatenate(image)
 
 
 def _at_optimum(J: Array, errors: Array) -> Array:

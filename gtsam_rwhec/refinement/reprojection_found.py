@@ -209,7 +209,7 @@ class Intrinsics:
         Of the corners that count, along each axis.
     projection_px : tuple of tuple of float or None
         Standard deviation of the projection of points at `projection_m` before the camera, pixels, by region of the
-        image.
+        image: of the lens alone, with the pose that hides its errors best where corners were seen.
     projection_m : float
     """
 

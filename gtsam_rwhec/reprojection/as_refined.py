@@ -85,14 +85,17 @@ def as_refined(
 
 def _projected(refined: Refined, corners: CornersRefined, sensor: str) -> Intrinsics:
     """A sensor's intrinsics with how sure projections are at the depth where it saw its corners."""
-    seen = []
+    intrinsics, seen = refined.intrinsics[sensor], []
     for stack in corners.graph.model.stacks:
         if stack.sensor == sensor:
             X, Y = corners.X[stack.target].matrix(), corners.Y[sensor].matrix()
-            seen.append(depths(stack, X, Y, corners.point.A, corners.shapes[stack.target])[stack.known])
-    distance_m = float(np.median(np.concatenate(seen)))
-    intrinsics, covariance = refined.intrinsics[sensor], refined.covariance(sensor, f"intrinsics:{sensor}")
-    regions = by_region(intrinsics.camera, covariance, distance_m)
+            z = depths(stack, X, Y, corners.point.A, corners.shapes[stack.target])[stack.known]
+            x = intrinsics.camera.undistort(stack.pixels[stack.known])
+            seen.append(z[:, None] * np.concatenate([x, np.ones((len(x), 1))], axis=1))
+    points = np.concatenate(seen)
+    points = points[np.isfinite(points).all(axis=1)]
+    distance_m = float(np.median(points[:, 2]))
+    regions = by_region(intrinsics.camera, refined.covariance(f"intrinsics:{sensor}"), points, distance_m)
     return replace(intrinsics, projection_px=regions, projection_m=distance_m)
 
 

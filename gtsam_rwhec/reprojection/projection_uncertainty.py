@@ -3,7 +3,10 @@
 A point that stands still on the sensor's carrier, at a distance along a pixel's ray, is projected again with other
 errors of Y and of the intrinsics. These errors belong together: a turn of the camera hides a shift of its centre. Where
 no corner was seen, they do not hide each other, and the deviation grows: a camera that was calibrated from one corner
-of its image says so. mrcal's measure.
+of its image says so.
+
+What of this is the lens's own, whatever errors all poses share, is mrcal's measure: intrinsics are off by dk, and the
+pose by what hides dk best where corners were seen, dp = -(sum Jp' Jp)^-1 sum Jp' Jk dk; a pixel moves by Jk dk + Jp dp.
 """
 
 from __future__ import annotations
@@ -67,39 +70,50 @@ def projection_deviations(
 
 def deviations_over(camera: Camera, covariance: Array, distance_m: float, *, steps: int = 20) -> tuple[Array, Array]:
     """The same, of a camera and the covariance (6 + m, 6 + m) of its pose's right perturbation and its m parameters."""
-    if not (is_real(distance_m) and 0.0 < distance_m < np.inf):
-        raise OptionError(f"distance_m={brief(distance_m)}; give metres, above 0")
-    sides = (camera.width, camera.height)
-    numbers = [max(round(steps * side / max(sides)), 1) for side in sides]
-    u, v = ((np.arange(number) + 0.5) * side / number - 0.5 for number, side in zip(numbers, sides, strict=True))
-    pixels = np.stack(np.meshgrid(u, v), axis=-1)
-    return pixels, _deviations_at(camera, covariance, pixels, distance_m)
+    pixels, P = _points_over(camera, distance_m, steps)
+    by_pose, by_camera = _derivatives(camera, P)
+    return pixels, _worst(np.concatenate([by_pose, by_camera], axis=-1), covariance)
 
 
-def by_region(camera: Camera, covariance: Array, distance_m: float) -> Regions:
-    """The deviation by region of the image, as errors of held-out corners are: root mean square over each region.
+def lens_deviations_over(
+    camera: Camera, covariance: Array, seen: Array, distance_m: float, *, steps: int = 20
+) -> tuple[Array, Array]:
+    """The same, of the lens alone: with the pose that hides errors of the intrinsics best where corners were seen.
 
     Parameters
     ----------
     camera : Camera
         With the estimated intrinsics.
-    covariance : (6 + m, 6 + m) array
-        Of the sensor's pose and its intrinsics, as ``refined.covariance(sensor, f"intrinsics:{sensor}")`` has it.
+    covariance : (m, m) array
+        Of its parameters, as ``refined.covariance(f"intrinsics:{sensor}")`` has it.
+    seen : (n, 3) array
+        The corners that were seen, in the camera's frame, metres.
     distance_m : float
         Depth of the points in front of the sensor, metres.
+    """
+    by_pose, by_camera = (J.reshape(-1, J.shape[-1]) for J in _derivatives(camera, seen))
+    size = np.maximum(np.linalg.norm(by_pose, axis=0), 1e-300)
+    hiding, *_ = np.linalg.lstsq(by_pose / size, -by_camera, rcond=1e-9)
+    pixels, P = _points_over(camera, distance_m, steps)
+    there, moved = _derivatives(camera, P)
+    return pixels, _worst(moved + there / size @ hiding, covariance)
+
+
+def by_region(camera: Camera, covariance: Array, seen: Array, distance_m: float) -> Regions:
+    """`lens_deviations_over` by region of the image, as errors of held-out corners are: root mean square over each.
 
     Returns
     -------
     tuple of tuple of float or None
         Pixels, rows from the top; None where the lens has no ray.
     """
-    pixels, deviations = deviations_over(camera, covariance, distance_m, steps=10 * REGIONS)
+    pixels, deviations = lens_deviations_over(camera, covariance, seen, distance_m, steps=10 * REGIONS)
     size = np.array([camera.width, camera.height])
     at = np.minimum((REGIONS * (pixels + 0.5) / size).astype(int), REGIONS - 1)
-    seen = np.isfinite(deviations)
+    known = np.isfinite(deviations)
     count, total = np.zeros((REGIONS, REGIONS)), np.zeros((REGIONS, REGIONS))
-    np.add.at(count, (at[seen][:, 1], at[seen][:, 0]), 1.0)
-    np.add.at(total, (at[seen][:, 1], at[seen][:, 0]), deviations[seen] ** 2)
+    np.add.at(count, (at[known][:, 1], at[known][:, 0]), 1.0)
+    np.add.at(total, (at[known][:, 1], at[known][:, 0]), deviations[known] ** 2)
     return tuple(
         tuple(float(np.sqrt(s / n)) if n else None for s, n in zip(*row, strict=True))
         for row in zip(total, count, strict=True)
@@ -132,17 +146,39 @@ def uneven_words(projection_px: Regions, corners: Regions = ()) -> str:
     )
 
 
-def _deviations_at(camera: Camera, covariance: Array, pixels: Array, distance_m: float) -> Array:
-    """Deviations (...) of pixels (..., 2) along the worse direction; nan where the lens has no ray."""
+def _points_over(camera: Camera, distance_m: float, steps: int) -> tuple[Array, Array]:
+    """Pixels (h, w, 2) evenly over the image, and points (h, w, 3) along their rays; nan where the lens has no ray."""
+    if not (is_real(distance_m) and 0.0 < distance_m < np.inf):
+        raise OptionError(f"distance_m={brief(distance_m)}; give metres, above 0")
+    sides = (camera.width, camera.height)
+    numbers = [max(round(steps * side / max(sides)), 1) for side in sides]
+    u, v = ((np.arange(number) + 0.5) * side / number - 0.5 for number, side in zip(numbers, sides, strict=True))
+    pixels = np.stack(np.meshgrid(u, v), axis=-1)
     x = camera.undistort(pixels)
-    seen = np.asarray(np.isfinite(x).all(axis=-1))
-    x = np.where(seen[..., None], x, 0.0)
+    return pixels, distance_m * np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
+
+
+def _derivatives(camera: Camera, P: Array) -> tuple[Array, Array]:
+    """Of the pixels of points (..., 3), by the camera's pose (..., 2, 6) and its parameters (..., 2, m).
+
+    Y Expmap([w, v]) moves a point that stands on the carrier by -(w x P + v) in the sensor's frame. Derivatives are nan
+    where the point is.
+    """
+    known = np.asarray(np.isfinite(P).all(axis=-1))
+    at = np.where(known[..., None], P, [0.0, 0.0, 1.0])
+    z = at[..., 2, None]
+    x = at[..., :2] / z
     _, by_x, by_camera = pixels_and_derivatives(camera, parameters_of(camera), x)
-    P = distance_m * np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
-    to_x = np.concatenate([np.broadcast_to(np.eye(2), (*x.shape, 2)), -x[..., None]], axis=-1) / distance_m
-    # Y Expmap([w, v]) moves a point that stands on the carrier by -(w x P + v) in the sensor's frame.
-    hat = se3.hat(P.reshape(-1, 3)).reshape(*P.shape, 3)
+    to_x = np.concatenate([np.broadcast_to(np.eye(2), (*x.shape, 2)), -x[..., None]], axis=-1) / z[..., None]
+    hat = se3.hat(at.reshape(-1, 3)).reshape(*at.shape, 3)
     by_xi = np.concatenate([hat, np.broadcast_to(-np.eye(3), hat.shape)], axis=-1)
-    J = np.concatenate([by_x @ to_x @ by_xi, by_camera], axis=-1)
-    worst = np.sqrt(np.linalg.eigvalsh(J @ covariance @ np.swapaxes(J, -1, -2))[..., -1])
-    return np.where(seen, worst, np.nan)
+    nowhere = np.where(known, 0.0, np.nan)[..., None, None]
+    return by_x @ to_x @ by_xi + nowhere, by_camera + nowhere
+
+
+def _worst(J: Array, covariance: Array) -> Array:
+    """Deviations (...) along the worse direction, with the derivatives J (..., 2, d); nan where these are."""
+    known = np.asarray(np.isfinite(J).all(axis=(-1, -2)))
+    J = np.where(known[..., None, None], J, 0.0)
+    variance = np.linalg.eigvalsh(J @ covariance @ np.swapaxes(J, -1, -2))[..., -1]
+    return np.where(known, np.sqrt(np.maximum(variance, 0.0)), np.nan)

@@ -27,7 +27,8 @@ def test_errors_are_those_of_the_optimum_where_A_is_a_variable() -> None:
     assert refined.reprojection is not None
     for stack in corners.graph.model.stacks:
         sensor = stack.sensor
-        found = residuals_of(refined.intrinsics[sensor].camera, views_of(sensor), refined.reprojection)
+        found, image = residuals_of(refined.intrinsics[sensor].camera, views_of(sensor), refined.reprojection)
+        assert np.bincount(image).tolist() == [len(stack.points)] * len(stack.instant)
         camera = corners.intrinsics[sensor].camera
         X, Y = corners.X["board"].matrix(), corners.Y[sensor].matrix()
         optimum = pixel_errors(stack, X, Y, corners.point.A, parameters_of(camera), corners.shapes["board"])
@@ -46,7 +47,7 @@ def test_a_misread_corner_does_not_count() -> None:
     moved = views[3].pixels.copy()
     moved[7] += 40.0
     camera = refined.intrinsics["cam_0"].camera
-    found = residuals_of(camera, [*views[:3], views[3]._replace(pixels=moved)], refined.reprojection)
+    found, _ = residuals_of(camera, [*views[:3], views[3]._replace(pixels=moved)], refined.reprojection)
     assert len(found.pixels) == 4 * len(moved) - 1
     assert np.abs(found.errors_px).max() < 0.6
 

@@ -11,7 +11,8 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FrameError, OptionError
-from gtsam_rwhec.reprojection.projection_uncertainty import by_region, projection_deviations
+from gtsam_rwhec.reprojection.projection_uncertainty import by_region, lens_deviations_over, projection_deviations
+from gtsam_rwhec.vision.camera import Camera
 
 EXACT = rw.CornerOptions(carrier_noise="exact")
 
@@ -57,11 +58,31 @@ def test_a_camera_that_was_calibrated_from_a_corner_of_its_image_says_so() -> No
     far = (pixels > [CAMERA.width * 0.8, CAMERA.height * 0.8]).all(axis=-1)
     assert deviations[far].min() > 5.0 * np.median(deviations[seen])
     assert everywhere.max() < deviations[far].min()
-    regions = by_region(part.intrinsics["cam_0"].camera, part.covariance("cam_0", "intrinsics:cam_0"), 1.5)
-    found = np.array(regions, dtype=float)  # a region without a value would be nan
-    assert found.shape == (3, 3)
-    assert found[2, 2] > 5.0 * found[0, 0]
-    assert found[0, 0] == pytest.approx(float(np.sqrt((deviations[:4, :6] ** 2).mean())), rel=0.3)
+    lens = part.intrinsics["cam_0"]
+    (view,) = in_one_corner(given).observations.views.values()
+    corners = view.pixels[np.isfinite(view.pixels).all(axis=2)]
+    points = 1.5 * np.concatenate([lens.camera.undistort(corners), np.ones((len(corners), 1))], axis=1)
+    regions = np.array(by_region(lens.camera, lens.covariance, points, 1.5), dtype=float)  # nan: no value
+    assert regions.shape == (3, 3)
+    assert regions[2, 2] > 5.0 * regions[0, 0]
+    _, alone = lens_deviations_over(lens.camera, lens.covariance, points, 1.5)
+    assert regions[0, 0] == pytest.approx(float(np.sqrt((alone[:4, :6] ** 2).mean())), rel=0.3)
+    # the lens alone is as sure as the lens on its carrier, where the carriers' poses count as exact and views are many
+    assert np.median(alone[far] / deviations[far]) == pytest.approx(1.0, abs=0.3)
+
+
+def test_what_all_poses_share_is_no_error_of_the_lens() -> None:
+    """A shift of the centre that a turn of the camera hides moves no pixel; one that nothing hides moves all."""
+    camera = Camera.of(1920, 1080, "pinhole", CAMERA.K, (), "test")
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-0.7, -0.4, 1.0], [0.7, 0.4, 1.6], size=(300, 3))
+    centre = np.diag([0.0, 0.0, 4.0, 4.0])
+    _, hidden = lens_deviations_over(camera, centre, points, 1.3)
+    assert np.median(hidden) < 0.4  # of 2 pixels
+    assert hidden.max() < 1.0
+    focal = np.diag([100.0, 0.0, 0.0, 0.0])  # fx alone: no pose stretches an image along one axis
+    pixels, seen = lens_deviations_over(camera, focal, points, 1.3)
+    assert seen.max() > 0.25 * 10.0 * np.abs(pixels[..., 0] - 960.0).max() / 1400.0
 
 
 def test_what_is_asked_is_checked() -> None:

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import fdtrc
 
 from gtsam_rwhec.files.rounded_numbers import rounded
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.plots.coverage import ARROW_SHARE, MEAN_CELLS, cells_of
 from gtsam_rwhec.report.plots.drawing import BLUE, GREY, picture, round_down, say, shortened
 from gtsam_rwhec.report.plots.plotted import PlottedIntrinsics
@@ -17,10 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
 
-#: A mean residual is drawn for a cell with at least this many corners.
-LEAST_CORNERS = 10
-#: A mean residual beyond this many standard errors is none of chance.
-BEYOND_CHANCE = 3.0
+#: Errors of a cell are alike in its images where chance gives such a mean with less than this probability.
+LEVEL = 1e-3
 #: The share of the colours, from bright to dark, on which black lines and numbers can be read.
 READABLE = 0.55
 #: Corners are dots of this size, points.
@@ -57,8 +57,8 @@ def plot_intrinsics(cameras: Mapping[str, PlottedIntrinsics], path: str | Path) 
             _draw_uncertainty(uncertainty, of)
             _draw_held_out(held_out, of)
         arrows = (
-            (BLUE, "mean error of neighbouring corners, enlarged: the lens model or the board lacks something here"),
-            (GREY, "the same, no larger than by chance"),
+            (BLUE, "mean error of neighbouring corners, enlarged; alike in the images: the lens model lacks something"),
+            (GREY, "the same, by chance"),
         )
         handles = [
             Line2D([], [], marker=">", markersize=5, lw=1.2, color=colour, label=says) for colour, says in arrows
@@ -90,27 +90,44 @@ def _draw_residuals(axes: Axes, sensor: str, of: PlottedIntrinsics) -> None:
         _frame(axes, of, f"{sensor}: no corners")
         return
     rms = float(np.sqrt((seen.errors_px**2).mean()))
-    cells, _ = cells_of(seen.pixels, of.size, MEAN_CELLS)
-    number = np.bincount(cells)
-    full = number >= LEAST_CORNERS
-    at, mean = (
-        np.stack([np.bincount(cells, values[:, k])[full] / number[full] for k in range(2)], axis=1)
-        for values in (seen.pixels, seen.errors_px)
-    )
-    length = np.linalg.norm(mean, axis=1)
+    at, mean, is_alike = _means(of)
     axes.plot(*seen.pixels.T, ls="", marker=".", markersize=DOT, color="#BBBBBB", zorder=1)
     title = f"{sensor}: errors that stay in the refinement\nrms {rms:.2g} px along each axis"
-    longest = float(length.max(initial=0.0))
+    longest = float(np.linalg.norm(mean, axis=1).max(initial=0.0))
     if longest > 0.0:
         times = round_down(ARROW_SHARE * max(of.size) / MEAN_CELLS / longest)
-        # the mean of n errors of two axes has the variance 2 rms^2 / n
-        systematic = length > BEYOND_CHANCE * rms * np.sqrt(2.0 / number[full])
         axes.quiver(
-            *at.T, *(times * mean).T, color=np.where(systematic, BLUE, GREY),
+            *at.T, *(times * mean).T, color=np.where(is_alike, BLUE, GREY),
             angles="xy", scale_units="xy", scale=1.0, width=0.006, minlength=0.3, zorder=3,
         )  # fmt: skip
         title += f"; arrows {times:,g}x"
     _frame(axes, of, title)
+
+
+def _means(of: PlottedIntrinsics) -> tuple[Array, Array, np.ndarray]:
+    """Middles (c, 2) and mean errors (c, 2) of cells that several images have, and where the images' means are alike.
+
+    Corners of an image share its errors of A, so that each image counts once. With n images' means m_i, of mean m,
+    n (n - 1) |m|^2 / sum |m_i - m|^2 is F-distributed with 2 and 2 (n - 1) degrees of freedom, if m is by chance.
+    """
+    cells, number = cells_of(of.corners.pixels, of.size, MEAN_CELLS)
+    _, of_pair, count = np.unique(np.stack([cells, of.image], axis=1), axis=0, return_inverse=True, return_counts=True)
+    of_pair = of_pair.ravel()
+    middles, means = (_mean(values, of_pair, count) for values in (of.corners.pixels, of.corners.errors_px))
+    cell = np.zeros(len(count), dtype=np.int64)
+    cell[of_pair] = cells
+    n = np.bincount(cell, minlength=number)
+    middle, mean = (_mean(values, cell, np.maximum(n, 1)) for values in (middles, means))
+    scatter = np.bincount(cell, ((means - mean[cell]) ** 2).sum(axis=1), number)
+    several = (n > 1) & (scatter > 0.0)
+    n, mean = n[several], mean[several]
+    F = n * (n - 1.0) * (mean**2).sum(axis=1) / scatter[several]
+    return middle[several], mean, fdtrc(2.0, 2.0 * (n - 1.0), F) < LEVEL
+
+
+def _mean(values: Array, group: np.ndarray, count: np.ndarray) -> Array:
+    """Means (g, 2) of values (N, 2) by their group."""
+    return np.stack([np.bincount(group, values[:, k], len(count)) / count for k in range(2)], axis=1)
 
 
 def _draw_uncertainty(axes: Axes, of: PlottedIntrinsics) -> None:
@@ -135,8 +152,8 @@ def _draw_uncertainty(axes: Axes, of: PlottedIntrinsics) -> None:
         lines = axes.contour(u, v, shades, levels=levels, colors="black", linewidths=0.8, zorder=3)
         axes.clabel(lines, fmt=lambda level: f"{level:g} px", fontsize=8)
     axes.plot(*of.corners.pixels.T, ls="", marker=".", markersize=DOT, color="black", alpha=0.4, zorder=2)
-    title = f"a point at {rounded(of.distance_m)} m is projected with a standard\n"
-    _frame(axes, of, f"{title}deviation of {rounded(low)} to {rounded(high)} px (dots: corners)")
+    where = f"how sure the lens is: a point at {rounded(of.distance_m)} m is projected"
+    _frame(axes, of, f"{where}\nwith a standard deviation of {rounded(low)} to {rounded(high)} px")
     axes.tick_params(labelleft=False)
 
 

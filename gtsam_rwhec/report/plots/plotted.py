@@ -83,10 +83,13 @@ class PlottedIntrinsics:
         Width and height of its images, pixels.
     corners : PlottedCorners
         Errors that stay in the refinement, with A of each image as it is there: what the lens model or the board lacks.
+    image : (N,) integers
+        Which image each corner is from.
     grid : (h, w, 2) array
         Pixels over the image.
     deviations_px : (h, w) array
-        Standard deviation of the projection of points at `distance_m` before the camera; nan where the lens has no ray.
+        Standard deviation of the projection of points at `distance_m` before the camera, of the lens alone; nan where
+        it has no ray.
     distance_m : float
     held_out_px : tuple of tuple of float or None
         Error of corners in images that were left out, by region, rows from the top; None where no corner was seen.
@@ -95,6 +98,7 @@ class PlottedIntrinsics:
 
     size: tuple[int, int]
     corners: PlottedCorners
+    image: np.ndarray
     grid: Array
     deviations_px: Array
     distance_m: float

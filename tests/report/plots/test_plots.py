@@ -186,24 +186,28 @@ def test_a_sensor_without_corners_or_intrinsics(tmp_path: Path) -> None:
     assert ink(drawn(tmp_path, plot_coverage, {"a": none}, {})) > 0.001
 
 
-def test_mean_errors_beyond_chance_have_a_colour_of_their_own(tmp_path: Path) -> None:
-    """Where the errors of neighbours are alike, the lens model lacks something."""
+def test_mean_errors_that_are_alike_in_the_images_have_a_colour_of_their_own(tmp_path: Path) -> None:
+    """There the lens model lacks something; errors that the corners of an image share, as those of A, are by chance."""
     rng, (name, of) = np.random.default_rng(3), next(iter(INTRINSICS.items()))
-    pixels = rng.uniform(0.0, 900.0, size=(2000, 2))
-    chance = rng.normal(scale=0.2, size=pixels.shape)
+    pixels, image = rng.uniform(0.0, 900.0, size=(2000, 2)), np.arange(2000) % 20
+    by_image = rng.normal(scale=0.5, size=(20, 2))[image] + rng.normal(scale=0.1, size=pixels.shape)
     blue = "#0072B2"
 
     def panel(errors: np.ndarray) -> np.ndarray:
-        return drawn(tmp_path, plot_intrinsics, {name: replace(of, corners=PlottedCorners(pixels, errors))})[60:-60]
+        given = replace(of, corners=PlottedCorners(pixels, errors), image=image)
+        return drawn(tmp_path, plot_intrinsics, {name: given})[60:-60]
 
-    assert not has_colour(panel(chance), blue)
-    assert has_colour(panel(chance + np.where(pixels > 600.0, 0.2, 0.0)), blue)
+    assert not has_colour(panel(by_image), blue)
+    assert has_colour(panel(by_image + np.where(pixels > 600.0, 1.0, 0.0)), blue)
 
 
 def test_cameras_with_little_to_say(tmp_path: Path) -> None:
     none = PlottedCorners(np.zeros((0, 2)), np.zeros((0, 2)))
     of = next(iter(INTRINSICS.values()))
-    unknown = replace(of, corners=none, deviations_px=np.full(of.deviations_px.shape, np.nan), held_out_px=())
+    nothing = np.zeros(0, dtype=int)
+    unknown = replace(
+        of, corners=none, image=nothing, deviations_px=np.full(of.deviations_px.shape, np.nan), held_out_px=()
+    )
     alike = replace(of, deviations_px=np.ones(of.deviations_px.shape), held_out_px=((0.0, None),))
     assert ink(drawn(tmp_path, plot_intrinsics, {"a": unknown, "b": alike})) > 0.01
 
