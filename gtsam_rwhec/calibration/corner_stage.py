@@ -143,6 +143,9 @@ def _choices(
         found = f"estimated with the poses, to {rounded(f)} px of f and {rounded(c)} px of c"
         if growth[name] > SEEN_GROWTH:
             found += f", which makes standard deviations of {name} up to {growth[name]:.2g} times those of exact ones"
+        lens = lens_that_was_left_out(corners, [name])
+        if lens:
+            found += f"; no distortion is stated, and {lens}"
         if one.held_by_prior:
             found += f"; {', '.join(one.held_by_prior)} about as stated, since the images do not tell them"
         yield Choice(f"intrinsics of {name}", found, known)
@@ -180,9 +183,9 @@ def _findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, In
             )
             yield Finding(Ground.INTRINSICS_ESTIMATED, words)
         lens = lens_that_was_left_out(corners, [name])
-        if lens:
+        if lens and one.stated_as == "calibration":
             words = f"the intrinsics of {name} are stated without distortion, and its corners show one: {lens}"
-            yield Finding(Ground.INTRINSICS_ESTIMATED, f"{words}; the estimated ones are used")
+            yield Finding(Ground.INTRINSICS_ESTIMATED, words)
     for score in tried.scores[:1]:
         times = score.px / score.expected_px
         if times > UNEXPLAINED:

@@ -72,6 +72,8 @@ class Ground(StrEnum):
     LATE_CLOCK = "late_clock"
     #: The stated size of a target was used, but it does not fit the motion.
     SIZE_DOUBTED = "size_doubted"
+    #: No stated size fits the motion: they were estimated, and the carriers' unit of length may be what is wrong.
+    NO_SIZE_FITS = "no_size_fits"
     #: The measurements are too few to tell how well the poses are known.
     NO_COVARIANCE = "no_covariance"
     #: Most measurements of a target were left out as outliers; the sensors' poses rest on other targets.
@@ -149,6 +151,7 @@ _MADE_BY_A_MISTAKE = frozenset({Ground.CORRELATED, Ground.SYSTEMATIC})
 #: Wrong focal lengths make sizes look wrong, and errors that vary with where a board is seen.
 _MADE_BY_INTRINSICS = frozenset({
     Ground.SIZE_DOUBTED,
+    Ground.NO_SIZE_FITS,
     Ground.SIZE_ESTIMATED,
     Ground.SIZE_UNCERTAIN,
     Ground.CORRELATED,
@@ -191,6 +194,10 @@ _ADVICE = {
     Ground.SIZE_DOUBTED: (
         "measure the named targets again and state the right sizes, or let the motion tell them: rw.Problem(scale="
         '"per_target") or --scale per_target (in a rig file: sizes: estimate)'
+    ),
+    Ground.NO_SIZE_FITS: (
+        "measure the named targets again and state the right sizes, and check that the carriers' positions are in "
+        "metres; if the targets are as found, let the motion tell the sizes (in the rig file: sizes: estimate)"
     ),
     Ground.NO_COVARIANCE: "take more measurements",
     Ground.TARGET_CONTRADICTED: (

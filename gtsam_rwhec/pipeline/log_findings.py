@@ -170,7 +170,7 @@ def estimated_sizes(sizes: Sequence[SizeFields], rig: Rig, *, with_intrinsics: b
         said = "the stated size of" if len(doubted) == 1 else "no stated size fits the motion:"
         why = "the poses use the sizes that the motion gives, and nothing tells whether the sizes are wrong or the "
         others = "carriers' unit of length" if with_intrinsics else "carriers' unit of length or the focal lengths"
-        return [Finding(Ground.SIZE_DOUBTED, f"{said} {words}; {why}{others}")]
+        return [Finding(Ground.NO_SIZE_FITS, f"{said} {words}; {why}{others}")]
     return [Finding(Ground.SIZE_ESTIMATED, f"the stated size of {words}; the poses use the size that the motion gives")]
 
 

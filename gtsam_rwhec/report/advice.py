@@ -21,7 +21,7 @@ COMMON_SCALE = 0.005
 #: Unknown tags are named up to this number.
 MOST_NAMED = 10
 #: Grounds that name the targets whose sizes are wrong.
-SIZES = frozenset({Ground.SIZE_DOUBTED, Ground.SIZE_ESTIMATED})
+SIZES = frozenset({Ground.SIZE_DOUBTED, Ground.NO_SIZE_FITS, Ground.SIZE_ESTIMATED})
 
 
 def print_advice(

@@ -201,6 +201,6 @@ def lens_that_was_left_out(refined: CornersRefined, sensors: list[str]) -> str:
     if bend_px < BEND_PX:
         return ""
     return (
-        f"k1 = {D[0]:.3g} +- {np.sqrt(covariance[0, 0]):.1g} fits, and moves corners by up to {bend_px:.2g} pixels. "
-        "The estimated distortion is used"
+        f"k1 = {D[0]:.3g} +- {np.sqrt(covariance[0, 0]):.1g} fits, and moves corners by up to {bend_px:.2g} pixels; "
+        "the estimated distortion is used"
     )
