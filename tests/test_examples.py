@@ -83,6 +83,18 @@ def test_one_call_is_short_and_leaves_the_outliers_out(tmp_path: Path) -> None:
     assert "A point 0.80 m from camera, expressed in hand, is within" in done.stdout
 
 
+def test_corners_give_the_pose_though_the_stated_intrinsics_are_off(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / "from_corners.py")], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("Use these poses: ")
+    assert re.search(r"Refinement: from 2\d{3} corners .* with A's noise estimated", done.stdout)
+    off_mm = re.search(r"The camera is ([\d.]+) mm from where it is", done.stdout)
+    assert off_mm is not None
+    assert float(off_mm[1]) < 0.5  # 6 mm by the poses
+
+
 def test_certified_start_then_refinement_is_short_and_goes_on(tmp_path: Path) -> None:
     path = EXAMPLES / "certified_init_then_refine.py"
     assert len(path.read_text(encoding="utf-8").splitlines()) < 30
@@ -95,7 +107,7 @@ def test_certified_start_then_refinement_is_short_and_goes_on(tmp_path: Path) ->
 
 def test_no_example_is_left_out() -> None:
     scripts = {path.stem for path in EXAMPLES.glob("*.py")} - {"figures"}
-    assert scripts == set(RUNS) | {"figure_8_grid", "certified_init_then_refine", "one_call"}
+    assert scripts == set(RUNS) | {"figure_8_grid", "certified_init_then_refine", "from_corners", "one_call"}
 
 
 def test_committed_pictures_are_small_and_made_by_an_example() -> None:

@@ -41,6 +41,7 @@ TABLE: dict[str, dict[str, str]] = {
         "calibration/test_cross_validation.py": "folds prediction_errors",
         "calibration/test_task_units.py": "point_uncertainty seen_from",
         "calibration/test_misreadings.py": "reading readings samples trial_fits wrong_units",
+        "reprojection/test_by_corners.py": "by_corners",
     },
     "gtsam_rwhec/cleaning": {
         "cleaning/test_pair_consensus.py": "removed",

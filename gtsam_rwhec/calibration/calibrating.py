@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+from gtsam_rwhec.calibration.by_corners import answered_by_corners, check_observations, with_better_poses
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.choices import READING
 from gtsam_rwhec.calibration.clock_stage import Answer, answer, check_offsets, late_in_place_of_shifted
@@ -80,6 +81,7 @@ def calibrate(
             "and kappa"
         )
     _check_what_needs_measurements(problem, options)
+    check_observations(problem, options)
     run = Run(problem, options, progress or silent)
     check_offsets(run)
     return _calibrated(run)
@@ -100,10 +102,15 @@ def _calibrated(run: Run) -> Calibration:
     with run.record.noted():
         first, why = _solved(run)
         reading, found = _read_and_answered(run, first)
+        better = with_better_poses(run, found)
+        if better is not None:
+            run.tell("once more, with the poses of targets that the answer says")
+            return _calibrated(better)
         if found.refined is not None:
             doubt_stated_poses(run, found.refined, found.inliers)
             doubt_one_pose(run, found.refined, found.inliers)
             found_sizes = doubt_stated_sizes(run, found.refined, found.inliers, found.noise.model)
+            found = answered_by_corners(run, found)
     problem, record = run.problem, run.record
     lengths = None
     if found.solution is not None and not reading.misreadings:

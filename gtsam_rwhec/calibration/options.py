@@ -11,12 +11,14 @@ from gtsam_rwhec.geometry.real_numbers import is_one_of, is_real
 from gtsam_rwhec.noise_model.options import Drift
 from gtsam_rwhec.noise_model.rows import Side
 from gtsam_rwhec.refinement.options import CarrierNoise, NoiseGroups
+from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 NoiseChoice = Literal["auto", "given", "estimate"]
 RobustChoice = Literal["auto", "gnc", "none"]
 SizesChoice = Literal["check", "known"]
+ObservationChoice = Literal["auto", "corners", "poses"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,12 @@ class CalibrateOptions:
         without a ``carrier_path``.
     carrier_path : Trajectory, optional
         T_sensorcarrier_targetcarrier over time, along which time offsets move A.
+    observations : "auto", "corners" or "poses"
+        What the answer is refined from. "auto": from the corners where the problem holds them for every measurement
+        (``problem.add_corners``) and they give a better answer than the poses. "corners": such a problem is asked for.
+    corners : CornerOptions, optional
+        How: where the intrinsics are from, what of the boards is free. Left out: intrinsics are nominal, boards are as
+        stated, and A's noise is estimated, or as in ``carrier_noise``.
     level : float
         Probability of the ellipsoids in the report, in task units.
     solve : SolveOptions
@@ -74,6 +82,8 @@ class CalibrateOptions:
     sizes: SizesChoice = "check"
     time_offsets: Literal["auto"] | bool | tuple[str, ...] = "auto"
     carrier_path: Trajectory | None = None
+    observations: ObservationChoice = "auto"
+    corners: CornerOptions | None = None
     level: float = 0.95
     solve: SolveOptions = field(default_factory=SolveOptions)
 
@@ -97,7 +107,11 @@ class CalibrateOptions:
                 f"CalibrateOptions.time_offsets={brief(self.time_offsets)}; give 'auto', True, False, or a tuple of "
                 "sensors' names: ('cam_0',)"
             )
-        for name, kind in (("carrier_noise", CarrierNoise), ("carrier_path", Trajectory)):
+        for name, kind in (
+            ("carrier_noise", CarrierNoise),
+            ("carrier_path", Trajectory),
+            ("corners", CornerOptions),
+        ):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise OptionError(f"CalibrateOptions.{name} is a {type(value).__name__}; give a {kind.__name__}")
@@ -119,4 +133,5 @@ _CHOICES = {
     "drift": Drift,
     "robust": RobustChoice,
     "sizes": SizesChoice,
+    "observations": ObservationChoice,
 }

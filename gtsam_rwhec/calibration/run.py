@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -19,6 +19,7 @@ from gtsam_rwhec.errors import (
 )
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.vision.camera import Camera
 
 #: The verdict says better what these warn of.
 SAID_BY_THE_VERDICT = (NotUniqueWarning, NotCertifiedWarning, WeightsWarning, OutliersWarning)
@@ -74,12 +75,22 @@ class Run:
     tell : Progress
         Is called with the name of each step.
     record : Record
+    times : int
+        How often it was begun, since poses of targets were computed again.
+    cameras : dict of str to Camera
+        The intrinsics by which they were, where these are not the stated ones.
     """
 
     problem: Problem
     options: CalibrateOptions
     tell: Progress
     record: Record = field(default_factory=Record)
+    times: int = 1
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+
+    def again(self, problem: Problem, cameras: Mapping[str, Camera]) -> Run:
+        """The run of a problem with other poses of targets, from its beginning."""
+        return Run(problem, self.options, self.tell, times=self.times + 1, cameras=cameras)
 
     def attempt(self) -> Run:
         """The same with an empty record: it may be thrown away."""

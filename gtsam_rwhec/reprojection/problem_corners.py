@@ -87,8 +87,6 @@ def check_corners_can_hold(problem: Problem) -> None:
     stated += [f"the prior of {name}" for name in problem.priors]
     if problem.scale == "shared":
         stated.append("one scale of all lengths (scale='shared'; 'per_target' estimates the boards' sizes)")
-    if 0 < len(problem.fixed_scales) < len(problem.targets):
-        stated.append(f"the known size of {', '.join(problem.fixed_scales)} beside unknown ones")
     if stated:
         raise OptionError(
             f"a refinement from corners does not hold {', '.join(stated)}; leave it out, or refine from poses "

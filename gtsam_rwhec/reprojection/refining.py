@@ -34,6 +34,7 @@ from gtsam_rwhec.reprojection.problem_corners import (
 from gtsam_rwhec.reprojection.refined import CornersRefined
 from gtsam_rwhec.reprojection.refining_corners import refine_corners
 from gtsam_rwhec.solving.solution import Solution
+from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: Standard deviation of a size that the problem does not know, a share of that which the poses say.
 SIZE_SHARE = 0.2
@@ -116,7 +117,7 @@ def _like(options: RefineOptions) -> CornerOptions:
 @one_blas_thread()
 def from_corners(problem: Problem, base: Refined, options: CornerOptions, tell: Progress) -> Refined:
     """Refine on from an answer from poses, by the corners of the images that agree with it."""
-    observations, options = observed(problem, base, options)
+    observations, options = observed(problem, base, options, base.options.carrier_path)
     tell("refining from corners")
     found = refine_corners(observations, base.X, base.Y, options, tell)
     stated = {name: options.stated_of(options.camera_of(name)) for name in found.Y}
@@ -124,12 +125,12 @@ def from_corners(problem: Problem, base: Refined, options: CornerOptions, tell: 
     return as_stated(refined, base, found)
 
 
-def observed(problem: Problem, base: Refined, options: CornerOptions) -> tuple[Observations, CornerOptions]:
+def observed(
+    problem: Problem, base: Refined, options: CornerOptions, carrier_path: Trajectory | None
+) -> tuple[Observations, CornerOptions]:
     """The corners of the images that agree with an answer, with boards of the sizes that it says, and what is free."""
     late = base.time_offsets_s
-    observations = observations_of(
-        problem, scale=base.scale, time_offsets_s=late, carrier_path=base.options.carrier_path
-    )
+    observations = observations_of(problem, scale=base.scale, time_offsets_s=late, carrier_path=carrier_path)
     if base.inliers:
         kept = {
             pair: view.selected(mask)
@@ -139,8 +140,9 @@ def observed(problem: Problem, base: Refined, options: CornerOptions) -> tuple[O
         observations = replace(observations, views=kept)
     if late and not options.time_offsets:
         options = replace(options, time_offsets=tuple(late))
-    if problem.scale == "per_target" and not options.size_share and len(problem.fixed_scales) < len(problem.targets):
-        options = replace(options, size_share=SIZE_SHARE)
+    if problem.scale == "per_target" and not options.size_share:
+        free = [name for name in problem.targets if name not in problem.fixed_scales]
+        options = replace(options, size_share=dict.fromkeys(free, SIZE_SHARE))
     return observations, options
 
 

@@ -18,6 +18,7 @@ from gtsam_rwhec.errors import (
     FrameError,
     MeasurementsNotKeptError,
     NoiseError,
+    PoseError,
     RwhecError,
     TargetError,
     UnitsWarning,
@@ -93,6 +94,21 @@ def test_all_forms_of_corners_are_the_same_measurements() -> None:
     known.add_corners("board", "cam", A, lists, points)
     np.testing.assert_array_equal(known.boards["board"], BOARD)
     np.testing.assert_array_equal(known.measurements("board", "cam").pixels, np.concatenate([pixels, pixels]))
+
+
+def longer(T: Array) -> Array:
+    """Poses in half the unit."""
+    return T * np.r_["-1,2,0", np.ones((4, 3)), [2.0, 2.0, 2.0, 1.0]]
+
+
+def test_lengths_in_another_unit_are_measurements_in_that_unit() -> None:
+    A, _, pixels = images(12)
+    once, twice = problem_of(A, pixels), problem_of(longer(A), pixels, 2.0 * BOARD)
+    metres, halves = (problem.measurements("board", "cam") for problem in (once, twice))
+    np.testing.assert_allclose(halves.B, longer(metres.B), atol=1e-7)
+    unit = np.repeat([1.0, 2.0], 3)
+    assert metres.covariances is not None
+    np.testing.assert_allclose(halves.covariances, metres.covariances * np.outer(unit, unit), rtol=1e-4, atol=1e-12)
 
 
 def test_batches_selections_and_sums_keep_corners_beside_their_measurements() -> None:
@@ -188,6 +204,7 @@ WRONG: dict[str, tuple[type[RwhecError], str, dict[str, Any]]] = {
     "an id beyond": (CountError, "from 0 to 23", {"corner_ids": [np.arange(1, 25)] * 16}),
     "an id twice": (CountError, "corner 0 twice", {"corner_ids": [np.r_[0, np.arange(23)]] * 16}),
     "ids and points": (CountError, "give one", {"board_points": [BOARD] * 16, "corner_ids": [np.arange(24)] * 16}),
+    "no pose": (PoseError, "A of board-cam", {"A": np.where(np.arange(16)[:, None, None] == 3, np.nan, A16)}),
     "noise of zero": (NoiseError, "corner_px is 0", {"corner_px": 0}),
     "one name": (FrameError, "names are unique", {"target": "cam"}),
 }  # fmt: skip
