@@ -184,13 +184,18 @@ def coefficient_jacobian(model: Model, D: Array, x: Array) -> Array:
         return np.concatenate([by_m @ by_xi[..., None], coefficient_jacobian("radtan", D[1:], m)], axis=-1)
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(D, (0, 14))[:8]
     a, b = x[..., 0], x[..., 1]
-    above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    up, down = 1.0 / below, -above / (below * below)
-    J = np.zeros((*x.shape, 12))
-    radial = np.stack([r2 * up, r2**2 * up, r2**3 * up, r2 * down, r2**2 * down, r2**3 * down], axis=-1)
-    J[..., [0, 1, 4, 5, 6, 7]] = x[..., :, None] * radial[..., None, :]
+    J = np.zeros((*x.shape, len(D)))
+    r4 = r2 * r2
+    radial = {0: r2, 1: r4, 4: r4 * r2} if len(D) > 4 else {0: r2, 1: r4}
+    if len(D) > 5:
+        above, below = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        down = -above / (below * below)
+        radial = {k: power / below for k, power in radial.items()} | {5: r2 * down, 6: r4 * down, 7: r4 * r2 * down}
+    for k, along_x in radial.items():
+        J[..., 0, k], J[..., 1, k] = a * along_x, b * along_x
     J[..., 0, 2], J[..., 0, 3] = 2 * a * b, r2 + 2 * a * a
     J[..., 1, 2], J[..., 1, 3] = r2 + 2 * b * b, 2 * a * b
-    J[..., 0, 8], J[..., 0, 9] = r2, r2 * r2
-    J[..., 1, 10], J[..., 1, 11] = r2, r2 * r2
-    return J[..., : len(D)]
+    if len(D) > 8:
+        J[..., 0, 8], J[..., 0, 9] = r2, r4
+        J[..., 1, 10], J[..., 1, 11] = r2, r4
+    return J
