@@ -19,7 +19,7 @@ from gtsam_rwhec.refinement.refined import PairNoise, Refined
 from gtsam_rwhec.refinement.refining import movements
 from gtsam_rwhec.refinement.reprojection_found import SIZE, BoardShape, Intrinsics, Reprojection
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
-from gtsam_rwhec.reprojection.corner_views import SHAPE, depths
+from gtsam_rwhec.reprojection.corner_views import SHAPE
 from gtsam_rwhec.reprojection.intrinsics import Stated
 from gtsam_rwhec.reprojection.projection_uncertainty import by_region
 from gtsam_rwhec.reprojection.refined import CornersRefined
@@ -88,8 +88,7 @@ def _projected(refined: Refined, corners: CornersRefined, sensor: str) -> Intrin
     intrinsics, seen = refined.intrinsics[sensor], []
     for stack in corners.graph.model.stacks:
         if stack.sensor == sensor:
-            X, Y = corners.X[stack.target].matrix(), corners.Y[sensor].matrix()
-            z = depths(stack, X, Y, corners.point.A, corners.shapes[stack.target])[stack.known]
+            z = corners.graph.model.depths(stack, corners.point)[stack.known]
             x = intrinsics.camera.undistort(stack.pixels[stack.known])
             seen.append(z[:, None] * np.concatenate([x, np.ones((len(x), 1))], axis=1))
     points = np.concatenate(seen)

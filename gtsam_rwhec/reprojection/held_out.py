@@ -131,10 +131,14 @@ def _predicted(stack: Stack, A: Array, refined: CornersRefined) -> tuple[Array, 
     J = np.concatenate(list(there.values()), axis=2)
     index = np.concatenate([np.arange(refined.slots[name].start, refined.slots[name].stop) for name in there])
     squares = np.einsum("vri,ij,vrj->vr", J, refined.joint[np.ix_(index, index)], J, optimize=True)
-    if ("p", stack.target) in refined.slots:  # each corner's own place; its correlations with the rest are small
-        at = refined.slots["p", stack.target]
-        own = refined.joint[at, at].reshape(-1, 3, known.shape[1], 3)[range(known.shape[1]), :, range(known.shape[1])]
-        squares += np.einsum("vnri,nij,vnrj->vnr", rows.by_corners, own, rows.by_corners).reshape(squares.shape)
+    if ("p", stack.target) in refined.slots:  # each corner's own place, which the target's pose goes with
+        at, n, by_corners = refined.slots["p", stack.target], known.shape[1], rows.by_corners
+        own = refined.joint[at, at].reshape(n, 3, n, 3)[range(n), :, range(n)]
+        mixed = refined.joint[index, at].reshape(-1, n, 3)
+        of_corner = np.einsum("vnri,nij,vnrj->vnr", by_corners, own, by_corners, optimize=True)
+        J_of_corner = J.reshape(*by_corners.shape[:3], -1)
+        of_corner += 2.0 * np.einsum("vnrm,mni,vnri->vnr", J_of_corner, mixed, by_corners, optimize=True)
+        squares += of_corner.reshape(squares.shape)
     noise = refined.noise.carrier
     if noise is not None:
         by_A = rows.by_A
