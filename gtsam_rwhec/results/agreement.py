@@ -197,6 +197,10 @@ def _check_certificate(certificate: Certificate, place: str) -> None:
     cause, status = certificate.cause, certificate.status
     if cause is not Cause.NOT_RECORDED and status is not cause.status:
         raise ValueError(f"{place}.status: must be '{cause.status}' with the cause '{cause}' (found '{status}')")
+    try:
+        certificate.reason  # noqa: B018 - its words are made of the figures
+    except KeyError as error:
+        raise ValueError(f"{place}.figures: lacks {error.args[0]}, of which the cause '{cause}' speaks") from error
 
 
 def _check_bound(certificate: Certificate, place: str) -> None:

@@ -25,6 +25,9 @@ def read(data: bytes) -> None:
     for direction in result.solution.identifiability.free_directions:
         str(direction)
     str(result.judgement)
+    if result.refined is not None:
+        for intrinsics in result.refined.intrinsics.values():
+            assert intrinsics.camera.width == intrinsics.stated_camera.width == intrinsics.width
     if result.calibration is not None:
         for said in (*result.calibration.choices, *result.calibration.points, *result.calibration.findings):
             str(said)
@@ -53,7 +56,7 @@ def seeds() -> Iterable[bytes]:
     yield (folder / "b.json").read_bytes()
     for calibration in calibrations:
         yield written_result.calibration_json(calibration)
-    for version in (1, 2, 3, 4, 5):
+    for version in (1, 2, 3, 4, 5, 6, 7):  # 7 is of a refinement from corners
         yield (GOLDEN / f"result_version_{version}.json").read_bytes()
 
 

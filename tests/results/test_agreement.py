@@ -75,6 +75,10 @@ def twice(rows: list[Any], times: int = 1) -> None:
 
 
 CASES: dict[str, tuple[Callable[[Any], object], str]] = {
+    "a cause without its figure": (
+        lambda raw: certificates(raw, cause="not_tight", status="gap", figures={}),
+        r"certificate\.figures: lacks relaxation_cost, of which the cause 'not_tight' speaks",
+    ),
     "no region": (lambda raw: raw["certified"]["certificate"].pop("region"), r"certificate\.region: is missing"),
     "no basis in a part": (
         lambda raw: raw["certified"]["parts"][0]["certificate"].pop("basis"),
@@ -116,7 +120,9 @@ CASES: dict[str, tuple[Callable[[Any], object], str]] = {
         r"\$\.certified\.certificate\.cost: must be .*, the sum of all parts \(found 1\.0\)",
     ),
     "a whole that is better than a part": (
-        lambda raw: raw["certified"]["parts"][0]["certificate"].update(status="gap", cause="not_tight"),
+        lambda raw: raw["certified"]["parts"][0]["certificate"].update(
+            status="gap", cause="not_tight", figures={"relaxation_cost": 0.0}
+        ),
         r"certificate\.status: must be 'gap', the worst of all parts \(found 'certified'\)",
     ),
     "two costs": (

@@ -217,6 +217,22 @@ def test_version_6_had_nothing_from_corners(tmp_path: Path) -> None:
         read_result(changed({**raw, **without_answer}, tmp_path))
 
 
+def test_version_7_has_what_corners_said() -> None:
+    path, raw = stored(7)
+    refined = rw.read_refined(path)
+    assert refined.reprojection is not None
+    assert refined.reprojection.rms_px == raw["refined"]["reprojection"]["rms_px"]
+    assert list(refined.intrinsics) == list(raw["refined"]["intrinsics"]) == ["cam_0", "cam_1"]
+    for name, fields in raw["refined"]["intrinsics"].items():
+        intrinsics = refined.intrinsics[name]
+        assert list(intrinsics.values) == fields["values"]
+        assert np.diagonal(intrinsics.camera.K)[:2].tolist() == fields["values"][:2]
+        np.testing.assert_allclose(
+            np.sqrt(np.diagonal(refined.covariance(f"intrinsics:{name}"))), fields["standard_deviations"], rtol=1e-12
+        )
+    assert refined.intrinsics["cam_0"].stated_deviations == (math.inf,) * 8
+
+
 @pytest.mark.parametrize(
     ("stated", "grounds", "now"),
     [
