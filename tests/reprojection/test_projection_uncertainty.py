@@ -11,7 +11,12 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FrameError, OptionError
-from gtsam_rwhec.reprojection.projection_uncertainty import by_region, lens_deviations_over, projection_deviations
+from gtsam_rwhec.reprojection.projection_uncertainty import (
+    by_region,
+    lens_deviations_over,
+    projection_deviations,
+    uneven_words,
+)
 from gtsam_rwhec.vision.camera import Camera
 
 EXACT = rw.CornerOptions(carrier_noise="exact")
@@ -65,6 +70,13 @@ def test_a_camera_that_was_calibrated_from_a_corner_of_its_image_says_so() -> No
     regions = np.array(by_region(lens.camera, lens.covariance, points, 1.5), dtype=float)  # nan: no value
     assert regions.shape == (3, 3)
     assert regions[2, 2] > 5.0 * regions[0, 0]
+    said = uneven_words(by_region(lens.camera, lens.covariance, points, 1.5))
+    assert said.startswith(f"projections are uncertain by up to {regions.max():.1f} px in 3 of 9 parts of the image")
+    (view,) = given.observations.views.values()
+    of_whole = whole.intrinsics["cam_0"]
+    x = of_whole.camera.undistort(view.pixels.reshape(-1, 2))
+    every = 1.5 * np.concatenate([x, np.ones((len(x), 1))], axis=1)
+    assert uneven_words(by_region(of_whole.camera, of_whole.covariance, every, 1.5)) == ""
     _, alone = lens_deviations_over(lens.camera, lens.covariance, points, 1.5)
     assert regions[0, 0] == pytest.approx(float(np.sqrt((alone[:4, :6] ** 2).mean())), rel=0.3)
     # the lens alone is as sure as the lens on its carrier, where the carriers' poses count as exact and views are many
