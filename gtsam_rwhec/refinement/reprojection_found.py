@@ -19,6 +19,10 @@ WARPS = {"x": "warp_x", "y": "warp_y"}
 Regions = tuple[tuple[float | None, ...], ...]
 
 
+#: Degrees and millimetres of noise below this are none, for who reads them.
+LEAST = 0.001
+
+
 @dataclass(frozen=True)
 class SensorReprojection:
     """Errors of a sensor's corners.
@@ -167,7 +171,7 @@ class Reprojection:
         corners = sum(of.corners for of in self.sensors.values())
         images = sum(of.images for of in self.sensors.values())
         rotation, translation = math.degrees(self.carrier_rotation_rad), 1e3 * self.carrier_translation_m
-        noise = f"{rounded(rotation)}° and {rounded(translation)} mm for each axis"
+        noise = f"{_size(rotation)}° and {_size(translation)} mm for each axis"
         of_A = {
             "exact": "The carriers' poses A count as exact.",
             "estimated": f"The carriers' poses A were refined too; their noise, as the corners show it: {noise}.",
@@ -239,13 +243,11 @@ class Intrinsics:
         else:
             origin = "a calibration's" if self.stated_as == "calibration" else "nominal ones"
             said = [f"estimated, with a prior from what was stated ({origin})"]
+            off = f"{self.innovation_deviations:.1f} deviations off"
             if self.widened > 1.0:
-                said.append(
-                    f"the images contradict that by {rounded(self.innovation_deviations)} deviations, so the prior was "
-                    f"widened {rounded(self.widened)} times"
-                )
+                said.append(f"the images are {off}, so the prior was widened {rounded(self.widened)} times")
             else:
-                said.append(f"the images agree with it ({rounded(self.innovation_deviations)} deviations off)")
+                said.append(f"the images agree with it ({off})")
         if self.held_by_prior:
             held = ", ".join(self.held_by_prior)
             said.append(f"the images do not determine {held}, which only the prior holds")
@@ -271,3 +273,7 @@ def camera_of(intrinsics: Intrinsics, values: tuple[float, ...]) -> Camera:
     """The camera with some values of an intrinsics' parameters; CameraError where they are none."""
     camera = lens_of(intrinsics).with_parameters(np.array(values))
     return Camera.of(camera.width, camera.height, camera.model, camera.K, camera.D, "intrinsics of the result")
+
+
+def _size(value: float) -> str:
+    return rounded(value) if value >= LEAST else f"under {LEAST:g}"

@@ -25,7 +25,8 @@ from gtsam_rwhec.reprojection.projection_uncertainty import uneven_words
 
 ERRORS_LEGEND = (
     "rms: root mean square of the corners that count, along each axis. hold-out: root mean square length of the error "
-    "in images that were left out of the calibration, in the image and on the target: so well are new images predicted."
+    "in images that were left out of the calibration, on the target and in the image: so well are images predicted. "
+    "expected: what it is if the model is right; far larger errors show what the model lacks."
 )
 INTRINSICS_LEGEND = (
     "±: one standard deviation; of what was stated, as it counted. told by: the images, or only what was stated, where "
@@ -87,10 +88,9 @@ def errors_table(found: Reprojection) -> FrameTable:
             str(of.corners),
             str(of.left_out),
             f"{of.rms_px:.3f}",
-            NONE if of.held_out_px is None else f"{of.held_out_px:.3f}",
-            NONE if of.held_out_mm is None else f"{of.held_out_mm:.3f}",
+            *(NONE if value is None else f"{value:.3f}" for value in (of.held_out_mm, of.held_out_px, of.expected_px)),
         )
-    headings = ("images", "corners", "left out", "rms px", "hold-out px", "hold-out mm")
+    headings = ("images", "corners", "left out", "rms px", "hold-out mm", "hold-out px", "expected px")
     return FrameTable("Errors of corners", "sensor", headings, rows)
 
 

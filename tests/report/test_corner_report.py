@@ -74,10 +74,11 @@ def test_errors_and_numbers_are_those_of_the_result(refined: Refined) -> None:
     cells = errors_table(refined.reprojection).rows["cam_1"]
     of = refined.reprojection.sensors["cam_1"]
     assert cells[:3] == (str(of.images), str(of.corners), "0")
-    assert [float(cell) for cell in cells[3:]] == pytest.approx([of.rms_px, of.held_out_px, of.held_out_mm], abs=6e-4)
-    alone = dataclasses.replace(of, held_out_px=None, held_out_mm=None)
+    numbers = [of.rms_px, of.held_out_mm, of.held_out_px, of.expected_px]
+    assert [float(cell) for cell in cells[3:]] == pytest.approx(numbers, abs=6e-4)
+    alone = dataclasses.replace(of, held_out_px=None, held_out_mm=None, expected_px=None)
     without = dataclasses.replace(refined.reprojection, sensors={"cam_1": alone})
-    assert errors_table(without).rows["cam_1"][4:] == ("-", "-")
+    assert errors_table(without).rows["cam_1"][4:] == ("-", "-", "-")
     rows = intrinsics_table(refined).rows
     assert len(rows) == 16
     cam = refined.intrinsics["cam_0"]
@@ -90,14 +91,13 @@ def test_errors_and_numbers_are_those_of_the_result(refined: Refined) -> None:
 def test_intrinsics_say_how_they_were_stated_and_what_the_images_do_not_tell(refined: Refined) -> None:
     agree = intrinsics_sentences(changed(refined, innovation_deviations=0.81, held_by_prior=()))[0]
     assert agree == (
-        "cam_0: estimated, with a prior from what was stated (nominal ones); the images agree with it (0.81 deviations "
+        "cam_0: estimated, with a prior from what was stated (nominal ones); the images agree with it (0.8 deviations "
         "off)."
     )
     held = changed(refined, stated_as="calibration", widened=3.2, innovation_deviations=7.0, held_by_prior=("k2", "p1"))
     assert intrinsics_sentences(held)[0] == (
-        "cam_0: estimated, with a prior from what was stated (a calibration's); the images contradict that by 7 "
-        "deviations, so the prior was widened 3.2 times; the images do not determine k2, p1, which only the prior "
-        "holds."
+        "cam_0: estimated, with a prior from what was stated (a calibration's); the images are 7.0 deviations "
+        "off, so the prior was widened 3.2 times; the images do not determine k2, p1, which only the prior holds."
     )
     assert intrinsics_table(held).rows["cam_0 k2"][-1] == "stated"
     assert intrinsics_table(held).rows["cam_0 k1"][-1] == "images"
@@ -160,6 +160,8 @@ def test_records_are_sentences(refined: Refined) -> None:
     number = sum(of.corners for of in refined.reprojection.sensors.values())
     assert text.startswith(f"The poses are refined from {number} corners in ")
     assert "The carriers' poses A were refined too; their noise, as the corners show it: " in text
+    small = dataclasses.replace(refined.reprojection, carrier_rotation_rad=1e-7, carrier_translation_m=2.6e-5)
+    assert str(small).endswith("their noise, as the corners show it: under 0.001° and 0.026 mm for each axis.")
     exact = dataclasses.replace(refined.reprojection, carrier_poses="exact")
     assert str(exact).endswith("The carriers' poses A count as exact.")
     board = str(refined.reprojection.boards["board"])
