@@ -82,7 +82,8 @@ def board_of(refined: RefinedPoses, target: str, corners: Array) -> Array:
         for name, value in zip(found.names, found.values, strict=True):
             if name != SIZE and name in WARPS.values():
                 shape[1 + list(WARPS.values()).index(name)] = value
-    return shaped(corners, shape)[0]
+    board = shaped(corners, shape)[0]
+    return board + np.array(found.corners_off_m) if found is not None and found.corners_off_m else board
 
 
 def camera_of(solved: Solved, sensor: str) -> Camera:

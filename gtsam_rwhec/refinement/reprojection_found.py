@@ -113,11 +113,16 @@ class BoardShape:
         along x and y, metres).
     values, standard_deviations : tuple of float
         In that order.
+    corners_off_m, corners_deviations_m : tuple of (x, y, z)
+        How far each corner is from its place on the board of that size and bend, in the target's axes, and its
+        deviations, metres; empty where corners were not free.
     """
 
     names: tuple[str, ...]
     values: tuple[float, ...]
     standard_deviations: tuple[float, ...]
+    corners_off_m: tuple[tuple[float, ...], ...] = ()
+    corners_deviations_m: tuple[tuple[float, ...], ...] = ()
 
     def __str__(self) -> str:
         """What was found, in percent and millimetres."""
@@ -130,6 +135,12 @@ class BoardShape:
             if name in found:
                 height, deviation = (1e3 * each[found[name]] for each in (self.values, self.standard_deviations))
                 said.append(f"its edge along {axis} is {height:+.3f} ± {rounded(deviation)} mm above its middle")
+        if self.corners_off_m:
+            off, deviation = (
+                1e3 * float(np.sqrt((np.array(each) ** 2).sum(axis=1).mean()))
+                for each in (self.corners_off_m, self.corners_deviations_m)
+            )
+            said.append(f"its corners are {off:.3f} mm rms from their places, each known to {rounded(deviation)} mm")
         return "; ".join(said)
 
 

@@ -103,14 +103,24 @@ def boards_of(corners: CornersRefined) -> dict[str, BoardShape]:
     found = {}
     for name in corners.X:
         free = corners.graph.model.free_shape(name)
+        board = BoardShape((), (), ())
         if len(free):
-            deviations = np.sqrt(np.diagonal(corners.covariance(f"shape:{name}")))
-            found[name] = BoardShape(
+            board = BoardShape(
                 tuple(SHAPE_NAMES[i] for i in free),
                 tuple(corners.shapes[name][free].tolist()),
-                tuple(deviations.tolist()),
+                tuple(np.sqrt(np.diagonal(corners.covariance(f"shape:{name}"))).tolist()),
             )
+        if name in corners.point.corners:
+            deviations = np.sqrt(np.diagonal(corners.covariance(f"corners:{name}"))).reshape(-1, 3)
+            off = corners.point.corners[name]
+            board = replace(board, corners_off_m=_in_rows(off), corners_deviations_m=_in_rows(deviations))
+        if board.names or board.corners_off_m:
+            found[name] = board
     return found
+
+
+def _in_rows(values: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, values.tolist()))
 
 
 def intrinsics_of(corners: CornersRefined, stated: Mapping[str, Stated]) -> dict[str, Intrinsics]:

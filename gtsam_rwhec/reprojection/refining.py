@@ -178,4 +178,4 @@ def _of_stated_size(board: BoardShape, scale: float) -> BoardShape:
     """A board's numbers where its size is over the stated one, which is `scale` times what it was taken to be."""
     values = [(1.0 + v) / scale - 1.0 if n == SIZE else v for n, v in zip(board.names, board.values, strict=True)]
     deviations = [d / scale if n == SIZE else d for n, d in zip(board.names, board.standard_deviations, strict=True)]
-    return BoardShape(board.names, tuple(values), tuple(deviations))
+    return replace(board, values=tuple(values), standard_deviations=tuple(deviations))

@@ -127,6 +127,11 @@ def _check_board(name: str, board: BoardShape, refined: RefinedFields, place: st
         raise ValueError(f"{place}: names, values and standard_deviations must have one entry each for every number")
     if min(board.standard_deviations, default=0.0) < 0.0:
         raise ValueError(f"{place}.standard_deviations: must not be negative")
+    off, of_off = board.corners_off_m, board.corners_deviations_m
+    if len(off) != len(of_off) or any(len(each) != 3 for each in (*off, *of_off)):
+        raise ValueError(f"{place}: corners_off_m and corners_deviations_m must have x, y, z of every corner")
+    if any(deviation < 0.0 for each in of_off for deviation in each):
+        raise ValueError(f"{place}.corners_deviations_m: must not be negative")
     shape = _deviations(refined, Unknown(UnknownKind.SHAPE, name))
     expected = iter(np.zeros(len(board.names)) if shape is None else shape)
     by_joint = []

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
+from problems_of_cells import problem_of
 from rwhec_factors import se3
 from scipy.stats import chi2
 from simulated_boards import misprinted
@@ -14,7 +16,7 @@ from simulated_cells import BOARD, CAMERA, Cell, cell
 from simulated_models import A_NOISE, CORNER_PX, model_and_point
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import OptionError
+from gtsam_rwhec.errors import FileFormatError, OptionError
 from gtsam_rwhec.reprojection.corner_graph import CornerGraph
 from gtsam_rwhec.reprojection.corner_views import linearised, pixel_errors, stacks_of
 from gtsam_rwhec.reprojection.held_out import held_out_errors
@@ -23,6 +25,9 @@ from gtsam_rwhec.reprojection.model import Model, Point
 from gtsam_rwhec.reprojection.reduced import Reduced
 
 MISPRINT_M = 2e-4
+#: Covariances of poses are those of corners alone: the noise of A is more.
+pytestmark = pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.WeightsWarning")
+
 OPTIONS = rw.CornerOptions(stated="calibration", corners_m=MISPRINT_M)
 
 
@@ -109,6 +114,25 @@ def test_corners_far_from_their_places_are_named() -> None:
     said = [words for words in refined.findings if "corners of board are farther" in words]
     assert len(said) == 1
     assert "than corners_m=0.0001 explains (corner " in said[0]
+
+
+def test_results_and_their_files_have_the_corners(tmp_path: Path) -> None:
+    given, off = misprinted(6, MISPRINT_M, images=15, stated="calibration", carrier=(5e-4, 2e-4))
+    problem = problem_of(given.observations)
+    refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(observations="corners"), corners=OPTIONS)
+    assert refined.reprojection is not None
+    board = refined.reprojection.boards["board"]
+    assert np.abs(np.array(board.corners_off_m) - off).max() < 5.0 * np.array(board.corners_deviations_m).max()
+    assert str(board).startswith("its corners are 0.3")
+    rw.write_refined(refined, tmp_path / "refined.json")
+    back = rw.read_refined(tmp_path / "refined.json").reprojection
+    assert back == refined.reprojection
+    short = replace(board, corners_deviations_m=board.corners_deviations_m[1:])
+    wrong = replace(refined, reprojection=replace(refined.reprojection, boards={"board": short}))
+    with pytest.raises(
+        FileFormatError, match=r"boards\.board: corners_off_m and corners_deviations_m must have x, y, z"
+    ):
+        rw.write_refined(wrong, tmp_path / "wrong.json")
 
 
 def test_a_board_as_stated_has_its_corners_where_they_are_stated(small: Cell) -> None:
