@@ -1,9 +1,10 @@
 """Intrinsics of sensors that state none (``intrinsics: estimate``), from their images of boards, before detection.
 
 Some of a sensor's images, spread over all of them, are searched with a pinhole in place of the camera that nobody
-knows: what detection tests in a board's plane holds for any focal length, and nearly so for most lenses. The corners
-give the intrinsics, and detection in all images then has a camera as it always has. The same images give the same
-camera, so an interrupted run goes on from the images that were detected with it.
+knows: what detection tests in a board's plane holds for any focal length. A lens bends boards, and many are rejected
+then; a first camera from those that were read, or from the rejected ones if there are few, reads them in a second
+look, and searches the other images. The corners give the intrinsics, and detection in all images then has a camera as
+it always has. The same images give the same camera, so an interrupted run goes on from the images that it has detected.
 """
 
 from __future__ import annotations
@@ -37,11 +38,13 @@ from gtsam_rwhec.vision.targets import Target
 from gtsam_rwhec.vision.unknown_intrinsics import CORNERS, ENOUGH, EstimatedIntrinsics, Lens, estimated_intrinsics
 
 #: This many of a sensor's images are searched at first, and this many times as many if they show too few boards.
-FIRST, TIMES = 60, 4
+FIRST, TIMES = 16, 4
 #: Images have the size that most of the first so many have.
 FOR_SIZE = 20
-#: Focal lengths over the width: of a usual lens, and of a fisheye, with which bent boards are searched for again.
-USUAL, FISHEYE = 0.87, 0.5
+#: From fewer views than this a first camera is made with those too that the lens bends too much for a pinhole.
+FEW = 6
+#: The focal length of a usual lens over the width.
+USUAL = 0.87
 #: These rejections are about poses, which need intrinsics.
 ABOUT_POSES = (Rejection.NO_POSE, Rejection.REPROJECTION, Rejection.GRAZING)
 
@@ -81,10 +84,10 @@ def in_words(sensor: str, found: EstimatedIntrinsics) -> str:
     K, camera = found.camera.K, found.camera
     bent = ", ".join(f"{k:.4g}" for k in camera.D) if camera.D.any() else "none"
     return (
-        f"The intrinsics of {sensor} are estimated from {found.views} views of boards in its images of "
-        f"{camera.width} x {camera.height} pixels: "
-        f"{camera.model}, fx, fy = {K[0, 0]:.1f}, {K[1, 1]:.1f}, cx, cy = {K[0, 2]:.1f}, {K[1, 2]:.1f}, "
-        f"distortion {bent}; {found.rms_px:.2f} px rms over {found.corners} corners."
+        f"No intrinsics of {sensor} are stated. Detection worked with a first estimate, from {found.views} views of "
+        f"boards in its images of {camera.width} x {camera.height} pixels: {camera.model}, "
+        f"fx, fy = {K[0, 0]:.1f}, {K[1, 1]:.1f}, cx, cy = {K[0, 2]:.1f}, {K[1, 2]:.1f}, distortion {bent}; "
+        f"{found.rms_px:.2f} px rms over {found.corners} corners."
     )
 
 
@@ -117,68 +120,88 @@ def refuse_not_estimated(
 def _of_images(
     log: Log, rig: Rig, sensor: str, topic: str, size: Size, lens: Lens, workers: int | None, progress: Progress
 ) -> EstimatedIntrinsics | NotEstimated:
-    """Search images, more of them while there are too few boards, then again if the lens bends the boards."""
+    """Search some images with a pinhole, and more, while there are too few boards, with what the boards so far say."""
     total = message_count(log, topic)
-    camera = _camera(size, "pinhole", USUAL)
-    images: list[DetectedImage] = []
-    looked_at: set[int] = set()
-    wanted = FIRST
+    camera = pinhole = _camera(size)
+    found: dict[int, DetectedImage] = {}
+    searched: set[int] = set()
 
-    def search(which: set[int], camera: Camera) -> list[DetectedImage]:
-        records = (record for i, record in enumerate(_records(log, topic)) if i in which)
-        makers = {topic: partial(Detector, camera, rig.target_list, rig.detection_options)}
+    def search(which: set[int]) -> None:
+        looked_at: list[int] = []
+
+        def images() -> Iterator[ImageRecord]:
+            for i, record in enumerate(_records(log, topic)):
+                if i in which:
+                    looked_at.append(i)
+                    yield record
+
+        done = len(searched - which)
         words = f"estimating the intrinsics of {sensor}: image"
-        done = len(images)
-        return list(
-            detect_in_images(
-                records, makers, workers=workers, progress=lambda n: progress(Counted(words, done + n, total))
-            )
+        makers = {topic: partial(Detector, camera, rig.target_list, rig.detection_options)}
+        seen = detect_in_images(
+            images(), makers, workers=workers, progress=lambda n: progress(Counted(words, done + n, total))
         )
+        found.update(zip(looked_at, list(seen), strict=False))  # in their order: they are of one topic
 
-    while len(looked_at) < total and len(_views(rig, images)) < ENOUGH:
-        which = set(np.linspace(0, total - 1, min(wanted, total)).round().astype(int).tolist()) - looked_at
-        looked_at |= which
-        images += search(which, camera)
+    wanted = FIRST
+    while True:
+        which = set(np.linspace(0, total - 1, min(wanted, total)).round().astype(int).tolist()) - searched
+        searched |= which
+        search(which)
+        if camera is pinhole:
+            camera = _roughly(rig, found, size, lens) or pinhole
+            if camera is not pinhole:
+                search({i for i, image in found.items() if _rejected(image)})
+        if len(searched) == total or len(_views(rig, found)) >= ENOUGH:
+            break
         wanted *= TIMES
-    result = _estimated(rig, images, size, lens, camera)
-    boards = _boards(images)
-    if len(_views(rig, images)) < min(boards, ENOUGH):  # boards that a pinhole rejects
-        bent = _camera(size, "equidistant", FISHEYE) if isinstance(result, NotEstimated) else result.camera
-        images, before = [], images
-        again = search(looked_at, bent)
-        if len(_views(rig, again)) > len(_views(rig, before)):
-            better = _estimated(rig, again, size, lens, bent)
-            return result if isinstance(better, NotEstimated) else better
-    return result
-
-
-def _estimated(
-    rig: Rig, images: Sequence[DetectedImage], size: Size, lens: Lens, camera: Camera
-) -> EstimatedIntrinsics | NotEstimated:
-    views = _views(rig, images)
+    views = _views(rig, found)
     try:
         return estimated_intrinsics([p for p, _ in views], [u for _, u in views], size, lens)
     except CameraError as error:
         why = str(error)
     if not views and all(len(target.corners()) < CORNERS for target in rig.target_list):
         why += ". The rig file has only single tags, whose four corners do not determine a camera: add a board"
-    return NotEstimated(why, camera, list(images))
+    return NotEstimated(why, camera, [found[i] for i in sorted(found)])
 
 
-def _views(rig: Rig, images: Sequence[DetectedImage]) -> list[tuple[Array, Array]]:
-    """Corners in their plane (n, 3) and pixels (n, 2) of every flat target that was read, in the images' order."""
+def _roughly(rig: Rig, found: Mapping[int, DetectedImage], size: Size, lens: Lens) -> Camera | None:
+    """A camera from the boards that were read; if they are few, also from those that no pinhole would see so bent."""
+    views = _views(rig, found)
+    if len(views) < FEW:
+        views = _views(rig, found, (*ABOUT_POSES, Rejection.NOT_A_GRID))
+    try:
+        return estimated_intrinsics([p for p, _ in views], [u for _, u in views], size, lens).camera
+    except CameraError:
+        return None
+
+
+def _views(
+    rig: Rig, found: Mapping[int, DetectedImage], also: Sequence[Rejection] = ABOUT_POSES
+) -> list[tuple[Array, Array]]:
+    """Corners in their plane (n, 3) and pixels (n, 2) of every flat target that was read, in the images' order.
+
+    `also` are the rejections that do not matter.
+    """
     views = []
+    images = [found[i].found for i in sorted(found)]
     for target in rig.target_list:
         flat = _flat(target)
         if flat is None:
             continue
-        track = [d for image in images if image.found for d in image.found.detections if d.target == target.name]
+        track = [d for image in images if image for d in image.detections if d.target == target.name]
         views += [
             (flat[seen.indices], seen.corners_px)
             for seen in layouts_over_track(track)
-            if (seen.rejection is None or seen.rejection in ABOUT_POSES) and len(seen.indices) >= CORNERS
+            if (seen.rejection is None or seen.rejection in also) and len(seen.indices) >= CORNERS
         ]
     return views
+
+
+def _rejected(image: DetectedImage) -> bool:
+    """Whether a board in an image was rejected, but for its pose."""
+    seen = image.found.detections if image.found else ()
+    return any(d.rejection is not None and d.rejection not in ABOUT_POSES and len(d.indices) >= CORNERS for d in seen)
 
 
 def _flat(target: Target) -> Array | None:
@@ -188,11 +211,6 @@ def _flat(target: Target) -> Array | None:
         return corners
     in_plane = plane_coordinates(corners.reshape(-1, 4, 3))
     return None if in_plane is None else np.pad(in_plane.reshape(-1, 2), ((0, 0), (0, 1)))
-
-
-def _boards(images: Sequence[DetectedImage]) -> int:
-    """How many boards were seen, read or rejected."""
-    return sum(len(d.indices) >= CORNERS for image in images if image.found for d in image.found.detections)
 
 
 def _without_poses(image: DetectedImage) -> DetectedImage:
@@ -206,11 +224,11 @@ def _without_poses(image: DetectedImage) -> DetectedImage:
     return replace(image, found=replace(image.found, detections=tuple(map(plain, image.found.detections))))
 
 
-def _camera(size: Size, model: str, focal: float) -> Camera:
-    """A camera of a usual focal length, a share of the width, whose axis is in the middle of the image."""
+def _camera(size: Size) -> Camera:
+    """A pinhole of a usual focal length whose axis is in the middle of the image."""
     width, height = size
-    K = [[focal * width, 0.0, 0.5 * (width - 1)], [0.0, focal * width, 0.5 * (height - 1)], [0.0, 0.0, 1.0]]
-    return Camera.of(width, height, model, K, (), "in place of the camera")
+    K = [[USUAL * width, 0.0, 0.5 * (width - 1)], [0.0, USUAL * width, 0.5 * (height - 1)], [0.0, 0.0, 1.0]]
+    return Camera.of(width, height, "pinhole", K, (), "in place of the camera")
 
 
 def _image_size(log: Log, rig: Rig, sensor: str, topic: str) -> Size:

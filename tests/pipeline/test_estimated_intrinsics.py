@@ -20,6 +20,7 @@ from gtsam_rwhec.pipeline.estimated_intrinsics import estimate_intrinsics
 from gtsam_rwhec.pipeline.folder_log import write_folder_log
 from gtsam_rwhec.pipeline.log_metadata import read_cameras, read_embedded_rig
 from gtsam_rwhec.rig import parse_rig
+from gtsam_rwhec.vision.images import Gray
 
 UNKNOWN = CIRCLES.replace("{K: [550, 550, 320, 240], size: [640, 480]}", "estimate")
 BLANK = """\
@@ -47,7 +48,10 @@ def test_images_alone_give_a_camera_that_the_log_records(circle_grid_10x10: Path
         report = detect_source(folder, parse_rig(UNKNOWN, "rig.yaml"), out, workers=1)
     assert [track.used for track in report.tracks] == [6]
     (words,) = report.remarks
-    assert words.startswith("The intrinsics of camera are estimated from 6 views of boards in its images of 640 x 480")
+    assert words.startswith(
+        "No intrinsics of camera are stated. Detection worked with a first estimate, from 6 views of"
+    )
+    assert "in its images of 640 x 480 pixels: radtan, fx, fy = 5" in words
     with open_log(out) as log:
         camera, rig = read_cameras(log)["camera"], read_embedded_rig(log)
         assert doubted_intrinsics(log, rig, {"camera": camera}) == ()  # nobody stated them
@@ -57,7 +61,7 @@ def test_images_alone_give_a_camera_that_the_log_records(circle_grid_10x10: Path
 
 
 def test_the_same_images_give_the_same_camera(circle_grid_10x10: Path, tmp_path: Path) -> None:
-    folder = part_of(tmp_path / "cell", circle_grid_10x10, [0, 6, 9, 14])
+    folder = part_of(tmp_path / "cell", circle_grid_10x10, [0, 6, 14])
     rig = parse_rig(UNKNOWN, "rig.yaml")
     with pytest.warns(LogWarning, match="poses have no image"):
         write_folder_log(folder, rig, tmp_path / "log.mcap")
@@ -70,11 +74,12 @@ def test_the_same_images_give_the_same_camera(circle_grid_10x10: Path, tmp_path:
     assert inputs[0] == inputs[1]  # an interrupted run goes on
 
 
-def blank_cell(folder: Path, targets: str = "") -> None:
+def write_cell(folder: Path, images: list[Gray]) -> None:
+    """A folder of images, each with a pose."""
     (folder / "images").mkdir(parents=True)
     rows = ["name,x,y,z,qx,qy,qz,qw"]
-    for i in range(4):
-        cv2.imwrite(str(folder / "images" / f"{i}.png"), np.full((48, 64), 200, np.uint8))
+    for i, image in enumerate(images):
+        cv2.imwrite(str(folder / "images" / f"{i}.png"), image)
         rows.append(f"{i}.png,0,0,{i},0,0,0,1")
     (folder / "poses.csv").write_text("\n".join(rows) + "\n")
 
@@ -88,7 +93,7 @@ def blank_cell(folder: Path, targets: str = "") -> None:
     ids=["no board", "single tags"],
 )
 def test_images_that_show_no_board_are_refused_with_what_to_do(target: str | None, said: str, tmp_path: Path) -> None:
-    blank_cell(tmp_path)
+    write_cell(tmp_path, [np.full((48, 64), 200, np.uint8)] * 4)
     text = BLANK if target is None else BLANK.partition("  board:")[0] + f"  {target}\n"
     with pytest.raises(CameraError) as caught:
         detect_source(tmp_path, parse_rig(text, "rig.yaml"), tmp_path / "detected.mcap", workers=1)
