@@ -8,9 +8,10 @@ nominal prior. Errors e of each unknown are squared with the inverse of its bloc
 is 1 in the mean where the estimate is efficient. C^-1 is the information at the truth under the true noise, with the
 prior where intrinsics were drawn from it (van Trees's bound), and with the carriers' errors eliminated.
 
-Refinement from poses takes the same images' poses with their covariances, whose scale it estimates where it can, and is
-told A's noise, which refinement from corners estimates. Its errors are squared with the same bound. Ours is not worse
-where the mean difference of the squares, run by run, is not above zero outside of its 99 % interval.
+Refinement from poses takes the same images' poses with their covariances, whose scale it estimates where it can. It is
+told A's noise, which refinement from corners estimates, and which of a flat board's two poses an image has. Its errors
+are squared with the same bound. Ours is not worse where the mean difference of the squares, run by run, is not above
+zero outside of its 99 % interval.
 """
 
 from __future__ import annotations
@@ -32,7 +33,6 @@ import simulated_cells
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NoiseError, RwhecWarning
-from gtsam_rwhec.reprojection.chosen_poses import solved_with_chosen_poses
 from gtsam_rwhec.reprojection.intrinsics import Stated
 from gtsam_rwhec.reprojection.lens import parameters_of
 from gtsam_rwhec.reprojection.reduced import Noise, Reduced
@@ -88,7 +88,7 @@ def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
     options = rw.CornerOptions(stated=kind.told, carrier_noise="exact" if exact else "estimate")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RwhecWarning)
-        poses = refined_from_poses(given.observations, kind.carrier)
+        poses = refined_from_poses(given, kind.carrier)
     corners = rw.refine_corners(given.observations, poses.X, poses.Y, options)
     bound = bound_at_the_truth(given, corners, Noise(CORNER_PX, *kind.carrier))
     found = {}
@@ -105,18 +105,19 @@ def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
     return found
 
 
-def refined_from_poses(observations: rw.Observations, carrier: tuple[float, float]) -> rw.Refined:
-    """From the images' poses, with A's noise as it is; a flat target's two poses are told apart."""
+def refined_from_poses(given: simulated_cells.Cell, carrier: tuple[float, float]) -> rw.Refined:
+    """From the images' poses, with A's noise as it is; of a flat target's two poses the one near the truth."""
+    near = {
+        (target, sensor): se3.inverse(given.Y[sensor]) @ view.A @ given.X[target]
+        for (target, sensor), view in given.observations.views.items()
+    }
+    problem = given.observations.poses(near)
+    start = rw.solve(problem)
     noise = rw.CarrierNoise(*carrier) if any(carrier) else None
-
-    def refined(problem: rw.Problem) -> rw.Refined:
-        start = rw.solve(problem)
-        try:
-            return rw.refine(problem, start, rw.RefineOptions(noise="estimate", carrier_noise=noise))
-        except NoiseError:  # what is told of A explains all residuals
-            return rw.refine(problem, start, rw.RefineOptions(noise="given", carrier_noise=noise))
-
-    return solved_with_chosen_poses(observations, refined, lambda answer: (answer.X, answer.Y))
+    try:
+        return rw.refine(problem, start, rw.RefineOptions(noise="estimate", carrier_noise=noise))
+    except NoiseError:  # what is told of A explains all residuals
+        return rw.refine(problem, start, rw.RefineOptions(noise="given", carrier_noise=noise))
 
 
 def bound_at_the_truth(given: simulated_cells.Cell, corners: rw.CornersRefined, noise: Noise) -> np.ndarray:
