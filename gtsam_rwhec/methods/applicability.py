@@ -68,7 +68,7 @@ def _check_frames(method: Method[Any], problem: Problem) -> None:
         "Xs": (sensors == 1, "several targets and one sensor"),
         "Xs or Ys": (min(targets, sensors) <= 1, "several targets or several sensors, not both"),
         "Xs and Ys": (True, ""),
-    }[method.properties.multiple]
+    }["Xs and Ys" if Takes.CORNERS in method.takes else method.properties.multiple]
     if not can:
         pairs = len(problem.pairs)
         raise FrameError(

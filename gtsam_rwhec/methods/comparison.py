@@ -17,8 +17,8 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.methods import certified
 from gtsam_rwhec.methods.applicability import check_problem, refusal
 from gtsam_rwhec.methods.estimate import Estimate
-from gtsam_rwhec.methods.method import Method, MethodOptions
-from gtsam_rwhec.methods.registry import METHODS, check_options, estimate_of, method_of, run
+from gtsam_rwhec.methods.method import Method, MethodOptions, check_options
+from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solving.solution import Solution

@@ -39,6 +39,7 @@ class Takes(Enum):
     MOMENTS = "a problem whose raw measurements were not kept"
     WEIGHTS = "weights of the motions"
     COVARIANCES = "covariances of the motions' residuals"
+    CORNERS = "corners in pixels, of all measurements of a problem, in place of poses"
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,12 @@ class MethodOptions:
                 raise OptionError(
                     f"MethodOptions.{name}={brief(value)}; give a whole number from {least} to {LARGEST_WHOLE}"
                 )
+
+
+def check_options(options: object) -> None:
+    """Raise an OptionError for options of another type."""
+    if options is not None and not isinstance(options, MethodOptions):
+        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.methods.MethodOptions")
 
 
 def checked_start(

@@ -27,7 +27,7 @@ from gtsam_rwhec.methods import (
 from gtsam_rwhec.methods.applicability import check_problem
 from gtsam_rwhec.methods.estimate import Estimate, Outcome, Poses, Proof
 from gtsam_rwhec.methods.evaluation import evaluate
-from gtsam_rwhec.methods.method import Method, MethodOptions
+from gtsam_rwhec.methods.method import Method, MethodOptions, check_options
 from gtsam_rwhec.problem.problem import Problem
 
 #: The cost by which all answers are compared.
@@ -87,12 +87,6 @@ def run(name: str, problem: Problem, options: MethodOptions | None = None) -> Es
     found = method.function(problem, options or MethodOptions())
     seconds = time.perf_counter() - start
     return estimate_of(method.name, problem, found, seconds)
-
-
-def check_options(options: object) -> None:
-    """Raise an OptionError for options of another type."""
-    if options is not None and not isinstance(options, MethodOptions):
-        raise OptionError(f"options is a {type(options).__name__}; give a gtsam_rwhec.methods.MethodOptions")
 
 
 def method_of(name: str) -> Method[[Problem, MethodOptions]]:

@@ -24,8 +24,7 @@ from gtsam_rwhec.methods.certified import quiet_solution
 from gtsam_rwhec.methods.corner_costs import Corners, Minimum
 from gtsam_rwhec.methods.estimate import Poses
 from gtsam_rwhec.methods.linear_methods import start_of
-from gtsam_rwhec.methods.method import MethodOptions, checked_start
-from gtsam_rwhec.methods.registry import check_options
+from gtsam_rwhec.methods.method import MethodOptions, check_options, checked_start
 from gtsam_rwhec.methods.tabb2017 import Parameterisation
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.reprojection.chosen_poses import solved_with_chosen_poses

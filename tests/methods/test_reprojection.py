@@ -10,9 +10,10 @@ from corner_problems import CAMERAS, GRID, SQUARE, seen
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, OptionError, TargetError
-from gtsam_rwhec.methods import MethodOptions, run
+from gtsam_rwhec.methods import MethodOptions, compare, run
 from gtsam_rwhec.methods import reprojection as methods
 from gtsam_rwhec.methods.corner_costs import Corners
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.simulate.simulation import frame_distance
@@ -42,6 +43,39 @@ def test_with_a_noise_of_a_ours_has_the_minimum_of_the_graph() -> None:
     table = methods.compare(observations, carrier=carrier, methods=("evangelista2023", "refine_corners"))
     costs = [row.answer.cost for row in table.rows if row.answer is not None]
     assert costs[0] == pytest.approx(costs[1], rel=1e-4)
+
+
+def test_corners_that_a_problem_holds_are_solved_beside_methods_on_poses() -> None:
+    observations, _, Y = seen(0.3, 4)
+    problem = Problem()
+    for (target, sensor), view in observations.views.items():
+        problem.add_corners(
+            target,
+            sensor,
+            view.A,
+            view.pixels,
+            observations.corners[target],
+            observations.cameras[sensor],
+            corner_px=0.3,
+        )
+    found = compare(problem, methods=("tabb2017_rp1", "evangelista2023", "certified"))
+    answers = {row.method.name: row.estimate for row in found.rows}
+    by_itself = methods.run("tabb2017_rp1", observations)
+    for name, pose in by_itself.Y.items():
+        estimate = answers["tabb2017_rp1"]
+        assert estimate is not None
+        assert frame_distance(estimate.Y[name].matrix(), pose.matrix()).translation_m < 1e-6
+        assert "px rms by the measured A" in estimate.notes[0]
+    errors = {
+        name: frame_distance(estimate.Y["left"].matrix(), Y["left"]).translation_m
+        for name, estimate in answers.items()
+        if estimate is not None
+    }
+    assert set(errors) == {"tabb2017_rp1", "evangelista2023", "certified"}
+    assert max(errors.values()) < 0.01
+    problem.add("board", "left", np.eye(4)[None], np.eye(4)[None])
+    with pytest.raises(CountError, match="measurements without corners"):
+        run("tabb2017_rp1", problem)
 
 
 def test_the_minimum_is_one() -> None:
