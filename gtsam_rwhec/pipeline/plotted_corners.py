@@ -22,7 +22,7 @@ from gtsam_rwhec.reprojection.projection_uncertainty import lens_deviations_over
 from gtsam_rwhec.vision.camera import Camera
 
 #: Fewer corners than this in an image say nothing beside its pose.
-FEWEST = 6
+FEWEST = 4
 #: A corner is far off beyond so many times the median of its image, or the noise.
 FAR = 6.0
 
@@ -30,20 +30,23 @@ FAR = 6.0
 class SeenView(NamedTuple):
     """A target's corners in an image: pixels (n, 2), and the same points (n, 3) in the camera's frame, metres.
 
-    With the points' derivatives (n, 3, 6) by A Expmap([omega, v]).
+    With the points' derivatives (n, 3, 6) by A Expmap([omega, v]), and the image's stamp.
     """
 
     pixels: Array
     points: Array
     by_A: Array
+    stamp_ns: int
 
     @staticmethod
-    def of(pixels: Array, corners: Array, T_camera_targetcarrier: Array, T_targetcarrier_target: Array) -> SeenView:
+    def of(
+        pixels: Array, corners: Array, T_camera_targetcarrier: Array, T_targetcarrier_target: Array, stamp_ns: int
+    ) -> SeenView:
         """Of corners (n, 3) in the target's frame."""
         Q = corners @ T_targetcarrier_target[:3, :3].T + T_targetcarrier_target[:3, 3]
         R = T_camera_targetcarrier[:3, :3]
         by_xi = np.concatenate([-se3.hat(Q), np.broadcast_to(np.eye(3), (len(Q), 3, 3))], axis=2)
-        return SeenView(pixels, Q @ R.T + T_camera_targetcarrier[:3, 3], R @ by_xi)
+        return SeenView(pixels, Q @ R.T + T_camera_targetcarrier[:3, 3], R @ by_xi, stamp_ns)
 
 
 def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
@@ -69,7 +72,7 @@ def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
             A, _ = path.at(np.array([record.stamp_ns + round(1e9 * offsets.get(sensor, 0.0))]))
             corners = boards[record.id][list(record.corner_indices)]
             X = solved.refined.X[record.id].matrix()
-            seen[sensor].append(SeenView.of(record.corners_px, corners, inverse @ A[0], X))
+            seen[sensor].append(SeenView.of(record.corners_px, corners, inverse @ A[0], X, record.stamp_ns))
     return dict(seen)
 
 
@@ -126,7 +129,7 @@ def plotted_intrinsics(solved: Solved, seen: dict[str, list[SeenView]]) -> dict[
 
 
 def residuals_of(camera: Camera, views: list[SeenView], found: Reprojection) -> tuple[PlottedCorners, np.ndarray]:
-    """Errors of corners at the optimum, and the image (N,) of each.
+    """Errors of corners at the optimum, and the stamp (N,) of each one's image.
 
     A of each image is off there by what its noise and its corners together say.
     With the derivatives J of the pixels by A's errors over their deviations, and residuals r over the corners' noise:
@@ -136,7 +139,7 @@ def residuals_of(camera: Camera, views: list[SeenView], found: Reprojection) -> 
     pixels: list[Array] = [np.zeros((0, 2))]
     errors: list[Array] = [np.zeros((0, 2))]
     image: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
-    for i, view in enumerate(views):
+    for view in views:
         P = view.points
         x = P[:, :2] / P[:, 2:]
         predicted, by_x = camera.pixel_jacobian(x)
@@ -150,7 +153,7 @@ def residuals_of(camera: Camera, views: list[SeenView], found: Reprojection) -> 
         if kept.sum() >= FEWEST:
             pixels.append(view.pixels[kept])
             errors.append(_at_optimum(J[kept], off[kept]))
-            image.append(np.full(len(pixels[-1]), i))
+            image.append(np.full(len(pixels[-1]), view.stamp_ns))
     return PlottedCorners(np.concatenate(pixels), np.concatenate(errors)), np.concatenate(image)
 
 

@@ -19,7 +19,8 @@ def views_of(sensor: str) -> list[SeenView]:
     corners = board_of(refined, "board", given.observations.corners["board"])
     inverse = np.linalg.inv(refined.Y[sensor].matrix())
     X = refined.X["board"].matrix()
-    return [SeenView.of(pixels, corners, inverse @ A, X) for A, pixels in zip(view.A, view.pixels, strict=True)]
+    seen = enumerate(zip(view.A, view.pixels, strict=True))
+    return [SeenView.of(pixels, corners, inverse @ A, X, i) for i, (A, pixels) in seen]
 
 
 def test_errors_are_those_of_the_optimum_where_A_is_a_variable() -> None:

@@ -72,7 +72,7 @@ def plot_coverage(corners: Mapping[str, PlottedCorners], cameras: Mapping[str, C
         bar = figure.colorbar(
             points, ax=panels.tolist(), extend="max", extendfrac=0.03, aspect=40, shrink=0.8, pad=0.015
         )
-        bar.set_label("reprojection error of a corner (px)")
+        bar.set_label("reprojection error of a corner, with A as measured (px)")
         words = f"mean error of {LEAST_CORNERS} or more neighbouring corners, enlarged as the title says"
         arrow = Line2D([], [], marker=">", markersize=5, lw=1.2, color=BLUE, label=words)
         figure.legend(handles=[arrow], loc="outside lower left")

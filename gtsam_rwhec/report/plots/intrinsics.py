@@ -27,6 +27,8 @@ READABLE = 0.55
 DOT = 1.4
 #: Lines of equal deviation are drawn at these steps of each power of ten.
 STEPS = (1.0, 2.0, 5.0)
+#: Of more lines than these only those at the powers of ten are drawn.
+MOST_LINES = 6
 
 
 def plot_intrinsics(cameras: Mapping[str, PlottedIntrinsics], path: str | Path) -> None:
@@ -148,6 +150,8 @@ def _draw_uncertainty(axes: Axes, of: PlottedIntrinsics) -> None:
     )  # fmt: skip
     every = [step * 10.0**power for power in range(-6, 7) for step in STEPS]
     levels = [level for level in every if low < level < high]
+    if len(levels) > MOST_LINES:
+        levels = [level for level in levels if round(np.log10(level), 6).is_integer()]
     if levels and min(of.deviations_px.shape) > 1:
         lines = axes.contour(u, v, shades, levels=levels, colors="black", linewidths=0.8, zorder=3)
         axes.clabel(lines, fmt=lambda level: f"{level:g} px", fontsize=8)
