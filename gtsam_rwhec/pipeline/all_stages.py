@@ -40,7 +40,7 @@ from gtsam_rwhec.pipeline.log_contract import (
     is_from_stage,
 )
 from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig, read_metadata
-from gtsam_rwhec.pipeline.output_paths import LEFT, check_is_not_read, made_folder, made_output_folder
+from gtsam_rwhec.pipeline.output_paths import INSIDE, LEFT, check_is_not_read, made_folder, made_output_folder
 from gtsam_rwhec.pipeline.samples_log import is_file_of_samples, write_samples_log
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solution_plots import plot_all
@@ -285,8 +285,8 @@ def export_solved(
             (out / name).unlink(missing_ok=True)
     else:
         written = export_all(frames_of(solved), out)
-    remove_unchanged(out, FOLDERS, keep=written)
     tell("plotting")
     written += plot_all(solved, solved_path, made_folder(out / PLOTS_FOLDER))
+    remove_unchanged(out, INSIDE, keep=written)
     list_written(out, solved.log.detection.sources, written)
     return written

@@ -212,7 +212,8 @@ def list_written(folder: Path, sources: Sequence[str], files: Iterable[Path]) ->
 def remove_unchanged(folder: Path, inside: Collection[str], keep: Iterable[Path] = ()) -> None:
     """Remove what a calibration wrote into some folders of a folder, where it is as it was written, but for `keep`.
 
-    A camera that has another name now has another file; and no file of others is removed.
+    A camera that has another name now has another file, and a picture of what is no more would be taken for one of now.
+    No file of others is removed.
     """
     written = _read_list(folder)
     kept = {file.relative_to(folder).as_posix() for file in keep}

@@ -88,8 +88,9 @@ def test_the_demo_runs_from_it_and_meets_the_truth(unpacked_wheel: Path, tmp_pat
     files = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
     assert files == {
         "clean.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
-        "plots/coverage.png", "plots/deviations.png", "plots/frames.png", "plots/residuals.png", ".written.json",
-        "seen.png", "cameras.opencv.yaml", "cameras.txt", "camera_info/cam_left.yaml", "camera_info/cam_wide.yaml",
+        "plots/coverage.png", "plots/deviations.png", "plots/frames.png", "plots/residuals.png",
+        "plots/intrinsics.png", ".written.json", "seen.png", "cameras.opencv.yaml", "cameras.txt",
+        "camera_info/cam_left.yaml", "camera_info/cam_wide.yaml",
     }  # fmt: skip
     check_against_truth(out)
 
