@@ -3,11 +3,11 @@
     python tests/benchmarks/run_all.py [--quick] [--store] [--no-scs] [--plot FOLDER]
 
 Takes some hours: SCS a minute, outliers ten, few measurements and coverage half an hour each, wrong assumptions, split
-halves and KinHEC some hours together, the paper's tables the rest (these in processes of their own, with their own
-tables). ``--quick`` takes a few minutes for a small part of each: it tells that all run and roughly where they are, and
-its figures are kept apart from the others. The noise sweep is examples/noise_sweep.py. Exits with 1 if a bar is missed.
-Needs scs, kinhec, and opencv-python-headless<5 for what is compared with OpenCV 4's hand-eye calls: `pip install
-'.[bench]'`; ``--quick`` leaves out what cannot run.
+halves, KinHEC and refinement from corners some hours together, the paper's tables the rest (these in processes of their
+own, with their own tables). ``--quick`` takes a few minutes for a small part of each: it tells that all run and roughly
+where they are, and its figures are kept apart from the others. The noise sweep is examples/noise_sweep.py. Exits with 1
+if a bar is missed. Needs scs, kinhec, and opencv-python-headless<5 for what is compared with OpenCV 4's hand-eye calls:
+`pip install '.[bench]'`; ``--quick`` leaves out what cannot run.
 """
 
 from __future__ import annotations
@@ -46,7 +46,10 @@ from bars import Row, benchmark_parser, print_rows
 from kinhec_sequences import STANDARD_SEED
 
 #: Scripts with tables of their own whose rows have bars; the others compare theirs with the papers'.
-WITH_BARS = ("coverage.py", "wrong_assumptions.py", "split_halves.py")
+WITH_BARS = (
+    "coverage.py", "wrong_assumptions.py", "split_halves.py", "corner_coverage.py", "corner_wrong_intrinsics.py",
+    "corner_undetermined.py", "corner_intrinsics.py", "corner_efficiency.py",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,11 @@ class Sizes:
         ("lom_tables.py", 300),
         ("wrong_assumptions.py", 1000),
         ("split_halves.py", 300),
+        ("corner_coverage.py", 2000),
+        ("corner_wrong_intrinsics.py", 400),
+        ("corner_undetermined.py", 60),
+        ("corner_intrinsics.py", 200),
+        ("corner_efficiency.py", 2000),
     )
     #: Of the neutral benchmark; none are run without its package.
     neutral_seeds: tuple[int, ...] = (STANDARD_SEED,)
