@@ -139,7 +139,7 @@ def observed(
         }
         observations = replace(observations, views=kept)
     if late and not options.time_offsets:
-        options = replace(options, time_offsets=tuple(late))
+        options = replace(options, time_offsets=tuple(name for name in late if name in observations.sensors))
     if problem.scale == "per_target" and not options.size_share:
         free = [name for name in problem.targets if name not in problem.fixed_scales]
         options = replace(options, size_share=dict.fromkeys(free, SIZE_SHARE))

@@ -156,6 +156,13 @@ def test_a_far_board_takes_the_poses_that_agree_with_the_carriers() -> None:
     assert again is problem
 
 
+def test_a_target_need_not_be_flat() -> None:
+    A, B, _ = images(12)
+    box = BOARD + np.r_["-1,2,0", np.zeros((24, 2)), np.where(BOARD[:, :1] > 0.0, 0.05, 0.0)]
+    pixels = CAMERA.project(box @ B[:, :3, :3].transpose(0, 2, 1) + B[:, None, :3, 3])
+    np.testing.assert_allclose(problem_of(A, pixels, box).measurements("board", "cam").B, B, atol=1e-6)
+
+
 def test_poses_by_other_intrinsics_take_the_place_of_all() -> None:
     A, B, pixels = images(8)
     stated = rw.Camera.of(1280, 960, "radtan", [[880, 0, 655], [0, 880, 470], [0, 0, 1]], CAMERA.D, "stated")

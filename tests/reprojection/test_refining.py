@@ -105,8 +105,14 @@ def test_a_target_of_unknown_size_is_found_by_its_corners_too() -> None:
     board = refined.reprojection.boards["board"]
     assert board.values[0] == pytest.approx(1.0 / refined.scale["board"] - 1.0)
     assert board.standard_deviations[0] == pytest.approx(sigma / refined.scale["board"] ** 2)
-    for name, truth in (given.X | given.Y).items():
-        assert refined.contains(name, truth, 0.999)
+    problem.fix_scale("board", 1.6)
+    known = rw.refine(problem, rw.solve(problem), CORNERS, corners=CALIBRATION)
+    assert known.scale == {"board": 1.6}
+    assert known.reprojection is not None
+    assert known.reprojection.boards == {}
+    for answer in (refined, known):
+        for name, truth in (given.X | given.Y).items():
+            assert answer.contains(name, truth, 0.999)
 
 
 def test_what_cannot_be_refined_from_corners_is_said() -> None:
