@@ -78,7 +78,7 @@ def test_the_sums_by_instant_have_the_graphs_information(small: Cell) -> None:
 
 
 def test_a_misprinted_board_is_found_with_everything_else() -> None:
-    given, off = misprinted(3, MISPRINT_M, images=60, cameras=3, stated="calibration", carrier=(1e-3, 5e-4))
+    given, off = misprinted(3, MISPRINT_M, images=40, cameras=3, stated="calibration", carrier=(1e-3, 5e-4))
     X, Y = given.near(np.random.default_rng(0))
     refined = rw.refine_corners(given.observations, X, Y, OPTIONS)
     assert refined.noise.corner_px == pytest.approx(0.1, rel=0.05)
@@ -117,7 +117,7 @@ def test_corners_far_from_their_places_are_named() -> None:
 
 
 def test_results_and_their_files_have_the_corners(tmp_path: Path) -> None:
-    given, off = misprinted(6, MISPRINT_M, images=15, stated="calibration", carrier=(5e-4, 2e-4))
+    given, off = misprinted(6, MISPRINT_M, images=10, stated="calibration", carrier=(5e-4, 2e-4))
     problem = problem_of(given.observations)
     refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(observations="corners"), corners=OPTIONS)
     assert refined.reprojection is not None
