@@ -26,8 +26,8 @@ CORNERS, VIEWS = 6, 3
 #: This many views, as different as there are, are enough.
 ENOUGH = 40
 #: A fisheye's model is tried where the image reaches further than this (degrees) from its axis, or where corners are
-#: off by more than this (pixels) without it; it is taken if its sum of squares is at most this share of the other's.
-WIDE_DEG, BADLY_PX, CLEARLY_LESS = 40.0, 0.3, 0.8
+#: off by more than this (pixels) without it; it is taken if Schwarz's criterion is less by this (very strong evidence).
+WIDE_DEG, BADLY_PX, CLEARLY = 40.0, 0.3, 10.0
 #: The kinds of distortion that are tried, with their numbers of coefficients, and these numbers for a fisheye.
 USUAL: tuple[tuple[Distortion, int], ...] = (("none", 0), ("radial", 2), ("all", 4))
 FISHEYE = (2, 4)
@@ -181,7 +181,7 @@ def _best(views: Sequence[tuple[Array, Array]], size: tuple[int, int], lens: Len
     fisheye = least(_fisheye(views, size))
     if usual is None or fisheye is None:
         return usual or fisheye
-    return fisheye if fisheye.squares.sum() < CLEARLY_LESS * usual.squares.sum() else usual
+    return fisheye if fisheye.criterion(corners) < usual.criterion(corners) - CLEARLY else usual
 
 
 def _is_usual(fit: _Fit, corners: int) -> bool:
