@@ -16,6 +16,7 @@ import pytest
 from places import REPOSITORY
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.vision.intrinsics_files import read_cameras
 
 CELL = REPOSITORY / "data" / "cell"
 
@@ -93,6 +94,7 @@ def test_the_demo_runs_from_it_and_meets_the_truth(unpacked_wheel: Path, tmp_pat
         "camera_info/cam_left.yaml", "camera_info/cam_wide.yaml",
     }  # fmt: skip
     check_against_truth(out)
+    check_cameras(out)
 
 
 def check_against_truth(out: Path) -> None:
@@ -115,3 +117,19 @@ def check_against_truth(out: Path) -> None:
     twice = [track["removed"] for track in said["detection"]["tracks"] if track["target"] == "tag_2"]
     assert {"seen twice in one image": 6} in twice
     assert [size["target"] for size in said["sizes"] if size["is_free"]] == ["board"]
+
+
+def check_cameras(out: Path) -> None:
+    """The images were made with what the log states; files for other programs have what was estimated."""
+    refined = rw.read_refined(out / "result.json")
+    exported = read_cameras(out / "cameras.opencv.yaml")
+    assert list(exported) == list(refined.intrinsics) == ["cam_left", "cam_wide"]
+    for sensor, intrinsics in refined.intrinsics.items():
+        off = np.array(intrinsics.values) - intrinsics.stated
+        assert (np.abs(off) < 4.0 * np.array(intrinsics.standard_deviations)).all(), sensor
+        (of_ros,) = read_cameras(out / "camera_info" / f"{sensor}.yaml").values()
+        for camera in (exported[sensor], of_ros):
+            assert (camera.K.tolist(), camera.D.tolist()) == (
+                intrinsics.camera.K.tolist(),
+                intrinsics.camera.D.tolist(),
+            )
