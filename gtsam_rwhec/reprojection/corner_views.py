@@ -240,6 +240,13 @@ def depths(
     return _seen(stack, X, Y, A, shape, offset_s, moved).z
 
 
+def off_axis(
+    stack: Stack, X: Array, Y: Array, A: Array, shape: Array, offset_s: float = 0.0, moved: Array | None = None
+) -> Array:
+    """Normalised radii (V, n) at which a stack's corners are; 0 where a corner was not seen."""
+    return np.asarray(np.linalg.norm(_seen(stack, X, Y, A, shape, offset_s, moved).x, axis=2))
+
+
 def linearised(
     stack: Stack,
     X: Array,

@@ -9,7 +9,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.refinement.options import About
-from gtsam_rwhec.reprojection.corner_views import Linear, Stack, depths, linearised, pixel_errors
+from gtsam_rwhec.reprojection.corner_views import Linear, Stack, depths, linearised, off_axis, pixel_errors
 from gtsam_rwhec.reprojection.row_sums import Rows, few_rows
 
 #: A residual of this many deviations stands for a corner behind its camera: the step is refused, and stays finite.
@@ -111,6 +111,11 @@ class Model:
         """Depths (V, n) of a stack's corners in front of the sensor, metres; 1 where a corner was not seen."""
         X, Y, A, _, shape, offset_s, moved = self._arguments(stack, point)
         return depths(stack, X, Y, A, shape, offset_s, moved)
+
+    def off_axis(self, stack: Stack, point: Point) -> Array:
+        """Normalised radii (V, n) at which a stack's corners are; 0 where a corner was not seen."""
+        X, Y, A, _, shape, offset_s, moved = self._arguments(stack, point)
+        return off_axis(stack, X, Y, A, shape, offset_s, moved)
 
     def _arguments(self, stack: Stack, point: Point) -> tuple[Array, Array, Array, Array, Array, float, Array | None]:
         camera = point.cameras[self.camera_of[stack.sensor]]

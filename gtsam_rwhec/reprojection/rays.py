@@ -37,7 +37,8 @@ def findings_of_rays(refined: CornersRefined) -> Iterator[str]:
     model = refined.graph.model
     for stack, weights in zip(model.stacks, model.weights, strict=True):
         counted = stack.known & (weights > 0.0)
-        now = without_rays(refined.intrinsics[stack.sensor].camera, _seen(stack), counted)
+        camera = refined.intrinsics[stack.sensor].camera
+        now = without_rays(camera, _seen(stack), counted, model.off_axis(stack, refined.point) >= camera.ring)
         before = without_rays(stack.camera, _seen(stack), counted)
         if now:
             yield f"As estimated, {now}: do not use these intrinsics there, and doubt this answer; {CURE}."
@@ -59,17 +60,21 @@ def _seen(stack: Stack) -> tuple[str, str, Array]:
     return stack.target, stack.sensor, np.where(stack.known[..., None], stack.pixels, np.nan)
 
 
-def without_rays(camera: Camera, seen: tuple[str, str, Array], counted: np.ndarray) -> str:
+def without_rays(
+    camera: Camera, seen: tuple[str, str, Array], counted: np.ndarray, beyond: np.ndarray | None = None
+) -> str:
     """Which corners of a target by a sensor (V, n, 2) a camera has no ray for, in words.
 
-    Empty where there are none that count (V, n), and hardly others.
+    Empty where there are none that count (V, n), and hardly others. Corners that poses put `beyond` the fold (V, n)
+    have none either, though the polynomial leads back to their pixel.
     """
     target, sensor, pixels = seen
-    dark, known = ~camera.has_ray(pixels), int(np.isfinite(pixels).all(axis=2).sum())
-    if not (dark & counted).any() and dark.sum() <= SHARE * known:
+    known = np.asarray(np.isfinite(pixels).all(axis=2))
+    dark = ~camera.has_ray(pixels) if beyond is None else ~camera.has_ray(pixels) | (beyond & known)
+    if not (dark & counted).any() and dark.sum() <= SHARE * known.sum():
         return ""
     return (
-        f"the lens model of {sensor} ({camera.model}) has no ray for {dark.sum()} of {known} corners of {target} "
+        f"the lens model of {sensor} ({camera.model}) has no ray for {dark.sum()} of {known.sum()} corners of {target} "
         f"({first_of(dark, pixels)}): {ends(camera)}"
     )
 

@@ -35,7 +35,7 @@ from gtsam_rwhec.reprojection.leverage import check_motion
 from gtsam_rwhec.reprojection.model import BEHIND, Model, Point
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
-from gtsam_rwhec.reprojection.rays import check_rays
+from gtsam_rwhec.reprojection.rays import check_rays, first_of
 from gtsam_rwhec.reprojection.reduced import Noise, Reduced
 from gtsam_rwhec.reprojection.refined import CornersRefined, RefinedIntrinsics
 from gtsam_rwhec.reprojection.stated_intrinsics import Innovation, innovation_of, wider
@@ -247,10 +247,12 @@ def _settled(
 
 def _check_start(model: Model, point: Point) -> None:
     for stack, error in zip(model.stacks, model.errors(point), strict=True):
-        if not (np.abs(error) < BEHIND).all():
+        behind = np.asarray(~(np.abs(error) < BEHIND).reshape(*stack.known.shape, 2).all(axis=2))
+        if behind.any():
             raise CameraError(
-                f"the start puts a corner of {stack.target} behind {stack.sensor}, which saw it; start at the "
-                "certified answer's poses"
+                f"the start puts {behind.sum()} of {stack.known.sum()} corners of {stack.target} behind "
+                f"{stack.sensor}, which saw them ({first_of(behind, stack.pixels)}); start at the certified answer's "
+                "poses"
             )
 
 

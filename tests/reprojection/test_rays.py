@@ -12,7 +12,7 @@ from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError
-from gtsam_rwhec.reprojection.rays import findings_of_rays
+from gtsam_rwhec.reprojection.rays import findings_of_rays, without_rays
 from gtsam_rwhec.vision.camera import Camera
 
 #: It folds back where r^2 = 1 / (3 * 1.5), 440 pixels from the centre; corners are seen to 570.
@@ -43,6 +43,9 @@ def test_a_nominal_lens_without_rays_is_replaced_and_named(given: Cell) -> None:
     for name, T in (given.X | given.Y).items():
         xi = se3.logmap((se3.inverse((result.X | result.Y)[name].matrix()) @ T)[None])[0]
         assert xi @ np.linalg.solve(result.covariance(name), xi) < chi2.ppf(0.999, 6)
+    stack = result.graph.model.stacks[0]
+    seen = np.linalg.norm(result.intrinsics["cam_0"].camera.undistort(stack.pixels), axis=2)[stack.known]
+    assert result.graph.model.off_axis(stack, result.point)[stack.known] == pytest.approx(seen, abs=3e-3)
     (words,) = (words for words in result.findings if "has no ray" in words and "cam_0" in words)
     assert words.startswith("As stated, the lens model of cam_0 (radtan) has no ray for ")
     assert "folds back 440 pixels from the centre. The estimated one has rays there: check D, its order" in words
@@ -55,6 +58,15 @@ def test_an_estimate_without_rays_is_doubted(given: Cell) -> None:
     assert first.startswith("As estimated, the lens model of cam_0 (radtan) has no ray for ")
     assert "doubt this answer" in first
     assert "cam_1" in second
+
+
+def test_corners_beyond_the_fold_whose_pixels_lead_back_are_seen_too() -> None:
+    """A radius of 1.2 times the ring and one of 0.79 times have the same pixel."""
+    pixels = FOLDED.pixels(np.array([[[1.2 * FOLDED.ring, 0.0]]]))
+    assert FOLDED.has_ray(pixels).all()
+    everyone = np.ones((1, 1), dtype=bool)
+    assert without_rays(FOLDED, ("board", "cam_0", pixels), everyone) == ""
+    assert "has no ray for 1 of 1 corners" in without_rays(FOLDED, ("board", "cam_0", pixels), everyone, everyone)
 
 
 def test_exact_intrinsics_without_rays_are_refused(given: Cell) -> None:
