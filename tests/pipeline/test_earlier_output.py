@@ -22,6 +22,7 @@ ALL = (
     "result.json", "clean.mcap", "detected.mcap", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
     "cameras.opencv.yaml", "cameras.txt", "camera_info/cam_0.yaml",
     "plots/frames.png", "plots/residuals.png", "plots/coverage.png", "plots/deviations.png",
+    "plots/intrinsics.png",
 )  # fmt: skip
 
 
