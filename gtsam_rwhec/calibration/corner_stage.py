@@ -107,6 +107,9 @@ def corners_found(
     if is_doubtful(corners):
         return CornersFound.none(f"the corners do not fit together: {' '.join(corners.findings)}")
     intrinsics = intrinsics_of(corners, {name: options.stated_of(options.camera_of(name)) for name in corners.Y})
+    faults = [f"{name}: {one.fault}" for name, one in intrinsics.items() if one.fault]
+    if faults:
+        return CornersFound.none(f"the corners lead to intrinsics that no camera has ({'; '.join(faults)})")
     return CornersFound(
         corners,
         intrinsics,

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from gtsam_rwhec.errors import CameraError
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.vision.camera import Camera
 
@@ -268,6 +269,15 @@ class Intrinsics:
     def camera(self) -> Camera:
         """The camera with these intrinsics."""
         return camera_of(self, self.values)
+
+    @property
+    def fault(self) -> str:
+        """Why no camera has these intrinsics, in words; empty where one has."""
+        try:
+            camera_of(self, self.values)
+        except CameraError as error:
+            return str(error)
+        return ""
 
     @property
     def stated_camera(self) -> Camera:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_as_refined import made
@@ -53,6 +55,14 @@ def test_intrinsics_are_in_numbers_that_make_the_camera_again() -> None:
         assert regions[1, 1] < middle  # which the errors of A share
         off = np.array(intrinsics.values)[:4] - given.cameras[name].K[[0, 1, 0, 1], [0, 1, 2, 2]]
         assert (np.abs(off) < 4.0 * np.array(intrinsics.standard_deviations)[:4]).all()
+
+
+def test_intrinsics_that_no_camera_has_say_so() -> None:
+    *_, refined = made()
+    one = refined.intrinsics["cam_0"]
+    assert one.fault == ""
+    absurd = replace(one, values=(-5.0, *one.values[1:]))
+    assert absurd.fault.startswith("intrinsics of the result: fx = -5 pixels for an image of 1920 x 1080 pixels")
 
 
 def test_what_the_poses_noise_model_found_widens_the_poses_alone() -> None:
