@@ -262,7 +262,8 @@ class Intrinsics:
                 said.append(f"the images agree with it ({off})")
         if self.held_by_prior:
             held = ", ".join(self.held_by_prior)
-            said.append(f"the images do not determine {held}, which only the prior holds")
+            by = "nothing else tells them" if self.stated_as == "unknown" else "only the prior holds them"
+            said.append(f"the images do not determine {held}: {by}")
         return "; ".join(said)
 
     @property

@@ -30,7 +30,7 @@ ERRORS_LEGEND = (
 )
 INTRINSICS_LEGEND = (
     "±: one standard deviation; of what was stated, as it counted. told by: the images, or only what was stated, where "
-    "the images do not determine a parameter."
+    "the images do not determine a parameter; nothing, where none was stated."
 )
 CONSEQUENCES_LEGEND = (
     "How far each pose would be off if an error stayed in the answer: for those who keep their own intrinsics, or take "
@@ -119,14 +119,20 @@ def intrinsics_table(refined: RefinedPoses) -> FrameTable:
             of.names, of.values, of.standard_deviations, of.stated, of.stated_deviations, strict=True
         ):
             decimals = _decimals(deviation)
+            was_stated = of.stated_as != "unknown"
             rows[f"{name} {parameter}"] = (
                 f"{value:.{decimals}f}",
                 f"{deviation:.{decimals}f}",
-                f"{stated:.{decimals}f}",
-                f"{known:.{decimals}f}" if math.isfinite(known) else "unknown",
-                "stated" if parameter in of.held_by_prior else "images",
+                *(f"{number:.{decimals}f}" if was_stated else NONE for number in (stated, known)),
+                _told_by(parameter, of),
             )
     return FrameTable("Intrinsics", "parameter", ("found", "±", "stated", "±", "told by"), rows)
+
+
+def _told_by(parameter: str, of: Intrinsics) -> str:
+    if of.stated_as != "exact" and parameter not in of.held_by_prior:
+        return "images"
+    return "nothing" if of.stated_as == "unknown" else "stated"
 
 
 def consequences_table(found: Reprojection, sensors: list[str]) -> FrameTable:

@@ -6,7 +6,6 @@ import dataclasses
 import io
 import re
 
-import numpy as np
 import pytest
 from refined_corners import two_cameras
 from rich.console import Console
@@ -97,17 +96,22 @@ def test_intrinsics_say_how_they_were_stated_and_what_the_images_do_not_tell(ref
     held = changed(refined, stated_as="calibration", widened=3.2, innovation_deviations=7.0, held_by_prior=("k2", "p1"))
     assert intrinsics_sentences(held)[0] == (
         "cam_0: estimated, with a prior from what was stated (a calibration's); the images are 7.0 deviations "
-        "off, so the prior was widened 3.2 times; the images do not determine k2, p1, which only the prior holds."
+        "off, so the prior was widened 3.2 times; the images do not determine k2, p1: only the prior holds them."
     )
     assert intrinsics_table(held).rows["cam_0 k2"][-1] == "stated"
     assert intrinsics_table(held).rows["cam_0 k1"][-1] == "images"
-    unknown = changed(refined, stated_as="unknown", stated_deviations=(np.inf,) * 8, held_by_prior=())
-    assert intrinsics_sentences(unknown)[0] == "cam_0: none were stated, so the images alone tell them."
-    assert intrinsics_table(unknown).rows["cam_0 fx"][3] == "unknown"
+    unknown = changed(refined, stated_as="unknown", held_by_prior=("k2",))
+    assert intrinsics_sentences(unknown)[0] == (
+        "cam_0: none were stated, so the images alone tell them; the images do not determine k2: nothing else tells "
+        "them."
+    )
+    assert intrinsics_table(unknown).rows["cam_0 fx"][2:] == ("-", "-", "images")
+    assert intrinsics_table(unknown).rows["cam_0 k2"][2:] == ("-", "-", "nothing")
     exact = changed(refined, stated_as="exact", held_by_prior=refined.intrinsics["cam_0"].names)
     assert intrinsics_sentences(exact)[0] == (
         "cam_0: they count as exact, as was said: their errors are not in the standard deviations."
     )
+    assert {row[-1] for name, row in intrinsics_table(exact).rows.items() if "cam_0" in name} == {"stated"}
 
 
 def test_a_camera_is_told_once_and_one_that_was_kept_is_told_too(refined: Refined) -> None:
