@@ -31,6 +31,11 @@ def refined(given: Cell, options: rw.CornerOptions) -> rw.CornersRefined:
     return rw.refine_corners(given.observations, X, Y, options)
 
 
+@pytest.fixture(scope="module")
+def result(given: Cell) -> rw.CornersRefined:
+    return refined(given, rw.CornerOptions())
+
+
 def test_where_rays_end() -> None:
     assert FOLDED.reach_px == pytest.approx(1400.0 * np.sqrt(1.0 / 4.5) * 2.0 / 3.0)
     pixels = np.array([[960.0, 540.0 + 439.0], [960.0, 540.0 + 441.0], [np.nan, np.nan]])
@@ -38,8 +43,7 @@ def test_where_rays_end() -> None:
     assert CAMERA.has_ray(np.array([[0.0, 0.0], [1919.0, 1079.0]])).all()
 
 
-def test_a_nominal_lens_without_rays_is_replaced_and_named(given: Cell) -> None:
-    result = refined(given, rw.CornerOptions())
+def test_a_nominal_lens_without_rays_is_replaced_and_named(given: Cell, result: rw.CornersRefined) -> None:
     for name, T in (given.X | given.Y).items():
         xi = se3.logmap((se3.inverse((result.X | result.Y)[name].matrix()) @ T)[None])[0]
         assert xi @ np.linalg.solve(result.covariance(name), xi) < chi2.ppf(0.999, 6)
@@ -51,8 +55,7 @@ def test_a_nominal_lens_without_rays_is_replaced_and_named(given: Cell) -> None:
     assert "folds back 440 pixels from the centre. The estimated one has rays there: check D, its order" in words
 
 
-def test_an_estimate_without_rays_is_doubted(given: Cell) -> None:
-    result = refined(given, rw.CornerOptions())
+def test_an_estimate_without_rays_is_doubted(result: rw.CornersRefined) -> None:
     folded = {name: replace(found, camera=FOLDED) for name, found in result.intrinsics.items()}
     first, second = findings_of_rays(replace(result, intrinsics=folded))
     assert first.startswith("As estimated, the lens model of cam_0 (radtan) has no ray for ")
@@ -76,7 +79,7 @@ def test_exact_intrinsics_without_rays_are_refused(given: Cell) -> None:
 
 def test_poses_are_made_of_corners_with_rays(given: Cell) -> None:
     """The images' poses are a start; images whose corners are all beyond the lens have none, and say so."""
-    few = cell(5, images=14, cameras=1)
+    few = cell(5, images=10, cameras=1)
     calibrated = rw.calibrate_corners(replace(few.observations, cameras={"cam_0": FOLDED}))
     assert any("has no ray" in words for words in calibrated.refined.findings)
     tiny = Camera.of(1920, 1080, "radtan", CAMERA.K, (-40.0, 0.0, 0.0, 0.0), "cell")
