@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from made_as_refined import made
-from simulated_cells import CAMERA
+from problems_of_cells import problem_of
+from simulated_cells import CAMERA, cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import FileFormatError
@@ -117,6 +118,28 @@ def test_exact_intrinsics_are_not_called_estimated() -> None:
     frames = rw.rig.frames_of_refined(replace(refined(), intrinsics={"cam_1": exact}), {"cam_0": CAMERA})
     assert frames.camera_origins == {"cam_1": "as stated, which count as exact"}
     assert frames.cameras["cam_0"] is CAMERA
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.WeightsWarning")
+@pytest.mark.parametrize(
+    ("options", "more"),
+    [
+        (rw.CornerOptions(stated="calibration", shared=(("cam_0", "cam_1"),)), set()),
+        (rw.CornerOptions(stated="calibration", size_share=0.02), {"scale:board"}),
+        (rw.CornerOptions(stated="unknown", warp_m=1e-3, corners_m=3e-4), {"shape:board"}),
+    ],
+    ids=["one camera for both", "a size that counted as known", "no intrinsics, a bent board"],
+)
+def test_every_refinement_from_corners_is_kept(options: rw.CornerOptions, more: set[str], tmp_path: Path) -> None:
+    problem = problem_of(
+        cell(5, images=20, stated="calibration", carrier=(5e-4, 2e-4), shape=(0.01, 0, 0)).observations
+    )
+    answer = rw.refine(problem, rw.solve(problem), rw.RefineOptions(observations="corners"), corners=options)
+    rw.write_refined(answer, tmp_path / "refined.json")
+    back = rw.read_refined(tmp_path / "refined.json")
+    assert (back.reprojection, back.intrinsics) == (answer.reprojection, answer.intrinsics)
+    assert set(back.names) == {"board", "cam_0", "cam_1", "intrinsics:cam_0", "intrinsics:cam_1"} | more
+    np.testing.assert_array_equal(back.covariance(), answer.covariance())
 
 
 def test_corners_may_estimate_a_size_that_was_known_before(text: str, tmp_path: Path) -> None:
