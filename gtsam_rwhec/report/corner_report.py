@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.refinement.reprojection_found import Consequence, Intrinsics, Reprojection
 from gtsam_rwhec.report.pose_table import FrameTable
@@ -37,6 +38,8 @@ CONSEQUENCES_LEGEND = (
     "the carriers' poses as exact. Millimetres / degrees; of A's errors, one standard deviation along the worst axis."
 )
 WORST_CAMERA = "Of intrinsics: those of the one camera whose error moves the pose most."
+#: Left-out images that are predicted so many times worse than expected show that the model lacks something.
+UNEXPECTED = 1.5
 #: So many cameras have columns of their own in the table of consequences.
 MOST_CAMERAS = 4
 #: Cells of a table with nothing to say.
@@ -60,6 +63,8 @@ def print_corners(refined: RefinedPoses, console: Console | None = None) -> None
     print_heading(console, "Corners and intrinsics")
     print_sentence(console, str(found))
     print_tables(console, [errors_table(found)], ERRORS_LEGEND)
+    for sentence in unexpected_sentences(found):
+        print_sentence(console, sentence, "yellow")
     console.print()
     if found.tried:
         print_sentence(console, "Models that were tried, by their error in images that were left out:")
@@ -92,6 +97,20 @@ def errors_table(found: Reprojection) -> FrameTable:
         )
     headings = ("images", "corners", "left out", "rms px", "hold-out mm", "hold-out px", "expected px")
     return FrameTable("Errors of corners", "sensor", headings, rows)
+
+
+def unexpected_sentences(found: Reprojection) -> list[str]:
+    """Of sensors whose left-out images are predicted worse than the covariances expect: these are too small."""
+    sentences = []
+    for name, of in found.sensors.items():
+        times = (of.held_out_px or 0.0) / (of.expected_px or np.inf)
+        if times > UNEXPECTED:
+            sentences.append(
+                f"{name}: images that were left out are predicted {rounded(times)} times worse than expected. The "
+                "arm's poses, the target or the lens have errors that the model lacks; the standard deviations of the "
+                "intrinsics come from the noise alone, and are too small by as much or more."
+            )
+    return sentences
 
 
 def intrinsics_sentences(refined: RefinedPoses) -> list[str]:

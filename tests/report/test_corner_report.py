@@ -87,6 +87,16 @@ def test_errors_and_numbers_are_those_of_the_result(refined: Refined) -> None:
     assert (stated, known) == pytest.approx((cam.stated[0], cam.stated_deviations[0]), abs=0.06)
 
 
+def test_worse_predictions_than_expected_are_said(refined: Refined) -> None:
+    assert refined.reprojection is not None
+    of = refined.reprojection.sensors["cam_0"]
+    for expected_px, is_said in ((0.5, True), (0.7, False), (None, False)):
+        one = dataclasses.replace(of, held_out_px=1.0, expected_px=expected_px)
+        found = dataclasses.replace(refined.reprojection, sensors={"cam_0": one})
+        text = printed(dataclasses.replace(refined, reprojection=found))
+        assert ("cam_0: images that were left out are predicted 2 times worse than expected." in text) is is_said
+
+
 def test_intrinsics_say_how_they_were_stated_and_what_the_images_do_not_tell(refined: Refined) -> None:
     agree = intrinsics_sentences(changed(refined, innovation_deviations=0.81, held_by_prior=()))[0]
     assert agree == (
