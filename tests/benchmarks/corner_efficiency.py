@@ -19,6 +19,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ from gtsam_rwhec.reprojection.reduced import Noise, Reduced
 MOST = 1.05
 CORNER_PX = 0.1
 NOISY = (1e-3, 5e-4)
+#: A letter (x, y, k) and a frame's name.
+Slot = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ def off(truth: np.ndarray, T: np.ndarray) -> np.ndarray:
     return error
 
 
-def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
+def one(name: str, seed: int) -> dict[str, tuple[float, ...]]:
     """Squared errors over the bound and over their number: of the corners, and of the poses (nan for intrinsics)."""
     kind = KINDS[name]
     stated = None if kind.told == "exact" else kind.told
@@ -91,17 +94,27 @@ def one(name: str, seed: int) -> dict[str, tuple[float, float]]:
         poses = refined_from_poses(given, kind.carrier)
     corners = rw.refine_corners(given.observations, poses.X, poses.Y, options)
     bound = bound_at_the_truth(given, corners, Noise(CORNER_PX, *kind.carrier))
+    sensors, slots = corners.graph.model.sensors, corners.slots
+    frames = {("x", "board"): given.X["board"]} | {("y", name): given.Y[name] for name in sensors}
+    errors = [
+        {
+            slot: off(truth, (answer.X if slot[0] == "x" else answer.Y)[slot[1]].matrix())
+            for slot, truth in frames.items()
+        }
+        for answer in (corners, poses)
+    ]
+    intrinsics = {
+        ("k", name): parameters_of(corners.intrinsics[name].camera) - parameters_of(given.cameras[name])
+        for name in (sensors if kind.told != "exact" else ())
+    }
+    groups = {"target": [("x", "board")], "sensors": [("y", name) for name in sensors], "all frames": list(frames)}
     found = {}
-    for what, (letter, frame) in {"target": ("x", "board"), "sensor": ("y", "cam_0")}.items():
-        truth, answers = (given.X, (corners.X, poses.X)) if letter == "x" else (given.Y, (corners.Y, poses.Y))
-        at = corners.slots[letter, frame]
-        block = bound[at, at]
-        squares = [squared(off(truth[frame], answer[frame].matrix()), block) for answer in answers]
-        found[what] = (squares[0], squares[1])
-    if kind.told != "exact":
-        at = corners.slots["k", "cam_0"]
-        error = parameters_of(corners.intrinsics["cam_0"].camera) - parameters_of(given.cameras["cam_0"])
-        found["intrinsics"] = (squared(error, bound[at, at]), np.nan)
+    for what, names in groups.items():
+        found[what] = tuple(squared(each, names, bound, slots) for each in errors)
+    if intrinsics:
+        found["intrinsics"] = squared(intrinsics, list(intrinsics), bound, slots), np.nan
+        every = errors[0] | intrinsics
+        found["everything"] = squared(every, list(every), bound, slots), np.nan
     return found
 
 
@@ -137,9 +150,13 @@ def bound_at_the_truth(given: simulated_cells.Cell, corners: rw.CornersRefined, 
     return inverse
 
 
-def squared(error: np.ndarray, covariance: np.ndarray) -> float:
-    """e' C^-1 e / d."""
-    return float(error @ np.linalg.solve(covariance, error)) / len(error)
+def squared(
+    errors: Mapping[Slot, np.ndarray], names: list[Slot], bound: np.ndarray, slots: Mapping[Slot, slice]
+) -> float:
+    """e' C^-1 e / d of the errors of some unknowns together."""
+    error = np.concatenate([errors[name] for name in names])
+    rows = np.concatenate([np.arange(slots[name].start, slots[name].stop) for name in names])
+    return float(error @ np.linalg.solve(bound[np.ix_(rows, rows)], error)) / len(error)
 
 
 def main() -> int:
