@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import re
+from pathlib import Path
 
 import pytest
 from refined_corners import two_cameras
@@ -21,11 +22,15 @@ from gtsam_rwhec.report.corner_report import (
 )
 from gtsam_rwhec.report.covariance_report import (
     FROM_POSES,
+    NOT_FROM_CORNERS,
     legend,
     refined_sentences,
     scale_and_offset_sentences,
 )
 from gtsam_rwhec.reprojection.consequences import OF_CARRIERS, centre_causes, focal_cause
+from gtsam_rwhec.results import read_result
+
+GOLDEN = Path(__file__).parents[1] / "golden"
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +61,14 @@ def test_the_section_stands_between_poses_and_details(refined: Refined) -> None:
     assert "it adds corners and intrinsics." in legend(refined)
     assert refined_sentences(refined)[0] == FROM_POSES
     assert printed(dataclasses.replace(refined, reprojection=None)) == ""
+
+
+def test_a_log_whose_corners_were_not_used_has_intrinsics_that_count_as_exact(refined: Refined) -> None:
+    log = read_result(GOLDEN / "result_version_3.json").log
+    for found, is_said in ((refined, False), (dataclasses.replace(refined, reprojection=None, intrinsics={}), True)):
+        stream = io.StringIO()
+        print_refined(found, Console(file=stream, width=160, color_system=None), log=log)
+        assert (NOT_FROM_CORNERS in stream.getvalue()) is is_said
 
 
 @pytest.mark.parametrize("width", [50, 80, 160])
