@@ -31,8 +31,8 @@ from gtsam_rwhec.vision.camera import Camera
 
 #: Poses of targets are computed again at most so often.
 AGAIN = 2
-#: Intrinsics are other ones than those that poses were computed by where a parameter is off by so many standard
-#: deviations, and the image by so many pixels (root mean square).
+#: Intrinsics are other ones than the stated ones where a parameter is off by so many standard deviations, and the image
+#: by so many pixels (root mean square).
 MOVED, MOVED_PX = 3.0, 0.5
 #: So many columns and rows of the image are looked at.
 GRID = 9
@@ -48,7 +48,7 @@ def check_observations(problem: Problem, options: CalibrateOptions) -> None:
 def with_better_poses(run: Run, found: Answer) -> Run | None:
     """The run again with images whose poses are those that the answer says, or None where they have them already.
 
-    Intrinsics are looked at in a part of the images where they are many.
+    Intrinsics are looked at once, in a part of the images where they are many.
     """
     base = found.refined
     if base is None or base.free_directions or not run.problem.boards or run.times > AGAIN:
@@ -64,10 +64,10 @@ def with_better_poses(run: Run, found: Answer) -> Run | None:
             return None
         X, Y = corners.X, corners.Y
         for name, one in corners.intrinsics.items():
-            if _have_moved(one, cameras.get(name, run.problem.cameras[name])):
+            if name not in cameras and _have_moved(one, run.problem.cameras[name]):
                 cameras[name] = one.camera
     better, changed = nearer_poses(run.problem, X, Y, cameras)
-    is_new = any(cameras[name] is not run.cameras.get(name) for name in cameras)
+    is_new = len(cameras) > len(run.cameras)
     return run.again(better, cameras) if is_new or changed else None
 
 
@@ -108,10 +108,10 @@ def _observed(run: Run, base: Refined, found: Answer) -> tuple[Observations, Cor
     return observed(run.problem, base, options, run.options.carrier_path)
 
 
-def _have_moved(found: RefinedIntrinsics, used: Camera) -> bool:
-    """Whether intrinsics are surely others than those that poses were computed by, and by enough to move these."""
-    size = np.array([used.width, used.height])
+def _have_moved(found: RefinedIntrinsics, stated: Camera) -> bool:
+    """Whether intrinsics are surely others than the stated ones, and by enough to move poses."""
+    size = np.array([stated.width, stated.height])
     pixels = np.stack(np.meshgrid(*np.linspace(0.0, size - 1.0, GRID).T), axis=-1)
-    off = np.linalg.norm(used.pixels(found.camera.undistort(pixels)) - pixels, axis=-1)
+    off = np.linalg.norm(stated.pixels(found.camera.undistort(pixels)) - pixels, axis=-1)
     is_sure = bool((np.abs(found.innovation.off) > MOVED * np.array(found.standard_deviations)).any())
     return is_sure and bool(np.nanmean(off**2) > MOVED_PX**2)
