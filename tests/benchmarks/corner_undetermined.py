@@ -4,7 +4,8 @@
 
 Simulated cells (`tests/reprojection/placements.py`): boards that face their camera almost straight, at one depth, or in
 a corner of the image only; stated intrinsics are drawn from the prior of a calibration, or of nominal ones. Parameters
-that the images do not tell must be named as held by the prior, and ellipsoids must hold the truth. Boards that face
+that the images do not tell must be named as held by the prior (or as doubted, with a prior that was widened), and
+ellipsoids must hold the truth. Boards that face
 their camera straight leave a place free, which must be refused.
 """
 
@@ -86,8 +87,11 @@ def one(name: str, seed: int) -> dict[str, bool]:
     for what, (unknown, error) in errors.items():
         squared = float(error @ np.linalg.solve(result.covariance(unknown), error))
         found[what] = squared < result.squared_radius(unknown, LEVEL)
-    if kind.named:
-        found["named"] = all(set(kind.named) <= set(camera.held_by_prior) for camera in result.intrinsics.values())
+    if kind.named:  # a prior that was widened, and said to be, holds less
+        found["named"] = all(
+            camera.widened > 1.0 or set(kind.named) <= set(camera.held_by_prior)
+            for camera in result.intrinsics.values()
+        )
     found["no deviation above the prior's"] = all(
         (np.sqrt(np.diagonal(camera.covariance)) <= (1.0 + 1e-6) * camera.stated_deviations).all()
         for camera in result.intrinsics.values()
@@ -101,12 +105,12 @@ def rows_of(name: str, found: list[dict[str, bool]]) -> list[Row]:
     if KINDS[name].is_refused:
         return [Row(f"{name}: refused", str(refused), "100 %", refused.value == 1.0)]
     rows = [Row(f"{name}: refused", str(refused), "0 %", refused.value == 0.0)]
-    for what in found[0].keys() - {"refused"}:
+    for what in [what for what in found[0] if what != "refused"]:
         share = Share.of([each[what] for each in found if not each["refused"]])
         is_coverage = what in ("target", "sensor", "intrinsics")
         bar, met = (">= 93 %", share.meets(LEAST, 1.0)) if is_coverage else ("100 %", share.value == 1.0)
         if what == "named":
-            what = f"{', '.join(KINDS[name].named)} named as held by the prior"
+            what = f"{', '.join(KINDS[name].named)} named as held by the prior, or widened"
         rows.append(Row(f"  {what}", str(share), bar, met))
     return rows
 
