@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from cells_of_others import CIRCLES, WORKCELL
+from places import CELL
+from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import CameraError, LogWarning
@@ -118,3 +122,16 @@ def test_a_workcell_of_other_people_from_images_and_poses_alone(workcell_camera2
     K = refined.intrinsics["camera2"].camera.K
     # as the people who made the set state them, half a pixel off
     assert K[[0, 1, 0, 1], [0, 1, 2, 2]] == pytest.approx([1371.0, 1371.0, 959.5, 539.5], abs=5.0)
+
+
+@pytest.mark.slow
+def test_the_demo_without_its_intrinsics_has_the_truth_in_its_ellipsoids(tmp_path: Path) -> None:
+    text = re.sub(r"intrinsics: \{topic: .*\}", "intrinsics: estimate", (CELL / "rig.yaml").read_text(encoding="utf-8"))
+    rig = parse_rig(text, "rig.yaml", CELL)
+    assert [sensor.stated for sensor in rig.sensors.values()] == ["unknown", "unknown"]
+    refined = rw.calibrate_log(CELL / "robot_cell.mcap", rig, tmp_path / "out", workers=1).refined
+    truth = json.loads((CELL / "truth.json").read_text(encoding="utf-8"))["T_hand_camera"]
+    for name, T in truth.items():
+        xi = se3.logmap((se3.inverse(refined.Y[name].matrix()) @ np.array(T))[None])[0]
+        assert xi @ np.linalg.solve(refined.covariance(name), xi) < 12.6  # 95 %
+    assert refined.intrinsics["cam_wide"].model == "equidistant"
