@@ -16,7 +16,6 @@ from gtsam_rwhec.calibration.corner_choice import Tried, chosen_model
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import Progress
-from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.noise_model.in_corners import beyond_independent_errors
@@ -52,6 +51,8 @@ class CornersFound:
     reprojection : Reprojection or None
     choices : tuple of Choice
     findings : tuple of Finding
+    unexplained : float
+        How many times as far off as the covariances say images are that were left out; 1 where that is by chance.
     """
 
     corners: CornersRefined | None
@@ -59,6 +60,7 @@ class CornersFound:
     reprojection: Reprojection | None
     choices: tuple[Choice, ...]
     findings: tuple[Finding, ...]
+    unexplained: float = 1.0
 
     @staticmethod
     def none(why: str) -> CornersFound:
@@ -77,7 +79,7 @@ class CornersFound:
         """The answer: from the corners, with what the poses (`base`) say of their noise; `base` where there is none."""
         if self.corners is None or self.reprojection is None:
             return base
-        more = None if noise is None else beyond_independent_errors(self.corners, noise)
+        more = beyond_independent_errors(self.corners, noise, self.unexplained)
         return as_refined(base, self.corners, self.reprojection, self.intrinsics, more)
 
 
@@ -116,6 +118,7 @@ def corners_found(
         numbers_of(observations, corners, tried.options, tried.held_out, _tried(tried)),
         tuple(_choices(observations, corners, tried, intrinsics)),
         tuple(_findings(corners, tried, intrinsics)),
+        _unexplained(tried),
     )
 
 
@@ -137,13 +140,12 @@ def _choices(
         if one.stated_as == "exact":
             yield Choice(f"intrinsics of {name}", "as stated, which count as exact", "an option says so")
             continue
-        f, c = max(one.standard_deviations[:2]), max(one.standard_deviations[2:4])
         known = {
             "calibration": "a calibration states them, and may be off by as much as calibrations are",
             "nominal": "the stated ones count as nominal (write stated: calibration where a calibration states them)",
             "unknown": "none are stated",
         }.get(one.stated_as, "")
-        found = f"estimated with the poses, to {rounded(f)} px of f and {rounded(c)} px of c"
+        found = "estimated with the poses"
         if growth[name] > SEEN_GROWTH:
             found += f", which makes standard deviations of {name} up to {growth[name]:.2g} times those of exact ones"
         lens = lens_that_was_left_out(corners, [name])
@@ -189,11 +191,16 @@ def _findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, In
         if lens and one.stated_as == "calibration":
             words = f"the intrinsics of {name} are stated without distortion, and its corners show one: {lens}"
             yield Finding(Ground.INTRINSICS_ESTIMATED, words)
-    for score in tried.scores[:1]:
-        times = score.px / score.expected_px
-        if times > UNEXPLAINED:
-            words = (
-                f"images that were left out are predicted to {score.mm:.2g} mm on the target, {times:.2g} times as far "
-                "off as the noise of corners and of A explains: the arm's poses, or the target, have systematic errors"
-            )
-            yield Finding(Ground.SYSTEMATIC, words)
+    times = _unexplained(tried)
+    if times > 1.0:
+        words = (
+            f"images that were left out are predicted to {tried.scores[0].mm:.2g} mm on the target, {times:.2g} times "
+            "as far off as the noise of corners and of A explains: the arm's poses, or the target, have systematic "
+            "errors, and the standard deviations are widened by as much"
+        )
+        yield Finding(Ground.SYSTEMATIC, words)
+
+
+def _unexplained(tried: Tried) -> float:
+    times = tried.scores[0].px / tried.scores[0].expected_px if tried.scores else 1.0
+    return times if times > UNEXPLAINED else 1.0

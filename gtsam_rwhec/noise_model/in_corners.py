@@ -16,15 +16,30 @@ from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.reprojection.refined import CornersRefined
 
 
-def beyond_independent_errors(corners: CornersRefined, found: NoiseInData) -> Array:
-    """The covariance (d, d) to add to that of the corners' unknowns."""
+def beyond_independent_errors(corners: CornersRefined, found: NoiseInData | None, unexplained: float = 1.0) -> Array:
+    """The covariance (d, d) to add to that of the corners' unknowns.
+
+    Parameters
+    ----------
+    corners : CornersRefined
+    found : NoiseInData or None
+        What the poses say of their noise. Where A counts as exact its errors are in intrinsics and boards too: these
+        widen as the poses do.
+    unexplained : float
+        How many times as far off images are that were left out as the corners' covariances say: where the model lacks
+        something that nothing else tells of, all deviations are too small by as much.
+    """
     size = len(corners.joint)
-    wider = np.ones(size)
-    factor = np.sqrt(max(found.instants / max(found.worth, 1e-300), 1.0))
-    for (letter, _), rows in corners.slots.items():
-        if letter in "xyt":
-            wider[rows] = factor
+    wider = np.full(size, max(unexplained, 1.0))
+    if found is not None:
+        letters = "xyt" if corners.noise.carrier is not None else "xytkbp"
+        factor = np.sqrt(max(found.instants / max(found.worth, 1e-300), 1.0))
+        for (letter, _), rows in corners.slots.items():
+            if letter in letters:
+                wider[rows] *= factor
     more: Array = corners.joint * (np.outer(wider, wider) - 1.0)
+    if found is None:
+        return more
     carriers: tuple[tuple[str, dict[str, gtsam.Pose3]], ...] = (("x", corners.X), ("y", corners.Y))
     for (letter, poses), deviations in zip(carriers, found.constant_deviations, strict=True):
         shift = np.zeros((size, 6))

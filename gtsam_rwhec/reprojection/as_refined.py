@@ -48,7 +48,10 @@ def as_refined(
     more : (d, d) array, optional
         Covariance of `corners`' unknowns beyond its own.
     """
-    joint = _joint(base, corners, more)
+    if more is not None:
+        corners = replace(corners, joint=corners.joint + more)
+        reprojection = replace(reprojection, boards=boards_of(corners))
+    joint = _joint(base, corners)
     freedom = min((value for (letter, _), value in corners.freedom.items() if letter in "xy"), default=np.inf)
     cost = float(corners.graph.graph.error(corners.graph.values(corners.point)))
     graph = corners.graph
@@ -95,7 +98,8 @@ def _projected(refined: Refined, corners: CornersRefined, sensor: str) -> Intrin
     points = points[np.isfinite(points).all(axis=1)]
     distance_m = float(np.median(points[:, 2]))
     regions = by_region(intrinsics.camera, refined.covariance(f"intrinsics:{sensor}"), points, distance_m)
-    return replace(intrinsics, projection_px=regions, projection_m=distance_m)
+    deviations = tuple(np.sqrt(np.diagonal(refined.covariance(f"intrinsics:{sensor}"))).tolist())
+    return replace(intrinsics, standard_deviations=deviations, projection_px=regions, projection_m=distance_m)
 
 
 def boards_of(corners: CornersRefined) -> dict[str, BoardShape]:
@@ -148,13 +152,12 @@ def intrinsics_of(corners: CornersRefined, stated: Mapping[str, Stated]) -> dict
     return found
 
 
-def _joint(base: Refined, corners: CornersRefined, more: Array | None) -> JointCovariance:
+def _joint(base: Refined, corners: CornersRefined) -> JointCovariance:
     """The covariance of frames, scales, offsets, intrinsics and shapes, in GTSAM's order of the unknowns.
 
     Sensors that share a camera have its rows each: the covariance is singular there, as it is. Places of single corners
     are left out: they are unknowns of the graph, and of no interest beside a board's.
     """
-    covariance = corners.joint if more is None else corners.joint + more
     parts: list[tuple[Unknown, slice, float | Array]] = []
     for name, (letter, owner) in corners.names.items():
         rows = corners.slots[letter, owner]
@@ -184,7 +187,7 @@ def _joint(base: Refined, corners: CornersRefined, more: Array | None) -> JointC
         factors.append(np.full(width, factor))
         end += width
     scaling = np.concatenate(factors)
-    finite = covariance[np.ix_(index, index)] * np.outer(scaling, scaling)
+    finite = corners.joint[np.ix_(index, index)] * np.outer(scaling, scaling)
     length = float(base.joint.unit[base.joint.slots[Unknown(UnknownKind.FRAME, next(iter(corners.X)))]][3])
     unit = np.ones(end)
     for unknown, rows in slots.items():

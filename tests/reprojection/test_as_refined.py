@@ -10,7 +10,7 @@ from made_as_refined import made
 
 from gtsam_rwhec.noise_model.in_corners import beyond_independent_errors
 from gtsam_rwhec.refinement.reprojection_found import Reprojection
-from gtsam_rwhec.reprojection.as_refined import as_refined
+from gtsam_rwhec.reprojection.as_refined import as_refined, boards_of, intrinsics_of
 from gtsam_rwhec.reprojection.projection_uncertainty import projection_deviations
 
 
@@ -65,6 +65,19 @@ def test_intrinsics_that_no_camera_has_say_so() -> None:
     assert absurd.fault.startswith("intrinsics of the result: fx = -5 pixels for an image of 1920 x 1080 pixels")
 
 
+def test_deviations_in_numbers_are_those_of_the_widened_covariance() -> None:
+    _, base, _, corners, _ = made()
+    intrinsics = intrinsics_of(corners, dict.fromkeys(corners.Y, "calibration"))
+    more = beyond_independent_errors(corners, None, unexplained=3.0)
+    found = Reprojection(0.1, 0.1, "estimated", 5e-4, 2e-4, {}, boards_of(corners), (), ())
+    wide = as_refined(base, corners, found, intrinsics, more)
+    assert wide.reprojection is not None
+    deviations = wide.reprojection.boards["board"].standard_deviations
+    assert deviations == pytest.approx(3.0 * np.array(found.boards["board"].standard_deviations))
+    for name, one in wide.intrinsics.items():
+        np.testing.assert_allclose(one.standard_deviations, 3.0 * np.array(intrinsics[name].standard_deviations))
+
+
 def test_what_the_poses_noise_model_found_widens_the_poses_alone() -> None:
     _, base, noise, corners, _ = made()
     more = beyond_independent_errors(corners, noise)
@@ -77,6 +90,9 @@ def test_what_the_poses_noise_model_found_widens_the_poses_alone() -> None:
             assert (after > before).all()
         else:
             np.testing.assert_allclose(after, before)
+    # what nothing explains widens all alike, and deviations in numbers with it
+    twice = corners.joint + beyond_independent_errors(corners, None, unexplained=2.0)
+    np.testing.assert_allclose(twice, 4.0 * corners.joint)
     # a constant error moves all frames of a carrier together: two cameras to each other are as before
     both = as_refined(base, corners, Reprojection(0.1, 0.1, "estimated", 0.0, 0.0, {}, {}, (), ()), {}, more)
     before_deg, _ = np.sqrt(np.diagonal(corners.covariance("cam_0"))[:2])
