@@ -1,6 +1,6 @@
 """Intrinsics by refinement from corners against ``cv2.calibrateCamera`` alone on the same corners.
 
-    python tests/benchmarks/corner_intrinsics.py [--runs 200] [--workers 1]
+    python tests/benchmarks/corner_intrinsics.py [--runs 200] [--workers 1] [--only WORDS]
 
 One fixed camera and a board on the hand (`tests/reprojection/simulated_cells.py`): 20 images, or few of them with small
 tilts. Stated intrinsics are drawn from the nominal prior. Ours starts at them, and knows A, or estimates its noise (1
@@ -104,10 +104,11 @@ def main() -> int:
     parser = benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--only", default="", help="the kinds whose name has these words")
     given = parser.parse_args()
     rows = []
     with ProcessPoolExecutor(given.workers) as pool:
-        for name, kind in KINDS.items():
+        for name, kind in ((name, kind) for name, kind in KINDS.items() if given.only in name):
             found = list(pool.map(one, [name] * given.runs, range(given.runs), chunksize=10))
             ours, theirs = (np.array(each) ** 2 for each in zip(*found, strict=True))
             for what, columns in (("f and c", slice(None, PINHOLE)), ("coefficients", slice(PINHOLE, None))):
