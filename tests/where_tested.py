@@ -157,6 +157,7 @@ TABLE: dict[str, dict[str, str]] = {
         "report/plots/test_plots.py": "coverage deviations frames intrinsics plotted residuals",
     },
     "gtsam_rwhec/reprojection": {
+        "reprojection/test_held_out.py": "jackknife",
         "methods/test_reprojection.py": "observations",
         "reprojection/test_calibrating_corners.py": "chosen_poses first_intrinsics",
         "reprojection/test_corner_findings.py": "findings",

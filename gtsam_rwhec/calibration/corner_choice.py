@@ -15,7 +15,7 @@ from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.refinement.options import CarrierNoise
-from gtsam_rwhec.reprojection.held_out import HeldOut, held_out_errors
+from gtsam_rwhec.reprojection.held_out import LeftOut, left_out
 from gtsam_rwhec.reprojection.observations import Observations, Views
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refining_corners import refine_corners
@@ -56,15 +56,15 @@ class Tried:
     evidence : str
     scores : tuple of Score
         Of all models, the chosen one first; empty where images are too few.
-    held_out : dict of str to HeldOut
-        Of the chosen one, by sensor.
+    left_out : LeftOut
+        Of the chosen one; empty where images are too few.
     """
 
     options: CornerOptions
     words: str
     evidence: str
     scores: tuple[Score, ...]
-    held_out: dict[str, HeldOut]
+    left_out: LeftOut
 
 
 def chosen_model(
@@ -82,16 +82,16 @@ def chosen_model(
     try:
         first = _scored(some, X, Y, options, tell)
     except CountError as error:
-        return Tried(options, _words(options), f"no other was tried: {error}", (), {})
+        return Tried(options, _words(options), f"no other was tried: {error}", (), LeftOut({}, {}))
     every = [first]
     if options.carrier_noise != "exact":
         every.append(_scored(some, X, Y, replace(options, carrier_noise="exact"), tell))
-    chosen, score, held_out = every[-1] if every[-1][1].mm < BETTER * first[1].mm else first
+    chosen, score, found = every[-1] if every[-1][1].mm < BETTER * first[1].mm else first
     rest = tuple(one for _, one, _ in every if one is not score)
     evidence = f"it predicts images that were left out to {score.px:.3g} px, and {score.mm:.3g} mm on the target"
     if rest:
         evidence += f" ({', '.join(one.in_words for one in rest)})"
-    return Tried(chosen, score.words, evidence, (score, *rest), held_out)
+    return Tried(chosen, score.words, evidence, (score, *rest), found)
 
 
 def thinned(observations: Observations) -> Observations:
@@ -112,10 +112,11 @@ def _scored(
     Y: Mapping[str, PoseLike],
     options: CornerOptions,
     tell: Progress,
-) -> tuple[CornerOptions, Score, dict[str, HeldOut]]:
+) -> tuple[CornerOptions, Score, LeftOut]:
     refined = refine_corners(observations, X, Y, options, tell)
     folds = FOLDS_OF_FEW if len(refined.point.A) < FEW else FOLDS
-    errors = held_out_errors(observations, refined, options, folds=folds, progress=tell)
+    found = left_out(observations, refined, options, folds=folds, progress=tell)
+    errors = found.errors
     weights = np.array([one.corners for one in errors.values()], dtype=float)
 
     def mean(values: list[float]) -> float:
@@ -124,7 +125,7 @@ def _scored(
     px, mm, expected = (
         mean([getattr(one, name) for one in errors.values()]) for name in ("rms_px", "rms_mm", "expected_px")
     )
-    return options, Score(_words(options), px, mm, expected), errors
+    return options, Score(_words(options), px, mm, expected), found
 
 
 def _words(options: CornerOptions) -> str:

@@ -7,7 +7,7 @@ configuration. The corners then give the answer, with the cameras' intrinsics as
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -51,8 +51,9 @@ class CornersFound:
     reprojection : Reprojection or None
     choices : tuple of Choice
     findings : tuple of Finding
-    unexplained : float
-        How many times as far off as the covariances say images are that were left out; 1 where that is by chance.
+    wider : dict of (letter, name) to float
+        By how much each unknown's deviations are widened, since images that were left out are farther off than the
+        covariances say; empty where they are not.
     """
 
     corners: CornersRefined | None
@@ -60,7 +61,7 @@ class CornersFound:
     reprojection: Reprojection | None
     choices: tuple[Choice, ...]
     findings: tuple[Finding, ...]
-    unexplained: float = 1.0
+    wider: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     @staticmethod
     def none(why: str) -> CornersFound:
@@ -79,7 +80,7 @@ class CornersFound:
         """The answer: from the corners, with what the poses (`base`) say of their noise; `base` where there is none."""
         if self.corners is None or self.reprojection is None:
             return base
-        more = beyond_independent_errors(self.corners, noise, self.unexplained)
+        more = beyond_independent_errors(self.corners, noise, self.wider)
         return as_refined(base, self.corners, self.reprojection, self.intrinsics, more)
 
 
@@ -115,10 +116,10 @@ def corners_found(
     return CornersFound(
         corners,
         intrinsics,
-        numbers_of(observations, corners, tried.options, tried.held_out, _tried(tried)),
+        numbers_of(observations, corners, tried.options, tried.left_out.errors, _tried(tried)),
         tuple(_choices(observations, corners, tried, intrinsics)),
         tuple(_findings(corners, tried, intrinsics)),
-        _unexplained(tried),
+        _wider(tried),
     )
 
 
@@ -196,11 +197,18 @@ def _findings(corners: CornersRefined, tried: Tried, intrinsics: Mapping[str, In
         words = (
             f"images that were left out are predicted to {tried.scores[0].mm:.2g} mm on the target, {times:.2g} times "
             "as far off as the noise of corners and of A explains: the arm's poses, or the target, have systematic "
-            "errors, and the standard deviations are widened by as much"
+            "errors, and the standard deviations are widened by as much, or as blocks of images disagree"
         )
         yield Finding(Ground.SYSTEMATIC, words)
 
 
+def _wider(tried: Tried) -> dict[tuple[str, str], float]:
+    """Where errors are unexplained: as much as these are, or as blocks of images disagree, whichever is more."""
+    times = _unexplained(tried)
+    return {slot: max(times, spread) for slot, spread in tried.left_out.spread.items()} if times > 1.0 else {}
+
+
 def _unexplained(tried: Tried) -> float:
+    """How many times as far off as the covariances say images are that were left out; 1 where that is by chance."""
     times = tried.scores[0].px / tried.scores[0].expected_px if tried.scores else 1.0
     return times if times > UNEXPLAINED else 1.0

@@ -8,6 +8,8 @@ poses or of corners: it moves the frames of one carrier together.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import gtsam
 import numpy as np
 
@@ -16,7 +18,9 @@ from gtsam_rwhec.noise_model.found import NoiseInData
 from gtsam_rwhec.reprojection.refined import CornersRefined
 
 
-def beyond_independent_errors(corners: CornersRefined, found: NoiseInData | None, unexplained: float = 1.0) -> Array:
+def beyond_independent_errors(
+    corners: CornersRefined, found: NoiseInData | None, wider: Mapping[tuple[str, str], float]
+) -> Array:
     """The covariance (d, d) to add to that of the corners' unknowns.
 
     Parameters
@@ -25,19 +29,21 @@ def beyond_independent_errors(corners: CornersRefined, found: NoiseInData | None
     found : NoiseInData or None
         What the poses say of their noise. Where A counts as exact its errors are in intrinsics and boards too: these
         widen as the poses do.
-    unexplained : float
-        How many times as far off images are that were left out as the corners' covariances say: where the model lacks
-        something that nothing else tells of, all deviations are too small by as much.
+    wider : dict of (letter, name) to float
+        By how much the deviations of each unknown of `corners` are widened, since images that were left out show that
+        the model lacks something that nothing else tells of.
     """
     size = len(corners.joint)
-    wider = np.full(size, max(unexplained, 1.0))
+    scale = np.ones(size)
+    for slot, factor in wider.items():
+        scale[corners.slots[slot]] = max(factor, 1.0)
     if found is not None:
         letters = "xyt" if corners.noise.carrier is not None else "xytkbp"
-        factor = np.sqrt(max(found.instants / max(found.worth, 1e-300), 1.0))
+        of_poses = np.sqrt(max(found.instants / max(found.worth, 1e-300), 1.0))
         for (letter, _), rows in corners.slots.items():
             if letter in letters:
-                wider[rows] *= factor
-    more: Array = corners.joint * (np.outer(wider, wider) - 1.0)
+                scale[rows] *= of_poses
+    more: Array = corners.joint * (np.outer(scale, scale) - 1.0)
     if found is None:
         return more
     carriers: tuple[tuple[str, dict[str, gtsam.Pose3]], ...] = (("x", corners.X), ("y", corners.Y))

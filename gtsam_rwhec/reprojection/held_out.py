@@ -20,6 +20,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_whole
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.reprojection.corner_views import Stack, stacks_of
+from gtsam_rwhec.reprojection.jackknife import spread_over_claims
 from gtsam_rwhec.reprojection.observations import Observations, Views
 from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refined import CornersRefined
@@ -52,7 +53,22 @@ class HeldOut:
     regions_px: Array
 
 
-@one_blas_thread()
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """What leaving images out in blocks shows.
+
+    Attributes
+    ----------
+    errors : dict of str to HeldOut
+        By sensor.
+    spread : dict of (letter, name) to float
+        By unknown: how much the blocks' estimates differ, over what their covariance says (the jackknife).
+    """
+
+    errors: dict[str, HeldOut]
+    spread: dict[tuple[str, str], float]
+
+
 def held_out_errors(
     observations: Observations,
     refined: CornersRefined,
@@ -61,7 +77,20 @@ def held_out_errors(
     folds: int = 5,
     progress: Progress | None = None,
 ) -> dict[str, HeldOut]:
-    """Errors of corners in images that were left out, by sensor.
+    """Errors of corners in images that were left out, by sensor: `left_out` without the spread."""
+    return left_out(observations, refined, options, folds=folds, progress=progress).errors
+
+
+@one_blas_thread()
+def left_out(
+    observations: Observations,
+    refined: CornersRefined,
+    options: CornerOptions | None = None,
+    *,
+    folds: int = 5,
+    progress: Progress | None = None,
+) -> LeftOut:
+    """Leave images out in blocks: their corners' errors, and how much the estimates differ.
 
     Parameters
     ----------
@@ -94,18 +123,21 @@ def held_out_errors(
         told = replace(told, carrier_noise=CarrierNoise(float(noise[0]), float(noise[3]), about=about))
     block = _blocks(stacks, len(A), folds)
     found: dict[str, list[tuple[Array, Array, Array, Array]]] = {name: [] for name in observations.sensors}
+    parts = []
     for fold in range(folds):
         tell(f"predicting images that were left out: block {fold + 1} of {folds}")
         rest = _some(counted, stacks, block != fold)
         again = refine_corners(rest, refined.X, refined.Y, told)
+        parts.append(again)
         for stack in _some_stacks(stacks, block == fold):
             found[stack.sensor].append(_predicted(stack, A, again))
-    return {
+    errors = {
         name: _of_sensor(
             *(np.concatenate(values) for values in zip(*each, strict=True)), camera=observations.cameras[name]
         )
         for name, each in found.items()
     }
+    return LeftOut(errors, spread_over_claims(refined, parts))
 
 
 def _predicted(stack: Stack, A: Array, refined: CornersRefined) -> tuple[Array, Array, Array, Array]:

@@ -68,7 +68,7 @@ def test_intrinsics_that_no_camera_has_say_so() -> None:
 def test_deviations_in_numbers_are_those_of_the_widened_covariance() -> None:
     _, base, _, corners, _ = made()
     intrinsics = intrinsics_of(corners, dict.fromkeys(corners.Y, "calibration"))
-    more = beyond_independent_errors(corners, None, unexplained=3.0)
+    more = beyond_independent_errors(corners, None, dict.fromkeys(corners.slots, 3.0))
     found = Reprojection(0.1, 0.1, "estimated", 5e-4, 2e-4, {}, boards_of(corners), (), ())
     wide = as_refined(base, corners, found, intrinsics, more)
     assert wide.reprojection is not None
@@ -80,7 +80,7 @@ def test_deviations_in_numbers_are_those_of_the_widened_covariance() -> None:
 
 def test_what_the_poses_noise_model_found_widens_the_poses_alone() -> None:
     _, base, noise, corners, _ = made()
-    more = beyond_independent_errors(corners, noise)
+    more = beyond_independent_errors(corners, noise, {})
     assert np.linalg.eigvalsh(corners.joint + more).min() > 0.0
     wider = corners.joint + more
     for letter, name in corners.slots:
@@ -91,7 +91,7 @@ def test_what_the_poses_noise_model_found_widens_the_poses_alone() -> None:
         else:
             np.testing.assert_allclose(after, before)
     # what nothing explains widens all alike, and deviations in numbers with it
-    twice = corners.joint + beyond_independent_errors(corners, None, unexplained=2.0)
+    twice = corners.joint + beyond_independent_errors(corners, None, dict.fromkeys(corners.slots, 2.0))
     np.testing.assert_allclose(twice, 4.0 * corners.joint)
     # a constant error moves all frames of a carrier together: two cameras to each other are as before
     both = as_refined(base, corners, Reprojection(0.1, 0.1, "estimated", 0.0, 0.0, {}, {}, (), ()), {}, more)
