@@ -7,14 +7,14 @@ configuration. The corners then give the answer, with the cameras' intrinsics as
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from gtsam_rwhec.calibration.choices import Choice
-from gtsam_rwhec.calibration.corner_choice import Tried, chosen_model
+from gtsam_rwhec.calibration.corner_choice import Tried, chosen_model, thinned
 from gtsam_rwhec.calibration.verdict import Finding, Ground
-from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.errors import OutlierError, RwhecError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.noise_model.found import NoiseInData
@@ -22,7 +22,7 @@ from gtsam_rwhec.noise_model.in_corners import beyond_independent_errors
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.reprojection_found import Intrinsics, Reprojection, TriedModel
 from gtsam_rwhec.reprojection.as_refined import as_refined, intrinsics_of
-from gtsam_rwhec.reprojection.findings import is_doubtful, lens_that_was_left_out
+from gtsam_rwhec.reprojection.findings import DETECTOR_PX, is_doubtful, lens_that_was_left_out
 from gtsam_rwhec.reprojection.in_numbers import numbers_of
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.reprojection.options import CornerOptions
@@ -37,6 +37,8 @@ SIZE_SHARE = 0.2
 SEEN_GROWTH = 1.05
 #: Images that were left out are off by more than this times what covariances say, where the model lacks something.
 UNEXPLAINED = 1.5
+#: Exact intrinsics that are off by more deviations of a calibration than this make wrong poses.
+SURE = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +66,10 @@ class CornersFound:
     wider: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     @staticmethod
-    def none(why: str) -> CornersFound:
-        """Nothing, and why."""
-        return CornersFound(None, {}, None, (Choice(MEASUREMENTS, "from the poses of targets in the images", why),), ())
+    def none(why: str, *findings: Finding) -> CornersFound:
+        """Nothing, and why; with what that says against the poses of the same images."""
+        choice = Choice(MEASUREMENTS, "from the poses of targets in the images", why)
+        return CornersFound(None, {}, None, (choice,), findings)
 
     @property
     def contradicted(self) -> tuple[str, ...]:
@@ -105,22 +108,63 @@ def corners_found(
         tried = chosen_model(observations, X, Y, options, tell)
         tell("refining from corners")
         corners = refine_corners(observations, X, Y, tried.options, tell)
+    except OutlierError as error:
+        return CornersFound.none(f"the corners give none: {error}", Finding(Ground.CORNERS_DOUBTED, str(error)))
     except RwhecError as error:
         return CornersFound.none(f"the corners give none: {error}")
     if is_doubtful(corners):
-        return CornersFound.none(f"the corners do not fit together: {' '.join(corners.findings)}")
+        return CornersFound.none(
+            f"the corners do not fit together: {' '.join(corners.findings)}", *_against_poses(corners)
+        )
     intrinsics = intrinsics_of(corners, {name: options.stated_of(options.camera_of(name)) for name in corners.Y})
     faults = [f"{name}: {one.fault}" for name, one in intrinsics.items() if one.fault]
     if faults:
-        return CornersFound.none(f"the corners lead to intrinsics that no camera has ({'; '.join(faults)})")
+        why = f"the corners lead to intrinsics that no camera has ({'; '.join(faults)})"
+        return CornersFound.none(why, Finding(Ground.CORNERS_DOUBTED, why))
     return CornersFound(
         corners,
         intrinsics,
         numbers_of(observations, corners, tried.options, tried.left_out.errors, _tried(tried)),
         tuple(_choices(observations, corners, tried, intrinsics)),
-        tuple(_findings(corners, tried, intrinsics)),
+        (*_findings(corners, tried, intrinsics), *_against_exact(observations, corners, tried.options)),
         _wider(tried),
     )
+
+
+def _against_poses(corners: CornersRefined) -> Iterator[Finding]:
+    """What corners that do not fit together say against poses of single images: these are of the same corners.
+
+    Noise of A alone says nothing against them: the noise of the poses has it.
+    """
+    px = corners.noise.corner_px
+    if px > DETECTOR_PX:
+        words = (
+            f"the corners of the images do not fit together: they are off by {px:.2g} pixels, more than a detector's "
+            "noise, and the poses are of the same corners"
+        )
+        yield Finding(Ground.CORNERS_DOUBTED, words)
+
+
+def _against_exact(observations: Observations, corners: CornersRefined, options: CornerOptions) -> Iterator[Finding]:
+    """Where intrinsics count as exact no residual is large for certain: freed as a calibration's are, they may move."""
+    exact = [name for name in corners.Y if options.stated_of(options.camera_of(name)) == "exact"]
+    if not exact:
+        return
+    stated = {name: options.stated_of(name) for name in corners.Y}
+    stated |= {options.camera_of(name): "calibration" for name in exact}
+    try:
+        free = refine_corners(thinned(observations), corners.X, corners.Y, replace(options, stated=stated))
+    except RwhecError:  # images that do not determine intrinsics do not contradict them
+        return
+    for name in exact:
+        innovation = free.intrinsics[name].innovation
+        if innovation.is_contradicted:
+            is_sure = innovation.deviations > SURE
+            words = (
+                f"the intrinsics of {name} count as exact, as an option says, and its corners contradict them "
+                f"({innovation.deviations:.2g} deviations of a calibration off)"
+            )
+            yield Finding(Ground.INTRINSICS_DOUBTED if is_sure else Ground.INTRINSICS_UNCERTAIN, words)
 
 
 def _tried(tried: Tried) -> tuple[TriedModel, ...]:

@@ -92,6 +92,8 @@ class Ground(StrEnum):
     SIZE_ESTIMATED = "size_estimated"
     #: The stated intrinsics of a sensor do not fit its corners; they were estimated in their place.
     INTRINSICS_ESTIMATED = "intrinsics_estimated"
+    #: The corners of the images do not fit together, so the poses are of targets in single images.
+    CORNERS_DOUBTED = "corners_doubted"
     #: Errors of neighbouring measurements are alike, beyond what the model of the noise holds.
     CORRELATED = "correlated"
     #: Errors depend on the configuration: an arm's kinematics, intrinsics, a board that is not flat.
@@ -127,6 +129,7 @@ _CARE = (
     Ground.FEW_MEASUREMENTS,
     Ground.SIZE_ESTIMATED,
     Ground.INTRINSICS_ESTIMATED,
+    Ground.CORNERS_DOUBTED,
     Ground.CORRELATED,
     Ground.SYSTEMATIC,
     Ground.OUTLIERS_KEPT,
@@ -142,18 +145,20 @@ _MADE_BY_A_MISREADING = frozenset({
     Ground.NOT_CERTIFIED,
     Ground.NOT_UNIQUE,
     Ground.NO_COVARIANCE,
+    Ground.CORNERS_DOUBTED,
     Ground.CORRELATED,
     Ground.SYSTEMATIC,
 })  # fmt: skip
 #: A wrong size, a wrong pose, what moved and a late clock make errors that vary with the configuration, and in time.
 _MISTAKES = frozenset({Ground.POSE_DOUBTED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED})
-_MADE_BY_A_MISTAKE = frozenset({Ground.CORRELATED, Ground.SYSTEMATIC})
+_MADE_BY_A_MISTAKE = frozenset({Ground.CORNERS_DOUBTED, Ground.CORRELATED, Ground.SYSTEMATIC})
 #: Wrong focal lengths make sizes look wrong, and errors that vary with where a board is seen.
 _MADE_BY_INTRINSICS = frozenset({
     Ground.SIZE_DOUBTED,
     Ground.NO_SIZE_FITS,
     Ground.SIZE_ESTIMATED,
     Ground.SIZE_UNCERTAIN,
+    Ground.CORNERS_DOUBTED,
     Ground.CORRELATED,
     Ground.SYSTEMATIC,
 })  # fmt: skip
@@ -217,6 +222,10 @@ _ADVICE = {
     Ground.INTRINSICS_ESTIMATED: (
         "check which calibration the stated intrinsics of the named sensor are from (its resolution, its lens), and "
         "state the estimated ones (camchain.yaml, result.json) if they hold in another run"
+    ),
+    Ground.CORNERS_DOUBTED: (
+        "look at the images for corners that are misread, check the board (its sizes, whether it is flat, the order of "
+        "its corners) and the stated intrinsics, and calibrate again"
     ),
     Ground.CORRELATED: "use the poses, but do not rely on their standard deviations",
     Ground.SYSTEMATIC: "measure at more and wider spread poses, and calibrate the arm itself",

@@ -190,7 +190,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         findings = not_of_late_clocks(findings, calibration.misreadings)
     findings = (*of_intrinsics, *of_shapes, *findings, *late)
     findings = (*findings, *estimated_sizes(fields.sizes, rig, with_intrinsics=bool(refined.intrinsics)))
-    if refined.intrinsics:
+    if refined.intrinsics or of_corners.corners is None:
         findings = (*findings, *of_corners.findings)
     if is_misread:  # as the poses were written, which tells more than A
         found = Reading(in_rig_file(before, rig)).finding

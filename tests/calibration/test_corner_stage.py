@@ -91,6 +91,32 @@ def test_stated_intrinsics_that_are_off_are_named() -> None:
     assert "cx, cy = 960" in found.findings[0].words
 
 
+def test_exact_intrinsics_that_the_corners_contradict_are_named() -> None:
+    """Held as exact, f that is 10 % off gave poses that are 166 mm off, and nothing was said."""
+    off = np.array([140.0, 140.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    of = {"cameras": 1, "images": 16, "carrier": (5e-4, 2e-4)}
+    exact = rw.CornerOptions(stated="exact")
+    right, wrong = cell(1, **of), cell(1, stated_off=off, **of)  # type: ignore[arg-type]
+    assert corners_found(*start(right), right.observations, exact, silent).findings == ()
+    found = corners_found(*start(right), wrong.observations, exact, silent)
+    assert found.corners is not None
+    assert Ground.INTRINSICS_DOUBTED in {one.ground for one in found.findings}
+
+
+def test_corners_that_do_not_fit_together_speak_against_poses_too() -> None:
+    """A third of the corners read at their neighbours' places: the poses of the same corners are wrong."""
+    given = cell(1, cameras=1, images=16, carrier=(5e-4, 2e-4))
+    view = given.observations.views["board", "cam_0"]
+    pixels = view.pixels.copy()
+    pixels[np.random.default_rng(0).random(pixels.shape[:2]) < 0.3] += [8.0, 3.0]
+    of = given.observations
+    misread = rw.Observations.of(of.cameras, of.corners, {("board", "cam_0"): (view.A, pixels)}, of.corner_px)
+    found = corners_found(*start(given), misread, rw.CornerOptions(), silent)
+    assert found.corners is None
+    assert {one.ground for one in found.findings} == {Ground.CORNERS_DOUBTED}
+    assert "more than a detector's noise" in found.findings[0].words
+
+
 def test_a_bent_arm_is_named() -> None:
     given = cell(6, images=24)
     found = corners_found(*start(given), with_bent_arm(given), rw.CornerOptions(carrier_noise="exact"), silent)
