@@ -162,7 +162,7 @@ TABLE: dict[str, dict[str, str]] = {
         "reprojection/test_calibrating_corners.py": "chosen_poses first_intrinsics",
         "reprojection/test_corner_findings.py": "findings",
         "reprojection/test_corner_graph.py": "model",
-        "reprojection/test_refining.py": "in_numbers problem_corners",
+        "reprojection/test_refining_a_problem.py": "in_numbers problem_corners refining",
         "reprojection/test_refining_corners.py": "corner_outliers freedom intrinsics options refined stated_intrinsics",
     },
     "gtsam_rwhec/results": {

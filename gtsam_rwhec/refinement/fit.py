@@ -107,13 +107,13 @@ def fit(
                 else "Join groups (noise_groups='sensor' or 'all'), or give sigma and kappa (noise='given')"
             ),
             NotConvergedWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
     if optimum.iterations >= options.max_iterations:
         warnings.warn(
             f"GTSAM stopped after {optimum.iterations} iterations without converging; raise "
             "RefineOptions.max_iterations",
             NotConvergedWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
     return SettledFit(graph, optimum, information, factors, degrees_of_freedom, iterations)

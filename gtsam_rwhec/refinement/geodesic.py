@@ -58,7 +58,7 @@ class GeodesicModel:
                     "independent for each measurement. The error of a shared pose does not average out, so standard "
                     "deviations are too small; take carrier_model='variables'",
                     WeightsWarning,
-                    stacklevel=4,
+                    stacklevel=5,
                 )
         share = 1.0
         if options.robust == "gnc":  # of a chi-square with 6 degrees of freedom, cut at its quantile

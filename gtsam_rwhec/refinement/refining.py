@@ -136,7 +136,7 @@ def refine(
             "the measurements leave directions free, along which variances are infinite: "
             + "; ".join(map(str, space.directions)),
             NotUniqueWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     if not estimates:
         _warn_of_weights(problem, variables, settled, options)
@@ -233,7 +233,7 @@ def _warn_of_weights(problem: Problem, variables: Variables, settled: SettledFit
             f"({cost / ratio:.4g}): standard deviations are too small by about {math.sqrt(ratio):.2g}; "
             "take noise='estimate', robust='gnc' if some measurements are wrong, or carrier_noise if A is not exact",
             WeightsWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 
@@ -247,7 +247,7 @@ def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> 
                 f"{what} is {offset_s:.3g} s, but the carriers' motion is known only within {WINDOW_S:g} s of each "
                 "stamp; shift the stamps first (cleaning.estimate_time_offset finds the shift)",
                 NotConvergedWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
         elif part * offset_s > 0.5 * math.sqrt(joint.covariance_of(joint.selector((unknown,)))[0, 0]):
             warnings.warn(
@@ -255,7 +255,7 @@ def _warn_of_offsets(space: FreeSpace, joint: JointCovariance, state: State) -> 
                 f"by about {1e3 * part * offset_s:.2g} ms. This is more than half of its standard deviation; move "
                 "faster, or log poses more often",
                 WeightsWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
 
 
