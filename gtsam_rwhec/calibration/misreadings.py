@@ -290,5 +290,6 @@ class _Trial:
 
     def named_with_unit(self, reading: Reading, fit: TrialFit) -> Misreading | None:
         """The record of a reading that fits with a free scale; None where the scale is no mistake."""
-        unit = wrong_unit(fit.one_scale, *self.sampled.median_lengths)
+        from_corners = all(pair.target in self.problem.boards for pair in self.problem.pairs)
+        unit = wrong_unit(fit.one_scale, *self.sampled.median_lengths, from_corners=from_corners)
         return self.named(reading, fit, unit) if unit else None

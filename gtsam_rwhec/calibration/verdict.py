@@ -221,7 +221,8 @@ _ADVICE = {
     Ground.SIZE_ESTIMATED: "measure the named target again, and correct its size",
     Ground.INTRINSICS_ESTIMATED: (
         "check which calibration the stated intrinsics of the named sensor are from (its resolution, its lens), and "
-        "state the estimated ones (camchain.yaml, result.json) if they hold in another run"
+        "state the estimated ones (in camchain.yaml and result.json; in Python `refined.intrinsics`) if they hold in "
+        "another run"
     ),
     Ground.CORNERS_DOUBTED: (
         "look at the images for corners that are misread, check the board (its sizes, whether it is flat, the order of "

@@ -27,10 +27,11 @@ class WrongUnit:
     of_B: float
 
 
-def wrong_unit(scale: float, median_A: float, median_B: float) -> WrongUnit | None:
+def wrong_unit(scale: float, median_A: float, median_B: float, *, from_corners: bool = False) -> WrongUnit | None:
     """What an estimated scale (lengths in B over those in A) says; None where it is about 1, or not positive.
 
     ``median_A`` and ``median_B`` are median lengths of the translations as given: the long ones are of another unit.
+    ``from_corners``: B is made of corners, so that its unit is that of board_points.
     """
     if not scale > 0.0 or abs(scale - 1.0) < NO_MISREADING:
         return None
@@ -42,6 +43,9 @@ def wrong_unit(scale: float, median_A: float, median_B: float) -> WrongUnit | No
         lengths = f"lengths in {longer} are {rounded(ratio, 4)} times those in {shorter}"
         if (median_B if longer == "B" else median_A) > LONG_M or number < 1000.0:
             of_B = number if longer == "B" else 1.0
+            if from_corners and longer == "B":
+                cure = f"give board_points in metres: divide them by {rounded(number, 4)}"
+                return WrongUnit(Mistake.UNIT, f"{lengths}: board_points are in {unit}", cure, of_B)
             cure = f"give metres: divide the translations of {longer} by {rounded(number, 4)}"
             return WrongUnit(Mistake.UNIT, f"{lengths}: {longer} is in {unit}", cure, of_B)
         of_B = 1.0 / number if shorter == "B" else 1.0

@@ -72,10 +72,11 @@ def candidates_of(camera: Camera, board: Array, pixels: Array, corner_px: float,
     extent = np.sqrt(np.nanvar(np.where(known[..., None], pixels, np.nan), axis=1).sum(axis=1))
     off = np.nan_to_num(found.reprojection_px[:, 0], nan=np.inf) / extent
     if np.median(off) > FARTHEST:
+        missed = f"miss it by {100.0 * np.median(off):.0f} % of its size or more" if np.isfinite(np.median(off)) else ""
         raise TargetError(
-            f"{where}: the corners do not belong to the board: half of the images miss it by "
-            f"{100.0 * np.median(off):.0f} % of its size or more, or have no pose; give image_points in the order of "
-            "board_points, and check rows and columns"
+            f"{where}: the corners do not belong to the board: half of the images {missed or 'have no pose of it'}; "
+            "give image_points in the order of board_points, and check its numbers of rows and columns, and whether "
+            "it is another board"
         )
     if lost.size:
         raise CameraError(f"{where}: the corners of image {lost[0]} have no pose; are they on one line?")

@@ -71,6 +71,12 @@ def check_camera(camera: object, known: Camera | None, sensor: str, where: str) 
     """The sensor's camera; a CameraError where there is none, or another one was given before."""
     if camera is None and known is not None:
         return known
+    if camera is None:
+        raise CameraError(
+            f"{where}: no camera is given, and {sensor} has none yet; give camera=rw.Camera.of(width, height, "
+            "'radtan', K, D, 'its name'). If nobody knows its intrinsics: rw.calibrate_corners with "
+            'rw.CornerOptions(stated="unknown")'
+        )
     if not isinstance(camera, Camera):
         raise CameraError(
             f"{where}: camera is a {type(camera).__name__}; give {sensor} intrinsics: rw.Camera.of(width, height, "

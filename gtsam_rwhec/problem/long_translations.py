@@ -20,20 +20,27 @@ MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class LongTranslations:
-    """The median sizes of A's and B's translations in a batch (m) that are too long, by "A" and "B", and where."""
+    """The median sizes of A's and B's translations in a batch (m) that are too long, by "A" and "B", and where.
+
+    ``from_corners``: B is made of corners, in the unit of their board.
+    """
 
     where: str
     sizes: dict[str, float]
+    from_corners: bool = False
 
     @staticmethod
-    def of(A: Array, B: Array, gauge: Gauge, motion: bool, where: str) -> LongTranslations:
+    def of(
+        A: Array, B: Array, gauge: Gauge, motion: bool, where: str, *, from_corners: bool = False
+    ) -> LongTranslations:
         """Look at a batch; A is taken about the gauge, so that a distant world origin is not too long."""
         c = gauge.sensor_carrier if motion else gauge.target_carrier
         centred_A = A[:BLOCK, :3, 3] + A[:BLOCK, :3, :3] @ c - gauge.sensor_carrier
         # What a sensor sees (B) is never far.
         found = {"A": centred_A, "B": B[:BLOCK, :3, 3]}
         sizes = {name: float(np.median(np.abs(t).max(axis=1))) for name, t in found.items()}
-        return LongTranslations(where, {name: size for name, size in sizes.items() if size > MILLIMETRES_M})
+        long = {name: size for name, size in sizes.items() if size > MILLIMETRES_M}
+        return LongTranslations(where, long, from_corners)
 
 
 def warn_of_millimetres(found: Sequence[LongTranslations], stacklevel: int) -> None:
@@ -45,9 +52,13 @@ def warn_of_millimetres(found: Sequence[LongTranslations], stacklevel: int) -> N
     sizes = [f"{np.median([each.sizes[name] for each in long if name in each.sizes]):.4g}" for name in sides]
     named = ", ".join(each.where for each in long[:MOST_NAMED])
     more = f" and {len(long) - MOST_NAMED} more" if len(long) > MOST_NAMED else ""
+    cure = "Give metres: divide by 1000"
+    if "B" in sides and all(each.from_corners for each in long):
+        also = ", and A too" if "A" in sides else ""
+        cure = f"B is made of board_points: give these in metres, divided by 1000{also}"
     warnings.warn(
         f"{named}{more}: translations of {' and '.join(sides)} have a median size of {' and '.join(sizes)}; this looks "
-        "like millimetres. Give metres: divide by 1000. (This is said once for all pairs of a problem)",
+        f"like millimetres. {cure}. (This is said once for all pairs of a problem)",
         UnitsWarning,
         stacklevel=stacklevel + 1,
     )

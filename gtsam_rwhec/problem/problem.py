@@ -222,7 +222,9 @@ class Problem(Contents):
                 stacklevel=3,
             )
             raw = raw.projected(where)
-        translations = LongTranslations.of(raw.A, raw.B, accumulator.gauge, pair.is_motion, where)
+        translations = LongTranslations.of(
+            raw.A, raw.B, accumulator.gauge, pair.is_motion, where, from_corners=given.pixels is not None
+        )
         if long is not None:
             long.append(translations)
         elif not translations.sizes.keys() <= self._long:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from rich.console import Console
 
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.refinement.refined import RefinedPoses
@@ -55,7 +56,18 @@ def print_corners(refined: RefinedPoses, console: Console | None = None) -> None
         A refinement from corners, also as a result file has it.
     console : rich.console.Console, optional
         Where to print; standard output by default.
+
+    Raises
+    ------
+    OptionError
+        It is no such refinement.
     """
+    if not isinstance(refined, RefinedPoses):
+        raise OptionError(
+            f"print_corners: this is a {type(refined).__name__}; give what rw.refine(problem, solution, "
+            'rw.RefineOptions(observations="corners")) returned, `refined` of rw.calibrate, or that of a '
+            "result file. Of rw.refine_corners and rw.calibrate_corners, print(result) says the main figures"
+        )
     console = report_console() if console is None else console
     found = refined.reprojection
     if found is None:

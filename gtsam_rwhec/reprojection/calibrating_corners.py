@@ -48,6 +48,15 @@ class CornersCalibrated:
     inliers: dict[Pair, np.ndarray]
     observations: Observations
 
+    def __str__(self) -> str:
+        """The answer, and how many images it is from, in a few sentences."""
+        left_out = sum(int((~mask).sum()) for mask in self.inliers.values())
+        proof = "certified" if self.solution.certificate.is_certified else "not certified"
+        return f"{self.refined} The start was {proof}; {left_out} images disagree with the others and are left out."
+
+    def __repr__(self) -> str:
+        return f"<CornersCalibrated: {self}>"
+
 
 @one_blas_thread()
 def calibrate_corners(

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import chdtri, fdtri
 
 from gtsam_rwhec.errors import FrameError, OptionError
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.real_numbers import is_real
@@ -115,12 +116,31 @@ class CornersRefined:
     last_step: float
     findings: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        """What was refined from what, how well it fits, and what is doubtful, in a few sentences."""
+        stacks, noise = self.graph.model.stacks, self.noise
+        images = sum(len(stack.pixels) for stack in stacks)
+        seen = sum(int(stack.known.sum()) for stack in stacks)
+        left_out = sum(int(mask.sum()) for mask in self.left_out.values())
+        rms = ", ".join(f"{name} {of.rms_px:.3f}" for name, of in self.intrinsics.items())
+        size = f"{rounded(np.degrees(noise.carrier_rad))} degrees and {rounded(1e3 * noise.carrier_m)} mm for each axis"
+        of_A = "A counts as exact" if noise.carrier is None else f"noise of A {size}"
+        findings = " ".join(self.findings) or "No findings."
+        return (
+            f"Refined from {seen - left_out} corners in {images} images of {', '.join(self.X)} by {', '.join(self.Y)}; "
+            f"{left_out} corners left out. rms in pixels along each axis: {rms}; {of_A}. {findings}"
+        )
+
+    def __repr__(self) -> str:
+        return f"<CornersRefined: {self}>"
+
     def covariance(self, *names: str) -> Array:
         """The joint covariance of unknowns, in the order given; without names, of all.
 
-        Frames have six rows each; ``intrinsics:SENSOR`` a camera's parameters; ``shape:TARGET`` the numbers that are
-        free of the size and the two heights of the edge; ``time_offset:SENSOR`` one row, s^2; ``corners:TARGET`` three
-        rows a corner, m^2.
+        Frames have six rows each, rotation first (rad, m, in the frame's own axes); ``intrinsics:SENSOR`` a camera's
+        parameters in the order of `RefinedIntrinsics.names` (pixels; coefficients have no unit); ``shape:TARGET`` the
+        numbers that are free of the size and the two heights of the edge; ``time_offset:SENSOR`` one row, s^2;
+        ``corners:TARGET`` three rows a corner, m^2.
 
         Raises
         ------

@@ -35,6 +35,9 @@ from gtsam_rwhec.solving.part_solution import PartSolution
 from gtsam_rwhec.solving.solution import Solution, SolvedPart
 from gtsam_rwhec.solving.weights import contradicted_by
 
+#: Images contradict A where their poses are farther off than any arm or tracker is: rad, m.
+ARM_RAD, ARM_M = np.radians(1.0), 0.01
+
 
 def solve(
     problem: Problem,
@@ -231,10 +234,38 @@ def _warn_of_weights(problem: Problem, results: list[PartSolution]) -> None:
     cost = sum(result.residual_cost for result in results)
     degrees_of_freedom = sum(6 * r.part.number_of_measurements - r.part.number_of_unknowns for r in results)
     ratio = contradicted_by(cost, degrees_of_freedom)
-    if ratio is not None:
+    if ratio is not None and _is_from_corners(problem):
+        _warn_of_images(results)
+    elif ratio is not None:
         warnings.warn(
             f"the residuals cost {cost:.4g}, {ratio:.3g} times what sigma and kappa predict ({cost / ratio:.4g}): the "
             "noise is larger than they say, some measurements are wrong, or A or B is inverted",
             WeightsWarning,
             stacklevel=4,
+        )
+
+
+def _is_from_corners(problem: Problem) -> bool:
+    """Whether ``add_corners`` made all measurements: nobody stated their noise."""
+    return all(pair.target in problem.boards and pair.sensor in problem.cameras for pair in problem.pairs)
+
+
+def _warn_of_images(results: list[PartSolution]) -> None:
+    """Warn where images contradict A by more than any arm is off.
+
+    B's covariance is that of the corners' noise alone: errors of A and of intrinsics, which every rig has, are not in
+    it, so that a cost above the expected one is no news.
+    """
+    found = {pair: residual for result in results for pair, residual in result.residuals.items()}
+    size = {pair: max(of.rotation_rms_rad / ARM_RAD, of.translation_rms_m / ARM_M) for pair, of in found.items()}
+    pair = max(size, key=size.__getitem__)
+    worst = found[pair]
+    if size[pair] > 1.0:
+        warnings.warn(
+            f"the target's poses by the corners of {pair} are off by {np.degrees(worst.rotation_rms_rad):.2g} degrees "
+            f"and {1e3 * worst.translation_rms_m:.3g} mm (rms) from what A and the answer predict, more than an arm or "
+            "a tracker is: A is inverted, in another unit or of other images, the board's size is wrong, intrinsics "
+            "are far off, or some images are misread (refine with robust='gnc')",
+            WeightsWarning,
+            stacklevel=5,
         )

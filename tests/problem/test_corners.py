@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from typing import Any
 
 import gtsam
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.misreadings import misreadings
 from gtsam_rwhec.errors import (
     CameraError,
     CountError,
@@ -22,9 +24,11 @@ from gtsam_rwhec.errors import (
     RwhecError,
     TargetError,
     UnitsWarning,
+    WeightsWarning,
 )
 from gtsam_rwhec.problem.nearer_poses import nearer_poses
 from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.solving.weights import contradicted_by
 
 Array = NDArray[np.float64]
 CAMERA = rw.Camera.of(1280, 960, "radtan", [[900, 0, 640], [0, 900, 480], [0, 0, 1]], [-0.1, 0.02, 0, 0], "test")
@@ -179,8 +183,27 @@ def test_poses_by_other_intrinsics_take_the_place_of_all() -> None:
 
 def test_corners_in_millimetres_warn_as_poses_do() -> None:
     A, _, pixels = images()
-    with pytest.warns(UnitsWarning, match=r"translations of B"):
-        problem_of(A, pixels, 1e3 * BOARD)
+    with pytest.warns(UnitsWarning, match=r"of B .* board_points: give these in metres, divided by 1000\. "):
+        problem = problem_of(A, pixels, 1e3 * BOARD)
+    (unit,) = misreadings(problem, None)
+    assert "board_points are in millimetres" in unit.likely
+    assert unit.cure == "give board_points in metres: divide them by 1000"
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.NotUniqueWarning")
+def test_a_solution_from_corners_warns_of_images_only_where_no_arm_is_so_far_off() -> None:
+    A, _, pixels = images(20)
+    rng = np.random.default_rng(2)
+    off = A @ se3.expmap(rng.normal(scale=np.repeat([2e-3, 1e-3], 3), size=(20, 6)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", WeightsWarning)  # an arm's errors: many times what corner_px explains
+        solution = rw.solve(problem_of(off, pixels))
+    ratio = contradicted_by(solution.cost, 6 * 20 - 12)
+    assert ratio is not None
+    assert ratio > 10.0
+    with pytest.warns(WeightsWarning, match=r"corners of board-cam are off by .* A is inverted") as said:
+        rw.solve(problem_of(se3.inverse(A), pixels))
+    assert not any("sigma" in str(each.message) for each in said)
 
 
 A16, _, P16 = images()
@@ -195,7 +218,7 @@ WRONG: dict[str, tuple[type[RwhecError], str, dict[str, Any]]] = {
     "corner twice on the board": (TargetError, "are one point", {"board_points": BOARD[[0, *range(23)]]}),
     "nan in the board": (TargetError, "finite: False", {"board_points": BOARD * np.nan}),
     "board as text": (CountError, "cannot be read as numbers", {"board_points": "board"}),
-    "no camera": (CameraError, "camera is a NoneType; give cam intrinsics", {"camera": None}),
+    "no camera": (CameraError, "no camera is given, and cam has none yet", {"camera": None}),
     "a matrix as camera": (CameraError, "camera is a ndarray", {"camera": CAMERA.K}),
     "images of another size": (CameraError, r"outside images of 640 x 480 .* another size", {"camera": OTHER_SIZE}),
     "rows and columns exchanged": (CameraError, "rows and columns", {"image_points": P16[..., ::-1] + [0, 400]}),

@@ -11,6 +11,7 @@ import pytest
 from refined_corners import two_cameras
 from rich.console import Console
 
+from gtsam_rwhec.errors import OptionError
 from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.refinement.reprojection_found import Consequence, Intrinsics
 from gtsam_rwhec.report import print_corners, print_refined
@@ -179,6 +180,17 @@ def test_consequences_have_a_row_for_each_frame_and_the_worst_of_many_cameras(re
     table = consequences_table(every, names)
     assert table.headings == ("1 px of c", "0.1% of f", "0.1° of A")
     assert table.rows["hand"] == ("-", "8.00 / 0.080", "1.20 / 0.300")
+
+
+def test_the_steps_results_say_their_figures_and_where_a_report_is() -> None:
+    _, corners, _ = two_cameras()
+    with pytest.raises(OptionError, match=r'is a CornersRefined; give what rw.refine.*observations="corners"'):
+        print_corners(corners)  # type: ignore[arg-type]
+    assert len(repr(corners)) < 1500
+    images = sum(len(stack.pixels) for stack in corners.graph.model.stacks)
+    assert f"corners in {images} images of board by cam_0, cam_1; " in str(corners)
+    assert f"cam_0 {corners.intrinsics['cam_0'].rms_px:.3f}" in str(corners)
+    assert all(finding in str(corners) for finding in corners.findings)
 
 
 def test_records_are_sentences(refined: Refined) -> None:

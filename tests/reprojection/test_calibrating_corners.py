@@ -40,6 +40,8 @@ def test_corners_and_arm_alone_give_everything(camera: Camera) -> None:
     given = with_nothing_stated(cell(2, images=40, camera=camera, carrier=(5e-4, 3e-4)))
     found = rw.calibrate_corners(given.observations, UNKNOWN)
     assert found.solution.certificate.is_optimal
+    assert str(found).startswith(str(found.refined))
+    assert len(repr(found)) < 2000
     for name, T in (*given.X.items(), *given.Y.items()):
         pose = (found.refined.X | found.refined.Y)[name].matrix()
         xi = se3.logmap((se3.inverse(pose) @ T)[None])[0]
