@@ -13,7 +13,8 @@ import gtsam
 import numpy as np
 
 from gtsam_rwhec.calibration.corner_stage import SIZE_SHARE, CornersFound, corners_found
-from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.errors import CameraError, RwhecError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.pipeline.log_corners import LogCorners
 from gtsam_rwhec.pipeline.settled_poses import SettledPoses, settled_poses
@@ -71,7 +72,10 @@ def _from_corners(
     start = rounds.refined(settled.pairs, settled.free, "time offsets")
     if start.free_directions:
         return CornersFound.none("the motion leaves poses free")
-    observations = logged.observations(used, cameras, motion, settled.pairs.offsets_s)
+    try:
+        observations = logged.observations(used, cameras, motion, settled.pairs.offsets_s)
+    except CameraError as error:  # a driver's corners outside of its images: the poses have an answer, in doubt
+        return CornersFound.none(f"the corners give none: {error}", Finding(Ground.CORNERS_DOUBTED, str(error)))
     assert observations is not None
     noise = motion.noise
     options = CornerOptions(

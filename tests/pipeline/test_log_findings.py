@@ -167,3 +167,18 @@ def test_other_readings_are_said_beside_an_exchange() -> None:
     assert [one.mistake for one in in_rig_file(given, rig)] == [Mistake.INVERTED, Mistake.QUATERNION_ORDER]
     (of_B,) = in_rig_file([replace(given[1], likely="B is inverted")], rig)
     assert of_B.cure.startswith("let the driver publish the target's pose")
+
+
+def test_a_drivers_corners_outside_of_its_images_leave_the_poses_in_doubt(tmp_path: Path) -> None:
+    """Intrinsics of another resolution, or a driver that makes corners up: its poses had no answer at all."""
+    text = made.RIG
+    for camera in made.CAMERAS:
+        topic = f"detections: /{camera}/tags"
+        text = text.replace(topic, f"{topic}\n    intrinsics: {{topic: /{camera}/camera_info}}")
+    low = {"height": 400}  # the made-up tags are seen beyond the borders too
+    messages = [*(made.camera_info(camera, **low) for camera in made.CAMERAS), *made.recording(2.5)]
+    calibrated = made.solved(tmp_path, messages, text)
+    assert calibrated.refined.reprojection is None
+    assert rw.Ground.CORNERS_DOUBTED in calibrated.judgement.grounds
+    assert "outside images of 640 x 400 pixels" in calibrated.judgement.reason
+    assert calibrated.judgement.verdict is rw.Verdict.CARE
