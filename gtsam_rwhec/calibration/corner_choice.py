@@ -82,7 +82,7 @@ def chosen_model(
     try:
         first = _scored(some, X, Y, options, tell)
     except CountError as error:
-        return Tried(options, _words(options), f"no other was tried: {error}", (), LeftOut({}, {}))
+        return Tried(options, in_words(options), f"no other was tried: {error}", (), LeftOut({}, {}))
     every = [first]
     if options.carrier_noise != "exact":
         every.append(_scored(some, X, Y, replace(options, carrier_noise="exact"), tell))
@@ -125,10 +125,11 @@ def _scored(
     px, mm, expected = (
         mean([getattr(one, name) for one in errors.values()]) for name in ("rms_px", "rms_mm", "expected_px")
     )
-    return options, Score(_words(options), px, mm, expected), found
+    return options, Score(in_words(options), px, mm, expected), found
 
 
-def _words(options: CornerOptions) -> str:
+def in_words(options: CornerOptions) -> str:
+    """What the options take as known of A and of sizes."""
     noise = options.carrier_noise
     if isinstance(noise, CarrierNoise):
         of_A = f"A's noise as stated ({np.degrees(noise.rotation_rad):.2g}° and {1e3 * noise.translation_m:.2g} mm)"
@@ -137,5 +138,7 @@ def _words(options: CornerOptions) -> str:
     shares = options.size_share.values() if isinstance(options.size_share, Mapping) else (options.size_share,)
     if not any(shares):
         return f"{of_A} and sizes as stated"
-    some = "some sizes" if isinstance(options.size_share, Mapping) else "sizes"
-    return f"{of_A} and {some} estimated"
+    if not isinstance(options.size_share, Mapping):
+        return f"{of_A} and sizes estimated"
+    free = [name for name, share in options.size_share.items() if share]
+    return f"{of_A} and {f'the size of {free[0]}' if len(free) == 1 else 'some sizes'} estimated"

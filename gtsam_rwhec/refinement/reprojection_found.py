@@ -87,7 +87,7 @@ class Consequence:
     cause : str
         In words, with its size.
     rotation_deg, translation_mm : float
-        Of an error of A: one standard deviation, along the worst axis.
+        Of A's noise: one standard deviation, along the worst axis.
     """
 
     frame: str
@@ -130,8 +130,10 @@ class BoardShape:
         found = {name: at for at, name in enumerate(self.names)}
         said = []
         if SIZE in found:
-            off, deviation = (100.0 * each[found[SIZE]] for each in (self.values, self.standard_deviations))
-            said.append(f"{abs(off):.3f} ± {rounded(deviation)} % {'larger' if off > 0.0 else 'smaller'} than stated")
+            true, deviation = 1.0 + self.values[found[SIZE]], self.standard_deviations[found[SIZE]]
+            off = 100.0 * (1.0 / true - 1.0)  # of the stated size over the true one, as scales are, and the verdict
+            which = "large" if off > 0.0 else "small"
+            said.append(f"its stated size is {abs(off):.3f} ± {rounded(100.0 * deviation / true**2)} % too {which}")
         for axis, name in WARPS.items():
             if name in found:
                 height, deviation = (1e3 * each[found[name]] for each in (self.values, self.standard_deviations))

@@ -145,11 +145,16 @@ def intrinsics_sentences(refined: RefinedPoses) -> list[str]:
 def intrinsics_table(refined: RefinedPoses) -> FrameTable:
     """Every parameter of every camera, beside what was stated."""
     rows = {}
+    decimals_of: dict[str, int] = {}
+    for of in refined.intrinsics.values():
+        for parameter, deviation in zip(of.names, of.standard_deviations, strict=True):
+            kind = _kind(parameter)
+            decimals_of[kind] = max(decimals_of.get(kind, 0), _decimals(deviation))
     for name, of in _by_camera(refined.intrinsics):
         for parameter, value, deviation, stated, known in zip(
             of.names, of.values, of.standard_deviations, of.stated, of.stated_deviations, strict=True
         ):
-            decimals = _decimals(deviation)
+            decimals = decimals_of[_kind(parameter)]
             was_stated = of.stated_as != "unknown"
             rows[f"{name} {parameter}"] = (
                 f"{value:.{decimals}f}",
@@ -158,6 +163,11 @@ def intrinsics_table(refined: RefinedPoses) -> FrameTable:
                 _told_by(parameter, of),
             )
     return FrameTable("Intrinsics", "parameter", ("found", "±", "stated", "±", "told by"), rows)
+
+
+def _kind(parameter: str) -> str:
+    """Parameters whose numbers have as many decimals, so that their points line up."""
+    return "pixels" if parameter in ("fx", "fy", "cx", "cy") else "coefficients"
 
 
 def _told_by(parameter: str, of: Intrinsics) -> str:
@@ -171,7 +181,7 @@ def consequences_table(found: Reprojection, sensors: list[str]) -> FrameTable:
 
     Few cameras have columns each; of many cameras, the one counts whose error moves the frame most.
     """
-    by = {(of.frame, of.cause): of for of in found.consequences}
+    by = {(of.frame, OF_CARRIERS if of.cause.startswith(OF_CARRIERS) else of.cause): of for of in found.consequences}
     cameras = _cameras(found, sensors)
     groups = [[name] for name in cameras] if len(cameras) <= MOST_CAMERAS else [cameras]
     columns: dict[str, list[str]] = {}

@@ -20,8 +20,14 @@ from gtsam_rwhec.reprojection.refined import CornersRefined
 CENTRE_PX, FOCAL_SHARE, CARRIER_RAD = 1.0, 1e-3, np.radians(0.1)
 
 
-#: The cause of A's, in words.
+#: The cause of A's, in words: how they begin.
 OF_CARRIERS = f"{np.degrees(CARRIER_RAD):.1f} degrees of A's noise about each axis"
+
+
+def carrier_cause(refined: CornersRefined) -> str:
+    """A's noise, in words: rotations of A leave the origin of one of the two carriers where it is."""
+    about = {"targetcarrier": "target carrier", "sensorcarrier": "sensor carrier"}[refined.graph.model.about]
+    return f"{OF_CARRIERS} (one standard deviation; A turns about the origin of the {about})"
 
 
 def centre_causes(sensor: str) -> tuple[str, str]:
@@ -57,11 +63,11 @@ def consequences_of(refined: CornersRefined) -> tuple[Consequence, ...]:
             moved = np.zeros(len(information))
             moved[rest] = -np.linalg.solve(information[np.ix_(rest, rest)], information[rest, at] @ dk)
             result += [_moved(frame, cause, moved[rows]) for frame, rows in poses.items()]
-    covariance = _of_carrier_noise(refined)
+    covariance, cause = _of_carrier_noise(refined), carrier_cause(refined)
     for frame, rows in poses.items():
         block = covariance[rows, rows]
         worst = [np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (block[:3, :3], block[3:, 3:])]
-        result.append(Consequence(frame, OF_CARRIERS, float(np.degrees(worst[0])), float(1e3 * worst[1])))
+        result.append(Consequence(frame, cause, float(np.degrees(worst[0])), float(1e3 * worst[1])))
     return tuple(result)
 
 

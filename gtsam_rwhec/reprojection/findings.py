@@ -26,6 +26,8 @@ CONSTANT_S = 0.02
 #: Distortion that nobody stated is named where chance gives it with less than this probability, and where it moves a
 #: corner by more pixels than this.
 NO_LENS, BEND_PX = 1e-4, 1.0
+#: A coefficient is named alone where it is not 0 by so many deviations; at most so many are named.
+TOLD, MOST_TERMS = 3.0, 2
 #: More corners than this share left out are many.
 MANY = 0.2
 
@@ -200,7 +202,11 @@ def lens_that_was_left_out(refined: CornersRefined, sensors: list[str]) -> str:
     bend_px = float(np.nanmax(np.linalg.norm(straight - pixels, axis=1), initial=0.0))
     if bend_px < BEND_PX:
         return ""
+    deviations = np.sqrt(np.diagonal(covariance))
+    told = np.argsort(-np.abs(D) / deviations)  # those that chance explains least, first
+    named = [at for at in told if abs(D[at]) > TOLD * deviations[at]] or told[:MOST_TERMS].tolist()
+    terms = [f"{intrinsics.names[PINHOLE + at]} = {D[at]:.3g} +- {deviations[at]:.1g}" for at in named[:MOST_TERMS]]
     return (
-        f"k1 = {D[0]:.3g} +- {np.sqrt(covariance[0, 0]):.1g} fits, and moves corners by up to {bend_px:.2g} pixels; "
-        "the estimated distortion is used"
+        f"a distortion that moves corners by up to {bend_px:.2g} pixels fits ({', '.join(terms)}); the estimated "
+        "distortion is used"
     )

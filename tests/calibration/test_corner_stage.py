@@ -10,7 +10,7 @@ import pytest
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.calibration.corner_choice import chosen_model, thinned
+from gtsam_rwhec.calibration.corner_choice import chosen_model, in_words, thinned
 from gtsam_rwhec.calibration.corner_stage import MEASUREMENTS, corners_found, growth_by_intrinsics
 from gtsam_rwhec.calibration.verdict import Ground
 
@@ -49,6 +49,15 @@ def test_exact_and_noisy_poses_are_told_apart_by_images_that_were_left_out() -> 
         # an error that is as large as the covariances say is no finding
         assert 0.6 < tried.scores[0].px / tried.scores[0].expected_px < 1.4
     assert tried.options.carrier_noise == "estimate"
+
+
+@pytest.mark.parametrize(("shares", "said"), [
+    ({"tag_0": 0.05, "tag_1": 0.0}, "the size of tag_0 estimated"),
+    ({"tag_0": 0.05, "tag_1": 0.05}, "some sizes estimated"),
+    (0.05, "sizes estimated"),
+])  # fmt: skip
+def test_one_size_that_is_free_is_named(shares: dict[str, float] | float, said: str) -> None:
+    assert in_words(rw.CornerOptions(size_share=shares)) == f"A's noise estimated and {said}"
 
 
 def test_what_is_chosen_and_found_is_said() -> None:

@@ -98,6 +98,9 @@ def test_errors_and_numbers_are_those_of_the_result(refined: Refined) -> None:
     found, deviation, stated, known = (float(cell) for cell in rows["cam_0 fx"][:4])
     assert found == pytest.approx(cam.values[0], abs=0.06)
     assert deviation == pytest.approx(cam.standard_deviations[0], rel=0.06)
+    for ending in ("x", "y", "k1", "k2", "p1", "p2"):  # points line up: as many decimals for each kind of parameter
+        cells = [row[0] for name, row in rows.items() if name.endswith(ending)]
+        assert len({len(cell.partition(".")[2]) for cell in cells}) == 1
     assert (stated, known) == pytest.approx((cam.stated[0], cam.stated_deviations[0]), abs=0.06)
 
 
@@ -204,8 +207,12 @@ def test_records_are_sentences(refined: Refined) -> None:
     exact = dataclasses.replace(refined.reprojection, carrier_poses="exact")
     assert str(exact).endswith("The carriers' poses A count as exact.")
     board = str(refined.reprojection.boards["board"])
+    scale = refined.scale["board"] if isinstance(refined.scale, dict) else refined.scale
+    assert f"its stated size is {abs(100.0 * (scale - 1.0)):.3f} ± " in board
+    assert ("too large" in board) is (scale > 1.0)
     assert re.fullmatch(
-        r"\d\.\d{3} ± \S+ % (larger|smaller) than stated; its edge along x is [+-]\d\.\d{3} ± \S+ mm above its middle; "
+        r"its stated size is \d\.\d{3} ± \S+ % too (large|small); "
+        r"its edge along x is [+-]\d\.\d{3} ± \S+ mm above its middle; "
         r"its edge along y is [+-]\d\.\d{3} ± \S+ mm above its middle",
         board,
     )

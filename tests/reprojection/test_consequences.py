@@ -11,7 +11,7 @@ from simulated_cells import cell
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.refinement.optimisation import optimise
-from gtsam_rwhec.reprojection.consequences import consequences_of
+from gtsam_rwhec.reprojection.consequences import OF_CARRIERS, consequences_of
 from gtsam_rwhec.reprojection.corner_graph import CornerGraph
 from gtsam_rwhec.reprojection.lens import parameters_of
 
@@ -54,4 +54,7 @@ def test_every_frame_and_cause_is_there() -> None:
     found = consequences_of(refined)
     assert {one.frame for one in found} == {"board", "cam_0", "cam_1"}
     assert len(found) == 3 * (2 * 3 + 1)
+    of_A = [str(one) for one in found if one.cause.startswith(OF_CARRIERS)]
+    assert len(of_A) == 3
+    assert all("(one standard deviation; A turns about the origin of the target carrier) would move" in s for s in of_A)
     assert all(one.rotation_deg >= 0.0 and one.translation_mm >= 0.0 for one in found)

@@ -111,7 +111,10 @@ def _draw(axes: Axes, sensor: str, seen: PlottedCorners, size: tuple[float, floa
     note = _draw_means(axes, seen, size)
     rms = np.sqrt(np.mean(errors**2))
     covered = _share(seen.pixels, size)
-    axes.set_title(f"{shortened(sensor)}: {len(errors)} corners, rms {rms:.2g} px\nin {covered:.0%} of the image{note}")
+    axes.set_title(
+        f"{shortened(sensor)}: {len(errors)} corners in {covered:.0%} of the image\n"
+        f"rms length of all errors, outliers too: {rms:.2g} px{note}"
+    )
     return points
 
 

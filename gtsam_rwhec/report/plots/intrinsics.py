@@ -156,8 +156,8 @@ def _draw_uncertainty(axes: Axes, of: PlottedIntrinsics) -> None:
         lines = axes.contour(u, v, shades, levels=levels, colors="black", linewidths=0.8, zorder=3)
         axes.clabel(lines, fmt=lambda level: f"{level:g} px", fontsize=8)
     axes.plot(*of.corners.pixels.T, ls="", marker=".", markersize=DOT, color="black", alpha=0.4, zorder=2)
-    where = f"how sure the lens is: a point at {rounded(of.distance_m)} m is projected"
-    _frame(axes, of, f"{where}\nwith a standard deviation of {rounded(low)} to {rounded(high)} px")
+    where = f"how sure the lens is: single points at {rounded(of.distance_m)} m are projected"
+    _frame(axes, of, f"{where}\nwith deviations of {rounded(low)} to {rounded(high)} px")
     axes.tick_params(labelleft=False)
 
 
