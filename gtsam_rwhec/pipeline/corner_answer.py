@@ -80,7 +80,7 @@ def _from_corners(
     noise = motion.noise
     options = CornerOptions(
         stated={name: rig.sensors[name].stated for name in observations.sensors},
-        size_share=dict.fromkeys(settled.free, SIZE_SHARE),
+        size_share=dict.fromkeys((name for name in settled.free if name in observations.corners), SIZE_SHARE),
         carrier_noise="estimate" if noise is None or noise.covariances is not None else noise,
         about=motion.about,
         time_offsets=tuple(name for name in rounds.estimated if name in observations.sensors),

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from gtsam_rwhec.errors import CountError, FrameError, OptionError, OutlierError, UnderdeterminedError
+from gtsam_rwhec.errors import CameraError, CountError, FrameError, OptionError, OutlierError, UnderdeterminedError
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.reprojection.corner_outliers import errors_px
@@ -38,11 +38,34 @@ def check_arguments(observations: object, options: object) -> None:
         raise OptionError(f"options={brief(options)} are not CornerOptions; give rw.CornerOptions(...), or None")
 
 
-def check_shared(options: CornerOptions, sensors: tuple[str, ...]) -> None:
-    """FrameError where a group of sensors that share intrinsics names one that saw nothing."""
-    strange = [name for group in options.shared for name in group if name not in sensors]
+def check_options(options: CornerOptions, observations: Observations) -> None:
+    """FrameError where options are of a frame that nobody knows; CameraError where two cameras cannot be one.
+
+    A misspelt name would leave a calibration nominal, or a size as stated, without a word.
+    """
+    sensors = observations.sensors
+    every = [name for group in options.shared for name in group]
+    strange = [name for name in every if name not in sensors]
     if strange:
         raise FrameError(f"CornerOptions.shared names {strange[0]!r}; the sensors are {', '.join(sensors)}")
+    twice = [name for i, name in enumerate(every) if name in every[:i]]
+    if twice:
+        raise FrameError(f"CornerOptions.shared names {twice[0]!r} twice; a sensor is in one group")
+    for name in every:
+        camera, first = (observations.cameras[each] for each in (name, options.camera_of(name)))
+        sizes = [f"{each.width} x {each.height}" for each in (camera, first)]
+        if sizes[0] != sizes[1]:
+            raise CameraError(
+                f"CornerOptions.shared says that {name} has the intrinsics of {options.camera_of(name)}, but its "
+                f"images have {sizes[0]} pixels, and those of the other {sizes[1]}; leave it out of the group"
+            )
+    for words, given, known, what in (
+        ("stated", options.stated, observations.cameras, "sensors"),
+        ("size_share", options.size_share, observations.corners, "targets"),
+    ):
+        strange = [name for name in given if name not in known] if isinstance(given, Mapping) else []
+        if strange:
+            raise FrameError(f"CornerOptions.{words} names {strange[0]!r}; the {what} are {', '.join(known)}")
 
 
 def check_clocks(options: CornerOptions, observations: Observations) -> None:

@@ -22,7 +22,7 @@ from gtsam_rwhec.reprojection.determined import (
     check_corners,
     check_determined,
     check_names,
-    check_shared,
+    check_options,
     farthest,
     few_corners,
     told_where_it_fails,
@@ -95,7 +95,7 @@ def refine_corners(
     CountError
         A time offset is free, and its sensor's images have no velocity of the carriers.
     FrameError
-        The start lacks a frame.
+        The start lacks a frame, or options name one that is not there.
     OptionError
         An argument is of another type.
     OutlierError
@@ -109,7 +109,7 @@ def refine_corners(
     check_names(X, observations.targets, letter="X")
     check_names(Y, observations.sensors, letter="Y")
     options, tell = options or CornerOptions(), progress or silent
-    check_shared(options, observations.sensors)
+    check_options(options, observations)
     check_clocks(options, observations)
     model, point, noise, cameras = _stated(observations, X, Y, options)
     priors, first = model.camera_priors, model.camera_of

@@ -10,7 +10,7 @@ import pytest
 from simulated_cells import Cell, cell
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import FrameError, OptionError, OutlierError, UnderdeterminedError
+from gtsam_rwhec.errors import CameraError, FrameError, OptionError, OutlierError, UnderdeterminedError
 from gtsam_rwhec.reprojection.determined import told_where_it_fails
 from gtsam_rwhec.reprojection.lens import parameters_of, pixels_of
 from gtsam_rwhec.reprojection.observations import Views
@@ -127,3 +127,20 @@ def test_fewer_corners_than_unknowns() -> None:
     (words,) = (words for words in result.findings if "coordinates of corners" in words)
     assert words.startswith("There are 24 coordinates of corners for 125 unknowns, which therefore rest on their")
     assert result.noise.corner_px == 0.2
+
+
+def test_options_of_frames_that_nobody_knows_are_refused() -> None:
+    """A misspelt sensor was nominal, and not exact, without a word; cameras of two resolutions were one."""
+    given = cell(4, images=12)
+    start = given.near(np.random.default_rng(0))
+    for options, words in (
+        (rw.CornerOptions(stated={"cam0": "exact"}), r"stated names 'cam0'; the sensors are cam_0, cam_1"),
+        (rw.CornerOptions(size_share={"Board": 0.1}), r"size_share names 'Board'; the targets are board"),
+        (rw.CornerOptions(shared=(("cam_0", "cam_1"), ("cam_1",))), r"shared names 'cam_1' twice"),
+    ):
+        with pytest.raises(FrameError, match=words):
+            rw.refine_corners(given.observations, *start, options)
+    larger = replace(given.observations.cameras["cam_1"], width=2400, height=1350)
+    two = replace(given.observations, cameras={**given.observations.cameras, "cam_1": larger})
+    with pytest.raises(CameraError, match="its images have 2400 x 1350 pixels, and those of the other 1920 x 1080"):
+        rw.refine_corners(two, *start, rw.CornerOptions(shared=(("cam_0", "cam_1"),)))
