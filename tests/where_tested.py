@@ -122,7 +122,7 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_seen_sheet.py": "detected_source image_names",
         "pipeline/test_bad_logs.py": "no_detections",
         "pipeline/test_kept_detections.py": "detection_inputs",
-        "pipeline/test_log_corners.py": "corner_answer",
+        "pipeline/test_log_corners.py": "corner_answer first_answer",
         "pipeline/test_doubted_intrinsics.py": "seen_corners",
         "pipeline/test_log_findings.py": "output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",

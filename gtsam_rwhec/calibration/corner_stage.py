@@ -190,6 +190,11 @@ def _choices(
             "nominal": "the stated ones count as nominal (write stated: calibration where a calibration states them)",
             "unknown": "none are stated",
         }.get(one.stated_as, "")
+        innovation = corners.intrinsics[name].innovation
+        if innovation.is_contradicted and one.stated_as != "unknown":
+            known = f"the stated ones are contradicted by {innovation.deviations:.2g} deviations"
+            if one.widened > 1.0:
+                known += f", and the prior about them was made {one.widened:.2g} times as wide"
         found = "estimated with the poses"
         if growth[name] > SEEN_GROWTH:
             found += f", which makes standard deviations of {name} up to {growth[name]:.2g} times those of exact ones"

@@ -152,8 +152,10 @@ _MADE_BY_A_MISREADING = frozenset({
 #: A wrong size, a wrong pose, what moved and a late clock make errors that vary with the configuration, and in time.
 _MISTAKES = frozenset({Ground.POSE_DOUBTED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED})
 _MADE_BY_A_MISTAKE = frozenset({Ground.CORNERS_DOUBTED, Ground.CORRELATED, Ground.SYSTEMATIC})
-#: Wrong focal lengths make sizes look wrong, and errors that vary with where a board is seen.
+#: Wrong focal lengths make sizes look wrong, motions look alike, and errors that vary with where a board is seen.
 _MADE_BY_INTRINSICS = frozenset({
+    Ground.NOT_UNIQUE,
+    Ground.NO_COVARIANCE,
     Ground.SIZE_DOUBTED,
     Ground.NO_SIZE_FITS,
     Ground.SIZE_ESTIMATED,
@@ -164,7 +166,8 @@ _MADE_BY_INTRINSICS = frozenset({
 })  # fmt: skip
 _CALIBRATE_INTRINSICS = (
     "calibrate the intrinsics of the named sensor with its distortion (cv2.calibrateCamera, Kalibr, ROS's "
-    "camera_calibration) at this resolution, and state them in place of the stated ones"
+    "camera_calibration) at this resolution, and state them in place of the stated ones, or let the images tell them "
+    "(in the rig file: intrinsics: estimate)"
 )
 _MEASURE_BOARD = "measure the named board (sizes, gaps, and the place and turn of each tag), and correct the rig file"
 _ADVICE = {

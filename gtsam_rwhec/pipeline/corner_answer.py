@@ -6,7 +6,7 @@ noise and findings are of them; where the corners contradict what was stated, al
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import gtsam
@@ -29,6 +29,7 @@ def corner_answer(
     rounds: SolvingRounds,
     logged: LogCorners,
     cameras: Mapping[str, Camera],
+    unknown: Collection[str] = (),
 ) -> tuple[SettledPoses, CornersFound]:
     """Refine from corners, where all measurements have them; and the poses under the estimated intrinsics.
 
@@ -42,15 +43,17 @@ def corner_answer(
     logged : LogCorners
     cameras : dict of str to Camera
         Stated intrinsics.
+    unknown : collection of str
+        Sensors whose intrinsics are only where the refinement starts: nobody stated them.
     """
-    found = _from_corners(settled, rounds, logged, cameras)
+    found = _from_corners(settled, rounds, logged, cameras, unknown)
     if found.corners is None:
         return settled, found
     rounds.progress("computing the poses of targets again, with the estimated intrinsics")
     try:
         if found.contradicted:
             again = settled_poses(rounds, _with_estimated(given, logged, cameras, found))
-            better = _from_corners(again, rounds, logged, cameras)
+            better = _from_corners(again, rounds, logged, cameras, unknown)
             if better.corners is not None:
                 settled, found = again, better
         return replace(settled, pairs=_with_estimated(settled.pairs, logged, cameras, found)), found
@@ -59,7 +62,11 @@ def corner_answer(
 
 
 def _from_corners(
-    settled: SettledPoses, rounds: SolvingRounds, logged: LogCorners, cameras: Mapping[str, Camera]
+    settled: SettledPoses,
+    rounds: SolvingRounds,
+    logged: LogCorners,
+    cameras: Mapping[str, Camera],
+    unknown: Collection[str],
 ) -> CornersFound:
     rig, motion = rounds.rig, rounds.motion
     used = {pair: measured for pair, measured in settled.pairs.pairs.items() if measured.used.any()}
@@ -79,7 +86,7 @@ def _from_corners(
     assert observations is not None
     noise = motion.noise
     options = CornerOptions(
-        stated={name: rig.sensors[name].stated for name in observations.sensors},
+        stated={name: "unknown" if name in unknown else rig.sensors[name].stated for name in observations.sensors},
         size_share=dict.fromkeys((name for name in settled.free if name in observations.corners), SIZE_SHARE),
         carrier_noise="estimate" if noise is None or noise.covariances is not None else noise,
         about=motion.about,

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.choices import OUTLIERS, Choice
-from gtsam_rwhec.calibration.corner_stage import CornersFound
 from gtsam_rwhec.calibration.outliers import Outliers
 from gtsam_rwhec.calibration.reading import Reading
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
@@ -18,16 +17,14 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
-from gtsam_rwhec.pipeline.clocks_by_turning import late_clocks
-from gtsam_rwhec.pipeline.corner_answer import corner_answer
-from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics
+from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics, finding_against
 from gtsam_rwhec.pipeline.doubted_shapes import continued_boards, doubted_shapes
+from gtsam_rwhec.pipeline.first_answer import first_answer
 from gtsam_rwhec.pipeline.log_contract import CLEANING_METADATA
 from gtsam_rwhec.pipeline.log_corners import LogCorners
 from gtsam_rwhec.pipeline.log_findings import (
     estimated_sizes,
     in_rig_file,
-    is_of_the_poses,
     known_to_nothing,
     may_be_exchanged,
     not_of_late_clocks,
@@ -36,7 +33,6 @@ from gtsam_rwhec.pipeline.log_findings import (
 )
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, poses_used, read_pairs
-from gtsam_rwhec.pipeline.settled_poses import SettledPoses, settled_poses
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, Purpose, SolvingRounds, sigma_of, without_outlier_marks
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
@@ -121,7 +117,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
             raise LogError(f"{clean_path}: it has no usable pair of measurements")
         motion = read_carrier_motion(log, rig)
         logged = LogCorners.of(log, rig, metadata.cameras)
-        of_intrinsics = doubted_intrinsics(log, rig, metadata.cameras)
+        doubted = doubted_intrinsics(log, rig, metadata.cameras)
         of_shapes = doubted_shapes(log, rig, metadata.cameras)
         of_shapes += continued_boards(metadata.detection.strangers, rig)
     estimated = tuple(
@@ -134,14 +130,9 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     given = rounds.at(without_outlier_marks(pairs), cleaning.time_offsets_s)
     stated = [name for name in rig.sensors if name in used_sensors and name not in estimated]
     stated_s = {name: given.offsets_s.get(name, 0.0) for name in stated}
-    late = late_clocks(given.pairs, motion.trajectory, rig, stated_s)
-    before = rounds.misreadings(given)
-    is_misread = is_of_the_poses(before)
-    # Outliers, sizes and corners mean nothing where poses were misread, or are of another time.
-    poses, of_corners = SettledPoses(given), CornersFound.none("the measurements look misread, or are of another time")
-    if not (is_misread or late):
-        poses = settled_poses(rounds, given)
-        poses, of_corners = corner_answer(poses, given, rounds, logged, metadata.cameras)
+    first = first_answer(rounds, given, logged, metadata.cameras, stated_s, doubted)
+    poses, of_corners, before, late = first.poses, first.of_corners, first.misreadings, first.late
+    is_misread = first.is_misread
     settled, sizes = poses.pairs, poses.sizes
     calibration = rounds.calibrated(settled, poses.free, is_late=bool(late))
     # Without a refined calibration (the measurements look misread) the poses are refined all the same, for the plots.
@@ -149,8 +140,10 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     refined = calibration.refined or rounds.refined(settled, poses.free, purpose)
     if calibration.refined is not None and not refined.free_directions:
         refined = of_corners.refined(refined, calibration.noise.model)
-    if refined.intrinsics:  # estimated from the same corners
-        of_intrinsics = ()
+    # Those that were estimated from the same corners are named by them.
+    of_intrinsics = (
+        () if refined.intrinsics else tuple(finding_against(name, one, rig) for name, one in doubted.items())
+    )
     offsets = settled.offsets_s | {n: settled.offsets_s[n] + value for n, value in refined.time_offsets_s.items()}
     outliers = tuple(_outlier_count(measured) for measured in settled.pairs.values())
     refined = replace(

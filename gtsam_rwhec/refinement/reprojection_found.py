@@ -253,7 +253,7 @@ class Intrinsics:
         if self.stated_as == "exact":
             return "they count as exact, as was said: their errors are not in the standard deviations"
         if self.stated_as == "unknown":
-            said = ["none were stated, so the images alone tell them"]
+            said = ["no stated ones count, so the images alone tell them"]
         else:
             origin = "a calibration's" if self.stated_as == "calibration" else "nominal ones"
             said = [f"estimated, with a prior from what was stated ({origin})"]

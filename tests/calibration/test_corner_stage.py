@@ -98,6 +98,10 @@ def test_stated_intrinsics_that_are_off_are_named() -> None:
     assert {one.ground for one in found.findings} == {Ground.INTRINSICS_ESTIMATED}
     assert "cx, cy = 985, 540" in found.findings[0].words
     assert "cx, cy = 960" in found.findings[0].words
+    (choice,) = (one for one in found.choices if one.what == "intrinsics of cam_0")
+    assert choice.evidence.startswith("the stated ones are contradicted by ")
+    assert "a calibration states them" not in choice.evidence
+    assert choice.evidence.endswith(f"{found.intrinsics['cam_0'].widened:.2g} times as wide")
 
 
 def test_exact_intrinsics_that_the_corners_contradict_are_named() -> None:

@@ -9,7 +9,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.logs import DetectionRecord, LogWriter, open_log
-from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics
+from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics, finding_against
 from gtsam_rwhec.pipeline.log_contract import detections_topic
 from gtsam_rwhec.rig import Rig, parse_rig
 from gtsam_rwhec.vision.camera import Camera
@@ -45,7 +45,8 @@ def found_in(folder: Path, rig: Rig, seen_by: Camera, target: str, *, reason: st
             )  # fmt: skip
             out.detections(topic, stamp, "camera", [record])
     with open_log(folder / "log.mcap") as log:
-        return doubted_intrinsics(log, rig, {"camera": camera_of(550.0, 240.0)})
+        doubted = doubted_intrinsics(log, rig, {"camera": camera_of(550.0, 240.0)})
+    return tuple(finding_against(name, one, rig) for name, one in doubted.items())
 
 
 def test_wrong_intrinsics_are_named_with_their_line_and_what_fits(tmp_path: Path) -> None:
@@ -78,6 +79,9 @@ def test_intrinsics_come_before_sizes_and_the_arm() -> None:
     judgement = Judgement.of([size, arm, intrinsics], "praise")
     assert judgement.verdict is Verdict.DO_NOT_USE
     assert judgement.grounds == (Ground.INTRINSICS_DOUBTED,)
+    free = Finding(Ground.NOT_UNIQUE, "the measurements do not determine all poses")
+    assert Judgement.of([free, intrinsics], "praise").grounds == (Ground.INTRINSICS_DOUBTED,)
+    assert "intrinsics: estimate" in str(judgement)
     assert str(judgement).startswith("Do not use these poses: the intrinsics of camera")
     assert "What to do: calibrate the intrinsics of the named sensor" in str(judgement)
     slightly = Finding(Ground.INTRINSICS_UNCERTAIN, intrinsics.words)

@@ -58,7 +58,7 @@ def test_images_alone_give_a_camera_that_the_log_records(circle_grid_10x10: Path
     assert "in its images of 640 x 480 pixels: radtan, fx, fy = 5" in words
     with open_log(out) as log:
         camera, rig = read_cameras(log)["camera"], read_embedded_rig(log)
-        assert doubted_intrinsics(log, rig, {"camera": camera}) == ()  # nobody stated them
+        assert doubted_intrinsics(log, rig, {"camera": camera}) == {}  # nobody stated them
     assert (camera.width, camera.height, camera.model) == (640, 480, "radtan")
     assert camera.K[[0, 1], [0, 1]] == pytest.approx(542.0, abs=8.0)  # of all 15 images together
     assert rig.sensors["camera"].stated == "unknown"

@@ -10,7 +10,7 @@ from cells_of_others import CIRCLES, WORKCELL
 from rwhec_factors import se3
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.errors import LogError
+from gtsam_rwhec.errors import LogError, LogWarning
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline import clean_log, detect_log, read_corners, solve_log, write_folder_log
 from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion
@@ -60,6 +60,28 @@ def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_c
         read = read_pairs(log, solved.rig)
     for pair, measured in solved.pairs.items():
         np.testing.assert_array_equal(measured.B, read[pair].B)
+
+
+def test_intrinsics_of_half_the_resolution_are_replaced_by_what_the_images_tell(
+    workcell_camera2: Path, tmp_path: Path
+) -> None:
+    """By the stated ones the boards' poses leave directions free; the corners of planes alone start the refinement."""
+    folder = tmp_path / "cell"
+    (folder / "image").mkdir(parents=True)
+    (folder / "pose").symlink_to(workcell_camera2 / "pose")
+    for image in sorted((workcell_camera2 / "image").glob("*.png"))[::2]:
+        (folder / "image" / image.name).symlink_to(image)
+    half = "{K: [685.5, 685.5, 480, 270], size: [1920, 1080], stated: calibration}"
+    with pytest.warns(LogWarning, match="poses have no image"):
+        corners_of(folder, WORKCELL.replace("intrinsic_pars_file.yaml", half), tmp_path)
+    solved = solve_log(tmp_path / "clean.mcap")
+    assert solved.judgement.grounds[0] is rw.Ground.INTRINSICS_ESTIMATED
+    assert solved.judgement.verdict is rw.Verdict.CARE
+    assert "like those of images of half the resolution" in solved.judgement.reason
+    assert solved.refined.intrinsics["camera2"].values[0] == pytest.approx(1371.0, abs=20.0)
+    np.testing.assert_allclose(solved.refined.Y["camera2"].translation(), [1.7666, 2.0622, 1.1559], atol=0.02)
+    (choice,) = (one for one in solved.calibration.choices if one.what == "intrinsics of camera2")
+    assert "do not fit the corners" in choice.evidence
 
 
 def test_nominal_intrinsics_of_other_people(circle_grid_10x10: Path, tmp_path: Path) -> None:

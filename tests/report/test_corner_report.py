@@ -129,8 +129,8 @@ def test_intrinsics_say_how_they_were_stated_and_what_the_images_do_not_tell(ref
     assert intrinsics_table(held).rows["cam_0 k1"][-1] == "images"
     unknown = changed(refined, stated_as="unknown", held_by_prior=("k2",))
     assert intrinsics_sentences(unknown)[0] == (
-        "cam_0: none were stated, so the images alone tell them; the images do not determine k2: nothing else tells "
-        "them."
+        "cam_0: no stated ones count, so the images alone tell them; the images do not determine k2: nothing else "
+        "tells them."
     )
     assert intrinsics_table(unknown).rows["cam_0 fx"][2:] == ("-", "-", "images")
     assert intrinsics_table(unknown).rows["cam_0 k2"][2:] == ("-", "-", "nothing")
