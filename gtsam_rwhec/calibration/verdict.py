@@ -171,7 +171,7 @@ _CALIBRATE_INTRINSICS = (
 )
 _MEASURE_BOARD = "measure the named board (sizes, gaps, and the place and turn of each tag), and correct the rig file"
 _ADVICE = {
-    Ground.MISREAD: "correct how the file is read, and calibrate again",
+    Ground.MISREAD: "correct how the measurements are read or given, and calibrate again",
     Ground.INTRINSICS_DOUBTED: _CALIBRATE_INTRINSICS,
     Ground.SHAPE_DOUBTED: _MEASURE_BOARD,
     Ground.IMPLAUSIBLE: (

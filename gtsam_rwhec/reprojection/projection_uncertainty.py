@@ -141,8 +141,8 @@ def uneven_words(projection_px: Regions, corners: Regions = ()) -> str:
     seen = f"; no corner was seen in {unseen} of these" if unseen else ""
     return (
         f"projections are uncertain by up to {rounded(max(known))} px in {len(far)} of {len(known)} parts of the "
-        f"image, and by {rounded(best)} px in the best part{seen}: take images with a target there, or do not use "
-        "these parts"
+        f"image (rms over a part), and by {rounded(best)} px in the best part{seen}: take images with a "
+        "target there, or do not use these parts"
     )
 
 

@@ -157,8 +157,9 @@ def test_a_camera_that_was_calibrated_from_a_corner_of_its_image_says_so(refined
     part = dataclasses.replace(refined, reprojection=dataclasses.replace(refined.reprojection, sensors=sensors))
     far = ((0.2, 0.4, 0.9), (0.3, 0.8, 2.0), (0.9, 2.0, 14.2))
     assert (
-        "cam_0: projections are uncertain by up to 14 px in 3 of 9 parts of the image, and by 0.2 px in the best part; "
-        "no corner was seen in 3 of these: take images with a target there, or do not use these parts."
+        "cam_0: projections are uncertain by up to 14 px in 3 of 9 parts of the image (rms over a part), and by 0.2 "
+        "px in the best part; no corner was seen in 3 of these: take images with a target there, or do not use these "
+        "parts."
     ) in intrinsics_sentences(changed(part, projection_px=far))
     for even in ((0.2, 0.4, 0.99), (0.3, 1.2, 1.4), (None, None, None)):
         said = intrinsics_sentences(changed(part, projection_px=(even,)))

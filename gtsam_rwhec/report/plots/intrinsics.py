@@ -156,8 +156,8 @@ def _draw_uncertainty(axes: Axes, of: PlottedIntrinsics) -> None:
         lines = axes.contour(u, v, shades, levels=levels, colors="black", linewidths=0.8, zorder=3)
         axes.clabel(lines, fmt=lambda level: f"{level:g} px", fontsize=8)
     axes.plot(*of.corners.pixels.T, ls="", marker=".", markersize=DOT, color="black", alpha=0.4, zorder=2)
-    where = f"how sure the lens is: single points at {rounded(of.distance_m)} m are projected"
-    _frame(axes, of, f"{where}\nwith deviations of {rounded(low)} to {rounded(high)} px")
+    where = f"how sure the lens is of single points at {rounded(of.distance_m)} m:"
+    _frame(axes, of, f"{where}\nprojections deviate by {rounded(low)} to {rounded(high)} px")
     axes.tick_params(labelleft=False)
 
 
@@ -183,5 +183,5 @@ def _draw_held_out(axes: Axes, of: PlottedIntrinsics) -> None:
                 left + 0.5 * across, top + 0.5 * down, words, ha="center", va="center",
                 color=GREY if px is None else "black", fontsize=9 if px is None else 12,
             )  # fmt: skip
-    _frame(axes, of, "error of corners in images that were left\nout of the calibration (px)")
+    _frame(axes, of, "rms error of corners by part of the image,\nin images that were left out (px)")
     axes.tick_params(labelleft=False)
