@@ -155,7 +155,12 @@ def found_tags(picture: np.ndarray) -> list[tuple[int, Array]]:
 
 @pytest.mark.parametrize(
     ("log", "camera"),
-    [("robot_cell", "cam_left"), ("robot_cell", "cam_wide"), ("eye_to_hand", "cam_front"), ("eye_to_hand", "cam_side")],
+    [
+        ("robot_cell", "cam_wide"),
+        ("eye_to_hand", "cam_front"),
+        pytest.param("robot_cell", "cam_left", marks=pytest.mark.slow),
+        pytest.param("eye_to_hand", "cam_side", marks=pytest.mark.slow),
+    ],
 )
 def test_targets_are_often_seen_where_the_truth_puts_them(log: str, camera: str, make_cell: ModuleType) -> None:
     cell, rig, true = make_cell.cell_of(camera), read_rig(CELL / LOGS[log][0]), truth(log)

@@ -28,8 +28,24 @@ def corners_of(folder: Path, text: str, out: Path) -> rw.Observations:
     return read_corners(out / "clean.mcap")
 
 
-def test_a_workcell_of_other_people(workcell_camera2: Path, tmp_path: Path) -> None:
-    observations = corners_of(workcell_camera2, WORKCELL, tmp_path)
+@pytest.fixture(scope="module")
+def workcell_log(workcell_camera2: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The cleaned log of the workcell."""
+    folder = tmp_path_factory.mktemp("workcell")
+    corners_of(workcell_camera2, WORKCELL, folder)
+    return folder / "clean.mcap"
+
+
+@pytest.fixture(scope="module")
+def circles_log(circle_grid_10x10: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The cleaned log of the grid of circles."""
+    folder = tmp_path_factory.mktemp("circles")
+    corners_of(circle_grid_10x10, CIRCLES, folder)
+    return folder / "clean.mcap"
+
+
+def test_a_workcell_of_other_people(workcell_log: Path) -> None:
+    observations = read_corners(workcell_log)
     view = observations.views["board", "camera2"]
     assert view.pixels.shape == (34, 12, 2)
     assert view.twist is None  # between stations nothing is known of the path
@@ -43,10 +59,9 @@ def test_a_workcell_of_other_people(workcell_camera2: Path, tmp_path: Path) -> N
     assert held_out_errors(found.observations, refined)["camera2"].rms_mm < 0.2
 
 
-def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_camera2: Path, tmp_path: Path) -> None:
+def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_log: Path) -> None:
     """Nominal intrinsics in its rig file: the simulator's own are within what the corners say of theirs."""
-    corners_of(workcell_camera2, WORKCELL, tmp_path)
-    solved = solve_log(tmp_path / "clean.mcap")
+    solved = solve_log(workcell_log)
     assert solved.judgement.verdict is rw.Verdict.USE
     found = solved.refined.intrinsics["camera2"]
     assert found.stated_as == "nominal"
@@ -56,7 +71,7 @@ def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_c
     assert sensor.held_out_mm is not None
     assert sensor.held_out_mm < 0.2
     # the log keeps the poses by the stated intrinsics: it can be solved again
-    with open_log(tmp_path / "clean.mcap") as log:
+    with open_log(workcell_log) as log:
         read = read_pairs(log, solved.rig)
     for pair, measured in solved.pairs.items():
         np.testing.assert_array_equal(measured.B, read[pair].B)
@@ -84,9 +99,9 @@ def test_intrinsics_of_half_the_resolution_are_replaced_by_what_the_images_tell(
     assert "do not fit the corners" in choice.evidence
 
 
-def test_nominal_intrinsics_of_other_people(circle_grid_10x10: Path, tmp_path: Path) -> None:
+def test_nominal_intrinsics_of_other_people(circles_log: Path) -> None:
     """With f, c and the spacing as stated the corners of images that are left out are predicted to 4.6 mm."""
-    observations = corners_of(circle_grid_10x10, CIRCLES, tmp_path)
+    observations = read_corners(circles_log)
     options = rw.CornerOptions(stated="nominal", carrier_noise="exact", size_share=0.03, outliers=False)
     found = rw.calibrate_corners(observations, options)
     camera = found.refined.intrinsics["camera"].camera
@@ -95,12 +110,9 @@ def test_nominal_intrinsics_of_other_people(circle_grid_10x10: Path, tmp_path: P
     assert held_out_errors(found.observations, found.refined, options)["camera"].rms_mm < 0.7 * 4.6
 
 
-def test_the_log_road_chooses_what_predicts_left_out_images_of_other_people(
-    circle_grid_10x10: Path, tmp_path: Path
-) -> None:
+def test_the_log_road_chooses_what_predicts_left_out_images_of_other_people(circles_log: Path) -> None:
     """Freeing the errors of A predicts them to 10 mm, A as exact to 2; and the arm's errors are named."""
-    corners_of(circle_grid_10x10, CIRCLES, tmp_path)
-    solved = solve_log(tmp_path / "clean.mcap")
+    solved = solve_log(circles_log)
     reprojection = solved.refined.reprojection
     assert reprojection is not None
     assert reprojection.carrier_poses == "exact"
