@@ -70,7 +70,9 @@ def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor
                 f"rig file, or the intrinsics of sensor {sensor}: with them poses are computed from corners"
             )
         return record
-    poses = plane_poses(camera, [target.corners()], [_in_our_order(record.corners_px)], corner_px=CORNER_PX)
+    corners_px = _in_our_order(record.corners_px)
+    record = replace(record, corners_px=corners_px)  # the refinement from corners reads them too
+    poses = plane_poses(camera, [target.corners()], [corners_px], corner_px=CORNER_PX)
     which = 0
     if record.T_camera_tag is not None:
         # Only the direction of the normal tells the two poses apart: drivers choose a tag's axes as they like.

@@ -182,3 +182,23 @@ def test_a_drivers_corners_outside_of_its_images_leave_the_poses_in_doubt(tmp_pa
     assert rw.Ground.CORNERS_DOUBTED in calibrated.judgement.grounds
     assert "outside images of 640 x 400 pixels" in calibrated.judgement.reason
     assert calibrated.judgement.verdict is rw.Verdict.CARE
+
+
+def test_corners_counterclockwise_as_of_the_apriltag_library_give_the_same_answer(tmp_path: Path) -> None:
+    """Poses read them clockwise, and the refinement as they came: it had tags upside down, to 0.1 pixel."""
+    text = made.RIG
+    for camera in made.CAMERAS:
+        topic = f"detections: /{camera}/tags"
+        text = text.replace(topic, f"{topic}\n    intrinsics: {{topic: /{camera}/camera_info}}")
+    wide = {"width": 1600, "height": 1200, "K": [400.0, 0.0, 800.0, 0.0, 400.0, 600.0, 0.0, 0.0, 1.0]}
+    messages = [made.camera_info(camera, **wide) for camera in made.CAMERAS]
+    for message in made.recording(2.5):
+        content = dict(message.content)
+        for one in content.get("detections", ()):
+            moved = [{"x": corner["x"] + 480.0, "y": corner["y"] + 360.0} for corner in one["corners_px"]]
+            one["corners_px"] = moved[::-1]
+        messages.append(replace(message, content=content))
+    refined = made.solved(tmp_path, messages, text).refined
+    assert refined.reprojection is not None
+    for name, truth in made.X.items():
+        assert refined.X[name].matrix() == pytest.approx(truth, abs=0.05)
