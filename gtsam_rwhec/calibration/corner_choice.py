@@ -21,7 +21,7 @@ from gtsam_rwhec.reprojection.options import CornerOptions
 from gtsam_rwhec.reprojection.refining_corners import refine_corners
 
 #: At most so many images are looked at, and of a pair at least so many.
-MOST_IMAGES, FEWEST_OF_PAIR = 120, 12
+MOST_IMAGES, FEWEST_OF_PAIR = 120, 8
 #: Images are left out in so many blocks; of so few images, in more: the rest must still tell what all of them tell.
 FOLDS, FEW, FOLDS_OF_FEW = 4, 50, 8
 #: A counts as exact where the error is below this share of that with its noise.

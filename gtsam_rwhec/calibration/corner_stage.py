@@ -14,7 +14,7 @@ import numpy as np
 from gtsam_rwhec.calibration.choices import Choice
 from gtsam_rwhec.calibration.corner_choice import Tried, chosen_model, thinned
 from gtsam_rwhec.calibration.verdict import Finding, Ground
-from gtsam_rwhec.errors import OutlierError, RwhecError
+from gtsam_rwhec.errors import CameraError, OutlierError, RwhecError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.geometry.poses import PoseLike
 from gtsam_rwhec.noise_model.found import NoiseInData
@@ -110,6 +110,11 @@ def corners_found(
         corners = refine_corners(observations, X, Y, tried.options, tell)
     except OutlierError as error:
         return CornersFound.none(f"the corners give none: {error}", Finding(Ground.CORNERS_DOUBTED, str(error)))
+    except (CameraError, UnderdeterminedError) as error:
+        words = (
+            f"the poses of targets take the stated intrinsics as exact, and the corners do not confirm them: {error}"
+        )
+        return CornersFound.none(f"the corners give none: {error}", Finding(Ground.CORNERS_DOUBTED, words))
     except RwhecError as error:
         return CornersFound.none(f"the corners give none: {error}")
     if is_doubtful(corners):

@@ -76,7 +76,7 @@ def _from_corners(
     lacking = logged.lacking(used)
     if lacking:
         return CornersFound.none(f"the detections of {', '.join(map(str, lacking[:5]))} have no corners")
-    start = rounds.refined(settled.pairs, settled.free, "time offsets")
+    start = settled.refined or rounds.refined(settled.pairs, settled.free, "time offsets")
     if start.free_directions:
         return CornersFound.none("the motion leaves poses free")
     try:

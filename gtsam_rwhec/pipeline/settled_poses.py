@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gtsam_rwhec.pipeline.solving_rounds import SolvingRounds, SynchronisedPairs
+from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.results.log_history import SizeFields
 
 
@@ -18,21 +19,25 @@ class SettledPoses:
     sizes : tuple of SizeFields
     free : frozenset of str
         Targets whose size is estimated.
+    refined : Refined or None
+        The refinement that says so, where the last round had one.
     """
 
     pairs: SynchronisedPairs
     sizes: tuple[SizeFields, ...] = ()
     free: frozenset[str] = frozenset()
+    refined: Refined | None = field(default=None, repr=False)
 
 
 def settled_poses(rounds: SolvingRounds, given: SynchronisedPairs) -> SettledPoses:
     """Settle outliers, time offsets and sizes."""
     rig = rounds.rig
     if rig.sizes == "known":
-        settled = rounds.settled(given, ())
-        return SettledPoses(settled, rounds.sizes_as_seen(settled))
+        settled, refined = rounds.settled(given, ())
+        return SettledPoses(settled, rounds.sizes_as_seen(settled), refined=refined)
     sizes, given = rounds.sizes(given)
     free: frozenset[str] = frozenset()
     if any(size.is_free for size in sizes):
         free = frozenset(rig.targets) - {size.target for size in sizes if not size.is_free}
-    return SettledPoses(rounds.settled(given, free), sizes, free)
+    settled, refined = rounds.settled(given, free)
+    return SettledPoses(settled, sizes, free, refined)

@@ -65,17 +65,14 @@ class SolvingRounds:
     estimated: tuple[str, ...]
     progress: Progress
 
-    def settled(self, given: SynchronisedPairs, free_sizes: Collection[str]) -> SynchronisedPairs:
-        """Mark outliers and estimate time offsets until neither changes.
-
-        Each round finds outliers at the present time offsets, then time offsets without the outliers.
-        """
-        return self._settled(given, free_sizes)[0]
-
-    def _settled(
+    def settled(
         self, given: SynchronisedPairs, free_sizes: Collection[str]
     ) -> tuple[SynchronisedPairs, Refined | None]:
-        """As `settled`, with the refinement that says that no time offset changes; None where there is none."""
+        """Mark outliers and estimate time offsets until neither changes.
+
+        Each round finds outliers at the present time offsets, then time offsets without the outliers. Beside the pairs
+        is the refinement that says that no time offset changes; None where there is none.
+        """
         last: Refined | None = None
         outliers: dict[Pair, np.ndarray] = {}
         everything = marked = given
@@ -199,7 +196,7 @@ class SolvingRounds:
             with warnings.catch_warnings():
                 if is_check:  # users get only the warnings of the answer
                     warnings.simplefilter("ignore", RwhecWarning)
-                marked, last = self._settled(given, self.rig.targets)
+                marked, last = self.settled(given, self.rig.targets)
                 refined = last or self.refined(marked, self.rig.targets, "time offsets")
         except ScaleError:
             if not is_check:

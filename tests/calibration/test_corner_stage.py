@@ -147,6 +147,8 @@ def test_few_images_are_not_left_out_and_nonsense_gives_nothing() -> None:
     nothing = corners_found(X, turned, few.observations, rw.CornerOptions(), silent)
     assert nothing.corners is None
     assert "behind" in str(nothing.choices[0])
+    assert [one.ground for one in nothing.findings] == [Ground.CORNERS_DOUBTED]
+    assert "take the stated intrinsics as exact" in nothing.findings[0].words
 
 
 def test_many_images_are_thinned_evenly() -> None:
