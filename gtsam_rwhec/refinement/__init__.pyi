@@ -4,4 +4,3 @@ from .refined import Movement as Movement
 from .refined import PairNoise as PairNoise
 from .refined import Refined as Refined
 from .refined import RefinedPoses as RefinedPoses
-from .refining import refine as refine

@@ -55,39 +55,9 @@ def refine(
     *,
     progress: Progress | None = None,
 ) -> Refined:
-    """Refine a certified solution in GTSAM under the full noise model, with covariances of all unknowns.
+    """The part of ``rw.refine`` that is from poses: `gtsam_rwhec.reprojection.refining.refine` describes it.
 
-    Parameters
-    ----------
-    problem : Problem
-        A problem that kept its raw measurements, unless ``residual="chordal"`` and ``robust="none"``.
-    solution : Solution or None
-        The start: the result of ``solve`` for this problem. With robust="gnc" it may be None, for outliers may leave
-        ``solve`` without an answer (a negative scale); ``moved`` is then from the inliers' solution.
-    options : RefineOptions, optional
-    progress : callable, optional
-        Is called with the name of each stage.
-
-    Raises
-    ------
-    FrameError, ScaleError, PriorError
-        If the solution is of another problem.
-    MeasurementsNotKeptError
-        If raw measurements are needed and the problem did not keep them.
-    NoiseError, OptionError, CountError
-        If the noise cannot be estimated or used, or options contradict each other.
-    OutlierError
-        With robust="gnc", if too few measurements agree with each other.
-
-    Warns
-    -----
-    NotUniqueWarning
-        If the measurements leave directions free, by name; variances are infinite there.
-    WeightsWarning
-        If the residuals show that the given noise is too small, or measurements share A's noise and
-        ``carrier_model="propagated"`` does not treat it so.
-    NotConvergedWarning
-        If iterations ended at their limit.
+    Warnings point to the caller of that function, one frame above this one's.
     """
     options = RefineOptions() if options is None else options
     check_progress(progress)
