@@ -12,6 +12,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from gtsam_rwhec.calibration.choices import Choice
 from gtsam_rwhec.calibration.corner_stage import SIZE_SHARE, CornersFound, corners_found
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.errors import CameraError, RwhecError
@@ -92,7 +93,13 @@ def _from_corners(
         about=motion.about,
         time_offsets=tuple(name for name in rounds.estimated if name in observations.sensors),
     )
-    return corners_found(start.X, start.Y, observations, options, rounds.progress)
+    found = corners_found(start.X, start.Y, observations, options, rounds.progress)
+    missing = logged.without_corners(used)
+    if found.corners is None or not missing:
+        return found
+    counts = ", ".join(f"{number} of {pair}" for pair, number in missing.items())
+    left_out = Choice("measurements without corners", f"{counts} do not count in the poses", "the others have corners")
+    return replace(found, choices=(*found.choices, left_out))
 
 
 def _with_estimated(

@@ -49,6 +49,15 @@ class LogCorners:
             pair for pair, measured in pairs.items() if measured.used.any() and not len(self.seen(measured)[0])
         )
 
+    def without_corners(self, pairs: Mapping[Pair, MeasuredPairs]) -> dict[Pair, int]:
+        """How many used measurements have no corners, of the pairs of which some have."""
+        missing = {
+            pair: int(measured.used.sum()) - number
+            for pair, measured in pairs.items()
+            if (number := len(self.seen(measured)[0]))
+        }
+        return {pair: number for pair, number in missing.items() if number}
+
     def seen(self, measured: MeasuredPairs) -> tuple[np.ndarray, Array]:
         """A pair's used measurements with corners (V,), and their pixels (V, n, 2), nan where a corner was not seen."""
         number = len(self.targets[measured.target])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,16 @@ from rwhec_factors import se3
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.errors import LogError, LogWarning
+from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline import clean_log, detect_log, read_corners, solve_log, write_folder_log
-from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion
+from gtsam_rwhec.pipeline.carrier_motion import CarrierMotion, read_carrier_motion
+from gtsam_rwhec.pipeline.corner_answer import corner_answer
+from gtsam_rwhec.pipeline.log_corners import LogCorners
+from gtsam_rwhec.pipeline.log_metadata import read_cameras, read_embedded_rig
 from gtsam_rwhec.pipeline.measured_pairs import read_pairs
+from gtsam_rwhec.pipeline.settled_poses import SettledPoses
+from gtsam_rwhec.pipeline.solving_rounds import SolvingRounds, SynchronisedPairs
 from gtsam_rwhec.reprojection import held_out_errors
 from gtsam_rwhec.rig.rig_file import parse_rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
@@ -75,6 +82,25 @@ def test_the_log_road_refines_a_workcell_of_other_people_from_corners(workcell_l
         read = read_pairs(log, solved.rig)
     for pair, measured in solved.pairs.items():
         np.testing.assert_array_equal(measured.B, read[pair].B)
+
+
+def test_measurements_without_corners_beside_others_are_counted(workcell_log: Path) -> None:
+    with open_log(workcell_log) as log:
+        rig = read_embedded_rig(log)
+        whole, pairs = LogCorners.of(log, rig, rig.sensors), read_pairs(log, rig)
+        cameras, motion = read_cameras(log), read_carrier_motion(log, rig)
+    assert whole.without_corners(pairs) == {}
+    (pair,) = pairs
+    first = min(stamp for _, _, stamp in whole.detections)
+    some = replace(whole, detections={key: one for key, one in whole.detections.items() if key[2] != first})
+    assert some.without_corners(pairs) == {pair: 1}
+    given, rounds = SynchronisedPairs(pairs, {"camera2": 0.0}), SolvingRounds(rig, motion, (), silent)
+    _, found = corner_answer(SettledPoses(given), given, rounds, some, cameras)
+    assert found.corners is not None
+    assert "1 of board-camera2 do not count in the poses" in str(found.choices[-1])
+    none = replace(whole, detections={})
+    assert none.without_corners(pairs) == {}
+    assert none.lacking(pairs) == (pair,)
 
 
 def test_intrinsics_of_half_the_resolution_are_replaced_by_what_the_images_tell(
