@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 from corner_problems import CAMERAS, GRID, SQUARE, seen
+from problems_of_corners import problem_of
 from rwhec_factors import se3
 
 from gtsam_rwhec.errors import CameraError, CountError, FrameError, NoiseError, OptionError, TargetError
 from gtsam_rwhec.methods import MethodOptions, compare, run
 from gtsam_rwhec.methods import reprojection as methods
 from gtsam_rwhec.methods.corner_costs import Corners
-from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.options import CarrierNoise
 from gtsam_rwhec.reprojection.observations import Observations
 from gtsam_rwhec.simulate.simulation import frame_distance
@@ -47,17 +47,7 @@ def test_with_a_noise_of_a_ours_has_the_minimum_of_the_graph() -> None:
 
 def test_corners_that_a_problem_holds_are_solved_beside_methods_on_poses() -> None:
     observations, _, Y = seen(0.3, 4)
-    problem = Problem()
-    for (target, sensor), view in observations.views.items():
-        problem.add_corners(
-            target,
-            sensor,
-            view.A,
-            view.pixels,
-            observations.corners[target],
-            observations.cameras[sensor],
-            corner_px=0.3,
-        )
+    problem = problem_of(dataclasses.replace(observations, corner_px=0.3))
     found = compare(problem, methods=("tabb2017_rp1", "evangelista2023", "certified"))
     answers = {row.method.name: row.estimate for row in found.rows}
     by_itself = methods.run("tabb2017_rp1", observations)

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from problems_of_cells import problem_of
+from problems_of_corners import problem_of
 from simulated_cells import CAMERA, Cell, cell
 
 import gtsam_rwhec as rw

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_as_refined import made
-from problems_of_cells import problem_of
+from problems_of_corners import problem_of
 from simulated_cells import CAMERA, cell
 
 import gtsam_rwhec as rw

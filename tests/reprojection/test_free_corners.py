@@ -8,7 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from problems_of_cells import problem_of
+from problems_of_corners import problem_of
 from rwhec_factors import se3
 from scipy.stats import chi2
 from simulated_boards import misprinted
