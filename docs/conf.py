@@ -1,0 +1,27 @@
+"""How Sphinx makes the guide: `python -m sphinx -W -n --keep-going -b html docs OUTPUT`, from the repository's root."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parent), str(HERE.parent / "factors"), str(HERE)]
+
+import gtsam_rwhec  # noqa: E402
+
+project = "gtsam-rwhec"
+author = "The gtsam-rwhec authors"
+release = version = gtsam_rwhec.__version__
+
+extensions = ["myst_parser", "building.repository_pages"]
+exclude_patterns = ["building"]
+nitpicky = True
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4  # the anchors that links on a repository's page have too
+
+html_theme = "furo"
+html_title = "gtsam-rwhec"
+html_show_sourcelink = False
+html_copy_source = False
