@@ -57,6 +57,7 @@ from .reprojection import calibrate_corners as calibrate_corners
 from .reprojection import refine_corners as refine_corners
 
 # Keep it in files, print it, draw it.
+from . import evidence as evidence
 from . import report as report
 from . import results as results
 from .results import judge as judge

@@ -54,6 +54,7 @@ TABLE: dict[str, dict[str, str]] = {
         "cli/test_wheel.py": "demo",
         "pipeline/test_commands.py": "clean convert detect export init solve",
     },
+    "gtsam_rwhec/evidence": {"report/page/test_written.py": "evidence gathered inputs measured record"},
     "gtsam_rwhec/compat": {
         "compat/test_opencv.py": (
             "andreff certified daniilidis dqopt inputs pair_translations quaternion_methods robot_world stations"
@@ -117,7 +118,7 @@ TABLE: dict[str, dict[str, str]] = {
         ),
     },
     "gtsam_rwhec/pipeline": {
-        "pipeline/test_all_stages.py": "image_options",
+        "pipeline/test_all_stages.py": "image_options log_evidence log_report",
         "vision/test_likely_causes.py": "causes_in_words likely_causes",
         "pipeline/test_seen_sheet.py": "detected_source image_names",
         "pipeline/test_bad_logs.py": "no_detections",
@@ -153,6 +154,8 @@ TABLE: dict[str, dict[str, str]] = {
         "methods/test_comparison.py": "comparison_report",
         "report/test_solution_report.py": "pose_table printing sentences",
     },
+    "gtsam_rwhec/report/page": {"report/page/test_written.py": "blocks figures html shown_result"},
+    "gtsam_rwhec/report/page/sections": {"report/page/test_written.py": "inputs verdict"},
     "gtsam_rwhec/report/plots": {
         "report/plots/test_plots.py": "coverage deviations frames intrinsics plotted residuals",
     },

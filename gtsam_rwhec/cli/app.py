@@ -24,6 +24,7 @@ from gtsam_rwhec.cli.export import export
 from gtsam_rwhec.cli.failures import failures_in_words
 from gtsam_rwhec.cli.fetch import utias
 from gtsam_rwhec.cli.init import init
+from gtsam_rwhec.cli.report import report
 from gtsam_rwhec.cli.solve import solve
 from gtsam_rwhec.files.terminal_text import printable, say
 
@@ -78,7 +79,7 @@ def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
     to.command(epilog=HELP)(run)
 
 
-for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, compare):
+for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare):
     add(subcommand, app)
 add(utias, fetch_app)
 

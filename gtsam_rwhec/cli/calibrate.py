@@ -30,6 +30,7 @@ from gtsam_rwhec.cli.options import (
     say_exported,
     show,
 )
+from gtsam_rwhec.cli.report import report_path
 from gtsam_rwhec.cli.roads import refuse
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import say, shown_path
@@ -204,21 +205,43 @@ def calibrate(
             of_reading = rw.reading_of(problem, solution, stage).finding if is_optimal else None
             findings = () if of_reading is None else (of_reading,)
             write = partial(rw.write_solution, solution)
+            evidence = None
             report = partial(rw.report.print_solution, solution, findings=findings)
             judgement = rw.judge(solution, findings=findings)
         else:
             options = rw.CalibrateOptions(noise=noise, robust=robust, carrier_noise=carriers, misreadings=not as_read)
             calibration = rw.calibrate(problem, options, progress=stage)
             write = partial(rw.write_calibration, calibration)
+            evidence = None if output is None else partial(_evidence, source, problem, calibration)
             report = partial(rw.report.print_calibration, calibration)
             judgement = calibration.judgement
     try:
         if output is not None:
             write(output)
-            say(f"Written to {shown_path(output)}.", to_errors=True)
+            page = _write_report(output, None if evidence is None else evidence())
+            beside = "" if page is None else f"; report: {shown_path(page)}"
+            say(f"Written to {shown_path(output)}{beside}.", to_errors=True)
     finally:  # the report is printed even if the file cannot be written
         report()
     return exit_status(judgement)
+
+
+def _evidence(source: Path, problem: rw.Problem, calibration: rw.Calibration) -> rw.evidence.Evidence:
+    """What the report shows beside the calibration of a folder of CSV files, or of a file of samples."""
+    read = sorted(source.glob("*.csv")) if source.is_dir() else [source]
+    inputs = rw.evidence.Inputs(files=rw.evidence.input_files(read), versions=rw.evidence.versions())
+    return rw.evidence.evidence_of(problem, calibration, inputs)
+
+
+def _write_report(output: Path, evidence: rw.evidence.Evidence | None) -> Path | None:
+    """Write the page of a result beside it, and its evidence; the page's path."""
+    if output.suffix != ".json":
+        return None  # a device, or a name that somebody chose for a reason: nothing is written beside it
+    if evidence is not None:
+        rw.evidence.write_evidence(evidence, rw.evidence.evidence_path(output))
+    page = report_path(output)
+    rw.report.write_html(output, page)
+    return page
 
 
 def is_log(source: Path) -> bool:

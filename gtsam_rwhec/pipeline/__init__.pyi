@@ -22,6 +22,7 @@ from .samples_log import write_samples_log as write_samples_log
 from .earlier_output import earlier_run as earlier_run
 from .image_options import check_drawable as check_drawable
 from .log_contract import CLEAN_LOG as CLEAN_LOG
+from .log_contract import REPORT_FILE as REPORT_FILE
 from .log_contract import RESULT_FILE as RESULT_FILE
 from .log_corners import read_corners as read_corners
 from .log_metadata import LogMetadata as LogMetadata

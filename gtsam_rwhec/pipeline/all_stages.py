@@ -40,6 +40,7 @@ from gtsam_rwhec.pipeline.log_contract import (
     is_from_stage,
 )
 from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig, read_metadata
+from gtsam_rwhec.pipeline.log_report import write_report
 from gtsam_rwhec.pipeline.output_paths import INSIDE, LEFT, check_is_not_read, made_folder, made_output_folder
 from gtsam_rwhec.pipeline.samples_log import is_file_of_samples, write_samples_log
 from gtsam_rwhec.pipeline.solution_frames import frames_of
@@ -70,9 +71,9 @@ def calibrate_log(
 
     The folder gets ``clean.mcap``, ``result.json``, ``static_tf.launch.py``, ``tf.yaml``, ``rig.urdf.xacro``,
     ``camchain.yaml``, ``cameras.opencv.yaml``, ``cameras.txt`` (COLMAP's), ``camera_info/`` (ROS's, one file a camera),
-    ``seen.png`` (a contact sheet of the images) and ``plots/``. For a log that a stage wrote, only the stages after it
-    run. A cleaned log is cleaned again if the settings for cleaning in `rig` differ from those that
-    the log was cleaned with.
+    ``seen.png`` (a contact sheet of the images), ``plots/``, and ``report.html`` with its ``evidence.json``. For a log
+    that a stage wrote, only the stages after it run. A cleaned log is cleaned again if the settings for cleaning in
+    `rig` differ from those that the log was cleaned with.
 
     During the work the folder has the detections so far. A run that was interrupted, or killed, goes on from them when
     it is started again: what it finds is the same as without the interruption. Images, sensors, targets and options of
@@ -139,7 +140,7 @@ def calibrate_log(
             return _from_raw(files, rig, output, images=images, workers=workers, anyway=anyway, progress=progress)
         output.begin()
         return _from_stage(
-            files[0], rig, output.path, is_cleaned=is_cleaned, images=images, anyway=anyway, progress=progress
+            files[0], rig, output.path, files, is_cleaned=is_cleaned, images=images, anyway=anyway, progress=progress
         )
 
 
@@ -162,25 +163,30 @@ def _from_raw(
     detected = output.path / DETECTED_LOG
     sheet = output.path / SEEN_SHEET
     detect_log(list(files), rig, detected, images=images, workers=workers, sheet=sheet, progress=progress, keep=keep)
-    return _from_stage(detected, rig, output.path, is_cleaned=False, images=images, anyway=anyway, progress=progress)
+    sources = files if folder is None else sorted(path for path in folder.rglob("*") if path.is_file())
+    return _from_stage(
+        detected, rig, output.path, sources, is_cleaned=False, images=images, anyway=anyway, progress=progress
+    )
 
 
 def _from_stage(
     source: Path,
     rig: Rig | None,
     out: Path,
+    sources: list[Path],
     *,
     is_cleaned: bool,
     images: Images,
     anyway: bool,
     progress: Progress | None,
 ) -> Calibrated:
-    """The stages after the one that wrote the log."""
+    """The stages after the one that wrote the log; the measurements come from the files `sources`."""
     if not is_cleaned:
         clean_log(source, out / CLEAN_LOG, rig, images=images, progress=progress)
         source = out / CLEAN_LOG
     calibrated = solve_into(source, rig, out, images=images, progress=progress)
     export_solved(out / CLEAN_LOG, out, anyway=anyway, progress=progress)
+    list_written(out, calibrated.log.detection.sources, write_report(calibrated, out, sources, progress))
     return calibrated
 
 

@@ -44,6 +44,10 @@ DETECTED_LOG = "detected.mcap"
 CLEAN_LOG = "clean.mcap"
 #: The result's file in the output folder has this name, and so has its copy attached to the solved log.
 RESULT_FILE = "result.json"
+#: What the report shows beside the result, in the output folder.
+EVIDENCE_FILE = "evidence.json"
+#: The report, in the output folder.
+REPORT_FILE = "report.html"
 #: The contact sheet of the images in the output folder: what was found, and what was not.
 SEEN_SHEET = "seen.png"
 #: The pictures are in this folder of the output folder.

@@ -9,13 +9,23 @@ from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.export.files import FILES, FOLDERS, SUFFIX
 from gtsam_rwhec.files.atomic_write import why_not_writable
 from gtsam_rwhec.logs import Log
-from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, DETECTED_LOG, PLOTS_FOLDER, RESULT_FILE, SEEN_SHEET
+from gtsam_rwhec.pipeline.log_contract import (
+    CLEAN_LOG,
+    DETECTED_LOG,
+    EVIDENCE_FILE,
+    PLOTS_FOLDER,
+    REPORT_FILE,
+    RESULT_FILE,
+    SEEN_SHEET,
+)
 from gtsam_rwhec.pipeline.solution_plots import COVERAGE, DEVIATIONS, FRAMES, INTRINSICS, RESIDUALS
 
 #: All files that a calibration leaves in its folder, relative to it. A file that is written there has its name here.
 LEFT = (
     CLEAN_LOG,
+    REPORT_FILE,
     RESULT_FILE,
+    EVIDENCE_FILE,
     *FILES,
     SEEN_SHEET,
     *(f"{PLOTS_FOLDER}/{name}" for name in (FRAMES, RESIDUALS, COVERAGE, DEVIATIONS, INTRINSICS)),

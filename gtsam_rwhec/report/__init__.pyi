@@ -11,3 +11,4 @@ from .pose_table import target_table as target_table
 from .sentences import certificate_sentence as certificate_sentence
 from .solution_report import print_solution as print_solution
 from .printing import report_console as report_console
+from .page.written import write_html as write_html

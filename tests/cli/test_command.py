@@ -106,7 +106,7 @@ def test_the_real_dataset_and_its_result_file(utias_folder: Path, tmp_path: Path
     assert done.returncode == 0, done.stderr
     assert "16 targets, 8 sensors, 73 pairs, 3230 measurements" in done.stdout
     assert "this answer costs 8.281245" in done.stdout
-    assert f"Written to {result}." in done.stderr
+    assert f"Written to {result}; report: {tmp_path / 'report.html'}." in done.stderr
     solution = rw.read_solution(result)
     assert solution.certificate.is_certified
     assert solution.cost == pytest.approx(8.2812454, abs=1e-7)
@@ -264,7 +264,7 @@ def test_refined_and_free_is_status_3(tmp_path: Path) -> None:
     folder = write_csv(general(2, 2, seed=5, motion="planar", noise=NOISE).problem, tmp_path)
     done = run("calibrate", folder, "--sigma", 0.005, "--kappa", 6000, "--noise", "given", "-o", tmp_path / "r.json")
     assert done.returncode == 3
-    assert without_stages(done.stderr) == [f"Written to {tmp_path / 'r.json'}."]
+    assert without_stages(done.stderr) == [f"Written to {tmp_path / 'r.json'}; report: {tmp_path / 'r.html'}."]
     assert " free " in done.stdout
     (direction,) = [line for line in done.stdout.splitlines() if "Not determined: " in line]
     assert all(name in direction for name in ("tag_0", "tag_1", "cam_0", "cam_1"))  # they move together

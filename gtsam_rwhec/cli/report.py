@@ -1,0 +1,44 @@
+"""``gtsam-rwhec report``: the report of a result as one HTML file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.cli.failures import check_output
+from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say, shown_path
+
+
+def report(
+    result: Annotated[Path, typer.Argument(help="Output folder of a calibration, or its result file (JSON).")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The HTML file.", show_default="report.html beside the result"),
+    ] = None,
+) -> ExitStatus:
+    """Write the report of a finished calibration as one HTML file, which needs no network.
+
+    ``calibrate`` writes it at its end; this command writes it again, or for results of other versions.
+    """
+    if output is None:
+        output = report_path(result)
+    check_output(output)
+    with StageDisplay() as stage:
+        stage("writing the report")
+        rw.report.write_html(result, output)
+    say(f"Written to {shown_path(output)}.", to_errors=True)
+    return ExitStatus.DONE
+
+
+def report_path(result: Path) -> Path:
+    """Where the page of a result is: report.html in its folder or beside result.json, NAME.html beside NAME.json."""
+    if result.is_dir():
+        return result / rw.pipeline.REPORT_FILE
+    if result.name == rw.pipeline.RESULT_FILE:
+        return result.with_name(rw.pipeline.REPORT_FILE)
+    return result.with_suffix(".html")

@@ -1,0 +1,11 @@
+from .evidence import Evidence as Evidence
+from .evidence import evidence_path as evidence_path
+from .evidence import read_evidence as read_evidence
+from .evidence import write_evidence as write_evidence
+from .gathered import evidence_of as evidence_of
+from .inputs import InputFile as InputFile
+from .inputs import Inputs as Inputs
+from .inputs import input_files as input_files
+from .inputs import versions as versions
+from .measured import MeasuredRows as MeasuredRows
+from .measured import measured_rows as measured_rows

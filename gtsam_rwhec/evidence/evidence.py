@@ -1,0 +1,66 @@
+"""The evidence of a calibration: the record, and its file beside the result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, Literal
+
+from pydantic import Field, ValidationError
+
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.evidence.inputs import Inputs
+from gtsam_rwhec.evidence.record import EvidenceRecord
+from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.results.json_tree import in_words
+
+FORMAT: Final = "gtsam-rwhec evidence"
+#: It grows whenever a reader of the version before would misread or refuse the file.
+FORMAT_VERSION: Final = 1
+#: Bytes of the largest file that is read.
+MOST_BYTES = 100_000_000
+
+
+class Evidence(EvidenceRecord):
+    """What a report shows beside the result. A part is None where its data are missing."""
+
+    format: Literal["gtsam-rwhec evidence"] = FORMAT
+    format_version: Literal[1] = FORMAT_VERSION
+    inputs: Inputs | None = Field(default=None, description="files, versions, options, rig file")
+
+
+def evidence_path(result_path: str | Path) -> Path:
+    """Where the evidence of a result file is: evidence.json beside result.json, NAME.evidence.json beside NAME.json."""
+    path = Path(result_path)
+    return path.with_name("evidence.json" if path.name == "result.json" else f"{path.stem}.evidence.json")
+
+
+def write_evidence(evidence: Evidence, path: str | Path) -> None:
+    """Write the evidence as JSON.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written.
+    """
+    write_atomically(path, evidence_json(evidence))
+
+
+def evidence_json(evidence: Evidence) -> bytes:
+    """What `write_evidence` writes."""
+    return evidence.model_dump_json(indent=1).encode("utf-8") + b"\n"
+
+
+def read_evidence(path: str | Path) -> Evidence:
+    """Read a file that `write_evidence` wrote.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be read, or is not the evidence of this version; the message has the field.
+    """
+    content = read_whole(path, MOST_BYTES, "The evidence was")
+    try:
+        return Evidence.model_validate_json(content)
+    except ValidationError as error:
+        raise FileFormatError(f"{path} is not the evidence of a calibration: {in_words(error)}") from error

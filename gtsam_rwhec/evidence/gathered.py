@@ -1,0 +1,30 @@
+"""The evidence of a calibration from a problem, gathered."""
+
+from __future__ import annotations
+
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.evidence.evidence import Evidence
+from gtsam_rwhec.evidence.inputs import Inputs, versions
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.problem.problem import Problem
+
+
+@one_blas_thread()
+def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | None = None) -> Evidence:
+    """What a report shows beside a calibration.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was calibrated, with its measurements.
+    calibration : Calibration
+        What ``calibrate`` returned for it.
+    inputs : Inputs, optional
+        The files that the problem was read from; without them only versions are known.
+
+    Raises
+    ------
+    MeasurementsNotKeptError
+        The problem was made with ``keep_measurements=False``.
+    """
+    return Evidence(inputs=Inputs(files=(), versions=versions()) if inputs is None else inputs)

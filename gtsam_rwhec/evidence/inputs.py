@@ -1,0 +1,61 @@
+"""What a calibration was made of: files with checksums, versions, options, and the rig file's text."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from pydantic import Field
+
+from gtsam_rwhec.evidence.record import EvidenceRecord
+
+#: The packages whose versions decide the last digits of an answer.
+PACKAGES = ("gtsam-rwhec", "gtsam", "numpy", "scipy", "clarabel", "opencv-python-headless", "mcap")
+#: Bytes that are read at once for a checksum.
+PIECE = 1 << 20
+
+
+class InputFile(EvidenceRecord):
+    """A file that was read."""
+
+    name: str = Field(description="its name, without its folder")
+    bytes: int = Field(description="its size", ge=0)
+    sha256: str = Field(description="checksum of its content", pattern="[0-9a-f]{64}")
+
+
+class Inputs(EvidenceRecord):
+    """All that is needed to make a calibration again."""
+
+    files: tuple[InputFile, ...] = Field(description="the files with the measurements")
+    command: str = Field(default="", description="the command, or the call, that made it")
+    versions: dict[str, str] = Field(description="of the packages that decide the answer, and of Python")
+    options: dict[str, str] = Field(default={}, description="options of the calibration, by name")
+    rig_file: str | None = Field(default=None, description="the text of the rig file")
+
+
+def versions() -> dict[str, str]:
+    """Versions of `PACKAGES` that are installed, and of Python."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # other builds of OpenCV have other names
+            continue
+    return found
+
+
+def input_files(paths: Iterable[str | Path]) -> tuple[InputFile, ...]:
+    """The files, each with its size and checksum, as they are now."""
+    return tuple(_input_file(Path(path)) for path in paths)
+
+
+def _input_file(path: Path) -> InputFile:
+    digest, size = hashlib.sha256(), 0
+    with path.open("rb") as stream:
+        while piece := stream.read(PIECE):
+            digest.update(piece)
+            size += len(piece)
+    return InputFile(name=path.name, bytes=size, sha256=digest.hexdigest())

@@ -1,0 +1,14 @@
+from .blocks import CopyText as CopyText
+from .blocks import Drawing as Drawing
+from .blocks import Chart as Chart
+from .blocks import Folded as Folded
+from .blocks import Listing as Listing
+from .blocks import Number as Number
+from .blocks import Page as Page
+from .blocks import Paragraph as Paragraph
+from .blocks import Picture as Picture
+from .blocks import Section as Section
+from .blocks import Table as Table
+from .html import page_html as page_html
+from .html import write_page as write_page
+from .shown_result import ShownResult as ShownResult

@@ -1,0 +1,167 @@
+"""The blocks of a page: what a section may hold. They say what is shown; the template says how.
+
+Every text is shown as text: a name that is HTML comes out as it is written. A ``Number`` knows its place in the result
+file or in the evidence, so that a test can read both and compare them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from gtsam_rwhec.files.terminal_text import printable
+
+#: How a paragraph is meant.
+Tone = Literal["plain", "lead", "note", "good", "care", "bad"]
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number of the result's JSON as it is shown.
+
+    Attributes
+    ----------
+    of : str
+        Where it stands: "result.json#/refined/cost", a JSON pointer in the named file.
+    value : float or None
+        As it stands there; None is an infinite number.
+    times : float
+        It is shown multiplied by this: 1e3 shows metres as millimetres.
+    spec : str
+        How it is formatted, as for `format`.
+    unit : str
+        Written after it.
+    """
+
+    of: str
+    value: float | None
+    times: float = 1.0
+    spec: str = ".4g"
+    unit: str = ""
+
+    @property
+    def text(self) -> str:
+        """As people read it."""
+        if self.value is None or not math.isfinite(self.value):
+            return "free"
+        return f"{self.times * self.value:{self.spec}}"
+
+
+#: A piece of a sentence, or a cell.
+Piece = str | Number
+#: A sentence: pieces one after the other.
+Words = Piece | tuple[Piece, ...]
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A paragraph."""
+
+    words: Words
+    tone: Tone = "plain"
+    kind: str = field(default="paragraph", init=False)
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A list of sentences."""
+
+    items: tuple[Words, ...]
+    kind: str = field(default="listing", init=False)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; the first cell of each row is its heading. Cells that are a ``Number`` stand to the right."""
+
+    caption: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[Words, ...], ...]
+    legend: str = ""
+    kind: str = field(default="table", init=False)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure as SVG, made by ``report.page.figures.svg_figure``. `says` is what it shows, for who cannot see it."""
+
+    name: str
+    title: str
+    says: str
+    svg: str
+    is_wide: bool = False
+    kind: str = field(default="chart", init=False)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photograph: JPEG or PNG bytes."""
+
+    name: str
+    title: str
+    says: str
+    content: bytes
+    media_type: Literal["image/jpeg", "image/png"] = "image/jpeg"
+    kind: str = field(default="picture", init=False)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A scene in 3D that can be turned: traces and layout of plotly, and a still picture for paper."""
+
+    name: str
+    title: str
+    says: str
+    traces: tuple[Mapping[str, Any], ...]
+    layout: Mapping[str, Any]
+    still_svg: str
+    kind: str = field(default="drawing", init=False)
+
+
+@dataclass(frozen=True)
+class CopyText:
+    """A text that a button copies."""
+
+    name: str
+    title: str
+    text: str
+    kind: str = field(default="copy", init=False)
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Blocks that are seen when somebody asks for them. On paper they are open."""
+
+    title: str
+    blocks: tuple[Block, ...]
+    kind: str = field(default="folded", init=False)
+
+
+Block = Paragraph | Listing | Table | Chart | Picture | Drawing | CopyText | Folded
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section. ``missing`` says why there is nothing to show, where there is not."""
+
+    name: str
+    title: str
+    blocks: tuple[Block, ...] = ()
+    missing: str = ""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page: its title, the verdict's tone, and its sections in order."""
+
+    title: str
+    tone: Literal["good", "care", "bad"]
+    sections: tuple[Section, ...]
+    made_by: str
+
+
+def safe(text: str) -> str:
+    """A text without signs that steer a terminal, for who copies it there."""
+    return printable(text)

@@ -1,0 +1,16 @@
+"""The sections of a report, in the order of the page: one module each."""
+
+from __future__ import annotations
+
+from gtsam_rwhec.report.page.blocks import Section
+from gtsam_rwhec.report.page.sections.inputs import inputs_section
+from gtsam_rwhec.report.page.sections.verdict import verdict_section
+from gtsam_rwhec.report.page.shown_result import ShownResult
+
+#: The functions that make them.
+SECTIONS = (verdict_section, inputs_section)
+
+
+def sections_of(shown: ShownResult) -> tuple[Section, ...]:
+    """All sections of a result."""
+    return tuple(section(shown) for section in SECTIONS)

@@ -1,0 +1,69 @@
+"""The result that a page shows: its JSON, the records that were read from it, and the evidence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from gtsam_rwhec.evidence import Evidence
+from gtsam_rwhec.evidence.evidence import evidence_json
+from gtsam_rwhec.report.page.blocks import Number
+from gtsam_rwhec.results.result_file import Result, parse_result
+
+
+@dataclass(frozen=True, eq=False)
+class ShownResult:
+    """A result as its page shows it.
+
+    Attributes
+    ----------
+    tree : dict
+        The result's JSON.
+    result : Result or None
+        The same as records; None where the calibration has no answer.
+    evidence : Evidence or None
+    name : str
+        Of the result's file.
+    """
+
+    tree: Mapping[str, Any]
+    result: Result | None
+    evidence: Evidence | None
+    name: str
+
+    @staticmethod
+    def of(content: bytes, evidence: Evidence | None, name: str = "result.json") -> ShownResult:
+        """Of a result file's content.
+
+        Raises
+        ------
+        FileFormatError, ResultVersionError
+            As `read_result` does; a result without an answer is shown all the same.
+        """
+        tree = json.loads(content)
+        has_answer = not (isinstance(tree, dict) and "certified" not in tree and "verdict_reason" in tree)
+        return ShownResult(tree, parse_result(content, name) if has_answer else None, evidence, name)
+
+    @cached_property
+    def evidence_tree(self) -> Any:
+        """The evidence's JSON; an empty object without evidence."""
+        return {} if self.evidence is None else json.loads(evidence_json(self.evidence))
+
+    def number(self, *path: str | int, times: float = 1.0, spec: str = ".4g", unit: str = "") -> Number:
+        """The number at a place of the result's JSON."""
+        return _number(self.tree, "result.json", path, times, spec, unit)
+
+    def evident(self, *path: str | int, times: float = 1.0, spec: str = ".4g", unit: str = "") -> Number:
+        """The number at a place of the evidence's JSON."""
+        return _number(self.evidence_tree, "evidence.json", path, times, spec, unit)
+
+
+def _number(tree: Any, file: str, path: tuple[str | int, ...], times: float, spec: str, unit: str) -> Number:
+    value = tree
+    for step in path:
+        value = value[step]
+    pointer = "".join(f"/{str(step).replace('~', '~0').replace('/', '~1')}" for step in path)
+    return Number(f"{file}#{pointer}", value, times, spec, unit)

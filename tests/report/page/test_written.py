@@ -1,0 +1,95 @@
+"""The report as one HTML page: every number is the JSON's, every name is text, and it needs no network."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from refinement_problems import rig
+from shown_numbers import numbers_of, wrong_numbers
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.report.page import (
+    Chart,
+    CopyText,
+    Drawing,
+    Folded,
+    Listing,
+    Number,
+    Page,
+    Paragraph,
+    Picture,
+    Section,
+    Table,
+    page_html,
+)
+from gtsam_rwhec.report.page.figures import svg_figure
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A calibration of a small rig: result, evidence and report."""
+    folder = tmp_path_factory.mktemp("report")
+    problem = rig().problem
+    calibration = rw.calibrate(problem)
+    rw.write_calibration(calibration, folder / "result.json")
+    evidence = rw.evidence.evidence_of(problem, calibration)
+    rw.evidence.write_evidence(evidence, folder / "evidence.json")
+    rw.report.write_html(folder, folder / "report.html")
+    return folder
+
+
+def test_every_number_is_that_of_the_json(folder: Path) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    files = {name: json.loads((folder / name).read_text(encoding="utf-8")) for name in ("result.json", "evidence.json")}
+    assert len(numbers_of(page)) > 1
+    assert list(wrong_numbers(page, files)) == []
+
+
+def test_a_number_that_is_not_that_of_the_json_is_found() -> None:
+    number = Number("result.json#/cost", 2.0, 1e3, ".1f")
+    page = page_html(Page("A page", "good", (Section("a", "A", (Paragraph(("costs ", number)),)),), "by hand"))
+    assert list(wrong_numbers(page, {"result.json": {"cost": 2.0}})) == []
+    assert list(wrong_numbers(page, {"result.json": {"cost": 2.5}})) != []
+    assert list(wrong_numbers(page.replace("2000.0", "2001.0"), {"result.json": {"cost": 2.0}})) != []
+
+
+def test_the_evidence_is_read_back(folder: Path) -> None:
+    evidence = rw.evidence.read_evidence(folder / "evidence.json")
+    rw.evidence.write_evidence(evidence, folder / "again.json")
+    assert (folder / "again.json").read_bytes() == (folder / "evidence.json").read_bytes()
+
+
+def test_evidence_of_another_kind_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "evidence.json").write_text('{"format": "something else", "format_version": 1}')
+    with pytest.raises(rw.errors.FileFormatError, match="is not the evidence of a calibration"):
+        rw.evidence.read_evidence(tmp_path / "evidence.json")
+
+
+def test_nothing_is_fetched(folder: Path) -> None:
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    without_script = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', without_script) == []
+    assert "url(" not in without_script
+
+
+def test_every_block_is_shown_and_names_are_text() -> None:
+    name = '<script>alert("x")</script>'
+    svg = svg_figure(lambda figure: figure.subplots().set_title(name) and None)
+    blocks = (
+        Paragraph(name, "lead"),
+        Listing((name, (name, Number("result.json#/a", 1.0)))),
+        Table(name, (name, "number"), ((name, Number("result.json#/a", None)),), name),
+        Chart("chart", name, name, svg),
+        Picture("picture", name, name, b"\x89PNG", "image/png"),
+        Drawing("drawing", name, name, ({"type": "scatter3d", "name": name},), {"title": name}, svg),
+        CopyText("copy", name, name),
+        Folded(name, (Paragraph(name),)),
+    )
+    page = page_html(Page(name, "bad", (Section("all", name, blocks), Section("none", "B", missing=name)), name))
+    assert name not in page
+    assert page.count("&lt;script&gt;alert") >= 14
+    assert "currentColor" in page
+    assert '"name": "\\u003cscript\\u003ealert' in page
