@@ -114,4 +114,5 @@ def _step(name: str, sample: Sample, cut: float, fit: TrialFit) -> TwoPoses | No
     rows = [(round(cut * len(B)), len(B)) for pair, (_, B) in sample.items() if name in pair.frames]
     first = sum(row for row, _ in rows)
     second = sum(count for _, count in rows) - first
-    return TwoPoses(name, first, second, angle, distance, rows[0][0] + 1 if len(rows) == 1 else None)
+    from_row = rows[0][0] + 1 if len(rows) == 1 else None
+    return TwoPoses(name, first, second, angle, distance, from_row, any(name == pair.sensor for pair in sample))

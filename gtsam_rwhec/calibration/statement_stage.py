@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from gtsam_rwhec.calibration.moved_frames import moved_frame
+from gtsam_rwhec.calibration.moved_outliers import Measured, moved_with_outliers
 from gtsam_rwhec.calibration.noise_choice import Inliers, estimated
 from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.sizes import TargetSize, common_factor, sizes
@@ -18,6 +19,7 @@ from gtsam_rwhec.errors import RwhecError
 from gtsam_rwhec.files.progress import silent
 from gtsam_rwhec.noise_model.drift_choice import CORRELATED, likeness_of_neighbours
 from gtsam_rwhec.noise_model.found import NoiseInData
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.problem.selection import selected
 from gtsam_rwhec.refinement.graduated import graduated
@@ -55,8 +57,17 @@ def doubt_one_pose(run: Run, refined: Refined, inliers: Inliers) -> None:
     if any(finding.ground is Ground.LATE_CLOCK for finding in run.record.findings):
         return  # a late clock makes such groups
     found = two_poses(run.problem, refined, inliers) or _moved(run, refined, inliers)
+    found = found or moved_with_outliers(refined, _with_outliers(run.problem, inliers))
     if found is not None:
-        run.record.find(Ground.CONTRADICTED, str(found))
+        run.record.find(Ground.MOVED, str(found))
+
+
+def _with_outliers(problem: Problem, inliers: Inliers) -> dict[Pair, Measured]:
+    """All measurements of the pairs of which some were left out, and of the others."""
+    if not problem.has_measurements or not inliers:
+        return {}
+    raw = {pair: problem.measurements(*pair) for pair in inliers}
+    return {pair: Measured(of.A, of.B, inliers[pair]) for pair, of in raw.items()}
 
 
 def _moved(run: Run, refined: Refined, inliers: Inliers) -> TwoPoses | None:

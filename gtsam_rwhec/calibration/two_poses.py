@@ -43,6 +43,8 @@ class TwoPoses:
     from_row : int or None
         The first measurement of the second group among those of its pair, counted from one, where the frame is in one
         pair and one group follows the other; else None.
+    is_sensor : bool
+        Whether it is a sensor: then its mount gave way.
     """
 
     frame: str
@@ -51,13 +53,15 @@ class TwoPoses:
     angle_rad: float
     distance_m: float
     from_row: int | None
+    is_sensor: bool = False
 
     def __str__(self) -> str:
         when = "" if self.from_row is None else f" from measurement {self.from_row} on"
         apart = f"{np.degrees(self.angle_rad):.2g} degrees and {1e3 * self.distance_m:.3g} mm apart"
+        moved = "its mount is loose or it was knocked" if self.is_sensor else "it was moved"
         return (
             f"{self.frame} was at two poses{when}: its measurements fall into groups of {self.first} and "
-            f"{self.second}, {apart}, and each group agrees with itself (it was moved, or it was seen in two ways)"
+            f"{self.second}, {apart}, and each group agrees with itself ({moved}, or it was seen in two ways)"
         )
 
 
@@ -80,7 +84,7 @@ def two_poses(problem: Problem, refined: Refined, inliers: Mapping[Pair, np.ndar
         kept = inliers.get(pair, np.ones(len(raw.A), dtype=bool))
         for name, twists in zip(pair, residual_twists(refined, pair, raw.A[kept], raw.B[kept]), strict=True):
             in_frame.setdefault(name, []).append(_Stations.of(twists, raw.A[kept], np.flatnonzero(kept)))
-    found = [_groups(name, parts) for name, parts in in_frame.items()]
+    found = [_groups(name, parts, is_sensor=name in refined.Y) for name, parts in in_frame.items()]
     apart, groups = max(found, key=lambda one: one[0], default=(0.0, None))
     return groups if apart > APART else None
 
@@ -131,7 +135,7 @@ class _Stations:
         )
 
 
-def _groups(name: str, parts: list[_Stations]) -> tuple[float, TwoPoses | None]:
+def _groups(name: str, parts: list[_Stations], *, is_sensor: bool) -> tuple[float, TwoPoses | None]:
     """How far apart the best two groups of the residuals of a frame's pairs are, in their own spread, and the groups.
 
     Groups that come with the carriers' poses, and not one after the other in time, are an arm's error, or views of a
@@ -169,5 +173,6 @@ def _groups(name: str, parts: list[_Stations]) -> tuple[float, TwoPoses | None]:
         angle_rad=float(np.linalg.norm(step[:3])),
         distance_m=float(np.linalg.norm(step[3:])),
         from_row=int(parts[0].rows[changes[0] + 1]) + 1 if len(changes) == 1 and len(parts) == 1 else None,
+        is_sensor=is_sensor,
     )
     return float(apart[best]), groups

@@ -64,6 +64,8 @@ class Ground(StrEnum):
     NOT_UNIQUE = "not_unique"
     #: A pose that was stated, by a prior or fixed, is not the one that the measurements give.
     POSE_DOUBTED = "pose_doubted"
+    #: A frame was at two poses: a target was moved, or a sensor's mount gave way.
+    MOVED = "moved"
     #: Most measurements of a sensor were left out as outliers.
     CONTRADICTED = "contradicted"
     #: A sensor or a target has no measurement in the answer, and so no pose; or a sensor of a rig file has too few.
@@ -150,7 +152,11 @@ _MADE_BY_A_MISREADING = frozenset({
     Ground.SYSTEMATIC,
 })  # fmt: skip
 #: A wrong size, a wrong pose, what moved and a late clock make errors that vary with the configuration, and in time.
-_MISTAKES = frozenset({Ground.POSE_DOUBTED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED})
+_MISTAKES = frozenset({
+    Ground.POSE_DOUBTED, Ground.MOVED, Ground.CONTRADICTED, Ground.LATE_CLOCK, Ground.SIZE_DOUBTED
+})  # fmt: skip
+#: What moved makes outliers of all that was measured after it.
+_MADE_BY_A_MOVE = frozenset({Ground.CONTRADICTED, Ground.TARGET_CONTRADICTED, Ground.MANY_OUTLIERS})
 _MADE_BY_A_MISTAKE = frozenset({Ground.CORNERS_DOUBTED, Ground.CORRELATED, Ground.SYSTEMATIC})
 #: Wrong focal lengths make sizes look wrong, motions look alike, and errors that vary with where a board is seen.
 _MADE_BY_INTRINSICS = frozenset({
@@ -187,6 +193,10 @@ _ADVICE = {
     Ground.POSE_DOUBTED: (
         "correct the stated pose of the named frame, or do not state it (leave out its prior, or do not fix it); if "
         "you are sure of it, check that the frame has not moved and has its right name"
+    ),
+    Ground.MOVED: (
+        "fix what moved (tighten the mount of a sensor, screw a target down) and measure again, or calibrate with the "
+        "measurements before it moved, or with those after it, alone"
     ),
     Ground.CONTRADICTED: (
         "check whether the named frame has moved, has another frame's name or was stated at a wrong pose, and whether "
@@ -297,6 +307,8 @@ class Judgement:
             made |= _MADE_BY_A_MISREADING
         if found & _MISTAKES:
             made |= _MADE_BY_A_MISTAKE
+        if Ground.MOVED in found:
+            made |= _MADE_BY_A_MOVE
         if Ground.INTRINSICS_DOUBTED in found:
             made |= _MADE_BY_INTRINSICS
         if Ground.NOT_UNIQUE in found:  # how well poses are known that are not determined is no question

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from gtsam_rwhec.calibration.misreadings import Misreading
+from gtsam_rwhec.calibration.moved_outliers import Measured, moved_with_outliers
 from gtsam_rwhec.calibration.reading import Reading
 from gtsam_rwhec.calibration.readings import Mistake
 from gtsam_rwhec.calibration.task_units import PointUncertainty
 from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.cleaning.removed import RemovalReason
+from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.refinement.refined import Refined
 from gtsam_rwhec.results.log_history import SizeFields
 from gtsam_rwhec.rig import Rig
 
@@ -109,6 +114,23 @@ def not_of_late_clocks(findings: Sequence[Finding], misreadings: Sequence[Misrea
 def not_of_marked_outliers(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """The findings without measurements that look wrong: outliers were looked for, under each detection's own noise."""
     return tuple(finding for finding in findings if finding.ground is not Ground.OUTLIERS_KEPT)
+
+
+def moved_of_left_out(
+    findings: Sequence[Finding], refined: Refined, pairs: Mapping[Pair, MeasuredPairs]
+) -> list[Finding]:
+    """A frame that was elsewhere when the outliers were measured; nothing where one is said to have moved already.
+
+    Where half of the measurements were left out, which half is right is open; how far apart both are is not.
+    """
+    if any(finding.ground is Ground.MOVED for finding in findings):
+        return []
+    measured = {}
+    for pair, one in pairs.items():
+        asked = one.used | np.array([reason == RemovalReason.OUTLIER for reason in one.reasons], dtype=bool)
+        measured[pair] = Measured(one.A[asked], one.B[asked], one.used[asked])
+    found = moved_with_outliers(refined, measured)
+    return [] if found is None else [Finding(Ground.MOVED, str(found))]
 
 
 def _cure(misreading: Misreading, rig: Rig) -> str:

@@ -27,6 +27,7 @@ from gtsam_rwhec.pipeline.log_findings import (
     in_rig_file,
     known_to_nothing,
     may_be_exchanged,
+    moved_of_left_out,
     not_of_late_clocks,
     not_of_marked_outliers,
     with_cures,
@@ -190,6 +191,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         others = (one for one in findings if one.ground not in (Ground.MISREAD, Ground.IMPLAUSIBLE))
         findings = (*([found] if found is not None else []), *others)
         calibration = replace(calibration, misreadings=before)
+    if not (is_misread or late):
+        findings = (*findings, *moved_of_left_out(findings, refined, settled.pairs))
     if not is_misread:  # a misreading makes cleaning remove measurements that are right
         findings = (*findings, *short_of_measurements(fields, poses_used(settled.pairs.values())))
         if calibration.judgement.verdict is not Verdict.DO_NOT_USE and rounds.may_be_exchanged(settled):

@@ -1,0 +1,70 @@
+"""Outliers that agree with one another name the frame that moved; others, and the frames beside it, are not named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rwhec_factors.se3 import expmap, inverse
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.moved_outliers import Measured, moved_with_outliers
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.simulate.transforms import random_poses
+
+#: A step of 3 degrees and 2 cm; noise of 0.02 degrees and 0.2 mm; the measurement before which the frame moves.
+STEP = expmap(np.array([[0.03, -0.02, 0.04, 0.012, -0.015, 0.008]]))[0]
+NOISE, FIRST, COUNT = np.repeat([3e-4, 2e-4], 3), 18, 28
+PAIR = Pair("board", "camera")
+
+
+def seen(moved: str, seed: int) -> tuple[Refined, dict[Pair, Measured]]:
+    """The answer from the measurements before a frame moved, and all of them; "nothing": the others are random."""
+    rng = np.random.default_rng(seed)
+    X, Y = random_poses(2, 0.5, rng)
+    A = random_poses(COUNT, 0.4, rng)
+    after = np.arange(COUNT) >= FIRST
+    X_then, Y_then = (
+        np.where(after[:, None, None] & (moved == name), T @ STEP, T)
+        for name, T in zip(PAIR.frames, (X, Y), strict=True)
+    )
+    B = inverse(Y_then) @ A @ X_then @ expmap(NOISE * rng.standard_normal((COUNT, 6)))
+    if moved == "nothing":
+        B[after] = random_poses(int(after.sum()), 0.6, rng)
+    problem = rw.Problem()
+    problem.add(*PAIR, A[~after], B[~after])
+    refined = rw.refine(problem, rw.solve(problem), rw.RefineOptions(noise="estimate"))
+    return refined, {PAIR: Measured(A, B, ~after)}
+
+
+@pytest.mark.parametrize("moved", PAIR.frames)
+def test_the_frame_that_moved_is_named_with_the_moment_and_the_step(moved: str) -> None:
+    found = moved_with_outliers(*seen(moved, 1))
+    assert found is not None
+    assert (found.frame, found.from_row, found.first, found.second) == (moved, FIRST + 1, FIRST, COUNT - FIRST)
+    assert found.is_sensor is (moved == "camera")
+    step: Array = np.array([found.angle_rad, found.distance_m])
+    assert step == pytest.approx([np.linalg.norm([0.03, 0.02, 0.04]), np.linalg.norm(STEP[:3, 3])], rel=0.05)
+    assert ("mount" in str(found)) is (moved == "camera")
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_outliers_that_agree_in_no_frame_name_none(seed: int) -> None:
+    assert moved_with_outliers(*seen("nothing", seed)) is None
+
+
+def test_few_outliers_name_none() -> None:
+    refined, measured = seen("board", 5)
+    few = measured[PAIR].kept.copy()
+    few[FIRST + 3 :] = True
+    assert moved_with_outliers(refined, {PAIR: Measured(measured[PAIR].A, measured[PAIR].B, few)}) is None
+
+
+def test_calibrate_says_that_a_board_moved_late_in_place_of_outliers() -> None:
+    _, measured = seen("board", 6)
+    problem = rw.Problem()
+    problem.add(*PAIR, measured[PAIR].A, measured[PAIR].B)
+    judgement = rw.calibrate(problem).judgement
+    assert judgement.grounds == (rw.Ground.MOVED,)
+    assert "board was at two poses from measurement 19 on" in judgement.reason
