@@ -123,7 +123,7 @@ def _step(refined: Refined, measured: Mapping[Pair, Measured], name: str) -> _St
 
 def _sizes(twists: Array) -> Array:
     """Angles and distances (N, 2) of twists (N, 6)."""
-    return np.linalg.norm(twists.reshape(-1, 2, 3), axis=2)
+    return np.asarray(np.linalg.norm(twists.reshape(-1, 2, 3), axis=2))
 
 
 def _moment(kept: np.ndarray) -> int | None:
