@@ -21,6 +21,7 @@ from gtsam_rwhec.cli.options import (
     AnywayOption,
     ImagesOption,
     KappaOption,
+    NoReportImagesOption,
     RigOption,
     ScaleOption,
     SensorsOption,
@@ -40,7 +41,7 @@ Noise = Literal["auto", "given", "estimate"]
 Robust = Literal["auto", "gnc", "none"]
 
 #: Parameters that count for a log; its rig file states the rest.
-OF_LOG = frozenset({"source", "rig", "images", "workers", "anyway", "force", "output"})
+OF_LOG = frozenset({"source", "rig", "images", "no_report_images", "workers", "anyway", "force", "output"})
 #: Parameters that count for a folder of CSV files.
 OF_FOLDER = frozenset({"source", "scale", "sigma", "kappa", "targets", "sensors", "certified_only", "output"})
 #: Parameters that overrule a choice of ``rw.calibrate``.
@@ -141,6 +142,7 @@ def calibrate(
         ),
     ] = None,
     images: ImagesOption = False,
+    no_report_images: NoReportImagesOption = False,
     workers: WorkersOption = None,
     anyway: AnywayOption = False,
     force: Annotated[
@@ -170,7 +172,16 @@ def calibrate(
             if rig is None:
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
-        return calibrate_log(source, rig, output, images=images, workers=workers, anyway=anyway, force=force)
+        return calibrate_log(
+            source,
+            rig,
+            output,
+            images=images,
+            report_images=not no_report_images,
+            workers=workers,
+            anyway=anyway,
+            force=force,
+        )
     if (words := other_than_csv(source)) is not None:
         raise typer.BadParameter(words)
     refuse(context, NOT_CERTIFIED_ONLY if certified_only else NOT_WITH_ALL)
@@ -271,6 +282,7 @@ def calibrate_log(
     output: Path,
     *,
     images: bool,
+    report_images: bool = True,
     workers: int | None,
     anyway: bool = False,
     force: bool = False,
@@ -286,6 +298,7 @@ def calibrate_log(
             described,
             output,
             images="copy" if images else "leave_out",
+            report_images=report_images,
             workers=workers,
             anyway=anyway,
             replace=force,

@@ -55,6 +55,14 @@ RigOption = Annotated[
 ImagesOption = Annotated[
     bool, typer.Option("--images", rich_help_panel=LOG_PANEL, help="Copy the images too. They are large.")
 ]
+NoReportImagesOption = Annotated[
+    bool,
+    typer.Option(
+        "--no-report-images",
+        rich_help_panel=LOG_PANEL,
+        help="Leave images out of report.html. They may be confidential.",
+    ),
+]
 WorkersOption = Annotated[
     int | None,
     typer.Option(

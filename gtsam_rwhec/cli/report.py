@@ -20,6 +20,10 @@ def report(
         Path | None,
         typer.Option("--output", "-o", help="The HTML file.", show_default="report.html beside the result"),
     ] = None,
+    images: Annotated[
+        bool,
+        typer.Option("--images/--no-images", help="Whether the page shows images. They may be confidential."),
+    ] = True,
 ) -> ExitStatus:
     """Write the report of a finished calibration as one HTML file, which needs no network.
 
@@ -30,7 +34,7 @@ def report(
     check_output(output)
     with StageDisplay() as stage:
         stage("writing the report")
-        rw.report.write_html(result, output)
+        rw.report.write_html(result, output, images=images)
     say(f"Written to {shown_path(output)}.", to_errors=True)
     return ExitStatus.DONE
 

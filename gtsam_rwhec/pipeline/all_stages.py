@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from gtsam_rwhec.calibration.verdict import Verdict
@@ -55,6 +56,16 @@ from gtsam_rwhec.vision.camera import Camera
 OUTPUTS = tuple(dict.fromkeys([*(name.partition("/")[0] for name in LEFT), *FOLDERS]))
 
 
+@dataclass(frozen=True)
+class _Choices:
+    """The options of `calibrate_log` that all its roads share."""
+
+    images: Images
+    workers: int | None
+    anyway: bool
+    report_images: bool
+
+
 @one_blas_thread()
 def calibrate_log(
     log_path: str | Path | list[str | Path],
@@ -65,6 +76,7 @@ def calibrate_log(
     workers: int | None = None,
     anyway: bool = False,
     replace: bool = True,
+    report_images: bool = True,
     progress: Progress | None = None,
 ) -> Calibrated:
     """Detect, clean, solve and export: from a log and a rig file to a folder with the calibration.
@@ -99,6 +111,8 @@ def calibrate_log(
         so that a script can be run again. False refuses both, as the command does without ``--force``. In either case
         an unfinished run of the same inputs is gone on with, and only files that a calibration wrote are replaced: a
         folder with other files, and without a calibration, is refused.
+    report_images : bool
+        Whether ``report.html`` shows images. They may be confidential, as the contact sheet ``seen.png`` then is.
     progress : callable, optional
 
     Raises
@@ -111,11 +125,10 @@ def calibrate_log(
         As each stage does.
     """
     check_is_no_other_folder(log_path, rig)
+    choices = _Choices(images, workers, anyway, report_images)
     if rig is not None and (is_folder_of_images(log_path, rig) or is_file_of_samples(log_path, rig)):
         source = Path(str(log_path))
-        return _calibrate_files(
-            source, rig, out, images=images, workers=workers, anyway=anyway, replace=replace, progress=progress
-        )
+        return _calibrate_files(source, rig, out, choices, replace=replace, progress=progress)
     with open_log(log_path) as log:
         files = [file.path for file in log.files]
         is_raw = not is_from_stage(log)
@@ -137,22 +150,18 @@ def calibrate_log(
     with output_folder(out, log_name(sources), replace=replace, sources=files) as output:
         if is_raw:
             assert rig is not None
-            return _from_raw(files, rig, output, images=images, workers=workers, anyway=anyway, progress=progress)
+            return _from_raw(files, rig, output, choices, progress=progress)
         output.begin()
-        return _from_stage(
-            files[0], rig, output.path, files, is_cleaned=is_cleaned, images=images, anyway=anyway, progress=progress
-        )
+        return _from_stage(files[0], rig, output.path, files, choices, is_cleaned=is_cleaned, progress=progress)
 
 
 def _from_raw(
     files: list[Path],
     rig: Rig,
     output: OutputFolder,
+    choices: _Choices,
     folder: Path | None = None,
     *,
-    images: Images,
-    workers: int | None,
-    anyway: bool,
     progress: Progress | None,
 ) -> Calibrated:
     """All stages; `folder` is the one whose images the log has, if it is of a folder."""
@@ -162,11 +171,18 @@ def _from_raw(
 
     detected = output.path / DETECTED_LOG
     sheet = output.path / SEEN_SHEET
-    detect_log(list(files), rig, detected, images=images, workers=workers, sheet=sheet, progress=progress, keep=keep)
-    sources = files if folder is None else sorted(path for path in folder.rglob("*") if path.is_file())
-    return _from_stage(
-        detected, rig, output.path, sources, is_cleaned=False, images=images, anyway=anyway, progress=progress
+    detect_log(
+        list(files),
+        rig,
+        detected,
+        images=choices.images,
+        workers=choices.workers,
+        sheet=sheet,
+        progress=progress,
+        keep=keep,
     )
+    sources = files if folder is None else sorted(path for path in folder.rglob("*") if path.is_file())
+    return _from_stage(detected, rig, output.path, sources, choices, is_cleaned=False, progress=progress)
 
 
 def _from_stage(
@@ -174,19 +190,19 @@ def _from_stage(
     rig: Rig | None,
     out: Path,
     sources: list[Path],
+    choices: _Choices,
     *,
     is_cleaned: bool,
-    images: Images,
-    anyway: bool,
     progress: Progress | None,
 ) -> Calibrated:
     """The stages after the one that wrote the log; the measurements come from the files `sources`."""
     if not is_cleaned:
-        clean_log(source, out / CLEAN_LOG, rig, images=images, progress=progress)
+        clean_log(source, out / CLEAN_LOG, rig, images=choices.images, progress=progress)
         source = out / CLEAN_LOG
-    calibrated = solve_into(source, rig, out, images=images, progress=progress)
-    export_solved(out / CLEAN_LOG, out, anyway=anyway, progress=progress)
-    list_written(out, calibrated.log.detection.sources, write_report(calibrated, out, sources, progress))
+    calibrated = solve_into(source, rig, out, images=choices.images, progress=progress)
+    export_solved(out / CLEAN_LOG, out, anyway=choices.anyway, progress=progress)
+    report = write_report(calibrated, out, sources, progress, images=choices.report_images)
+    list_written(out, calibrated.log.detection.sources, report)
     return calibrated
 
 
@@ -194,10 +210,8 @@ def _calibrate_files(
     source: Path,
     rig: Rig,
     out: str | Path,
+    choices: _Choices,
     *,
-    images: Images,
-    workers: int | None,
-    anyway: bool,
     replace: bool,
     progress: Progress | None,
 ) -> Calibrated:
@@ -216,9 +230,7 @@ def _calibrate_files(
             else:
                 (progress or silent)(write_samples_log(source, rig, recorded))
             folder = source if has_images else None
-            return _from_raw(
-                [recorded], rig, output, folder, images=images, workers=workers, anyway=anyway, progress=progress
-            )
+            return _from_raw([recorded], rig, output, choices, folder, progress=progress)
         finally:
             recorded.unlink(missing_ok=True)
 

@@ -14,9 +14,16 @@ from gtsam_rwhec.report.page.written import write_html
 
 
 def write_report(
-    calibrated: Calibrated, out: Path, sources: Sequence[Path], progress: Progress | None = None
+    calibrated: Calibrated,
+    out: Path,
+    sources: Sequence[Path],
+    progress: Progress | None = None,
+    *,
+    images: bool = True,
 ) -> list[Path]:
     """Write ``evidence.json`` and ``report.html`` beside ``result.json`` and ``clean.mcap``; return their paths.
+
+    The page shows images unless `images` is False.
 
     Raises
     ------
@@ -26,5 +33,5 @@ def write_report(
     (progress or silent)("writing the report")
     evidence = evidence_of_log(calibrated, out / CLEAN_LOG, sources)
     write_evidence(evidence, out / EVIDENCE_FILE)
-    write_html(out / RESULT_FILE, out / REPORT_FILE, evidence)
+    write_html(out / RESULT_FILE, out / REPORT_FILE, evidence, images=images)
     return [out / EVIDENCE_FILE, out / REPORT_FILE]

@@ -33,6 +33,7 @@ VALUES = {
     "carrier_noise_deg": "0.1",
     "carrier_noise_mm": "1",
     "images": None,
+    "no_report_images": None,
     "anyway": None,
     "force": None,
     "workers": "2",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Literal
 
 from gtsam_rwhec.report.plots.drawing import STYLE
 
@@ -34,18 +34,52 @@ PAGE_STYLE = {
     "ytick.color": INK,
 }
 
+#: Files are on white, and their pictures have this many pixels an inch.
+ON_WHITE = {"figure.facecolor": "white", "axes.facecolor": "white", "savefig.facecolor": "white"}
+FILE_DPI = 200
 
-def svg_figure(draw: Callable[[MatplotlibFigure], None], height_in: float = 3.2, width_in: float = WIDTH_IN) -> str:
+
+class SvgFigure(str):
+    """A figure as an SVG element of the page. It knows how it was drawn, so that it can be written as files too."""
+
+    draw: Callable[[MatplotlibFigure], None]
+    size_in: tuple[float, float]
+
+    def svg_file(self) -> bytes:
+        """The figure as an SVG file: black on white, whatever the page's colours."""
+        return _drawn(self.draw, self.size_in, "svg", ON_WHITE)
+
+    def png_file(self) -> bytes:
+        """The figure as a PNG file: black on white."""
+        return _drawn(self.draw, self.size_in, "png", {**ON_WHITE, "savefig.dpi": FILE_DPI})
+
+
+def svg_figure(
+    draw: Callable[[MatplotlibFigure], None], height_in: float = 3.2, width_in: float = WIDTH_IN
+) -> SvgFigure:
     """Draw a figure and give it as an SVG element, fit to stand in a page; equal figures give equal text."""
+    size_in = (width_in, height_in)
+    figure = SvgFigure(in_page(_drawn(draw, size_in, "svg", {}).decode("utf-8")))
+    figure.draw, figure.size_in = draw, size_in
+    return figure
+
+
+def _drawn(
+    draw: Callable[[MatplotlibFigure], None],
+    size_in: tuple[float, float],
+    form: Literal["svg", "png"],
+    style_too: Mapping[str, Any],
+) -> bytes:
     from matplotlib import style
     from matplotlib.figure import Figure
 
-    with style.context(["default", PAGE_STYLE]):
-        figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    with style.context(["default", PAGE_STYLE, dict(style_too)]):
+        figure = Figure(figsize=size_in, layout="constrained")
         draw(figure)
-        stream = io.StringIO()
-        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    return in_page(stream.getvalue())
+        stream = io.BytesIO()
+        metadata = {"Date": None, "Creator": None} if form == "svg" else {"Software": None}
+        figure.savefig(stream, format=form, metadata=metadata)
+    return stream.getvalue()
 
 
 def in_page(svg: str) -> str:

@@ -27,15 +27,18 @@ class ShownResult:
     evidence : Evidence or None
     name : str
         Of the result's file.
+    images : bool
+        Whether the page may show what cameras saw; images may be confidential.
     """
 
     tree: Mapping[str, Any]
     result: Result | None
     evidence: Evidence | None
     name: str
+    images: bool = True
 
     @staticmethod
-    def of(content: bytes, evidence: Evidence | None, name: str = "result.json") -> ShownResult:
+    def of(content: bytes, evidence: Evidence | None, name: str = "result.json", *, images: bool = True) -> ShownResult:
         """Of a result file's content.
 
         Raises
@@ -45,7 +48,7 @@ class ShownResult:
         """
         tree = json.loads(content)
         has_answer = not (isinstance(tree, dict) and "certified" not in tree and "verdict_reason" in tree)
-        return ShownResult(tree, parse_result(content, name) if has_answer else None, evidence, name)
+        return ShownResult(tree, parse_result(content, name) if has_answer else None, evidence, name, images)
 
     @cached_property
     def evidence_tree(self) -> Any:

@@ -28,6 +28,7 @@ def write_html(
     evidence: Evidence | None = None,
     *,
     log: LogFields | None = None,
+    images: bool = True,
 ) -> None:
     """Write the report of a calibration as one HTML file, which needs nothing else and no network.
 
@@ -42,6 +43,8 @@ def write_html(
         What ``rw.evidence.evidence_of(problem, calibration)`` gathered. Sections whose data are missing say so.
     log : LogFields, optional
         What became of the measurements, if a calibration comes from a log.
+    images : bool
+        Whether the page shows images. False for a page that others may see when the images are confidential.
 
     Raises
     ------
@@ -50,13 +53,13 @@ def write_html(
     """
     path = checked_path(path)
     if isinstance(result, Calibration):
-        shown = ShownResult.of(calibration_json(result, log), evidence)
+        shown = ShownResult.of(calibration_json(result, log), evidence, images=images)
     else:
-        shown = read_shown(result, evidence)
+        shown = read_shown(result, evidence, images=images)
     write_page(report_page(shown), path)
 
 
-def read_shown(path: str | Path, evidence: Evidence | None = None) -> ShownResult:
+def read_shown(path: str | Path, evidence: Evidence | None = None, *, images: bool = True) -> ShownResult:
     """A result from its file, or its folder, with the evidence that is beside it."""
     path = Path(path)
     if path.is_dir():
@@ -65,7 +68,7 @@ def read_shown(path: str | Path, evidence: Evidence | None = None) -> ShownResul
     beside = evidence_path(path)
     if evidence is None and beside.exists():
         evidence = read_evidence(beside)
-    return ShownResult.of(content, evidence, path.name)
+    return ShownResult.of(content, evidence, path.name, images=images)
 
 
 def report_page(shown: ShownResult) -> Page:
