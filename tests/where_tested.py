@@ -54,7 +54,7 @@ TABLE: dict[str, dict[str, str]] = {
         "cli/test_wheel.py": "demo",
         "pipeline/test_commands.py": "clean convert detect export init solve",
     },
-    "gtsam_rwhec/evidence": {"report/page/test_written.py": "evidence gathered inputs measured record"},
+    "gtsam_rwhec/evidence": {"report/page/test_written.py": "derived evidence gathered inputs measured record"},
     "gtsam_rwhec/compat": {
         "compat/test_opencv.py": (
             "andreff certified daniilidis dqopt inputs pair_translations quaternion_methods robot_world stations"
@@ -63,7 +63,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/export": {
         "export/test_camchain.py": "overlaps",
         "export/test_camera_files.py": "camera_info camera_words colmap opencv_cameras",
-        "export/test_exported_files.py": "files static_tf tf_tree urdf written_poses",
+        "export/test_exported_files.py": "files python_poses static_tf tf_tree urdf written_poses",
     },
     "gtsam_rwhec/files": {
         "cli/test_stage_display.py": "progress",
@@ -155,7 +155,7 @@ TABLE: dict[str, dict[str, str]] = {
         "report/test_solution_report.py": "pose_table printing sentences",
     },
     "gtsam_rwhec/report/page": {"report/page/test_written.py": "blocks figures html shown_result"},
-    "gtsam_rwhec/report/page/sections": {"report/page/test_written.py": "inputs verdict"},
+    "gtsam_rwhec/report/page/sections": {"report/page/test_number_sections.py": "inputs pose_tables verdict"},
     "gtsam_rwhec/report/plots": {
         "report/plots/test_plots.py": "coverage deviations frames intrinsics plotted residuals",
     },

@@ -32,7 +32,7 @@ from gtsam_rwhec.cli.options import (
     show,
 )
 from gtsam_rwhec.cli.report import report_path
-from gtsam_rwhec.cli.roads import refuse
+from gtsam_rwhec.cli.roads import command_of, refuse
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
@@ -223,7 +223,7 @@ def calibrate(
             options = rw.CalibrateOptions(noise=noise, robust=robust, carrier_noise=carriers, misreadings=not as_read)
             calibration = rw.calibrate(problem, options, progress=stage)
             write = partial(rw.write_calibration, calibration)
-            evidence = None if output is None else partial(_evidence, source, problem, calibration)
+            evidence = None if output is None else partial(_evidence, source, problem, calibration, command_of(context))
             report = partial(rw.report.print_calibration, calibration)
             judgement = calibration.judgement
     try:
@@ -237,10 +237,10 @@ def calibrate(
     return exit_status(judgement)
 
 
-def _evidence(source: Path, problem: rw.Problem, calibration: rw.Calibration) -> rw.evidence.Evidence:
+def _evidence(source: Path, problem: rw.Problem, calibration: rw.Calibration, command: str) -> rw.evidence.Evidence:
     """What the report shows beside the calibration of a folder of CSV files, or of a file of samples."""
     read = sorted(source.glob("*.csv")) if source.is_dir() else [source]
-    inputs = rw.evidence.Inputs(files=rw.evidence.input_files(read), versions=rw.evidence.versions())
+    inputs = rw.evidence.Inputs(files=rw.evidence.input_files(read), versions=rw.evidence.versions(), command=command)
     return rw.evidence.evidence_of(problem, calibration, inputs)
 
 

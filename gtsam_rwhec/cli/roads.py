@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Mapping
 
 import typer
@@ -30,3 +31,15 @@ def is_given(context: typer.Context, name: str) -> bool:
     """Whether the user wrote this option."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
+
+
+def command_of(context: typer.Context) -> str:
+    """The command as it was given: its arguments, and the options that are not left to their defaults."""
+    words = ["gtsam-rwhec", context.info_name or ""]
+    for parameter in context.command.params:
+        name, value = str(parameter.name), context.params.get(str(parameter.name))
+        if parameter.param_type_name == "argument":
+            words.append(str(value))
+        elif is_given(context, name):
+            words += [parameter.opts[0]] if value is True else [parameter.opts[0], str(value)]
+    return shlex.join(words)

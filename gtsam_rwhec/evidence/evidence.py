@@ -8,6 +8,7 @@ from typing import Final, Literal
 from pydantic import Field, ValidationError
 
 from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.evidence.derived import Derived
 from gtsam_rwhec.evidence.inputs import Inputs
 from gtsam_rwhec.evidence.record import EvidenceRecord
 from gtsam_rwhec.files.atomic_write import write_atomically
@@ -26,6 +27,7 @@ class Evidence(EvidenceRecord):
 
     format: Literal["gtsam-rwhec evidence"] = FORMAT
     format_version: Literal[1] = FORMAT_VERSION
+    derived: Derived | None = Field(default=None, description="what follows from poses and covariances")
     inputs: Inputs | None = Field(default=None, description="files, versions, options, rig file")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.evidence.derived import derived_of
 from gtsam_rwhec.evidence.evidence import Evidence
 from gtsam_rwhec.evidence.inputs import Inputs, versions
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -27,4 +28,8 @@ def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | Non
     MeasurementsNotKeptError
         The problem was made with ``keep_measurements=False``.
     """
-    return Evidence(inputs=Inputs(files=(), versions=versions()) if inputs is None else inputs)
+    inputs = Inputs(files=(), versions=versions()) if inputs is None else inputs
+    return Evidence(
+        derived=derived_of(calibration),
+        inputs=inputs.with_options(calibration.options),
+    )

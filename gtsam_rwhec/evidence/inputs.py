@@ -5,12 +5,15 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Iterable
+from dataclasses import fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from pydantic import Field
 
+from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.evidence.record import EvidenceRecord
+from gtsam_rwhec.files.terminal_text import brief
 
 #: The packages whose versions decide the last digits of an answer.
 PACKAGES = ("gtsam-rwhec", "gtsam", "numpy", "scipy", "clarabel", "opencv-python-headless", "mcap")
@@ -32,8 +35,27 @@ class Inputs(EvidenceRecord):
     files: tuple[InputFile, ...] = Field(description="the files with the measurements")
     command: str = Field(default="", description="the command, or the call, that made it")
     versions: dict[str, str] = Field(description="of the packages that decide the answer, and of Python")
-    options: dict[str, str] = Field(default={}, description="options of the calibration, by name")
+    options: dict[str, str] = Field(default={}, description="options of the calibration that are not the default")
+    seeds: dict[str, int] = Field(default={}, description="seeds of random numbers, by what draws them")
     rig_file: str | None = Field(default=None, description="the text of the rig file")
+
+    def with_options(self, options: CalibrateOptions) -> Inputs:
+        """The record with the options of a calibration, and its seeds."""
+        update = {"options": chosen_options(options), "seeds": {"random starts of the search": options.solve.seed}}
+        return self.model_copy(update=update)
+
+
+def chosen_options(options: CalibrateOptions) -> dict[str, str]:
+    """Options that are not the default, by name, as Python writes them; of a path of poses only its kind."""
+    chosen = {}
+    for field in fields(options):
+        value, default = getattr(options, field.name), getattr(CalibrateOptions(), field.name)
+        if field.name == "carrier_path":
+            if value is not None:
+                chosen[field.name] = f"the poses of the carrier over time ({type(value).__name__})"
+        elif value != default:
+            chosen[field.name] = brief(value) if isinstance(value, str) else repr(value)
+    return chosen
 
 
 def versions() -> dict[str, str]:

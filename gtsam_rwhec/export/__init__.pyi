@@ -1,10 +1,13 @@
 from .camchain import camchain_yaml as camchain_yaml
 from .camera_info import camera_info_yaml as camera_info_yaml
 from .colmap import colmap_cameras_txt as colmap_cameras_txt
+from .files import COPIED as COPIED
 from .files import FILES as FILES
 from .files import FOLDERS as FOLDERS
+from .files import copied_texts as copied_texts
 from .files import export_all as export_all
 from .opencv_cameras import opencv_yaml as opencv_yaml
+from .python_poses import python_poses as python_poses
 from .static_tf import static_tf_launch as static_tf_launch
 from .tf_tree import tf_yaml as tf_yaml
 from .urdf import urdf_xacro as urdf_xacro

@@ -12,6 +12,7 @@ from gtsam_rwhec.export.camera_info import camera_info_yaml
 from gtsam_rwhec.export.camera_words import comment
 from gtsam_rwhec.export.colmap import colmap_cameras_txt
 from gtsam_rwhec.export.opencv_cameras import FIRST_LINES, opencv_yaml
+from gtsam_rwhec.export.python_poses import python_poses
 from gtsam_rwhec.export.static_tf import static_tf_launch
 from gtsam_rwhec.export.tf_tree import tf_yaml
 from gtsam_rwhec.export.urdf import urdf_xacro
@@ -26,6 +27,13 @@ FILES: dict[str, Callable[[RigFrames], str]] = {
     "camchain.yaml": camchain_yaml,
     "cameras.opencv.yaml": opencv_yaml,
     "cameras.txt": colmap_cameras_txt,
+}
+#: The texts with poses that people copy, by the name of each.
+COPIED: dict[str, Callable[[RigFrames], str]] = {
+    "static_tf.launch.py": static_tf_launch,
+    "rig.urdf.xacro": urdf_xacro,
+    "tf.yaml": tf_yaml,
+    "poses.py": python_poses,
 }
 #: These functions give the texts of a folder's files, by the files' names: one for each camera.
 FOLDERS: dict[str, Callable[[RigFrames], dict[str, str]]] = {"camera_info": camera_info_yaml}
@@ -53,7 +61,7 @@ def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
         A file cannot be written; the message says why.
     """
     # All texts come first: if one of them fails, no file is written.
-    remarks = (*frames.warnings, *(f"Left out, because it has no answer: {why}" for why in frames.left_out.values()))
+    remarks = _remarks(frames)
     texts = {Path(folder) / name: _with_head(text(frames), remarks, name) for name, text in FILES.items()}
     of_cameras = {
         Path(folder) / inside / name: _with_head(text, remarks, name)
@@ -69,6 +77,16 @@ def export_all(frames: RigFrames, folder: str | Path) -> list[Path]:
             raise FileFormatError(f"{path.parent} cannot be made a folder: {error.strerror or error}.") from error
         write_atomically(path, text.encode())
     return [*texts, *of_cameras]
+
+
+def copied_texts(frames: RigFrames) -> dict[str, str]:
+    """The texts of `COPIED`, by name, with the warnings in the head of each."""
+    return {name: _with_head(text(frames), _remarks(frames), name) for name, text in COPIED.items()}
+
+
+def _remarks(frames: RigFrames) -> tuple[str, ...]:
+    """What the head of every file says."""
+    return (*frames.warnings, *(f"Left out, because it has no answer: {why}" for why in frames.left_out.values()))
 
 
 def _with_head(text: str, remarks: tuple[str, ...], name: str) -> str:

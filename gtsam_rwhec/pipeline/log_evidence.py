@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
+from os.path import commonpath
 from pathlib import Path
 
 from gtsam_rwhec.evidence import Evidence
+from gtsam_rwhec.evidence.derived import derived_of
 from gtsam_rwhec.evidence.inputs import Inputs, input_files, versions
 from gtsam_rwhec.pipeline.solving_stage import Calibrated
 from gtsam_rwhec.rig import rig_text
@@ -22,6 +25,21 @@ def evidence_of_log(calibrated: Calibrated, log_path: str | Path, sources: Seque
     sources : sequence of Path
         The files that the measurements come from.
     """
-    return Evidence(
-        inputs=Inputs(files=input_files(sources), versions=versions(), rig_file=rig_text(calibrated.rig)),
+    inputs = Inputs(
+        files=input_files(sources),
+        command=_command(sources),
+        versions=versions(),
+        rig_file=rig_text(calibrated.rig),
     )
+    return Evidence(
+        derived=derived_of(calibrated.calibration),
+        inputs=inputs.with_options(calibrated.calibration.options),
+    )
+
+
+def _command(sources: Sequence[Path]) -> str:
+    """The command that makes the calibration again, with the rig file of this record as rig.yaml."""
+    if not sources:
+        return ""
+    source = sources[0] if len(sources) == 1 else Path(commonpath([path.parent for path in sources]))
+    return shlex.join(["gtsam-rwhec", "calibrate", source.name, "--rig", "rig.yaml", "-o", "output"])

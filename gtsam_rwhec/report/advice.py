@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from rich.console import Console
@@ -24,24 +25,56 @@ MOST_NAMED = 10
 SIZES = frozenset({Ground.SIZE_DOUBTED, Ground.NO_SIZE_FITS, Ground.SIZE_ESTIMATED})
 
 
+@dataclass(frozen=True)
+class Advice:
+    """What to do about a calibration, in sentences.
+
+    Attributes
+    ----------
+    undetermined : tuple of str
+        What the measurements leave free.
+    cures : tuple of str
+        What settles it.
+    doubts : tuple of str
+        What is odd about the log or its rig file.
+    """
+
+    undetermined: tuple[str, ...]
+    cures: tuple[str, ...]
+    doubts: tuple[str, ...]
+
+    @staticmethod
+    def of(free: Sequence[FreeDirection], log: LogFields | None = None, judgement: Judgement | None = None) -> Advice:
+        """What the ``judgement``, which stands above it, does not say.
+
+        What a misreading leaves free is no fault of the motion, so its cure is the only one.
+        """
+        if judgement is not None and judgement.is_of_the_reading:
+            free = ()
+        help_ = "Measure again, and turn the carriers about at least two different axes. Or fix frames that you know."
+        return Advice(
+            undetermined=tuple(_not_determined(free)),
+            cures=(help_,) if free else (),
+            doubts=() if log is None else tuple(log_advice(log, judgement)),
+        )
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """All of them, in order."""
+        return (*self.undetermined, *self.cures, *self.doubts)
+
+
 def print_advice(
     console: Console, free: Sequence[FreeDirection], log: LogFields | None = None, judgement: Judgement | None = None
 ) -> None:
-    """Print the section "What to do", if there is anything to do that the ``judgement`` above it does not say.
-
-    What a misreading leaves free is no fault of the motion, so its cure is the only one.
-    """
-    if judgement is not None and judgement.is_of_the_reading:
-        free = ()
-    doubts = [] if log is None else log_advice(log, judgement)
-    if not free and not doubts:
+    """Print the section "What to do", if there is anything to do that the ``judgement`` above it does not say."""
+    advice = Advice.of(free, log, judgement)
+    if not advice.sentences:
         return
     print_heading(console, "What to do")
-    print_list(console, _not_determined(free), "bold red")
-    if free:
-        help_ = "Measure again, and turn the carriers about at least two different axes. Or fix frames that you know."
-        print_list(console, [help_])
-    print_list(console, doubts, "bold yellow")
+    print_list(console, advice.undetermined, "bold red")
+    print_list(console, advice.cures)
+    print_list(console, advice.doubts, "bold yellow")
 
 
 def _not_determined(free: Sequence[FreeDirection]) -> list[str]:

@@ -1,3 +1,4 @@
+from .blocks import Block as Block
 from .blocks import CopyText as CopyText
 from .blocks import Drawing as Drawing
 from .blocks import Chart as Chart
