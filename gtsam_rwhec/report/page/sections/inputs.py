@@ -59,7 +59,7 @@ def frames_of_tree(tree: Mapping[str, Any]) -> RigFrames:
         A name cannot be the name of a frame in other programs' files.
     """
     verdict = Verdict(tree["verdict"])
-    warnings = () if verdict is Verdict.USE else (f"{verdict.words}: {tree['verdict_reason']}.",)
+    warnings: tuple[str, ...] = () if verdict is Verdict.USE else (f"{verdict.words}: {tree['verdict_reason']}.",)
     wrong = [row["child"] for side in ("sensors", "targets") for row in tree[side] if row.get("contradicted")]
     if wrong:
         warnings += (f"Do not use these poses, which their own measurements contradict: {', '.join(wrong)}",)
