@@ -63,7 +63,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/export": {
         "export/test_camchain.py": "overlaps",
         "export/test_camera_files.py": "camera_info camera_words colmap opencv_cameras",
-        "export/test_exported_files.py": "files python_poses static_tf tf_tree urdf written_poses",
+        "export/test_exported_files.py": "files python_snippet static_tf tf_tree urdf written_poses",
     },
     "gtsam_rwhec/files": {
         "cli/test_stage_display.py": "progress",

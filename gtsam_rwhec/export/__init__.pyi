@@ -7,7 +7,7 @@ from .files import FOLDERS as FOLDERS
 from .files import copied_texts as copied_texts
 from .files import export_all as export_all
 from .opencv_cameras import opencv_yaml as opencv_yaml
-from .python_poses import python_poses as python_poses
+from .python_snippet import python_poses as python_poses
 from .static_tf import static_tf_launch as static_tf_launch
 from .tf_tree import tf_yaml as tf_yaml
 from .urdf import urdf_xacro as urdf_xacro

@@ -12,7 +12,7 @@ from gtsam_rwhec.export.camera_info import camera_info_yaml
 from gtsam_rwhec.export.camera_words import comment
 from gtsam_rwhec.export.colmap import colmap_cameras_txt
 from gtsam_rwhec.export.opencv_cameras import FIRST_LINES, opencv_yaml
-from gtsam_rwhec.export.python_poses import python_poses
+from gtsam_rwhec.export.python_snippet import python_poses
 from gtsam_rwhec.export.static_tf import static_tf_launch
 from gtsam_rwhec.export.tf_tree import tf_yaml
 from gtsam_rwhec.export.urdf import urdf_xacro
