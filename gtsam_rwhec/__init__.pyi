@@ -67,6 +67,9 @@ from .results import write_calibration as write_calibration
 from .results import write_refined as write_refined
 from .results import write_solution as write_solution
 
+# What changed since, and does it still hold.
+from . import changes as changes
+
 # From a log of images to a calibration, at once or step by step.
 from . import cleaning as cleaning
 from . import export as export

@@ -43,6 +43,7 @@ TABLE: dict[str, dict[str, str]] = {
         "calibration/test_misreadings.py": "reading readings samples trial_fits wrong_units",
         "reprojection/test_by_corners.py": "by_corners",
     },
+    "gtsam_rwhec/changes": {"changes/test_difference.py": "calibration_files constant_errors quantities"},
     "gtsam_rwhec/cleaning": {
         "cleaning/test_pair_consensus.py": "removed",
         "pipeline/test_synthetic_calibration.py": "odometry synchronisation",
@@ -150,6 +151,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/report": {
         "calibration/test_cross_validation.py": "cross_validation_table",
+        "cli/test_diff.py": "change_report",
         "cli/test_wheel.py": "advice",
         "methods/test_comparison.py": "comparison_report",
         "report/test_solution_report.py": "pose_table printing sentences",

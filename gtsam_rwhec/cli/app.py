@@ -19,6 +19,7 @@ from gtsam_rwhec.cli.compare import compare
 from gtsam_rwhec.cli.convert import convert
 from gtsam_rwhec.cli.demo import demo
 from gtsam_rwhec.cli.detect import detect
+from gtsam_rwhec.cli.diff import diff
 from gtsam_rwhec.cli.exit_status import HELP, ExitStatus
 from gtsam_rwhec.cli.export import export
 from gtsam_rwhec.cli.failures import failures_in_words
@@ -79,7 +80,7 @@ def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
     to.command(epilog=HELP)(run)
 
 
-for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare):
+for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare, diff):
     add(subcommand, app)
 add(utias, fetch_app)
 

@@ -1,4 +1,5 @@
 from .calibration_report import print_calibration as print_calibration
+from .change_report import print_difference as print_difference
 from .comparison_report import print_comparison as print_comparison
 from .corner_report import print_corners as print_corners
 from .covariance_report import print_refined as print_refined

@@ -65,6 +65,10 @@ class CalibrationFields:
         How many measurements were left out, in words.
     notes : tuple of str
         Warnings on the way that changed no choice.
+    constant_errors : two tuples of 6 float, or empty
+        Deviations of a constant error of the carriers' poses, which the covariance holds although no residual shows
+        it: [omega (rad), v (m)] of the targets' carrier in its own axes, and of the sensors'. Another calibration with
+        the same carriers has the same error.
     """
 
     findings: tuple[Finding, ...]
@@ -73,6 +77,7 @@ class CalibrationFields:
     noise: str
     outliers: str
     notes: tuple[str, ...]
+    constant_errors: tuple[tuple[float, ...], ...] = ()
 
     @staticmethod
     def of(calibration: Calibration) -> CalibrationFields:
@@ -84,4 +89,5 @@ class CalibrationFields:
             noise=str(calibration.noise),
             outliers=str(calibration.outliers),
             notes=calibration.notes,
+            constant_errors=() if calibration.noise.model is None else calibration.noise.model.constant_deviations,
         )

@@ -1,0 +1,46 @@
+"""``gtsam-rwhec diff``: what changed from one calibration to the next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.exit_status import ExitStatus
+
+RESULT_HELP = "result.json, or the folder that calibrate wrote."
+LevelOption = Annotated[
+    float, typer.Option(help="How often it may say that something changed where nothing did: 0.01 is once in 100.")
+]
+
+
+def diff(
+    old: Annotated[Path, typer.Argument(help=f"The old calibration: {RESULT_HELP}")],
+    new: Annotated[Path, typer.Argument(help=f"The new calibration: {RESULT_HELP}")],
+    level: LevelOption = rw.changes.LEVEL,
+    frame: Annotated[
+        list[str] | None,
+        typer.Option(help="Test only this frame, most sharply; repeat the option for several.", show_default="all"),
+    ] = None,
+    clocks_may_change: Annotated[
+        bool, typer.Option("--clocks-may-change", help="Do not test the time offsets of sensors.")
+    ] = False,
+    other_arm: Annotated[
+        bool, typer.Option("--other-arm", help="The carriers' poses of NEW come from another arm or tracker.")
+    ] = False,
+) -> ExitStatus:
+    """What moved from an old calibration to a new one, and whether by more than chance; exit status 1 if so."""
+    found = rw.changes.difference(
+        rw.changes.read_calibration(old),
+        rw.changes.read_calibration(new),
+        level=level,
+        frames=frame or (),
+        clocks_may_change=clocks_may_change,
+        same_arm=not other_arm,
+    )
+    rw.report.print_difference(found)
+    if found.test is None and not found.is_same:
+        return ExitStatus.BAD_INPUT
+    return ExitStatus.CHANGED if found.has_changed else ExitStatus.DONE

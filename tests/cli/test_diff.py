@@ -1,0 +1,60 @@
+"""``gtsam-rwhec diff``: exit statuses, the verdict first, and names that cannot steer a terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from two_logs import calibrated, log_of
+from typer.testing import CliRunner
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.app import app
+from gtsam_rwhec.cli.exit_status import ExitStatus
+
+BAD_NAME = "\x1b[31mleft<script>"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three calibrations: old, the same cell later, and with a camera that was knocked."""
+    folder = tmp_path_factory.mktemp("calibrations")
+    problems = {"old": log_of(0), "same": log_of(1), "knocked": log_of(2, knocked="left")}
+    for name, problem in problems.items():
+        renamed = rw.Problem()
+        for pair in problem.pairs:
+            one = problem.measurements(*pair)
+            sensor = BAD_NAME if pair.sensor == "left" else pair.sensor
+            renamed.add(pair.target, sensor, one.A, one.B, 0.001, 1e5, stamps_ns=one.stamps_ns)
+        (folder / name).mkdir()
+        rw.write_calibration(calibrated(renamed), folder / name / "result.json")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("new", "status", "begins"),
+    [
+        ("same", ExitStatus.DONE, "Nothing changed by more than chance at 1 %"),
+        ("knocked", ExitStatus.CHANGED, r"Changed: \x1b[31mleft<script> moved"),
+        ("old", ExitStatus.DONE, "Nothing changed: both are the same answer"),
+    ],
+)
+def test_the_verdict_is_the_first_line_and_the_status(folder: Path, new: str, status: ExitStatus, begins: str) -> None:
+    done = CliRunner().invoke(app, ["diff", str(folder / "old"), str(folder / new)])
+    assert done.exit_code == status, done.output
+    assert done.output.startswith(begins)
+    assert "\x1b" not in done.output
+
+
+def test_what_cannot_be_tested_is_said_and_has_a_status_of_its_own(folder: Path, tmp_path: Path) -> None:
+    answer = rw.results.read_solution(folder / "knocked" / "result.json")
+    rw.write_solution(answer, tmp_path / "solved.json")
+    done = CliRunner().invoke(app, ["diff", str(folder / "old"), str(tmp_path / "solved.json")])
+    assert done.exit_code == ExitStatus.BAD_INPUT
+    assert done.output.startswith("Not tested: NEW has no covariances")
+    assert "not tested" in done.output  # in the table, beside each movement
+
+
+def test_a_path_that_is_none_is_refused(tmp_path: Path, folder: Path) -> None:
+    done = CliRunner().invoke(app, ["diff", str(folder / "old"), str(tmp_path / "nothing.json")])
+    assert done.exit_code == ExitStatus.BAD_INPUT
