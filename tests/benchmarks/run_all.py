@@ -48,7 +48,7 @@ from kinhec_sequences import STANDARD_SEED
 #: Scripts with tables of their own whose rows have bars; the others compare theirs with the papers'.
 WITH_BARS = (
     "coverage.py", "wrong_assumptions.py", "split_halves.py", "corner_coverage.py", "corner_wrong_intrinsics.py",
-    "corner_undetermined.py", "corner_intrinsics.py", "corner_efficiency.py",
+    "corner_undetermined.py", "corner_intrinsics.py", "corner_efficiency.py", "changes.py",
 )  # fmt: skip
 
 
@@ -85,6 +85,7 @@ class Sizes:
         ("corner_undetermined.py", 60),
         ("corner_intrinsics.py", 200),
         ("corner_efficiency.py", 2000),
+        ("changes.py", 1000),
     )
     #: Of the neutral benchmark; none are run without its package.
     neutral_seeds: tuple[int, ...] = (STANDARD_SEED,)
