@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gtsam_rwhec.changes.change_test import ChangeTest
-from gtsam_rwhec.changes.difference import Difference, share_words
+from gtsam_rwhec.changes.comparing import Difference, share_words
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console

@@ -44,8 +44,8 @@ from simulated_arms import ARM, BENT_RAD, Arm, moved_by, white
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.changes.change_test import change_test
+from gtsam_rwhec.changes.comparing import as_result
 from gtsam_rwhec.changes.constant_errors import without_constant_errors
-from gtsam_rwhec.changes.difference import as_result
 from gtsam_rwhec.changes.quantities import Quantities, quantities
 from gtsam_rwhec.simulate.motion import Motion, carrier_poses
 from gtsam_rwhec.simulate.transforms import random_poses
