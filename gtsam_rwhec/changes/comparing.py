@@ -132,7 +132,7 @@ def difference(
 
     Parameters
     ----------
-    old, new : Result (``rw.read_result``) or Calibration
+    old, new : Result (``rw.results.read_result``) or Calibration
     level : float
         How often it may say that something changed where nothing did.
     frames : names, optional
@@ -208,7 +208,7 @@ def as_result(given: object) -> Result:
         return Result(given.solution, given.refined, None, CalibrationFields.of(given))
     if not isinstance(given, Result):
         raise OptionError(
-            f"a calibration to compare is a {type(given).__name__}; give what rw.read_result or rw.calibrate returned"
+            f"a calibration to compare is a {type(given).__name__}; give what rw.results.read_result or rw.calibrate returned"
         )
     return given
 
