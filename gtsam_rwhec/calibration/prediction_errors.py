@@ -11,7 +11,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
-from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.trajectories.local_paths import LocalPaths
 
@@ -65,7 +65,7 @@ class HoldOutError:
     not_predicted: int
 
 
-def prediction_errors(problem: Problem, answer: Solution | Refined, pair: Pair, one: Measurements) -> Array:
+def prediction_errors(problem: Problem, answer: Solution | RefinedPoses, pair: Pair, one: Measurements) -> Array:
     """The errors (2, N) of a pair's predicted measurements, in true metres and radians; nan if a pose is not known."""
     poses: dict[str, Array] = {name: pose.matrix() for name, pose in (answer.X | answer.Y).items()}
     poses = {**problem.fixed, **poses}

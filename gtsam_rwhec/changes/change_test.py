@@ -26,7 +26,7 @@ from gtsam_rwhec.refinement.joint_covariance import SHARE
 #: The level at which something counts as changed, unless another one is asked for.
 LEVEL = 0.01
 #: Random differences without a change, and the most numbers of one array of them.
-DRAWS, MOST_NUMBERS = 50_000, 4_000_000
+DRAWS, MOST_NUMBERS = 20_000, 2_000_000
 #: A chance that fewer of them fall below is bounded by the sum of both tests'.
 FEWEST_DRAWS = 50
 #: A direction whose length is below this share of the longest is rounding.

@@ -208,7 +208,8 @@ def as_result(given: object) -> Result:
         return Result(given.solution, given.refined, None, CalibrationFields.of(given))
     if not isinstance(given, Result):
         raise OptionError(
-            f"a calibration to compare is a {type(given).__name__}; give what rw.results.read_result or rw.calibrate returned"
+            f"a calibration to compare is a {type(given).__name__}; give what rw.results.read_result or rw.calibrate "
+            "returned"
         )
     return given
 

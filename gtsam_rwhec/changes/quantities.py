@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -12,8 +13,8 @@ from rwhec_factors.se3 import right_jacobian_inverse
 
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.refinement.joint_covariance import SHARE
-from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.refinement.joint_covariance import SHARE, JointCovariance
+from gtsam_rwhec.refinement.reprojection_found import Intrinsics
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 
 
@@ -73,7 +74,35 @@ class Quantities:
         return {str(unknown): rows for unknown, rows in self.slots.items()}
 
 
-def quantities(old: RefinedPoses, new: RefinedPoses, without: Collection[UnknownKind] = ()) -> Quantities:
+class Answer(Protocol):
+    """Poses and numbers with their joint covariance: ``Refined``, or what a new log says near an old answer."""
+
+    @property
+    def X(self) -> Mapping[str, gtsam.Pose3]:
+        """T_targetcarrier_target."""
+
+    @property
+    def Y(self) -> Mapping[str, gtsam.Pose3]:
+        """T_sensorcarrier_sensor."""
+
+    @property
+    def scale(self) -> float | Mapping[str, float]:
+        """Measured length / true length."""
+
+    @property
+    def time_offsets_s(self) -> Mapping[str, float]:
+        """By sensor."""
+
+    @property
+    def intrinsics(self) -> Mapping[str, Intrinsics]:
+        """By sensor, where they were estimated."""
+
+    @property
+    def joint(self) -> JointCovariance:
+        """Of all unknowns."""
+
+
+def quantities(old: Answer, new: Answer, without: Collection[UnknownKind] = ()) -> Quantities:
     """What both have, of frames, scales, time offsets and intrinsics; kinds in ``without`` are left out."""
     unknowns = [unknown for unknown in _common(old, new) if unknown.kind not in without]
     not_compared = {}
@@ -110,11 +139,11 @@ def quantities(old: RefinedPoses, new: RefinedPoses, without: Collection[Unknown
     )
 
 
-def _common(old: RefinedPoses, new: RefinedPoses) -> Iterator[Unknown]:
+def _common(old: Answer, new: Answer) -> Iterator[Unknown]:
     """Frames that both have, and unknowns of other kinds that both estimated."""
     for poses, others in ((old.X, new.X), (old.Y, new.Y)):
         yield from (Unknown(UnknownKind.FRAME, name) for name in poses if name in others)
-    for unknown in old.unknowns:
+    for unknown in old.joint.slots:
         if unknown not in new.joint.slots or unknown.kind in (UnknownKind.FRAME, UnknownKind.SHAPE):
             continue
         if unknown.kind is UnknownKind.INTRINSICS:
@@ -126,14 +155,14 @@ def _common(old: RefinedPoses, new: RefinedPoses) -> Iterator[Unknown]:
         yield unknown
 
 
-def _selector(refined: RefinedPoses, unknown: Unknown) -> Array:
+def _selector(refined: Answer, unknown: Unknown) -> Array:
     """The matrix (m, d) of an unknown's rows; zero for a frame that is known exactly."""
     if unknown in refined.joint.slots:
         return refined.joint.selector((unknown,))
     return np.zeros((6, len(refined.joint.unit)))
 
 
-def _why_not(old: RefinedPoses, new: RefinedPoses, unknown: Unknown, G: tuple[Array, Array]) -> str:
+def _why_not(old: Answer, new: Answer, unknown: Unknown, G: tuple[Array, Array]) -> str:
     """Why a quantity cannot be compared; empty where it can."""
     if not G[0].any() and not G[1].any():
         return "its pose was given as known, in both"
@@ -155,10 +184,10 @@ def _is_free(reach: Array, unknown: Unknown) -> bool:
     return bool(reach.shape[1]) and float(np.linalg.norm(rows, axis=1).max()) > SHARE
 
 
-def _difference(old: RefinedPoses, new: RefinedPoses, unknown: Unknown) -> tuple[Array, tuple[Array, Array]]:
+def _difference(old: Answer, new: Answer, unknown: Unknown) -> tuple[Array, tuple[Array, Array]]:
     """New less old, and its derivatives by the errors of both, old first."""
     if unknown.kind is UnknownKind.FRAME:
-        first, second = ((refined.X | refined.Y)[unknown.owner] for refined in (old, new))
+        first, second = ((each.Y if unknown.owner in each.Y else each.X)[unknown.owner] for each in (old, new))
         xi = error_of(first, second)
         return xi, (-right_jacobian_inverse(-xi[None])[0], right_jacobian_inverse(xi[None])[0])
     values = [_values(refined, unknown) for refined in (old, new)]
@@ -166,16 +195,16 @@ def _difference(old: RefinedPoses, new: RefinedPoses, unknown: Unknown) -> tuple
     return values[1] - values[0], (-one, one)
 
 
-def _values(refined: RefinedPoses, unknown: Unknown) -> Array:
+def _values(refined: Answer, unknown: Unknown) -> Array:
     if unknown.kind is UnknownKind.INTRINSICS:
         return np.array(refined.intrinsics[unknown.owner].values)
     if unknown.kind is UnknownKind.TIME_OFFSET:
         return np.array([refined.time_offsets_s[unknown.owner]])
     scale = refined.scale
-    return np.array([scale[unknown.owner] if isinstance(scale, dict) else scale])
+    return np.array([scale[unknown.owner] if isinstance(scale, Mapping) else scale])
 
 
-def _unit(old: RefinedPoses, new: RefinedPoses, unknown: Unknown) -> Array:
+def _unit(old: Answer, new: Answer, unknown: Unknown) -> Array:
     """The unit of each row, from the first of both that has the unknown."""
     joint = old.joint if unknown in old.joint.slots else new.joint
     found: Array = joint.unit[joint.rows((unknown,))] if unknown in joint.slots else np.ones(6)

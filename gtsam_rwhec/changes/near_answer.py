@@ -1,0 +1,213 @@
+"""What a new log says about an old answer: its own estimate, found from the old poses on, under its own noise.
+
+Nothing is solved anew: the noise of the new log and one linear model about the old poses, settled in a few steps, give
+the estimate and its covariance. Directions that a short log leaves free are free in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.noise_model.agreement import agreeing
+from gtsam_rwhec.noise_model.blocks import widening
+from gtsam_rwhec.noise_model.mixture import FEWEST, SAMPLES, mixture_of
+from gtsam_rwhec.noise_model.modelled import FEWER_SAMPLES, is_drift_untried, settled
+from gtsam_rwhec.noise_model.options import NoiseOptions
+from gtsam_rwhec.noise_model.refining import SPARE_EQUATIONS
+from gtsam_rwhec.noise_model.rows import Instants
+from gtsam_rwhec.noise_model.settling import INSTANTS, Settled, Task, moved, thinned
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
+from gtsam_rwhec.refinement.free_space import free_space_of
+from gtsam_rwhec.refinement.input_checks import sensors_with_offset
+from gtsam_rwhec.refinement.joint_covariance import JointCovariance
+from gtsam_rwhec.refinement.options import RefineOptions
+from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.refinement.refining import data_of, scale_of
+from gtsam_rwhec.refinement.reprojection_found import Intrinsics
+from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
+from gtsam_rwhec.refinement.variables import State, Variables
+from gtsam_rwhec.solver.parts import parts_of
+
+#: A measurement that is farther off than this many times the median, as seen from either end, is a gross error.
+GROSS = 10.0
+#: Gross errors are no smaller than this, rad and m.
+SMALLEST_GROSS = np.radians(0.5), 0.005
+#: Outliers are chosen again at most this many times.
+MAX_CHOICES = 4
+
+
+@dataclass(frozen=True)
+class NearAnswer:
+    """What a new log says near an old answer.
+
+    Attributes
+    ----------
+    X, Y, scale, time_offsets_s
+        As in ``RefinedPoses``; those that fit the new log best, near the old ones.
+    joint : JointCovariance
+    degrees_of_freedom : float
+    inliers : dict of (target, sensor) to (N,) booleans
+        The measurements that agree with one another.
+    free : tuple of str
+        Directions that the new log leaves free, in words.
+    """
+
+    X: dict[str, gtsam.Pose3]
+    Y: dict[str, gtsam.Pose3]
+    scale: float | dict[str, float]
+    time_offsets_s: dict[str, float]
+    joint: JointCovariance
+    degrees_of_freedom: float
+    inliers: dict[Pair, np.ndarray]
+    free: tuple[str, ...]
+    intrinsics: dict[str, Intrinsics] = field(default_factory=dict)
+
+
+def near(
+    old: RefinedPoses,
+    problem: Problem,
+    how: RefineOptions,
+    noise: NoiseOptions,
+    progress: Progress | None = None,
+) -> NearAnswer:
+    """The estimate of a problem's measurements near an old answer that has all its frames.
+
+    Raises
+    ------
+    CountError
+        There are too few measurements to tell their noise.
+    UnderdeterminedError
+        There are fewer equations than unknowns.
+    """
+    tell = progress or silent
+    inliers = without_gross_errors(old, problem)
+    task, found = _settled(old, selected(problem, inliers), how, noise, tell)
+    for _ in range(MAX_CHOICES):
+        tell("judging outliers")
+        again = agreeing(problem, inliers, task, found, how)
+        if all(np.array_equal(mask, inliers[pair]) for pair, mask in again.items()) or not _has_all(again):
+            break
+        inliers = again
+        task, found = _settled(old, selected(problem, inliers), how, noise, tell)
+    tell("covariances")
+    is_dense = task.instants.count > INSTANTS
+    mixture = mixture_of(thinned(found.model), found.fit, found.model, FEWER_SAMPLES if is_dense else SAMPLES)
+    basis = found.model.basis
+    state = moved(found.state, task.variables, task.layout, basis @ mixture.step)
+    finite = basis @ mixture.covariance @ basis.T
+    if is_drift_untried(task, found):
+        wider = widening(task, found)
+        finite = finite * wider[:, None] * wider
+    frames = [
+        rows
+        for unknown, rows in task.layout.slots.items()
+        if unknown.kind is UnknownKind.FRAME and not task.layout.free[rows].any()
+    ]
+    freedom = min((mixture.degrees_of_freedom(basis[rows]) for rows in frames), default=float(np.inf))
+    spare = 6 * task.problem.number_of_measurements - len(task.layout.unit)
+    return NearAnswer(
+        X=state.X,
+        Y=state.Y,
+        scale=scale_of(task.problem, state),
+        time_offsets_s=state.offsets_s,
+        joint=replace(task.layout, finite=finite),
+        degrees_of_freedom=min(freedom, max(0.5 * spare, FEWEST)),
+        inliers=inliers,
+        free=tuple(map(str, task.free_directions)),
+    )
+
+
+def _has_all(inliers: Mapping[Pair, np.ndarray]) -> bool:
+    """Whether each pair keeps something: without it, its frames would be no longer there to test."""
+    return all(mask.any() for mask in inliers.values())
+
+
+def _settled(
+    old: RefinedPoses, problem: Problem, how: RefineOptions, noise: NoiseOptions, tell: Progress
+) -> tuple[Task, Settled]:
+    """The noise and the estimate of some measurements, from the old answer on."""
+    offsets = sensors_with_offset(problem, how)
+    variables = Variables.of(problem, offsets)
+    unknowns = sum(unknown.dimension for unknown in variables.unknowns)
+    spare = 6 * problem.number_of_measurements - unknowns
+    if spare < SPARE_EQUATIONS:
+        raise CountError(
+            f"{problem.number_of_measurements} measurements of {len(problem.targets)} targets by "
+            f"{len(problem.sensors)} sensors are too few to tell their noise, and so whether the old calibration "
+            f"holds; measure from {-(-(SPARE_EQUATIONS - spare) // 6)} more poses at least"
+        )
+    data = data_of(problem, variables, how)
+    state = _start(old, variables)
+    space = free_space_of(parts_of(problem), variables, state, data)
+    layout = JointCovariance.of(variables.unknowns, np.eye(len(space.unit)), space.basis, space.unit)
+    task = Task(problem, data, variables, layout, Instants.of(data), noise, space.directions, tell)
+    return task, settled(task, state, tell)
+
+
+def _start(old: RefinedPoses, variables: Variables) -> State:
+    scale = old.scale
+    return State(
+        {name: old.X[name] for name in variables.targets},
+        {name: old.Y[name] for name in variables.sensors},
+        {unknown: scale[unknown.owner] if isinstance(scale, dict) else scale for unknown in variables.scales},
+        dict.fromkeys(variables.offsets, 0.0),
+    )
+
+
+def stated_as(old: RefinedPoses, problem: Problem) -> Problem:
+    """The measurements of frames that the old answer has, with what was known of these: fixed frames, sizes."""
+    stated = Problem(old.scale_mode)
+    for pair in problem.pairs:
+        if pair.is_motion or pair.target not in old.X or pair.sensor not in old.Y:
+            continue
+        one = problem.measurements(*pair)
+        weights = {"covariances": one.covariances} if one.covariances is not None else {}
+        if not weights and not problem.is_relative:
+            weights = {"sigma": one.sigma, "kappa": one.kappa}
+        stated.add(*pair, one.A, one.B, stamps_ns=one.stamps_ns, **weights)  # type: ignore[arg-type]
+    for poses, names in ((old.X, stated.targets), (old.Y, stated.sensors)):
+        for name in names:
+            if Unknown(UnknownKind.FRAME, name) not in old.joint.slots:
+                stated.fix(name, poses[name])
+    if isinstance(old.scale, dict):
+        for name in stated.targets:
+            if Unknown(UnknownKind.SCALE, name) not in old.joint.slots:
+                stated.fix_scale(name, old.scale[name])
+    return stated
+
+
+def without_gross_errors(old: RefinedPoses, problem: Problem) -> dict[Pair, np.ndarray]:
+    """Masks (N,) of measurements that are not far off, as seen from the sensor or from the target.
+
+    A sensor that moved turns all B alike from the left, a target that moved from the right. A measurement that is far
+    from the others' median both ways is a gross error.
+    """
+    result = {}
+    for pair in problem.pairs:
+        one = problem.measurements(*pair)
+        scale = old.scale[pair.target] if isinstance(old.scale, dict) else old.scale
+        B = one.B.copy()
+        B[:, :3, 3] /= scale
+        predicted = se3.inverse(old.Y[pair.sensor].matrix()[None]) @ one.A @ old.X[pair.target].matrix()
+        seen = predicted @ se3.inverse(B), se3.inverse(B) @ predicted
+        result[pair] = ~(_far_off(se3.logmap(seen[0])) & _far_off(se3.logmap(seen[1])))
+    return result
+
+
+def _far_off(xi: Array) -> np.ndarray:
+    """Which twists (N, 6) are far from the median, in rotation or in translation."""
+    away = xi - np.median(xi, axis=0)
+    sizes = np.linalg.norm(away.reshape(-1, 2, 3), axis=2)
+    limit = np.maximum(GROSS * np.median(sizes, axis=0), SMALLEST_GROSS)
+    far: np.ndarray = (sizes > limit).any(axis=1)
+    return far

@@ -1,0 +1,295 @@
+"""``verify``: whether an old calibration still holds on a new log, without calibrating anew."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gtsam_rwhec.calibration.calibrated import Calibration
+from gtsam_rwhec.calibration.prediction_errors import PredictionError, prediction_errors
+from gtsam_rwhec.changes.change_test import LEVEL, ChangeTest, change_test, checked_level
+from gtsam_rwhec.changes.comparing import as_result, share_words
+from gtsam_rwhec.changes.constant_errors import without_constant_errors
+from gtsam_rwhec.changes.near_answer import NearAnswer, near, stated_as
+from gtsam_rwhec.changes.quantities import Movement, Quantities, quantities
+from gtsam_rwhec.errors import FrameError, OptionError, UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.noise_model.components import Component
+from gtsam_rwhec.noise_model.options import NoiseOptions
+from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.refinement.options import CarrierNoise, RefineOptions
+from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.refinement.unknowns import UnknownKind
+from gtsam_rwhec.results.result_file import Result
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+
+#: Why frames are not checked.
+UNSEEN_SENSOR = "the new log has no measurement by it"
+UNSEEN_TARGET = "the new log has no measurement of it"
+#: Residuals that are this many times those of the old log are told.
+NOISIER = 2.0
+
+
+@dataclass(frozen=True)
+class SensorCheck:
+    """How well the old poses predict what a sensor saw in the new log.
+
+    Attributes
+    ----------
+    held : PredictionError
+        Of the old poses: what a robot that uses them is off by, with the noise of the measurements.
+    best : PredictionError
+        Of the poses that fit the new log best: the noise of the measurements.
+    outliers : int
+        Measurements that agree with no others; they count in neither.
+    noise_ratio : float or None
+        `best`'s median translation over the root mean square of the old log's residuals; None where that has none.
+    """
+
+    held: PredictionError
+    best: PredictionError
+    outliers: int
+    noise_ratio: float | None
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Whether an old calibration still holds; ``str()`` is the verdict.
+
+    Attributes
+    ----------
+    test : ChangeTest
+        Of the old poses against those that fit the new log best, by the sum of both covariances.
+    movements : dict of str to Movement
+        From the old pose of each frame to the one that fits the new log best.
+    sensors : dict of str to SensorCheck
+    not_checked : dict of str to str
+        Sensors and targets of the old calibration that the new log tells nothing of, with the reason.
+    targets_may_move : bool
+        Whether targets were left out of the test.
+    remarks : tuple of str
+    """
+
+    test: ChangeTest
+    movements: dict[str, Movement]
+    sensors: dict[str, SensorCheck]
+    not_checked: dict[str, str]
+    targets_may_move: bool
+    remarks: tuple[str, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing says that the old calibration no longer holds."""
+        return not self.test.has_changed
+
+    @property
+    def unchecked_sensors(self) -> tuple[str, ...]:
+        """The sensors of the old calibration that were not checked."""
+        return tuple(name for name, why in self.not_checked.items() if why == UNSEEN_SENSOR or name in self.sensors)
+
+    def __str__(self) -> str:
+        level = f"{100.0 * self.test.level:g} %"
+        said = ", ".join(map(shown, self.unchecked_sensors))
+        but = f" Not checked: {said}." if said else ""
+        if self.holds:
+            return (
+                f"The calibration still holds at {level}: the new log agrees with it as well as by chance in "
+                f"{share_words(self.test.chance)}.{but}"
+            )
+        named = self.test.changed
+        if not named:
+            return f"The calibration no longer holds, at {level}. No frame stands out by itself.{but}"
+        return f"The calibration no longer holds, at {level}: {'; '.join(map(self.sentence, named))}.{but}"
+
+    def sentence(self, name: str) -> str:
+        """How far a frame seems to have moved, in words, without a full stop."""
+        deviations = f"{self.test.groups[name].deviations:.1f} joint deviations"
+        if name not in self.movements:
+            return f"{shown(name)} changed ({deviations})"
+        moved = self.movements[name]
+        return f"{shown(name)} moved {moved.translation_mm:.3g} mm and {moved.rotation_deg:.2g} degrees ({deviations})"
+
+
+@one_blas_thread()
+def verify(
+    old: Result | Calibration,
+    problem: Problem,
+    *,
+    level: float = LEVEL,
+    targets_may_move: bool = False,
+    systematic: bool = True,
+    carrier_noise: CarrierNoise | None = None,
+    time_offsets: Collection[str] = (),
+    carrier_path: Trajectory | None = None,
+    progress: Progress | None = None,
+) -> Verification:
+    """Whether an old calibration still holds on new measurements, without calibrating anew.
+
+    The noise of the new measurements is found, and from the old poses on the poses that fit them best. The difference
+    is tested against the sum of both covariances, as `difference` does. What the new log leaves free is not tested, so
+    that a short log is enough for what it shows.
+
+    Parameters
+    ----------
+    old : Result (``rw.results.read_result``) or Calibration
+    problem : Problem
+        The new measurements, with raw poses.
+    level : float
+        How often it may say that the calibration no longer holds where nothing changed.
+    targets_may_move : bool
+        The targets may stand elsewhere than before: only sensors are tested, and need a motion that tells their poses
+        without the targets'.
+    systematic : bool
+        Whether A may have errors that vary with the configuration, as arms have.
+    carrier_noise : CarrierNoise, optional
+        The noise of A, where it is known.
+    time_offsets : names of sensors, optional
+        Sensors whose clock may be off: their time offset is free.
+    carrier_path : Trajectory, optional
+        The carriers' path, for time offsets.
+    progress : callable, optional
+
+    Raises
+    ------
+    FrameError
+        The new measurements have no pair of frames that the old calibration has.
+    UnderdeterminedError
+        The old calibration has no covariances, or nothing that the new log determines can be compared.
+    CountError
+        There are too few measurements to tell their noise.
+    """
+    checked_level(level)
+    result = as_result(old)
+    if not isinstance(problem, Problem):
+        raise OptionError(f"the problem is a {type(problem).__name__}; give a gtsam_rwhec.Problem")
+    if result.refined is None:
+        raise UnderdeterminedError(
+            "the old calibration has no covariances, because it was not refined, so nothing can be tested; calibrate "
+            "with rw.calibrate or gtsam-rwhec calibrate"
+        )
+    refined = without_constant_errors(result)
+    problem.require_raw_measurements("verify")
+    stated = stated_as(refined, problem)
+    if not stated.pairs:
+        raise FrameError(
+            f"the new measurements are of {', '.join(map(shown, (*problem.targets, *problem.sensors)))}, the old "
+            f"calibration of {', '.join(map(shown, (*refined.X, *refined.Y)))}: no target and sensor of "
+            "one pair are in both"
+        )
+    how = RefineOptions(
+        noise="estimate", time_offsets=tuple(time_offsets) or False, carrier_path=carrier_path if time_offsets else None
+    )
+    found = near(refined, stated, how, _noise_options(carrier_noise, systematic=systematic), progress)
+    common = quantities(refined, found, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
+    if targets_may_move:
+        common = _of_sensors(common, refined)
+    not_checked = {name: UNSEEN_SENSOR for name in refined.Y if name not in found.Y}
+    not_checked |= {name: UNSEEN_TARGET for name in refined.X if name not in found.X and not targets_may_move}
+    not_checked |= {str(unknown): why for unknown, why in common.not_compared.items()}
+    if not common.slots:
+        said = "; ".join(f"{shown(name)}: {why}" for name, why in not_checked.items())
+        raise UnderdeterminedError(f"nothing can be tested ({said}); move about two axes, and take more images")
+    test = change_test(
+        common.difference, common.covariances, common.free, common.groups,
+        (refined.degrees_of_freedom, found.degrees_of_freedom), level,
+    )  # fmt: skip
+    movements = {
+        name: Movement.of(pose, now[name])
+        for poses, now in ((refined.Y, found.Y), (refined.X, found.X))
+        for name, pose in poses.items()
+        if name in now
+    }
+    checks = _checks(result, refined, found, stated)
+    return Verification(
+        test=test,
+        movements=movements,
+        sensors=checks,
+        not_checked=not_checked,
+        targets_may_move=targets_may_move,
+        remarks=tuple(_remarks(refined, problem, found, checks, targets_may_move=targets_may_move)),
+    )
+
+
+def _noise_options(carrier: CarrierNoise | None, *, systematic: bool) -> NoiseOptions:
+    stated: dict[Component, float] = {}
+    if carrier is not None and carrier.covariances is None:
+        stated = {
+            Component.CARRIER_ROTATION: carrier.rotation_rad,
+            Component.CARRIER_TRANSLATION: carrier.translation_m,
+        }
+        return NoiseOptions(stated=stated, systematic=systematic, side=carrier.about)
+    return NoiseOptions(systematic=systematic)
+
+
+def _of_sensors(common: Quantities, old: RefinedPoses) -> Quantities:
+    """The quantities that are not of targets: these are unknown again."""
+    kept = {unknown: rows for unknown, rows in common.slots.items() if unknown.owner in old.Y}
+    rows = [row for place in kept.values() for row in range(place.start, place.stop)]
+    slots, first = {}, 0
+    for unknown, place in kept.items():
+        slots[unknown] = slice(first, first + place.stop - place.start)
+        first = slots[unknown].stop
+    at = np.ix_(rows, rows)
+    one, other = common.covariances
+    not_compared = {unknown: why for unknown, why in common.not_compared.items() if unknown.owner in old.Y}
+    return Quantities(common.difference[rows], (one[at], other[at]), common.free[rows], slots, not_compared)
+
+
+def _checks(result: Result, old: RefinedPoses, found: NearAnswer, problem: Problem) -> dict[str, SensorCheck]:
+    """By sensor, how well the old poses and the best ones predict what it saw."""
+    held = replace(old, time_offsets_s=found.time_offsets_s)
+    best = replace(held, X=found.X, Y=found.Y, scale=found.scale)
+    checks = {}
+    for sensor in problem.sensors:
+        pairs = [pair for pair in problem.pairs if pair.sensor == sensor]
+        errors = []
+        for answer in (held, best):
+            of_pairs = [
+                prediction_errors(problem, answer, pair, problem.measurements(*pair))[:, found.inliers[pair]]
+                for pair in pairs
+            ]
+            errors.append(PredictionError.of(*np.concatenate(of_pairs, axis=1)))
+        before = _residual_m(result, sensor)
+        checks[sensor] = SensorCheck(
+            held=errors[0],
+            best=errors[1],
+            outliers=sum(int((~found.inliers[pair]).sum()) for pair in pairs),
+            noise_ratio=None if before is None else 1e-3 * errors[1].translation_rms_mm / before,
+        )
+    return checks
+
+
+def _residual_m(result: Result, sensor: str) -> float | None:
+    """The root mean square of a sensor's residuals in the old log, m."""
+    residuals = [residual for pair, residual in result.solution.residuals.items() if pair.sensor == sensor]
+    count = sum(one.number_of_measurements for one in residuals)
+    square = sum(one.number_of_measurements * one.translation_rms_m**2 for one in residuals)
+    return float(np.sqrt(square / count)) if count and square > 0.0 else None
+
+
+def _remarks(
+    old: RefinedPoses, problem: Problem, found: NearAnswer, checks: dict[str, SensorCheck], *, targets_may_move: bool
+) -> list[str]:
+    remarks = []
+    strangers = [name for name in (*problem.sensors, *problem.targets) if name not in old.X and name not in old.Y]
+    if strangers:
+        remarks.append(
+            f"the old calibration has no {', '.join(map(shown, strangers))}; their measurements do not count"
+        )
+    remarks += [f"the new log leaves free: {direction}" for direction in found.free]
+    remarks += [f"the old calibration leaves free: {direction}" for direction in old.free_directions]
+    for name, check in checks.items():
+        if check.noise_ratio is not None and check.noise_ratio > NOISIER:
+            remarks.append(
+                f"what {shown(name)} measures scatters {check.noise_ratio:.1f} times as much as in the old log, "
+                "whatever its pose: look for a loose mount, blur, another exposure, or targets that are farther away"
+            )
+        if check.outliers:
+            remarks.append(f"{check.outliers} measurements of {shown(name)} agree with no others, and do not count")
+    if targets_may_move:
+        remarks.append("the targets may stand elsewhere than before: their poses are not tested")
+    return remarks
