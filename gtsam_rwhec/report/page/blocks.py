@@ -7,7 +7,7 @@ file or in the evidence, so that a test can read both and compare them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -160,6 +160,14 @@ class Page:
     tone: Literal["good", "care", "bad"]
     sections: tuple[Section, ...]
     made_by: str
+
+
+def every(blocks: Iterable[Block]) -> Iterator[Block]:
+    """The blocks, and those that are folded in them."""
+    for block in blocks:
+        yield block
+        if isinstance(block, Folded):
+            yield from every(block.blocks)
 
 
 def safe(text: str) -> str:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import base64
 import gzip
+import hashlib
 import json
+import re
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.report.page.blocks import Number, Page, Words
+from gtsam_rwhec.report.page.blocks import Number, Page, Words, every
 
 
 def write_page(page: Page, path: str | Path) -> None:
@@ -36,14 +39,25 @@ def page_html(page: Page) -> str:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters.update(base64=_base64, script_json=_script_json, pieces=_pieces)
+    environment.filters.update(base64=_base64, script_json=_script_json, pieces=_pieces, own_ids=_own_ids)
     environment.tests.update(number=lambda piece: isinstance(piece, Number))
-    has_drawing = any(block.kind == "drawing" for section in page.sections for block in section.blocks)
+    has_drawing = any(block.kind == "drawing" for section in page.sections for block in every(section.blocks))
+    script = _own_file("page.js")
     return environment.get_template("page.html.j2").render(
         page=page,
         style=_own_file("page.css"),
-        script=_own_file("page.js"),
-        plotly=_plotly() if has_drawing else "",
+        script=script,
+        plotly=_packed_plotly() if has_drawing else "",
+        policy=_policy([script, *([_plotly()] if has_drawing else [])]),
+    )
+
+
+def _policy(scripts: Sequence[str]) -> str:
+    """What the browser may do with the page: run these scripts, and no other; and fetch nothing from anywhere."""
+    sums = " ".join(f"'sha256-{_base64(hashlib.sha256(script.encode()).digest())}'" for script in scripts)
+    return (
+        f"default-src 'none'; script-src {sums}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; "
+        "form-action 'none'"
     )
 
 
@@ -53,10 +67,23 @@ def _own_file(name: str) -> str:
 
 @cache
 def _plotly() -> str:
-    """plotly's script, compressed, as base64: browsers unpack it; as it is it would be most of the page."""
+    """plotly's script."""
     from plotly.offline import get_plotlyjs
 
-    return _base64(gzip.compress(get_plotlyjs().encode("utf-8"), 6, mtime=0))
+    return str(get_plotlyjs())
+
+
+@cache
+def _packed_plotly() -> str:
+    """The same, compressed, as base64: browsers unpack it; as it is it would be most of the page."""
+    return _base64(gzip.compress(_plotly().encode("utf-8"), 6, mtime=0))
+
+
+def _own_ids(svg: str, name: str) -> str:
+    """A figure whose ids are its own: several on one page have parts of the same name. Ids without use are left out."""
+    used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', svg))
+    svg = re.sub(r' id="([^"]*)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", svg)
+    return re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)
 
 
 def _base64(content: bytes) -> str:
