@@ -30,7 +30,7 @@ def test_the_page_is_beside_the_result_of_a_file_or_a_folder(result: Path) -> No
 def test_sections_without_data_say_why(result: Path, tmp_path: Path) -> None:
     status, _ = command("report", result, "-o", tmp_path / "page.html")
     assert status == 0
-    assert "Not shown: the result has no record of its inputs" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "Not shown: files, versions and options" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_a_file_that_is_no_result_is_refused_in_words(tmp_path: Path) -> None:
