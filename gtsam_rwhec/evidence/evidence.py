@@ -11,6 +11,7 @@ from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.evidence.derived import Derived
 from gtsam_rwhec.evidence.inputs import Inputs
 from gtsam_rwhec.evidence.record import EvidenceRecord
+from gtsam_rwhec.evidence.weak import WeakDirection
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.results.json_tree import in_words
@@ -28,6 +29,7 @@ class Evidence(EvidenceRecord):
     format: Literal["gtsam-rwhec evidence"] = FORMAT
     format_version: Literal[1] = FORMAT_VERSION
     derived: Derived | None = Field(default=None, description="what follows from poses and covariances")
+    weak: tuple[WeakDirection, ...] = Field(default=(), description="least known directions, the worst first")
     inputs: Inputs | None = Field(default=None, description="files, versions, options, rig file")
 
 

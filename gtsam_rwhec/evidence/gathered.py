@@ -6,6 +6,8 @@ from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.evidence.derived import derived_of
 from gtsam_rwhec.evidence.evidence import Evidence
 from gtsam_rwhec.evidence.inputs import Inputs, versions
+from gtsam_rwhec.evidence.measured import measured_rows
+from gtsam_rwhec.evidence.weak import weak_directions
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.problem import Problem
 
@@ -31,5 +33,6 @@ def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | Non
     inputs = Inputs(files=(), versions=versions()) if inputs is None else inputs
     return Evidence(
         derived=derived_of(calibration),
+        weak=weak_directions(calibration, measured_rows(problem, calibration)),
         inputs=inputs.with_options(calibration.options),
     )

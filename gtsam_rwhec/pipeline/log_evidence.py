@@ -10,7 +10,10 @@ from pathlib import Path
 from gtsam_rwhec.evidence import Evidence
 from gtsam_rwhec.evidence.derived import derived_of
 from gtsam_rwhec.evidence.inputs import Inputs, input_files, versions
-from gtsam_rwhec.pipeline.solving_stage import Calibrated
+from gtsam_rwhec.evidence.measured import MeasuredRows
+from gtsam_rwhec.evidence.weak import weak_directions
+from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.rig import rig_text
 
 
@@ -33,8 +36,17 @@ def evidence_of_log(calibrated: Calibrated, log_path: str | Path, sources: Seque
     )
     return Evidence(
         derived=derived_of(calibrated.calibration),
+        weak=weak_directions(calibrated.calibration, rows_of_log(calibrated)),
         inputs=inputs.with_options(calibrated.calibration.options),
     )
+
+
+def rows_of_log(calibrated: Solved) -> dict[Pair, MeasuredRows]:
+    """The measurements of a log, used or not, in the order of its pairs."""
+    return {
+        pair: MeasuredRows(one.A, one.B, one.stamps_ns, one.covariance, one.reasons)
+        for pair, one in calibrated.pairs.items()
+    }
 
 
 def _command(sources: Sequence[Path]) -> str:

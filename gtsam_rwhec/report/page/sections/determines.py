@@ -1,0 +1,125 @@
+"""Section 4: which sensor and target determine each other, and which directions are free or weak, with their cures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from gtsam_rwhec.files.natural_order import natural_key
+from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
+from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Number, Paragraph, Section, Table, Words
+from gtsam_rwhec.report.page.sections.weak_directions import weak_blocks
+from gtsam_rwhec.report.page.shown_result import ShownResult
+from gtsam_rwhec.report.pair_grid import DETERMINED, NOT_DETERMINED, NOT_OBSERVED, Symbol
+
+#: A grid with more targets has a row for each target, and a column for each sensor.
+MOST_COLUMNS = 16
+#: A grid with more rows is folded.
+MOST_ROWS = 40
+#: What settles a free direction, by the reason for which it is free.
+CURES: Mapping[FreeReason, str] = {
+    FreeReason.CONTRADICTION: "First correct how A and B are read; the motion may be good.",
+    FreeReason.FEW: "Measure these frames at three poses or more, which turn about two different axes.",
+    FreeReason.NO_ROTATION: "Turn the carriers, by 30 degrees or more, about two axes that are far from parallel.",
+    FreeReason.ONE_AXIS: "Turn the carriers about a second axis, across the first, by 30 degrees or more.",
+    FreeReason.NOISE: "Turn by larger angles about the axes that were used least, or measure far more often.",
+    FreeReason.COMPENSATED: "Turn about a second axis, or state what is known: a size, a scale, or one of the poses.",
+    FreeReason.STANDSTILL: "Measure while the carriers move and turn, faster and with changes of direction.",
+    FreeReason.SYMMETRY: "Turn by other angles than half a turn, and about axes that are not in one plane.",
+}
+FREE_IN_WORDS = "Turn the carriers about at least two different axes, or fix frames that you know."
+ALL_DETERMINED = "The measurements determine every direction beyond their noise: none is free."
+NO_ANSWER = "the calibration has no answer."
+
+
+Count = tuple[Number | str, ...]
+
+
+def determines_section(shown: ShownResult) -> Section:
+    """The grid of the RWHEC paper's Figure 8 with counts; free and weak directions, with motions that settle them."""
+    title = "Who determines whom"
+    if shown.result is None:
+        return Section("determines", title, missing=NO_ANSWER)
+    known = shown.result.solution.identifiability
+    blocks: list[Block] = [Paragraph(str(known)), *_grid(shown), *_motions(shown)]
+    refined = shown.result.refined
+    free = (refined.free_directions if refined is not None else ()) or known.free_directions
+    if free:
+        blocks.append(Paragraph("Free directions: the poses can move along them and fit as well.", "bad"))
+        blocks.append(Listing(tuple(f"Not determined: {one}. {cure_of(one)}" for one in free)))
+    else:
+        blocks.append(Paragraph(ALL_DETERMINED))
+    blocks += weak_blocks(shown)
+    return Section("determines", title, tuple(blocks))
+
+
+def cure_of(free: FreeDirection) -> str:
+    """The motion that settles a free direction."""
+    return FREE_IN_WORDS if free.reason is None else CURES[free.reason]
+
+
+def _grid(shown: ShownResult) -> Iterator[Block]:
+    """The grid: in each cell a sign, and the measurements that are used."""
+    assert shown.result is not None
+    alone = shown.result.solution.identifiability.pairs
+    counts = _counts(shown)
+    pairs = [pair for pair in counts if not pair.is_motion]
+    if not pairs:
+        return
+    targets = sorted({pair.target for pair in pairs}, key=natural_key)
+    sensors = sorted({pair.sensor for pair in pairs}, key=natural_key)
+
+    def cell(target: str, sensor: str) -> Words:
+        pair = Pair(target, sensor)
+        found = alone.get(pair)
+        sign = NOT_OBSERVED if found is None else DETERMINED if found.is_unique else NOT_DETERMINED
+        return _cell(sign, counts.get(pair))
+
+    by_targets = len(targets) > MOST_COLUMNS and len(targets) > len(sensors)
+    across, down = (sensors, targets) if by_targets else (targets, sensors)
+    rows = tuple((name, *(cell(name, other) if by_targets else cell(other, name) for other in across)) for name in down)
+    caption = "Sensors and targets (RWHEC paper, Figure 8)"
+    kind = "target" if by_targets else "sensor"
+    table = Table(caption, (kind, *across), rows, _legend(any(len(count) > 1 for count in counts.values())))
+    yield table if len(rows) <= MOST_ROWS else Folded(f"{caption}: {len(rows)} rows", (table,))
+
+
+def _legend(has_outliers: bool) -> str:
+    signs = "; ".join(f"{kind.symbol} {kind.meaning}" for kind in (DETERMINED, NOT_DETERMINED, NOT_OBSERVED))
+    more = "; where some were left out, the number of all follows" if has_outliers else ""
+    return f"{signs}. The number beside a sign is that of the measurements in the answer{more}."
+
+
+def _cell(sign: Symbol, count: Count | None) -> Words:
+    return sign.symbol if count is None else (f"{sign.symbol} ", *count)
+
+
+def _counts(shown: ShownResult) -> dict[Pair, Count]:
+    """The measurements of each pair in the answer, and how many there were, as the result has them."""
+    tree, certified = shown.tree, ("certified", "identifiability", "pairs")
+    counts: dict[Pair, Count] = {
+        Pair(row["target"], row["sensor"]): (shown.number(*certified, i, "number_of_measurements", spec=".0f"),)
+        for i, row in enumerate(tree["certified"]["identifiability"]["pairs"])
+    }
+    for i, row in enumerate((tree.get("log") or {}).get("outliers", ())):
+        if row.get("left_out", 0):
+            used, left_out = (shown.number("log", "outliers", i, name, spec=".0f") for name in ("used", "left_out"))
+            counts[Pair(row["target"], row["sensor"])] = (used, " (", left_out, " left out)")
+    for i, row in enumerate((tree.get("refined") or {}).get("inlier_counts", ())):
+        kept, of = row["value"]
+        if kept < of:
+            kept, of = (shown.number("refined", "inlier_counts", i, "value", k, spec=".0f") for k in range(2))
+            counts[Pair(row["target"], row["sensor"])] = (kept, " of ", of)
+    return counts
+
+
+def _motions(shown: ShownResult) -> Iterator[Block]:
+    """A sentence for each sensor's own motion, which sees no target."""
+    assert shown.result is not None
+    sentences = [
+        f"{pair.sensor} from its own motion: {'determined' if alone.is_unique else 'not determined'}."
+        for pair, alone in shown.result.solution.identifiability.pairs.items()
+        if pair.is_motion
+    ]
+    if sentences:
+        yield Listing(tuple(sentences))

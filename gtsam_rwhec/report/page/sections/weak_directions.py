@@ -1,0 +1,102 @@
+"""The least known direction of each frame in words, with the motion that would make it known better."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gtsam_rwhec.evidence.weak import MORE, TURN_RAD, WEAK, WeakDirection
+from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Paragraph, Table, Words
+from gtsam_rwhec.report.page.shown_result import ShownResult
+
+#: A direction is called after a coordinate axis within 8 degrees of it.
+AXIS_COSINE = np.cos(np.radians(8.0))
+NOT_KNOWN = "Not shown: the least known directions, for the result has no evidence.json beside it with covariances."
+NONE_IS_WEAK = (
+    f"No direction is weak: none has a standard deviation above {WEAK:g} times the median of all. The table has the "
+    "least known direction of each frame."
+)
+LEGEND = (
+    f"Least known first. Turning: {MORE} more measurements with the named partner in view, one carrier turned against "
+    f"the other by {np.degrees(TURN_RAD):.0f} degrees to both sides about this axis of the sensors' carrier, through "
+    f"the target. Same: {MORE} more like those there are. Both count for as much as those there are do, correlation "
+    "counted; errors that all measurements share stay."
+)
+
+
+def weak_blocks(shown: ShownResult) -> Iterator[Block]:
+    """The weak directions as sentences, and the least known direction of every frame as a table."""
+    weak = () if shown.evidence is None else shown.evidence.weak
+    if not weak:
+        yield Paragraph(NOT_KNOWN, "note")
+        return
+    said = tuple(_sentence(shown, i, one) for i, one in enumerate(weak) if one.is_weak)
+    if said:
+        yield Paragraph("Weak directions: determined, but far less well than the others.")
+        yield Listing(said)
+    else:
+        yield Paragraph(NONE_IS_WEAK)
+    tables = [
+        Table(
+            f"Least known {'directions' if kind == 'translation' else 'rotation axes'}",
+            ("frame", "along" if kind == "translation" else "about", unit, "with", "turn about", "turning", "same"),
+            tuple(_row(shown, i, one) for i, one in enumerate(weak) if one.kind == kind),
+            LEGEND,
+        )
+        for kind, unit in (("translation", "±mm"), ("rotation", "±°"))
+    ]
+    yield Folded("The least known direction of each frame, and the motion that would help", tuple(tables))
+
+
+def axis_words(axis: tuple[float, float, float], frame: str) -> str:
+    """Words for a direction: "hand's z axis", or "(0.60, 0.80, 0.00) of hand"."""
+    k = int(np.abs(axis).argmax())
+    if abs(axis[k]) > AXIS_COSINE:
+        return f"{frame}'s {'xyz'[k]} axis"
+    rounded = np.round(np.array(axis) * np.sign(axis[k]), 2) + 0.0
+    return f"({', '.join(f'{value:.2f}' for value in rounded)}) of {frame}"
+
+
+def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
+    """A weak direction and its cure."""
+    along, unit = ("along", " mm") if one.kind == "translation" else ("about", "°")
+    deviation = shown.evident("weak", i, "deviation", spec=".2g")
+    words: tuple[str | object, ...] = (
+        f"{one.frame} {along} {axis_words(one.axis_in_carrier, one.carrier)}: ± ",
+        deviation,
+        f"{unit}.",
+    )
+    if one.turn is not None:
+        words += (
+            f" Turn about {axis_words(one.turn, sensor_carrier(shown))} with {one.partner} in view: {MORE} "
+            "measurements would bring it to about ± ",
+            shown.evident("weak", i, "after_turning", spec=".2g"),
+            f"{unit}, as many like those there are to ± ",
+            shown.evident("weak", i, "after_more", spec=".2g"),
+            f"{unit}.",
+        )
+    elif one.after_more is not None:
+        words += (
+            f" No turn helps more than measuring on: {MORE} more measurements would bring it to about ± ",
+            shown.evident("weak", i, "after_more", spec=".2g"),
+            f"{unit}.",
+        )
+    return words  # type: ignore[return-value]
+
+
+def _row(shown: ShownResult, i: int, one: WeakDirection) -> tuple[Words, ...]:
+    return (
+        one.frame,
+        axis_words(one.axis_in_carrier, one.carrier),
+        shown.evident("weak", i, "deviation", spec=".2g"),
+        one.partner or "-",
+        "-" if one.turn is None else axis_words(one.turn, sensor_carrier(shown)),
+        "-" if one.after_turning is None else shown.evident("weak", i, "after_turning", spec=".2g"),
+        "-" if one.after_more is None else shown.evident("weak", i, "after_more", spec=".2g"),
+    )
+
+
+def sensor_carrier(shown: ShownResult) -> str:
+    """The name of the frame that carries the sensors."""
+    return str(shown.tree["sensors"][0]["parent"])
