@@ -107,6 +107,10 @@ class LogWarning(RwhecWarning):
     """Parts of a log could not be read; the message says which, how many and why."""
 
 
+class EvidenceWarning(RwhecWarning):
+    """The evidence beside a result cannot be shown: it is damaged, or of another result. The message says which."""
+
+
 class UnfinishedRigWarning(RwhecWarning):
     """Lines of a rig file are still marked TODO: their values are guesses. The message names the lines."""
 

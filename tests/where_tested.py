@@ -159,9 +159,12 @@ TABLE: dict[str, dict[str, str]] = {
         "methods/test_comparison.py": "comparison_report",
         "report/test_solution_report.py": "pose_table printing sentences",
     },
-    "gtsam_rwhec/report/page": {"report/page/test_written.py": "blocks figures html shown_result"},
     "gtsam_rwhec/report/page/sections": {
         "report/page/test_number_sections.py": ("determines inputs pose_tables verdict weak_directions")
+    },
+    "gtsam_rwhec/report/page": {
+        "report/page/test_figures.py": "figure_files",
+        "report/page/test_written.py": "blocks html shown_result",
     },
     "gtsam_rwhec/report/plots": {
         "report/plots/test_plots.py": "coverage deviations frames intrinsics plotted residuals",

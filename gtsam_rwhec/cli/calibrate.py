@@ -249,7 +249,7 @@ def _write_report(output: Path, evidence: rw.evidence.Evidence | None) -> Path |
     if output.suffix != ".json":
         return None  # a device, or a name that somebody chose for a reason: nothing is written beside it
     if evidence is not None:
-        rw.evidence.write_evidence(evidence, rw.evidence.evidence_path(output))
+        rw.evidence.write_evidence(evidence, rw.evidence.evidence_path(output), output)
     page = report_path(output)
     rw.report.write_html(output, page)
     return page

@@ -24,6 +24,10 @@ def report(
         bool,
         typer.Option("--images/--no-images", help="Whether the page shows images. They may be confidential."),
     ] = True,
+    figures: Annotated[
+        Path | None,
+        typer.Option("--figures", help="Folder that gets every figure of the page as SVG and PNG too."),
+    ] = None,
 ) -> ExitStatus:
     """Write the report of a finished calibration as one HTML file, which needs no network.
 
@@ -34,8 +38,9 @@ def report(
     check_output(output)
     with StageDisplay() as stage:
         stage("writing the report")
-        rw.report.write_html(result, output, images=images)
-    say(f"Written to {shown_path(output)}.", to_errors=True)
+        rw.report.write_html(result, output, images=images, figures=figures)
+    beside = "" if figures is None else f"; figures: {shown_path(figures)}"
+    say(f"Written to {shown_path(output)}{beside}.", to_errors=True)
     return ExitStatus.DONE
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Final, Literal
 
@@ -28,6 +29,7 @@ class Evidence(EvidenceRecord):
 
     format: Literal["gtsam-rwhec evidence"] = FORMAT
     format_version: Literal[1] = FORMAT_VERSION
+    result_sha256: str = Field(default="", description="checksum of the result's file; empty where it was not known")
     derived: Derived | None = Field(default=None, description="what follows from poses and covariances")
     weak: tuple[WeakDirection, ...] = Field(default=(), description="least known directions, the worst first")
     inputs: Inputs | None = Field(default=None, description="files, versions, options, rig file")
@@ -39,15 +41,31 @@ def evidence_path(result_path: str | Path) -> Path:
     return path.with_name("evidence.json" if path.name == "result.json" else f"{path.stem}.evidence.json")
 
 
-def write_evidence(evidence: Evidence, path: str | Path) -> None:
+def write_evidence(evidence: Evidence, path: str | Path, result_path: str | Path | None = None) -> None:
     """Write the evidence as JSON.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    path
+        Its file.
+    result_path : optional
+        The result's file. Its checksum is kept, so that the evidence is never shown beside another result.
 
     Raises
     ------
     FileFormatError
-        The file cannot be written.
+        The file cannot be written, or that of the result cannot be read.
     """
+    if result_path is not None:
+        content = read_whole(Path(result_path), MOST_BYTES, "A result was")
+        evidence = evidence.model_copy(update={"result_sha256": checksum(content)})
     write_atomically(path, evidence_json(evidence))
+
+
+def checksum(content: bytes) -> str:
+    """SHA-256 of a result's content, as the evidence keeps it."""
+    return hashlib.sha256(content).hexdigest()
 
 
 def evidence_json(evidence: Evidence) -> bytes:

@@ -32,6 +32,6 @@ def write_report(
     """
     (progress or silent)("writing the report")
     evidence = evidence_of_log(calibrated, out / CLEAN_LOG, sources)
-    write_evidence(evidence, out / EVIDENCE_FILE)
+    write_evidence(evidence, out / EVIDENCE_FILE, out / RESULT_FILE)
     write_html(out / RESULT_FILE, out / REPORT_FILE, evidence, images=images)
     return [out / EVIDENCE_FILE, out / REPORT_FILE]

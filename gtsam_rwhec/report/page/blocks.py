@@ -154,12 +154,13 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A page: its title, the verdict's tone, and its sections in order."""
+    """A page: its title, the verdict's tone, its sections in order, and what is wrong with the data that it shows."""
 
     title: str
     tone: Literal["good", "care", "bad"]
     sections: tuple[Section, ...]
     made_by: str
+    warnings: tuple[str, ...] = ()
 
 
 def every(blocks: Iterable[Block]) -> Iterator[Block]:

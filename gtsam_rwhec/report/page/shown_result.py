@@ -33,6 +33,8 @@ class ShownResult:
         Of the result's file.
     images : bool
         Whether the page may show what cameras saw; images may be confidential.
+    warnings : tuple of str
+        What could not be shown although it is there.
     """
 
     tree: Mapping[str, Any]
@@ -40,6 +42,7 @@ class ShownResult:
     evidence: Evidence | None
     name: str
     images: bool = True
+    warnings: tuple[str, ...] = ()
 
     @staticmethod
     def of(content: bytes, evidence: Evidence | None, name: str = "result.json", *, images: bool = True) -> ShownResult:

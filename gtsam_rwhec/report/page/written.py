@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.verdict import Verdict
+from gtsam_rwhec.errors import EvidenceWarning, FileFormatError
 from gtsam_rwhec.evidence import Evidence, evidence_path, read_evidence
+from gtsam_rwhec.evidence.evidence import checksum
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.report.page.blocks import Page
+from gtsam_rwhec.report.page.figure_files import write_figures
 from gtsam_rwhec.report.page.html import write_page
 from gtsam_rwhec.report.page.sections import sections_of
 from gtsam_rwhec.report.page.shown_result import ShownResult
@@ -29,6 +34,7 @@ def write_html(
     *,
     log: LogFields | None = None,
     images: bool = True,
+    figures: str | Path | None = None,
 ) -> None:
     """Write the report of a calibration as one HTML file, which needs nothing else and no network.
 
@@ -45,6 +51,8 @@ def write_html(
         What became of the measurements, if a calibration comes from a log.
     images : bool
         Whether the page shows images. False for a page that others may see when the images are confidential.
+    figures : str or Path, optional
+        A folder, made if it is not there, that gets every figure as NAME.svg and NAME.png, black on white.
 
     Raises
     ------
@@ -56,19 +64,38 @@ def write_html(
         shown = ShownResult.of(calibration_json(result, log), evidence, images=images)
     else:
         shown = read_shown(result, evidence, images=images)
-    write_page(report_page(shown), path)
+    page = report_page(shown)
+    write_page(page, path)
+    if figures is not None:
+        write_figures(page, figures)
 
 
 def read_shown(path: str | Path, evidence: Evidence | None = None, *, images: bool = True) -> ShownResult:
-    """A result from its file, or its folder, with the evidence that is beside it."""
+    """A result from its file, or its folder, with the evidence that is beside it.
+
+    Evidence that is damaged, or of another result, is left out with a warning: the result is shown without it.
+    """
     path = Path(path)
     if path.is_dir():
         path = path / RESULT_FILE
     content = read_whole(path, MOST_BYTES, "A result was")
+    wrong = ""
     beside = evidence_path(path)
     if evidence is None and beside.exists():
-        evidence = read_evidence(beside)
-    return ShownResult.of(content, evidence, path.name, images=images)
+        try:
+            evidence = read_evidence(beside)
+        except FileFormatError as error:
+            wrong = f"{error} What it holds is not shown."
+        if evidence is not None and evidence.result_sha256 not in ("", checksum(content)):
+            evidence = None
+            wrong = (
+                f"{beside} is the evidence of another result: {path.name} was changed after it was written. What it "
+                "holds is not shown. Calibrate again, or put the two files of one calibration together."
+            )
+    if wrong:
+        warnings.warn(wrong, EvidenceWarning, stacklevel=2)
+    shown = ShownResult.of(content, evidence, path.name, images=images)
+    return replace(shown, warnings=(wrong,)) if wrong else shown
 
 
 def report_page(shown: ShownResult) -> Page:
@@ -78,4 +105,5 @@ def report_page(shown: ShownResult) -> Page:
         tone=TONES[Verdict(shown.tree["verdict"])],  # type: ignore[arg-type]
         sections=sections_of(shown),
         made_by=f"Written by {shown.tree['written_by']}.",
+        warnings=shown.warnings,
     )

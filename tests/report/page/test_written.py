@@ -93,3 +93,24 @@ def test_every_block_is_shown_and_names_are_text() -> None:
     assert page.count("&lt;script&gt;alert") >= 14
     assert "currentColor" in page
     assert '"name": "\\u003cscript\\u003ealert' in page
+
+
+def test_evidence_of_another_result_is_left_out_and_said(folder: Path, tmp_path: Path) -> None:
+    result, beside = tmp_path / "result.json", tmp_path / "evidence.json"
+    result.write_bytes((folder / "result.json").read_bytes())
+    rw.evidence.write_evidence(rw.evidence.read_evidence(folder / "evidence.json"), beside, result)
+    rw.report.write_html(tmp_path, tmp_path / "same.html")
+    result.write_bytes(result.read_bytes() + b"\n")
+    with pytest.warns(rw.errors.EvidenceWarning, match="is the evidence of another result"):
+        rw.report.write_html(tmp_path, tmp_path / "other.html")
+    beside.write_bytes(beside.read_bytes()[:100])
+    with pytest.warns(rw.errors.EvidenceWarning, match="is not the evidence of a calibration"):
+        rw.report.write_html(tmp_path, tmp_path / "damaged.html")
+    same, other, damaged = (
+        (tmp_path / f"{name}.html").read_text(encoding="utf-8") for name in ("same", "other", "damaged")
+    )
+    assert "Python" in same
+    assert 'class="told care warning"' not in same
+    assert "of another result" in other
+    assert "is not the evidence of a calibration" in damaged
+    assert "evidence.json#" not in other + damaged

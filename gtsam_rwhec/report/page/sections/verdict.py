@@ -10,8 +10,6 @@ from gtsam_rwhec.report.page.blocks import Block, Listing, Paragraph, Section, T
 from gtsam_rwhec.report.page.sections.pose_tables import pose_blocks
 from gtsam_rwhec.report.page.shown_result import ShownResult
 
-#: A sign beside the words: they can be told apart without colours.
-SIGNS = {Verdict.USE: "✓", Verdict.CARE: "!", Verdict.DO_NOT_USE: "✕"}
 TONES: dict[Verdict, Tone] = {Verdict.USE: "good", Verdict.CARE: "care", Verdict.DO_NOT_USE: "bad"}
 #: The words in a reason between facts and advice.
 BETWEEN = ". What to do: "
@@ -29,7 +27,7 @@ def verdict_section(shown: ShownResult) -> Section:
     """The verdict with its grounds, how far off a point is, what to do; then the poses."""
     verdict = Verdict(shown.tree["verdict"])
     facts, _, cure = shown.tree["verdict_reason"].partition(BETWEEN)
-    blocks: list[Block] = [Paragraph(f"{SIGNS[verdict]} {verdict.words}: {facts}.", TONES[verdict])]
+    blocks: list[Block] = [Paragraph(f"{verdict.words}: {facts}.", TONES[verdict])]
     todo = list(_todo(shown, cure))
     if todo:
         blocks += [Paragraph("What to do next", "lead"), Listing(tuple(todo))]
