@@ -47,13 +47,16 @@ class SensorCheck:
     outliers : int
         Measurements that agree with no others; they count in neither.
     noise_ratio : float or None
-        `best`'s median translation over the root mean square of the old log's residuals; None where that has none.
+        `best`'s root mean square translation over that of the old log's residuals; None where that has none.
+    held_px : float or None
+        Median distance of corners from where the old poses say that they are, pixels; None without images.
     """
 
     held: PredictionError
     best: PredictionError
     outliers: int
     noise_ratio: float | None
+    held_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -203,7 +206,7 @@ def verify(
         for name, pose in poses.items()
         if name in now
     }
-    checks = _checks(result, refined, found, stated)
+    checks = _checks(result, refined, found, stated, carrier_path)
     return Verification(
         test=test,
         movements=movements,
@@ -239,9 +242,26 @@ def _of_sensors(common: Quantities, old: RefinedPoses) -> Quantities:
     return Quantities(common.difference[rows], (one[at], other[at]), common.free[rows], slots, not_compared)
 
 
-def _checks(result: Result, old: RefinedPoses, found: NearAnswer, problem: Problem) -> dict[str, SensorCheck]:
+def _at_offsets(problem: Problem, found: NearAnswer, path: Trajectory | None) -> Problem:
+    """The measurements with A on the carriers' path at the time offsets that were found."""
+    if path is None:
+        return problem
+    moved = {}
+    for pair in problem.pairs:
+        one = problem.measurements(*pair)
+        offset_s = found.time_offsets_s.get(pair.sensor)
+        if offset_s is not None and one.stamps_ns is not None:
+            one = replace(one, A=path.at(one.stamps_ns + round(1e9 * offset_s))[0])
+        moved[pair] = one
+    return problem.with_measurements(moved)
+
+
+def _checks(
+    result: Result, old: RefinedPoses, found: NearAnswer, problem: Problem, path: Trajectory | None
+) -> dict[str, SensorCheck]:
     """By sensor, how well the old poses and the best ones predict what it saw."""
-    held = replace(old, time_offsets_s=found.time_offsets_s)
+    problem = _at_offsets(problem, found, path)
+    held = replace(old, time_offsets_s={} if path is not None else found.time_offsets_s)
     best = replace(held, X=found.X, Y=found.Y, scale=found.scale)
     checks = {}
     for sensor in problem.sensors:

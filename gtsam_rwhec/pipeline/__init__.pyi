@@ -1,6 +1,7 @@
 # All stages in a row.
 from .all_stages import OUTPUTS as OUTPUTS
 from .all_stages import calibrate_log as calibrate_log
+from .verified_log import verify_log as verify_log
 
 # Stage by stage.
 from .all_stages import export_solved as export_solved

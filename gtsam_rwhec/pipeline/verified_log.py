@@ -1,0 +1,274 @@
+"""Whether an old calibration still holds on a new log: detect, clean, and test, without calibrating anew."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.changes.calibration_files import result_path
+from gtsam_rwhec.changes.change_test import LEVEL, checked_level
+from gtsam_rwhec.changes.verifying import Verification, verify
+from gtsam_rwhec.errors import FrameError, LogError
+from gtsam_rwhec.files.progress import Progress, silent
+from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.logs import open_log
+from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
+from gtsam_rwhec.pipeline.cleaning_stage import clean_log
+from gtsam_rwhec.pipeline.corner_answer import with_intrinsics
+from gtsam_rwhec.pipeline.detection_stage import detect_log
+from gtsam_rwhec.pipeline.folder_log import is_folder_of_images, write_folder_log
+from gtsam_rwhec.pipeline.log_contract import (
+    CLEAN_LOG,
+    CLEANING_METADATA,
+    DETECTED_LOG,
+    RECORDED_LOG,
+    RESULT_FILE,
+    is_from_stage,
+)
+from gtsam_rwhec.pipeline.log_corners import LogCorners
+from gtsam_rwhec.pipeline.log_metadata import read_cameras, read_cleaning_report, read_embedded_rig, read_metadata
+from gtsam_rwhec.pipeline.measured_pairs import problem_of, read_pairs
+from gtsam_rwhec.pipeline.samples_log import is_file_of_samples, write_samples_log
+from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, without_outlier_marks
+from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.results.result_file import Result, parse_result, read_result
+from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.intrinsics_section import Intrinsics
+from gtsam_rwhec.vision.camera import Camera
+
+#: Standard deviation of a corner along each axis where the old calibration is not from corners, pixels: what detection
+#: takes before it has measured it. The test finds the noise of poses itself.
+CORNER_PX = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class OldCalibration:
+    """An old calibration of a log, as its output folder holds it.
+
+    Attributes
+    ----------
+    result : Result
+    rig : Rig or None
+        The rig file in its solved log.
+    cameras : dict of sensor to Camera
+        Intrinsics as it has them: estimated where they were.
+    """
+
+    result: Result
+    rig: Rig | None
+    cameras: dict[str, Camera]
+
+    @staticmethod
+    def read(path: str | Path) -> OldCalibration:
+        """From an output folder, its ``clean.mcap``, or a result file, beside which the solved log may be.
+
+        Raises
+        ------
+        FileFormatError, LogError
+            The files cannot be read, or hold no calibration.
+        """
+        path = Path(path)
+        if path.suffix.lower() == ".mcap":
+            with open_log(path) as log:
+                content = log.attachment(RESULT_FILE)
+            if content is None:
+                raise LogError(f"{path} has no {RESULT_FILE} attached: gtsam-rwhec solve or calibrate did not write it")
+            result, solved = parse_result(content, f"{path}, attachment {RESULT_FILE}"), path
+        else:
+            file = result_path(path)
+            result, solved = read_result(file), file.with_name(CLEAN_LOG)
+        rig, cameras = None, {}
+        if solved.is_file():
+            with open_log(solved) as log:
+                rig, cameras = read_embedded_rig(log), read_cameras(log)
+        estimated = {} if result.refined is None else result.refined.intrinsics
+        return OldCalibration(result, rig, cameras | {name: one.camera for name, one in estimated.items()})
+
+
+@one_blas_thread()
+def verify_log(
+    old: str | Path,
+    log_path: str | Path | list[str | Path],
+    rig: Rig | None = None,
+    *,
+    level: float = LEVEL,
+    targets_may_move: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Verification:
+    """Whether the calibration in an output folder still holds on a new log.
+
+    Targets are detected with the intrinsics of the old calibration, and the measurements cleaned as for a calibration.
+    Nothing is written.
+
+    Parameters
+    ----------
+    old
+        The output folder of a calibration, its ``clean.mcap`` or its ``result.json``.
+    log_path
+        As for ``calibrate_log``; of a log that a stage wrote, only the stages after it run.
+    rig : Rig, optional
+        By default the rig file of the old calibration.
+    level : float
+    targets_may_move : bool
+        As in ``rw.changes.verify``.
+    workers : int, optional
+        As in ``calibrate_log``.
+    progress : callable, optional
+
+    Raises
+    ------
+    RwhecError
+        A file cannot be read, the rigs differ, or the new log has too few measurements; the message says which.
+    """
+    checked_level(level)
+    tell = progress or silent
+    calibration = OldCalibration.read(old)
+    rig = rig or calibration.rig
+    with TemporaryDirectory(prefix="gtsam-rwhec-verify-") as folder:
+        cleaned = _cleaned(log_path, rig, calibration, Path(folder), workers, tell)
+        return _verified(calibration, cleaned, level=level, targets_may_move=targets_may_move, tell=tell)
+
+
+def _cleaned(
+    log_path: str | Path | list[str | Path],
+    rig: Rig | None,
+    old: OldCalibration,
+    folder: Path,
+    workers: int | None,
+    tell: Progress,
+) -> Path:
+    """The new log after detection and cleaning."""
+    if rig is not None and not isinstance(log_path, list):
+        source = Path(log_path)
+        if is_folder_of_images(source, rig):
+            recorded = folder / f"new{RECORDED_LOG}"
+            rig = rig.model_copy(update={"folder": source})
+            write_folder_log(source, rig, recorded, progress=tell)
+            log_path = recorded
+        elif is_file_of_samples(source, rig):
+            recorded = folder / f"new{RECORDED_LOG}"
+            tell(write_samples_log(source, rig, recorded))
+            log_path = recorded
+    with open_log(log_path) as log:
+        files = [file.path for file in log.files]
+        is_raw = not is_from_stage(log)
+        is_cleaned = CLEANING_METADATA in log.metadata()
+    if is_cleaned:
+        return files[0]
+    detected = files[0]
+    if is_raw:
+        if rig is None:
+            raise LogError(
+                f"{files[0]}: a raw log needs a rig file, and the old calibration has no {CLEAN_LOG} that holds one: "
+                "give --rig FILE"
+            )
+        detected = folder / DETECTED_LOG
+        detect_log(list(files), with_cameras(rig, old.cameras), detected, workers=workers, progress=tell)
+    clean_log(detected, folder / CLEAN_LOG, images="leave_out", progress=tell)
+    return folder / CLEAN_LOG
+
+
+def with_cameras(rig: Rig, cameras: Mapping[str, Camera]) -> Rig:
+    """The rig file with the intrinsics of an old calibration as numbers, for the sensors that have images."""
+    sensors = {}
+    for name, sensor in rig.sensors.items():
+        camera = cameras.get(name)
+        if camera is not None and sensor.images is not None:
+            (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
+            numbers = Intrinsics(
+                model=camera.model, size=(camera.width, camera.height), K=(fx, fy, cx, cy),
+                D=tuple(camera.D.tolist()) or None, stated="calibration",
+            )  # fmt: skip
+            sensor = sensor.model_copy(update={"intrinsics": numbers})
+        sensors[name] = sensor
+    return rig.model_copy(update={"sensors": sensors})
+
+
+def _verified(
+    old: OldCalibration, cleaned: Path, *, level: float, targets_may_move: bool, tell: Progress
+) -> Verification:
+    with open_log(cleaned) as log:
+        rig, metadata, cleaning = read_embedded_rig(log), read_metadata(log), read_cleaning_report(log)
+        pairs, motion = without_outlier_marks(read_pairs(log, rig)), read_carrier_motion(log, rig)
+        corners = LogCorners.of(log, rig, metadata.cameras)
+    _check_carriers(old.result, rig)
+    used = {measured.sensor for measured in pairs.values() if measured.used.any()}
+    free = tuple(name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in used)
+    rounds = SolvingRounds(rig, motion, free, tell)
+    pairs = rounds.at(pairs, cleaning.time_offsets_s).pairs
+    cameras = {**metadata.cameras, **old.cameras}
+    refined = old.result.refined
+    if refined is not None and any(_differ(cameras[name], metadata.cameras[name]) for name in metadata.cameras):
+        px = CORNER_PX if refined.reprojection is None else refined.reprojection.corner_px
+        pairs = with_intrinsics(pairs, corners, cameras, refined.X, refined.Y, px)
+    problem = problem_of(pairs, rig, cleaning.time_offsets_s)
+    tell("testing the old poses")
+    found = verify(
+        old.result, problem, level=level, targets_may_move=targets_may_move, carrier_noise=motion.noise,
+        time_offsets=free, carrier_path=motion.trajectory if free else None, progress=tell,
+    )  # fmt: skip
+    if refined is None:
+        return found
+    pixels = {name: pixel_errors(refined, pairs, corners, cameras, name) for name in found.sensors if name in cameras}
+    return replace(
+        found,
+        sensors={name: replace(check, held_px=_median(pixels.get(name))) for name, check in found.sensors.items()},
+    )
+
+
+def _check_carriers(old: Result, rig: Rig) -> None:
+    if old.log is None:
+        return
+    for what, name, now in (
+        ("sensors", old.log.sensor_carrier, rig.carriers.sensors),
+        ("targets", old.log.target_carrier, rig.carriers.targets),
+    ):
+        if name != now:
+            raise FrameError(
+                f"the carrier of the {what} is {shown(name)} in the old calibration and {shown(now)} in the new log: "
+                "they are of different rigs. Give a log of the same rig"
+            )
+
+
+def _differ(one: Camera, other: Camera) -> bool:
+    return one.model != other.model or not np.allclose(one.parameters, other.parameters, rtol=1e-12, atol=0.0)
+
+
+def pixel_errors(
+    answer: RefinedPoses, pairs: Pairs, corners: LogCorners, cameras: Mapping[str, Camera], sensor: str
+) -> Array:
+    """How far (n,) each corner is from where the poses say that it is, pixels.
+
+    A target's corners are of its stated size; the answer's scale makes it the true one.
+    """
+    found = []
+    for pair, measured in pairs.items():
+        if pair.sensor != sensor or pair.target not in answer.X or sensor not in answer.Y:
+            continue
+        seen, pixels = corners.seen(measured)
+        if not len(seen):
+            continue
+        scale = answer.scale[pair.target] if isinstance(answer.scale, dict) else answer.scale
+        T = _inverse(answer.Y[sensor]) @ measured.A[seen] @ answer.X[pair.target].matrix()
+        points = np.einsum("nij,kj->nki", T[:, :3, :3], corners.targets[pair.target] / scale) + T[:, None, :3, 3]
+        projected = cameras[sensor].project(points.reshape(-1, 3)).reshape(pixels.shape)
+        lengths = np.linalg.norm(projected - pixels, axis=2)
+        found.append(lengths[np.isfinite(lengths)])
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+def _inverse(pose: gtsam.Pose3) -> Array:
+    inverse: Array = pose.inverse().matrix()
+    return inverse
+
+
+def _median(errors: Array | None) -> float | None:
+    return None if errors is None or not len(errors) else float(np.median(errors))
