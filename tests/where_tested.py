@@ -57,6 +57,7 @@ TABLE: dict[str, dict[str, str]] = {
         "cli/test_roads.py": "calibrate",
         "cli/test_wheel.py": "demo",
         "pipeline/test_commands.py": "clean convert detect export init solve",
+        "pipeline/test_verified_log.py": "verify",
     },
     "gtsam_rwhec/evidence": {"report/page/test_written.py": "derived evidence gathered inputs measured record"},
     "gtsam_rwhec/compat": {
@@ -155,6 +156,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/report": {
         "calibration/test_cross_validation.py": "cross_validation_table",
         "cli/test_diff.py": "change_report",
+        "pipeline/test_verified_log.py": "verification_report",
         "cli/test_wheel.py": "advice",
         "methods/test_comparison.py": "comparison_report",
         "report/test_solution_report.py": "pose_table printing sentences",
@@ -163,6 +165,7 @@ TABLE: dict[str, dict[str, str]] = {
         "report/page/test_number_sections.py": ("determines inputs pose_tables verdict weak_directions")
     },
     "gtsam_rwhec/report/page": {
+        "cli/test_diff.py": "changes_page",
         "report/page/test_figures.py": "figure_files",
         "report/page/test_written.py": "blocks html shown_result",
     },

@@ -27,6 +27,7 @@ from gtsam_rwhec.cli.fetch import utias
 from gtsam_rwhec.cli.init import init
 from gtsam_rwhec.cli.report import report
 from gtsam_rwhec.cli.solve import solve
+from gtsam_rwhec.cli.verify import verify
 from gtsam_rwhec.files.terminal_text import printable, say
 
 #: Typer has a click of its own, whose classes have no public names: this is the base of all usage errors.
@@ -80,7 +81,7 @@ def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
     to.command(epilog=HELP)(run)
 
 
-for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare, diff):
+for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare, diff, verify):
     add(subcommand, app)
 add(utias, fetch_app)
 

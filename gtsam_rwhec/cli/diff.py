@@ -9,11 +9,25 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.cli.failures import check_output
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 RESULT_HELP = "result.json, or the folder that calibrate wrote."
 LevelOption = Annotated[
     float, typer.Option(help="How often it may say that something changed where nothing did: 0.01 is once in 100.")
 ]
+
+
+PageOption = Annotated[
+    Path | None, typer.Option("--output", "-o", help="An HTML file for the same as a page, which needs no network.")
+]
+
+
+def write_page_to(found: rw.changes.Difference | rw.changes.Verification, output: Path | None) -> None:
+    """Write the page, if one is asked for, and say so."""
+    if output is not None:
+        rw.report.write_changes(found, output)
+        say(f"Written to {shown_path(output)}.", to_errors=True)
 
 
 def diff(
@@ -30,8 +44,10 @@ def diff(
     other_arm: Annotated[
         bool, typer.Option("--other-arm", help="The carriers' poses of NEW come from another arm or tracker.")
     ] = False,
+    output: PageOption = None,
 ) -> ExitStatus:
     """What moved from an old calibration to a new one, and whether by more than chance; exit status 1 if so."""
+    check_output(output)
     found = rw.changes.difference(
         rw.changes.read_calibration(old),
         rw.changes.read_calibration(new),
@@ -41,6 +57,7 @@ def diff(
         same_arm=not other_arm,
     )
     rw.report.print_difference(found)
+    write_page_to(found, output)
     if found.test is None and not found.is_same:
         return ExitStatus.BAD_INPUT
     return ExitStatus.CHANGED if found.has_changed else ExitStatus.DONE

@@ -38,6 +38,7 @@ from gtsam_rwhec.pipeline.measured_pairs import problem_of, read_pairs
 from gtsam_rwhec.pipeline.samples_log import is_file_of_samples, write_samples_log
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, without_outlier_marks
 from gtsam_rwhec.refinement.refined import RefinedPoses
+from gtsam_rwhec.results.log_history import DetectionReport
 from gtsam_rwhec.results.result_file import Result, parse_result, read_result
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.intrinsics_section import Intrinsics
@@ -217,11 +218,19 @@ def _verified(
     )  # fmt: skip
     if refined is None:
         return found
+    if old.result.log is not None and are_same_images(old.result.log.detection, metadata.detection):
+        remark = "the new log is the one that the old calibration comes from, so that it holds as a matter of course"
+        found = replace(found, remarks=(remark, *found.remarks))
     pixels = {name: pixel_errors(refined, pairs, corners, cameras, name) for name in found.sensors if name in cameras}
     return replace(
         found,
         sensors={name: replace(check, held_px=_median(pixels.get(name))) for name, check in found.sensors.items()},
     )
+
+
+def are_same_images(one: DetectionReport, other: DetectionReport) -> bool:
+    """Whether two detections are of the same images: the noise of their corners is the same to the last digit."""
+    return bool(one.corner_px) and one.corner_px == other.corner_px and len(set(one.corner_px.values())) > 1
 
 
 def _check_carriers(old: Result, rig: Rig) -> None:

@@ -9,6 +9,8 @@ from .log_report import print_log as print_log
 from .pair_grid import PairGrid as PairGrid
 from .pose_table import sensor_table as sensor_table
 from .pose_table import target_table as target_table
+from .verification_report import print_verification as print_verification
+from .page.changes_page import write_changes as write_changes
 from .sentences import certificate_sentence as certificate_sentence
 from .solution_report import print_solution as print_solution
 from .printing import report_console as report_console

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from gtsam_rwhec.changes.change_test import ChangeTest
 from gtsam_rwhec.changes.comparing import Difference, share_words
+from gtsam_rwhec.changes.quantities import Movement
 from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
@@ -33,10 +34,7 @@ def print_difference(found: Difference) -> None:
 
 def change_tables(found: Difference) -> tuple[FrameTable, FrameTable]:
     """How every frame moved, and how every number changed."""
-    frames = {
-        name: (f"{moved.translation_mm:.3f}", f"{moved.rotation_deg:.4f}", *_test_cells(found.test, name))
-        for name, moved in found.movements.items()
-    }
+    frames = {name: moved_cells(moved, found.test, name) for name, moved in found.movements.items()}
     numbers = {
         one.name: (f"{one.old:.7g}", f"{one.new:.7g}", *_test_cells(found.test, group))
         for group, ones in found.numbers.items()
@@ -46,6 +44,11 @@ def change_tables(found: Difference) -> tuple[FrameTable, FrameTable]:
         FrameTable("From OLD to NEW, in each frame's own axes", "frame", MOVED_HEADINGS, frames),
         FrameTable("Other numbers that both estimated", "number", NUMBER_HEADINGS, numbers),
     )
+
+
+def moved_cells(moved: Movement, test: ChangeTest | None, name: str) -> tuple[str, ...]:
+    """The cells of a frame under ``MOVED_HEADINGS``."""
+    return f"{moved.translation_mm:.3f}", f"{moved.rotation_deg:.4f}", *_test_cells(test, name)
 
 
 def remark_sentences(found: Difference) -> list[str]:

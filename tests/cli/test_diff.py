@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import gtsam
+import numpy as np
 import pytest
 from two_logs import calibrated, log_of
 from typer.testing import CliRunner
@@ -40,10 +42,34 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_the_verdict_is_the_first_line_and_the_status(folder: Path, new: str, status: ExitStatus, begins: str) -> None:
-    done = CliRunner().invoke(app, ["diff", str(folder / "old"), str(folder / new)])
+    page = folder / f"{new}.html"
+    done = CliRunner().invoke(app, ["diff", str(folder / "old"), str(folder / new), "-o", str(page)])
     assert done.exit_code == status, done.output
-    assert done.output.startswith(begins)
+    assert done.stdout.startswith(begins)
     assert "\x1b" not in done.output
+    text = page.read_text("utf-8")
+    assert "left<script>" not in text
+    assert "left&lt;script&gt;" in text
+    assert "\x1b" not in text
+
+
+def test_a_calibration_of_csv_files_is_verified_on_others(folder: Path, tmp_path: Path) -> None:
+    """The calibration of a folder of CSV files, and one more folder: the camera was knocked in between."""
+    done = []
+    for name, log in (("old", log_of(0)), ("new", log_of(2, knocked="left"))):
+        (tmp_path / name).mkdir()
+        one = log.measurements("board", "left")
+        for side, poses in (("A", one.A), ("B", one.B)):
+            q = [gtsam.Rot3(T[:3, :3]).toQuaternion() for T in poses]
+            rows = [[each.w(), each.x(), each.y(), each.z(), *T[:3, 3]] for each, T in zip(q, poses, strict=True)]
+            np.savetxt(tmp_path / name / f"tag_0_cam_0_{side}.csv", rows, delimiter=",")
+    rw.write_calibration(rw.calibrate(rw.read_csv(tmp_path / "old")), tmp_path / "old.json")
+    for name in ("old", "new"):
+        done.append(CliRunner().invoke(app, ["verify", str(tmp_path / "old.json"), str(tmp_path / name)]))
+    assert [one.exit_code for one in done] == [ExitStatus.DONE, ExitStatus.CHANGED], done[1].output
+    assert done[1].stdout.startswith("The calibration no longer holds, at 1 %")
+    refused = CliRunner().invoke(app, ["verify", str(tmp_path / "old.json"), "log.mcap"])
+    assert refused.exit_code == ExitStatus.BAD_INPUT
 
 
 def test_what_cannot_be_tested_is_said_and_has_a_status_of_its_own(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,55 @@
+"""Whether an old calibration still holds, on the terminal: the verdict, how far off it is, and what to keep in mind."""
+
+from __future__ import annotations
+
+from gtsam_rwhec.changes.verifying import Verification
+from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.report.change_report import MOVED_HEADINGS, STYLES, moved_cells
+from gtsam_rwhec.report.pose_table import FrameTable
+from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
+
+ERROR_HEADINGS = ("n", "old mm", "old°", "old px", "best mm", "best°")
+VERIFICATION_LEGEND = (
+    "old: how far the old poses' predictions are from the new measurements (root mean square; px: median of corners). "
+    "best: the same with the poses that fit the new log best: noise. deviations: joint (Mahalanobis) deviations of the "
+    "difference, correlations counted. chance: how often it is so large without a change, corrected for the number of "
+    "lines."
+)
+
+
+def print_verification(found: Verification) -> None:
+    """Print whether an old calibration still holds: the verdict first, then tables, then remarks."""
+    console = report_console()
+    print_sentence(console, str(found), STYLES[not found.holds])
+    console.print()
+    print_tables(console, verification_tables(found), VERIFICATION_LEGEND)
+    words = verification_remarks(found)
+    if words:
+        print_heading(console, "Keep in mind")
+        print_list(console, words)
+
+
+def verification_tables(found: Verification) -> tuple[FrameTable, FrameTable]:
+    """How far off each sensor's predictions are, and how far each frame seems to have moved."""
+    errors = {
+        name: (
+            str(check.held.count),
+            f"{check.held.translation_rms_mm:.3f}",
+            f"{check.held.rotation_rms_deg:.3f}",
+            "-" if check.held_px is None else f"{check.held_px:.2f}",
+            f"{check.best.translation_rms_mm:.3f}",
+            f"{check.best.rotation_rms_deg:.3f}",
+        )
+        for name, check in found.sensors.items()
+    }
+    moved = {name: moved_cells(one, found.test, name) for name, one in found.movements.items()}
+    return (
+        FrameTable("Predictions of the new measurements", "sensor", ERROR_HEADINGS, errors),
+        FrameTable("From the old poses to those that fit the new log best", "frame", MOVED_HEADINGS, moved),
+    )
+
+
+def verification_remarks(found: Verification) -> list[str]:
+    """What to keep in mind."""
+    words = [f"Not checked: {shown(name)}, because {why}." for name, why in found.not_checked.items()]
+    return [*words, *(f"{remark[0].upper()}{remark[1:].removesuffix('.')}." for remark in found.remarks)]
