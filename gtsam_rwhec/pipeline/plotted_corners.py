@@ -3,62 +3,38 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import NamedTuple
 
 import numpy as np
-from rwhec_factors import se3
 
+from gtsam_rwhec.cleaning.removed import RemovalReason
+from gtsam_rwhec.evidence.seen_views import SeenView, board_of, errors_as_measured, errors_at_optimum
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.log_contract import detections_topic, records_of
 from gtsam_rwhec.pipeline.solving_stage import Solved
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.refinement.refined import RefinedPoses
-from gtsam_rwhec.refinement.reprojection_found import SIZE, WARPS, Reprojection
+from gtsam_rwhec.refinement.reprojection_found import Reprojection
 from gtsam_rwhec.report.plots import PlottedCorners, PlottedIntrinsics
-from gtsam_rwhec.reprojection.corner_views import shaped
 from gtsam_rwhec.reprojection.projection_uncertainty import lens_deviations_over
 from gtsam_rwhec.vision.camera import Camera
 
-#: Fewer corners than this in an image say nothing beside its pose.
-FEWEST = 4
-#: A corner is far off beyond so many times the median of its image, or the noise.
-FAR = 6.0
 
+def seen_views(solved: Solved, log: Log, *, left_out: bool = False) -> dict[str, list[SeenView]]:
+    """The corners of used detections, with where the calibration has them, by camera.
 
-class SeenView(NamedTuple):
-    """A target's corners in an image: pixels (n, 2), and the same points (n, 3) in the camera's frame, metres.
-
-    With the points' derivatives (n, 3, 6) by A Expmap([omega, v]), and the image's stamp.
+    With `left_out` those that robust estimation left out are there too, marked as not used.
     """
-
-    pixels: Array
-    points: Array
-    by_A: Array
-    stamp_ns: int
-
-    @staticmethod
-    def of(
-        pixels: Array, corners: Array, T_camera_targetcarrier: Array, T_targetcarrier_target: Array, stamp_ns: int
-    ) -> SeenView:
-        """Of corners (n, 3) in the target's frame."""
-        Q = corners @ T_targetcarrier_target[:3, :3].T + T_targetcarrier_target[:3, 3]
-        R = T_camera_targetcarrier[:3, :3]
-        by_xi = np.concatenate([-se3.hat(Q), np.broadcast_to(np.eye(3), (len(Q), 3, 3))], axis=2)
-        return SeenView(pixels, Q @ R.T + T_camera_targetcarrier[:3, 3], R @ by_xi, stamp_ns)
-
-
-def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
-    """The corners of used detections, with where the calibration has them, by camera."""
     path = read_carrier_motion(log, solved.rig).trajectory
     targets = {target.name: target for target in solved.rig.target_list}
     offsets = {offset.sensor: offset.offset_s for offset in solved.log.time_offsets}
     boards = {name: board_of(solved.refined, name, targets[name].corners()) for name in solved.refined.X}
-    used = {
-        (pair, int(stamp))
+    wanted = ("", RemovalReason.OUTLIER) if left_out else ("",)
+    is_used = {
+        (pair, stamp): not reason
         for pair, measured in solved.pairs.items()
-        for stamp in measured.stamps_ns[measured.used].tolist()
+        for stamp, reason in zip(measured.stamps_ns.tolist(), measured.reasons, strict=True)
+        if reason in wanted and pair.target in solved.refined.X
     }
     seen: dict[str, list[SeenView]] = defaultdict(list)
     for sensor in solved.cameras:
@@ -67,26 +43,16 @@ def seen_views(solved: Solved, log: Log) -> dict[str, list[SeenView]]:
         inverse = np.linalg.inv(solved.refined.Y[sensor].matrix())
         for record in records_of(log, [detections_topic(sensor)], DetectionRecord):
             pair = Pair(record.id, sensor)
-            if record.corners_px is None or record.corner_indices is None or (pair, record.stamp_ns) not in used:
+            used = is_used.get((pair, record.stamp_ns))
+            if record.corners_px is None or record.corner_indices is None or used is None:
                 continue
             A, _ = path.at(np.array([record.stamp_ns + round(1e9 * offsets.get(sensor, 0.0))]))
             corners = boards[record.id][list(record.corner_indices)]
             X = solved.refined.X[record.id].matrix()
-            seen[sensor].append(SeenView.of(record.corners_px, corners, inverse @ A[0], X, record.stamp_ns))
+            T = inverse @ A[0]
+            view = SeenView.of(record.corners_px, corners, T, X, record.stamp_ns, record.id, is_used=used)
+            seen[sensor].append(view)
     return dict(seen)
-
-
-def board_of(refined: RefinedPoses, target: str, corners: Array) -> Array:
-    """A target's corners (n, 3) as they were found to be: larger or smaller than stated, and bent."""
-    scale = refined.scale if isinstance(refined.scale, float) else refined.scale[target]
-    shape = np.array([1.0 / scale - 1.0, 0.0, 0.0])
-    found = None if refined.reprojection is None else refined.reprojection.boards.get(target)
-    if found is not None:
-        for name, value in zip(found.names, found.values, strict=True):
-            if name != SIZE and name in WARPS.values():
-                shape[1 + list(WARPS.values()).index(name)] = value
-    board = shaped(corners, shape)[0]
-    return board + np.array(found.corners_off_m) if found is not None and found.corners_off_m else board
 
 
 def camera_of(solved: Solved, sensor: str) -> Camera:
@@ -100,7 +66,7 @@ def plotted_corners(solved: Solved, seen: dict[str, list[SeenView]]) -> dict[str
     return {
         sensor: PlottedCorners(
             np.concatenate([view.pixels for view in views]),
-            np.concatenate([view.pixels - camera_of(solved, sensor).project(view.points) for view in views]),
+            np.concatenate([errors_as_measured(camera_of(solved, sensor), view).px for view in views]),
         )
         for sensor, views in seen.items()
     }
@@ -131,35 +97,15 @@ def plotted_intrinsics(solved: Solved, seen: dict[str, list[SeenView]]) -> dict[
 def residuals_of(camera: Camera, views: list[SeenView], found: Reprojection) -> tuple[PlottedCorners, np.ndarray]:
     """Errors of corners at the optimum, and the stamp (N,) of each one's image.
 
-    A of each image is off there by what its noise and its corners together say.
-    With the derivatives J of the pixels by A's errors over their deviations, and residuals r over the corners' noise:
-    r - J (J' J + I)^-1 J' r, to first order. Corners that are far off do not count.
+    `errors_at_optimum` says how. Corners that are far off do not count.
     """
-    deviations = np.repeat([found.carrier_rotation_rad, found.carrier_translation_m], 3)
     pixels: list[Array] = [np.zeros((0, 2))]
     errors: list[Array] = [np.zeros((0, 2))]
     image: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
     for view in views:
-        P = view.points
-        x = P[:, :2] / P[:, 2:]
-        predicted, by_x = camera.pixel_jacobian(x)
-        off = view.pixels - predicted
-        if len(P) < FEWEST or not (np.isfinite(off).all() and (P[:, 2] > 0.0).all()):
-            continue
-        to_x = np.concatenate([np.broadcast_to(np.eye(2), (len(P), 2, 2)), -x[:, :, None]], axis=2)
-        J = by_x @ (to_x / P[:, 2, None, None]) @ view.by_A * deviations / found.corner_px
-        length = np.linalg.norm(_at_optimum(J, off), axis=1)
-        kept = length <= FAR * max(float(np.median(length)), found.corner_px)
-        if kept.sum() >= FEWEST:
-            pixels.append(view.pixels[kept])
-            errors.append(_at_optimum(J[kept], off[kept]))
+        off = errors_at_optimum(camera, view, found)
+        if off is not None:
+            pixels.append(view.pixels[off.counts])
+            errors.append(off.px[off.counts])
             image.append(np.full(len(pixels[-1]), view.stamp_ns))
     return PlottedCorners(np.concatenate(pixels), np.concatenate(errors)), np.concatenate(image)
-
-
-def _at_optimum(J: Array, errors: Array) -> Array:
-    """Errors (n, 2) without what A's errors explain, of their derivatives (n, 2, 6) in deviations."""
-    flat = J.reshape(-1, 6)
-    explained = flat @ np.linalg.solve(flat.T @ flat + np.eye(6), flat.T @ errors.ravel())
-    left: Array = errors - explained.reshape(-1, 2)
-    return left

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from refined_corners import two_cameras
 
-from gtsam_rwhec.pipeline.plotted_corners import SeenView, board_of, residuals_of
+from gtsam_rwhec.evidence.seen_views import SeenView, board_of
+from gtsam_rwhec.pipeline.plotted_corners import residuals_of
 from gtsam_rwhec.refinement.reprojection_found import BoardShape
 from gtsam_rwhec.reprojection.corner_views import pixel_errors
 from gtsam_rwhec.reprojection.lens import parameters_of
