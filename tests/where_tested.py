@@ -59,7 +59,11 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_commands.py": "clean convert detect export init solve",
         "pipeline/test_verified_log.py": "verify",
     },
-    "gtsam_rwhec/evidence": {"report/page/test_written.py": "derived evidence gathered inputs measured record"},
+    "gtsam_rwhec/evidence": {
+        "report/page/test_written.py": "derived evidence gathered inputs measured record",
+        "evidence/test_seen_cameras.py": "seen seen_in_problem",
+        "pipeline/test_plotted_corners.py": "seen_views",
+    },
     "gtsam_rwhec/compat": {
         "compat/test_opencv.py": (
             "andreff certified daniilidis dqopt inputs pair_translations quaternion_methods robot_world stations"
@@ -217,6 +221,7 @@ TABLE: dict[str, dict[str, str]] = {
         "vision/test_circle_grids.py": "circle_centres circle_lattice",
         "vision/test_contact_sheet.py": "picture_text",
         "vision/test_detection.py": "options rejection",
+        "vision/test_drawn_errors.py": "jpeg",
         "vision/test_edges.py": "edge_geometry edge_profiles",
         "vision/test_images.py": "image_sizes",
         "vision/test_intrinsics_files.py": "intrinsics_numbers",

@@ -7,6 +7,7 @@ from gtsam_rwhec.evidence.derived import derived_of
 from gtsam_rwhec.evidence.evidence import Evidence
 from gtsam_rwhec.evidence.inputs import Inputs, versions
 from gtsam_rwhec.evidence.measured import measured_rows
+from gtsam_rwhec.evidence.seen_in_problem import seen_in_problem
 from gtsam_rwhec.evidence.weak import weak_directions
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.problem import Problem
@@ -31,8 +32,10 @@ def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | Non
         The problem was made with ``keep_measurements=False``.
     """
     inputs = Inputs(files=(), versions=versions()) if inputs is None else inputs
+    rows = measured_rows(problem, calibration)
     return Evidence(
         derived=derived_of(calibration),
-        weak=weak_directions(calibration, measured_rows(problem, calibration)),
+        weak=weak_directions(calibration, rows),
+        seen=seen_in_problem(problem, calibration.refined, rows, calibration.options.carrier_path),
         inputs=inputs.with_options(calibration.options),
     )

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gtsam_rwhec.calibration.calibrated import Calibration
-from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.errors import CountError
 from gtsam_rwhec.evidence.measured import MeasuredRows
 from gtsam_rwhec.evidence.seen import PIECES, SeenEvidence
 from gtsam_rwhec.evidence.seen_cameras import rated_views, seen_cameras, worst_image, worst_views
@@ -18,16 +17,21 @@ from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.pair_data import local_paths
 from gtsam_rwhec.refinement.refined import Refined
+from gtsam_rwhec.trajectories.trajectory import Trajectory
 
 #: The stage that removes measurements of a problem.
 ROBUST = "robust estimation"
 
 
-def seen_in_problem(problem: Problem, calibration: Calibration, rows: Mapping[Pair, MeasuredRows]) -> SeenEvidence:
-    """What was seen, of a problem and its measurements."""
+def seen_in_problem(
+    problem: Problem,
+    refined: Refined | None,
+    rows: Mapping[Pair, MeasuredRows],
+    carrier_path: Trajectory | None = None,
+) -> SeenEvidence:
+    """What was seen, of a problem and its measurements; corners are there where there is a refined calibration."""
     used = sum(int(measured.used.sum()) for measured in rows.values())
-    refined = calibration.refined
-    views = {} if refined is None else _views(problem, refined, rows)
+    views = {} if refined is None else _views(problem, refined, rows, carrier_path)
     found = None if refined is None else refined.reprojection
     cameras = dict(problem.cameras)
     if refined is not None:
@@ -55,13 +59,13 @@ def seen_in_problem(problem: Problem, calibration: Calibration, rows: Mapping[Pa
 
 
 def _views(
-    problem: Problem, refined: Refined, rows: Mapping[Pair, MeasuredRows]
+    problem: Problem, refined: Refined, rows: Mapping[Pair, MeasuredRows], path: Trajectory | None
 ) -> dict[str, list[SeenView]]:
     """The corners of a problem's images, by sensor, with A at the final time offsets."""
     late = dict(refined.time_offsets_s)
     try:
-        paths = local_paths(problem, tuple(late), None)
-    except RwhecError:  # the motion came from a path of its own: A as it was measured is what is left
+        paths = local_paths(problem, tuple(late), path)
+    except CountError:  # the motion that gave the offsets is not known here: A as it was measured is what is left
         paths = {}
     views: dict[str, list[SeenView]] = {}
     for pair, measured in rows.items():
@@ -71,7 +75,7 @@ def _views(
         A = measured.A @ paths[pair].motion(late[pair.sensor]) if pair in paths else measured.A
         T = np.linalg.inv(refined.Y[pair.sensor].matrix()) @ A
         X, board = refined.X[pair.target].matrix(), board_of(refined, pair.target, problem.boards[pair.target])
-        seen = np.isfinite(pixels).all(axis=2)
+        seen: np.ndarray = np.asarray(np.isfinite(pixels).all(axis=2))
         for i in np.flatnonzero(seen.any(axis=1)).tolist():
             stamp = i if measured.stamps_ns is None else int(measured.stamps_ns[i])
             views.setdefault(pair.sensor, []).append(

@@ -27,7 +27,7 @@ class Marked(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """A row of the figure: where its measurements are in time, and the stage that removed each, empty where it is used."""
+    """A row of the figure: where its measurements are in time, and the stage that removed each (empty: it is used)."""
 
     sensor: str
     target: str | None
@@ -103,9 +103,7 @@ def counts_of(
     )
 
 
-def removed_list(
-    pairs: Mapping[Pair, Marked], name_of: Callable[[str, int], str]
-) -> tuple[RemovedMeasurement, ...]:
+def removed_list(pairs: Mapping[Pair, Marked], name_of: Callable[[str, int], str]) -> tuple[RemovedMeasurement, ...]:
     """The first removed measurements in order of time; `name_of` has an image's name by sensor and stamp."""
     first, span = span_of(pairs.values())
     found = sorted(_removed(pairs), key=lambda one: (one[0], one[1].sensor, one[1].target))

@@ -152,7 +152,7 @@ def calibrate_log(
             assert rig is not None
             return _from_raw(files, rig, output, choices, progress=progress)
         output.begin()
-        return _from_stage(files[0], rig, output.path, files, choices, is_cleaned=is_cleaned, progress=progress)
+        return _from_stage(files[0], rig, output.path, files, files, choices, is_cleaned=is_cleaned, progress=progress)
 
 
 def _from_raw(
@@ -182,7 +182,7 @@ def _from_raw(
         keep=keep,
     )
     sources = files if folder is None else sorted(path for path in folder.rglob("*") if path.is_file())
-    return _from_stage(detected, rig, output.path, sources, choices, is_cleaned=False, progress=progress)
+    return _from_stage(detected, rig, output.path, sources, files, choices, is_cleaned=False, progress=progress)
 
 
 def _from_stage(
@@ -190,18 +190,19 @@ def _from_stage(
     rig: Rig | None,
     out: Path,
     sources: list[Path],
+    logs: list[Path],
     choices: _Choices,
     *,
     is_cleaned: bool,
     progress: Progress | None,
 ) -> Calibrated:
-    """The stages after the one that wrote the log; the measurements come from the files `sources`."""
+    """The stages after the one that wrote the log; `logs` have the images, and `sources` all that was measured."""
     if not is_cleaned:
         clean_log(source, out / CLEAN_LOG, rig, images=choices.images, progress=progress)
         source = out / CLEAN_LOG
     calibrated = solve_into(source, rig, out, images=choices.images, progress=progress)
     export_solved(out / CLEAN_LOG, out, anyway=choices.anyway, progress=progress)
-    report = write_report(calibrated, out, sources, progress, images=choices.report_images)
+    report = write_report(calibrated, out, sources, progress, logs=logs, images=choices.report_images)
     list_written(out, calibrated.log.detection.sources, report)
     return calibrated
 

@@ -12,12 +12,15 @@ from gtsam_rwhec.evidence.derived import derived_of
 from gtsam_rwhec.evidence.inputs import Inputs, input_files, versions
 from gtsam_rwhec.evidence.measured import MeasuredRows
 from gtsam_rwhec.evidence.weak import weak_directions
+from gtsam_rwhec.pipeline.seen_in_log import Pictures, seen_in_log
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.rig import rig_text
 
 
-def evidence_of_log(calibrated: Calibrated, log_path: str | Path, sources: Sequence[Path]) -> Evidence:
+def evidence_of_log(
+    calibrated: Calibrated, log_path: str | Path, sources: Sequence[Path], pictures: Pictures | None = None
+) -> Evidence:
     """What a report shows beside a calibration from a log.
 
     Parameters
@@ -27,6 +30,8 @@ def evidence_of_log(calibrated: Calibrated, log_path: str | Path, sources: Seque
         The solved log, which has the corners.
     sources : sequence of Path
         The files that the measurements come from.
+    pictures : Pictures, optional
+        Where images are; without it the evidence has none.
     """
     inputs = Inputs(
         files=input_files(sources),
@@ -37,6 +42,7 @@ def evidence_of_log(calibrated: Calibrated, log_path: str | Path, sources: Seque
     return Evidence(
         derived=derived_of(calibrated.calibration),
         weak=weak_directions(calibrated.calibration, rows_of_log(calibrated)),
+        seen=seen_in_log(calibrated, log_path, pictures),
         inputs=inputs.with_options(calibrated.calibration.options),
     )
 

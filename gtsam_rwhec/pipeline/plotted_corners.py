@@ -40,18 +40,19 @@ def seen_views(solved: Solved, log: Log, *, left_out: bool = False) -> dict[str,
     for sensor in solved.cameras:
         if sensor not in solved.refined.Y:
             continue
-        inverse = np.linalg.inv(solved.refined.Y[sensor].matrix())
-        for record in records_of(log, [detections_topic(sensor)], DetectionRecord):
-            pair = Pair(record.id, sensor)
-            used = is_used.get((pair, record.stamp_ns))
-            if record.corners_px is None or record.corner_indices is None or used is None:
+        records = [
+            record
+            for record in records_of(log, [detections_topic(sensor)], DetectionRecord)
+            if record.corners_px is not None and (Pair(record.id, sensor), record.stamp_ns) in is_used
+        ]
+        stamps = np.array([record.stamp_ns for record in records], dtype=np.int64)
+        A, _ = path.at(stamps + round(1e9 * offsets.get(sensor, 0.0)))
+        for record, T in zip(records, np.linalg.inv(solved.refined.Y[sensor].matrix()) @ A, strict=True):
+            if record.corners_px is None or record.corner_indices is None:
                 continue
-            A, _ = path.at(np.array([record.stamp_ns + round(1e9 * offsets.get(sensor, 0.0))]))
-            corners = boards[record.id][list(record.corner_indices)]
-            X = solved.refined.X[record.id].matrix()
-            T = inverse @ A[0]
-            view = SeenView.of(record.corners_px, corners, T, X, record.stamp_ns, record.id, is_used=used)
-            seen[sensor].append(view)
+            corners, X = boards[record.id][list(record.corner_indices)], solved.refined.X[record.id].matrix()
+            used = is_used[Pair(record.id, sensor), record.stamp_ns]
+            seen[sensor].append(SeenView.of(record.corners_px, corners, T, X, record.stamp_ns, record.id, is_used=used))
     return dict(seen)
 
 
