@@ -166,7 +166,9 @@ TABLE: dict[str, dict[str, str]] = {
         "report/test_solution_report.py": "pose_table printing sentences",
     },
     "gtsam_rwhec/report/page/sections": {
-        "report/page/test_number_sections.py": ("determines inputs pose_tables verdict weak_directions")
+        "report/page/test_number_sections.py": (
+            "determines inputs pose_tables proof spectrum_chart uncertainty verdict weak_directions"
+        ),
     },
     "gtsam_rwhec/report/page": {
         "cli/test_diff.py": "changes_page",

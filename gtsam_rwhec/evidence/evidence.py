@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.evidence.derived import Derived
 from gtsam_rwhec.evidence.inputs import Inputs
+from gtsam_rwhec.evidence.proof import Proof
 from gtsam_rwhec.evidence.record import EvidenceRecord
 from gtsam_rwhec.evidence.seen import SeenEvidence
 from gtsam_rwhec.evidence.weak import WeakDirection
@@ -32,6 +33,7 @@ class Evidence(EvidenceRecord):
     format_version: Literal[1] = FORMAT_VERSION
     result_sha256: str = Field(default="", description="checksum of the result's file; empty where it was not known")
     derived: Derived | None = Field(default=None, description="what follows from poses and covariances")
+    proof: Proof | None = Field(default=None, description="gap and spectrum of the certificate")
     weak: tuple[WeakDirection, ...] = Field(default=(), description="least known directions, the worst first")
     seen: SeenEvidence | None = Field(default=None, description="detections, removed measurements, corners, images")
     inputs: Inputs | None = Field(default=None, description="files, versions, options, rig file")

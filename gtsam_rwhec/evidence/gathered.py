@@ -7,10 +7,12 @@ from gtsam_rwhec.evidence.derived import derived_of
 from gtsam_rwhec.evidence.evidence import Evidence
 from gtsam_rwhec.evidence.inputs import Inputs, versions
 from gtsam_rwhec.evidence.measured import measured_rows
+from gtsam_rwhec.evidence.proof import Proof, proof_of
 from gtsam_rwhec.evidence.seen_in_problem import seen_in_problem
 from gtsam_rwhec.evidence.weak import weak_directions
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.problem.problem import Problem
+from gtsam_rwhec.problem.selection import selected
 
 
 @one_blas_thread()
@@ -35,7 +37,16 @@ def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | Non
     rows = measured_rows(problem, calibration)
     return Evidence(
         derived=derived_of(calibration),
+        proof=_proof(problem, calibration),
         weak=weak_directions(calibration, rows),
         seen=seen_in_problem(problem, calibration.refined, rows, calibration.options.carrier_path),
         inputs=inputs.with_options(calibration.options),
     )
+
+
+def _proof(problem: Problem, calibration: Calibration) -> Proof | None:
+    """The proof of the certified solution, with the measurements that it is of."""
+    if calibration.solution is None:
+        return None
+    inliers = calibration.outliers.inliers
+    return proof_of(calibration.solution, selected(problem, inliers) if inliers else problem)

@@ -11,6 +11,7 @@ from gtsam_rwhec.evidence import Evidence
 from gtsam_rwhec.evidence.derived import derived_of
 from gtsam_rwhec.evidence.inputs import Inputs, input_files, versions
 from gtsam_rwhec.evidence.measured import MeasuredRows
+from gtsam_rwhec.evidence.proof import proof_of
 from gtsam_rwhec.evidence.weak import weak_directions
 from gtsam_rwhec.pipeline.seen_in_log import Pictures, seen_in_log
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
@@ -41,6 +42,7 @@ def evidence_of_log(
     )
     return Evidence(
         derived=derived_of(calibrated.calibration),
+        proof=proof_of(calibrated.solution, calibrated.problem),
         weak=weak_directions(calibrated.calibration, rows_of_log(calibrated)),
         seen=seen_in_log(calibrated, log_path, pictures),
         inputs=inputs.with_options(calibrated.calibration.options),

@@ -33,8 +33,9 @@ from gtsam_rwhec.pipeline.log_findings import (
     with_cures,
 )
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
-from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, poses_used, read_pairs
+from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, poses_used, problem_of, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, Purpose, SolvingRounds, sigma_of, without_outlier_marks
+from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.judging import judge
@@ -84,10 +85,13 @@ class Calibrated(Solved):
     ----------
     calibration : Calibration
         What ``calibrate`` found and chose; its refined poses, time offsets and outliers are those of the whole log.
+    problem : Problem
+        The measurements of the certified solution, with their weights.
     """
 
     refined: Refined
     calibration: Calibration
+    problem: Problem
 
 
 @one_blas_thread()
@@ -222,7 +226,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     pairs = {
         pair: replace(one, B=pairs[pair].B, covariance=pairs[pair].covariance) for pair, one in settled.pairs.items()
     }
-    return Calibrated(refined, solution, pairs, fields, cameras, rig, judgement, calibration)
+    problem = problem_of(settled.pairs, rig, settled.offsets_s, poses.free)
+    return Calibrated(refined, solution, pairs, fields, cameras, rig, judgement, calibration, problem)
 
 
 def _outliers(counts: tuple[OutlierCount, ...], *, looked_for: bool) -> Outliers:

@@ -39,7 +39,7 @@ def page_html(page: Page) -> str:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters.update(base64=_base64, script_json=_script_json, pieces=_pieces, own_ids=_own_ids)
+    environment.filters.update(base64=_base64, script_json=_script_json, pieces=_pieces, signs=_signs, own_ids=_own_ids)
     environment.tests.update(number=lambda piece: isinstance(piece, Number))
     has_drawing = any(block.kind == "drawing" for section in page.sections for block in every(section.blocks))
     script = _own_file("page.js")
@@ -98,3 +98,8 @@ def _script_json(value: Any) -> str:
 
 def _pieces(words: Words) -> tuple[str | Number, ...]:
     return words if isinstance(words, tuple) else (words,)
+
+
+def _signs(words: Words) -> int:
+    """How many signs words have as they are read."""
+    return sum(len(piece if isinstance(piece, str) else piece.text) for piece in _pieces(words))
