@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from gtsam_rwhec.files.terminal_text import printable
@@ -47,6 +47,13 @@ class Number:
         if self.value is None or not math.isfinite(self.value):
             return "free"
         return f"{self.times * self.value:{self.spec}}"
+
+
+def significant(number: Number, figures: int) -> Number:
+    """The number with so many figures that count, without an exponent; a large one has no decimals."""
+    shown = abs(number.times * (number.value or 0.0))
+    size = math.floor(math.log10(shown)) if 0.0 < shown < math.inf else 0
+    return replace(number, spec=f".{max(figures - 1 - size, 0)}f")
 
 
 #: A piece of a sentence, or a cell.

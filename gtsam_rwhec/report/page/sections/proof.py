@@ -14,10 +14,10 @@ from gtsam_rwhec.solver.cause import Status
 from gtsam_rwhec.solver.certificate import Certificate
 
 HEADLINES: Mapping[Status, tuple[str, Tone]] = {
-    Status.CERTIFIED: ("✓ Proven: no other answer fits these measurements better, and they determine it.", "good"),
-    Status.CERTIFIED_NOT_UNIQUE: ("! Proven, but not unique: no answer fits better, and others fit as well.", "care"),
-    Status.GAP: ("✕ Not proven: a better answer may exist.", "bad"),
-    Status.FAILED: ("✕ Not proven: there is no bound on what a better answer could cost.", "bad"),
+    Status.CERTIFIED: ("Proven: no other answer fits these measurements better, and they determine it.", "good"),
+    Status.CERTIFIED_NOT_UNIQUE: ("Proven, but not unique: no answer fits better, and others fit as well.", "care"),
+    Status.GAP: ("Not proven: a better answer may exist.", "bad"),
+    Status.FAILED: ("Not proven: there is no bound on what a better answer could cost.", "bad"),
 }
 ABOUT = (
     "This is about the certified answer, at which the refinement began. It says nothing of the measurements: of wrong "

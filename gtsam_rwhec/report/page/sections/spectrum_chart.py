@@ -39,6 +39,9 @@ def spectrum_svg(values: Array, rounding: float) -> SvgFigure:
         )  # fmt: skip
         axes.set(yscale="log", xlabel="number, in order", ylabel="eigenvalue")
         axes.set_ylim(low, 5.0 * max(float(size.max()), level))
+        # The style takes "$" as it is, so powers of ten are written out.
+        axes.yaxis.set_major_formatter(lambda value, _: f"1e{round(float(np.log10(value)))}")
+        axes.yaxis.set_minor_formatter(lambda value, _: "")
         axes.legend(loc="center right", fontsize=9)
 
     return svg_figure(draw, 3.0)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from gtsam_rwhec.calibration.verdict import Finding, Verdict, findings_of
 from gtsam_rwhec.report.advice import Advice
-from gtsam_rwhec.report.page.blocks import Block, Listing, Paragraph, Section, Table, Tone
+from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Paragraph, Section, Table, Tone, significant
 from gtsam_rwhec.report.page.sections.pose_tables import pose_blocks
 from gtsam_rwhec.report.page.shown_result import ShownResult
 
@@ -35,8 +36,8 @@ def verdict_section(shown: ShownResult) -> Section:
         blocks.append(Paragraph(NOTHING_TO_DO))
     findings = _findings(shown)
     if len(findings) > 1:
-        blocks.append(Paragraph("The grounds of this verdict, the most serious first:"))
-        blocks.append(Listing(tuple(f"{_sentence(one.words)} {_sentence(one.ground.advice)}" for one in findings)))
+        grounds = Listing(tuple(f"{_sentence(one.words)} {_sentence(one.ground.advice)}" for one in findings))
+        blocks.append(Folded("The grounds of this verdict one by one, the most serious first", (grounds,)))
     blocks += _points(shown)
     blocks += pose_blocks(shown)
     return Section("verdict", "Verdict", tuple(blocks))
@@ -44,8 +45,8 @@ def verdict_section(shown: ShownResult) -> Section:
 
 def _todo(shown: ShownResult, cure: str) -> Iterator[str]:
     """What to do: the advice of the verdict, and what the terminal says below it."""
-    if cure:
-        yield _sentence(cure)
+    numbered = re.split(r"(?:^|; )\(\d+\) ", cure)
+    yield from (_sentence(one) for one in numbered if one)
     result = shown.result
     if result is None:
         return
@@ -89,7 +90,7 @@ def _points(shown: ShownResult) -> Iterator[Block]:
         title += ": the worst sensor"
     yield Paragraph(f"{title}:")
     for i in which:
-        radius = shown.number("calibration", "points", i, "radius_mm", spec=".2g")
+        radius = significant(shown.number("calibration", "points", i, "radius_mm"), 2)
         level = shown.number("calibration", "points", i, "level", times=100.0, spec="g", unit="%")
         if radius.value is None:
             yield Paragraph(f"{points[i]['frame']}: not determined", "lead")
@@ -100,10 +101,10 @@ def _points(shown: ShownResult) -> Iterator[Block]:
             point["frame"],
             point["seen_from"],
             shown.number("calibration", "points", i, "level", times=100.0, spec="g"),
-            shown.number("calibration", "points", i, "radius_mm", spec=".3g"),
+            significant(shown.number("calibration", "points", i, "radius_mm"), 3),
             "-"
             if point.get("measurement_mm") is None
-            else shown.number("calibration", "points", i, "measurement_mm", spec=".3g"),
+            else significant(shown.number("calibration", "points", i, "measurement_mm"), 3),
         )
         for i, point in enumerate(points)
     )

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gtsam_rwhec.evidence.weak import MORE, TURN_RAD, WEAK, WeakDirection
-from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Paragraph, Table, Words
+from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Paragraph, Table, Words, significant
 from gtsam_rwhec.report.page.shown_result import ShownResult
 
 #: A direction is called after a coordinate axis within 8 degrees of it.
@@ -61,7 +61,7 @@ def axis_words(axis: tuple[float, float, float], frame: str) -> str:
 def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
     """A weak direction and its cure."""
     along, unit = ("along", " mm") if one.kind == "translation" else ("about", "°")
-    deviation = shown.evident("weak", i, "deviation", spec=".2g")
+    deviation = significant(shown.evident("weak", i, "deviation"), 2)
     words: tuple[str | object, ...] = (
         f"{one.frame} {along} {axis_words(one.axis_in_carrier, one.carrier)}: ± ",
         deviation,
@@ -71,15 +71,15 @@ def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
         words += (
             f" Turn about {axis_words(one.turn, sensor_carrier(shown))} with {one.partner} in view: {MORE} "
             "measurements would bring it to about ± ",
-            shown.evident("weak", i, "after_turning", spec=".2g"),
+            significant(shown.evident("weak", i, "after_turning"), 2),
             f"{unit}, as many like those there are to ± ",
-            shown.evident("weak", i, "after_more", spec=".2g"),
+            significant(shown.evident("weak", i, "after_more"), 2),
             f"{unit}.",
         )
     elif one.after_more is not None:
         words += (
             f" No turn helps more than measuring on: {MORE} more measurements would bring it to about ± ",
-            shown.evident("weak", i, "after_more", spec=".2g"),
+            significant(shown.evident("weak", i, "after_more"), 2),
             f"{unit}.",
         )
     return words  # type: ignore[return-value]
@@ -89,11 +89,11 @@ def _row(shown: ShownResult, i: int, one: WeakDirection) -> tuple[Words, ...]:
     return (
         one.frame,
         axis_words(one.axis_in_carrier, one.carrier),
-        shown.evident("weak", i, "deviation", spec=".2g"),
+        significant(shown.evident("weak", i, "deviation"), 2),
         one.partner or "-",
         "-" if one.turn is None else axis_words(one.turn, sensor_carrier(shown)),
-        "-" if one.after_turning is None else shown.evident("weak", i, "after_turning", spec=".2g"),
-        "-" if one.after_more is None else shown.evident("weak", i, "after_more", spec=".2g"),
+        "-" if one.after_turning is None else significant(shown.evident("weak", i, "after_turning"), 2),
+        "-" if one.after_more is None else significant(shown.evident("weak", i, "after_more"), 2),
     )
 
 
