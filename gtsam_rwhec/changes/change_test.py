@@ -4,8 +4,9 @@ With z the whitened difference, |z|^2 is a chi-square of as many degrees of free
 (dimension times an F, where covariances were estimated). Its power is spread over all of them, so that a change of one
 frame of many is hard to see. So each group of quantities, a frame's pose or a size, is also tested for "this changed,
 and nothing else did": the squared length of z's projection on the directions in which that group moves z. The alarm is
-the smaller of the joint chance and the number of groups times the smallest of a group. How often it is so small without
-any change is counted over random z, because the tests share what they are made of.
+the smaller of the joint chance and, at a third of its weight, the smallest of a group times their number: what one frame
+gains, a change of all of them hardly loses. How often it is so small without any change is counted over random z,
+because the tests share what they are made of.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from gtsam_rwhec.refinement.joint_covariance import SHARE
 
 #: The level at which something counts as changed, unless another one is asked for.
 LEVEL = 0.01
+#: The weight of the groups' tests beside the joint one.
+OF_GROUPS = 1.0 / 3.0
 #: Random differences without a change, and the most numbers of one array of them.
 DRAWS, MOST_NUMBERS = 20_000, 2_000_000
 #: A chance that fewer of them fall below is bounded by the sum of both tests'.
@@ -196,20 +199,20 @@ def _tail(square: Array | float, dimension: int, freedom: float) -> Array:
 
 
 def _family(chances: list[float], moved: list[Array]) -> float:
-    """The number of groups times the smallest of their chances."""
+    """The number of groups times the smallest of their chances, at their weight."""
     compared = [chance for chance, U in zip(chances, moved, strict=True) if U.shape[1]]
-    return len(compared) * min(compared, default=1.0)
+    return len(compared) * min(compared, default=1.0) / OF_GROUPS
 
 
 def _calibrated(smallest: float, size: int, freedom: float, moved: list[Array]) -> float:
     """How often the smaller of the two chances is as small without a change.
 
-    It is counted over random differences, always the same ones; below ``FEWEST_DRAWS`` of them, and where everything
-    is one group, it is the sum of both chances, or the one chance.
+    It is counted over random differences, always the same ones. Below ``FEWEST_DRAWS`` of them it is the sum of both
+    chances; where everything is one group, it is the joint one.
     """
     if not size or (len(moved) == 1 and moved[0].shape[1] == size):
         return min(smallest, 1.0)
-    bound = min(2.0 * smallest, 1.0)
+    bound = min((1.0 + OF_GROUPS) * smallest, 1.0)
     number = min(DRAWS, max(MOST_NUMBERS // size, FEWEST_DRAWS))
     chance = np.random.default_rng(0)
     z = chance.standard_normal((number, size))
@@ -218,7 +221,9 @@ def _calibrated(smallest: float, size: int, freedom: float, moved: list[Array]) 
     least = _tail(np.einsum("ni,ni->n", z, z), size, freedom)
     for U in moved:
         along = z @ U
-        least = np.minimum(least, len(moved) * _tail(np.einsum("ni,ni->n", along, along), U.shape[1], freedom))
+        least = np.minimum(
+            least, len(moved) / OF_GROUPS * _tail(np.einsum("ni,ni->n", along, along), U.shape[1], freedom)
+        )
     below = int((least <= smallest).sum())
     return min(bound, below / number) if below >= FEWEST_DRAWS else bound
 

@@ -62,7 +62,7 @@ DRIFT = np.radians(0.3), 0.003
 #: By how much each of the arm's angles (rad) and lengths (m) is off; how far its joints move, rad.
 MISBUILT, JOINTS = (np.radians(0.03), 2e-4), np.radians([25.0, 20.0, 20.0, 30.0, 30.0, 60.0])
 #: The correlation of drift from one measurement to the next, and the measurements of each pair of frames.
-CORRELATION, COUNT = 0.9, 40
+CORRELATION, COUNT = 0.9, 60
 #: A change of one frame, in its own joint deviations; the share that must be found, and how near the theory's.
 DEVIATIONS, FOUND, NEAR = 4.5, 0.80, 0.05
 #: A change of all frames is as large as is found with this probability.
