@@ -1,4 +1,5 @@
 from .calibration_files import read_calibration as read_calibration
+from .calibration_files import result_path as result_path
 from .change_test import LEVEL as LEVEL
 from .change_test import ChangeTest as ChangeTest
 from .change_test import GroupChange as GroupChange

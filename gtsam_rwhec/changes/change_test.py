@@ -4,9 +4,9 @@ With z the whitened difference, |z|^2 is a chi-square of as many degrees of free
 (dimension times an F, where covariances were estimated). Its power is spread over all of them, so that a change of one
 frame of many is hard to see. So each group of quantities, a frame's pose or a size, is also tested for "this changed,
 and nothing else did": the squared length of z's projection on the directions in which that group moves z. The alarm is
-the smaller of the joint chance and, at a third of its weight, the smallest of a group times their number: what one frame
-gains, a change of all of them hardly loses. How often it is so small without any change is counted over random z,
-because the tests share what they are made of.
+the smaller of the joint chance and, at a third of its weight, the smallest of a group times their number: one frame
+gains by it, and a change of all of them hardly loses. How often it is so small without any change is counted over
+random z, because the tests share what they are made of.
 """
 
 from __future__ import annotations

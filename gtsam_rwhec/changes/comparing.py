@@ -90,20 +90,22 @@ class Difference:
                 f"Changed, by more than chance at {level}: by {self.test.deviations:.1f} joint deviations in "
                 f"{self.test.dimension} directions together. No frame stands out by itself."
             )
-        return f"Changed: {'; '.join(self.sentence(name) for name in named)}: more than chance at {level}."
+        return f"Changed: {'; '.join(self.sentence(name) for name in named)}, more than chance at {level}."
 
     def sentence(self, name: str) -> str:
         """How one frame or number changed, in words, without a full stop."""
         deviations = "" if self.test is None or name not in self.test.groups else _deviations(self.test, name)
         if name in self.movements:
             moved = self.movements[name]
-            return f"{shown(name)} moved {moved.translation_mm:.3g} mm and {moved.rotation_deg:.2g} degrees{deviations}"
+            verb = "moved" if self.test is None or name in self.test.changed else "differs by"
+            by = f"{verb} {moved.translation_mm:.3g} mm and {moved.rotation_deg:.2g} degrees"
+            return f"{shown(name)} {by}{deviations}"
         said = ", ".join(f"{shown(one.name)} from {one.old:.6g} to {one.new:.6g}" for one in self.numbers[name])
         return f"{said}{deviations}"
 
 
 def _deviations(test: ChangeTest, name: str) -> str:
-    return f" ({test.groups[name].deviations:.1f} joint deviations)"
+    return f": {test.groups[name].deviations:.1f} joint deviations"
 
 
 def share_words(chance: float) -> str:
@@ -122,6 +124,7 @@ def difference(
     frames: Collection[str] = (),
     clocks_may_change: bool = False,
     same_arm: bool = True,
+    same_measurements: bool = False,
 ) -> Difference:
     """What changed from an old calibration to a new one, and whether by more than chance.
 
@@ -142,6 +145,9 @@ def difference(
     same_arm : bool
         Whether the carriers' poses come from the same arm or tracker. A constant error of these, which no residual
         shows, is then the same in both, and does not count in the difference.
+    same_measurements : bool
+        Whether the measurements of both are known to be the same, such as by their files' checksums: then nothing is
+        tested. What the numbers themselves show of it is seen without.
 
     Raises
     ------
@@ -180,7 +186,7 @@ def difference(
     not_compared = {str(unknown): why for unknown, why in common.not_compared.items()}
     if all(abs(common.difference) <= SAME) and all(abs(moved.xi).max() <= SAME for moved in movements.values()):
         return Difference(movements, numbers, None, "", not_compared, tuple(remarks), is_same=True)
-    if is_of_the_same_measurements(first, second):
+    if same_measurements or is_of_the_same_measurements(first, second):
         why = "both rest on the same measurements, whose errors cancel in the difference; compare with another log"
         return Difference(movements, numbers, None, why, not_compared, tuple(remarks))
     if frames:

@@ -105,16 +105,22 @@ class Verification:
             )
         named = self.test.changed
         if not named:
-            return f"The calibration no longer holds, at {level}. No frame stands out by itself.{but}"
-        return f"The calibration no longer holds, at {level}: {'; '.join(map(self.sentence, named))}.{but}"
+            return (
+                f"The calibration no longer holds, by more than chance at {level}. No frame stands out by itself.{but}"
+            )
+        said = "; ".join(map(self.sentence, named))
+        return f"The calibration no longer holds: {said}, more than chance at {level}.{but}"
 
     def sentence(self, name: str) -> str:
         """How far a frame seems to have moved, in words, without a full stop."""
         deviations = f"{self.test.groups[name].deviations:.1f} joint deviations"
+        verb = "changed" if name in self.test.changed else "differs"
         if name not in self.movements:
-            return f"{shown(name)} changed ({deviations})"
+            return f"{shown(name)} {verb}: {deviations}"
         moved = self.movements[name]
-        return f"{shown(name)} moved {moved.translation_mm:.3g} mm and {moved.rotation_deg:.2g} degrees ({deviations})"
+        verb = "moved" if name in self.test.changed else "differs by"
+        by = f"{verb} {moved.translation_mm:.3g} mm and {moved.rotation_deg:.2g} degrees"
+        return f"{shown(name)} {by}: {deviations}"
 
 
 @one_blas_thread()

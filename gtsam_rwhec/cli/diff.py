@@ -10,6 +10,7 @@ import typer
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import check_output
+from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
 RESULT_HELP = "result.json, or the folder that calibrate wrote."
@@ -23,10 +24,12 @@ PageOption = Annotated[
 ]
 
 
-def write_page_to(found: rw.changes.Difference | rw.changes.Verification, output: Path | None) -> None:
+def write_page_to(
+    found: rw.changes.Difference | rw.changes.Verification, output: Path | None, compared: tuple[Path, Path]
+) -> None:
     """Write the page, if one is asked for, and say so."""
     if output is not None:
-        rw.report.write_changes(found, output)
+        rw.report.write_changes(found, output, compared)
         say(f"Written to {shown_path(output)}.", to_errors=True)
 
 
@@ -55,9 +58,27 @@ def diff(
         frames=frame or (),
         clocks_may_change=clocks_may_change,
         same_arm=not other_arm,
+        same_measurements=have_same_inputs(old, new),
     )
     rw.report.print_difference(found)
-    write_page_to(found, output)
+    write_page_to(found, output, (old, new))
     if found.test is None and not found.is_same:
         return ExitStatus.BAD_INPUT
     return ExitStatus.CHANGED if found.has_changed else ExitStatus.DONE
+
+
+def have_same_inputs(old: Path, new: Path) -> bool:
+    """Whether the evidence beside two results names input files with the same checksums."""
+    first, second = (_checksums(rw.evidence.evidence_path(rw.changes.result_path(path))) for path in (old, new))
+    return bool(first) and first == second
+
+
+def _checksums(evidence: Path) -> set[str]:
+    """Of the input files; empty where nothing readable says them."""
+    if not evidence.exists():
+        return set()
+    try:
+        inputs = rw.evidence.read_evidence(evidence).inputs
+    except FileFormatError:  # of another version: the numbers themselves are compared all the same
+        return set()
+    return set() if inputs is None else {file.sha256 for file in inputs.files}

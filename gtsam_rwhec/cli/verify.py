@@ -58,7 +58,7 @@ def verify(
                 progress=stage,
             )
     rw.report.print_verification(found)
-    write_page_to(found, output)
+    write_page_to(found, output, (result, source))
     if not found.holds:
         return ExitStatus.CHANGED
     return ExitStatus.NOT_UNIQUE if found.unchecked_sensors else ExitStatus.DONE

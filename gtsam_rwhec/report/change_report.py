@@ -25,7 +25,8 @@ def print_difference(found: Difference) -> None:
     tested = None if found.test is None and not found.is_same else found.has_changed
     print_sentence(console, str(found), STYLES[tested])
     console.print()
-    print_tables(console, change_tables(found), CHANGE_LEGEND if found.test is not None else "")
+    if not found.is_same:
+        print_tables(console, change_tables(found), CHANGE_LEGEND if found.test is not None else "")
     words = list(remark_sentences(found))
     if words:
         print_heading(console, "Keep in mind")

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from gtsam_rwhec.changes.verifying import Verification
 from gtsam_rwhec.files.terminal_text import shown
-from gtsam_rwhec.report.change_report import MOVED_HEADINGS, STYLES, moved_cells
+from gtsam_rwhec.report.change_report import CHANGE_LEGEND, MOVED_HEADINGS, STYLES, moved_cells
 from gtsam_rwhec.report.pose_table import FrameTable
 from gtsam_rwhec.report.printing import print_heading, print_list, print_sentence, print_tables, report_console
 
 ERROR_HEADINGS = ("n", "old mm", "old°", "old px", "best mm", "best°")
-VERIFICATION_LEGEND = (
+PIXELS = "old px"
+ERROR_LEGEND = (
     "old: how far the old poses' predictions are from the new measurements (root mean square; px: median of corners). "
-    "best: the same with the poses that fit the new log best: noise. deviations: joint (Mahalanobis) deviations of the "
-    "difference, correlations counted. chance: how often it is so large without a change, corrected for the number of "
-    "lines."
+    "best: the same with the poses that fit the new log best: noise."
 )
 
 
@@ -22,7 +21,9 @@ def print_verification(found: Verification) -> None:
     console = report_console()
     print_sentence(console, str(found), STYLES[not found.holds])
     console.print()
-    print_tables(console, verification_tables(found), VERIFICATION_LEGEND)
+    for table, legend in zip(verification_tables(found), (ERROR_LEGEND, CHANGE_LEGEND), strict=True):
+        print_tables(console, [table], legend)
+        console.print()
     words = verification_remarks(found)
     if words:
         print_heading(console, "Keep in mind")
@@ -31,21 +32,23 @@ def print_verification(found: Verification) -> None:
 
 def verification_tables(found: Verification) -> tuple[FrameTable, FrameTable]:
     """How far off each sensor's predictions are, and how far each frame seems to have moved."""
+    has_pixels = any(check.held_px is not None for check in found.sensors.values())
     errors = {
         name: (
             str(check.held.count),
             f"{check.held.translation_rms_mm:.3f}",
             f"{check.held.rotation_rms_deg:.3f}",
-            "-" if check.held_px is None else f"{check.held_px:.2f}",
+            *(["-" if check.held_px is None else f"{check.held_px:.2f}"] if has_pixels else []),
             f"{check.best.translation_rms_mm:.3f}",
             f"{check.best.rotation_rms_deg:.3f}",
         )
         for name, check in found.sensors.items()
     }
+    headings = tuple(heading for heading in ERROR_HEADINGS if has_pixels or heading != PIXELS)
     moved = {name: moved_cells(one, found.test, name) for name, one in found.movements.items()}
     return (
-        FrameTable("Predictions of the new measurements", "sensor", ERROR_HEADINGS, errors),
-        FrameTable("From the old poses to those that fit the new log best", "frame", MOVED_HEADINGS, moved),
+        FrameTable("Predictions of the new measurements", "sensor", headings, errors),
+        FrameTable("Movement since the old log", "frame", MOVED_HEADINGS, moved),
     )
 
 

@@ -18,7 +18,7 @@ from gtsam_rwhec.pipeline.verified_log import OldCalibration, verify_log, with_c
 
 #: Three of the old calibration's joint deviations and more: 4 mm and 0.3 degrees.
 KNOCK = se3.expmap(np.array([[0.0, 0.005, 0.0, 0.004, 0.0, 0.0]]))[0]
-SECONDS = 5.0
+SECONDS = 4.0
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_a_camera_that_was_knocked_is_named(old: Path, tmp_path: Path, monkeypat
     log = new_log(tmp_path)
     done = CliRunner().invoke(app, ["verify", str(old / "result.json"), str(log)])
     assert done.exit_code == ExitStatus.CHANGED, done.output
-    assert done.stdout.startswith("The calibration no longer holds, at 1 %: cam_1 moved ")
+    assert done.stdout.startswith("The calibration no longer holds: cam_1 moved ")
 
 
 def test_a_camera_that_sees_nothing_is_named(old: Path, tmp_path: Path) -> None:
@@ -64,7 +64,8 @@ def test_a_camera_that_sees_nothing_is_named(old: Path, tmp_path: Path) -> None:
 def test_a_clock_that_is_estimated_may_be_late_by_another_time(old: Path, tmp_path: Path) -> None:
     rig = made.rig(cam_1="detections: /cam_1/tags\n    time_offset: estimate")
     log = new_log(tmp_path, offsets_s={"cam_1": 0.03})
-    assert verify_log(old, log, rig).holds
+    (tmp_path / "result.json").write_bytes((old / "result.json").read_bytes())  # and nothing beside it
+    assert verify_log(tmp_path / "result.json", log, rig).holds
 
 
 def test_the_log_of_the_calibration_itself_is_told(old: Path) -> None:
@@ -99,4 +100,3 @@ def test_a_result_without_its_log_needs_a_rig_file(old: Path, tmp_path: Path) ->
     log = new_log(tmp_path)
     with pytest.raises(LogError, match="give --rig FILE"):
         verify_log(tmp_path / "result.json", log)
-    assert verify_log(tmp_path / "result.json", log, made.rig()).holds
