@@ -166,11 +166,13 @@ TABLE: dict[str, dict[str, str]] = {
         "report/test_solution_report.py": "pose_table printing sentences",
     },
     "gtsam_rwhec/report/page/sections": {
+        "report/page/test_seen.py": "seen",
         "report/page/test_number_sections.py": (
             "determines inputs pose_tables proof spectrum_chart verdict weak_directions"
         ),
     },
     "gtsam_rwhec/report/page": {
+        "report/page/test_seen.py": "empty_regions seen_figures",
         "cli/test_diff.py": "changes_page",
         "report/page/test_figures.py": "figure_files",
         "report/page/test_written.py": "blocks html shown_result",

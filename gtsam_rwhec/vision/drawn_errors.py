@@ -15,6 +15,8 @@ from gtsam_rwhec.vision.picture_text import Picture, Words, written
 
 #: The picture's longer side, pixels, and the part of the target's size that is around it.
 SIDE_PX, AROUND = 720, 0.25
+#: Width over height of the part of the image.
+SHAPE = 4.0 / 3.0
 #: Pixels: a circle's radius, a cross's arm, letters.
 RADIUS, ARM, LETTERS = 7, 5, 17
 #: So many of the largest errors have a number, 1 for the largest.
@@ -84,15 +86,15 @@ def magnification(errors: Array, scale: float) -> float:
 
 
 def _window(gray: Gray, seen: Array) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of a part of the image with the corners, not narrower or lower than half the other."""
+    """Left, top, right, bottom of a part of the image with the corners, of the shape `SHAPE` if the image allows it."""
     low, high = seen.min(axis=0), seen.max(axis=0)
     half = 0.5 * (high - low) + AROUND * float((high - low).max()) + 4.0
-    half = np.maximum(half, 0.5 * half.max())
     limit = np.array(gray.shape[::-1], dtype=float)
-    middle = np.clip(0.5 * (low + high), 0.0, limit)
-    left, top = np.floor(np.clip(middle - half, 0.0, limit - 2.0)).astype(int).tolist()
-    right, bottom = np.ceil(np.clip(middle + half, 2.0, limit)).astype(int).tolist()
-    return left, top, right, bottom
+    half = np.minimum(max(half[0], SHAPE * half[1]) * np.array([1.0, 1.0 / SHAPE]), 0.5 * limit)
+    middle = np.clip(0.5 * (low + high), half, limit - half)
+    left, top = np.floor(middle - half).astype(int).tolist()
+    right, bottom = np.ceil(middle + half).astype(int).tolist()
+    return max(left, 0), max(top, 0), right, bottom
 
 
 def _mark(at: Array) -> float:

@@ -42,7 +42,7 @@ def test_errors_are_as_long_as_is_said() -> None:
     errors[0] = [-0.11, 0.0]  # the answer has it to the right
     drawn, none = draw_errors(GRAY, SEEN, errors), draw_errors(GRAY, SEEN, np.zeros((4, 2)))
     changed = np.argwhere((drawn.picture != none.picture).any(axis=2))[:, ::-1]
-    scale = SIDE_PX / 128.0  # the window: 80 + 2 (0.25 80 + 4)
+    scale = SIDE_PX / 144.0  # the window's width: 80 + 2 (0.25 80 + 4), or of its height, 60 + 2 (0.25 80 + 4), 4 / 3
     assert drawn.magnified in (20.0, 50.0, 100.0)
     assert np.ptp(changed[:, 0]) == pytest.approx(scale * drawn.magnified * 0.11, abs=14.0)
 

@@ -111,6 +111,7 @@ class Picture:
     says: str
     content: bytes
     media_type: Literal["image/jpeg", "image/png"] = "image/jpeg"
+    is_wide: bool = True
     kind: str = field(default="picture", init=False)
 
 

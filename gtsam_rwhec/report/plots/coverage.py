@@ -94,17 +94,14 @@ def _size(seen: PlottedCorners, camera: Camera | None) -> tuple[float, float]:
 
 
 def _draw(axes: Axes, sensor: str, seen: PlottedCorners, size: tuple[float, float], largest: float) -> PathCollection:
-    width, height = size
     errors = np.linalg.norm(seen.errors_px, axis=1)
     order = np.argsort(errors, kind="stable")  # the largest errors on top
     points = axes.scatter(
         seen.pixels[order, 0], seen.pixels[order, 1],
         c=errors[order], s=6, lw=0, cmap=_colours(), vmin=0.0, vmax=largest, zorder=2,
     )  # fmt: skip
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="u (px)", ylabel="v (px)")
-    axes.set_aspect("equal")
-    axes.spines[:].set_visible(True)
-    axes.grid(visible=False)
+    image_axes(axes, size)
+    axes.set(xlabel="u (px)", ylabel="v (px)")
     if not len(errors):
         axes.set_title(f"{shortened(sensor)}: no corners")
         return points
@@ -116,6 +113,15 @@ def _draw(axes: Axes, sensor: str, seen: PlottedCorners, size: tuple[float, floa
         f"rms length of all errors, outliers too: {rms:.2g} px{note}"
     )
     return points
+
+
+def image_axes(axes: Axes, size: tuple[float, float]) -> None:
+    """Make axes those of an image of a (width, height): its pixels from the upper left, with a frame around it."""
+    width, height = size
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    axes.set_aspect("equal")
+    axes.spines[:].set_visible(True)
+    axes.grid(visible=False)
 
 
 def _colours() -> Colormap:
