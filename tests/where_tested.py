@@ -44,8 +44,8 @@ TABLE: dict[str, dict[str, str]] = {
         "reprojection/test_by_corners.py": "by_corners",
     },
     "gtsam_rwhec/changes": {
-        "changes/test_comparing.py": "calibration_files constant_errors quantities",
-        "changes/test_verifying.py": "near_answer",
+        "changes/test_comparing.py": "calibration_files comparable constant_errors quantities",
+        "changes/test_verifying.py": "near_answer predictions verification",
     },
     "gtsam_rwhec/cleaning": {
         "cleaning/test_pair_consensus.py": "removed",

@@ -7,6 +7,6 @@ from .comparing import Difference as Difference
 from .comparing import NumberChange as NumberChange
 from .comparing import difference as difference
 from .quantities import Movement as Movement
-from .verifying import SensorCheck as SensorCheck
-from .verifying import Verification as Verification
+from .verification import SensorCheck as SensorCheck
+from .verification import Verification as Verification
 from .verifying import verify as verify

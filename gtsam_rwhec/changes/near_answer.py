@@ -6,6 +6,7 @@ the estimate and its covariance. Directions that a short log leaves free are fre
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -13,7 +14,7 @@ import gtsam
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.errors import CountError
+from gtsam_rwhec.errors import CountError, RwhecWarning
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.noise_model.agreement import agreeing
@@ -37,6 +38,7 @@ from gtsam_rwhec.refinement.reprojection_found import Intrinsics
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.refinement.variables import State, Variables
 from gtsam_rwhec.solver.parts import parts_of
+from gtsam_rwhec.solving.certified_solution import solve
 
 #: A measurement that is farther off than this many times the median, as seen from either end, is a gross error.
 GROSS = 10.0
@@ -147,8 +149,15 @@ def _settled(
             f"holds; measure from {-(-(SPARE_EQUATIONS - spare) // 6)} more poses at least"
         )
     data = data_of(problem, variables, how)
-    state = _start(old, variables)
-    space = free_space_of(parts_of(problem), variables, state, data)
+    state, parts = _start(old, variables), parts_of(problem)
+    space = free_space_of(parts, variables, state, data)
+    if space.directions:  # the motion is poor; or residuals are so large that it looks so, and another start is needed
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RwhecWarning)
+            there = variables.start(solve(problem))
+        other = free_space_of(parts, variables, there, data)
+        if len(other.directions) < len(space.directions):
+            state, space = there, other
     layout = JointCovariance.of(variables.unknowns, np.eye(len(space.unit)), space.basis, space.unit)
     task = Task(problem, data, variables, layout, Instants.of(data), noise, space.directions, tell)
     return task, settled(task, state, tell)

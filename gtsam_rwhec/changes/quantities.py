@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 from rwhec_factors.se3 import right_jacobian_inverse
 
+from gtsam_rwhec.files.rounded_numbers import rounded
 from gtsam_rwhec.geometry.pose_covariances import error_of
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.refinement.joint_covariance import SHARE, JointCovariance
@@ -44,6 +45,9 @@ class Movement:
     def rotation_deg(self) -> float:
         """By how much the frame turned, degrees."""
         return math.degrees(float(np.linalg.norm(self.xi[:3])))
+
+    def __str__(self) -> str:
+        return f"{rounded(self.translation_mm, 3)} mm and {rounded(self.rotation_deg)} degrees"
 
 
 @dataclass(frozen=True)

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gtsam_rwhec.calibration.calibrated import Calibration
-from gtsam_rwhec.calibration.prediction_errors import PredictionError, prediction_errors
-from gtsam_rwhec.changes.change_test import LEVEL, ChangeTest, change_test, checked_level
-from gtsam_rwhec.changes.comparing import as_result, share_words
+from gtsam_rwhec.changes.change_test import LEVEL, change_test, checked_level
+from gtsam_rwhec.changes.comparing import as_result
 from gtsam_rwhec.changes.constant_errors import without_constant_errors
 from gtsam_rwhec.changes.near_answer import NearAnswer, near, stated_as
+from gtsam_rwhec.changes.predictions import checks_of, far_off
 from gtsam_rwhec.changes.quantities import Movement, Quantities, quantities
-from gtsam_rwhec.errors import FrameError, OptionError, UnderdeterminedError
+from gtsam_rwhec.changes.verification import UNSEEN_SENSOR, UNSEEN_TARGET, SensorCheck, Verification
+from gtsam_rwhec.errors import CountError, FrameError, OptionError, UnderdeterminedError
 from gtsam_rwhec.files.progress import Progress
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -27,100 +27,8 @@ from gtsam_rwhec.refinement.unknowns import UnknownKind
 from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 
-#: Why frames are not checked.
-UNSEEN_SENSOR = "the new log has no measurement by it"
-UNSEEN_TARGET = "the new log has no measurement of it"
 #: Residuals that are this many times those of the old log are told.
 NOISIER = 2.0
-
-
-@dataclass(frozen=True)
-class SensorCheck:
-    """How well the old poses predict what a sensor saw in the new log.
-
-    Attributes
-    ----------
-    held : PredictionError
-        Of the old poses: what a robot that uses them is off by, with the noise of the measurements.
-    best : PredictionError
-        Of the poses that fit the new log best: the noise of the measurements.
-    outliers : int
-        Measurements that agree with no others; they count in neither.
-    noise_ratio : float or None
-        `best`'s root mean square translation over that of the old log's residuals; None where that has none.
-    held_px : float or None
-        Median distance of corners from where the old poses say that they are, pixels; None without images.
-    """
-
-    held: PredictionError
-    best: PredictionError
-    outliers: int
-    noise_ratio: float | None
-    held_px: float | None = None
-
-
-@dataclass(frozen=True)
-class Verification:
-    """Whether an old calibration still holds; ``str()`` is the verdict.
-
-    Attributes
-    ----------
-    test : ChangeTest
-        Of the old poses against those that fit the new log best, by the sum of both covariances.
-    movements : dict of str to Movement
-        From the old pose of each frame to the one that fits the new log best.
-    sensors : dict of str to SensorCheck
-    not_checked : dict of str to str
-        Sensors and targets of the old calibration that the new log tells nothing of, with the reason.
-    targets_may_move : bool
-        Whether targets were left out of the test.
-    remarks : tuple of str
-    """
-
-    test: ChangeTest
-    movements: dict[str, Movement]
-    sensors: dict[str, SensorCheck]
-    not_checked: dict[str, str]
-    targets_may_move: bool
-    remarks: tuple[str, ...]
-
-    @property
-    def holds(self) -> bool:
-        """Whether nothing says that the old calibration no longer holds."""
-        return not self.test.has_changed
-
-    @property
-    def unchecked_sensors(self) -> tuple[str, ...]:
-        """The sensors of the old calibration that were not checked."""
-        return tuple(name for name, why in self.not_checked.items() if why == UNSEEN_SENSOR or name in self.sensors)
-
-    def __str__(self) -> str:
-        level = f"{100.0 * self.test.level:g} %"
-        said = ", ".join(map(shown, self.unchecked_sensors))
-        but = f" Not checked: {said}." if said else ""
-        if self.holds:
-            return (
-                f"The calibration still holds at {level}: the new log agrees with it as well as by chance in "
-                f"{share_words(self.test.chance)}.{but}"
-            )
-        named = self.test.changed
-        if not named:
-            return (
-                f"The calibration no longer holds, by more than chance at {level}. No frame stands out by itself.{but}"
-            )
-        said = "; ".join(map(self.sentence, named))
-        return f"The calibration no longer holds: {said}, more than chance at {level}.{but}"
-
-    def sentence(self, name: str) -> str:
-        """How far a frame seems to have moved, in words, without a full stop."""
-        deviations = f"{self.test.groups[name].deviations:.1f} joint deviations"
-        verb = "changed" if name in self.test.changed else "differs"
-        if name not in self.movements:
-            return f"{shown(name)} {verb}: {deviations}"
-        moved = self.movements[name]
-        verb = "moved" if name in self.test.changed else "differs by"
-        by = f"{verb} {moved.translation_mm:.3g} mm and {moved.rotation_deg:.2g} degrees"
-        return f"{shown(name)} {by}: {deviations}"
 
 
 @one_blas_thread()
@@ -181,6 +89,7 @@ def verify(
             "with rw.calibrate or gtsam-rwhec calibrate"
         )
     refined = without_constant_errors(result)
+    problem.require_pairs()
     problem.require_raw_measurements("verify")
     stated = stated_as(refined, problem)
     if not stated.pairs:
@@ -192,16 +101,16 @@ def verify(
     how = RefineOptions(
         noise="estimate", time_offsets=tuple(time_offsets) or False, carrier_path=carrier_path if time_offsets else None
     )
-    found = near(refined, stated, how, _noise_options(carrier_noise, systematic=systematic), progress)
-    common = quantities(refined, found, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
-    if targets_may_move:
-        common = _of_sensors(common, refined)
-    not_checked = {name: UNSEEN_SENSOR for name in refined.Y if name not in found.Y}
-    not_checked |= {name: UNSEEN_TARGET for name in refined.X if name not in found.X and not targets_may_move}
-    not_checked |= {str(unknown): why for unknown, why in common.not_compared.items()}
-    if not common.slots:
-        said = "; ".join(f"{shown(name)}: {why}" for name, why in not_checked.items())
-        raise UnderdeterminedError(f"nothing can be tested ({said}); move about two axes, and take more images")
+    try:
+        found, common = _compared(
+            refined, stated, how, _noise_options(carrier_noise, systematic=systematic), progress, targets_may_move
+        )
+    except (UnderdeterminedError, CountError) as error:
+        far = {} if targets_may_move else far_off(result, refined, stated)
+        if not far:
+            raise
+        return Verification(None, {}, far, _unseen(refined, stated, targets_may_move), targets_may_move, (str(error),))
+    not_checked = _unseen(refined, stated, targets_may_move) | in_words(common)
     test = change_test(
         common.difference, common.covariances, common.free, common.groups,
         (refined.degrees_of_freedom, found.degrees_of_freedom), level,
@@ -212,7 +121,7 @@ def verify(
         for name, pose in poses.items()
         if name in now
     }
-    checks = _checks(result, refined, found, stated, carrier_path)
+    checks = checks_of(result, refined, found, stated, carrier_path)
     return Verification(
         test=test,
         movements=movements,
@@ -221,6 +130,44 @@ def verify(
         targets_may_move=targets_may_move,
         remarks=tuple(_remarks(refined, problem, found, checks, targets_may_move=targets_may_move)),
     )
+
+
+def _compared(
+    old: RefinedPoses,
+    problem: Problem,
+    how: RefineOptions,
+    noise: NoiseOptions,
+    progress: Progress | None,
+    targets_may_move: bool,
+) -> tuple[NearAnswer, Quantities]:
+    """What the new measurements say near the old poses, and what of it can be compared."""
+    found = near(old, problem, how, noise, progress)
+    common = quantities(old, found, {UnknownKind.TIME_OFFSET, UnknownKind.INTRINSICS})
+    if targets_may_move:
+        common = _of_sensors(common, old)
+    if not common.slots:
+        said = "; ".join(f"{shown(name)}: {why}" for name, why in in_words(common).items())
+        raise UnderdeterminedError(f"nothing can be tested ({said}); move about two axes, and take more images")
+    return found, common
+
+
+def in_words(common: Quantities) -> dict[str, str]:
+    """What is not compared, and why."""
+    words = {"of OLD": "of the old log", "of NEW": "of the new log"}
+    said = {}
+    for unknown, why in common.not_compared.items():
+        for name, other in words.items():
+            why = why.replace(name, other)
+        said[str(unknown)] = why
+    return said
+
+
+def _unseen(old: RefinedPoses, problem: Problem, targets_may_move: bool) -> dict[str, str]:
+    """The frames of the old calibration that the new log has no measurement of."""
+    unseen = {name: UNSEEN_SENSOR for name in old.Y if name not in problem.sensors}
+    if not targets_may_move:
+        unseen |= {name: UNSEEN_TARGET for name in old.X if name not in problem.targets}
+    return unseen
 
 
 def _noise_options(carrier: CarrierNoise | None, *, systematic: bool) -> NoiseOptions:
@@ -246,55 +193,6 @@ def _of_sensors(common: Quantities, old: RefinedPoses) -> Quantities:
     one, other = common.covariances
     not_compared = {unknown: why for unknown, why in common.not_compared.items() if unknown.owner in old.Y}
     return Quantities(common.difference[rows], (one[at], other[at]), common.free[rows], slots, not_compared)
-
-
-def _at_offsets(problem: Problem, found: NearAnswer, path: Trajectory | None) -> Problem:
-    """The measurements with A on the carriers' path at the time offsets that were found."""
-    if path is None:
-        return problem
-    moved = {}
-    for pair in problem.pairs:
-        one = problem.measurements(*pair)
-        offset_s = found.time_offsets_s.get(pair.sensor)
-        if offset_s is not None and one.stamps_ns is not None:
-            one = replace(one, A=path.at(one.stamps_ns + round(1e9 * offset_s))[0])
-        moved[pair] = one
-    return problem.with_measurements(moved)
-
-
-def _checks(
-    result: Result, old: RefinedPoses, found: NearAnswer, problem: Problem, path: Trajectory | None
-) -> dict[str, SensorCheck]:
-    """By sensor, how well the old poses and the best ones predict what it saw."""
-    problem = _at_offsets(problem, found, path)
-    held = replace(old, time_offsets_s={} if path is not None else found.time_offsets_s)
-    best = replace(held, X=found.X, Y=found.Y, scale=found.scale)
-    checks = {}
-    for sensor in problem.sensors:
-        pairs = [pair for pair in problem.pairs if pair.sensor == sensor]
-        errors = []
-        for answer in (held, best):
-            of_pairs = [
-                prediction_errors(problem, answer, pair, problem.measurements(*pair))[:, found.inliers[pair]]
-                for pair in pairs
-            ]
-            errors.append(PredictionError.of(*np.concatenate(of_pairs, axis=1)))
-        before = _residual_m(result, sensor)
-        checks[sensor] = SensorCheck(
-            held=errors[0],
-            best=errors[1],
-            outliers=sum(int((~found.inliers[pair]).sum()) for pair in pairs),
-            noise_ratio=None if before is None else 1e-3 * errors[1].translation_rms_mm / before,
-        )
-    return checks
-
-
-def _residual_m(result: Result, sensor: str) -> float | None:
-    """The root mean square of a sensor's residuals in the old log, m."""
-    residuals = [residual for pair, residual in result.solution.residuals.items() if pair.sensor == sensor]
-    count = sum(one.number_of_measurements for one in residuals)
-    square = sum(one.number_of_measurements * one.translation_rms_m**2 for one in residuals)
-    return float(np.sqrt(square / count)) if count and square > 0.0 else None
 
 
 def _remarks(

@@ -12,7 +12,8 @@ import numpy as np
 
 from gtsam_rwhec.changes.calibration_files import result_path
 from gtsam_rwhec.changes.change_test import LEVEL, checked_level
-from gtsam_rwhec.changes.verifying import Verification, verify
+from gtsam_rwhec.changes.verification import Verification
+from gtsam_rwhec.changes.verifying import verify
 from gtsam_rwhec.errors import FrameError, LogError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.terminal_text import shown

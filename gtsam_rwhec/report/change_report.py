@@ -43,7 +43,12 @@ def change_tables(found: Difference) -> tuple[FrameTable, FrameTable]:
     }
     return (
         FrameTable("From OLD to NEW, in each frame's own axes", "frame", MOVED_HEADINGS, frames),
-        FrameTable("Other numbers that both estimated", "number", NUMBER_HEADINGS, numbers),
+        FrameTable(
+            "Other numbers that both estimated (the intrinsics of a camera are tested together)",
+            "number",
+            NUMBER_HEADINGS,
+            numbers,
+        ),
     )
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from gtsam_rwhec.changes.verifying import Verification
+from gtsam_rwhec.calibration.prediction_errors import PredictionError
+from gtsam_rwhec.changes.verification import Verification
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.report.change_report import CHANGE_LEGEND, MOVED_HEADINGS, STYLES, moved_cells
 from gtsam_rwhec.report.pose_table import FrameTable
@@ -36,11 +37,9 @@ def verification_tables(found: Verification) -> tuple[FrameTable, FrameTable]:
     errors = {
         name: (
             str(check.held.count),
-            f"{check.held.translation_rms_mm:.3f}",
-            f"{check.held.rotation_rms_deg:.3f}",
+            *_millimetres_and_degrees(check.held),
             *(["-" if check.held_px is None else f"{check.held_px:.2f}"] if has_pixels else []),
-            f"{check.best.translation_rms_mm:.3f}",
-            f"{check.best.rotation_rms_deg:.3f}",
+            *(("-", "-") if check.best is None else _millimetres_and_degrees(check.best)),
         )
         for name, check in found.sensors.items()
     }
@@ -50,6 +49,10 @@ def verification_tables(found: Verification) -> tuple[FrameTable, FrameTable]:
         FrameTable("Predictions of the new measurements", "sensor", headings, errors),
         FrameTable("Movement since the old log", "frame", MOVED_HEADINGS, moved),
     )
+
+
+def _millimetres_and_degrees(error: PredictionError) -> tuple[str, str]:
+    return f"{error.translation_rms_mm:.3f}", f"{error.rotation_rms_deg:.3f}"
 
 
 def verification_remarks(found: Verification) -> list[str]:

@@ -91,6 +91,31 @@ def test_gross_errors_do_not_count(old: rw.Calibration) -> None:
     assert found.sensors["left"].outliers == 6
 
 
+def test_a_camera_that_was_turned_round_is_named(old: rw.Calibration) -> None:
+    """So far off that from the old poses on its residuals look as if nothing were determined."""
+    round_about = expmap(np.array([[2.5, 0.0, 0.0, 0.0, 3.0, 0.0]]))[0]
+    log, turned = log_of(1), rw.Problem()
+    for pair in log.pairs:
+        one = log.measurements(*pair)
+        turned.add(*pair, one.A, round_about @ one.B if pair.sensor == "left" else one.B, stamps_ns=one.stamps_ns)
+    found = rw.changes.verify(old, turned)
+    assert found.test is not None
+    assert found.test.changed == ("left",)
+    assert found.movements["left"].rotation_deg == pytest.approx(np.degrees(2.5), abs=0.5)
+
+
+def test_measurements_that_fit_nothing_are_no_verification(old: rw.Calibration) -> None:
+    log, chance = log_of(1), np.random.default_rng(0)
+    garbage = rw.Problem()
+    for pair in log.pairs:
+        garbage.add(*pair, *expmap(chance.standard_normal((40, 6))).reshape(2, 20, 4, 4))
+    found = rw.changes.verify(old, garbage)
+    assert not found.holds
+    assert found.test is None
+    assert str(found).startswith("The calibration no longer holds: what left sees is ")
+    assert "Check also that A and B are read as before." in str(found)
+
+
 def test_a_log_that_is_too_short_is_refused_in_words(old: rw.Calibration) -> None:
     with pytest.raises((CountError, UnderdeterminedError), match="measure"):
         rw.changes.verify(old, log_of(1, count=1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gtsam_rwhec.changes.comparing import Difference
-from gtsam_rwhec.changes.verifying import Verification
+from gtsam_rwhec.changes.verification import Verification
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.report.change_report import CHANGE_LEGEND, change_tables, remark_sentences
