@@ -168,7 +168,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/report/page/sections": {
         "report/page/test_seen.py": "seen",
         "report/page/test_number_sections.py": (
-            "determines inputs pose_tables proof spectrum_chart verdict weak_directions"
+            "covariance_charts determines inputs pose_tables proof spectrum_chart uncertainty verdict weak_directions"
         ),
     },
     "gtsam_rwhec/report/page": {

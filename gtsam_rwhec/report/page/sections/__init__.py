@@ -7,11 +7,19 @@ from gtsam_rwhec.report.page.sections.determines import determines_section
 from gtsam_rwhec.report.page.sections.inputs import inputs_section
 from gtsam_rwhec.report.page.sections.proof import proof_section
 from gtsam_rwhec.report.page.sections.seen import seen_section
+from gtsam_rwhec.report.page.sections.uncertainty import uncertainty_section
 from gtsam_rwhec.report.page.sections.verdict import verdict_section
 from gtsam_rwhec.report.page.shown_result import ShownResult
 
 #: The functions that make them.
-SECTIONS = (verdict_section, seen_section, determines_section, proof_section, inputs_section)
+SECTIONS = (
+    verdict_section,
+    seen_section,
+    determines_section,
+    proof_section,
+    uncertainty_section,
+    inputs_section,
+)
 
 
 def sections_of(shown: ShownResult) -> tuple[Section, ...]:
