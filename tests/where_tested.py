@@ -60,7 +60,7 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_verified_log.py": "verify",
     },
     "gtsam_rwhec/evidence": {
-        "report/page/test_written.py": "derived evidence gathered inputs measured record",
+        "report/page/test_written.py": "evidence gathered inputs measured record",
         "evidence/test_seen_cameras.py": "seen seen_in_problem",
         "pipeline/test_plotted_corners.py": "seen_views",
     },
