@@ -13,6 +13,7 @@ from two_logs import KNOCKED, calibrated, log_of
 import gtsam_rwhec as rw
 from gtsam_rwhec.changes.constant_errors import without_constant_errors
 from gtsam_rwhec.errors import FileFormatError, FrameError, OptionError
+from gtsam_rwhec.refinement.unknowns import Unknown
 from gtsam_rwhec.results.calibration_fields import CalibrationFields
 from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport, LogFields
 from gtsam_rwhec.results.result_file import Result
@@ -34,9 +35,9 @@ def knocked() -> rw.Calibration:
     return calibrated(log_of(2, knocked="left"))
 
 
-def result_of(calibration: rw.Calibration, /, **changed: object) -> Result:
-    assert calibration.solution is not None
-    result = Result(calibration.solution, calibration.refined, None)
+def result_of(of: rw.Calibration, /, **changed: object) -> Result:
+    assert of.solution is not None
+    result = Result(of.solution, of.refined, None)
     return dataclasses.replace(result, **changed)  # type: ignore[arg-type]
 
 
@@ -93,8 +94,9 @@ def test_the_same_answer_is_no_change(old: rw.Calibration) -> None:
 
 
 def test_the_same_measurements_are_not_tested(old: rw.Calibration) -> None:
-    with_other_noise = rw.calibrate(log_of(0), rw.CalibrateOptions(robust="none", misreadings=False))
-    found = rw.changes.difference(old, with_other_noise)
+    assert old.solution is not None
+    with_other_noise = rw.refine(log_of(0), old.solution, rw.RefineOptions(noise="estimate"))
+    found = rw.changes.difference(old, result_of(old, refined=with_other_noise))
     assert found.test is None
     assert "both rest on the same measurements" in str(found)
 
@@ -112,17 +114,25 @@ def test_frames_that_only_one_has_are_named(old: rw.Calibration) -> None:
     assert "right" not in found.movements
 
 
-def test_the_constant_error_of_an_arm_is_no_difference() -> None:
-    """A same error c of A in both logs moves both answers alike; each answer's covariance holds it."""
-    one = rw.calibrate(log_of(5), rw.CalibrateOptions(robust="none", misreadings=False))
-    result = result_of(one, calibration=CalibrationFields.of(one))
-    assert result.calibration is not None
-    assert one.refined is not None
-    assert np.any(result.calibration.constant_errors)
+def test_the_constant_error_of_an_arm_is_no_difference(old: rw.Calibration) -> None:
+    """A Expmap(c) in place of A moves the targets by Ad(X^-1) c in both logs; the covariance of each has it."""
+    refined = old.refined
+    assert refined is not None
+    deviations = np.repeat([0.002, 0.001], 3)
+    shift = np.zeros((len(refined.joint.unit), 6))
+    for name, pose in refined.X.items():
+        shift[refined.joint.slots[Unknown.of(name)]] = pose.inverse().AdjointMap() * deviations
+    joint = dataclasses.replace(refined.joint, finite=refined.joint.finite + shift @ shift.T)
+    fields = CalibrationFields((), (), (), "", "", (), constant_errors=(tuple(deviations), (0.0,) * 6))
+    result = result_of(old, refined=dataclasses.replace(refined, joint=joint), calibration=fields)
     beside = without_constant_errors(result)
-    adjoint = one.X["board"].inverse().AdjointMap()
-    of_constant = adjoint @ np.diag(np.square(result.calibration.constant_errors[0])) @ adjoint.T
-    assert np.allclose(beside.covariance("board") + of_constant, one.refined.covariance("board"), rtol=1e-6, atol=1e-14)
+    assert np.allclose(beside.joint.finite, refined.joint.finite, rtol=1e-6, atol=1e-14)
+    too_much = CalibrationFields((), (), (), "", "", (), constant_errors=(tuple(2.0 * deviations), (0.0,) * 6))
+    assert without_constant_errors(dataclasses.replace(result, calibration=too_much)) is result.refined
+
+
+def test_a_calibration_says_the_constant_error_that_its_covariance_has(old: rw.Calibration) -> None:
+    assert CalibrationFields.of(old).constant_errors == ()  # the noise was given, and no arm was assumed
 
 
 @pytest.mark.parametrize(
@@ -136,11 +146,10 @@ def test_other_carriers_are_refused(
 
 
 def test_other_rigs_are_refused(old: rw.Calibration) -> None:
-    other = rw.calibrate(rw.simulate.general(1, 1, seed=0, noise=rw.simulate.Noise(0.001, 1e5)).problem)
-    with pytest.raises(
-        FrameError, match="no frame is in both: OLD has left, right, board, tag, NEW has sensor0, target0"
-    ):
-        rw.changes.difference(old, other)
+    assert old.refined is not None
+    other = dataclasses.replace(old.refined, X={"table": old.X["board"]}, Y={"head": old.Y["left"]})
+    with pytest.raises(FrameError, match="no frame is in both: OLD has left, right, board, tag, NEW has head, table"):
+        rw.changes.difference(old, result_of(old, refined=other))
 
 
 def test_exchanged_roles_are_refused(old: rw.Calibration) -> None:

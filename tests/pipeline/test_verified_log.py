@@ -18,7 +18,7 @@ from gtsam_rwhec.pipeline.verified_log import OldCalibration, verify_log, with_c
 
 #: Three of the old calibration's joint deviations and more: 4 mm and 0.3 degrees.
 KNOCK = se3.expmap(np.array([[0.0, 0.005, 0.0, 0.004, 0.0, 0.0]]))[0]
-SECONDS = 4.0
+SECONDS = 3.0
 
 
 @pytest.fixture(scope="module")
