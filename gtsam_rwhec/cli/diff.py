@@ -13,6 +13,8 @@ from gtsam_rwhec.cli.failures import check_output
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
+#: As ``rw.changes.LEVEL``, which help must not bring in.
+LEVEL = 0.01
 RESULT_HELP = "result.json, or the folder that calibrate wrote."
 LevelOption = Annotated[
     float, typer.Option(help="How often it may say that something changed where nothing did: 0.01 is once in 100.")
@@ -36,7 +38,7 @@ def write_page_to(
 def diff(
     old: Annotated[Path, typer.Argument(help=f"The old calibration: {RESULT_HELP}")],
     new: Annotated[Path, typer.Argument(help=f"The new calibration: {RESULT_HELP}")],
-    level: LevelOption = rw.changes.LEVEL,
+    level: LevelOption = LEVEL,
     frame: Annotated[
         list[str] | None,
         typer.Option(help="Test only this frame, most sharply; repeat the option for several.", show_default="all"),

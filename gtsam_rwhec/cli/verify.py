@@ -9,7 +9,7 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.calibrate import is_log, other_than_csv
-from gtsam_rwhec.cli.diff import RESULT_HELP, LevelOption, PageOption, write_page_to
+from gtsam_rwhec.cli.diff import LEVEL, RESULT_HELP, LevelOption, PageOption, write_page_to
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import check_output
 from gtsam_rwhec.cli.options import FOLDER_OF_CSV, RigOption, SensorsOption, TargetsOption, WorkersOption
@@ -26,7 +26,7 @@ def verify(
         ),
     ],
     rig: RigOption = None,
-    level: LevelOption = rw.changes.LEVEL,
+    level: LevelOption = LEVEL,
     targets_may_move: Annotated[
         bool,
         typer.Option("--targets-may-move", help="Targets may stand elsewhere than before: test the sensors alone."),

@@ -11,6 +11,7 @@ from two_logs import calibrated, log_of
 from typer.testing import CliRunner
 
 import gtsam_rwhec as rw
+from gtsam_rwhec.cli import diff
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.exit_status import ExitStatus
 
@@ -70,6 +71,10 @@ def test_a_calibration_of_csv_files_is_verified_on_others(folder: Path, tmp_path
     assert done[1].stdout.startswith("The calibration no longer holds: ")
     refused = CliRunner().invoke(app, ["verify", str(tmp_path / "old.json"), "log.mcap"])
     assert refused.exit_code == ExitStatus.BAD_INPUT
+
+
+def test_the_level_is_that_of_the_library() -> None:
+    assert diff.LEVEL == rw.changes.LEVEL
 
 
 def test_what_cannot_be_tested_is_said_and_has_a_status_of_its_own(folder: Path, tmp_path: Path) -> None:
