@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -27,6 +28,15 @@ class FrameAngles(EvidenceRecord):
 
     frame: str = Field(description="sensor or target")
     rpy_deg: Triple = Field(description="roll, pitch, yaw, degrees: R = Rz(yaw) Ry(pitch) Rx(roll)")
+
+
+class Scalar(EvidenceRecord):
+    """A scale or a clock offset that was estimated."""
+
+    kind: Literal["scale", "time_offset"]
+    owner: str = Field(description="target or sensor; empty for a scale that all share")
+    value: float = Field(description="measured / true length; or seconds: a stamp + this = the carriers' time")
+    deviation: float | None = Field(description="one standard deviation; null: infinite")
 
 
 class PointAt(EvidenceRecord):
@@ -63,6 +73,7 @@ class Derived(EvidenceRecord):
     """What follows from poses and covariances."""
 
     angles: tuple[FrameAngles, ...] = Field(description="of every sensor and target")
+    scalars: tuple[Scalar, ...] = Field(default=(), description="scales and clock offsets that were estimated")
     level: float = Field(default=0.95, description="probability of the points' radii")
     points: tuple[PointAt, ...] = Field(default=(), description="at several distances, by sensor")
     relative: tuple[RelativePose, ...] = Field(default=(), description="of sensors in the first sensor's frame")
@@ -76,11 +87,24 @@ def derived_of(calibration: Calibration) -> Derived:
         return Derived(angles=angles)
     return Derived(
         angles=angles,
+        scalars=tuple(_scalars(refined)),
         level=calibration.options.level,
         points=tuple(_points(calibration)),
         relative=tuple(_relative(refined)),
         clocks=tuple(clock_effects(refined)),
     )
+
+
+def _scalars(refined: RefinedPoses) -> Iterator[Scalar]:
+    """Scales and clock offsets with their deviations."""
+    for unknown in refined.unknowns:
+        deviation = _finite(math.sqrt(refined.covariance(unknown)[0, 0]))
+        if unknown.kind is UnknownKind.SCALE:
+            value = refined.scale[unknown.owner] if isinstance(refined.scale, Mapping) else refined.scale
+            yield Scalar(kind="scale", owner=unknown.owner, value=value, deviation=deviation)
+        elif unknown.kind is UnknownKind.TIME_OFFSET:
+            value = refined.time_offsets_s[unknown.owner]
+            yield Scalar(kind="time_offset", owner=unknown.owner, value=value, deviation=deviation)
 
 
 def _points(calibration: Calibration) -> Iterator[PointAt]:

@@ -38,6 +38,9 @@ class Inputs(EvidenceRecord):
     options: dict[str, str] = Field(default={}, description="options of the calibration that are not the default")
     seeds: dict[str, int] = Field(default={}, description="seeds of random numbers, by what draws them")
     rig_file: str | None = Field(default=None, description="the text of the rig file")
+    copies: dict[str, str] = Field(
+        default={}, description="the poses as texts of other programs, under the rig file's names, by the file's name"
+    )
 
     def with_options(self, options: CalibrateOptions) -> Inputs:
         """The record with the options of a calibration, and its seeds."""

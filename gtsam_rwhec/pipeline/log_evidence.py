@@ -13,7 +13,9 @@ from gtsam_rwhec.evidence.inputs import Inputs, input_files, versions
 from gtsam_rwhec.evidence.measured import MeasuredRows
 from gtsam_rwhec.evidence.proof import proof_of
 from gtsam_rwhec.evidence.weak import weak_directions
+from gtsam_rwhec.export import copied_texts
 from gtsam_rwhec.pipeline.seen_in_log import Pictures, seen_in_log
+from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.rig import rig_text
@@ -39,6 +41,7 @@ def evidence_of_log(
         command=_command(sources),
         versions=versions(),
         rig_file=rig_text(calibrated.rig),
+        copies=copied_texts(frames_of(calibrated)),
     )
     return Evidence(
         derived=derived_of(calibrated.calibration),

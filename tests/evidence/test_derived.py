@@ -44,6 +44,14 @@ def test_sensors_are_in_the_frame_of_the_first(calibration: rw.Calibration, deri
         assert one.deviations_mm == pytest.approx(1e3 * np.sqrt(np.diagonal(covariance)[3:]))
 
 
+def test_scales_have_their_deviations() -> None:
+    calibration = rw.calibrate(rig(targets=1, sensors=2, scale="shared").problem)
+    (scale,) = derived_of(calibration).scalars
+    assert (scale.kind, scale.owner) == ("scale", "")
+    assert scale.value == calibration.scale
+    assert scale.deviation == pytest.approx(math.sqrt(calibration.covariance("scale")[0, 0]))
+
+
 def test_a_clock_moves_poses_as_the_best_poses_of_another_offset_do() -> None:
     refined = rw.read_refined(REPOSITORY / "tests" / "golden" / "result_version_5.json")
     frames = [Unknown.of(name) for name in (*refined.X, *refined.Y)]

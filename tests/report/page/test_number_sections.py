@@ -113,6 +113,15 @@ def test_copied_texts_of_poses_that_are_not_to_be_used_say_so(folder: Path) -> N
         assert "\nmade up" not in head
 
 
+def test_names_that_other_programs_cannot_read_are_said(folder: Path) -> None:
+    tree = json.loads((folder / "result.json").read_bytes())
+    tree["sensors"][0]["child"] = "<script>alert(1)</script>"
+    shown = ShownResult(tree, read_shown(folder).result, None, "x")
+    found = section(shown, "inputs")
+    assert texts(found.blocks) == {}
+    assert "other programs cannot read them: '<script>alert(1)</script>' cannot be" in str(found)
+
+
 def test_options_that_are_not_the_default_and_seeds_are_shown(folder: Path) -> None:
     found = tables(section(read_shown(folder), "inputs").blocks)
     assert found["Options that are not the default"].rows == (("sizes", "'known'"),)

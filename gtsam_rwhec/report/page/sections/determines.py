@@ -7,7 +7,17 @@ from collections.abc import Iterator, Mapping
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.problem.pairs import Pair
-from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Number, Paragraph, Section, Table, Words
+from gtsam_rwhec.report.page.blocks import (
+    Block,
+    Folded,
+    Listing,
+    Number,
+    Paragraph,
+    Section,
+    Table,
+    Words,
+    significant,
+)
 from gtsam_rwhec.report.page.sections.weak_directions import weak_blocks
 from gtsam_rwhec.report.page.shown_result import ShownResult
 from gtsam_rwhec.report.pair_grid import DETERMINED, NOT_DETERMINED, NOT_OBSERVED, Symbol
@@ -16,6 +26,8 @@ from gtsam_rwhec.report.pair_grid import DETERMINED, NOT_DETERMINED, NOT_OBSERVE
 MOST_COLUMNS = 16
 #: A grid with more rows is folded.
 MOST_ROWS = 40
+#: A direction with less than this many times the information at which it would be free is near to it.
+NEAR = 10.0
 #: What settles a free direction, by the reason for which it is free.
 CURES: Mapping[FreeReason, str] = {
     FreeReason.CONTRADICTION: "First correct how A and B are read; the motion may be good.",
@@ -49,8 +61,27 @@ def determines_section(shown: ShownResult) -> Section:
         blocks.append(Listing(tuple(f"Not determined: {one}. {cure_of(one)}" for one in free)))
     else:
         blocks.append(Paragraph(ALL_DETERMINED))
+        blocks += _distance_to_free(shown)
     blocks += weak_blocks(shown)
     return Section("determines", title, tuple(blocks))
+
+
+def _distance_to_free(shown: ShownResult) -> Iterator[Block]:
+    """How far the least known direction is from being free, by the test against noise."""
+    at = ("certified", "identifiability")
+    weakest, threshold = (significant(shown.number(*at, name), 2) for name in ("weakest", "threshold"))
+    if weakest.value is None or threshold.value is None:
+        return
+    near = " That is near: turn more before you rely on it." if weakest.value < NEAR * threshold.value else ""
+    yield Paragraph(
+        (
+            "The least known direction of all holds ",
+            weakest,
+            " times the information that noise alone would make; up to ",
+            threshold,
+            f" times it would count as free.{near}",
+        )
+    )
 
 
 def cure_of(free: FreeDirection) -> str:

@@ -41,13 +41,17 @@ def _copies(shown: ShownResult) -> Iterator[Block]:
     yield Paragraph("The poses, to copy")
     if verdict is not Verdict.USE:
         yield Paragraph("Each text has the verdict in its head.", "note")
-    try:
-        texts = copied_texts(frames_of_tree(shown.tree))
-    except RwhecError as error:
-        yield Paragraph(f"Not shown, because other programs cannot read them: {error}.", "note")
-        return
+    inputs = None if shown.evidence is None else shown.evidence.inputs
+    texts = {} if inputs is None else inputs.copies
+    if not texts:
+        try:
+            texts = copied_texts(frames_of_tree(shown.tree))
+        except RwhecError as error:
+            yield Paragraph(f"Not shown, because other programs cannot read them: {error}.", "note")
+            return
     for name, text in texts.items():
-        yield CopyText(name.split(".")[0].replace("_", "-"), f"{KINDS[name]} ({name})", text)
+        if name in KINDS:
+            yield CopyText(name.split(".")[0].replace("_", "-"), f"{KINDS[name]} ({name})", text)
 
 
 def frames_of_tree(tree: Mapping[str, Any]) -> RigFrames:

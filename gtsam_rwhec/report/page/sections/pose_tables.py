@@ -17,6 +17,11 @@ LEGEND = (
     "leave a direction free."
 )
 LEGEND_ANGLES = "Roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll). "
+SCALARS = {"scale": "scale", "time_offset": "clock offset"}
+SCALARS_LEGEND = (
+    "Scale: measured length / true length. Clock offset: a stamp of the sensor + this = the carriers' time. ±: one "
+    "standard deviation."
+)
 FIXED = "fixed"
 
 
@@ -31,9 +36,35 @@ def pose_blocks(shown: ShownResult) -> Iterator[Block]:
     for title, kind, side in sides:
         if tree[side]:
             yield _table(shown, f"{title} in the frame {tree[side][0]['parent']}", kind, side)
+    yield from _scalars(shown)
     if wrong:
         names = ", ".join(sorted(wrong, key=natural_key))
         yield Paragraph(f"{MARK}: do not use this pose, because its own measurements contradict it: {names}.", "bad")
+
+
+def _scalars(shown: ShownResult) -> Iterator[Block]:
+    """Scales and clock offsets that were estimated; without evidence, without their deviations."""
+    known = (shown.evidence_tree.get("derived") or {}).get("scalars", ())
+    rows: list[tuple[Words, ...]] = []
+    for i, scalar in enumerate(known):
+        times, spec, unit = (1.0, ".6f", "") if scalar["kind"] == "scale" else (1e3, "+.3f", "ms")
+        deviation_spec = spec.removeprefix("+")
+        rows.append(
+            (
+                SCALARS[scalar["kind"]] + (f" of {scalar['owner']}" if scalar["owner"] else ""),
+                shown.evident("derived", "scalars", i, "value", times=times, spec=spec),
+                shown.evident("derived", "scalars", i, "deviation", times=times, spec=deviation_spec),
+                unit,
+            )
+        )
+    if not known and shown.tree.get("scale_mode") != "known":
+        scale = shown.tree.get("scale")
+        names = list(scale) if isinstance(scale, dict) else []
+        rows += [(f"scale of {name}", shown.number("scale", name, spec=".6f"), "-", "") for name in names]
+        if isinstance(scale, float):
+            rows.append(("scale", shown.number("scale", spec=".6f"), "-", ""))
+    if rows:
+        yield Table("Scales and clocks", ("of", "value", "±", "unit"), tuple(rows), SCALARS_LEGEND)
 
 
 def _table(shown: ShownResult, title: str, kind: str, side: str) -> Table:
