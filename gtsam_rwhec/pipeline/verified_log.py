@@ -21,6 +21,7 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
+from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.corner_answer import with_intrinsics
 from gtsam_rwhec.pipeline.detection_stage import detect_log
@@ -117,7 +118,7 @@ def verify_log(
     log_path
         As for ``calibrate_log``; of a log that a stage wrote, only the stages after it run.
     rig : Rig, optional
-        By default the rig file of the old calibration.
+        By default the rig file of the old calibration, or, for a log that a stage wrote, the log's own.
     level : float
     targets_may_move : bool
         As in ``rw.changes.verify``.
@@ -133,21 +134,21 @@ def verify_log(
     checked_level(level)
     tell = progress or silent
     calibration = OldCalibration.read(old)
-    rig = rig or calibration.rig
     with TemporaryDirectory(prefix="gtsam-rwhec-verify-") as folder:
-        cleaned = _cleaned(log_path, rig, calibration, Path(folder), workers, tell)
-        return _verified(calibration, cleaned, level=level, targets_may_move=targets_may_move, tell=tell)
+        cleaned, rig = _cleaned(log_path, rig, calibration, Path(folder), workers, tell)
+        return _verified(calibration, cleaned, rig, level=level, targets_may_move=targets_may_move, tell=tell)
 
 
 def _cleaned(
     log_path: str | Path | list[str | Path],
-    rig: Rig | None,
+    given: Rig | None,
     old: OldCalibration,
     folder: Path,
     workers: int | None,
     tell: Progress,
-) -> Path:
-    """The new log after detection and cleaning."""
+) -> tuple[Path, Rig | None]:
+    """The new log after detection and cleaning, and the rig file for what comes after, if it is not the log's own."""
+    rig = given or old.rig
     if rig is not None and not isinstance(log_path, list):
         source = Path(log_path)
         if is_folder_of_images(source, rig):
@@ -164,7 +165,7 @@ def _cleaned(
         is_raw = not is_from_stage(log)
         is_cleaned = CLEANING_METADATA in log.metadata()
     if is_cleaned:
-        return files[0]
+        return files[0], given
     detected = files[0]
     if is_raw:
         if rig is None:
@@ -174,8 +175,8 @@ def _cleaned(
             )
         detected = folder / DETECTED_LOG
         detect_log(list(files), with_cameras(rig, old.cameras), detected, workers=workers, progress=tell)
-    clean_log(detected, folder / CLEAN_LOG, images="leave_out", progress=tell)
-    return folder / CLEAN_LOG
+    clean_log(detected, folder / CLEAN_LOG, None if is_raw else given, images="leave_out", progress=tell)
+    return folder / CLEAN_LOG, None
 
 
 def with_cameras(rig: Rig, cameras: Mapping[str, Camera]) -> Rig:
@@ -195,10 +196,10 @@ def with_cameras(rig: Rig, cameras: Mapping[str, Camera]) -> Rig:
 
 
 def _verified(
-    old: OldCalibration, cleaned: Path, *, level: float, targets_may_move: bool, tell: Progress
+    old: OldCalibration, cleaned: Path, given: Rig | None, *, level: float, targets_may_move: bool, tell: Progress
 ) -> Verification:
     with open_log(cleaned) as log:
-        rig, metadata, cleaning = read_embedded_rig(log), read_metadata(log), read_cleaning_report(log)
+        rig, metadata, cleaning = rig_for_solving(log, given), read_metadata(log), read_cleaning_report(log)
         pairs, motion = without_outlier_marks(read_pairs(log, rig)), read_carrier_motion(log, rig)
         corners = LogCorners.of(log, rig, metadata.cameras)
     _check_carriers(old.result, rig)

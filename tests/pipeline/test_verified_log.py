@@ -77,6 +77,12 @@ def test_the_log_of_the_calibration_itself_is_told(old: Path) -> None:
     assert found.test.chance > 0.999
 
 
+def test_a_rig_file_that_a_cleaned_log_was_not_made_with_is_refused(old: Path) -> None:
+    other = made.rig(tag_0=f"{{type: tag, family: tag36h11, id: 7, size_m: {made.SIZE_M}}}")
+    with pytest.raises(LogError, match="was made with another rig file"):
+        verify_log(old, old / "clean.mcap", other)
+
+
 def test_intrinsics_of_the_old_calibration_become_numbers() -> None:
     camera = rw.Camera.of(640, 480, "radtan", made.K, [-0.1, 0.01, 0.0, 0.0], "a test")
     text = "images: /cam_0/image\n    intrinsics: estimate"
