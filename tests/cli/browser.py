@@ -24,6 +24,8 @@ ARGUMENTS = [
     "--no-first-run",
 ]
 NAMES = ("chromium", "chromium-browser", "google-chrome")
+#: Pixels of the height of a screenshot.
+PIECE = 2000
 #: The page is ready when its scenes are drawn, or when it is known that they cannot be.
 READY = "document.documentElement.dataset.scenes || !document.getElementById('plotly')"
 
@@ -61,6 +63,14 @@ class Opened:
     def _asked(self, request: Any) -> None:
         if not request.url.startswith(("file:", "data:", "blob:")):
             self.complaints.append(f"network: {request.url}")
+
+    def photograph(self, folder: Path, name: str) -> None:
+        """Save the page as NAME-1.png, NAME-2.png and so on: a browser has no picture of any height."""
+        height = self.page.evaluate("document.documentElement.scrollHeight")
+        width = self.page.viewport_size["width"]
+        for number, top in enumerate(range(0, height, PIECE), start=1):
+            clip = {"x": 0, "y": top, "width": width, "height": min(PIECE, height - top)}
+            self.page.screenshot(path=folder / f"{name}-{number}.png", full_page=True, clip=clip)
 
     def wrong_layout(self) -> list[str]:
         """What is cut or overlaps."""

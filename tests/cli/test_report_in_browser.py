@@ -20,7 +20,7 @@ WIDTHS = (1280, 390)
 SCHEMES = ("light", "dark")
 REPORTS = ("demo", "real")
 #: What must be on paper.
-PRINTED = "h2, main summary, caption, th, td, main li, figcaption, main p:not(.how):not(.title):not(.buttons)"
+PRINTED = "h2, main summary, .caption, th, td, main li, figcaption, main p:not(.how):not(.title):not(.buttons)"
 NO_CLIPBOARD = "Object.defineProperty(Navigator.prototype, 'clipboard', { get: () => undefined })"
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null"
 NO_DECOMPRESSION = "delete window.DecompressionStream"
@@ -57,7 +57,7 @@ def test_nothing_is_cut_and_nothing_overlaps(
     browser: Any, reports: dict[str, Path], looks: Path, name: str, width: int, scheme: str
 ) -> None:
     with opened(browser, reports[name], width=width, color_scheme=scheme) as report:
-        report.page.screenshot(path=looks / f"{name}-{width}-{scheme}.png", full_page=True)
+        report.photograph(looks, f"{name}-{width}-{scheme}")
         assert report.wrong_layout() == []
         report.page.evaluate("for (const folded of document.querySelectorAll('main details')) folded.open = true")
         assert report.wrong_layout() == []
