@@ -28,6 +28,7 @@ from gtsam_rwhec.calibration.run import Run
 from gtsam_rwhec.calibration.seen_from import Carriers
 from gtsam_rwhec.calibration.sizes import TargetSize
 from gtsam_rwhec.calibration.statement_stage import doubt_one_pose, doubt_stated_poses, doubt_stated_sizes
+from gtsam_rwhec.calibration.turning import of_turning
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, findings_of, proof_of
 from gtsam_rwhec.calibration.views import views_of
 from gtsam_rwhec.errors import OptionError, ScaleError
@@ -135,6 +136,9 @@ def _calibrated(run: Run) -> Calibration:
         number = found.noise.model.instants
         words = f"all measurements come from {number} poses of the carriers, and each pose has one error"
         record.find(Ground.COVARIANCE_DOUBTED, words)
+    if reading.finding is None and solution is not None:
+        free = solution.identifiability.free_directions if refined is None else refined.free_directions
+        record.findings += of_turning(problem, inliers, free, is_answered=refined is not None)
     best = solution if refined is None else refined
     return Calibration(
         X={} if best is None else best.X,

@@ -88,6 +88,8 @@ class Ground(StrEnum):
     SIZE_UNCERTAIN = "size_uncertain"
     #: A stated pose fits the measurements badly.
     POSE_UNCERTAIN = "pose_uncertain"
+    #: The carriers hardly turned, or hardly about a second axis.
+    LITTLE_ROTATION = "little_rotation"
     #: A frame rests on so few measurements that a wrong one would not show.
     FEW_MEASUREMENTS = "few_measurements"
     #: The stated size of a target does not fit the motion, while others do; it was estimated in its place.
@@ -128,6 +130,7 @@ _CARE = (
     Ground.SHAPE_UNCERTAIN,
     Ground.SIZE_UNCERTAIN,
     Ground.POSE_UNCERTAIN,
+    Ground.LITTLE_ROTATION,
     Ground.FEW_MEASUREMENTS,
     Ground.SIZE_ESTIMATED,
     Ground.INTRINSICS_ESTIMATED,
@@ -147,6 +150,7 @@ _MADE_BY_A_MISREADING = frozenset({
     Ground.NOT_CERTIFIED,
     Ground.NOT_UNIQUE,
     Ground.NO_COVARIANCE,
+    Ground.LITTLE_ROTATION,
     Ground.CORNERS_DOUBTED,
     Ground.CORRELATED,
     Ground.SYSTEMATIC,
@@ -230,6 +234,7 @@ _ADVICE = {
     Ground.POSE_UNCERTAIN: (
         "measure the stated pose again, or state it as uncertain as it is: Problem.add_prior in place of Problem.fix"
     ),
+    Ground.LITTLE_ROTATION: "turn the carriers by 30 degrees and more, about two different axes, and measure again",
     Ground.FEW_MEASUREMENTS: "measure each named frame at three poses or more, or do not use its pose",
     Ground.SIZE_ESTIMATED: "measure the named target again, and correct its size",
     Ground.INTRINSICS_ESTIMATED: (
