@@ -33,7 +33,7 @@ def write_report(
         A file cannot be written.
     """
     (progress or silent)("writing the report")
-    pictures = Pictures(tuple(logs), out / SEEN_SHEET) if images else None
+    pictures = Pictures(tuple(logs), out / SEEN_SHEET, may_show=images)
     evidence = evidence_of_log(calibrated, out / CLEAN_LOG, sources, pictures)
     write_evidence(evidence, out / EVIDENCE_FILE, out / RESULT_FILE)
     write_html(out / RESULT_FILE, out / REPORT_FILE, evidence, images=images)

@@ -30,6 +30,7 @@ from gtsam_rwhec.vision.rejection import Rejection
 SHEET_WIDTH, SHEET_BYTES, PICTURE_BYTES = 1200, 500_000, 90_000
 #: Where images are not found by their stamps, logs up to this size are gone through for them, bytes.
 MOST_SEARCHED = 300_000_000
+WITHOUT = "the report was made without images."
 #: The stages that remove measurements.
 DETECTION, CLEANING, ROBUST = "detection", "cleaning", "robust estimation"
 _BY_DETECTION = {str(reason) for reason in Rejection}
@@ -37,17 +38,20 @@ _BY_DETECTION = {str(reason) for reason in Rejection}
 
 @dataclass(frozen=True)
 class Pictures:
-    """Where images are: the recorded logs, and the contact sheet's file, which may be missing."""
+    """Where images are: the recorded logs, and the contact sheet's file; either may be missing.
+
+    With `may_show` False only the images' names are read.
+    """
 
     logs: tuple[Path, ...]
     sheet: Path
+    may_show: bool = True
 
 
 def seen_in_log(solved: Solved, log_path: str | Path, pictures: Pictures | None) -> SeenEvidence:
-    """What was seen, of a solved log; without `pictures` there are no images."""
+    """What was seen, of a solved log; without `pictures` there are neither images nor their names."""
     with open_log(log_path) as log:
         views = seen_views(solved, log, left_out=True)
-        names = image_names(log)
     found = solved.refined.reprojection
     cameras = {sensor: camera_of(solved, sensor) for sensor in views}
     of_tracks = solved.log.detection.corner_px
@@ -59,11 +63,12 @@ def seen_in_log(solved: Solved, log_path: str | Path, pictures: Pictures | None)
     )
     topics = {sensor: source.images or "" for sensor, source in solved.rig.sensors.items()}
 
+    worst = worst_views(rated)
+    images, names, why_not = images_of(pictures, solved.rig, worst)
+
     def name_of(sensor: str, stamp_ns: int) -> str:
         return PurePosixPath(image_name(names, topics[sensor], stamp_ns)).name
 
-    worst = worst_views(rated)
-    images, why_not = images_of(pictures, solved.rig, worst)
     counts = removed_of(solved)
     return SeenEvidence(
         span_s=span_of(solved.pairs.values())[1],
@@ -75,7 +80,7 @@ def seen_in_log(solved: Solved, log_path: str | Path, pictures: Pictures | None)
         removed_list=removed_list(solved.pairs, name_of),
         cameras=seen_cameras(rated, cameras, found),
         worst=tuple(_drawn(one, name_of(one.sensor, one.view.stamp_ns), images) for one in worst),
-        sheet=None if pictures is None else small_sheet(pictures.sheet),
+        sheet=small_sheet(pictures.sheet) if pictures is not None and pictures.may_show else None,
         no_pictures=why_not,
     )
 
@@ -100,10 +105,21 @@ def removed_of(solved: Solved) -> tuple[RemovedCount, ...]:
 
 def images_of(
     pictures: Pictures | None, rig: Rig, wanted: Sequence[RatedView]
-) -> tuple[dict[tuple[str, int], ImageRecord], str]:
+) -> tuple[dict[tuple[str, int], ImageRecord], Mapping[str, str], str]:
+    """Images by sensor and stamp, the names of the files that images were, and why there are no images."""
+    if pictures is None or not pictures.logs:
+        return {}, {}, "the recorded log is not known any more."
+    try:
+        with open_log(list(pictures.logs)) as log:
+            names = image_names(log)
+            found, why_not = _wanted_images(log, rig, wanted) if pictures.may_show else ({}, WITHOUT)
+    except LogError as error:
+        return {}, {}, f"the log with the images cannot be read: {error}"
+    return found, names, why_not
+
+
+def _wanted_images(log: Log, rig: Rig, wanted: Sequence[RatedView]) -> tuple[dict[tuple[str, int], ImageRecord], str]:
     """Images by sensor and stamp, and why there are none."""
-    if pictures is None:
-        return {}, "the report was made without images."
     stamps: dict[str, set[int]] = defaultdict(set)
     for one in wanted:
         topic = rig.sensors[one.sensor].images
@@ -111,16 +127,11 @@ def images_of(
             stamps[topic].add(one.view.stamp_ns)
     if not stamps:
         return {}, "no sensor has images: its detections come from a driver." if wanted else ""
-    try:
-        with open_log(list(pictures.logs)) as log:
-            there = {topic.name for topic in log.topics() if topic.count}
-            found = _found(log, {topic: of for topic, of in stamps.items() if topic in there})
-    except LogError as error:
-        return {}, f"the log with the images cannot be read: {error}"
-    if not found:
-        return {}, "the log that was calibrated has no images (any more)."
+    there = {topic.name for topic in log.topics() if topic.count}
+    found = _found(log, {topic: of for topic, of in stamps.items() if topic in there})
     sensor_of = {source.images: name for name, source in rig.sensors.items()}
-    return {(sensor_of[topic], stamp): image for (topic, stamp), image in found.items()}, ""
+    images = {(sensor_of[topic], stamp): image for (topic, stamp), image in found.items()}
+    return images, "" if images else "the log that was calibrated has no images (any more)."
 
 
 def _found(log: Log, stamps: Mapping[str, set[int]]) -> dict[tuple[str, int], ImageRecord]:

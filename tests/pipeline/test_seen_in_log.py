@@ -72,14 +72,15 @@ def test_images_come_from_the_log_and_only_if_they_may(tmp_path: Path) -> None:
         for stamp in (STAMP_NS - 1, STAMP_NS):
             out.compressed_image("/cam_0/image", stamp, "cam_0", "png", b"an image")
     pictures = Pictures((tmp_path / "raw.mcap",), tmp_path / "seen.png")
-    found, why_not = images_of(pictures, rig, wanted)
+    found, _, why_not = images_of(pictures, rig, wanted)
     assert list(found) == [("cam_0", STAMP_NS)]
     assert why_not == ""
-    assert images_of(None, rig, wanted) == ({}, "the report was made without images.")
-    assert images_of(pictures, rig, [rated("cam_1", STAMP_NS)])[1].startswith("no sensor has images")
-    assert "no images (any more)" in images_of(pictures, rig, [rated("cam_0", 7)])[1]
+    hidden = Pictures(pictures.logs, pictures.sheet, may_show=False)
+    assert images_of(hidden, rig, wanted) == ({}, {}, "the report was made without images.")
+    assert images_of(pictures, rig, [rated("cam_1", STAMP_NS)])[2].startswith("no sensor has images")
+    assert "no images (any more)" in images_of(pictures, rig, [rated("cam_0", 7)])[2]
     (tmp_path / "raw.mcap").write_bytes(b"no log")
-    assert "cannot be read" in images_of(pictures, rig, wanted)[1]
+    assert "cannot be read" in images_of(pictures, rig, wanted)[2]
 
 
 def test_the_sheet_of_a_page_is_small(tmp_path: Path) -> None:

@@ -10,19 +10,23 @@ import numpy as np
 from gtsam_rwhec.evidence.seen import SeenCamera, SeenEvidence, SeenTrack
 from gtsam_rwhec.report.page.figures import INK, SvgFigure, svg_figure
 from gtsam_rwhec.report.plots.coverage import image_axes
-from gtsam_rwhec.report.plots.drawing import BLUE, GREY, ORANGE, PURPLE, VERMILLION, shortened
+from gtsam_rwhec.report.plots.drawing import GREY, ORANGE, PURPLE, VERMILLION, shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
+#: Ticks and corners: Okabe and Ito's blue, a little lighter, to be seen on dark as well as on light.
+USED = "#2C8CC9"
 #: Signs of what was removed, by stage, in this order.
 SIGNS = (("x", VERMILLION), ("^", ORANGE), ("s", PURPLE))
 #: Half the height of a tick of a used measurement, and how far above its row the signs stand, rows.
 TICK, ABOVE = 0.28, 0.36
 #: So many cameras are drawn, in so many columns, each at most so high as wide.
 MOST_CAMERAS, COLUMNS, TALLEST = 12, 2, 1.4
+#: More corners than this have smaller marks.
+MANY_CORNERS = 1500
 #: A row's name has so many characters.
 LONGEST = 26
 
@@ -49,7 +53,7 @@ def detections_figure(seen: SeenEvidence) -> SvgFigure:
             axes.set_xlabel("measurement, in the order given")
         else:
             axes.set_xlabel("time (s)")
-        handles = [_handle("used", "|", BLUE)] + [
+        handles = [_handle("used", "|", USED)] + [
             _handle(f"removed by {stage}", *sign) for stage, sign in signs.items()
         ]
         figure.legend(handles=handles, loc="outside upper left", ncols=2, handletextpad=0.2, columnspacing=1.0)
@@ -67,7 +71,7 @@ def _draw_track(axes: Axes, row: int, track: SeenTrack, step: float, signs: dict
         at = step * (0.5 + np.array(track.used_at)[:, 0])
         gap = np.full(len(at), np.nan)
         ends = np.column_stack([np.full(len(at), row - TICK), np.full(len(at), row + TICK), gap])
-        axes.plot(np.column_stack([at, at, gap]).ravel(), ends.ravel(), color=BLUE, lw=1.0)  # one path for all ticks
+        axes.plot(np.column_stack([at, at, gap]).ravel(), ends.ravel(), color=USED, lw=1.0)  # one path for all ticks
     for stage, pieces in track.removed_at.items():
         marker, colour = signs.get(stage, ("+", GREY))
         at = step * (0.5 + np.array(pieces)[:, 0])
@@ -111,6 +115,7 @@ def _draw_camera(axes: Axes, camera: SeenCamera) -> None:
     axes.add_collection(
         PatchCollection(empty, facecolor=ORANGE, alpha=0.35, edgecolor=INK, lw=0.3, hatch="////", zorder=1)
     )
+    size = 2.6 if len(camera.x) > MANY_CORNERS else 3.6
     # As a picture in the figure: thousands of marks would be most of the page.
-    axes.plot(camera.x, camera.y, ".", color=BLUE, markersize=2.6, markeredgewidth=0, zorder=2, rasterized=True)
+    axes.plot(camera.x, camera.y, ".", color=USED, markersize=size, markeredgewidth=0, zorder=2, rasterized=True)
     axes.set_title(f"{shortened(camera.sensor)}: {camera.share:.0%}")

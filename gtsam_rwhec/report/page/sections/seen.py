@@ -186,7 +186,7 @@ def _worst(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
         return
     rows: list[tuple[Words, ...]] = []
     for i, one in enumerate(seen.worst):
-        times = "" if one.times_noise is None else shown.evident("seen", "worst", i, "times_noise", spec=".2g")
+        times = "" if one.times_noise is None else shown.evident("seen", "worst", i, "times_noise", spec=".1f")
         rows.append(
             (
                 f"{i + 1}. {one.image}",
@@ -216,7 +216,7 @@ def _worst(shown: ShownResult, seen: SeenEvidence) -> Iterator[Block]:
     for i, one in enumerate(seen.worst):
         if one.picture is None:
             continue
-        noise = "" if one.times_noise is None else f", {one.times_noise:.2g} times the noise"
+        noise = "" if one.times_noise is None else f", {one.times_noise:.1f} times the noise"
         left_out = "" if one.is_used else " It was left out of the answer."
         yield Picture(
             f"worst-{i + 1}",
