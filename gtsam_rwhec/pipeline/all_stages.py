@@ -44,6 +44,7 @@ from gtsam_rwhec.pipeline.log_metadata import read_embedded_rig, read_metadata
 from gtsam_rwhec.pipeline.log_report import write_report
 from gtsam_rwhec.pipeline.output_paths import INSIDE, LEFT, check_is_not_read, made_folder, made_output_folder
 from gtsam_rwhec.pipeline.samples_log import is_file_of_samples, write_samples_log
+from gtsam_rwhec.pipeline.seen_in_log import Pictures
 from gtsam_rwhec.pipeline.solution_frames import frames_of
 from gtsam_rwhec.pipeline.solution_plots import plot_all
 from gtsam_rwhec.pipeline.solved_log import read_solved, write_solved
@@ -152,7 +153,10 @@ def calibrate_log(
             assert rig is not None
             return _from_raw(files, rig, output, choices, progress=progress)
         output.begin()
-        return _from_stage(files[0], rig, output.path, files, files, choices, is_cleaned=is_cleaned, progress=progress)
+        pictures = Pictures(tuple(files), files[0].parent / SEEN_SHEET, choices.report_images)
+        return _from_stage(
+            files[0], rig, output.path, files, pictures, choices, is_cleaned=is_cleaned, progress=progress
+        )
 
 
 def _from_raw(
@@ -171,6 +175,7 @@ def _from_raw(
 
     detected = output.path / DETECTED_LOG
     sheet = output.path / SEEN_SHEET
+    before = _version(sheet)
     detect_log(
         list(files),
         rig,
@@ -182,7 +187,15 @@ def _from_raw(
         keep=keep,
     )
     sources = files if folder is None else sorted(path for path in folder.rglob("*") if path.is_file())
-    return _from_stage(detected, rig, output.path, sources, files, choices, is_cleaned=False, progress=progress)
+    # A driver's log has no sheet, and that of an earlier calibration is not its own.
+    pictures = Pictures(tuple(files), sheet if _version(sheet) != before else None, choices.report_images)
+    return _from_stage(detected, rig, output.path, sources, pictures, choices, is_cleaned=False, progress=progress)
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """What tells a file that was written anew from the one before; None where there is none."""
+    stat = path.stat() if path.is_file() else None
+    return None if stat is None else (stat.st_ino, stat.st_mtime_ns)
 
 
 def _from_stage(
@@ -190,19 +203,19 @@ def _from_stage(
     rig: Rig | None,
     out: Path,
     sources: list[Path],
-    logs: list[Path],
+    pictures: Pictures,
     choices: _Choices,
     *,
     is_cleaned: bool,
     progress: Progress | None,
 ) -> Calibrated:
-    """The stages after the one that wrote the log; `logs` have the images, and `sources` all that was measured."""
+    """The stages after the one that wrote the log; the measurements come from the files `sources`."""
     if not is_cleaned:
         clean_log(source, out / CLEAN_LOG, rig, images=choices.images, progress=progress)
         source = out / CLEAN_LOG
     calibrated = solve_into(source, rig, out, images=choices.images, progress=progress)
     export_solved(out / CLEAN_LOG, out, anyway=choices.anyway, progress=progress)
-    report = write_report(calibrated, out, sources, progress, logs=logs, images=choices.report_images)
+    report = write_report(calibrated, out, sources, pictures, progress)
     list_written(out, calibrated.log.detection.sources, report)
     return calibrated
 

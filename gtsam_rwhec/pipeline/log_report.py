@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gtsam_rwhec.evidence import write_evidence
 from gtsam_rwhec.files.progress import Progress, silent
-from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, EVIDENCE_FILE, REPORT_FILE, RESULT_FILE, SEEN_SHEET
+from gtsam_rwhec.pipeline.log_contract import CLEAN_LOG, EVIDENCE_FILE, REPORT_FILE, RESULT_FILE
 from gtsam_rwhec.pipeline.log_evidence import evidence_of_log
 from gtsam_rwhec.pipeline.seen_in_log import Pictures
 from gtsam_rwhec.pipeline.solving_stage import Calibrated
@@ -18,14 +18,12 @@ def write_report(
     calibrated: Calibrated,
     out: Path,
     sources: Sequence[Path],
+    pictures: Pictures,
     progress: Progress | None = None,
-    *,
-    logs: Sequence[Path] = (),
-    images: bool = True,
 ) -> list[Path]:
     """Write ``evidence.json`` and ``report.html`` beside ``result.json`` and ``clean.mcap``; return their paths.
 
-    Page and evidence have images unless `images` is False: those of the contact sheet, and of the recorded `logs`.
+    Page and evidence have images if `pictures` may be shown.
 
     Raises
     ------
@@ -33,8 +31,7 @@ def write_report(
         A file cannot be written.
     """
     (progress or silent)("writing the report")
-    pictures = Pictures(tuple(logs), out / SEEN_SHEET, may_show=images)
     evidence = evidence_of_log(calibrated, out / CLEAN_LOG, sources, pictures)
     write_evidence(evidence, out / EVIDENCE_FILE, out / RESULT_FILE)
-    write_html(out / RESULT_FILE, out / REPORT_FILE, evidence, images=images)
+    write_html(out / RESULT_FILE, out / REPORT_FILE, evidence, images=pictures.may_show)
     return [out / EVIDENCE_FILE, out / REPORT_FILE]

@@ -38,13 +38,13 @@ _BY_DETECTION = {str(reason) for reason in Rejection}
 
 @dataclass(frozen=True)
 class Pictures:
-    """Where images are: the recorded logs, and the contact sheet's file; either may be missing.
+    """Where images are: the recorded logs, and the contact sheet's file, which may be missing.
 
     With `may_show` False only the images' names are read.
     """
 
     logs: tuple[Path, ...]
-    sheet: Path
+    sheet: Path | None
     may_show: bool = True
 
 
@@ -80,7 +80,7 @@ def seen_in_log(solved: Solved, log_path: str | Path, pictures: Pictures | None)
         removed_list=removed_list(solved.pairs, name_of),
         cameras=seen_cameras(rated, cameras, found),
         worst=tuple(_drawn(one, name_of(one.sensor, one.view.stamp_ns), images) for one in worst),
-        sheet=small_sheet(pictures.sheet) if pictures is not None and pictures.may_show else None,
+        sheet=_sheet(pictures),
         no_pictures=why_not,
     )
 
@@ -163,6 +163,12 @@ def _drawn(one: RatedView, name: str, images: Mapping[tuple[str, int], ImageReco
         return record
     drawn = draw_errors(gray, one.view.pixels, one.errors.px)
     return record.model_copy(update={"magnified": drawn.magnified, "picture": jpeg_of(drawn.picture, PICTURE_BYTES)})
+
+
+def _sheet(pictures: Pictures | None) -> bytes | None:
+    if pictures is None or pictures.sheet is None or not pictures.may_show:
+        return None
+    return small_sheet(pictures.sheet)
 
 
 def small_sheet(path: Path) -> bytes | None:
