@@ -69,12 +69,12 @@ def deviations_chart(refined: RefinedPoses) -> Iterator[Block]:
                 axes.set_xlim(0.8 * low, 1.25 * high)
             else:
                 axes.set_xlim(0.0, 1.12 * high or 1.0)
-                axes.locator_params(axis="x", nbins=3)
+                axes.locator_params(axis="x", nbins=4, steps=[1, 2, 4, 5, 10])
                 axes.xaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
             axes.set_xlabel(f"± {unit}")
         panels[0].set_yticks(range(len(known)), [shortened(name, 14) for name in known])
         panels[0].set_ylim(len(known) - 0.5, -0.5)
-        panels[1].legend(loc="upper center", bbox_to_anchor=(0.0, 0.0, 1.0, 1.14), ncols=3, fontsize=9)
+        figure.legend(*panels[1].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=9)
 
     yield Chart("deviations", "Standard deviations.", says, svg_figure(draw, 1.1 + 0.24 * len(known)))
 

@@ -23,7 +23,9 @@ from gtsam_rwhec.report.page.shown_result import ShownResult
 from gtsam_rwhec.report.pair_grid import DETERMINED, NOT_DETERMINED, NOT_OBSERVED, Symbol
 
 #: A grid with more targets has a row for each target, and a column for each sensor.
-MOST_COLUMNS = 16
+MOST_COLUMNS = 10
+#: A blank at which no line is broken.
+TOGETHER = "\N{NO-BREAK SPACE}"
 #: A grid with more rows is folded.
 MOST_ROWS = 40
 #: A direction with less than this many times the information at which it would be free is near to it.
@@ -117,12 +119,12 @@ def _grid(shown: ShownResult) -> Iterator[Block]:
 
 def _legend(has_outliers: bool) -> str:
     signs = "; ".join(f"{kind.symbol} {kind.meaning}" for kind in (DETERMINED, NOT_DETERMINED, NOT_OBSERVED))
-    more = "; where some were left out, the number of all follows" if has_outliers else ""
+    more = ", out of how many where some were left out" if has_outliers else ""
     return f"{signs}. The number beside a sign is that of the measurements in the answer{more}."
 
 
 def _cell(sign: Symbol, count: Count | None) -> Words:
-    return sign.symbol if count is None else (f"{sign.symbol} ", *count)
+    return sign.symbol if count is None else (f"{sign.symbol}{TOGETHER}", *count)
 
 
 def _counts(shown: ShownResult) -> dict[Pair, Count]:
@@ -135,12 +137,12 @@ def _counts(shown: ShownResult) -> dict[Pair, Count]:
     for i, row in enumerate((tree.get("log") or {}).get("outliers", ())):
         if row.get("left_out", 0):
             used, left_out = (shown.number("log", "outliers", i, name, spec=".0f") for name in ("used", "left_out"))
-            counts[Pair(row["target"], row["sensor"])] = (used, " (", left_out, " left out)")
+            counts[Pair(row["target"], row["sensor"])] = (used, f"{TOGETHER}(-", left_out, ")")
     for i, row in enumerate((tree.get("refined") or {}).get("inlier_counts", ())):
         kept, of = row["value"]
         if kept < of:
             kept, of = (shown.number("refined", "inlier_counts", i, "value", k, spec=".0f") for k in range(2))
-            counts[Pair(row["target"], row["sensor"])] = (kept, " of ", of)
+            counts[Pair(row["target"], row["sensor"])] = (kept, "/", of)
     return counts
 
 

@@ -10,6 +10,7 @@ from gtsam_rwhec.evidence.weak import MORE, TURN_RAD, WEAK, WeakDirection
 from gtsam_rwhec.report.page.blocks import Block, Folded, Listing, Paragraph, Table, Words, significant
 from gtsam_rwhec.report.page.shown_result import ShownResult
 
+NO_TURN = "No such turn would help clearly more than measuring on."
 #: A direction is called after a coordinate axis within 8 degrees of it.
 AXIS_COSINE = np.cos(np.radians(8.0))
 NOT_KNOWN = "Not shown: the least known directions, for the result has no evidence.json beside it with covariances."
@@ -18,10 +19,10 @@ NONE_IS_WEAK = (
     "least known direction of each frame."
 )
 LEGEND = (
-    f"Least known first. Turning: {MORE} more measurements with the named partner in view, one carrier turned against "
-    f"the other by {np.degrees(TURN_RAD):.0f} degrees to both sides about this axis of the sensors' carrier, through "
-    f"the target. Same: {MORE} more like those there are. Both count for as much as those there are do, correlation "
-    "counted; errors that all measurements share stay."
+    f"Least known first. With turns: {MORE} more measurements with the named partner in view, one carrier turned "
+    f"against the other by {np.degrees(TURN_RAD):.0f} degrees to both sides about an axis of the sensors' carrier, "
+    f"through the target. With more: {MORE} more like those there are. Both count for as much as those there are do, "
+    "correlation counted; errors that all measurements share stay."
 )
 
 
@@ -37,12 +38,14 @@ def weak_blocks(shown: ShownResult) -> Iterator[Block]:
         yield Listing(said)
     else:
         yield Paragraph(NONE_IS_WEAK)
+    can_help = any(one.turn is not None for one in weak)
+    turning = ("turn about", "with turns") if can_help else ()
     tables = [
         Table(
             f"Least known {'directions' if kind == 'translation' else 'rotation axes'}",
-            ("frame", "along" if kind == "translation" else "about", unit, "with", "turn about", "turning", "same"),
-            tuple(_row(shown, i, one) for i, one in enumerate(weak) if one.kind == kind),
-            LEGEND,
+            ("frame", "along" if kind == "translation" else "about", unit, "measured with", *turning, "with more"),
+            tuple(_row(shown, i, one, can_help) for i, one in enumerate(weak) if one.kind == kind),
+            LEGEND if can_help else f"{NO_TURN} {LEGEND}",
         )
         for kind, unit in (("translation", "±mm"), ("rotation", "±°"))
     ]
@@ -55,7 +58,8 @@ def axis_words(axis: tuple[float, float, float], frame: str) -> str:
     if abs(axis[k]) > AXIS_COSINE:
         return f"{frame}'s {'xyz'[k]} axis"
     rounded = np.round(np.array(axis) * np.sign(axis[k]), 2) + 0.0
-    return f"({', '.join(f'{value:.2f}' for value in rounded)}) of {frame}"
+    vector = ",\N{NO-BREAK SPACE}".join(f"{value:.2f}" for value in rounded)
+    return f"({vector}) of {frame}"
 
 
 def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
@@ -85,14 +89,17 @@ def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
     return words  # type: ignore[return-value]
 
 
-def _row(shown: ShownResult, i: int, one: WeakDirection) -> tuple[Words, ...]:
+def _row(shown: ShownResult, i: int, one: WeakDirection, can_help: bool) -> tuple[Words, ...]:
+    turning: tuple[Words, ...] = (
+        "-" if one.turn is None else axis_words(one.turn, sensor_carrier(shown)),
+        "-" if one.after_turning is None else significant(shown.evident("weak", i, "after_turning"), 2),
+    )
     return (
         one.frame,
         axis_words(one.axis_in_carrier, one.carrier),
         significant(shown.evident("weak", i, "deviation"), 2),
         one.partner or "-",
-        "-" if one.turn is None else axis_words(one.turn, sensor_carrier(shown)),
-        "-" if one.after_turning is None else significant(shown.evident("weak", i, "after_turning"), 2),
+        *(turning if can_help else ()),
         "-" if one.after_more is None else significant(shown.evident("weak", i, "after_more"), 2),
     )
 
