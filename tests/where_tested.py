@@ -137,6 +137,7 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_log_findings.py": "output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",
         "pipeline/test_same_log.py": "log_metadata",
+        "pipeline/test_verified_log.py": "old_calibration",
         "pipeline/test_synthetic_calibration.py": (
             "carrier_motion cleaning_stage detection_stage detections_in_images image_detections measured_pairs "
             "sensor_detections settled_poses solution_frames solution_plots solved_log solving_rounds solving_stage"

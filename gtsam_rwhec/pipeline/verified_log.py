@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.changes.calibration_files import result_path
 from gtsam_rwhec.changes.change_test import LEVEL, checked_level
 from gtsam_rwhec.changes.verification import Verification
 from gtsam_rwhec.changes.verifying import verify
-from gtsam_rwhec.errors import FrameError, LogError
+from gtsam_rwhec.errors import FrameError, LogError, LogWarning, StampError
 from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
-from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
+from gtsam_rwhec.pipeline.changed_rig import rig_for_cleaning, rig_for_solving
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.corner_answer import with_intrinsics
 from gtsam_rwhec.pipeline.detection_stage import detect_log
@@ -31,68 +31,23 @@ from gtsam_rwhec.pipeline.log_contract import (
     CLEANING_METADATA,
     DETECTED_LOG,
     RECORDED_LOG,
-    RESULT_FILE,
     is_from_stage,
 )
 from gtsam_rwhec.pipeline.log_corners import LogCorners
-from gtsam_rwhec.pipeline.log_metadata import read_cameras, read_cleaning_report, read_embedded_rig, read_metadata
+from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import problem_of, read_pairs
+from gtsam_rwhec.pipeline.old_calibration import OldCalibration, with_cameras
 from gtsam_rwhec.pipeline.samples_log import is_file_of_samples, write_samples_log
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, SolvingRounds, without_outlier_marks
 from gtsam_rwhec.refinement.refined import RefinedPoses
 from gtsam_rwhec.results.log_history import DetectionReport
-from gtsam_rwhec.results.result_file import Result, parse_result, read_result
+from gtsam_rwhec.results.result_file import Result
 from gtsam_rwhec.rig import Rig
-from gtsam_rwhec.rig.intrinsics_section import Intrinsics
 from gtsam_rwhec.vision.camera import Camera
 
 #: Standard deviation of a corner along each axis where the old calibration is not from corners, pixels: what detection
 #: takes before it has measured it. The test finds the noise of poses itself.
 CORNER_PX = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class OldCalibration:
-    """An old calibration of a log, as its output folder holds it.
-
-    Attributes
-    ----------
-    result : Result
-    rig : Rig or None
-        The rig file in its solved log.
-    cameras : dict of sensor to Camera
-        Intrinsics as it has them: estimated where they were.
-    """
-
-    result: Result
-    rig: Rig | None
-    cameras: dict[str, Camera]
-
-    @staticmethod
-    def read(path: str | Path) -> OldCalibration:
-        """From an output folder, its ``clean.mcap``, or a result file, beside which the solved log may be.
-
-        Raises
-        ------
-        FileFormatError, LogError
-            The files cannot be read, or hold no calibration.
-        """
-        path = Path(path)
-        if path.suffix.lower() == ".mcap":
-            with open_log(path) as log:
-                content = log.attachment(RESULT_FILE)
-            if content is None:
-                raise LogError(f"{path} has no {RESULT_FILE} attached: gtsam-rwhec solve or calibrate did not write it")
-            result, solved = parse_result(content, f"{path}, attachment {RESULT_FILE}"), path
-        else:
-            file = result_path(path)
-            result, solved = read_result(file), file.with_name(CLEAN_LOG)
-        rig, cameras = None, {}
-        if solved.is_file():
-            with open_log(solved) as log:
-                rig, cameras = read_embedded_rig(log), read_cameras(log)
-        estimated = {} if result.refined is None else result.refined.intrinsics
-        return OldCalibration(result, rig, cameras | {name: one.camera for name, one in estimated.items()})
 
 
 @one_blas_thread()
@@ -175,24 +130,32 @@ def _cleaned(
             )
         detected = folder / DETECTED_LOG
         detect_log(list(files), with_cameras(rig, old.cameras), detected, workers=workers, progress=tell)
-    clean_log(detected, folder / CLEAN_LOG, None if is_raw else given, images="leave_out", progress=tell)
+    _clean(detected, folder / CLEAN_LOG, None if is_raw else given, old, tell)
     return folder / CLEAN_LOG, None
 
 
-def with_cameras(rig: Rig, cameras: Mapping[str, Camera]) -> Rig:
-    """The rig file with the intrinsics of an old calibration as numbers, for the sensors that have images."""
-    sensors = {}
-    for name, sensor in rig.sensors.items():
-        camera = cameras.get(name)
-        if camera is not None and sensor.images is not None:
-            (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
-            numbers = Intrinsics(
-                model=camera.model, size=(camera.width, camera.height), K=(fx, fy, cx, cy),
-                D=tuple(camera.D.tolist()) or None, stated="calibration",
-            )  # fmt: skip
-            sensor = sensor.model_copy(update={"intrinsics": numbers})
-        sensors[name] = sensor
-    return rig.model_copy(update={"sensors": sensors})
+def _clean(detected: Path, cleaned: Path, rig: Rig | None, old: OldCalibration, tell: Progress) -> None:
+    """Clean a log; where its motion does not tell the time offset of a sensor, the old one is taken as stated."""
+    before = {} if old.result.log is None else {one.sensor: one.offset_s for one in old.result.log.time_offsets}
+    with open_log(detected) as log:
+        rig = rig_for_cleaning(log, rig)
+    free = [name for name, sensor in rig.sensors.items() if sensor.time_offset == "estimate" and name in before]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LogWarning)
+            found = clean_log(detected, cleaned, rig, images="leave_out", progress=tell).time_offsets_s
+    except StampError:
+        if not free:
+            raise
+        found = {}
+    untold = [name for name in free if name not in found]
+    if untold:
+        sensors = {
+            name: sensor.model_copy(update={"time_offset": before[name]}) if name in untold else sensor
+            for name, sensor in rig.sensors.items()
+        }
+        rig = rig.model_copy(update={"sensors": sensors})
+        clean_log(detected, cleaned, rig, images="leave_out", progress=tell)
 
 
 def _verified(
@@ -220,6 +183,9 @@ def _verified(
     )  # fmt: skip
     if refined is None:
         return found
+    taken = _taken_offsets(old.result, rig)
+    if taken:
+        found = replace(found, remarks=(*found.remarks, *taken))
     if old.result.log is not None and are_same_images(old.result.log.detection, metadata.detection):
         remark = "the new log is the one that the old calibration comes from, so that it holds as a matter of course"
         found = replace(found, remarks=(remark, *found.remarks))
@@ -228,6 +194,17 @@ def _verified(
         found,
         sensors={name: replace(check, held_px=_median(pixels.get(name))) for name, check in found.sensors.items()},
     )
+
+
+def _taken_offsets(old: Result, rig: Rig) -> list[str]:
+    """The sensors whose old time offset was taken."""
+    offsets = [] if old.log is None else [one for one in old.log.time_offsets if one.sigma_s is not None]
+    return [
+        f"the new motion does not tell the time offset of {shown(one.sensor)}, and the old one was taken: "
+        f"{1e3 * one.offset_s:.1f} ms"
+        for one in offsets
+        if one.sensor in rig.sensors and rig.sensors[one.sensor].time_offset == one.offset_s
+    ]
 
 
 def are_same_images(one: DetectionReport, other: DetectionReport) -> bool:

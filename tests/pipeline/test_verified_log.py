@@ -14,7 +14,8 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.errors import FrameError, LogError
-from gtsam_rwhec.pipeline.verified_log import OldCalibration, verify_log, with_cameras
+from gtsam_rwhec.pipeline.old_calibration import OldCalibration, with_cameras
+from gtsam_rwhec.pipeline.verified_log import verify_log
 
 #: Three of the old calibration's joint deviations and more: 4 mm and 0.3 degrees.
 KNOCK = se3.expmap(np.array([[0.0, 0.005, 0.0, 0.004, 0.0, 0.0]]))[0]
@@ -63,9 +64,18 @@ def test_a_camera_that_sees_nothing_is_named(old: Path, tmp_path: Path) -> None:
 
 def test_a_clock_that_is_estimated_may_be_late_by_another_time(old: Path, tmp_path: Path) -> None:
     rig = made.rig(cam_1="detections: /cam_1/tags\n    time_offset: estimate")
-    log = new_log(tmp_path, offsets_s={"cam_1": 0.03})
+    log = made.write(tmp_path / "new.mcap", made.recording(6.0, seed=1, offsets_s={"cam_1": 0.03}))
     (tmp_path / "result.json").write_bytes((old / "result.json").read_bytes())  # and nothing beside it
-    assert verify_log(tmp_path / "result.json", log, rig).holds
+    found = verify_log(tmp_path / "result.json", log, rig)
+    assert found.holds
+    assert found.not_checked == {}
+
+
+def test_a_clock_that_the_new_motion_does_not_tell_is_as_it_was(old: Path, tmp_path: Path) -> None:
+    rig = made.rig(cam_1="detections: /cam_1/tags\n    time_offset: estimate")
+    found = verify_log(old, new_log(tmp_path), rig)  # so short that its motion repeats itself
+    assert found.holds
+    assert found.not_checked == {}
 
 
 def test_the_log_of_the_calibration_itself_is_told(old: Path) -> None:
