@@ -14,7 +14,9 @@ Errors that vary with the configuration are modelled in the last kind alone, whe
 
 ``difference`` compares both answers; ``verify`` tests the first one on the second log. For the power a frame of the
 second log is moved by a number of joint deviations in a random direction, or all frames together, and the share that is
-found is compared with that of the noncentral chi-square.
+found is compared with that of the noncentral chi-square, which is of noise that is known. (Noise that is estimated from
+60 measurements of a pair costs some three points. An arm's errors that vary with its configuration are in both
+covariances although both logs share a part of them: there alarms are rarer, and power is lower.)
 
 ``--keep`` is a file of JSON lines to which every pair is added, and from which an interrupted campaign goes on. Exits
 with 1 if a bar is missed.
@@ -54,6 +56,8 @@ from gtsam_rwhec.simulate.transforms import random_poses
 
 FloatArray = NDArray[np.float64]
 KINDS = ("white", "carriers", "drift", "arm")
+#: In these the errors of both logs are independent.
+INDEPENDENT = KINDS[:3]
 LEVEL, BAND = 0.01, 0.005
 #: Rotation (rad) and translation (m) about and along each axis.
 OF_B = np.radians(0.1), 0.001
@@ -259,28 +263,28 @@ def rows(found: list[dict[str, Any]]) -> list[Row]:
             is_near,
         )
     )
-    for size in sorted({one["dimension"] for one in answered}):
-        own = [one for one in answered if one["dimension"] == size]
+    for kind in KINDS:
+        own = [one for one in answered if one["kind"] == kind]
         one_of = Share.of([one["one"] for one in own])
-        joint_theory = float(np.mean([one["one_expected"] for one in own]))
+        theory = float(np.mean([one["one_expected"] for one in own]))
         right = Share.of([one["one_named"] for one in own if one["one"]])
         result.append(
             Row(
-                f"    the same, tested with all {size} directions of the cell",
-                f"{one_of}; noncentral chi-square of the joint statistic {100 * joint_theory:.1f} %; "
-                f"frame named {right}",
-                f"not {100 * NEAR:g} points below",
-                one_of.value >= joint_theory - NEAR,
+                f"    {kind}: the same, tested with the whole cell",
+                f"{one_of}; noncentral chi-square of the joint statistic {100 * theory:.1f} %; frame named {right}",
             )
         )
+    # The errors that vary with an arm's configuration are in both covariances, and partly the same in both logs.
+    for kind in ("", *KINDS):
+        own = [one for one in answered if one["kind"] in ((kind,) if kind else INDEPENDENT)]
         together = Share.of([one["together"] for one in own])
         joint = Share.of([one["together_joint"] for one in own])
         result.append(
             Row(
-                f"    all {size} directions moved together",
+                f"    {kind}" if kind else f"diff: all frames moved, in {', '.join(INDEPENDENT)}",
                 f"{together}; joint statistic alone {joint}; noncentral chi-square {100 * POWER:g} %",
-                f"within {100 * NEAR:g} points",
-                abs(together.value - POWER) <= NEAR,
+                "" if kind else f"within {100 * NEAR:g} points",
+                None if kind else abs(together.value - POWER) <= NEAR,
             )
         )
     own = [one for one in answered if "verified_one" in one]
