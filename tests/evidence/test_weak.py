@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from rwhec_factors import se3
@@ -9,9 +11,12 @@ from rwhec_factors import se3
 import gtsam_rwhec as rw
 from gtsam_rwhec.evidence.measured import measured_rows
 from gtsam_rwhec.evidence.weak import MORE, TURN_RAD, WeakDirection, weak_directions
+from gtsam_rwhec.report.page import Listing
+from gtsam_rwhec.report.page.sections.determines import determines_section
+from gtsam_rwhec.report.page.written import read_shown
 
 SIGMA_M, SIGMA_RAD = 0.002, np.radians(0.2)
-OPTIONS = rw.CalibrateOptions(noise="given", robust="none", drift="none", systematic=False, sizes="known")
+OPTIONS = rw.CalibrateOptions(noise="given", robust="none", drift="none", systematic=False, misreadings=False)
 X = se3.expmap(np.array([[0.2, -0.1, 0.4, 0.5, 0.1, -0.3]]))[0]
 Y = se3.expmap(np.array([[-0.3, 0.5, 0.1, 0.05, -0.02, 0.1]]))[0]
 
@@ -59,6 +64,25 @@ def test_the_axis_of_the_motion_is_weak_and_the_motion_across_it_helps_as_said()
     after = 1e3 * np.sqrt(axis @ calibration.covariance("cam")[3:, 3:] @ axis)
     assert after == pytest.approx(found.after_turning, rel=0.1)
     assert found.after_turning < 0.7 * found.after_more < found.deviation
+
+
+@pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")
+def test_the_report_says_the_weak_direction_and_the_turn(tmp_path: Path) -> None:
+    of = problem(mostly_about_z())
+    calibration = rw.calibrate(of, OPTIONS)
+    rw.write_calibration(calibration, tmp_path / "result.json")
+    rw.evidence.write_evidence(rw.evidence.evidence_of(of, calibration), tmp_path / "evidence.json")
+    said = [
+        "".join(piece if isinstance(piece, str) else piece.text for piece in item)
+        for block in determines_section(read_shown(tmp_path)).blocks
+        if isinstance(block, Listing)
+        for item in block.items
+    ]
+    assert len(said) == 2
+    for sentence in said:
+        assert "along" in sentence
+        assert "carrier's z axis: ± 5.1 mm. Turn by 30 degrees to both sides about sensorcarrier's" in sentence
+        assert ", with board in view of cam: 10 measurements would bring it to about ± 1.2 mm" in sentence
 
 
 @pytest.mark.filterwarnings("ignore::gtsam_rwhec.errors.RwhecWarning")

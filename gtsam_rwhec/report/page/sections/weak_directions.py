@@ -73,8 +73,8 @@ def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
     )
     if one.turn is not None:
         words += (
-            f" Turn about {axis_words(one.turn, sensor_carrier(shown))} with {one.partner} in view: {MORE} "
-            "measurements would bring it to about ± ",
+            f" Turn by {np.degrees(TURN_RAD):.0f} degrees to both sides about "
+            f"{axis_words(one.turn, sensor_carrier(shown))}, with {_in_view(shown, one)}: {MORE} measurements would bring it to about ± ",
             significant(shown.evident("weak", i, "after_turning"), 2),
             f"{unit}, as many like those there are to ± ",
             significant(shown.evident("weak", i, "after_more"), 2),
@@ -87,6 +87,13 @@ def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
             f"{unit}.",
         )
     return words  # type: ignore[return-value]
+
+
+def _in_view(shown: ShownResult, one: WeakDirection) -> str:
+    """Which target is to be in view of which sensor."""
+    is_target = any(row["child"] == one.frame for row in shown.tree["targets"])
+    target, sensor = (one.frame, one.partner) if is_target else (one.partner, one.frame)
+    return f"{target} in view of {sensor}"
 
 
 def _row(shown: ShownResult, i: int, one: WeakDirection, can_help: bool) -> tuple[Words, ...]:
