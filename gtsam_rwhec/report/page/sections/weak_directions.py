@@ -74,7 +74,8 @@ def _sentence(shown: ShownResult, i: int, one: WeakDirection) -> Words:
     if one.turn is not None:
         words += (
             f" Turn by {np.degrees(TURN_RAD):.0f} degrees to both sides about "
-            f"{axis_words(one.turn, sensor_carrier(shown))}, with {_in_view(shown, one)}: {MORE} measurements would bring it to about ± ",
+            f"{axis_words(one.turn, sensor_carrier(shown))}, with {_in_view(shown, one)}: {MORE} "
+            "measurements would bring it to about ± ",
             significant(shown.evident("weak", i, "after_turning"), 2),
             f"{unit}, as many like those there are to ± ",
             significant(shown.evident("weak", i, "after_more"), 2),
