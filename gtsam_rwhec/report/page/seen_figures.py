@@ -25,6 +25,8 @@ SIGNS = (("x", VERMILLION), ("^", ORANGE), ("s", PURPLE))
 TICK, ABOVE = 0.28, 0.36
 #: So many cameras are drawn, in so many columns, each at most so high as wide.
 MOST_CAMERAS, COLUMNS, TALLEST = 12, 2, 1.4
+#: More signs than this in a row stand together, those of so many pieces as one.
+MOST_SIGNS, TOGETHER = 100, 4
 #: More corners than this have smaller marks.
 MANY_CORNERS = 1500
 #: A row's name has so many characters.
@@ -67,16 +69,24 @@ def name_of(track: SeenTrack) -> str:
 
 
 def _draw_track(axes: Axes, row: int, track: SeenTrack, step: float, signs: dict[str, tuple[str, str]]) -> None:
-    if track.used_at:
-        at = step * (0.5 + np.array(track.used_at)[:, 0])
-        gap = np.full(len(at), np.nan)
-        ends = np.column_stack([np.full(len(at), row - TICK), np.full(len(at), row + TICK), gap])
-        axes.plot(np.column_stack([at, at, gap]).ravel(), ends.ravel(), color=USED, lw=1.0)  # one path for all ticks
+    # Ticks of single pieces are one line, and pieces that follow one another one area: few words in the SVG.
+    at = np.array([piece for piece, _ in track.used_at], dtype=int)
+    begins = np.flatnonzero(np.diff(at, prepend=-2) > 1)
+    first, last = at[begins], at[np.append(begins[1:], len(at)) - 1] if len(at) else at
+    alone = step * (first[first == last] + 0.5)
+    gap = np.full(len(alone), np.nan)
+    ends = np.column_stack([np.full(len(alone), row - TICK), np.full(len(alone), row + TICK), gap])
+    axes.plot(np.column_stack([alone, alone, gap]).ravel(), ends.ravel(), color=USED, lw=1.0)
+    wide = first != last
+    areas = list(zip(step * first[wide], step * (last - first + 1)[wide], strict=True))
+    axes.broken_barh(areas, (row - TICK, 2.0 * TICK), facecolor=USED, lw=0.0)
     for stage, pieces in track.removed_at.items():
         marker, colour = signs.get(stage, ("+", GREY))
-        at = step * (0.5 + np.array(pieces)[:, 0])
+        at = np.array(pieces)[:, 0]
+        if len(at) > MOST_SIGNS:
+            at = np.unique(at // TOGETHER) * TOGETHER + TOGETHER // 2
         axes.plot(
-            at, np.full(len(at), row - ABOVE), marker,
+            step * (0.5 + at), np.full(len(at), row - ABOVE), marker,
             color=colour, markersize=4.5, markerfacecolor="none", zorder=3,
         )  # fmt: skip
 

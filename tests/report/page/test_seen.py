@@ -56,9 +56,11 @@ def made_up() -> SeenEvidence:
         tracks=(
             SeenTrack(sensor=NAME, target="tag", used=7, removed=2, used_at=((0, 4), (9, 3)),
                       removed_at={"cleaning": ((3, 1),), "detection": ((PIECES - 1, 1),)}),
+            SeenTrack(sensor=NAME, target="none", used=0, removed=150, used_at=(),
+                      removed_at={"detection": tuple((i, 1) for i in range(150))}),
         ),
         used=7,
-        removed=2,
+        removed=152,
         removed_counts=(
             RemovedCount(target="tag", sensor=NAME, stage="cleaning", reason="gap (s)", count=1),
             RemovedCount(target="tag", sensor=NAME, stage="detection", reason="blurred", count=1),
