@@ -76,7 +76,7 @@ def deviations_chart(refined: RefinedPoses) -> Iterator[Block]:
         panels[0].set_ylim(len(known) - 0.5, -0.5)
         figure.legend(*panels[1].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=9)
 
-    yield Chart("deviations", "Standard deviations.", says, svg_figure(draw, 1.1 + 0.24 * len(known)))
+    yield Chart("deviations", "Standard deviations", says, svg_figure(draw, 1.1 + 0.24 * len(known)))
 
 
 def correlation_chart(refined: RefinedPoses) -> Iterator[Block]:
@@ -128,7 +128,7 @@ def correlation_chart(refined: RefinedPoses) -> Iterator[Block]:
         if not has_blocks:
             bar.ax.set_ylim(0.0, 1.0)
 
-    yield Chart("correlation", "Correlation.", says, svg_figure(draw, 4.6))
+    yield Chart("correlation", "Correlation", says, svg_figure(draw, 4.6))
 
 
 def correlation(covariance: Array) -> Array:

@@ -114,7 +114,7 @@ def _spectra(shown: ShownResult) -> Iterator[Block]:
         return
     part = max(having, key=lambda each: each["rows"])
     values, rounding = np.array(part["eigenvalues"]), part["rounding"]
-    yield Chart("spectrum", "Spectrum of Z.", _says(part, values, rounding), spectrum_svg(values, rounding))
+    yield Chart("spectrum", "Spectrum of Z", _says(part, values, rounding), spectrum_svg(values, rounding))
 
 
 def _says(part: Mapping[str, Any], values: np.ndarray, rounding: float) -> str:

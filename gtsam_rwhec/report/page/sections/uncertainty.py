@@ -30,8 +30,9 @@ def uncertainty_section(shown: ShownResult) -> Section:
     title = "Uncertainty"
     if shown.result is None or shown.result.refined is None:
         return Section("uncertainty", title, missing=NOT_REFINED)
-    blocks: list[Block] = [*_points(shown), *deviations_chart(shown.result.refined), *_deviations(shown)]
-    blocks += correlation_chart(shown.result.refined)
+    blocks: list[Block] = [*_points(shown), *deviations_chart(shown.result.refined)]
+    blocks += correlation_chart(shown.result.refined)  # beside one another where the page is wide
+    blocks += _deviations(shown)
     blocks += [*_relative(shown), *_intrinsics(shown), *_clocks(shown)]
     return Section("uncertainty", title, tuple(blocks))
 
