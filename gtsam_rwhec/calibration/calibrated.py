@@ -208,7 +208,7 @@ class Calibration:
             self._known(),
             self.views,
             noise,
-            self._noise_of_A,
+            self.noise_of_A,
             self.carriers,
             point,
             frame=frame,
@@ -218,8 +218,8 @@ class Calibration:
         )
 
     @property
-    def _noise_of_A(self) -> CarrierNoise | None:
-        """The noise of A that was found, or stated as standard deviations."""
+    def noise_of_A(self) -> CarrierNoise | None:
+        """The noise of A that was found, or stated as standard deviations; None where A counts as exact."""
         found = None if self.noise.model is None else self.noise.model.carrier_noise
         stated = self.options.carrier_noise
         return found or (stated if stated is not None and stated.covariances is None else None)

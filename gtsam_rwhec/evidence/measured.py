@@ -23,7 +23,7 @@ class MeasuredRows:
         T_sensorcarrier_targetcarrier at the final time offsets, and T_sensor_target, metres.
     stamps_ns : (N,) int or None
     covariance : (N, 6, 6) or None
-        Of B's right perturbation [omega (rad), v (m)], as it counted before the fit; None where it was not stated.
+        Of B's right perturbation [omega (rad), v (m)], as it was stated; None where a log has none.
     reasons : tuple of str
         Why a measurement is not used; empty where it is.
     """
@@ -63,7 +63,7 @@ def measured_rows(problem: Problem, calibration: Calibration) -> Mapping[Pair, M
             A=measured.A,
             B=measured.B,
             stamps_ns=measured.stamps_ns,
-            covariance=measured.covariances,
+            covariance=measured.covariance_of_B(),
             reasons=tuple("" if one else LEFT_OUT for one in used),
         )
     return rows
