@@ -9,10 +9,12 @@ from typing import Final, Literal
 from pydantic import Field, ValidationError
 
 from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.evidence.contribution import ContributionEvidence
 from gtsam_rwhec.evidence.derived import Derived
 from gtsam_rwhec.evidence.inputs import Inputs
 from gtsam_rwhec.evidence.proof import Proof
 from gtsam_rwhec.evidence.record import EvidenceRecord
+from gtsam_rwhec.evidence.residuals import ResidualsEvidence
 from gtsam_rwhec.evidence.seen import SeenEvidence
 from gtsam_rwhec.evidence.weak import WeakDirection
 from gtsam_rwhec.files.atomic_write import write_atomically
@@ -36,6 +38,8 @@ class Evidence(EvidenceRecord):
     proof: Proof | None = Field(default=None, description="gap and spectrum of the certificate")
     weak: tuple[WeakDirection, ...] = Field(default=(), description="least known directions, the worst first")
     seen: SeenEvidence | None = Field(default=None, description="detections, removed measurements, corners, images")
+    residuals: ResidualsEvidence | None = Field(default=None, description="what is left, and what it says of the noise")
+    contribution: ContributionEvidence | None = Field(default=None, description="how much each image told")
     inputs: Inputs | None = Field(default=None, description="files, versions, options, rig file")
 
 

@@ -53,6 +53,8 @@ class LinearModel:
         The change of the prediction by the measurement's own unknowns.
     places : (N, 13) int
         Where these are among all unknowns; ``dimension`` stands for one that is known.
+    A : (N, 4, 4)
+        The carriers' poses.
     frames : dict of str to slice
         Where the frames' six unknowns are.
     dimension : int
@@ -67,6 +69,7 @@ class LinearModel:
     noise: Array
     J: Array
     places: np.ndarray
+    A: Array
     frames: dict[str, slice]
     dimension: int
 
@@ -117,6 +120,7 @@ class LinearModel:
             noise=noise,
             J=J,
             places=places,
+            A=np.concatenate([rows[pair].A for pair in known]),
             frames=frames,
             dimension=dimension,
         )
@@ -126,13 +130,15 @@ class LinearModel:
         """Time (N,) since the first measurement; without stamps, the place in its pair."""
         if self.stamps_ns is None:
             return self.within.astype(float)
-        return (self.stamps_ns - self.stamps_ns.min()) * 1e-9
+        seconds: Array = (self.stamps_ns - self.stamps_ns.min()) * 1e-9
+        return seconds
 
     @property
     def sensor(self) -> np.ndarray:
         """The sensor's place (N,) among all sensors, in the order of the pairs."""
         names = list(dict.fromkeys(pair.sensor for pair in self.pairs))
-        return np.array([names.index(pair.sensor) for pair in self.pairs])[self.pair]
+        of_pair = np.array([names.index(pair.sensor) for pair in self.pairs])
+        return np.asarray(of_pair[self.pair])
 
     def whitened(self) -> tuple[Array, Array]:
         """Residuals (N, 6) and derivatives (N, 6, 13) in units of the noise."""

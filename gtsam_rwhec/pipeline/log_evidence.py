@@ -8,14 +8,19 @@ from os.path import commonpath
 from pathlib import Path
 
 from gtsam_rwhec.evidence import Evidence
+from gtsam_rwhec.evidence.contribution import contribution_of
 from gtsam_rwhec.evidence.derived import derived_of
 from gtsam_rwhec.evidence.inputs import Inputs, input_files, versions
+from gtsam_rwhec.evidence.linear_model import LinearModel
 from gtsam_rwhec.evidence.measured import MeasuredRows
 from gtsam_rwhec.evidence.proof import proof_of
+from gtsam_rwhec.evidence.residuals import residuals_of
 from gtsam_rwhec.evidence.weak import weak_directions
 from gtsam_rwhec.export import copied_texts
+from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.seen_in_log import Pictures, seen_in_log
 from gtsam_rwhec.pipeline.solution_frames import frames_of
+from gtsam_rwhec.pipeline.solution_plots import by_estimated_intrinsics
 from gtsam_rwhec.pipeline.solving_stage import Calibrated, Solved
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.rig import rig_text
@@ -43,11 +48,14 @@ def evidence_of_log(
         rig_file=rig_text(calibrated.rig),
         copies=copied_texts(frames_of(calibrated)),
     )
+    model = LinearModel.of(rows_by_final_intrinsics(calibrated, log_path), calibrated.calibration)
     return Evidence(
         derived=derived_of(calibrated.calibration),
         proof=proof_of(calibrated.solution, calibrated.problem),
         weak=weak_directions(calibrated.calibration, rows_of_log(calibrated)),
         seen=seen_in_log(calibrated, log_path, pictures),
+        residuals=None if model is None else residuals_of(model, calibrated.calibration),
+        contribution=None if model is None else contribution_of(model),
         inputs=inputs.with_options(calibrated.calibration.options),
     )
 
@@ -58,6 +66,12 @@ def rows_of_log(calibrated: Solved) -> dict[Pair, MeasuredRows]:
         pair: MeasuredRows(one.A, one.B, one.stamps_ns, one.covariance, one.reasons)
         for pair, one in calibrated.pairs.items()
     }
+
+
+def rows_by_final_intrinsics(calibrated: Solved, log_path: str | Path) -> dict[Pair, MeasuredRows]:
+    """The same with poses of targets by the estimated intrinsics, if there are any."""
+    with open_log(log_path) as log:
+        return rows_of_log(by_estimated_intrinsics(calibrated, log))
 
 
 def _command(sources: Sequence[Path]) -> str:

@@ -1,0 +1,183 @@
+"""How much each image tells: its information, what would change without it, and how many images tell nearly all.
+
+At the level of poses, with independent noise: an image is all that one sensor measured at one stamp; without stamps
+each measurement counts by itself.
+"""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+from pydantic import Field
+
+from gtsam_rwhec.evidence.linear_model import OWN, LinearModel, inverse_of
+from gtsam_rwhec.evidence.record import EvidenceRecord, Row
+from gtsam_rwhec.geometry.poses import Array
+
+#: Of more images the choice is among every so-many-th.
+MOST_CHOSEN_FROM = 250
+#: The choice begins with this share of all information, so that every direction has a finite deviation.
+BEGIN = 1e-6
+#: How much larger the worst standard deviation may be.
+GROWTHS = (0.05, 0.1, 0.25, 0.5)
+#: So many images are listed.
+LISTED = 10
+
+
+class ImageContribution(EvidenceRecord):
+    """What one image tells."""
+
+    sensor: str = Field(description="the sensor's name")
+    targets: tuple[str, ...] = Field(description="what it saw")
+    time: float = Field(description="seconds since the first measurement, or the place of the measurement in its pair")
+    stamp_ns: int | None = Field(description="its stamp")
+    share: float = Field(description="of all that was learnt: the trace of its part of the hat matrix over unknowns")
+    moved: float = Field(description="without it the pose that moves most moves so many of its standard deviations")
+    moved_frame: str = Field(description="which pose that is")
+    moved_mm: float = Field(description="how far that pose's origin moves, millimetres")
+    growth: float = Field(description="without it the standard deviation that grows most grows by this share")
+
+
+class Fewer(EvidenceRecord):
+    """How many images tell nearly as much as all."""
+
+    growth: float = Field(description="no standard deviation is larger by more than this share")
+    images: int = Field(description="so many images are enough, if they are chosen well", ge=0)
+
+
+class ContributionEvidence(EvidenceRecord):
+    """How much each image contributed."""
+
+    has_stamps: bool = Field(description="whether an image is known by its stamp; else each measurement is one")
+    images: int = Field(description="in the answer", ge=0)
+    chosen_from: int = Field(description="images among which the choice was", ge=0)
+    important: tuple[ImageContribution, ...] = Field(description="those that tell most, the first most of all")
+    influential: tuple[ImageContribution, ...] = Field(description="those without which the answer moves most")
+    shares: Row = Field(description="of all images, the largest first")
+    fewer: tuple[Fewer, ...] = Field(description="how many images are enough")
+    curve: Row = Field(description="the largest growth of a standard deviation with the first 1, 2, ... chosen images")
+
+
+def contribution_of(model: LinearModel) -> ContributionEvidence | None:
+    """What each image of a model contributed; None where nothing is in the answer, or no frame is unknown."""
+    r, J = model.whitened()
+    which = np.flatnonzero(model.used)
+    if not len(which):
+        return None
+    covariance = inverse_of(model.information(J, model.used))
+    padded = np.pad(covariance, ((0, 1), (0, 1)))
+    images = _images(model, which)
+    own = [np.linalg.pinv(covariance[where, where], hermitian=True) for where in model.frames.values()]
+    if not own:
+        return None
+    blocks = np.array(own)
+    found = [_image(model, r, J, padded, blocks, rows) for rows in images]
+    by_share = sorted(found, key=lambda one: -one.share)
+    by_move = sorted(found, key=lambda one: -one.moved)
+    every = -(-len(images) // MOST_CHOSEN_FROM)
+    curve = _chosen(model, J, covariance, images[::every])
+    return ContributionEvidence(
+        has_stamps=model.stamps_ns is not None,
+        images=len(images),
+        chosen_from=len(images[::every]),
+        important=tuple(by_share[:LISTED]),
+        influential=tuple(by_move[:LISTED]),
+        shares=tuple(float(f"{one.share:.6g}") for one in by_share[:1000]),
+        fewer=tuple(_fewer(curve, growth) for growth in GROWTHS),
+        curve=tuple(float(f"{value:.6g}") for value in curve),
+    )
+
+
+def _images(model: LinearModel, which: np.ndarray) -> list[np.ndarray]:
+    """The measurements of each image."""
+    if model.stamps_ns is None:
+        return [np.array([i]) for i in which]
+    keys = np.column_stack([model.sensor[which], model.stamps_ns[which] - model.stamps_ns.min()])
+    _, image = np.unique(keys, axis=0, return_inverse=True)
+    order = np.argsort(image.ravel(), kind="stable")
+    return np.split(which[order], np.flatnonzero(np.diff(image.ravel()[order])) + 1)
+
+
+def _image(
+    model: LinearModel, r: Array, J: Array, covariance: Array, blocks: Array, rows: np.ndarray
+) -> ImageContribution:
+    """Leave-one-out of one image: d = -S J' (1 - J S J')^-1 r, and the covariance S + S J' (1 - J S J')^-1 J S.
+
+    ``blocks`` (F, 6, 6) are the inverses of the frames' own covariances; zero along free directions.
+    """
+    own, derivative = _stacked(model, J, rows)
+    spread = covariance[:, own] @ derivative.T  # S J'
+    hat = derivative @ spread[own]
+    left = np.eye(len(hat)) - hat
+    # Where only this image tells something, a direction is lost without it: its eigenvalue is zero up to rounding.
+    values, vectors = np.linalg.eigh(left)
+    values = np.maximum(values, 1e-9)
+    half = spread @ vectors / np.sqrt(values)
+    residual = r[rows].reshape(-1)
+    step = -(half @ (vectors.T @ residual / np.sqrt(values)))
+    variance = np.diagonal(covariance)[:-1]
+    known = variance > 0.0
+    growth = np.sqrt(1.0 + (half[:-1] ** 2).sum(axis=1)[known] / variance[known]) - 1.0
+    by_frame = step[: 6 * len(blocks)].reshape(-1, 6)
+    squares = np.einsum("fi,fij,fj->f", by_frame, blocks, by_frame)
+    most = int(squares.argmax())
+    sensor = model.pairs[model.pair[rows[0]]].sensor
+    return ImageContribution(
+        sensor=sensor,
+        targets=tuple(model.pairs[pair].target for pair in model.pair[rows].tolist()),
+        time=float(model.seconds[rows[0]]),
+        stamp_ns=None if model.stamps_ns is None else int(model.stamps_ns[rows[0]]),
+        share=float(np.trace(hat)) / max(int(known.sum()), 1),
+        moved=float(np.sqrt(max(squares[most], 0.0))),
+        moved_frame=list(model.frames)[most],
+        moved_mm=1e3 * float(np.linalg.norm(by_frame[most, 3:])),
+        growth=float(growth.max(initial=0.0)),
+    )
+
+
+def _stacked(model: LinearModel, J: Array, rows: np.ndarray) -> tuple[np.ndarray, Array]:
+    """The unknowns of some measurements, and their whitened derivatives by these (6 n, m)."""
+    places = model.places[rows]
+    own, at = np.unique(places, return_inverse=True)
+    derivative = np.zeros((len(rows), 6, len(own)))
+    at = at.reshape(len(rows), OWN)
+    for i in range(len(rows)):
+        np.add.at(derivative[i].T, at[i], J[rows[i]].T)
+    return own, derivative.reshape(-1, len(own))
+
+
+def _chosen(model: LinearModel, J: Array, covariance: Array, images: list[np.ndarray]) -> list[float]:
+    """The largest growth of a standard deviation after each image, if each next one is that which tells most.
+
+    The gain log det(1 + J S J') falls as images are added, so an image whose old gain is below another's new one need
+    not be looked at again.
+    """
+    stacked = [_stacked(model, J, rows) for rows in images]
+    whole = np.zeros((len(covariance) + 1,) * 2)
+    for own, derivative in stacked:
+        whole[np.ix_(own, own)] += derivative.T @ derivative
+    final = inverse_of(whole[:-1, :-1])
+    known = np.diagonal(final) > 0.0
+    S = np.pad(final / BEGIN, ((0, 1), (0, 1)))
+    gains = [(-np.inf, i) for i in range(len(stacked))]
+    heapq.heapify(gains)
+    curve = []
+    while gains:
+        while True:
+            _, i = heapq.heappop(gains)
+            own, derivative = stacked[i]
+            gain = np.linalg.slogdet(np.eye(len(derivative)) + derivative @ S[np.ix_(own, own)] @ derivative.T)[1]
+            if not gains or -gain <= gains[0][0]:
+                break
+            heapq.heappush(gains, (-gain, i))
+        spread = S[:, own] @ derivative.T
+        S = S - spread @ np.linalg.solve(np.eye(len(derivative)) + derivative @ spread[own], spread.T)
+        ratio = np.diagonal(S)[:-1][known] / np.diagonal(final)[known]
+        curve.append(float(np.sqrt(ratio.max(initial=1.0)) - 1.0))
+    return curve
+
+
+def _fewer(curve: list[float], growth: float) -> Fewer:
+    enough = next((i + 1 for i, value in enumerate(curve) if value <= growth), len(curve))
+    return Fewer(growth=growth, images=enough)
