@@ -62,6 +62,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/evidence": {
         "report/page/test_written.py": "evidence gathered inputs measured record",
         "evidence/test_seen_cameras.py": "seen seen_in_problem",
+        "evidence/test_linear_model.py": "contribution residuals",
         "pipeline/test_plotted_corners.py": "seen_views",
     },
     "gtsam_rwhec/compat": {
@@ -168,12 +169,14 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/report/page/sections": {
         "report/page/test_seen.py": "seen",
+        "report/page/test_residual_sections.py": "contribution residuals",
         "report/page/test_number_sections.py": (
             "covariance_charts determines inputs pose_tables proof spectrum_chart uncertainty verdict weak_directions"
         ),
     },
     "gtsam_rwhec/report/page": {
         "report/page/test_seen.py": "empty_regions seen_figures",
+        "report/page/test_residual_sections.py": "residual_charts",
         "cli/test_diff.py": "changes_page",
         "report/page/test_figures.py": "figure_files",
         "report/page/test_written.py": "blocks html shown_result",

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from gtsam_rwhec.report.page.blocks import Section
+from gtsam_rwhec.report.page.sections.contribution import contribution_section
 from gtsam_rwhec.report.page.sections.determines import determines_section
 from gtsam_rwhec.report.page.sections.inputs import inputs_section
 from gtsam_rwhec.report.page.sections.proof import proof_section
+from gtsam_rwhec.report.page.sections.residuals import residuals_section
 from gtsam_rwhec.report.page.sections.seen import seen_section
 from gtsam_rwhec.report.page.sections.uncertainty import uncertainty_section
 from gtsam_rwhec.report.page.sections.verdict import verdict_section
@@ -17,7 +19,9 @@ SECTIONS = (
     seen_section,
     determines_section,
     proof_section,
+    residuals_section,
     uncertainty_section,
+    contribution_section,
     inputs_section,
 )
 

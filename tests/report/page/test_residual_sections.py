@@ -1,0 +1,67 @@
+"""The sections of residuals and of what each image contributed: their numbers, words and charts."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from refinement_problems import rig
+from shown_numbers import numbers_of, wrong_numbers
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.evidence.evidence import evidence_json
+from gtsam_rwhec.report.page import Chart, Page, ShownResult, page_html
+from gtsam_rwhec.report.page.residual_charts import image_figure
+from gtsam_rwhec.report.page.sections.contribution import contribution_section
+from gtsam_rwhec.report.page.sections.residuals import residuals_section
+from gtsam_rwhec.results.written_result import calibration_json
+
+
+@pytest.fixture(scope="module")
+def shown() -> ShownResult:
+    problem = rig().problem
+    calibration = rw.calibrate(problem)
+    return ShownResult.of(calibration_json(calibration), rw.evidence.evidence_of(problem, calibration))
+
+
+def test_every_number_is_that_of_the_evidence(shown: ShownResult) -> None:
+    assert shown.evidence is not None
+    page = page_html(Page("A page", "good", (residuals_section(shown), contribution_section(shown)), "by hand"))
+    files = {"result.json": shown.tree, "evidence.json": json.loads(evidence_json(shown.evidence))}
+    assert len(numbers_of(page)) > 100
+    assert list(wrong_numbers(page, files)) == []
+    assert "They are not" not in page
+    assert "as large as the noise that was found" in page
+    assert "could be left out" in page
+
+
+def test_each_question_has_its_chart(shown: ShownResult) -> None:
+    blocks = (*residuals_section(shown).blocks, *contribution_section(shown).blocks)
+    charts = {block.name for block in blocks if isinstance(block, Chart)}
+    assert charts == {
+        "residuals-by-pair",
+        "residuals-by-time",
+        "residuals-by-configuration",
+        "residuals-against-noise",
+        "contribution-curve",
+    }
+
+
+def test_without_evidence_the_sections_say_why(shown: ShownResult) -> None:
+    bare = ShownResult.of(json.dumps(shown.tree).encode(), None)
+    for section in (residuals_section(bare), contribution_section(bare)):
+        assert section.missing == "the result has no evidence.json beside it."
+        assert not section.blocks
+
+
+def test_arrows_over_the_image_point_where_corners_are_off() -> None:
+    from gtsam_rwhec.evidence.seen import SeenCamera
+
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(0.0, 640.0, 400), rng.uniform(0.0, 480.0, 400)
+    camera = SeenCamera(
+        sensor="cam", width=640, height=480, images=4, corners=400, cells=((400,),), share=1.0, rms_px=1.0,
+        noise_px=0.1, at_optimum=True, x=tuple(x), y=tuple(y), dx=tuple(np.full(400, 0.25)), dy=tuple(np.zeros(400)),
+    )  # fmt: skip
+    assert "cam: longest 0.25 px" in image_figure((camera,))
