@@ -18,6 +18,7 @@ from gtsam_rwhec.cli.options import (
     CSV_PANEL,
     FOLDER_OF_CSV,
     LOG_PANEL,
+    WHOLE,
     AnywayOption,
     ImagesOption,
     KappaOption,
@@ -27,8 +28,9 @@ from gtsam_rwhec.cli.options import (
     SensorsOption,
     SigmaOption,
     TargetsOption,
+    VerboseOption,
     WorkersOption,
-    say_exported,
+    exported,
     show,
 )
 from gtsam_rwhec.cli.report import report_path
@@ -41,9 +43,11 @@ Noise = Literal["auto", "given", "estimate"]
 Robust = Literal["auto", "gnc", "none"]
 
 #: Parameters that count for a log; its rig file states the rest.
-OF_LOG = frozenset({"source", "rig", "images", "no_report_images", "workers", "anyway", "force", "output"})
+OF_LOG = frozenset({"source", "verbose", "rig", "images", "no_report_images", "workers", "anyway", "force", "output"})
 #: Parameters that count for a folder of CSV files.
-OF_FOLDER = frozenset({"source", "scale", "sigma", "kappa", "targets", "sensors", "certified_only", "output"})
+OF_FOLDER = frozenset(
+    {"source", "verbose", "scale", "sigma", "kappa", "targets", "sensors", "certified_only", "output"}
+)
 #: Parameters that overrule a choice of ``rw.calibrate``.
 OF_CHOICES = frozenset({"noise", "robust", "carrier_noise_deg", "carrier_noise_mm", "as_read"})
 #: Parameters of the certified solution alone.
@@ -159,8 +163,9 @@ def calibrate(
         Path | None,
         typer.Option("--output", "-o", help="For CSV files: result file (JSON). For a log: folder for all files."),
     ] = None,
+    verbose: VerboseOption = False,
 ) -> ExitStatus:
-    """Calibrate from a log or from a folder of CSV files; print the verdict, what to do, and how far off a point is.
+    """Calibrate from a log or from a folder of CSV files; print the verdict, what to do, and the poses.
 
     A log needs a rig file, which states the sizes of the targets. Its calibration writes clean.mcap, result.json,
     static_tf.launch.py, tf.yaml, rig.urdf.xacro, the cameras for Kalibr, ROS, OpenCV and COLMAP, and plots.
@@ -181,6 +186,7 @@ def calibrate(
             workers=workers,
             anyway=anyway,
             force=force,
+            verbose=verbose,
         )
     if (words := other_than_csv(source)) is not None:
         raise typer.BadParameter(words)
@@ -226,14 +232,16 @@ def calibrate(
             evidence = None if output is None else partial(_evidence, source, problem, calibration, command_of(context))
             report = partial(rw.report.print_calibration, calibration)
             judgement = calibration.judgement
+    written, page = [], None
     try:
         if output is not None:
             write(output)
             page = _write_report(output, None if evidence is None else evidence())
             beside = "" if page is None else f"; report: {shown_path(page)}"
-            say(f"Written to {shown_path(output)}{beside}.", to_errors=True)
+            written.append(f"Written to {shown_path(output)}{beside}.")
+            say(written[0], to_errors=True)
     finally:  # the report is printed even if the file cannot be written
-        report()
+        report(verbose=verbose, lines=rw.report.lines_beside(written), page=page, whole=WHOLE)
     return exit_status(judgement)
 
 
@@ -286,6 +294,7 @@ def calibrate_log(
     workers: int | None,
     anyway: bool = False,
     force: bool = False,
+    verbose: bool = False,
 ) -> ExitStatus:
     """Run all stages and print the report."""
     with StageDisplay() as stage, said_in_the_report():
@@ -304,8 +313,7 @@ def calibrate_log(
             replace=force,
             progress=stage,
         )
-    status = show(calibrated)
     written = [name for name in rw.pipeline.OUTPUTS if (output / name).exists()]
-    say(f"Written to {shown_path(output)}: {', '.join(written)}.", to_errors=True)
-    say_exported(calibrated, anyway=anyway)
-    return status
+    page = output / rw.pipeline.REPORT_FILE if rw.pipeline.REPORT_FILE in written else None
+    messages = [f"Written to {shown_path(output)}: {', '.join(written)}.", *exported(calibrated, anyway=anyway)]
+    return show(calibrated, messages, verbose=verbose, page=page)

@@ -9,7 +9,7 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
-from gtsam_rwhec.cli.options import AnywayOption, say_exported
+from gtsam_rwhec.cli.options import AnywayOption, exported
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
@@ -26,5 +26,6 @@ def export(
     found = rw.pipeline.read_solved(solved)
     if found.judgement.verdict is not rw.Verdict.USE:
         say(str(found.judgement), to_errors=True)
-    say_exported(found, anyway=anyway)
+    for message in exported(found, anyway=anyway):
+        say(message, to_errors=True)
     return exit_status(found.judgement, of_rig=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -84,18 +85,38 @@ AnywayOption = Annotated[
 ]
 
 
-def say_exported(solved: rw.pipeline.Solved, *, anyway: bool) -> None:
-    """Say that files of poses that are not to be used were written, or that they were not."""
+VerboseOption = Annotated[
+    bool,
+    typer.Option(
+        "--verbose", "-v", help="Print everything, and not one screen: choices, corners, residuals, the proof."
+    ),
+]
+#: How the commands' reports say where everything is.
+WHOLE = "--verbose"
+
+
+def exported(solved: rw.pipeline.Solved, *, anyway: bool) -> list[str]:
+    """The message that files of poses that are not to be used were written, or that they were not; or none."""
     if solved.judgement.verdict is not rw.Verdict.DO_NOT_USE:
-        return
+        return []
     names = ", ".join([*rw.export.FILES, *(f"{folder}/" for folder in rw.export.FOLDERS)])
     if anyway:
-        say(f"Written although the poses are not to be used, and marked so in the head: {names}.", to_errors=True)
-    else:
-        say(f"Not written, as the poses are not to be used: {names}. --anyway writes them, marked.", to_errors=True)
+        return [f"Written although the poses are not to be used, and marked so in the head: {names}."]
+    return [f"Not written, as the poses are not to be used: {names}. --anyway writes them, marked."]
 
 
-def show(calibrated: rw.pipeline.Calibrated) -> ExitStatus:
-    """Print the report of a calibrated log; its exit status."""
-    rw.report.print_calibration(calibrated.calibration, log=calibrated.log)
+def show(
+    calibrated: rw.pipeline.Calibrated, messages: Sequence[str], *, verbose: bool, page: Path | None = None
+) -> ExitStatus:
+    """Print the report of a calibrated log, and the command's messages, on one screen; its exit status."""
+    rw.report.print_calibration(
+        calibrated.calibration,
+        log=calibrated.log,
+        verbose=verbose,
+        lines=rw.report.lines_beside(messages),
+        page=page,
+        whole=WHOLE,
+    )
+    for message in messages:
+        say(message, to_errors=True)
     return exit_status(calibrated.judgement, of_rig=True)

@@ -10,25 +10,24 @@ import typer
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import said_in_the_report
-from gtsam_rwhec.cli.options import RigOption, show
+from gtsam_rwhec.cli.options import RigOption, VerboseOption, show
 from gtsam_rwhec.cli.stage_display import StageDisplay
-from gtsam_rwhec.files.terminal_text import say, shown_path
+from gtsam_rwhec.files.terminal_text import shown_path
 
 
 def solve(
     cleaned: Annotated[Path, typer.Argument(help="The log that clean wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for result.json and clean.mcap.")],
     rig: RigOption = None,
+    verbose: VerboseOption = False,
 ) -> ExitStatus:
     """Third stage: find the certified poses, refine them, and print covariances."""
     with StageDisplay() as stage, said_in_the_report():
         calibrated = rw.pipeline.solve_into(
             cleaned, None if rig is None else rw.rig.read_rig(rig), output, progress=stage
         )
-    status = show(calibrated)
-    say(
+    messages = (
         f"Written: {shown_path(output / rw.pipeline.RESULT_FILE)}, {shown_path(output / rw.pipeline.CLEAN_LOG)}.",
-        to_errors=True,
+        f"Next: gtsam-rwhec export {shown_path(output / rw.pipeline.CLEAN_LOG)} -o FOLDER",
     )
-    say(f"Next: gtsam-rwhec export {shown_path(output / rw.pipeline.CLEAN_LOG)} -o FOLDER", to_errors=True)
-    return status
+    return show(calibrated, messages, verbose=verbose)

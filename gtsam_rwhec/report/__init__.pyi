@@ -15,3 +15,4 @@ from .sentences import certificate_sentence as certificate_sentence
 from .solution_report import print_solution as print_solution
 from .printing import report_console as report_console
 from .page.written import write_html as write_html
+from .short_report import lines_beside as lines_beside

@@ -12,9 +12,11 @@ from rich.console import Console
 from gtsam_rwhec.calibration.verdict import Ground, Judgement
 from gtsam_rwhec.files.natural_order import natural_key
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
-from gtsam_rwhec.report.printing import print_heading, print_list
+from gtsam_rwhec.report.printing import print_heading, print_sentence
 from gtsam_rwhec.results.log_history import LogFields
 
+#: A sentence as it is printed, and its style.
+Styled = tuple[str, str]
 #: An estimated size is named if it differs from the stated size by more than this many standard deviations.
 SIZE_SIGMAS = 3.0
 #: A common cause explains the targets' scales if they differ by less than this.
@@ -63,18 +65,22 @@ class Advice:
         """All of them, in order."""
         return (*self.undetermined, *self.cures, *self.doubts)
 
+    @property
+    def items(self) -> tuple[Styled, ...]:
+        """All of them as items of a list, each with its style."""
+        groups = ((self.undetermined, "bold red"), (self.cures, ""), (self.doubts, "bold yellow"))
+        return tuple((f"  - {words}", style) for said, style in groups for words in said)
+
 
 def print_advice(
     console: Console, free: Sequence[FreeDirection], log: LogFields | None = None, judgement: Judgement | None = None
 ) -> None:
     """Print the section "What to do", if there is anything to do that the ``judgement`` above it does not say."""
-    advice = Advice.of(free, log, judgement)
-    if not advice.sentences:
-        return
-    print_heading(console, "What to do")
-    print_list(console, advice.undetermined, "bold red")
-    print_list(console, advice.cures)
-    print_list(console, advice.doubts, "bold yellow")
+    items = Advice.of(free, log, judgement).items
+    if items:
+        print_heading(console, "What to do")
+        for words, style in items:
+            print_sentence(console, words, style)
 
 
 def _not_determined(free: Sequence[FreeDirection]) -> list[str]:

@@ -1,26 +1,42 @@
-"""The report of ``calibrate``: the verdict, what to do, how far off a point is, the choices; then poses and details."""
+"""The report of ``calibrate``: a screen of it, or all: verdict, what to do, points, choices, poses and details."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Console
 
 from gtsam_rwhec.calibration.calibrated import Calibration
-from gtsam_rwhec.report.advice import print_advice
-from gtsam_rwhec.report.covariance_report import print_refined_body
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.report.advice import Advice, print_advice
+from gtsam_rwhec.report.covariance_report import label, print_refined_body, wrong_sentence
 from gtsam_rwhec.report.printing import STYLES, print_heading, print_list, print_sentence, report_console
-from gtsam_rwhec.report.solution_report import print_solution_body
+from gtsam_rwhec.report.short_poses import refined_poses, scales_and_clocks
+from gtsam_rwhec.report.short_report import LINES, ShortReport
+from gtsam_rwhec.report.solution_report import print_solution_body, solved_poses
+from gtsam_rwhec.results.judging import contradicted_names
 from gtsam_rwhec.results.log_history import LogFields
 
 POINTS = (
     "This is the error of the calibration alone, where the sensor typically saw its targets; in Python, "
     "calibration.uncertainty_at(point, frame) tells of any other point."
 )
+#: How to see everything, in Python.
+WHOLE = "print_calibration(calibration, verbose=True)"
 
 
 def print_calibration(
-    calibration: Calibration, console: Console | None = None, *, log: LogFields | None = None
+    calibration: Calibration,
+    console: Console | None = None,
+    *,
+    log: LogFields | None = None,
+    verbose: bool = False,
+    lines: int = LINES,
+    page: Path | None = None,
+    whole: str = WHOLE,
 ) -> None:
-    """Print the verdict, what to do, how far off a point is, the choices with their evidence, poses, and details.
+    """Print a screen with the verdict, what to do, how far off a point is, and the poses; or everything.
 
     Parameters
     ----------
@@ -30,14 +46,49 @@ def print_calibration(
         Where to print; standard output by default.
     log : LogFields, optional
         What became of the measurements, if they come from a log.
+    verbose : bool
+        Print everything: the choices with their evidence, all columns and rows, corners, residuals, the proof.
+    lines : int
+        The lines of the screen. Sentences in a file are not wrapped, and count as on a terminal of 80 columns.
+    page : Path, optional
+        The page with everything, if one was written: the last line names it.
+    whole : str
+        How to see everything here: the last line says it.
     """
     console = report_console() if console is None else console
-    judgement, refined, solution = calibration.judgement, calibration.refined, calibration.solution
-    print_sentence(console, str(judgement), STYLES[judgement.verdict])
+    if verbose:
+        _print_everything(calibration, console, log)
+    else:
+        _short(calibration, log).print(console, lines=lines, page=page, whole=whole)
+
+
+def _short(calibration: Calibration, log: LogFields | None) -> ShortReport:
+    refined, solution = calibration.refined, calibration.solution
+    said = Advice.of(_free(calibration), log, calibration.judgement).items
+    points = tuple(calibration.points.values())
+    notes = tuple((note, "yellow") for note in calibration.notes)
+    if refined is None:
+        poses = () if solution is None else (solved_poses(solution),)
+        return ShortReport(calibration.judgement, said, points, poses, notes)
+    wrong = contradicted_names(refined, log)
+    marked = frozenset(label(name, wrong) for name in wrong)
+    sentences: tuple[tuple[str, str], ...] = ((wrong_sentence(refined, log), "bold"),) if wrong else ()
+    sentences += (*notes, *((words, "") for words in scales_and_clocks(refined)))
+    return ShortReport(calibration.judgement, said, points, refined_poses(refined, wrong, log), sentences, marked)
+
+
+def _free(calibration: Calibration) -> Sequence[FreeDirection]:
+    refined, solution = calibration.refined, calibration.solution
     free = () if refined is None else refined.free_directions
     if not free and solution is not None:
         free = solution.identifiability.free_directions
-    print_advice(console, free, log, judgement)
+    return free
+
+
+def _print_everything(calibration: Calibration, console: Console, log: LogFields | None) -> None:
+    judgement, refined, solution = calibration.judgement, calibration.refined, calibration.solution
+    print_sentence(console, str(judgement), STYLES[judgement.verdict])
+    print_advice(console, _free(calibration), log, judgement)
     points = calibration.points
     if points:
         print_heading(console, "How far off a point is")

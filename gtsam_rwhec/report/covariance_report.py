@@ -83,8 +83,7 @@ def print_refined_body(
     )
     print_tables(console, tables, legend(refined))
     if wrong:
-        counts = "; ".join(map(str, contradicted(refined, log)))
-        print_sentence(console, f"{MARK}: do not use this pose; {counts}.", "bold")
+        print_sentence(console, wrong_sentence(refined, log), "bold")
     for sentence in scale_and_offset_sentences(refined):
         print_sentence(console, sentence)
     if refined.reprojection is None and log is not None:
@@ -108,6 +107,12 @@ def print_refined_body(
     weights_from = "as given" if log is None else _weights_of_log(refined)
     estimated = refined.noise_source == "estimated"
     print_solution_details(console, solution, weights_from, noise_is_estimated=estimated)
+
+
+def wrong_sentence(refined: Refined, log: LogFields | None) -> str:
+    """What the mark beside a frame means, with the counts behind it."""
+    counts = "; ".join(map(str, contradicted(refined, log)))
+    return f"{MARK}: do not use this pose; {counts}."
 
 
 def legend(refined: Refined) -> str:
@@ -237,7 +242,7 @@ def _frame_table(
     rows = {}
     for name in sorted(poses, key=natural_key):
         moved = refined.moved[name]
-        rows[_label(name, wrong)] = (
+        rows[label(name, wrong)] = (
             *pose_cells(refined.X[name] if name in refined.X else refined.Y[name]),
             *(deviation_cells(refined.covariance(name)) if name in refined.names else ("fixed",) * 6),
             f"{moved.translation_mm:.2f}",
@@ -246,7 +251,8 @@ def _frame_table(
     return FrameTable(title, kind, (*POSE_HEADINGS, *DEVIATION_HEADINGS, "moved mm", "moved°"), rows)
 
 
-def _label(name: str, wrong: Collection[str]) -> str:
+def label(name: str, wrong: Collection[str]) -> str:
+    """A frame's name in tables, marked where its pose is not to be used."""
     return f"{name} {MARK}" if name in wrong else name
 
 
@@ -256,7 +262,7 @@ def _relative_table(kind: str, poses: Mapping[str, object], refined: Refined, wr
     rows = {}
     for name in names[1:]:
         pose, covariance = refined.relative(names[0], name)
-        rows[_label(name, wrong)] = (*pose_cells(pose), *deviation_cells(covariance))
+        rows[label(name, wrong)] = (*pose_cells(pose), *deviation_cells(covariance))
     title = f"Other {kind}s in the frame of {names[0]}" if names else ""
     return FrameTable(title, kind, (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows)
 

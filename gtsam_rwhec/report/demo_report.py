@@ -41,11 +41,11 @@ def print_demo(
         Where to print; standard output by default.
     """
     console = report_console() if console is None else console
-    print_heading(console, "Errors that we put into this log, and what was found")
+    print_heading(console, "Errors that we put into this log, and what was found", tight=True)
     print_list(console, hidden_sentences(refined, log, truth))
-    print_heading(console, "How far the answer is from the truth")
+    print_heading(console, "How far the answer is from the truth", tight=True)
     print_tables(console, [truth_table(refined, truth)], LEGEND)
-    print_heading(console, "What to do next")
+    print_heading(console, "What to do next", tight=True)
     steps = (
         f"Look at {folder / 'plots' / 'frames.png'} and the other pictures in that folder. {folder / 'result.json'} "
         "has all numbers.",
@@ -91,4 +91,4 @@ def truth_table(refined: RefinedPoses, truth: DemoTruth) -> FrameTable:
         xi = error_of((refined.Y | refined.X)[name], true)
         inside = "inside" if refined.contains(name, true) else "outside"
         rows[name] = (f"{1e3 * np.linalg.norm(xi[3:]):.2f}", f"{np.degrees(np.linalg.norm(xi[:3])):.3f}", inside)
-    return FrameTable("Found poses and true poses", "frame", ("off mm", "off°", "95 %"), rows)
+    return FrameTable("Found poses and true poses", "frame", ("off mm", "off°", "95 %"), rows, tight=True)

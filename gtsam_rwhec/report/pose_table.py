@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -34,13 +34,20 @@ SPLIT = len(POSE_HEADINGS)
 class FrameTable:
     """Frames with numbers under headings. The table prints itself to any width and never cuts a number or a name.
 
-    It prints one table if that fits; otherwise several tables of six columns each, or a paragraph for each frame.
+    It prints one table if that fits; otherwise several tables of six columns each, or a paragraph for each frame. A
+    ``tight`` one has no empty lines.
     """
 
     title: str
     kind: str
     headings: tuple[str, ...]
     rows: Mapping[str, tuple[str, ...]]
+    tight: bool = False
+
+    def first(self, number: int, marked: Collection[str] = ()) -> FrameTable:
+        """The table with this many rows, in their order: those that are ``marked``, then the first of the others."""
+        names = sorted(self.rows, key=lambda name: name not in marked)[:number]
+        return replace(self, rows={name: cells for name, cells in self.rows.items() if name in names})
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Print the widest layout that fits."""
@@ -59,11 +66,12 @@ class FrameTable:
         for name, cells in self.rows.items():
             numbers = [f"{heading} {cell}" for heading, cell in zip(self.headings, cells, strict=True)]
             yield Text("\n".join(_filled(f"{shown(name)}:", numbers, options.max_width)))
-        yield Text()
+        if not self.tight:
+            yield Text()
 
     def _table(self, columns: slice) -> Table:
         # One space between columns: with short names the table fits 80 columns.
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=not self.tight)
         table.add_column(self.kind, no_wrap=True)
         for heading in self.headings[columns]:
             table.add_column(heading, justify="right", no_wrap=True)

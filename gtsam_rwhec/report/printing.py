@@ -15,6 +15,8 @@ from gtsam_rwhec.solving.solution import Solution
 
 #: Tables in a file have this many columns. Sentences in a file are not wrapped.
 PLAIN_WIDTH = 160
+#: What to do where no noise was stated.
+NO_NOISE = "Look at the residuals, in mm and degrees, before you trust the poses: no noise was stated."
 #: Each verdict has its colour.
 STYLES = {Verdict.USE: "bold green", Verdict.CARE: "bold yellow", Verdict.DO_NOT_USE: "bold red"}
 
@@ -29,15 +31,15 @@ def print_verdict(console: Console, judgement: Judgement, solution: Solution) ->
     """Print whether to use the poses: every report begins with this sentence. Below: whether the noise was stated."""
     print_sentence(console, str(judgement), STYLES[judgement.verdict])
     if solution.is_relative:
-        advice = "Look at the residuals, in mm and degrees, before you trust the poses: no noise was stated."
-        print_sentence(console, advice, STYLES[Verdict.CARE])
+        print_sentence(console, NO_NOISE, STYLES[Verdict.CARE])
 
 
-def print_heading(console: Console, words: str) -> None:
-    """Print the heading of a section."""
+def print_heading(console: Console, words: str, *, tight: bool = False) -> None:
+    """Print the heading of a section; a ``tight`` one has no empty line below it."""
     console.print()
-    console.print(Text(printable(words), style="bold"))
-    console.print()
+    console.print(Text(printable(words), style="bold"), soft_wrap=not console.is_terminal)
+    if not tight:
+        console.print()
 
 
 def print_tables(console: Console, tables: Iterable[FrameTable], legend: str) -> None:

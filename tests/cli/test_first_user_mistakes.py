@@ -307,7 +307,7 @@ def test_one_bad_image_costs_one_image_and_is_named(cell: Path, tmp_path: Path) 
     corrupt(folder / "left" / "image" / "0003.png")
     mirrored(folder / "left" / "image" / "0005.png")
     (tmp_path / "rig.yaml").write_text(CELL, encoding="utf-8")
-    run = ("calibrate", folder, "--rig", tmp_path / "rig.yaml", "-o", tmp_path / "out")
+    run = ("calibrate", folder, "--rig", tmp_path / "rig.yaml", "--verbose", "-o", tmp_path / "out")
     status, said = command(*run)
     assert status == 0, said
     assert "1 images of left could not be used. The first: left/image/0003.png" in said

@@ -106,7 +106,7 @@ TABLES = {
                                ("the quaternions of B are xyzw, and were read as wxyz", "order='xyzw'")),
     "A inverted": (rows(inverse, "A"), (), ("A is inverted", "give A = T_sensorcarrier_targetcarrier")),
     "A in millimetres": (rows(lambda row: row * [1, 1, 1, 1, 1000, 1000, 1000], "A"), (),
-                         ("A", "millimetres", "0.001")),
+                         ("A is in millimetres", "divide the translations of A by 1000")),
     "roles exchanged": (lambda _: None, ("--targets", "cam", "--sensors", "tag"),
                         ("targets and sensors are exchanged", "name the targets as targets")),
 }  # fmt: skip

@@ -66,7 +66,7 @@ def test_stage_by_stage(log: Path, tmp_path: Path) -> None:
         assert sum(isinstance(r, ImageRecord) for r in opened.records(["/cam_left/image"])) == IMAGES
 
     assert "measurements to use" in run("clean", detected, "-o", cleaned).stdout
-    said = run("solve", cleaned, "-o", out).stdout
+    said = run("solve", cleaned, "-o", out, "--verbose").stdout
     assert "Certified globally optimal" in said
     assert sorted(path.name for path in out.iterdir()) == [".written.json", "clean.mcap", "result.json"]
     written = run("export", out / "clean.mcap", "-o", out).stdout.splitlines()

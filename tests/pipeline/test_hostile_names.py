@@ -68,7 +68,7 @@ def folder_of(tmp_path: Path, name: str) -> Path:
 def test_names_of_a_folder_of_csv_files(name: str, tmp_path: Path) -> None:
     folder = folder_of(tmp_path, name)
     (folder / f"{name}.txt").touch()
-    weights = ("--sigma", 0.005, "--kappa", 6565, "--noise", "given", "-o", tmp_path / "result.json")
+    weights = ("--sigma", 0.005, "--kappa", 6565, "--noise", "given", "--verbose", "-o", tmp_path / "result.json")
     text = run("calibrate", folder, *weights, status=0)
     assert (r"tag_\x1b[2J\x1b]0;owned\x07\x1b[1A[bold red]x" if name == FILE_NAMES[0] else "tag_.. [red] -rf") in text
     assert f"tag_{name}" in rw.read_refined(tmp_path / "result.json").X

@@ -14,7 +14,8 @@ import gtsam_rwhec as rw
 
 def printed(calibration: rw.Calibration) -> str:
     stream = io.StringIO()
-    rw.report.print_calibration(calibration, Console(file=stream, width=200, color_system=None, highlight=False))
+    console = Console(file=stream, width=200, color_system=None, highlight=False)
+    rw.report.print_calibration(calibration, console, verbose=True)
     return stream.getvalue()
 
 

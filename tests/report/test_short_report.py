@@ -1,0 +1,156 @@
+"""The short report: one screen at most, whatever there is to say, and what a person must act on is in it."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from refinement_problems import rig
+from rich.console import Console
+from rich.text import Text
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration.task_units import PointUncertainty
+from gtsam_rwhec.calibration.verdict import Finding, Ground
+from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
+from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable
+from gtsam_rwhec.report.short_poses import _with_largest
+from gtsam_rwhec.report.short_report import LINES, PoseTables, ShortReport, lines_beside
+
+WIDTHS = (80, 120)
+
+
+@pytest.fixture(scope="module")
+def calibration() -> rw.Calibration:
+    """A calibration with nothing to say against it."""
+    return rw.calibrate(rig().problem)
+
+
+def console(stream: io.StringIO, width: int, *, terminal: bool = True) -> Console:
+    return Console(file=stream, width=width, force_terminal=terminal, color_system=None, highlight=False)
+
+
+def printed(calibration: rw.Calibration, width: int = 80, **options: object) -> str:
+    stream = io.StringIO()
+    rw.report.print_calibration(calibration, console(stream, width), **options)  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def frames(kind: str, number: int) -> FrameTable:
+    """Many frames, whose rows differ."""
+    rows = {f"{kind}_{i}": tuple(f"{i + j / 8:.4f}" for j in range(12)) for i in range(number)}
+    return FrameTable(f"{kind}s", kind, (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows, tight=True)
+
+
+def large(sensors: int, targets: int, facts: int, advice: int, sentences: int) -> ShortReport:
+    """A report with much to say."""
+    found = [Finding(Ground.CORRELATED, f"fact number {i} of a long list of facts") for i in range(facts)]
+    tables = (frames("sensor", sensors), frames("target", targets))
+    points = tuple(
+        PointUncertainty(
+            np.ones(3), f"sensor_{i}", "hand", 0.95, np.ones(3), np.eye(3), np.eye(3), np.ones(3), 1.0 + i, 0.5
+        )
+        for i in range(sensors)
+    )
+    return ShortReport(
+        judgement=rw.Judgement.of(found, "nothing speaks against them"),
+        advice=tuple(
+            (f"  - Do the thing of number {i}, and what it asks for in many words.", "") for i in range(advice)),
+        points=points,
+        poses=(PoseTables(tables, "±: of all axes."), PoseTables(tuple(map(_with_largest, tables)), "±: the largest.")),
+        sentences=tuple((f"A sentence of number {i}.", "") for i in range(sentences)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize(
+    "size", [(2, 5, 1, 0, 3), (8, 16, 9, 1, 1), (1, 100, 0, 0, 0), (20, 100, 60, 30, 20), (100, 100, 12, 3, 9)]
+)
+def test_it_is_never_longer_than_a_screen(size: tuple[int, int, int, int, int], width: int) -> None:
+    stream = io.StringIO()
+    large(*size).print(console(stream, width), whole="--verbose", page=Path("out/report.html"))
+    lines = stream.getvalue().splitlines()
+    assert len(lines) <= LINES
+    assert max(map(len, lines)) <= width
+    assert lines[-1] == "Everything else: out/report.html, or --verbose."
+    text = " ".join(stream.getvalue().split())
+    if sum(size[:2]) > LINES:  # no line is wasted
+        assert len(lines) == LINES
+        assert " more targets not shown here." in text
+    for count, words in ((size[3], "Do the thing of number "), (size[4], "A sentence of number ")):
+        said = text.count(words)
+        left = count - said
+        assert said == count or f"- and {left} more" in text
+        assert said > 0 or count == 0
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_in_a_file_sentences_count_as_on_a_narrow_terminal(width: int) -> None:
+    stream = io.StringIO()
+    out = console(stream, width, terminal=False)
+    large(8, 30, 9, 1, 1).print(out, whole="--verbose")
+    shown = sum(max(1, len(Text(line).wrap(out, 80))) for line in stream.getvalue().splitlines())
+    assert shown <= LINES
+
+
+def test_the_verdict_is_first_and_whole_and_every_frame_is_there(calibration: rw.Calibration) -> None:
+    for width in WIDTHS:
+        text = printed(calibration, width)
+        assert len(text.splitlines()) <= LINES
+        assert " ".join(text.split()).startswith(str(calibration.judgement))
+        places = [text.index(words) for words in ("How far off a point is", "Sensors in", "Targets in", "Everything")]
+        assert places == sorted(places)
+        for name in (*calibration.X, *calibration.Y):
+            assert f"\n{name} " in text
+        assert text.endswith("Everything else: print_calibration(calibration, verbose=True).\n")
+    deviations = calibration.standard_deviations("sensor0")[1]
+    (row, *_) = [line for line in printed(calibration, 160).splitlines() if line.startswith("sensor0 ")]
+    np.testing.assert_allclose([float(cell) for cell in row.split()[7:10]], deviations, atol=0.0051)
+
+
+def test_of_many_sensors_the_worst_is_named() -> None:
+    stream = io.StringIO()
+    large(9, 3, 0, 0, 0).print(console(stream, 80), whole="--verbose")
+    said = stream.getvalue()
+    assert "  - sensor_8: within 9 mm, 1.73 m away" in said
+    assert "This is the worst of 9 sensors. The other 8: 1 mm to 8 mm." in said
+
+
+def test_one_that_is_not_determined_is_the_worst() -> None:
+    report = large(9, 3, 0, 0, 0)
+    points = (*report.points[:-1], replace(report.points[-1], frame="cam", radius_mm=math.inf))
+    stream = io.StringIO()
+    replace(report, points=points).print(console(stream, 80), whole="--verbose")
+    assert "  - cam: not determined, 1.73 m away" in stream.getvalue()
+
+
+def test_frames_that_are_not_to_be_used_are_among_the_rows() -> None:
+    stream = io.StringIO()
+    replace(large(2, 100, 0, 0, 0), marked=frozenset({"target_93"})).print(console(stream, 80), whole="--verbose")
+    assert "\ntarget_93 " in stream.getvalue()
+    assert "\ntarget_92 " not in stream.getvalue()
+
+
+def test_where_columns_do_not_fit_the_largest_deviation_stands_for_all() -> None:
+    table = FrameTable(
+        "", "", (*POSE_HEADINGS, *DEVIATION_HEADINGS), {"a": (*"123456", "7.1", "9.0", "8.3", "0.1", "free", "0.3")}
+    )
+    assert _with_largest(table).rows == {"a": (*"123456", "9.0", "free")}  # fmt: skip
+
+
+def test_warnings_and_frames_without_covariances_are_said(calibration: rw.Calibration) -> None:
+    text = printed(replace(calibration, notes=("something is odd",), refined=None))
+    assert "something is odd" in text
+    assert "rms mm" in text
+    assert "How far off" not in text
+
+
+def test_what_a_command_says_besides_takes_lines() -> None:
+    out = console(io.StringIO(), 80)
+    assert lines_beside((), out) == LINES
+    assert lines_beside(("short", "word " * 30), out) == LINES - 3
+    assert lines_beside(("word " * 5_000,), out) == LINES // 2
