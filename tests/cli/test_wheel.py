@@ -90,6 +90,7 @@ def test_the_demo_runs_from_it_and_meets_the_truth(unpacked_wheel: Path, tmp_pat
         "clean.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
         "plots/coverage.png", "plots/deviations.png", "plots/frames.png", "plots/residuals.png",
         "plots/intrinsics.png", ".written.json", "seen.png", "cameras.opencv.yaml", "cameras.txt",
+        "report.html", "evidence.json",
         "camera_info/cam_left.yaml", "camera_info/cam_wide.yaml",
     }  # fmt: skip
     check_against_truth(out)
