@@ -166,6 +166,7 @@ TABLE: dict[str, dict[str, str]] = {
         "cli/test_wheel.py": "advice",
         "methods/test_comparison.py": "comparison_report",
         "report/test_solution_report.py": "pose_table printing sentences",
+        "report/test_short_report.py": "short_poses",
     },
     "gtsam_rwhec/report/page/sections": {
         "report/page/test_seen.py": "seen",

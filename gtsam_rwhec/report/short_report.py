@@ -101,7 +101,7 @@ class ShortReport:
         room.take(closing)
         verdict = _cut(room, str(self.judgement), math.floor(VERDICT_SHARE * lines))
         room.take(verdict)
-        all_poses = min((room.lines_of(*poses.tables, poses.legend) + 1 for poses in self.poses), default=0)
+        all_poses = min((_height_of_all(room, poses) for poses in self.poses), default=0)
         poses_need = min(POSE_LINES, all_poses)
         most = max(min(ADVICE_LINES, room.left - poses_need - 2), room.left - all_poses - MOST_POINTS - 2)
         advice = _first(room, self.advice, most - 2)
@@ -221,6 +221,12 @@ def _point(point: PointUncertainty) -> str:
     return f"{said}; noise of one new measurement: {rounded(point.measurement_mm)} mm"
 
 
+def _height_of_all(room: _Room, poses: PoseTables) -> int:
+    """Lines of all rows and what the columns mean; of more rows than lines, as many as rows."""
+    rows = sum(len(table.rows) for table in poses.tables)
+    return rows if rows > room.left else room.lines_of(*poses.tables, poses.legend) + 1
+
+
 def _print_poses(console: Console, room: _Room, choices: Sequence[PoseTables], marked: frozenset[str]) -> None:
     """The poses in the first choice of columns that shows all frames, or most of them."""
 
@@ -234,7 +240,7 @@ def _print_poses(console: Console, room: _Room, choices: Sequence[PoseTables], m
         return room.lines_of(*tables, legend) <= room.left - 1
 
     rows = sum(len(table.rows) for table in choices[0].tables)
-    fitting = [_most(partial(fits, poses), rows) for poses in choices]
+    fitting = [_most(partial(fits, poses), min(rows, room.left)) for poses in choices]
     chosen = choices[int(np.argmax(fitting))]  # the first of those that show most
     rows = max(max(fitting), min(rows, len(chosen.tables)))
     tables, legend = said(chosen, rows)
