@@ -18,7 +18,7 @@ def certificate_sentence(certificate: Certificate, answer: str = "this answer") 
         f"{answer} costs {certificate.cost:.10g}, and {no_answer} can cost less than {certificate.lower_bound:.10g} "
         f"(relative gap {certificate.relative_gap:.1e}; {certificate.path.words})"
     )
-    limits = _limits(certificate)
+    limits = limits_of(certificate)
     if certificate.status is Status.CERTIFIED:
         return f"Certified globally optimal: {proof}.{limits}"
     if certificate.status is Status.CERTIFIED_NOT_UNIQUE:
@@ -28,7 +28,7 @@ def certificate_sentence(certificate: Certificate, answer: str = "this answer") 
     return f"Not certified: {answer} costs {certificate.cost:.10g}; {certificate.reason}."
 
 
-def _limits(certificate: Certificate) -> str:
+def limits_of(certificate: Certificate) -> str:
     """What the bound is not about, in sentences with a blank before each; empty where it is about everything."""
     region, basis = certificate.region, _BASES[certificate.basis]
     said = "" if region is None else f" {str(region)[0].upper()}{str(region)[1:]}."

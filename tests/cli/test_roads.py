@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from gtsam_rwhec.calibration.options import NoiseChoice, RobustChoice
 from gtsam_rwhec.cli import calibrate, convert, options
 from gtsam_rwhec.cli.app import app
+from gtsam_rwhec.cli.roads import command_of
 from gtsam_rwhec.logs.image_folder import Columns
 from gtsam_rwhec.problem import ScaleMode
 from gtsam_rwhec.solver import options as solver_options
@@ -110,3 +112,13 @@ def test_all_refused_options_are_named_at_once() -> None:
     said = " ".join(done.stderr.replace("│", " ").split())
     assert "--images, --workers: only for a log." in said
     assert "--method: only with --certified-only." in said
+
+
+def test_a_report_keeps_the_command_as_it_was_given() -> None:
+    given = ["a folder", "--scale", "shared", "--sigma", "0.01", "--as-read", "-o", "out/result.json"]
+    context = COMMANDS["calibrate"].make_context("calibrate", list(given))
+    command = command_of(context)
+    assert command.startswith("gtsam-rwhec calibrate 'a folder' ")
+    again = COMMANDS["calibrate"].make_context("calibrate", shlex.split(command)[2:])
+    assert again.params == context.params
+    assert "--robust" not in command

@@ -10,6 +10,7 @@ import numpy as np
 from gtsam_rwhec.report.page.blocks import Block, Chart, Folded, Listing, Paragraph, Section, Table, Tone, Words
 from gtsam_rwhec.report.page.sections.spectrum_chart import spectrum_svg
 from gtsam_rwhec.report.page.shown_result import ShownResult
+from gtsam_rwhec.report.sentences import limits_of
 from gtsam_rwhec.solver.cause import Status
 from gtsam_rwhec.solver.certificate import Certificate
 
@@ -34,7 +35,7 @@ def proof_section(shown: ShownResult) -> Section:
         return Section("proof", title, missing="the calibration has no answer.")
     certificate = shown.result.solution.certificate
     words, tone = HEADLINES[certificate.status]
-    blocks: list[Block] = [Paragraph(words, tone)]
+    blocks: list[Block] = [Paragraph(words + limits_of(certificate), tone)]
     sentence = shown.tree["certified"]["certificate"].get("sentence")
     if sentence:
         blocks.append(Paragraph(f"In the result's words: {sentence}."))
