@@ -60,6 +60,7 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_verified_log.py": "verify",
     },
     "gtsam_rwhec/evidence": {
+        "report/page/test_scene.py": "board_shapes scene",
         "report/page/test_written.py": "evidence gathered inputs measured record",
         "evidence/test_seen_cameras.py": "seen seen_in_problem",
         "evidence/test_linear_model.py": "contribution residuals",
@@ -168,7 +169,9 @@ TABLE: dict[str, dict[str, str]] = {
         "report/test_solution_report.py": "pose_table printing sentences",
         "report/test_short_report.py": "short_poses",
     },
+    "gtsam_rwhec/report/page/scene": {"report/page/test_scene.py": "directions layout model still traces"},
     "gtsam_rwhec/report/page/sections": {
+        "report/page/test_scene.py": "scene",
         "report/page/test_seen.py": "seen",
         "report/page/test_residual_sections.py": "contribution residuals",
         "report/page/test_number_sections.py": (

@@ -15,6 +15,7 @@ from gtsam_rwhec.evidence.inputs import Inputs
 from gtsam_rwhec.evidence.proof import Proof
 from gtsam_rwhec.evidence.record import EvidenceRecord
 from gtsam_rwhec.evidence.residuals import ResidualsEvidence
+from gtsam_rwhec.evidence.scene import SceneEvidence
 from gtsam_rwhec.evidence.seen import SeenEvidence
 from gtsam_rwhec.evidence.weak import WeakDirection
 from gtsam_rwhec.files.atomic_write import write_atomically
@@ -37,6 +38,7 @@ class Evidence(EvidenceRecord):
     derived: Derived | None = Field(default=None, description="what follows from poses and covariances")
     proof: Proof | None = Field(default=None, description="gap and spectrum of the certificate")
     weak: tuple[WeakDirection, ...] = Field(default=(), description="least known directions, the worst first")
+    scene: SceneEvidence | None = Field(default=None, description="what is needed to draw the rig in space")
     seen: SeenEvidence | None = Field(default=None, description="detections, removed measurements, corners, images")
     residuals: ResidualsEvidence | None = Field(default=None, description="what is left, and what it says of the noise")
     contribution: ContributionEvidence | None = Field(default=None, description="how much each image told")

@@ -11,6 +11,7 @@ from gtsam_rwhec.evidence.linear_model import LinearModel
 from gtsam_rwhec.evidence.measured import measured_rows
 from gtsam_rwhec.evidence.proof import Proof, proof_of
 from gtsam_rwhec.evidence.residuals import residuals_of
+from gtsam_rwhec.evidence.scene import scene_of_problem
 from gtsam_rwhec.evidence.seen_in_problem import seen_in_problem
 from gtsam_rwhec.evidence.weak import weak_directions
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
@@ -43,6 +44,7 @@ def evidence_of(problem: Problem, calibration: Calibration, inputs: Inputs | Non
         derived=derived_of(calibration),
         proof=_proof(problem, calibration),
         weak=weak_directions(calibration, rows),
+        scene=scene_of_problem(problem, calibration, rows),
         seen=seen_in_problem(problem, calibration.refined, rows, calibration.options.carrier_path),
         residuals=None if model is None else residuals_of(model, calibration),
         contribution=None if model is None else contribution_of(model),

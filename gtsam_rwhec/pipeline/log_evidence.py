@@ -15,6 +15,7 @@ from gtsam_rwhec.evidence.linear_model import LinearModel
 from gtsam_rwhec.evidence.measured import MeasuredRows
 from gtsam_rwhec.evidence.proof import proof_of
 from gtsam_rwhec.evidence.residuals import residuals_of
+from gtsam_rwhec.evidence.scene import SceneEvidence, scene_of
 from gtsam_rwhec.evidence.weak import weak_directions
 from gtsam_rwhec.export import copied_texts
 from gtsam_rwhec.logs import open_log
@@ -53,11 +54,20 @@ def evidence_of_log(
         derived=derived_of(calibrated.calibration),
         proof=proof_of(calibrated.solution, calibrated.problem),
         weak=weak_directions(calibrated.calibration, rows_of_log(calibrated)),
+        scene=_scene(calibrated),
         seen=seen_in_log(calibrated, log_path, pictures),
         residuals=None if model is None else residuals_of(model, calibrated.calibration),
         contribution=None if model is None else contribution_of(model),
         inputs=inputs.with_options(calibrated.calibration.options),
     )
+
+
+def _scene(calibrated: Calibrated) -> SceneEvidence | None:
+    """The rig in space, with its boards as the rig file states them."""
+    rig = calibrated.rig
+    names = rig.carriers.sensors, rig.carriers.targets
+    targets = {target.name: target for target in rig.target_list}
+    return scene_of(calibrated.calibration, rows_of_log(calibrated), names, calibrated.cameras, targets)
 
 
 def rows_of_log(calibrated: Solved) -> dict[Pair, MeasuredRows]:

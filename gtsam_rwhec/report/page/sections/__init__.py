@@ -8,6 +8,7 @@ from gtsam_rwhec.report.page.sections.determines import determines_section
 from gtsam_rwhec.report.page.sections.inputs import inputs_section
 from gtsam_rwhec.report.page.sections.proof import proof_section
 from gtsam_rwhec.report.page.sections.residuals import residuals_section
+from gtsam_rwhec.report.page.sections.scene import scene_section
 from gtsam_rwhec.report.page.sections.seen import seen_section
 from gtsam_rwhec.report.page.sections.uncertainty import uncertainty_section
 from gtsam_rwhec.report.page.sections.verdict import verdict_section
@@ -16,6 +17,7 @@ from gtsam_rwhec.report.page.shown_result import ShownResult
 #: The functions that make them.
 SECTIONS = (
     verdict_section,
+    scene_section,
     seen_section,
     determines_section,
     proof_section,

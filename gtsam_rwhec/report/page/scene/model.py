@@ -1,0 +1,278 @@
+"""What is drawn of a rig, in the axes of the carrier that stands still: frames, boards, views, path, ellipsoids."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.evidence.scene import SceneEvidence
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.report.page.shown_result import ShownResult
+from gtsam_rwhec.report.plots.drawing import round_down
+
+Kind = Literal["carrier", "sensor", "target"]
+#: Axes of frames have at most and at least this share of the scene, and this share of the distance between neighbours.
+AXIS, LEAST_AXIS, OF_NEIGHBOURS = 0.06, 0.02, 0.4
+#: The largest ellipsoid has a half axis of this share of the scene.
+ELLIPSOID = 0.035
+#: An ellipsoid this many times the median one does not set the magnification: it is drawn as a line.
+FAR_LARGER = 20.0
+#: A carrier whose origin is farther away than this many times the spread of all else is left out of sight.
+FAR = 5.0
+#: Boards of unknown size are squares of this share of the scene.
+PLAIN = 0.03
+#: Scenes are at least this wide, metres.
+SMALLEST_M = 1e-3
+#: With more frames than this, targets are points without ellipsoids.
+MANY = 60
+LEVEL = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame in the scene.
+
+    Attributes
+    ----------
+    name : str
+    kind : "carrier", "sensor" or "target"
+    T : (4, 4) array
+        Pose in the scene, metres.
+    words : tuple of str
+        What is known of it, line by line.
+    covariance : (3, 3) array or None
+        Of its position, in the scene's axes, m^2; None where it is not known, or not finite.
+    """
+
+    name: str
+    kind: Kind
+    T: Array
+    words: tuple[str, ...]
+    covariance: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera sees: its place (3,) and the border of its image (n, 3), from the top left corner clockwise."""
+
+    name: str
+    apex: Array
+    rim: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Polygons:
+    """Paper and dark parts of boards, each polygon (n, 3), metres."""
+
+    paper: tuple[Array, ...]
+    dark: tuple[Array, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A rig, or the frames on one of its carriers.
+
+    Attributes
+    ----------
+    world : str
+        The carrier whose axes the scene has.
+    frames : tuple of Frame
+    views : tuple of View
+    boards : Polygons
+    path : (n, 7) array
+        x, y, z, roll, pitch, yaw (degrees) and seconds of the moving carrier; seconds are nan without stamps.
+    moving : str
+        Its name; empty where there is none.
+    low, high : (3,) arrays
+        The box that holds all of it.
+    times : float
+        Ellipsoids are drawn so many times as large.
+    radius : float
+        Deviations to the border of an ellipsoid of `LEVEL`.
+    out_of_sight : tuple of str
+        Carriers whose origins are too far away.
+    """
+
+    world: str
+    frames: tuple[Frame, ...]
+    views: tuple[View, ...]
+    boards: Polygons
+    path: Array
+    moving: str
+    low: Array
+    high: Array
+    times: float
+    radius: float
+    out_of_sight: tuple[str, ...]
+
+    @property
+    def extent(self) -> float:
+        """The longest side of the box, metres."""
+        return float((self.high - self.low).max())
+
+    @property
+    def axis_m(self) -> float:
+        """Length of the frames' axes."""
+        places = np.array([frame.T[:3, 3] for frame in self.frames if frame.kind != "carrier"]).reshape(-1, 3)
+        apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(len(places), np.inf))
+        nearest = apart.min(axis=1) if len(places) > 1 else np.array([self.extent])
+        return float(np.clip(OF_NEIGHBOURS * np.median(nearest), LEAST_AXIS * self.extent, AXIS * self.extent))
+
+    @property
+    def ellipsoids(self) -> dict[str, Array]:
+        """The shape matrix (3, 3) of each ellipsoid that is drawn, as large as it is drawn: a a' of its half axes."""
+        factor = (self.times * self.radius) ** 2
+        many = len(self.frames) > MANY
+        known = {f.name: f for f in self.frames if f.covariance is not None and not (many and f.kind == "target")}
+        shapes = {name: factor * frame.covariance for name, frame in known.items() if frame.covariance is not None}
+        return {name: shape for name, shape in shapes.items() if np.linalg.norm(shape, 2) ** 0.5 <= 0.5 * self.extent}
+
+
+def scene_of_rig(shown: ShownResult, evidence: SceneEvidence) -> Scene:
+    """Both carriers, the moving one at its typical pose."""
+    typical = _pose(evidence.poses[evidence.typical])
+    stands = evidence.standing == "targets"
+    placed = {"targets": np.eye(4) if stands else typical, "sensors": typical if stands else np.eye(4)}
+    world, moving = (carrier(shown, kind) for kind in (("targets", "sensors") if stands else ("sensors", "targets")))
+    rpy = np.degrees([gtsam.Rot3.Quaternion(*row[3:]).rpy() for row in evidence.poses])
+    seconds = evidence.seconds or (np.nan,) * len(evidence.poses)
+    path = np.column_stack([np.array(evidence.poses)[:, :3], rpy, seconds])
+    return _scene(shown, evidence, placed, world, path, moving)
+
+
+def scene_of_carrier(shown: ShownResult, kind: Literal["sensors", "targets"]) -> Scene:
+    """The frames on one carrier, in its axes: all that a result alone tells."""
+    return _scene(shown, None, {kind: np.eye(4)}, carrier(shown, kind), np.zeros((0, 7)), "")
+
+
+def carrier(shown: ShownResult, kind: str) -> str:
+    """The name of the carrier of the sensors, or of the targets."""
+    rows = shown.tree.get(kind, [])
+    return str(rows[0]["parent"]) if rows else f"the carrier of the {kind}"
+
+
+def _scene(
+    shown: ShownResult,
+    evidence: SceneEvidence | None,
+    placed: Mapping[str, Array],
+    world: str,
+    path: Array,
+    moving: str,
+) -> Scene:
+    assert shown.result is not None
+    refined = shown.result.refined
+    frames = [
+        frame for kind, T in placed.items() for frame in _frames(shown, "sensor" if kind == "sensors" else "target", T)
+    ]
+    origins = [Frame(carrier(shown, kind), "carrier", T, _words(T, world)) for kind, T in placed.items()]
+    views = () if evidence is None else tuple(_views(frames, evidence))
+    extent = np.concatenate([path[:, :3], *(f.T[None, :3, 3] for f in frames), *(v.rim for v in views)])
+    near = [f for f in origins if f.name != world or _is_near(f.T[:3, 3], extent)]
+    extent = np.concatenate([extent, *(f.T[None, :3, 3] for f in near)])
+    size = max(float(np.ptp(extent, axis=0).max()), SMALLEST_M)
+    boards = _boards(frames, evidence, PLAIN * size)
+    extent = np.concatenate([extent, *boards.paper, *boards.dark])
+    low, high = extent.min(axis=0), extent.max(axis=0)
+    margin = 0.04 * max(float((high - low).max()), SMALLEST_M)
+    radius = float(np.sqrt(7.814727903251179 if refined is None else refined.squared_radius(3, LEVEL)))
+    return Scene(
+        world=world,
+        frames=(*near, *frames),
+        views=views,
+        boards=boards,
+        path=path,
+        moving=moving,
+        low=low - margin,
+        high=high + margin,
+        times=_magnification(frames, radius, float((high - low).max())),
+        radius=radius,
+        out_of_sight=tuple(f.name for f in origins if f not in near),
+    )
+
+
+def _frames(shown: ShownResult, kind: Literal["sensor", "target"], placed: Array) -> Iterator[Frame]:
+    """The frames on a carrier that is placed in the scene."""
+    parts = shown.tree.get("refined", {}).get("frames", {})
+    for row in shown.tree[f"{kind}s"]:
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = row["rotation_matrix"], row["translation_m"]
+        name, known = row["child"], parts.get(row["child"])
+        words, covariance = list(_words(T, row["parent"])), None
+        if known is not None:
+            words.append(_deviations(known))
+            block = np.array([line[3:] for line in known["covariance"][3:]], dtype=float)
+            if np.isfinite(block).all():
+                R = (placed @ T)[:3, :3]
+                covariance = R @ block @ R.T
+        if row.get("contradicted"):
+            words.append("its own measurements contradict this pose")
+        yield Frame(name, kind, placed @ T, tuple(words), covariance)
+
+
+def _deviations(known: Mapping[str, list[float | None]]) -> str:
+    """Standard deviations of a frame in words."""
+    mm, deg = (
+        ", ".join("free" if value is None else f"{value:.2g}" for value in known[f"standard_deviations_{unit}"])
+        for unit in ("mm", "deg")
+    )
+    return f"± {mm} mm, ± {deg}° (1 σ, own axes)"
+
+
+def _words(T: Array, parent: str) -> tuple[str, ...]:
+    """A pose in words."""
+    x, y, z = T[:3, 3]
+    roll, pitch, yaw = np.degrees(gtsam.Rot3(T[:3, :3]).rpy())
+    return f"in {parent}: {x:.4f}, {y:.4f}, {z:.4f} m", f"roll {roll:.2f}°, pitch {pitch:.2f}°, yaw {yaw:.2f}°"
+
+
+def _views(frames: list[Frame], evidence: SceneEvidence) -> Iterator[View]:
+    """Cameras' views, as far as the typical distance of what they saw."""
+    for frame in frames:
+        seen = evidence.sensors.get(frame.name) if frame.kind == "sensor" else None
+        if seen is None or not seen.rim or seen.distance_m is None:
+            continue
+        rim = seen.distance_m[1] * np.array(seen.rim) @ frame.T[:3, :3].T + frame.T[:3, 3]
+        yield View(frame.name, frame.T[:3, 3], rim)
+
+
+def _boards(frames: list[Frame], evidence: SceneEvidence | None, plain: float) -> Polygons:
+    """The boards in the scene; one of unknown shape is a plain square."""
+    paper, dark = [], []
+    square = plain * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+    for frame in frames:
+        if frame.kind != "target":
+            continue
+        target = None if evidence is None else evidence.targets.get(frame.name)
+        board = None if target is None else target.board
+        R, t = frame.T[:3, :3], frame.T[:3, 3]
+        if board is None:
+            paper.append(square @ R.T + t)
+            continue
+        paper += [np.array(board.paper) @ R.T + t] if board.paper else []
+        dark += [np.array(polygon) @ R.T + t for polygon in board.dark]
+    return Polygons(tuple(paper), tuple(dark))
+
+
+def _is_near(place: Array, others: Array) -> bool:
+    spread = max(float(np.ptp(others, axis=0).max()), SMALLEST_M)
+    return bool(np.linalg.norm(place - others.mean(axis=0)) <= FAR * spread)
+
+
+def _magnification(frames: list[Frame], radius: float, extent: float) -> float:
+    """One factor for all ellipsoids, with which the largest can be seen: 1, 2 or 5 times a power of ten."""
+    half = [radius * float(np.linalg.norm(f.covariance, 2)) ** 0.5 for f in frames if f.covariance is not None]
+    half = [each for each in half if each > 0.0]
+    if not half:
+        return 1.0
+    largest = max(each for each in half if each <= FAR_LARGER * float(np.median(half)))
+    return max(round_down(ELLIPSOID * extent / largest), 1.0)
+
+
+def _pose(row: tuple[float, ...]) -> Array:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = gtsam.Rot3.Quaternion(*row[3:]).matrix(), row[:3]
+    return T

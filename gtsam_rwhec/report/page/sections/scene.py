@@ -1,0 +1,191 @@
+"""Section 2: the rig in space, and in numbers where its frames are and from where they were seen."""
+
+from __future__ import annotations
+
+from gtsam_rwhec.report.page.blocks import Block, Drawing, Listing, Paragraph, Section, Table, Words
+from gtsam_rwhec.report.page.scene.directions import Line, lines_of
+from gtsam_rwhec.report.page.scene.layout import layout_of
+from gtsam_rwhec.report.page.scene.model import MANY, Scene, carrier, scene_of_carrier, scene_of_rig
+from gtsam_rwhec.report.page.scene.still import still_of
+from gtsam_rwhec.report.page.scene.traces import traces_of
+from gtsam_rwhec.report.page.shown_result import ShownResult
+
+TITLE = "The rig in 3D"
+WITHOUT_PATH = (
+    "Not shown: how the two carriers stand to each other, boards, views and path, for the result has no evidence.json "
+    "beside it with measurements. Each carrier is drawn alone."
+)
+#: A target is said to be farther off the axis by the poses than as measured above this, degrees.
+OFF_DEG = 5.0
+
+
+def scene_section(shown: ShownResult) -> Section:
+    """The drawing, the directions in it as a list, and what it shows in numbers."""
+    if shown.result is None:
+        return Section("scene", TITLE, missing="the calibration has no answer, and so no poses to draw.")
+    evidence = None if shown.evidence is None else shown.evidence.scene
+    blocks: list[Block] = []
+    if evidence is not None:
+        scene = scene_of_rig(shown, evidence)
+        lines = lines_of(shown, scene)
+        blocks += [_drawing("rig", "The rig", scene, lines, _about_rig(shown, scene)), *_list_of(lines)]
+        blocks += _facts(shown)
+        return Section("scene", TITLE, tuple(blocks))
+    for kind in ("targets", "sensors"):
+        if not shown.tree[kind]:
+            continue
+        scene = scene_of_carrier(shown, kind)
+        lines = lines_of(shown, scene)
+        says = (
+            f"{_count(len(shown.tree[kind]), kind[:-1])} on {scene.world}, in its axes. {_of_ellipsoids(scene, lines)}"
+        )
+        blocks += [_drawing(kind, f"The {kind}", scene, lines, says), *_list_of(lines)]
+    return Section("scene", TITLE, (*blocks, Paragraph(WITHOUT_PATH, "note"), *_heights(shown)))
+
+
+def _drawing(name: str, title: str, scene: Scene, lines: tuple[Line, ...], says: str) -> Drawing:
+    traces = traces_of(scene, lines)
+    return Drawing(f"scene-{name}", title, says, traces, layout_of(scene, traces), still_of(scene, lines))
+
+
+def _about_rig(shown: ShownResult, scene: Scene) -> str:
+    """What is drawn, and how."""
+    assert shown.evidence is not None
+    evidence = shown.evidence.scene
+    assert evidence is not None
+    poses = f"its path in {evidence.of} poses"
+    if evidence.of > len(evidence.poses):
+        poses += f", of which {len(evidence.poses)} are drawn"
+    stands = f"{scene.world} stands still here" + ("" if evidence.why.startswith("by") else f" ({evidence.why})")
+    says = f"{stands}; {scene.moving} is at the typical one of its poses, with {poses}. "
+    if scene.views:
+        says += "Cameras' views reach as far as the typical distance of what they saw. "
+    without = [one for one in evidence.targets.values() if one.board is None]
+    if without:
+        says += "Squares stand for targets whose shape the result's inputs do not state. "
+    return says + _of_ellipsoids(scene, lines_of(shown, scene))
+
+
+def _of_ellipsoids(scene: Scene, lines: tuple[Line, ...]) -> str:
+    says = []
+    if scene.ellipsoids:
+        larger = f"all drawn {scene.times:,.0f} times as large" if scene.times > 1.0 else "drawn to scale"
+        says.append(f"Ellipsoids hold the true position with 95 % probability, {larger}.")
+    else:
+        says.append("There are no covariances, and so no ellipsoids.")
+    if any(line.is_free for line in lines):
+        says.append("Dashed lines: directions that the measurements leave free.")
+    if any(not line.is_free for line in lines):
+        says.append("Solid purple lines: directions known far less well than the others.")
+    if len(scene.frames) > MANY:
+        says.append(f"Of more than {MANY} frames, targets are drawn without axes and ellipsoids.")
+    if scene.out_of_sight:
+        says.append(f"The origin of {', '.join(scene.out_of_sight)} is too far away to be in sight.")
+    return " ".join(says)
+
+
+def _list_of(lines: tuple[Line, ...]) -> list[Block]:
+    """Each direction once, with its label in the drawing."""
+    said = {line.label: f"{line.label}: {line.words}" for line in lines}
+    return [Listing(tuple(said.values()))] if said else []
+
+
+def _facts(shown: ShownResult) -> list[Block]:
+    """Where sensors saw their targets, and where targets are, in numbers."""
+    assert shown.evidence is not None
+    evidence = shown.evidence.scene
+    assert evidence is not None
+    rows: list[tuple[Words, ...]] = []
+    for name, seen in evidence.sensors.items():
+        if seen.distance_m is None or seen.off_axis_deg is None or seen.off_axis_by_poses_deg is None:
+            continue
+        at = ("scene", "sensors", name)
+        rows.append(
+            (
+                name,
+                shown.evident(*at, "measurements", spec=".0f"),
+                *(shown.evident(*at, "distance_m", i, spec=".2f") for i in range(3)),
+                *(shown.evident(*at, "off_axis_deg", i, spec=".1f") for i in range(2)),
+                *(shown.evident(*at, "off_axis_by_poses_deg", i, spec=".1f") for i in range(2)),
+                shown.evident(*at, "behind", spec=".0f"),
+            )
+        )
+    table = Table(
+        "Where each sensor saw its targets",
+        (
+            "sensor",
+            "seen",
+            "nearest m",
+            "median m",
+            "farthest m",
+            "off axis, median°",
+            "largest°",
+            "by the poses, median°",
+            "largest°",
+            "behind",
+        ),
+        tuple(rows),
+        "Off axis: the angle between the sensor's z axis, which is a camera's optical axis, and the target's origin, "
+        "as measured, and as the calibrated poses have it. Behind: targets measured at z below 0.",
+    )
+    return [*([table] if rows else []), *_turned_away(shown), *_heights(shown)]
+
+
+def _turned_away(shown: ShownResult) -> list[Block]:
+    """Sensors for which the poses have targets elsewhere than the measurements."""
+    assert shown.evidence is not None
+    evidence = shown.evidence.scene
+    assert evidence is not None
+    said: list[Words] = []
+    for name, seen in evidence.sensors.items():
+        if seen.off_axis_deg is None or seen.off_axis_by_poses_deg is None:
+            continue
+        at = ("scene", "sensors", name)
+        if seen.off_axis_by_poses_deg[1] > seen.off_axis_deg[1] + OFF_DEG:
+            said.append(
+                (
+                    f"By the poses, targets that {name} saw are up to ",
+                    shown.evident(*at, "off_axis_by_poses_deg", 1, spec=".0f"),
+                    "° off its z axis; as measured, at most ",
+                    shown.evident(*at, "off_axis_deg", 1, spec=".0f"),
+                    "°.",
+                )
+            )
+    return [Listing(tuple(said))] if said else []
+
+
+def _heights(shown: ShownResult) -> list[Block]:
+    """Height and tilt of each target on its carrier."""
+    rows = shown.tree["targets"]
+    if not rows:
+        return []
+    where = carrier(shown, "targets")
+    evidence = None if shown.evidence is None else shown.evidence.scene
+    found: list[tuple[Words, ...]] = []
+    for i, row in enumerate(rows):
+        name = row["child"]
+        cells: list[Words] = [name]
+        cells += [shown.number("targets", i, "translation_m", k, spec=".3f") for k in range(2)]
+        cells.append(shown.number("targets", i, "translation_m", 2, times=1e3, spec=".1f"))
+        seen = None if evidence is None else evidence.targets.get(name)
+        if evidence is not None:
+            at = ("scene", "targets", name)
+            cells.append("-" if seen is None else shown.evident(*at, "tilt_deg", spec=".1f"))
+            has_view = seen is not None and seen.oblique_deg is not None
+            cells += [shown.evident(*at, "oblique_deg", k, spec=".0f") if has_view else "-" for k in range(2)]
+            cells.append("not known" if seen is None or seen.board is None else seen.board.words)
+        found.append(tuple(cells))
+    more = () if evidence is None else ("tilt°", "seen from, median°", "largest°", "what it is")
+    legend = f"Above: along the z axis of {where}."
+    if evidence is not None:
+        legend += (
+            f" Tilt: the angle between the target's z axis and that of {where}. Seen "
+            "from: the angle between the target's z axis and the direction to the sensor, by the poses; near "
+            "180° for detectors whose z axis goes into the paper."
+        )
+    title = f"Where the targets are on {where}"
+    return [Table(title, ("target", "x m", "y m", "above mm", *more), tuple(found), legend)]
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"
