@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 
 from gtsam_rwhec.cleaning.removed import RemovalReason
-from gtsam_rwhec.errors import ImageError, LogError
+from gtsam_rwhec.errors import ImageError, LogError, LogWarning
 from gtsam_rwhec.evidence.seen import PIECES, RemovedCount, SeenEvidence, WorstImage
 from gtsam_rwhec.evidence.seen_cameras import RatedView, rated_views, seen_cameras, worst_image, worst_views
 from gtsam_rwhec.evidence.seen_tracks import counts_of, removed_list, span_of, tracks_of
@@ -110,7 +111,8 @@ def images_of(
     if pictures is None or not pictures.logs:
         return {}, {}, "the recorded log is not known any more."
     try:
-        with open_log(list(pictures.logs)) as log:
+        # What is damaged in the log was said when it was read for its detections.
+        with warnings.catch_warnings(action="ignore", category=LogWarning), open_log(list(pictures.logs)) as log:
             names = image_names(log)
             found, why_not = _wanted_images(log, rig, wanted) if pictures.may_show else ({}, WITHOUT)
     except LogError as error:

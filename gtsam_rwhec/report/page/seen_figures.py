@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 #: Ticks and corners: Okabe and Ito's blue, a little lighter, to be seen on dark as well as on light.
 USED = "#2C8CC9"
-#: Signs of what was removed, by stage, in this order.
-SIGNS = (("x", VERMILLION), ("^", ORANGE), ("s", PURPLE))
+#: Signs of what was removed, by stage.
+SIGNS = {"detection": ("^", ORANGE), "cleaning": ("x", VERMILLION), "robust estimation": ("s", PURPLE)}
+OTHER = ("+", GREY)
 #: Half the height of a tick of a used measurement, and how far above its row the signs stand, rows.
 TICK, ABOVE = 0.28, 0.36
 #: So many cameras are drawn, in so many columns, each at most so high as wide.
@@ -36,7 +37,7 @@ LONGEST = 26
 def detections_figure(seen: SeenEvidence) -> SvgFigure:
     """A row for each pair, or sensor: a tick where a measurement is used, a sign where it was removed."""
     stages = sorted({stage for track in seen.tracks for stage in track.removed_at})
-    signs = dict(zip(stages, SIGNS, strict=False))
+    signs = {stage: SIGNS.get(stage, OTHER) for stage in [*SIGNS, *stages] if stage in stages}
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
@@ -81,7 +82,7 @@ def _draw_track(axes: Axes, row: int, track: SeenTrack, step: float, signs: dict
     areas = list(zip(step * first[wide], step * (last - first + 1)[wide], strict=True))
     axes.broken_barh(areas, (row - TICK, 2.0 * TICK), facecolor=USED, lw=0.0)
     for stage, pieces in track.removed_at.items():
-        marker, colour = signs.get(stage, ("+", GREY))
+        marker, colour = signs[stage]
         at = np.array(pieces)[:, 0]
         if len(at) > MOST_SIGNS:
             at = np.unique(at // TOGETHER) * TOGETHER + TOGETHER // 2

@@ -119,7 +119,7 @@ def test_without_evidence_or_corners_it_is_said(result: bytes) -> None:
     assert not section.missing
     assert "have no corners" in page
     assert "Not shown: the contact sheet. Why: there were none." in page
-    assert "in which they were given" in page
+    assert "in which it was given" in page
 
 
 def test_a_problem_without_images_has_its_measurements_in_the_figure(result: bytes) -> None:

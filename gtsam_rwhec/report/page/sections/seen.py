@@ -80,7 +80,7 @@ def _detections(seen: SeenEvidence) -> Iterator[Block]:
     piece = (
         f"one tick stands for all within {seen.span_s / PIECES:.2g} s"
         if seen.span_s
-        else "there are no stamps, so they stand in the order in which they were given"
+        else "there are no stamps, so each pair stands in the order in which it was given, from its first to its last"
     )
     yield Chart(
         "detections",
