@@ -15,7 +15,7 @@ from gtsam_rwhec.evidence.linear_model import OWN, LinearModel, inverse_of
 from gtsam_rwhec.evidence.record import EvidenceRecord, Row
 from gtsam_rwhec.geometry.poses import Array
 
-#: Of more images the choice is among every so-many-th.
+#: More images are chosen in bundles of neighbours.
 MOST_CHOSEN_FROM = 250
 #: The choice begins with this share of all information, so that every direction has a finite deviation.
 BEGIN = 1e-6
@@ -43,7 +43,7 @@ class Fewer(EvidenceRecord):
     """How many images tell nearly as much as all."""
 
     growth: float = Field(description="no standard deviation is larger by more than this share")
-    images: int = Field(description="so many images are enough, if they are chosen well", ge=0)
+    bundles: int = Field(description="so many bundles of images are enough, if they are chosen well", ge=0)
 
 
 class ContributionEvidence(EvidenceRecord):
@@ -51,12 +51,13 @@ class ContributionEvidence(EvidenceRecord):
 
     has_stamps: bool = Field(description="whether an image is known by its stamp; else each measurement is one")
     images: int = Field(description="in the answer", ge=0)
-    chosen_from: int = Field(description="images among which the choice was", ge=0)
+    bundle: int = Field(description="images are chosen in bundles of so many neighbours", ge=1)
+    bundles: int = Field(description="bundles among which the choice was", ge=0)
     important: tuple[ImageContribution, ...] = Field(description="those that tell most, the first most of all")
     influential: tuple[ImageContribution, ...] = Field(description="those without which the answer moves most")
     shares: Row = Field(description="of all images, the largest first")
     fewer: tuple[Fewer, ...] = Field(description="how many images are enough")
-    curve: Row = Field(description="the largest growth of a standard deviation with the first 1, 2, ... chosen images")
+    curve: Row = Field(description="the largest growth of a standard deviation with the first 1, 2, ... chosen bundles")
 
 
 def contribution_of(model: LinearModel) -> ContributionEvidence | None:
@@ -75,12 +76,14 @@ def contribution_of(model: LinearModel) -> ContributionEvidence | None:
     found = [_image(model, r, J, padded, blocks, rows) for rows in images]
     by_share = sorted(found, key=lambda one: -one.share)
     by_move = sorted(found, key=lambda one: -one.moved)
-    every = -(-len(images) // MOST_CHOSEN_FROM)
-    curve = _chosen(model, J, covariance, images[::every])
+    each = -(-len(images) // MOST_CHOSEN_FROM)
+    bundles = [np.concatenate(images[i : i + each]) for i in range(0, len(images), each)]
+    curve = _chosen(model, J, covariance, bundles)
     return ContributionEvidence(
         has_stamps=model.stamps_ns is not None,
         images=len(images),
-        chosen_from=len(images[::every]),
+        bundle=each,
+        bundles=len(bundles),
         important=tuple(by_share[:LISTED]),
         influential=tuple(by_move[:LISTED]),
         shares=tuple(float(f"{one.share:.6g}") for one in by_share[:1000]),
@@ -180,4 +183,4 @@ def _chosen(model: LinearModel, J: Array, covariance: Array, images: list[np.nda
 
 def _fewer(curve: list[float], growth: float) -> Fewer:
     enough = next((i + 1 for i, value in enumerate(curve) if value <= growth), len(curve))
-    return Fewer(growth=growth, images=enough)
+    return Fewer(growth=growth, bundles=enough)

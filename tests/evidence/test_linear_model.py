@@ -63,7 +63,7 @@ def test_shares_add_up_to_one_and_curves_fall(calibrated: tuple[rw.Calibration, 
     assert list(found.shares) == sorted(found.shares, reverse=True)
     assert (np.diff(found.curve) <= 1e-9).all()
     assert found.curve[-1] == pytest.approx(0.0, abs=1e-3)
-    assert [one.images for one in found.fewer] == sorted((one.images for one in found.fewer), reverse=True)
+    assert [one.bundles for one in found.fewer] == sorted((one.bundles for one in found.fewer), reverse=True)
 
 
 def test_what_an_image_moves_is_what_a_refit_without_it_moves(

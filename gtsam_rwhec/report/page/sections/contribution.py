@@ -57,14 +57,13 @@ def _fewer(shown: ShownResult, found: ContributionEvidence, what: str) -> Iterat
     at = ("contribution", "fewer")
     for i, one in enumerate(found.fewer):
         if one.growth == 0.1:
-            of = "" if found.chosen_from == found.images else ", every so-many-th of the whole"
+            of = what if found.bundle == 1 else f"bundles of {found.bundle} {what}"
             yield Paragraph(
                 (
-                    shown.evident(*at, i, "images", spec=".0f"),
+                    shown.evident(*at, i, "bundles", spec=".0f"),
                     " of ",
-                    shown.evident("contribution", "chosen_from", spec=".0f"),
-                    f" {what}{of}, chosen well, tell nearly as much as all: no standard deviation is larger by more "
-                    "than ",
+                    shown.evident("contribution", "bundles", spec=".0f"),
+                    f" {of}, chosen well, tell nearly as much as all: no standard deviation is larger by more than ",
                     shown.evident(*at, i, "growth", times=100.0, spec=".0f"),
                     " %. The others could be left out.",
                 ),
@@ -73,16 +72,17 @@ def _fewer(shown: ShownResult, found: ContributionEvidence, what: str) -> Iterat
     rows = tuple(
         (
             (shown.evident(*at, i, "growth", times=100.0, spec=".0f"), " %"),
-            shown.evident(*at, i, "images", spec=".0f"),
+            shown.evident(*at, i, "bundles", spec=".0f"),
         )
         for i in range(len(found.fewer))
     )
-    yield Table(f"How many {what} are enough", ("no deviation larger by", f"{what} needed"), rows)
+    chosen = what if found.bundle == 1 else "bundles"
+    yield Table(f"How many {chosen} are enough", ("no deviation larger by", f"{chosen} needed"), rows)
     yield Chart(
         "contribution-curve",
-        f"With fewer {what}",
-        f"The largest growth of a standard deviation, if {what} are added in the best order found.",
-        _curve(found, what),
+        f"With fewer {chosen}",
+        f"The largest growth of a standard deviation, if {chosen} are added in the best order found.",
+        _curve(found, chosen),
     )
 
 
@@ -93,10 +93,10 @@ def _curve(found: ContributionEvidence, what: str) -> SvgFigure:
         at = np.arange(1, len(growth) + 1)
         low = growth <= 200.0
         axes.plot(at[low], growth[low], color=BLUE, lw=2)
-        axes.set_xlabel(f"{what} used, of {found.chosen_from}")
+        axes.set_xlabel(f"{what} used, of {found.bundles}")
         axes.set_ylabel("worst deviation larger by (%)")
         axes.set_ylim(0.0, 200.0)
-        axes.set_xlim(0.0, found.chosen_from)
+        axes.set_xlim(0.0, found.bundles)
 
     return svg_figure(draw, 2.8)
 

@@ -182,7 +182,7 @@ def _neighbours(shown: ShownResult, found: ResidualsEvidence) -> Iterator[Block]
     if judged:
         words.append(
             f"In {beyond} of {judged} pairs a residual is like the one before it by more than chance allows in 95 %: "
-            f"of {judged} pairs about {0.05 * judged:.0f} are by chance."
+            f"of {judged} pairs about {0.05 * judged:.1f} are so by chance."
         )
     if found.instants is None or found.worth is None:
         yield Paragraph((*words, " No model of all noise was made, so what the data are worth is not known."), "plain")
