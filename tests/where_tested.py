@@ -95,6 +95,7 @@ TABLE: dict[str, dict[str, str]] = {
         "handeye/test_optimal.py": "proof saddle",
         "handeye/test_prior.py": "linear_prior",
         "handeye/test_refusals.py": "request",
+        "methods/test_chained.py": "on_pairs",
     },
     "gtsam_rwhec/identifiability": {"identifiability/test_identification.py": "threshold verdicts"},
     "gtsam_rwhec/logs": {

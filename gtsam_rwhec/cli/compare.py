@@ -38,7 +38,10 @@ def compare(
     seed: Annotated[int, typer.Option(help="Seed for methods that draw random numbers.")] = 0,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File for all results (JSON).")] = None,
 ) -> ExitStatus:
-    """Solve with every published method that applies; print the cost, gap, residuals and time of each."""
+    """Solve with every published method that applies; print the cost, gap, residuals and time of each.
+
+    Methods for one target and one sensor run on each pair of the best tree, as people do by hand.
+    """
     check_output(output)
     with StageDisplay() as stage, warnings.catch_warnings():
         stage(f"reading {folder}")
@@ -48,6 +51,7 @@ def compare(
             problem,
             rw.methods.MethodOptions(seed=seed),
             methods=method,
+            pair_solvers=rw.handeye.PAIR_SOLVERS if method is None else None,
             progress=lambda name: stage(f"solving by {name}"),
         )
     try:

@@ -13,6 +13,8 @@ from .method import Properties as Properties
 from .method import Takes as Takes
 
 # All that apply, side by side.
+from .chained import Chained as Chained
+from .chained import PairSolver as PairSolver
 from .comparison import Compared as Compared
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from gtsam_rwhec.errors import OptionError, RwhecError
+from gtsam_rwhec.errors import FrameError, OptionError, RwhecError
 from gtsam_rwhec.files.progress import Progress, check_progress
 from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.methods import certified
 from gtsam_rwhec.methods.applicability import check_problem, refusal
+from gtsam_rwhec.methods.chained import Chained, PairSolver, chained, solver_of, undetermined_pairs
 from gtsam_rwhec.methods.estimate import Estimate
-from gtsam_rwhec.methods.method import Method, MethodOptions, check_options
+from gtsam_rwhec.methods.method import Method, MethodOptions, Takes, check_options
 from gtsam_rwhec.methods.registry import METHODS, estimate_of, method_of, run
+from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solving.solution import Solution
@@ -62,11 +64,18 @@ class Comparison:
         The certified solution; its certificate's bound holds for every answer.
     error : RwhecError or None
         Why there is no certified solution.
+    chained : tuple of Chained
+        Methods for one pair on each pair of the best tree, cheapest first; none where the problem has one pair, an
+        unknown scale, priors or fixed frames.
+    undetermined : tuple of Pair
+        Pairs that no tree takes, since their own measurements do not determine their frames.
     """
 
     rows: tuple[Compared, ...]
     solution: Solution | None
     error: RwhecError | None = None
+    chained: tuple[Chained, ...] = ()
+    undetermined: tuple[Pair, ...] = ()
 
     @property
     def certificate(self) -> Certificate | None:
@@ -91,9 +100,10 @@ def compare(
     options: MethodOptions | None = None,
     *,
     methods: Iterable[str] | None = None,
+    pair_solvers: Mapping[str, PairSolver] | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Solve a problem by every method that can solve it.
+    """Solve a problem by every method that can solve it, and by those for one pair on each pair of the best tree.
 
     Parameters
     ----------
@@ -102,6 +112,8 @@ def compare(
         The same for all methods.
     methods : iterable of str, optional
         Names; all methods if left out. The certified method always runs, for its bound.
+    pair_solvers : mapping of str to callable, optional
+        Other methods for one pair, to be chained too: ``gtsam_rwhec.handeye.PAIR_SOLVERS``.
     progress : callable, optional
         Called with each method's name when the method begins.
 
@@ -135,7 +147,35 @@ def compare(
             estimate = estimate_of("certified", problem, certified.outcome_of(solution), seconds)
         rows.append(Compared(certified.METHOD, estimate, error))
     rows.sort(key=lambda row: math.inf if row.estimate is None else row.estimate.cost)
-    return Comparison(tuple(rows), solution, error)
+    trees, undetermined = _chained(problem, solution, rows, options, pair_solvers or {}, progress)
+    return Comparison(tuple(rows), solution, error, trees, undetermined)
+
+
+def _chained(
+    problem: Problem,
+    solution: Solution | None,
+    rows: list[Compared],
+    options: MethodOptions,
+    others: Mapping[str, PairSolver],
+    progress: Progress | None,
+) -> tuple[tuple[Chained, ...], tuple[Pair, ...]]:
+    """The methods that take one pair only, and ``others``, on the pairs of the best tree; and pairs that it avoids."""
+    has_knowledge = bool(problem.fixed or problem.priors) or problem.scale != "known"
+    of_poses = [pair for pair in problem.pairs if not pair.is_motion]
+    if solution is None or len(of_poses) < 2 or has_knowledge or not problem.keep_measurements:
+        return (), ()
+    solvers = {
+        row.method.name: solver_of(row.method, replace(options, start=None))
+        for row in rows
+        if isinstance(row.error, FrameError) and Takes.CORNERS not in row.method.takes
+    }
+    found = []
+    for name, solver in {**solvers, **others}.items():
+        if progress is not None:
+            progress(f"{name}, pair by pair")
+        found.append(chained(name, solver, problem, solution))
+    found.sort(key=lambda each: math.inf if each.estimate is None else each.estimate.cost)
+    return tuple(found), undetermined_pairs(problem, solution)
 
 
 def _compared(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.methods.chained import Chained
 from gtsam_rwhec.methods.comparison import Compared, Comparison
 from gtsam_rwhec.results.conventions import CONVENTIONS
 from gtsam_rwhec.results.schema import SENSOR_CARRIER, TARGET_CARRIER, pose_rows
@@ -30,6 +31,8 @@ def comparison_fields(comparison: Comparison) -> dict[str, Any]:
         "lower_bound": None if certificate is None else _finite(certificate.lower_bound),
         "tolerance": None if certificate is None else certificate.tolerance,
         "methods": [_row(comparison, row) for row in comparison.rows],
+        "chained": [_chained_row(row) for row in comparison.chained],
+        "pairs_that_no_tree_takes": list(map(str, comparison.undetermined)),
     }
 
 
@@ -71,6 +74,20 @@ def _row(comparison: Comparison, row: Compared) -> dict[str, Any]:
             "targets": pose_rows(TARGET_CARRIER, estimate.X),
             "sensors": pose_rows(SENSOR_CARRIER, estimate.Y),
         }
+    }
+
+
+def _chained_row(row: Chained) -> dict[str, Any]:
+    return {
+        "method": row.method,
+        "tree": list(map(str, row.tree)),
+        "failed": {str(pair): why for pair, why in row.failed.items()},
+        "unreached": list(row.unreached),
+        "cost": None if row.estimate is None else row.estimate.cost,
+        "off_mm": _finite(row.off_mm),
+        "off_deg": _finite(row.off_deg),
+        "targets": pose_rows(TARGET_CARRIER, row.X),
+        "sensors": pose_rows(SENSOR_CARRIER, row.Y),
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from rich.console import Console
 
@@ -18,6 +19,14 @@ LEGEND = (
     "the certificate's lower bound; 0: proven optimal. rms: root mean square residual over all measurements. ms: time "
     "of the method."
 )
+#: What the table of chained methods has.
+CHAINED_LEGEND = (
+    "Each pair of the tree with the most measurements is solved alone, and each frame takes its pose from the pair by "
+    "which the tree reaches it, as people do by hand. times joint: cost over that of the joint answer. off: the "
+    "largest difference of a frame's pose from the joint answer. pairs: those of the tree."
+)
+#: Pairs and frames are named up to this number.
+MOST_NAMED = 10
 
 
 def comparison_table(comparison: Comparison) -> FrameTable:
@@ -50,6 +59,7 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
         print_tables(console, [table], LEGEND)
     for sentence in _remarks(comparison):
         print_sentence(console, sentence)
+    _print_chained(comparison, console)
     reasons: dict[str, list[str]] = {}
     for row in comparison.rows:
         if row.estimate is None:
@@ -57,6 +67,48 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
     if reasons:
         print_heading(console, "Methods without an answer")
         print_list(console, (f"{', '.join(names)}: {reason}" for reason, names in reasons.items()))
+
+
+def chained_table(comparison: Comparison) -> FrameTable:
+    """A line for each method for one pair: what its chained answer costs, and how far it is from the joint one."""
+    joint = None if comparison.certificate is None else comparison.certificate.cost
+    rows = {}
+    for row in comparison.chained:
+        cost = None if row.estimate is None else row.estimate.cost
+        times = "-" if cost is None or not joint else f"{cost / joint:.3g}"
+        off = (f"{row.off_mm:.2f}", f"{row.off_deg:.3f}") if row.tree else ("-", "-")
+        rows[row.method] = ("-" if cost is None else f"{cost:.7g}", times, *off, str(len(row.tree)))
+    headings = ("cost J", "times joint", "off mm", "off°", "pairs")
+    return FrameTable("Methods for few frames, pair by pair, chained along the best tree", "method", headings, rows)
+
+
+def _print_chained(comparison: Comparison, console: Console) -> None:
+    """The table of chained methods, which pairs the trees avoid and why, and frames that they do not reach."""
+    if not comparison.chained:
+        return
+    console.print()
+    print_tables(console, [chained_table(comparison)], CHAINED_LEGEND)
+    said: dict[str, list[str]] = {}
+    if comparison.undetermined:
+        few = f"{_first(map(str, comparison.undetermined))}: their own measurements do not determine their frames"
+        said[f"No tree takes {few}."] = []
+    for row in comparison.chained:
+        reasons: dict[str, list[str]] = {}
+        for pair, why in row.failed.items():
+            reasons.setdefault(why, []).append(str(pair))
+        for why, pairs in reasons.items():
+            said.setdefault(f"the tree avoids {_first(pairs)}: {why}", []).append(row.method)
+        if row.unreached:
+            said.setdefault(f"no pair that can be used has {_first(row.unreached)}.", []).append(row.method)
+    for words, names in said.items():
+        print_sentence(console, f"{', '.join(names)}: {words}" if names else words)
+
+
+def _first(names: Iterable[str]) -> str:
+    """The first of many names, and how many more there are."""
+    all_ = list(names)
+    more = len(all_) - MOST_NAMED
+    return ", ".join(all_[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _remarks(comparison: Comparison) -> list[str]:
