@@ -2,29 +2,50 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 
 class RwhecError(ValueError):
-    """Root of every error that bad input raises."""
+    """Root of every error that bad input raises.
+
+    Attributes
+    ----------
+    page : str
+        The page of the guide that helps, as a path in the repository with the heading's anchor; "" where there is none.
+        The command prints it after the message.
+    """
+
+    page: ClassVar[str] = ""
 
 
 class PoseError(RwhecError):
     """A pose is not valid: NaN, a block that is not a rotation, a zero quaternion, or a wrong shape."""
 
+    page = "docs/frames.md"
+
 
 class CountError(RwhecError):
     """The counts of A, B, weights, stamps and covariances differ, or there are no measurements."""
+
+    page = "docs/files.md#csv-folders"
 
 
 class StampError(RwhecError):
     """Stamps are all zero, out of order or of another clock, or do not determine what is asked."""
 
+    page = "docs/calibrate.md#what-it-does-in-order"
+
 
 class NoiseError(RwhecError):
     """A sigma or kappa is not positive and finite, or a covariance is not positive definite."""
 
+    page = "docs/refinement.md"
+
 
 class FrameError(RwhecError):
     """A frame's name is unknown, empty, or used for both a target and a sensor."""
+
+    page = "docs/frames.md"
 
 
 class PriorError(RwhecError):
@@ -34,9 +55,13 @@ class PriorError(RwhecError):
 class UnderdeterminedError(RwhecError):
     """There are fewer equations than unknowns: no method can solve the problem."""
 
+    page = "docs/certificate.md#what-the-motion-leaves-free"
+
 
 class ScaleError(RwhecError):
     """A scale is not positive, in the input or at the optimum."""
+
+    page = "docs/calibrate.md#what-it-does-in-order"
 
 
 class OptionError(RwhecError):
@@ -50,17 +75,25 @@ class MeasurementsNotKeptError(RwhecError):
 class OutlierError(RwhecError):
     """Too few measurements agree with one another for an answer."""
 
+    page = "docs/calibrate.md#the-verdict"
+
 
 class FileFormatError(RwhecError):
     """A file cannot be read in its format; the message has the file and the line or field."""
+
+    page = "docs/files.md"
 
 
 class RigError(FileFormatError):
     """A rig file cannot be used (the message has each fault with its line), or cannot be made from a log."""
 
+    page = "docs/rig_file.md"
+
 
 class LogError(FileFormatError):
     """A log cannot be read or written, or lacks what is asked of it."""
+
+    page = "docs/from_a_log.md#what-a-log-may-be"
 
 
 class MessageError(LogError):
@@ -70,21 +103,31 @@ class MessageError(LogError):
 class BudgetError(LogError):
     """A log asks for more memory or work than a file of its size may: it is damaged, or made to exhaust its reader."""
 
+    page = "SECURITY.md#what-is-promised"
+
 
 class TransformError(RwhecError):
     """No chain of transforms joins two frames, or the chain is a loop; the message has the chain."""
+
+    page = "docs/frames.md"
 
 
 class CameraError(RwhecError):
     """Intrinsics are not valid or of an unsupported model, or no lens can have seen a point."""
 
+    page = "docs/corners.md#what-you-state"
+
 
 class ImageError(RwhecError):
     """An image cannot be decoded or does not fit its camera; the message has topic and stamp."""
 
+    page = "docs/from_a_log.md#folders-of-images"
+
 
 class TargetError(RwhecError):
     """A target cannot be printed: an unknown family, an id that the family lacks, or a size that is not valid."""
+
+    page = "docs/from_a_log.md#the-targets-of-a-rig-file"
 
     def __init__(self, fault: str, target: str = "") -> None:
         super().__init__(f"target {target}: {fault}" if target else fault)
@@ -93,6 +136,8 @@ class TargetError(RwhecError):
 
 class ResultVersionError(FileFormatError):
     """A result file has an unknown version of the format."""
+
+    page = "docs/files.md#what-stays-stable"
 
 
 class FetchError(RwhecError):

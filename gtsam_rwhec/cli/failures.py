@@ -62,6 +62,8 @@ def failures_in_words() -> Iterator[None]:
             yield
         except RwhecError as error:
             console.print(Text("Error: ", style="bold red").append(_indented(str(error)), style="not bold default"))
+            if error.page:
+                console.print(f"More: {error.page}", style="dim", markup=False)
             status = ExitStatus.DOWNLOAD_FAILED if isinstance(error, FetchError) else ExitStatus.BAD_INPUT
             raise typer.Exit(status) from error
         except KeyboardInterrupt as error:
