@@ -1,7 +1,7 @@
 """Run the code of the guide: `python docs/building/run_code.py [PAGE.md or NOTEBOOK.ipynb ...]`.
 
 Every page's ```python blocks are one session, in a folder of its own. What a page takes as given (a problem, a log) is
-made by ``before/PAGE.py``, in the same session. A block that cannot run has a line ``<!-- not run: REASON -->`` above it,
+made by ``before/PAGE.py``, in the same session. A block that cannot run has ``<!-- not run: REASON -->`` above it,
 which readers do not see. Notebooks run in a kernel of their own, as a user runs them.
 """
 
