@@ -130,6 +130,7 @@ TABLE: dict[str, dict[str, str]] = {
         ),
     },
     "gtsam_rwhec/pipeline": {
+        "test_gallery.py": "turned_images",
         "pipeline/test_all_stages.py": "image_options log_evidence log_report",
         "vision/test_likely_causes.py": "causes_in_words likely_causes",
         "pipeline/test_seen_sheet.py": "detected_source image_names",

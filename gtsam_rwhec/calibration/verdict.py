@@ -88,6 +88,10 @@ class Ground(StrEnum):
     SIZE_UNCERTAIN = "size_uncertain"
     #: A stated pose fits the measurements badly.
     POSE_UNCERTAIN = "pose_uncertain"
+    #: Single images are upside down.
+    IMAGE_TURNED = "image_turned"
+    #: Many images are blurred, and no target is read in them.
+    IMAGES_BLURRED = "images_blurred"
     #: The carriers hardly turned, or hardly about a second axis.
     LITTLE_ROTATION = "little_rotation"
     #: A frame rests on so few measurements that a wrong one would not show.
@@ -130,6 +134,8 @@ _CARE = (
     Ground.SHAPE_UNCERTAIN,
     Ground.SIZE_UNCERTAIN,
     Ground.POSE_UNCERTAIN,
+    Ground.IMAGE_TURNED,
+    Ground.IMAGES_BLURRED,
     Ground.LITTLE_ROTATION,
     Ground.FEW_MEASUREMENTS,
     Ground.SIZE_ESTIMATED,
@@ -233,6 +239,12 @@ _ADVICE = {
     ),
     Ground.POSE_UNCERTAIN: (
         "measure the stated pose again, or state it as uncertain as it is: Problem.add_prior in place of Problem.fix"
+    ),
+    Ground.IMAGE_TURNED: (
+        "turn the named images back, or take them out, and look for what turned them: others may have been turned too"
+    ),
+    Ground.IMAGES_BLURRED: (
+        "stand still for each image, or expose for a shorter time with more light, or focus the lens, and measure again"
     ),
     Ground.LITTLE_ROTATION: "turn the carriers by 30 degrees and more, about two different axes, and measure again",
     Ground.FEW_MEASUREMENTS: "measure each named frame at three poses or more, or do not use its pose",

@@ -14,11 +14,13 @@ from gtsam_rwhec.files.progress import Progress, silent
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import DetectionRecord, Log, LogWriter, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
+from gtsam_rwhec.pipeline.blurred_images import blurred_images
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.detections_in_images import draw_images
 from gtsam_rwhec.pipeline.driver_detections import read_driver_detections
 from gtsam_rwhec.pipeline.estimated_intrinsics import estimate_intrinsics, in_words, refuse_not_estimated
 from gtsam_rwhec.pipeline.image_detections import check_usable, detect_in_log
+from gtsam_rwhec.pipeline.image_names import image_names
 from gtsam_rwhec.pipeline.image_options import check_drawable, check_image_options
 from gtsam_rwhec.pipeline.intrinsics import read_intrinsics
 from gtsam_rwhec.pipeline.kept_detections import KeptDetections
@@ -112,8 +114,10 @@ def detect_log(
             draw_images(log, rig, cameras, {sensor: of.records for sensor, of in found.items()}, draw, tell)
         check_usable(log, rig, found)  # after the pictures: they show what is wrong
         tell("looking for what hides targets")
-        report = report.model_copy(update={"likely": likely_causes(log, rig, cameras, found)})
+        blurred, likely = blurred_images(log, rig, cameras, found), likely_causes(log, rig, cameras, found)
+        report = report.model_copy(update={"likely": likely, "blurred": blurred})
         if not any(track.used for track in report.tracks):
+            report = report.model_copy(update={"likely": (*(f"{words}." for words in blurred), *likely)})
             shown = f" {sheet} shows some of the images." if has_sheet else ""
             raise LogError(f"{no_detections(log, report)}{shown}")
         tell("writing detections")
@@ -121,7 +125,7 @@ def detect_log(
             out.copy(log, raw_topics(log), images)
             for sensor, of_sensor in found.items():
                 _write_detections(out, sensor, of_sensor.records)
-            LogMetadata(rig, cameras, report).write(out)
+            LogMetadata(rig, cameras, report, image_names=image_names(log)).write(out)
     return report
 
 

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log, LogWriter
-from gtsam_rwhec.pipeline.log_contract import CAMERAS_METADATA, CLEANING_METADATA, DETECTION_METADATA, RIG_METADATA
+from gtsam_rwhec.pipeline.image_names import image_names
+from gtsam_rwhec.pipeline.log_contract import (
+    CAMERAS_METADATA,
+    CLEANING_METADATA,
+    DETECTION_METADATA,
+    IMAGES_METADATA,
+    RIG_METADATA,
+)
 from gtsam_rwhec.results.log_history import CleaningReport, DetectionReport
 from gtsam_rwhec.rig import Rig, parse_rig, rig_text
 from gtsam_rwhec.vision.camera import Camera
@@ -33,12 +40,15 @@ class LogMetadata:
         The report of detection.
     cleaning : CleaningReport or None
         The report of cleaning; None before cleaning.
+    image_names : dict of str to str
+        Of the files that a folder's images were, as `image_names` has them.
     """
 
     rig: Rig
     cameras: Mapping[str, Camera]
     detection: DetectionReport
     cleaning: CleaningReport | None = None
+    image_names: Mapping[str, str] = field(default_factory=dict)
 
     def write(self, out: LogWriter) -> None:
         """Write the metadata into a log."""
@@ -51,6 +61,8 @@ class LogMetadata:
         }
         out.metadata(CAMERAS_METADATA, entries)
         out.metadata(DETECTION_METADATA, {"json": self.detection.model_dump_json()})
+        if self.image_names:
+            out.metadata(IMAGES_METADATA, self.image_names)
         if self.cleaning is not None:
             out.metadata(CLEANING_METADATA, {"json": self.cleaning.model_dump_json()})
 
@@ -66,7 +78,7 @@ def read_metadata(log: Log) -> LogMetadata:
     rig = read_embedded_rig(log)
     cleaning = read_cleaning_report(log) if CLEANING_METADATA in log.metadata() else None
     detection = _report(log, DETECTION_METADATA, DetectionReport)
-    return LogMetadata(rig, read_cameras(log), detection, cleaning)
+    return LogMetadata(rig, read_cameras(log), detection, cleaning, image_names(log))
 
 
 def read_cleaning_report(log: Log) -> CleaningReport:

@@ -7,6 +7,7 @@ from pathlib import Path
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.logs import Log, LogWriter, PoseRecord, open_log
 from gtsam_rwhec.logs.mcap_writer import Images
+from gtsam_rwhec.pipeline.image_names import image_names
 from gtsam_rwhec.pipeline.log_contract import (
     CERTIFICATE_METADATA,
     RESULT_FILE,
@@ -43,7 +44,8 @@ def write_solved(
         # A calibrated frame gets a name of its own if the raw log has one of its name.
         named = [(parent, child + CALIBRATED if child in taken else child, T) for parent, child, T in frames]
         out.transforms(SOLUTION_TOPIC, first_ns, named)
-        LogMetadata(rig, calibrated.cameras, calibrated.log.detection, calibrated.log.cleaning).write(out)
+        history = calibrated.log
+        LogMetadata(rig, calibrated.cameras, history.detection, history.cleaning, image_names(log)).write(out)
         certificate = refined.solution.certificate
         out.metadata(
             CERTIFICATE_METADATA,

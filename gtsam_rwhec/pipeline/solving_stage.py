@@ -9,7 +9,7 @@ from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.choices import OUTLIERS, Choice
 from gtsam_rwhec.calibration.outliers import Outliers
 from gtsam_rwhec.calibration.reading import Reading
-from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
+from gtsam_rwhec.calibration.verdict import Finding, Ground, Judgement, Verdict
 from gtsam_rwhec.cleaning.removed import RemovalReason
 from gtsam_rwhec.errors import LogError
 from gtsam_rwhec.files.progress import Progress, silent
@@ -35,6 +35,7 @@ from gtsam_rwhec.pipeline.log_findings import (
 from gtsam_rwhec.pipeline.log_metadata import read_cleaning_report, read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, poses_used, problem_of, read_pairs
 from gtsam_rwhec.pipeline.solving_rounds import Pairs, Purpose, SolvingRounds, sigma_of, without_outlier_marks
+from gtsam_rwhec.pipeline.turned_images import turned_images
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.refined import Refined, RefinedPoses
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
@@ -195,8 +196,10 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         others = (one for one in findings if one.ground not in (Ground.MISREAD, Ground.IMPLAUSIBLE))
         findings = (*([found] if found is not None else []), *others)
         calibration = replace(calibration, misreadings=before)
+    findings = (*findings, *(Finding(Ground.IMAGES_BLURRED, words) for words in metadata.detection.blurred))
     if not (is_misread or late):
         findings = (*findings, *moved_of_left_out(findings, refined, settled.pairs))
+        findings = (*findings, *turned_images(settled.pairs, refined, rig, metadata.image_names))
     if not is_misread:  # a misreading makes cleaning remove measurements that are right
         findings = (*findings, *short_of_measurements(fields, poses_used(settled.pairs.values())))
         if calibration.judgement.verdict is not Verdict.DO_NOT_USE and rounds.may_be_exchanged(settled):

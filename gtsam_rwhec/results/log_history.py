@@ -84,6 +84,9 @@ class DetectionReport(_Record):
         default=(), description="why targets were not read where most were not: what some of the images show, and cures"
     )
     remarks: tuple[str, ...] = Field(default=(), description="what was found out about targets, in words")
+    blurred: tuple[str, ...] = Field(
+        default=(), description="sensors with many images in which no target is read since they are blurred, in words"
+    )
     corner_px: dict[str, NotNegative] = Field(
         description="measured standard deviation of a corner along each axis, pixels, by target/sensor"
     )

@@ -18,6 +18,8 @@ SATURATED = 253
 AGAIN_PX, WIDE_PX = ((0.7, 1.5), (2.0, 4.0)), 1.8
 #: The strongest edges that are looked at, as a share of the pixels, and their gradient at least (gray values a pixel).
 EDGES, LEAST_GRADIENT = 0.003, 2.0
+#: Edges are looked at by this number of directions, each where it has this number of them.
+DIRECTIONS, FEWEST_EDGES = 8, 40
 #: A brightened image goes from black to white between these percentiles of its gray values.
 DARKEST, BRIGHTEST = 0.5, 99.7
 
@@ -30,6 +32,29 @@ def edge_blur_px(gray: Gray) -> float:
     """
     blur_px = _edge_blur_px(gray, *AGAIN_PX[0])
     return _edge_blur_px(gray, *AGAIN_PX[1]) if blur_px > WIDE_PX else blur_px
+
+
+def motion_blur_px(gray: Gray) -> tuple[float, float]:
+    """The blur of edges by their direction, where it is widest and where it is narrowest (pixels); nan without both.
+
+    The standard deviation as in `edge_blur_px`, of edges by their direction: what moves blurs the edges across its way,
+    and leaves those along it sharp. A lens that is out of focus blurs all alike.
+    """
+    smooth = cv2.GaussianBlur(np.asarray(gray, dtype=np.float32), (0, 0), AGAIN_PX[0][0])
+    again = cv2.GaussianBlur(smooth, (0, 0), AGAIN_PX[0][1])
+    x, y = _slopes(np.asarray(smooth))
+    first, second = np.asarray(cv2.magnitude(x, y)), _gradient(np.asarray(again))
+    peak = (first >= cv2.dilate(first, np.ones((3, 3), np.uint8))) & (first >= LEAST_GRADIENT)
+    direction = np.rint(np.arctan2(y, x) % np.pi / np.pi * DIRECTIONS).astype(int) % DIRECTIONS
+    found = []
+    for number in range(DIRECTIONS):
+        of_these = peak & (direction == number)
+        if of_these.sum() < FEWEST_EDGES:
+            continue
+        some = of_these & (first >= np.median(first[of_these]))
+        ratio = max(float(np.median(first[some] / np.maximum(second[some], 1e-6))), 1.01)
+        found.append(float(np.sqrt(max(AGAIN_PX[0][1] ** 2 / (ratio**2 - 1.0) - AGAIN_PX[0][0] ** 2, 0.0))))
+    return (max(found), min(found)) if len(found) > 1 else (float("nan"), float("nan"))
 
 
 def _edge_blur_px(gray: Gray, first_px: float, again_px: float) -> float:
@@ -87,5 +112,9 @@ def resized(gray: Gray, camera: Camera, scale: float) -> tuple[Gray, Camera]:
 
 
 def _gradient(values: Array) -> Array:
+    return np.asarray(cv2.magnitude(*_slopes(values)))
+
+
+def _slopes(values: Array) -> tuple[Array, Array]:
     x, y = (cv2.Sobel(values, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1)))
-    return np.asarray(cv2.magnitude(x, y))
+    return np.asarray(x), np.asarray(y)

@@ -145,7 +145,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "motion_blur",
         "Motion blur",
-        "The arm does not stop, and the shutter is open for 50 to 100 ms.",
+        "The arm does not stop, and the light is dim, and the shutter is open for 120 to 250 ms.",
         (r"blur",),
         "Stand still for each image, or expose for a shorter time with more light.",
         made.motion_blur,

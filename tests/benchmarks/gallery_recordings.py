@@ -140,7 +140,7 @@ def loose_camera(rng: np.random.Generator) -> Recording:
 def motion_blur(rng: np.random.Generator) -> Recording:
     """The shutter is open for too long while the arm moves."""
     good = scene.in_motion(rng)
-    return replace(good, exposure_s=rng.uniform(0.05, 0.10))
+    return replace(good, exposure_s=rng.uniform(0.12, 0.25))
 
 
 def upside_down(rng: np.random.Generator) -> Recording:

@@ -126,8 +126,9 @@ def looking(distance_m: Array, tilt_rad: Array, towards_rad: Array, roll_rad: Ar
     return T
 
 
-def all_around(rng: np.random.Generator, n: int = IMAGES) -> Array:
+def all_around(rng: np.random.Generator, n: int | None = None) -> Array:
     """T_board_camera (N, 4, 4) of good stations: from all sides, near and far, and turned."""
+    n = IMAGES if n is None else n
     return looking(
         rng.uniform(0.42, 0.62, n),
         np.radians(rng.uniform(8.0, 36.0, n)),
@@ -156,8 +157,9 @@ def at_rest(rng: np.random.Generator, T_board_camera: Array) -> Recording:
     return _recorded(rng, T_board_camera)
 
 
-def in_motion(rng: np.random.Generator, n: int = IMAGES) -> Recording:
+def in_motion(rng: np.random.Generator) -> Recording:
     """A good recording of an arm that does not stop, with a short exposure."""
+    n = IMAGES
     reported_s = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
     image_s = np.linspace(0.6, SECONDS - 0.6, n) + rng.uniform(-0.05, 0.05, n)
     step_s = 1e-3

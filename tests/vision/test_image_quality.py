@@ -13,6 +13,7 @@ from gtsam_rwhec.vision.image_quality import (
     brightest_value,
     edge_blur_px,
     folded,
+    motion_blur_px,
     resized,
     saturated_share,
 )
@@ -61,3 +62,20 @@ def test_a_resized_image_has_its_camera(camera: Camera, scale: float) -> None:
     points = np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0], [0.0, 0.0, 1.0]])
     factor = np.array([of_it.width / 320, of_it.height / 240])
     np.testing.assert_allclose(of_it.project(points) + 0.5, (camera.project(points) + 0.5) * factor, atol=1e-9)
+
+
+def squares(way_px: int, defocus_px: float) -> np.ndarray:
+    """A turned checkerboard that moved along x while the shutter was open, out of focus."""
+    x, y = np.meshgrid(np.arange(320.0), np.arange(240.0))
+    u, v = 0.8 * x + 0.6 * y, -0.6 * x + 0.8 * y
+    sharp = np.where((u // 31 + v // 31) % 2 == 0, 200.0, 40.0) + 30.0 * (np.sin(x / 9.0) > 0.0) + 30.0 * (y % 60 > 30)
+    moved = cv2.filter2D(sharp, -1, np.full((1, way_px), 1.0 / way_px))
+    noisy = cv2.GaussianBlur(moved, (0, 0), defocus_px) + 2.0 * np.random.default_rng(0).normal(size=moved.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("way_px", "defocus_px", "is_motion"), [(1, 0.8, False), (1, 2.0, False), (9, 0.8, True)])
+def test_motion_blurs_edges_across_its_way_only(way_px: int, defocus_px: float, is_motion: bool) -> None:
+    wide_px, narrow_px = motion_blur_px(squares(way_px, defocus_px))
+    assert (wide_px > 1.5 * narrow_px) is is_motion
+    assert 0.4 < narrow_px < 1.6
