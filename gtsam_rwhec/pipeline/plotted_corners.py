@@ -48,9 +48,10 @@ def seen_views(solved: Solved, log: Log, *, left_out: bool = False) -> dict[str,
         stamps = np.array([record.stamp_ns for record in records], dtype=np.int64)
         A, _ = path.at(stamps + round(1e9 * offsets.get(sensor, 0.0)))
         for record, T in zip(records, np.linalg.inv(solved.refined.Y[sensor].matrix()) @ A, strict=True):
-            if record.corners_px is None or record.corner_indices is None:
+            board, X = boards[record.id], solved.refined.X[record.id].matrix()
+            if record.corners_px is None or (record.corner_indices is None and len(record.corners_px) != len(board)):
                 continue
-            corners, X = boards[record.id][list(record.corner_indices)], solved.refined.X[record.id].matrix()
+            corners = board if record.corner_indices is None else board[list(record.corner_indices)]  # a driver's: all
             used = is_used[Pair(record.id, sensor), record.stamp_ns]
             seen[sensor].append(SeenView.of(record.corners_px, corners, T, X, record.stamp_ns, record.id, is_used=used))
     return dict(seen)

@@ -31,9 +31,14 @@ STAMP_NS = made.BEGIN_NS + 5
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibrated]:
-    """A driver's detections, calibrated: the log and the answer."""
-    folder = tmp_path_factory.mktemp("seen")
-    return folder, made.solved(folder, made.recording(4.0), made.rig_text())
+    """A driver's detections with corners, calibrated: the log and the answer."""
+    folder, text = tmp_path_factory.mktemp("seen"), made.rig_text()
+    for name in made.CAMERAS:
+        own = f"detections: /{name}/tags"
+        text = text.replace(
+            own, f"{own}\n    intrinsics: {{K: [{made.FOCAL}, {made.FOCAL}, 320, 240], size: [640, 480]}}"
+        )
+    return folder, made.solved(folder, made.recording(4.0, camera_hz=2.0), text)
 
 
 def test_counts_are_those_of_the_result(calibrated: tuple[Path, Calibrated]) -> None:
@@ -45,7 +50,11 @@ def test_counts_are_those_of_the_result(calibrated: tuple[Path, Calibrated]) -> 
         for reason, count in track.removed.items():
             assert by_reason[track.target, track.sensor, reason] == count
     assert sum(track.used + track.removed for track in seen.tracks) == seen.used + seen.removed
-    assert seen.span_s == pytest.approx(3.6, abs=0.3)
+    assert seen.span_s == pytest.approx(3.05, abs=0.1)
+    assert [camera.sensor for camera in seen.cameras] == list(made.CAMERAS)  # with the corners that the driver gave
+    assert all(camera.rms_px < 3.0 for camera in seen.cameras)
+    assert len(seen.worst) == 6
+    assert seen.no_pictures.startswith("no sensor has images")
     assert seen.sheet is None
     assert all(one.picture is None for one in seen.worst)
 
