@@ -29,7 +29,7 @@ WITH_IMAGES = {
 #: What there is of a calibration, beside plots/.
 WRITTEN = {
     "clean.mcap", "result.json", "static_tf.launch.py", "tf.yaml", "rig.urdf.xacro", "camchain.yaml",
-    "cameras.opencv.yaml", "cameras.txt",
+    "cameras.opencv.yaml", "cameras.txt", "report.html", "evidence.json",
 }  # fmt: skip
 
 

@@ -25,7 +25,7 @@ def write_page(page: Page, path: str | Path) -> None:
     FileFormatError
         The file cannot be written.
     """
-    write_atomically(path, page_html(page).encode("utf-8", "replace"))
+    write_atomically(path, f"{page_html(page)}\n".encode("utf-8", "replace"))
 
 
 def page_html(page: Page) -> str:
