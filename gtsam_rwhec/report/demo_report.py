@@ -47,7 +47,7 @@ def print_demo(
     print_tables(console, [truth_table(refined, truth)], LEGEND)
     print_heading(console, "What to do next", tight=True)
     steps = (
-        f"Look at {folder / 'plots' / 'frames.png'} and the other pictures in that folder. {folder / 'result.json'} "
+        f"Open {folder / 'report.html'} in a browser: the rig in 3D, the proof, the images. {folder / 'result.json'} "
         "has all numbers.",
         "Write a rig file for your own log, then complete the lines marked TODO: gtsam-rwhec init LOG.mcap -o rig.yaml",
         "Calibrate your log: gtsam-rwhec calibrate LOG.mcap --rig rig.yaml -o FOLDER",

@@ -73,4 +73,4 @@ def test_it_ends_with_what_to_do_next(found: tuple[rw.RefinedPoses, LogFields]) 
     )
     places = [out.getvalue().index(words) for words in headings]
     assert places == sorted(places)
-    assert "here/plots/frames.png" in out.getvalue()
+    assert "here/report.html" in out.getvalue()
