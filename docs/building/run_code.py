@@ -1,7 +1,7 @@
 """Run the code of the guide: `python docs/building/run_code.py [PAGE.md or NOTEBOOK.ipynb ...]`.
 
 Every page's ```python blocks are one session, in a folder of its own. What a page takes as given (a problem, a log) is
-made by ``before/PAGE.py``, in the same session. A block that cannot run has ``<!-- not run: REASON -->`` above it,
+made by files in ``before/``, in the same session. A block that cannot run has ``<!-- not run: REASON -->`` above it,
 which readers do not see. Notebooks run in a kernel of their own, as a user runs them.
 """
 
@@ -17,6 +17,21 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parent.parent
 REPOSITORY = DOCS.parent
 BEFORE = Path(__file__).resolve().parent / "before"
+#: What pages take as given.
+GIVEN = {
+    "README.md": ("rig.py",),
+    "docs/calibrate.md": ("rig.py",),
+    "docs/files.md": ("rig.py", "result.py"),
+    "docs/methods.md": ("rig.py", "methods.py"),
+}
+#: Pages whose blocks are no sessions, and why.
+NOT_RUN = {
+    "docs/changes.md": "it compares folders of two calibrations; tests/changes has its calls",
+    "docs/corners.md": "the corners are the reader's; examples/from_corners.py goes this way, and is tested",
+    "docs/from_a_log.md": "it takes a minute of detection; tests/pipeline goes the same way",
+    "docs/refinement.md": "the corners are the reader's; examples/from_corners.py goes this way, and is tested",
+    "factors/README.md": "its graph is the reader's; examples/slam_graph.py is a whole one, and is tested",
+}
 #: A session that takes longer has hung.
 MOST_SECONDS = 120
 _BLOCK = re.compile(r"(?:<!-- not run: (?P<why>[^\n]+) -->\n)?^```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -32,10 +47,10 @@ def blocks(text: str) -> list[tuple[int, str, str]]:
 
 def session_of(page: Path) -> str:
     """The page's session: what it takes as given, then its blocks, each at its own line of the page."""
-    given = BEFORE / f"{page.stem}.py" if page.parent == DOCS else BEFORE / f"{page.parent.name}_{page.stem}.py"
     parts = []
-    if given.is_file():
-        parts.append(f"exec(compile(open({str(given)!r}).read(), {str(given)!r}, 'exec'))\n")
+    for name in GIVEN.get(str(page.relative_to(REPOSITORY)), ()):
+        given = BEFORE / name
+        parts.append(f"exec(compile({given.read_text(encoding='utf-8')!r}, {str(given)!r}, 'exec'))\n")
     for line, code, why in blocks(page.read_text(encoding="utf-8")):
         if not why:  # line breaks before the code, so that a traceback has the page's lines
             placed = "\n" * (line - 1) + code
@@ -81,6 +96,7 @@ def pages() -> list[Path]:
     """All pages that have Python, and the notebooks."""
     found = [REPOSITORY / "README.md", REPOSITORY / "factors" / "README.md", *sorted(DOCS.glob("*.md"))]
     found += sorted((DOCS / "mathematics").glob("*.md"))
+    found = [page for page in found if str(page.relative_to(REPOSITORY)) not in NOT_RUN]
     with_code = [page for page in found if any(not why for *_place, why in blocks(page.read_text(encoding="utf-8")))]
     return [*with_code, *sorted((REPOSITORY / "examples" / "notebooks").glob("*.ipynb"))]
 
