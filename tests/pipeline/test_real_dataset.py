@@ -8,7 +8,9 @@ import numpy as np
 from utias_log import rig_text, write_utias_log
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.pipeline.all_stages import calibrate_log
+from gtsam_rwhec.pipeline.all_stages import solve_into
+from gtsam_rwhec.pipeline.cleaning_stage import clean_log
+from gtsam_rwhec.pipeline.detection_stage import detect_log
 from gtsam_rwhec.results.result_file import read_result
 from gtsam_rwhec.rig import parse_rig
 
@@ -21,7 +23,10 @@ def test_the_same_cost_and_poses_as_from_csv(utias_folder: Path, tmp_path: Path)
     refined = rw.refine(problem, expected)
     write_utias_log(utias_folder, tmp_path / "utias.mcap")
     rig = parse_rig(rig_text(problem.targets, ROTATION_DEG, 1e3 * SIGMA_M), "rig")
-    found = calibrate_log(tmp_path / "utias.mcap", rig, tmp_path / "out").refined
+    # Stage by stage, without the pictures and pages of a whole run.
+    detect_log(tmp_path / "utias.mcap", rig, tmp_path / "detected.mcap")
+    clean_log(tmp_path / "detected.mcap", tmp_path / "cleaned.mcap")
+    found = solve_into(tmp_path / "cleaned.mcap", None, tmp_path / "out").refined
     solution = found.solution
     said = read_result(tmp_path / "out" / "result.json").log
     assert said is not None

@@ -13,7 +13,7 @@ from ros2_twin import CELL, write_twins
 from gtsam_rwhec.pipeline.all_stages import calibrate_log, export_solved, solve_into
 from gtsam_rwhec.pipeline.cleaning_stage import clean_log
 from gtsam_rwhec.pipeline.detection_stage import detect_log
-from gtsam_rwhec.rig import parse_rig
+from gtsam_rwhec.rig import Rig, parse_rig
 
 
 def text_of(path: Path) -> str:
@@ -40,28 +40,49 @@ def rig_text(offsets: str) -> str:
     return left.replace("estimate", "0.0", 1) + "  cam_wide:" + wide.replace("estimate", "0.035", 1)
 
 
-@pytest.mark.parametrize(
-    ("images", "offsets"), [(6, "stated"), pytest.param(16, "estimate", marks=pytest.mark.slow)], ids=["few", "more"]
-)
-def test_ros2_bag_and_foxglove_json_and_stage_by_stage(images: int, offsets: str, tmp_path: Path) -> None:
-    """`images` of each camera, as json.mcap and ros2.mcap."""
-    twins = tmp_path
-    write_twins(twins / "json.mcap", twins / "ros2.mcap", images)
-    rig = parse_rig(rig_text(offsets), "rig.yaml")
-    calibrate_log(twins / "json.mcap", rig, twins / "from_json", workers=2)
-    calibrate_log(twins / "ros2.mcap", rig, twins / "from_ros2", workers=1)
-    assert numbers(twins / "from_json") == numbers(twins / "from_ros2")
-    assert numbers(twins / "from_json")["certified"]["certificate"]["status"] == "certified"
+def by_stage(raw: Path, rig: Rig, out: Path) -> None:
+    """Each stage by itself."""
+    detect_log(raw, rig, out / "detected.mcap")
+    clean_log(out / "detected.mcap", out / "cleaned.mcap")
+    solve_into(out / "cleaned.mcap", None, out)
 
-    detect_log(twins / "json.mcap", rig, twins / "detected.mcap")
-    clean_log(twins / "detected.mcap", twins / "cleaned.mcap")
-    solve_into(twins / "cleaned.mcap", None, twins / "by_stage")
-    export_solved(twins / "by_stage" / "clean.mcap", twins / "by_stage")
-    assert numbers(twins / "by_stage") == numbers(twins / "from_json")
-    for path in (twins / "from_json").rglob("*"):
-        if path.is_file() and path.suffix not in (".mcap", ".png", ".json"):
-            assert text_of(path) == text_of(twins / "by_stage" / path.relative_to(twins / "from_json"))
 
-    # Taken up where a stage ended, and solved again in place: nothing of the solution before counts.
-    calibrate_log(twins / "by_stage" / "clean.mcap", None, twins / "by_stage")
-    assert numbers(twins / "by_stage") == numbers(twins / "from_json")
+def check_files(out: Path, expected: Path) -> None:
+    """The text files for other programs are the same."""
+    for path in expected.rglob("*"):
+        if path.is_file() and path.suffix not in (".mcap", ".png", ".json", ".html"):
+            assert text_of(path) == text_of(out / path.relative_to(expected))
+
+
+def test_foxglove_json_at_once_and_a_ros2_bag_stage_by_stage(tmp_path: Path) -> None:
+    """Six images of each camera."""
+    write_twins(tmp_path / "json.mcap", tmp_path / "ros2.mcap", 6)
+    rig, out = parse_rig(rig_text("stated"), "rig.yaml"), tmp_path / "by_stage"
+    calibrate_log(tmp_path / "json.mcap", rig, tmp_path / "from_json", workers=2)
+    out.mkdir()
+    by_stage(tmp_path / "ros2.mcap", rig, out)
+    export_solved(out / "clean.mcap", out)
+    assert numbers(out) == numbers(tmp_path / "from_json")
+    assert numbers(out)["certified"]["certificate"]["status"] == "certified"
+    check_files(out, tmp_path / "from_json")
+    # Solved again in place: nothing of the solution before counts.
+    solve_into(out / "clean.mcap", None, out)
+    assert numbers(out) == numbers(tmp_path / "from_json")
+
+
+@pytest.mark.slow
+def test_each_encoding_at_once_and_stage_by_stage_with_estimated_clocks(tmp_path: Path) -> None:
+    """Sixteen images of each camera, each way by itself; and a whole calibration taken up where a stage ended."""
+    write_twins(tmp_path / "json.mcap", tmp_path / "ros2.mcap", 16)
+    rig, out = parse_rig(rig_text("estimate"), "rig.yaml"), tmp_path / "by_stage"
+    calibrate_log(tmp_path / "json.mcap", rig, tmp_path / "from_json", workers=2)
+    calibrate_log(tmp_path / "ros2.mcap", rig, tmp_path / "from_ros2", workers=1)
+    assert numbers(tmp_path / "from_json") == numbers(tmp_path / "from_ros2")
+    assert numbers(tmp_path / "from_json")["certified"]["certificate"]["status"] == "certified"
+    out.mkdir()
+    by_stage(tmp_path / "json.mcap", rig, out)
+    export_solved(out / "clean.mcap", out)
+    assert numbers(out) == numbers(tmp_path / "from_json")
+    check_files(out, tmp_path / "from_json")
+    calibrate_log(out / "clean.mcap", None, out)
+    assert numbers(out) == numbers(tmp_path / "from_json")
