@@ -14,8 +14,8 @@ from gtsam_rwhec.report.page.shown_result import ShownResult
 
 #: A line has this share of the scene to each side, and its arrowheads and circles this one.
 LENGTH, HEAD = 0.16, 0.022
-#: Of each direction so many frames are drawn.
-MOST_FRAMES = 40
+#: Of each direction so many frames are drawn, and of all so many lines.
+MOST_FRAMES, MOST_LINES = 40, 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def lines_of(shown: ShownResult, scene: Scene) -> tuple[Line, ...]:
         yield_at = {"moves" if one.kind == "translation" else "about": along}
         pieces = draw(frame.T[:3, 3], along, 0.5 * scene.extent)
         lines.append(Line(one.frame, f"weak {number}", words, False, pieces, **yield_at))
-    return (*lines, *_too_large(scene))
+    return (*lines, *_too_large(scene))[:MOST_LINES]
 
 
 def _free(direction: FreeDirection, label: str, frames: dict[str, Frame], extent: float) -> Iterator[Line]:

@@ -15,15 +15,17 @@ from gtsam_rwhec.report.page.scene.traces import Trace
 ELEVATION = np.radians(28.0)
 #: plotly's field of view over the height, and the least width of a screen over its height: half of each, as tangents.
 HIGH, WIDE = np.tan(np.radians(22.5)), 1.05 * np.tan(np.radians(22.5))
+#: Sensors within this share of the scene have a button of their own that shows them from near.
+SMALL = 0.25
 #: The eye is so much nearer than where it would see the corners of the box: few scenes fill them.
 NEARER = 0.97
-#: Groups with a button, in order: what the button is called, and where it begins, as shares of a narrow screen.
+#: Groups with a button, in order: what the button is called, and its width as a share of a narrow screen.
 BUTTONS = (
-    ("views", "Views", 0.0),
-    ("path", "Path", 0.17),
-    ("ellipsoids", "Ellipsoids", 0.315),
-    ("boards", "Boards", 0.54),
-    ("names", "Names", 0.73),
+    ("views", "Views", 0.17),
+    ("path", "Path", 0.145),
+    ("ellipsoids", "Ellipsoids", 0.225),
+    ("boards", "Boards", 0.19),
+    ("names", "Names", 0.19),
 )
 #: A pressed button of plotly is nearly white on any page, so that all have dark words.
 BUTTON = {"bgcolor": "#C3CAD2", "bordercolor": "#8A929B", "font": {"size": 11, "color": "#14181D"}}
@@ -46,7 +48,7 @@ def layout_of(scene: Scene, traces: Sequence[Trace]) -> dict[str, Any]:
         "scene": {
             **axes,
             "aspectmode": "data",
-            "domain": {"x": [0.0, 1.0], "y": [0.1, 0.86]},
+            "domain": {"x": [0.0, 1.0], "y": [0.09, 0.83]},
             "camera": camera(scene, first_view(scene)),
             "dragmode": "orbit",
         },
@@ -57,7 +59,7 @@ def layout_of(scene: Scene, traces: Sequence[Trace]) -> dict[str, Any]:
             "yanchor": "bottom",
             "font": {"size": 11},
             "itemsizing": "constant",
-            "entrywidth": 52,
+            "entrywidth": 64,
             "entrywidthmode": "pixels",
             "bgcolor": "rgba(0,0,0,0)",
         },
@@ -90,6 +92,20 @@ def camera(scene: Scene, towards_eye: Array, up: Sequence[float] = (0.0, 0.0, 1.
     return {"eye": _xyz(eye), "up": _xyz(up), "center": _xyz((0.0, 0.0, 0.0))}
 
 
+def near_sensors(scene: Scene) -> dict[str, Any] | None:
+    """A view of the sensors alone, where they are small in the whole scene; None where they are not."""
+    places = np.array([frame.T[:3, 3] for frame in scene.frames if frame.kind == "sensor"]).reshape(-1, 3)
+    if len(places) < 2 or len({frame.kind for frame in scene.frames}) < 3:
+        return None
+    size = float(np.ptp(places, axis=0).max())
+    if size > SMALL * scene.extent:
+        return None
+    unit = float(np.prod(scene.high - scene.low)) ** (1.0 / 3.0)
+    centre = (0.5 * (places.min(axis=0) + places.max(axis=0)) - 0.5 * (scene.low + scene.high)) / unit
+    eye = centre + 2.2 * max(size, SMALL * 0.2 * scene.extent) / unit * first_view(scene)
+    return {"eye": _xyz(eye), "up": _xyz((0.0, 0.0, 1.0)), "center": _xyz(centre)}
+
+
 def _spread(scene: Scene) -> Array:
     places = np.concatenate(
         [scene.path[:, :3], *(f.T[None, :3, 3] for f in scene.frames), *(v.rim for v in scene.views)]
@@ -99,8 +115,9 @@ def _spread(scene: Scene) -> Array:
 
 def _shown(traces: Sequence[Trace]) -> list[dict[str, Any]]:
     """A button for each group that is there: pressed, the group is seen."""
-    menus = []
-    for group, label, x in BUTTONS:
+    menus: list[dict[str, Any]] = []
+    x = 0.0
+    for group, label, width in BUTTONS:
         members = [i for i, trace in enumerate(traces) if trace["meta"] == group]
         if not members:
             continue
@@ -112,6 +129,7 @@ def _shown(traces: Sequence[Trace]) -> list[dict[str, Any]]:
             "args2": [{"visible": False}, members],
         }
         menus.append(_menu([button], x, 1.0, 0 if is_seen else -1, is_marked=True))
+        x += width
     return menus
 
 
@@ -121,14 +139,17 @@ def _turned(scene: Scene) -> dict[str, Any]:
     side = np.array([*(slant[:2] / np.linalg.norm(slant[:2])), 0.0])
     front = np.array([-side[1], side[0], 0.0])
     above = camera(scene, np.array([0.0, 0.0, 1.0]), [*(-side[:2]), 0.0])
-    views = (
+    views: tuple[tuple[str, dict[str, Any]], ...] = (
         ("Slant", camera(scene, slant)),
         ("Above", above),
-        ("Side", camera(scene, side)),
-        ("Other side", camera(scene, front)),
+        ("Front", camera(scene, side)),
+        ("Side", camera(scene, front)),
     )
+    near = near_sensors(scene)
+    if near is not None:
+        views = (*views, ("Sensors", near))
     buttons = [{"method": "relayout", "label": label, "args": [{"scene.camera": view}]} for label, view in views]
-    return _menu(buttons, 0.0, 0.925, 0, is_marked=False)
+    return _menu(buttons, 0.0, 0.91, 0, is_marked=False)
 
 
 def _menu(buttons: list[dict[str, Any]], x: float, y: float, active: int, *, is_marked: bool) -> dict[str, Any]:

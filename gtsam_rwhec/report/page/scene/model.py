@@ -16,7 +16,7 @@ from gtsam_rwhec.report.plots.drawing import round_down
 
 Kind = Literal["carrier", "sensor", "target"]
 #: Axes of frames have at most and at least this share of the scene, and this share of the distance between neighbours.
-AXIS, LEAST_AXIS, OF_NEIGHBOURS = 0.06, 0.02, 0.4
+AXIS, LEAST_AXIS, OF_NEIGHBOURS = 0.06, 0.01, 0.6
 #: The largest ellipsoid has a half axis of this share of the scene.
 ELLIPSOID = 0.035
 #: An ellipsoid this many times the median one does not set the magnification: it is drawn as a line.
@@ -65,10 +65,10 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Polygons:
-    """Paper and dark parts of boards, each polygon (n, 3), metres."""
+class Board:
+    """A board: its paper (n, 3), empty where it is not known, and its dark parts, each (n, 3), metres."""
 
-    paper: tuple[Array, ...]
+    paper: Array
     dark: tuple[Array, ...]
 
 
@@ -82,7 +82,7 @@ class Scene:
         The carrier whose axes the scene has.
     frames : tuple of Frame
     views : tuple of View
-    boards : Polygons
+    boards : tuple of Board
     path : (n, 7) array
         x, y, z, roll, pitch, yaw (degrees) and seconds of the moving carrier; seconds are nan without stamps.
     moving : str
@@ -100,7 +100,7 @@ class Scene:
     world: str
     frames: tuple[Frame, ...]
     views: tuple[View, ...]
-    boards: Polygons
+    boards: tuple[Board, ...]
     path: Array
     moving: str
     low: Array
@@ -115,12 +115,15 @@ class Scene:
         return float((self.high - self.low).max())
 
     @property
-    def axis_m(self) -> float:
-        """Length of the frames' axes."""
-        places = np.array([frame.T[:3, 3] for frame in self.frames if frame.kind != "carrier"]).reshape(-1, 3)
-        apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(len(places), np.inf))
-        nearest = apart.min(axis=1) if len(places) > 1 else np.array([self.extent])
-        return float(np.clip(OF_NEIGHBOURS * np.median(nearest), LEAST_AXIS * self.extent, AXIS * self.extent))
+    def axes_m(self) -> dict[Kind, float]:
+        """Length of the axes of frames of each kind: shorter where frames are near to each other."""
+        found: dict[Kind, float] = {"carrier": 1.6 * AXIS * self.extent}
+        for kind in ("sensor", "target"):
+            places = np.array([frame.T[:3, 3] for frame in self.frames if frame.kind == kind]).reshape(-1, 3)
+            apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(len(places), np.inf))
+            nearest = float(np.median(apart.min(axis=1))) if len(places) > 1 else self.extent
+            found[kind] = float(np.clip(OF_NEIGHBOURS * nearest, LEAST_AXIS * self.extent, AXIS * self.extent))
+        return found
 
     @property
     def ellipsoids(self) -> dict[str, Array]:
@@ -174,8 +177,8 @@ def _scene(
     near = [f for f in origins if f.name != world or _is_near(f.T[:3, 3], extent)]
     extent = np.concatenate([extent, *(f.T[None, :3, 3] for f in near)])
     size = max(float(np.ptp(extent, axis=0).max()), SMALLEST_M)
-    boards = _boards(frames, evidence, PLAIN * size)
-    extent = np.concatenate([extent, *boards.paper, *boards.dark])
+    boards = tuple(_boards(frames, evidence, PLAIN * size))
+    extent = np.concatenate([extent, *(part for board in boards for part in (board.paper, *board.dark))])
     low, high = extent.min(axis=0), extent.max(axis=0)
     margin = 0.04 * max(float((high - low).max()), SMALLEST_M)
     radius = float(np.sqrt(7.814727903251179 if refined is None else refined.squared_radius(3, LEVEL)))
@@ -239,9 +242,8 @@ def _views(frames: list[Frame], evidence: SceneEvidence) -> Iterator[View]:
         yield View(frame.name, frame.T[:3, 3], rim)
 
 
-def _boards(frames: list[Frame], evidence: SceneEvidence | None, plain: float) -> Polygons:
+def _boards(frames: list[Frame], evidence: SceneEvidence | None, plain: float) -> Iterator[Board]:
     """The boards in the scene; one of unknown shape is a plain square."""
-    paper, dark = [], []
     square = plain * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
     for frame in frames:
         if frame.kind != "target":
@@ -250,11 +252,10 @@ def _boards(frames: list[Frame], evidence: SceneEvidence | None, plain: float) -
         board = None if target is None else target.board
         R, t = frame.T[:3, :3], frame.T[:3, 3]
         if board is None:
-            paper.append(square @ R.T + t)
+            yield Board(square @ R.T + t, ())
             continue
-        paper += [np.array(board.paper) @ R.T + t] if board.paper else []
-        dark += [np.array(polygon) @ R.T + t for polygon in board.dark]
-    return Polygons(tuple(paper), tuple(dark))
+        paper = np.array(board.paper).reshape(-1, 3) @ R.T + t
+        yield Board(paper, tuple(np.array(polygon) @ R.T + t for polygon in board.dark))
 
 
 def _is_near(place: Array, others: Array) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +11,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.page.figures import INK, SvgFigure, svg_figure
 from gtsam_rwhec.report.page.scene.directions import Line
 from gtsam_rwhec.report.page.scene.layout import first_view
-from gtsam_rwhec.report.page.scene.model import MANY, Scene
+from gtsam_rwhec.report.page.scene.model import MANY, Board, Scene
 from gtsam_rwhec.report.page.scene.traces import DARK, EARLY, LATE, MOST_NAMES, PAPER
 from gtsam_rwhec.report.plots.drawing import AXIS_COLOURS, AXIS_NAMES, GREY, ORANGE, PURPLE, SKY, shortened
 
@@ -43,8 +43,7 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
     axes.set_axis_off()
     axes.set_aspect("equal")
     P, eye = projection(scene), first_view(scene)
-    parts = [(p, PAPER, 0.6) for p in scene.boards.paper] + [(p, DARK, 0.0) for p in scene.boards.dark]
-    parts.sort(key=lambda part: float(part[0].mean(axis=0) @ eye))
+    parts = [part for board in sorted(scene.boards, key=lambda one: _depth(one, eye)) for part in _parts(board, eye)]
     if parts:
         polygons, colours, widths = zip(*((p @ P.T, colour, width) for p, colour, width in parts), strict=True)
         axes.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=GREY, linewidths=widths, zorder=1))
@@ -58,9 +57,10 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
         x, y = P @ scene.path[:, :3].T
         axes.scatter(x, y, c=np.arange(len(scene.path)), cmap=shades, s=5, zorder=2)
     _ellipsoids(axes, scene, P)
+    lengths = scene.axes_m
     for k, colour in enumerate(AXIS_COLOURS):
         strokes = [
-            np.array([f.T[:3, 3], f.T[:3, 3] + scene.axis_m * (1.6 if f.kind == "carrier" else 1.0) * f.T[:3, k]]) @ P.T
+            np.array([f.T[:3, 3], f.T[:3, 3] + lengths[f.kind] * f.T[:3, k]]) @ P.T
             for f in scene.frames
             if not (len(scene.frames) > MANY and f.kind == "target")
         ]
@@ -75,11 +75,27 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
     named = {f.name: at for f, at in zip(scene.frames, places, strict=True)} if len(scene.frames) <= MOST_NAMES else {}
     for words, colour in ((named, INK), (said, PURPLE)):
         for name, at in words.items():
-            axes.annotate(shortened(name), at, (4, 4), textcoords="offset points", size=8.5, color=colour, zorder=7)
+            axes.annotate(shortened(name), at, (8, 9), textcoords="offset points", size=8.5, color=colour, zorder=7)
     corners = np.array(np.meshgrid(*zip(scene.low, scene.high, strict=True))).reshape(3, -1).T @ P.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     _legend(figure, scene, lines)
+
+
+def _depth(board: Board, eye: Array) -> float:
+    """How near a board is to the eye."""
+    return float(np.concatenate([board.paper, *board.dark]).mean(axis=0) @ eye)
+
+
+def _parts(board: Board, eye: Array) -> Iterator[tuple[Array, str, float]]:
+    """What is seen of a board, with its colour and the width of its edge: from behind, the paper alone."""
+    dark = np.concatenate(board.dark) if board.dark else np.zeros((0, 3))
+    if len(board.paper):
+        yield board.paper, PAPER, 0.6
+        normal = np.cross(board.paper[1] - board.paper[0], board.paper[2] - board.paper[0])
+        if len(dark) and ((dark.mean(axis=0) - board.paper.mean(axis=0)) @ normal) * (normal @ eye) < 0.0:
+            return
+    yield from ((part, DARK, 0.0) for part in board.dark)
 
 
 def _ellipsoids(axes: Axes, scene: Scene, P: Array) -> None:

@@ -26,6 +26,8 @@ EARLY, LATE = "#3B76C4", "#E69F00"
 EXACT, DIGITS = 10, 5
 #: Names stand on different sides of their frames, one after the other, as neighbours are often near.
 TEXTS = ("bottom center", "top right", "bottom right", "top left", "bottom left")
+#: A sentence has at most this many characters beside the pointer; the list below the scene has all of it.
+LONGEST = 120
 #: Flat colours, whatever the light.
 FLAT = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
 Trace = dict[str, Any]
@@ -48,12 +50,13 @@ def traces_of(scene: Scene, lines: Sequence[Line]) -> tuple[Trace, ...]:
 
 
 def _boards(scene: Scene) -> Iterator[Trace]:
-    boards = scene.boards
-    for name, polygons, colour in (("boards", boards.paper, PAPER), ("boards, dark", boards.dark, DARK)):
+    paper = [board.paper for board in scene.boards if len(board.paper)]
+    dark = [part for board in scene.boards for part in board.dark]
+    for name, polygons, colour in (("boards", paper, PAPER), ("boards, dark", dark, DARK)):
         if polygons:
             yield _mesh("boards", name, *_fans(polygons), scene, colour=colour, lighting=FLAT, showlegend=False)
     if len(scene.frames) <= MANY:
-        closed = [np.vstack([polygon, polygon[:1]]) for polygon in boards.paper]
+        closed = [np.vstack([polygon, polygon[:1]]) for polygon in paper]
         if closed:
             yield {**_strokes("boards", "boards, edges", closed, scene, colour=GREY, width=2), "showlegend": False}
 
@@ -116,13 +119,13 @@ def _ellipsoids(scene: Scene) -> Iterator[Trace]:
 
 
 def _axes(scene: Scene) -> Iterator[Trace]:
+    lengths = scene.axes_m
     for k, (name, colour) in enumerate(zip(AXIS_NAMES, AXIS_COLOURS, strict=True)):
         pieces = []
         for frame in scene.frames:
             if len(scene.frames) > MANY and frame.kind == "target":
                 continue
-            length = scene.axis_m * (1.6 if frame.kind == "carrier" else 1.0)
-            pieces.append(np.array([frame.T[:3, 3], frame.T[:3, 3] + length * frame.T[:3, k]]))
+            pieces.append(np.array([frame.T[:3, 3], frame.T[:3, 3] + lengths[frame.kind] * frame.T[:3, k]]))
         yield _strokes("axes", name, pieces, scene, colour=colour, width=5)
 
 
@@ -153,7 +156,12 @@ def _lines(scene: Scene, lines: Sequence[Line]) -> Iterator[Trace]:
         if not some:
             continue
         pieces = [piece for line in some for piece in line.pieces]
-        said = [_safe(f"{line.label}: {line.words}") for line in some for piece in line.pieces for _ in (*piece, None)]
+        said = [
+            _safe(shortened(f"{line.label}: {line.words}", LONGEST)) if k == 0 else ""
+            for line in some
+            for k, piece in enumerate(line.pieces)
+            for _ in (*piece, None)
+        ]
         trace = _strokes("directions", name, pieces, scene, colour=PURPLE, width=6 if is_free else 4, dash=dash)
         yield {**trace, "text": said, "hoverinfo": "text"}
 

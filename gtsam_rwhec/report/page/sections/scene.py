@@ -72,7 +72,14 @@ def _of_ellipsoids(scene: Scene, lines: tuple[Line, ...]) -> str:
         larger = f"all drawn {scene.times:,.0f} times as large" if scene.times > 1.0 else "drawn to scale"
         says.append(f"Ellipsoids hold the true position with 95 % probability, {larger}.")
     else:
-        says.append("There are no covariances, and so no ellipsoids.")
+        known = any(frame.covariance is not None for frame in scene.frames)
+        has_deviations = any(words.startswith("±") for frame in scene.frames for words in frame.words)
+        if known:
+            says.append("No ellipsoid fits into the scene.")
+        elif has_deviations:
+            says.append("No position is known in all directions, and so there are no ellipsoids.")
+        else:
+            says.append("There are no covariances, and so no ellipsoids.")
     if any(line.is_free for line in lines):
         says.append("Dashed lines: directions that the measurements leave free.")
     if any(not line.is_free for line in lines):
