@@ -65,7 +65,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Board:
+class PlacedBoard:
     """A board: its paper (n, 3), empty where it is not known, and its dark parts, each (n, 3), metres."""
 
     paper: Array
@@ -82,7 +82,7 @@ class Scene:
         The carrier whose axes the scene has.
     frames : tuple of Frame
     views : tuple of View
-    boards : tuple of Board
+    boards : tuple of PlacedBoard
     path : (n, 7) array
         x, y, z, roll, pitch, yaw (degrees) and seconds of the moving carrier; seconds are nan without stamps.
     moving : str
@@ -100,7 +100,7 @@ class Scene:
     world: str
     frames: tuple[Frame, ...]
     views: tuple[View, ...]
-    boards: tuple[Board, ...]
+    boards: tuple[PlacedBoard, ...]
     path: Array
     moving: str
     low: Array
@@ -242,7 +242,7 @@ def _views(frames: list[Frame], evidence: SceneEvidence) -> Iterator[View]:
         yield View(frame.name, frame.T[:3, 3], rim)
 
 
-def _boards(frames: list[Frame], evidence: SceneEvidence | None, plain: float) -> Iterator[Board]:
+def _boards(frames: list[Frame], evidence: SceneEvidence | None, plain: float) -> Iterator[PlacedBoard]:
     """The boards in the scene; one of unknown shape is a plain square."""
     square = plain * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
     for frame in frames:
@@ -252,10 +252,10 @@ def _boards(frames: list[Frame], evidence: SceneEvidence | None, plain: float) -
         board = None if target is None else target.board
         R, t = frame.T[:3, :3], frame.T[:3, 3]
         if board is None:
-            yield Board(square @ R.T + t, ())
+            yield PlacedBoard(square @ R.T + t, ())
             continue
         paper = np.array(board.paper).reshape(-1, 3) @ R.T + t
-        yield Board(paper, tuple(np.array(polygon) @ R.T + t for polygon in board.dark))
+        yield PlacedBoard(paper, tuple(np.array(polygon) @ R.T + t for polygon in board.dark))
 
 
 def _is_near(place: Array, others: Array) -> bool:

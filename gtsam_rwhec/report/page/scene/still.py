@@ -11,7 +11,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.report.page.figures import INK, SvgFigure, svg_figure
 from gtsam_rwhec.report.page.scene.directions import Line
 from gtsam_rwhec.report.page.scene.layout import first_view
-from gtsam_rwhec.report.page.scene.model import MANY, Board, Scene
+from gtsam_rwhec.report.page.scene.model import MANY, PlacedBoard, Scene
 from gtsam_rwhec.report.page.scene.traces import DARK, EARLY, LATE, MOST_NAMES, PAPER
 from gtsam_rwhec.report.plots.drawing import AXIS_COLOURS, AXIS_NAMES, GREY, ORANGE, PURPLE, SKY, shortened
 
@@ -82,12 +82,12 @@ def _draw(figure: Figure, scene: Scene, lines: Sequence[Line]) -> None:
     _legend(figure, scene, lines)
 
 
-def _depth(board: Board, eye: Array) -> float:
+def _depth(board: PlacedBoard, eye: Array) -> float:
     """How near a board is to the eye."""
     return float(np.concatenate([board.paper, *board.dark]).mean(axis=0) @ eye)
 
 
-def _parts(board: Board, eye: Array) -> Iterator[tuple[Array, str, float]]:
+def _parts(board: PlacedBoard, eye: Array) -> Iterator[tuple[Array, str, float]]:
     """What is seen of a board, with its colour and the width of its edge: from behind, the paper alone."""
     dark = np.concatenate(board.dark) if board.dark else np.zeros((0, 3))
     if len(board.paper):
