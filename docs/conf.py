@@ -22,6 +22,7 @@ extensions = [
     "building.command_pages",
     "building.api_pages",
     "building.docstrings",
+    "building.formulas",
     "building.names",
 ]
 exclude_patterns = ["building"]
@@ -42,6 +43,7 @@ napoleon_use_ivar = True
 napoleon_use_rtype = False
 default_role = "py:obj"
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "gtsam-rwhec"
 html_show_sourcelink = False
