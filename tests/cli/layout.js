@@ -53,7 +53,8 @@
   overlaps(boxes.filter(({ rect }) => rect.width > 0), "blocks");
 
   // The words of each figure: inside of it, and clear of one another.
-  for (const svg of document.querySelectorAll("figure svg")) {
+  // In a scene names are where their frames are, some of them at one place.
+  for (const svg of document.querySelectorAll("figure :not(.still) > svg")) {
     const frame = svg.getBoundingClientRect();
     if (!frame.width || !svg.checkVisibility()) continue;
     const name = svg.closest("figure").id;
