@@ -156,8 +156,8 @@ def found_tags(picture: np.ndarray) -> list[tuple[int, Array]]:
 @pytest.mark.parametrize(
     ("log", "camera"),
     [
-        ("robot_cell", "cam_wide"),
         ("eye_to_hand", "cam_front"),
+        pytest.param("robot_cell", "cam_wide", marks=pytest.mark.slow),
         pytest.param("robot_cell", "cam_left", marks=pytest.mark.slow),
         pytest.param("eye_to_hand", "cam_side", marks=pytest.mark.slow),
     ],
