@@ -200,7 +200,7 @@ def calibrate(
         raise typer.BadParameter("--carrier-noise-deg and --carrier-noise-mm go together: give both, or neither")
     if noise == "given" and (sigma is None or kappa is None):
         raise typer.BadParameter("--noise given needs --sigma and --kappa: give both, or use --noise estimate")
-    check_output(output)
+    check_output(output, source)
     carriers = None
     if carrier_noise_deg is not None and carrier_noise_mm is not None:
         carriers = rw.CarrierNoise(math.radians(carrier_noise_deg), 1e-3 * carrier_noise_mm)

@@ -10,6 +10,7 @@ import typer
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import check_output
+from gtsam_rwhec.cli.report import read_of
 from gtsam_rwhec.errors import FileFormatError
 from gtsam_rwhec.files.terminal_text import say, shown_path
 
@@ -52,7 +53,7 @@ def diff(
     output: PageOption = None,
 ) -> ExitStatus:
     """What moved from an old calibration to a new one, and whether by more than chance; exit status 1 if so."""
-    check_output(output)
+    check_output(output, *(file for each in (old, new) for file in read_of(each)))
     found = rw.changes.difference(
         rw.changes.read_calibration(old),
         rw.changes.read_calibration(new),

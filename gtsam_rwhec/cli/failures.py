@@ -20,6 +20,7 @@ from gtsam_rwhec.errors import (
     RwhecWarning,
 )
 from gtsam_rwhec.files.atomic_write import why_not_writable
+from gtsam_rwhec.files.paths import is_one_of
 from gtsam_rwhec.files.terminal_text import printable
 
 
@@ -85,8 +86,12 @@ def said_in_the_report() -> Iterator[None]:
         yield
 
 
-def check_output(output: Path | None) -> None:
-    """Check before a long calculation that its result can be written; raise FileFormatError if not."""
-    why = "" if output is None else why_not_writable(output)
+def check_output(output: Path | None, *inputs: Path) -> None:
+    """Check before a long calculation that its result can be written, and not onto an input; else FileFormatError."""
+    if output is None:
+        return
+    why = why_not_writable(output)
+    if not why and is_one_of(output, inputs):
+        why = "the command reads it; give the name of another file"
     if why:
         raise FileFormatError(f"{output} cannot be written: {why}.")

@@ -35,13 +35,19 @@ def report(
     """
     if output is None:
         output = report_path(result)
-    check_output(output)
+    check_output(output, *read_of(result))
     with StageDisplay() as stage:
         stage("writing the report")
         rw.report.write_html(result, output, images=images, figures=figures)
     beside = "" if figures is None else f"; figures: {shown_path(figures)}"
     say(f"Written to {shown_path(output)}{beside}.", to_errors=True)
     return ExitStatus.DONE
+
+
+def read_of(result: Path) -> tuple[Path, ...]:
+    """The files that are read of a result, or of the folder that has it."""
+    file = result / rw.pipeline.RESULT_FILE if result.is_dir() else result
+    return file, rw.evidence.evidence_path(file)
 
 
 def report_path(result: Path) -> Path:

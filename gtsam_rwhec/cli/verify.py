@@ -13,6 +13,7 @@ from gtsam_rwhec.cli.diff import LEVEL, RESULT_HELP, LevelOption, PageOption, wr
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import check_output
 from gtsam_rwhec.cli.options import FOLDER_OF_CSV, RigOption, SensorsOption, TargetsOption, WorkersOption
+from gtsam_rwhec.cli.report import read_of
 from gtsam_rwhec.cli.stage_display import StageDisplay
 
 
@@ -40,7 +41,7 @@ def verify(
 
     Exit status 0: it holds. 1: it no longer does. 3: nothing contradicts it, but a sensor of it was not seen.
     """
-    check_output(output)
+    check_output(output, source, *read_of(result), *([] if rig is None else [rig]))
     old = rw.changes.read_calibration(result) if result.suffix.lower() != ".mcap" else None
     with StageDisplay() as stage:
         if old is not None and old.log is None:

@@ -35,12 +35,15 @@ def why_not_writable(path: str | Path) -> str:
     For checks before a long calculation: rights, read-only disks and names that folders have show only by trying.
     """
     path = Path(path).absolute()
-    if not path.parent.is_dir():
-        return f"the folder {path.parent} does not exist"
-    if path.is_dir():
-        return "it is a folder; give the name of a file"
-    if path.exists() and not path.is_file():
-        return ""  # a pipe or a device: to open it is to begin
+    try:
+        if not path.parent.is_dir():
+            return f"the folder {path.parent} does not exist"
+        if path.is_dir():
+            return "it is a folder; give the name of a file"
+        if path.exists() and not path.is_file():
+            return ""  # a pipe or a device: to open it is to begin
+    except OSError as error:  # a name that is too long
+        return error.strerror or str(error)
     trial = Path(os.path.realpath(path)).with_name(f".{path.name}.{os.getpid()}.trial")
     try:
         with open(trial, "xb"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from gtsam_rwhec.errors import FileFormatError
@@ -19,6 +20,18 @@ def checked_path(path: object) -> Path:
     if len(os.fsencode(text)) >= MOST_BYTES or any(len(os.fsencode(part)) > LONGEST_NAME for part in Path(text).parts):
         raise FileFormatError(f"{brief(path)} is not a path; no file can have so long a name.")
     return Path(text)
+
+
+def is_one_of(path: Path, files: Iterable[Path]) -> bool:
+    """Whether a path is one of these ordinary files, by whatever name; what cannot be looked at is not."""
+    return any(_is_same(path, file) for file in files)
+
+
+def _is_same(path: Path, file: Path) -> bool:
+    try:
+        return file.is_file() and path.samefile(file)
+    except OSError:  # one of them is not there
+        return False
 
 
 def _is_encodable(text: str) -> bool:

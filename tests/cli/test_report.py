@@ -44,3 +44,22 @@ def test_a_folder_that_cannot_be_written_is_said_before_the_work(result: Path, t
     status, said = command("report", result, "-o", tmp_path / "none" / "page.html")
     assert status == 2
     assert "cannot be written: the folder" in said
+
+
+def test_a_page_is_not_written_onto_the_result_or_its_evidence(result: Path) -> None:
+    content = result.read_bytes()
+    status, said = command("report", result.parent, "-o", result)
+    assert (status, "the command reads it" in said) == (2, True)
+    evidence = rw.evidence.evidence_path(result)
+    rw.evidence.write_evidence(rw.evidence.Evidence(), evidence, result)
+    assert command("report", result, "-o", evidence)[0] == 2
+    assert command("diff", result, result, "-o", result)[0] == 2
+    assert command("verify", result, result, "-o", result)[0] == 2
+    assert result.read_bytes() == content
+    assert rw.evidence.read_evidence(evidence).derived is None
+    evidence.unlink()
+
+
+def test_a_name_that_is_too_long_is_refused_in_words(result: Path, tmp_path: Path) -> None:
+    status, said = command("report", result, "-o", tmp_path / f"{'a' * 300}.html")
+    assert (status, "cannot be written: File name too long" in said.replace("\n", " ")) == (2, True)

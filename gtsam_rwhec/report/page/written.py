@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
+import numpy as np
+
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.verdict import Verdict
-from gtsam_rwhec.errors import EvidenceWarning, FileFormatError
+from gtsam_rwhec.errors import EvidenceWarning, FileFormatError, OptionError
 from gtsam_rwhec.evidence import Evidence, evidence_path, read_evidence
 from gtsam_rwhec.evidence.evidence import checksum
-from gtsam_rwhec.files.paths import checked_path
+from gtsam_rwhec.files.paths import checked_path, is_one_of
+from gtsam_rwhec.files.terminal_text import brief
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.report.page.blocks import Page
 from gtsam_rwhec.report.page.figure_files import write_figures
@@ -24,6 +29,8 @@ from gtsam_rwhec.results.written_result import calibration_json
 
 #: The name of a result in an output folder.
 RESULT_FILE = "result.json"
+#: Rotations whose matrices differ by less are the same.
+SAME_ROTATION = 1e-6
 TONES = {Verdict.USE: "good", Verdict.CARE: "care", Verdict.DO_NOT_USE: "bad"}
 
 
@@ -58,16 +65,56 @@ def write_html(
     ------
     FileFormatError, ResultVersionError
         A file cannot be read or written, or is no result; the message says which.
+    OptionError
+        `result` or `evidence` is something else, or the evidence is of another calibration.
     """
     path = checked_path(path)
+    folder = None if figures is None else checked_path(figures)
+    _check_evidence(evidence)
     if isinstance(result, Calibration):
         shown = ShownResult.of(calibration_json(result, log), evidence, images=images)
     else:
-        shown = read_shown(result, evidence, images=images)
+        file = _result_file(result)
+        if is_one_of(path, (file, evidence_path(file))):
+            raise FileFormatError(f"{path} is read for the page: give the page another name.")
+        shown = read_shown(file, evidence, images=images)
+    if evidence is not None and not _is_of(evidence, shown):
+        raise OptionError("evidence is of another calibration: it has other frames, or their poses are others")
     page = report_page(shown)
     write_page(page, path)
-    if figures is not None:
-        write_figures(page, figures)
+    if folder is not None:
+        write_figures(page, folder)
+
+
+def _check_evidence(evidence: object) -> None:
+    if not isinstance(evidence, Evidence | None):
+        raise OptionError(
+            f"evidence is {brief(evidence)}; give what rw.evidence.evidence_of(problem, calibration) returned, or "
+            "nothing: the evidence beside a result file is read with it"
+        )
+
+
+def _is_of(evidence: Evidence, shown: ShownResult) -> bool:
+    """Whether evidence is of the result, by its frames and their rotations; without either there is no telling."""
+    if evidence.derived is None or shown.result is None:
+        return True
+    answer = shown.result.refined or shown.result.solution
+    poses = {**answer.Y, **answer.X}
+    angles = {each.frame: np.radians(each.rpy_deg) for each in evidence.derived.angles}
+    return angles.keys() == poses.keys() and all(
+        np.allclose(gtsam.Rot3.RzRyRx(*angles[name]).matrix(), pose.rotation().matrix(), rtol=0.0, atol=SAME_ROTATION)
+        for name, pose in poses.items()
+    )
+
+
+def _result_file(result: object) -> Path:
+    """The file of a result that is given by its path, or by its folder's."""
+    if not isinstance(result, str | os.PathLike):
+        raise OptionError(
+            f"result is a {type(result).__name__}; give what rw.calibrate returned, or the path of a result file"
+        )
+    path = checked_path(result)
+    return path / RESULT_FILE if path.is_dir() else path
 
 
 def read_shown(path: str | Path, evidence: Evidence | None = None, *, images: bool = True) -> ShownResult:
@@ -75,9 +122,7 @@ def read_shown(path: str | Path, evidence: Evidence | None = None, *, images: bo
 
     Evidence that is damaged, or of another result, is left out with a warning: the result is shown without it.
     """
-    path = Path(path)
-    if path.is_dir():
-        path = path / RESULT_FILE
+    path = _result_file(path)
     content = read_whole(path, MOST_BYTES, "A result was")
     wrong = ""
     beside = evidence_path(path)

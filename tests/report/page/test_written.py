@@ -114,3 +114,22 @@ def test_evidence_of_another_result_is_left_out_and_said(folder: Path, tmp_path:
     assert "of another result" in other
     assert "is not the evidence of a calibration" in damaged
     assert "evidence.json#" not in other + damaged
+
+
+def test_a_page_is_of_a_result_its_own_evidence_and_a_file_of_its_own(folder: Path, tmp_path: Path) -> None:
+    problem = rig(1, 1).problem
+    other = rw.calibrate(problem)
+    page, own = tmp_path / "page.html", rw.evidence.evidence_of(problem, other)
+    with pytest.raises(rw.errors.OptionError, match="evidence is of another calibration"):
+        rw.report.write_html(folder / "result.json", page, own)
+    for wrong in (5, "evidence.json"):
+        with pytest.raises(rw.errors.OptionError, match="give what rw.evidence.evidence_of"):
+            rw.report.write_html(other, page, wrong)  # type: ignore[arg-type]
+    for wrong in (None, other.solution, b"result.json"):
+        with pytest.raises(rw.errors.OptionError, match="give what rw.calibrate returned"):
+            rw.report.write_html(wrong, page)  # type: ignore[arg-type]
+    with pytest.raises(rw.errors.FileFormatError, match="is not a path"):
+        rw.report.write_html(other, page, own, figures=5)  # type: ignore[arg-type]
+    with pytest.raises(rw.errors.FileFormatError, match="is read for the page"):
+        rw.report.write_html(folder, folder / "evidence.json")
+    assert not page.exists()
