@@ -181,7 +181,7 @@ def _neighbours(shown: ShownResult, found: ResidualsEvidence) -> Iterator[Block]
     words: list[str] = []
     if judged:
         words.append(
-            f"In {beyond} of {judged} pairs a residual is like the one before it by more than chance allows in 95 %: "
+            f"In {beyond} of {judged} pairs residuals follow or oppose those before more than chance allows in 95 %: "
             f"of {judged} pairs about {0.05 * judged:.1f} are so by chance."
         )
     if found.instants is None or found.worth is None:

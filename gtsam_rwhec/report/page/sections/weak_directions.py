@@ -13,7 +13,10 @@ from gtsam_rwhec.report.page.shown_result import ShownResult
 NO_TURN = "No such turn would help clearly more than measuring on."
 #: A direction is called after a coordinate axis within 8 degrees of it.
 AXIS_COSINE = np.cos(np.radians(8.0))
-NOT_KNOWN = "Not shown: the least known directions, for the result has no evidence.json beside it with covariances."
+NOT_KNOWN = (
+    "Not shown: the least known directions beside those that are free. They need evidence.json beside the result, and "
+    "covariances that are finite for some frame."
+)
 NONE_IS_WEAK = (
     f"No direction is weak: none has a standard deviation above {WEAK:g} times the median of all. The table has the "
     "least known direction of each frame."
