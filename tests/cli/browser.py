@@ -27,7 +27,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 #: Pixels of the height of a screenshot.
 PIECE = 2000
 #: The page is ready when its scenes are drawn, or when it is known that they cannot be.
-READY = "document.documentElement.dataset.scenes || !document.getElementById('plotly')"
+READY = "() => document.documentElement.dataset.scenes || !document.getElementById('plotly')"
 
 
 def chromium() -> str:

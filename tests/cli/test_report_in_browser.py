@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import unicodedata
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
@@ -111,7 +112,7 @@ def test_the_rig_turns_and_takes_the_colours_of_the_page(
         assert max(abs(turned[axis] - before[axis]) for axis in "xyz") > 0.05
         ink = page.evaluate("document.querySelector('.turn')._fullLayout.font.color")
         page.emulate_media(color_scheme="dark")
-        page.wait_for_function(f"document.querySelector('.turn')._fullLayout.font.color !== '{ink}'")
+        page.wait_for_function(f"() => document.querySelector('.turn')._fullLayout.font.color !== '{ink}'")
         kept = camera(page)
         assert max(abs(turned[axis] - kept[axis]) for axis in "xyz") < 1e-6
         assert report.complaints == []
@@ -181,8 +182,8 @@ def test_paper_has_everything(browser: Any, reports: dict[str, Path], looks: Pat
 
 
 def _packed(text: str) -> str:
-    """A text without white space and hyphens, which differ where lines end."""
-    return re.sub(r"[\s\u00ad\u2010-]+", "", text)
+    """A text without white space, hyphens and ligatures, which are others on paper."""
+    return re.sub(r"[\s\u00ad\u2010-]+", "", unicodedata.normalize("NFKC", text))
 
 
 def test_without_javascript_everything_is_there_but_turning(browser: Any, reports: dict[str, Path]) -> None:
