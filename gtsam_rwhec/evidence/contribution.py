@@ -7,6 +7,7 @@ each measurement counts by itself.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 
 import numpy as np
 from pydantic import Field
@@ -21,6 +22,8 @@ MOST_CHOSEN_FROM = 250
 BEGIN = 1e-6
 #: How much larger the worst standard deviation may be.
 GROWTHS = (0.05, 0.1, 0.25, 0.5)
+#: So many measurements are looked at together.
+AT_ONCE = 512
 #: So many images are listed.
 LISTED = 10
 
@@ -73,7 +76,7 @@ def contribution_of(model: LinearModel) -> ContributionEvidence | None:
     if not own:
         return None
     blocks = np.array(own)
-    found = [_image(model, r, J, padded, blocks, rows) for rows in images]
+    found = _left_out(model, r, J, padded, blocks, images)
     by_share = sorted(found, key=lambda one: -one.share)
     by_move = sorted(found, key=lambda one: -one.moved)
     each = -(-len(images) // MOST_CHOSEN_FROM)
@@ -102,41 +105,62 @@ def _images(model: LinearModel, which: np.ndarray) -> list[np.ndarray]:
     return np.split(which[order], np.flatnonzero(np.diff(image.ravel()[order])) + 1)
 
 
-def _image(
-    model: LinearModel, r: Array, J: Array, covariance: Array, blocks: Array, rows: np.ndarray
-) -> ImageContribution:
-    """Leave-one-out of one image: d = -S J' (1 - J S J')^-1 r, and the covariance S + S J' (1 - J S J')^-1 J S.
+def _left_out(
+    model: LinearModel, r: Array, J: Array, covariance: Array, blocks: Array, images: list[np.ndarray]
+) -> list[ImageContribution]:
+    """Leave-one-out of images, all of one size together: d = -S J' (1 - J S J')^-1 r, and S + S J' (1 - J S J')^-1 J S.
 
-    ``blocks`` (F, 6, 6) are the inverses of the frames' own covariances; zero along free directions.
+    ``covariance`` S has a last row and column of zeros; ``blocks`` (F, 6, 6) are the inverses of the frames' own
+    covariances, zero along free directions.
     """
-    own, derivative = _stacked(model, J, rows)
-    spread = covariance[:, own] @ derivative.T  # S J'
-    hat = derivative @ spread[own]
-    left = np.eye(len(hat)) - hat
+    found: dict[int, ImageContribution] = {}
+    sizes = np.array([len(rows) for rows in images])
+    for size in np.unique(sizes).tolist():
+        alike = np.flatnonzero(sizes == size)
+        for part in np.array_split(alike, -(-len(alike) * size // AT_ONCE)):
+            rows = np.array([images[i] for i in part])
+            found |= dict(zip(part.tolist(), _alike(model, r, J, covariance, blocks, rows), strict=True))
+    return [found[i] for i in range(len(images))]
+
+
+def _alike(
+    model: LinearModel, r: Array, J: Array, covariance: Array, blocks: Array, rows: np.ndarray
+) -> Iterator[ImageContribution]:
+    """The same for images with as many measurements each: their places (n, k)."""
+    n, k = rows.shape
+    places, derivative = model.places[rows], J[rows]
+    spread = np.einsum("dnkp,nkip->ndki", covariance[:, places], derivative, optimize=True)  # S J'
+    spread = spread.reshape(n, len(covariance), 6 * k)
+    there = np.take_along_axis(spread, places.reshape(n, -1, 1), axis=1).reshape(n, k, OWN, 6 * k)
+    hat = np.einsum("nkip,nkpj->nkij", derivative, there).reshape(n, 6 * k, 6 * k)
     # Where only this image tells something, a direction is lost without it: its eigenvalue is zero up to rounding.
-    values, vectors = np.linalg.eigh(left)
+    values, vectors = np.linalg.eigh(np.eye(6 * k) - hat)
     values = np.maximum(values, 1e-9)
-    half = spread @ vectors / np.sqrt(values)
-    residual = r[rows].reshape(-1)
-    step = -(half @ (vectors.T @ residual / np.sqrt(values)))
-    variance = np.diagonal(covariance)[:-1]
+    half = spread @ (vectors / np.sqrt(values)[:, None, :])
+    turned = np.einsum("nij,ni->nj", vectors, r[rows].reshape(n, 6 * k)) / np.sqrt(values)
+    step = -np.einsum("ndj,nj->nd", half, turned)
+    variance = np.diagonal(covariance)
     known = variance > 0.0
-    growth = np.sqrt(1.0 + (half[:-1] ** 2).sum(axis=1)[known] / variance[known]) - 1.0
-    by_frame = step[: 6 * len(blocks)].reshape(-1, 6)
-    squares = np.einsum("fi,fij,fj->f", by_frame, blocks, by_frame)
-    most = int(squares.argmax())
-    sensor = model.pairs[model.pair[rows[0]]].sensor
-    return ImageContribution(
-        sensor=sensor,
-        targets=tuple(model.pairs[pair].target for pair in model.pair[rows].tolist()),
-        time=float(model.seconds[rows[0]]),
-        stamp_ns=None if model.stamps_ns is None else int(model.stamps_ns[rows[0]]),
-        share=float(np.trace(hat)) / max(int(known.sum()), 1),
-        moved=float(np.sqrt(max(squares[most], 0.0))),
-        moved_frame=list(model.frames)[most],
-        moved_mm=1e3 * float(np.linalg.norm(by_frame[most, 3:])),
-        growth=float(growth.max(initial=0.0)),
-    )
+    ratio = (half**2).sum(axis=2)[:, known] / variance[known]
+    growth = np.sqrt(1.0 + ratio.max(axis=1, initial=0.0)) - 1.0
+    by_frame = step[:, : 6 * len(blocks)].reshape(n, -1, 6)
+    squares = np.maximum(np.einsum("nfi,fij,nfj->nf", by_frame, blocks, by_frame, optimize=True), 0.0)
+    most = squares.argmax(axis=1)
+    share = np.einsum("nii->n", hat) / max(int(known.sum()), 1)
+    names, seconds = list(model.frames), model.seconds
+    for i, first in enumerate(rows[:, 0].tolist()):
+        frame = int(most[i])
+        yield ImageContribution(
+            sensor=model.pairs[model.pair[first]].sensor,
+            targets=tuple(model.pairs[pair].target for pair in model.pair[rows[i]].tolist()),
+            time=float(seconds[first]),
+            stamp_ns=None if model.stamps_ns is None else int(model.stamps_ns[first]),
+            share=float(share[i]),
+            moved=float(np.sqrt(squares[i, frame])),
+            moved_frame=names[frame],
+            moved_mm=1e3 * float(np.linalg.norm(by_frame[i, frame, 3:])),
+            growth=float(growth[i]),
+        )
 
 
 def _stacked(model: LinearModel, J: Array, rows: np.ndarray) -> tuple[np.ndarray, Array]:
