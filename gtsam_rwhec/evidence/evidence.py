@@ -20,6 +20,7 @@ from gtsam_rwhec.evidence.seen import SeenEvidence
 from gtsam_rwhec.evidence.weak import WeakDirection
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.results.json_text import MOST_BYTES as MOST_BYTES_OF_RESULT
 from gtsam_rwhec.results.json_tree import in_words
 
 FORMAT: Final = "gtsam-rwhec evidence"
@@ -68,7 +69,7 @@ def write_evidence(evidence: Evidence, path: str | Path, result_path: str | Path
         The file cannot be written, or that of the result cannot be read.
     """
     if result_path is not None:
-        content = read_whole(Path(result_path), MOST_BYTES, "A result was")
+        content = read_whole(Path(result_path), MOST_BYTES_OF_RESULT, "A result was")
         evidence = evidence.model_copy(update={"result_sha256": checksum(content)})
     write_atomically(path, evidence_json(evidence))
 

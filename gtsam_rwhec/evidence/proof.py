@@ -66,7 +66,7 @@ def proof_of(solution: Solution, problem: Problem) -> Proof:
     return Proof(gap=gap, relative_gap=relative, parts=tuple(parts))
 
 
-OTHER = "the measurements at hand are not those of the proof"
+OTHER = "the proof is of other measurements than these, or of other weights, as the search for outliers finds them"
 
 
 def _gaps(certificate: Certificate) -> tuple[float | None, float | None]:

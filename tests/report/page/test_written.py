@@ -133,3 +133,11 @@ def test_a_page_is_of_a_result_its_own_evidence_and_a_file_of_its_own(folder: Pa
     with pytest.raises(rw.errors.FileFormatError, match="is read for the page"):
         rw.report.write_html(folder, folder / "evidence.json")
     assert not page.exists()
+
+
+def test_a_result_that_is_larger_than_evidence_may_be_has_evidence(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gtsam_rwhec.evidence.evidence.MOST_BYTES", 10)  # a result of 300 frames has 112 MB
+    rw.evidence.write_evidence(rw.evidence.Evidence(), tmp_path / "evidence.json", folder / "result.json")
+    assert (tmp_path / "evidence.json").exists()
