@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from typing import Annotated
 
+from pydantic import BaseModel, ConfigDict, Field
+
+#: A number of a file that may come from anyone: its square, and sums of many, are still finite.
+Bounded = Annotated[float, Field(ge=-1e60, le=1e60)]
 #: Rows of numbers: an array as JSON has it.
-Row = tuple[float, ...]
+Row = tuple[Bounded, ...]
 Rows = tuple[Row, ...]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -65,3 +66,19 @@ def test_arrows_over_the_image_point_where_corners_are_off() -> None:
         noise_px=0.1, at_optimum=True, x=tuple(x), y=tuple(y), dx=tuple(np.full(400, 0.25)), dy=tuple(np.zeros(400)),
     )  # fmt: skip
     assert "cam: longest 0.25 px" in image_figure((camera,))
+
+
+def test_evidence_of_numbers_without_bounds_is_refused(shown: ShownResult, tmp_path: Path) -> None:
+    """Found by damaging a file: 1e308 was read, and the page ended in a ValueError of its chart."""
+    assert shown.evidence is not None
+    tree = json.loads(evidence_json(shown.evidence))
+    path = tmp_path / "evidence.json"
+    for value, is_refused in ((1e308, True), (1e59, False)):
+        tree["residuals"]["pairs"][0]["normalised"][0][0] = value
+        path.write_text(json.dumps(tree), encoding="utf-8")
+        if is_refused:
+            with pytest.raises(rw.errors.FileFormatError, match="normalised"):
+                rw.evidence.read_evidence(path)
+        else:
+            of = ShownResult.of(json.dumps(shown.tree).encode(), rw.evidence.read_evidence(path))
+            assert residuals_section(of).blocks
