@@ -72,12 +72,13 @@ def diff(
 
 def have_same_inputs(old: Path, new: Path) -> bool:
     """Whether the evidence beside two results names input files with the same checksums."""
-    first, second = (_checksums(rw.evidence.evidence_path(rw.changes.result_path(path))) for path in (old, new))
+    first, second = map(old_checksums, (old, new))
     return bool(first) and first == second
 
 
-def _checksums(evidence: Path) -> set[str]:
-    """Of the input files; empty where nothing readable says them."""
+def old_checksums(result: Path) -> set[str]:
+    """Of the input files of a calibration; empty where nothing readable beside its result says them."""
+    evidence = rw.evidence.evidence_path(rw.changes.result_path(result))
     if not evidence.exists():
         return set()
     try:

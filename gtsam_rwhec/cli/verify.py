@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,12 +10,17 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.calibrate import is_log, other_than_csv
-from gtsam_rwhec.cli.diff import LEVEL, RESULT_HELP, LevelOption, PageOption, write_page_to
+from gtsam_rwhec.cli.diff import LEVEL, RESULT_HELP, LevelOption, PageOption, old_checksums, write_page_to
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import check_output
 from gtsam_rwhec.cli.options import FOLDER_OF_CSV, RigOption, SensorsOption, TargetsOption, WorkersOption
 from gtsam_rwhec.cli.report import read_of
 from gtsam_rwhec.cli.stage_display import StageDisplay
+
+#: The files of a folder by which it is known again; images are not read for it.
+LOG_SUFFIXES = (".mcap", ".db3", ".bag", ".csv")
+#: What is said of a log that the old calibration was made from.
+SAME_LOG = "The old calibration was made from this very log, so that it agrees says nothing: give a log recorded later."
 
 
 def verify(
@@ -58,11 +64,21 @@ def verify(
                 workers=workers,
                 progress=stage,
             )
+    if is_of_old_log(result, source):
+        found = replace(found, remarks=(SAME_LOG, *found.remarks))
     rw.report.print_verification(found)
     write_page_to(found, output, (result, source))
     if not found.holds:
         return ExitStatus.CHANGED
     return ExitStatus.NOT_UNIQUE if found.unchecked_sensors else ExitStatus.DONE
+
+
+def is_of_old_log(result: Path, source: Path) -> bool:
+    """Whether all files of the new log are files that the old calibration was made from, by their checksums."""
+    if not (old := old_checksums(result)):
+        return False
+    files = [path for path in source.glob("*") if path.suffix in LOG_SUFFIXES] if source.is_dir() else [source]
+    return bool(files) and {file.sha256 for file in rw.evidence.input_files(files)} <= old
 
 
 def _problem(source: Path, scale: rw.ScaleMode, targets: str, sensors: str) -> rw.Problem:

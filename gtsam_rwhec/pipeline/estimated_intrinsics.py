@@ -87,7 +87,8 @@ def in_words(sensor: str, found: EstimatedIntrinsics) -> str:
         f"No intrinsics of {sensor} are stated. Detection worked with a first estimate, from {found.views} views of "
         f"boards in its images of {camera.width} x {camera.height} pixels: {camera.model}, "
         f"fx, fy = {K[0, 0]:.1f}, {K[1, 1]:.1f}, cx, cy = {K[0, 2]:.1f}, {K[1, 2]:.1f}, distortion {bent}; "
-        f"{found.rms_px:.2f} px rms over {found.corners} corners."
+        f"{found.rms_px:.2f} px rms over {found.corners} corners. "
+        "If you have a calibration of this camera, state it in the rig file."
     )
 
 

@@ -65,7 +65,9 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
         if row.estimate is None:
             reasons.setdefault(str(row.error), []).append(row.method.name)
     if reasons:
-        print_heading(console, "Methods without an answer")
+        chained = any(row.tree for row in comparison.chained)  # these have an answer, in the table above
+        heading = "Why methods do not apply to all pairs at once" if chained else "Methods without an answer"
+        print_heading(console, heading)
         print_list(console, (f"{', '.join(names)}: {reason}" for reason, names in reasons.items()))
 
 

@@ -11,7 +11,7 @@ from two_logs import calibrated, log_of
 from typer.testing import CliRunner
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.cli import diff
+from gtsam_rwhec.cli import diff, verify
 from gtsam_rwhec.cli.app import app
 from gtsam_rwhec.cli.exit_status import ExitStatus
 
@@ -97,6 +97,23 @@ def test_files_with_the_same_checksums_are_not_tested(folder: Path, tmp_path: Pa
     done = CliRunner().invoke(app, ["diff", str(tmp_path / "old"), str(tmp_path / "same")])
     assert done.exit_code == ExitStatus.BAD_INPUT
     assert done.stdout.startswith("Not tested: both rest on the same measurements")
+
+
+def test_a_log_that_the_calibration_was_made_from_is_known_again(tmp_path: Path) -> None:
+    """By its content: under another name too, and as a folder; another log is not."""
+    result, log, other = (tmp_path / name for name in ("result.json", "run.mcap", "other.mcap"))
+    result.write_bytes(b"{}")
+    log.write_bytes(b"a log")
+    other.write_bytes(b"another log")
+    assert not verify.is_of_old_log(result, log)  # nothing says what it was made from
+    inputs = rw.evidence.Inputs(files=rw.evidence.input_files([log]), versions={})
+    rw.evidence.write_evidence(rw.evidence.Evidence(inputs=inputs), rw.evidence.evidence_path(result), result)
+    (tmp_path / "bag").mkdir()
+    assert not verify.is_of_old_log(result, tmp_path / "bag")
+    (tmp_path / "bag" / "again.mcap").write_bytes(b"a log")
+    assert verify.is_of_old_log(result, log)
+    assert verify.is_of_old_log(result, tmp_path / "bag")
+    assert not verify.is_of_old_log(result, other)
 
 
 def test_a_path_that_is_none_is_refused(tmp_path: Path, folder: Path) -> None:

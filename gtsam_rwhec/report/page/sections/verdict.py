@@ -29,6 +29,8 @@ def verdict_section(shown: ShownResult) -> Section:
     verdict = Verdict(shown.tree["verdict"])
     facts, _, cure = shown.tree["verdict_reason"].partition(BETWEEN)
     blocks: list[Block] = [Paragraph(f"{verdict.words}: {facts}.", TONES[verdict])]
+    points = list(_points(shown))
+    blocks += [block for block in points if isinstance(block, Paragraph)]
     todo = list(_todo(shown, cure))
     if todo:
         blocks += [Paragraph("What to do next", "lead"), Listing(tuple(todo))]
@@ -38,7 +40,7 @@ def verdict_section(shown: ShownResult) -> Section:
     if len(findings) > 1:
         grounds = Listing(tuple(f"{_sentence(one.words)} {_sentence(one.ground.advice)}" for one in findings))
         blocks.append(Folded("The grounds of this verdict one by one, the most serious first", (grounds,)))
-    blocks += _points(shown)
+    blocks += [block for block in points if not isinstance(block, Paragraph)]
     blocks += pose_blocks(shown)
     return Section("verdict", "Verdict", tuple(blocks))
 
