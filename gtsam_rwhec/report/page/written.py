@@ -33,6 +33,12 @@ RESULT_FILE = "result.json"
 SAME_ROTATION = 1e-6
 TONES = {Verdict.USE: "good", Verdict.CARE: "care", Verdict.DO_NOT_USE: "bad"}
 
+#: What a page says once that lacks the parts that need the measurements.
+WITHOUT_EVIDENCE = (
+    "There is no evidence beside this result, so some parts are left out. gtsam-rwhec calibrate writes it "
+    "(evidence.json); in Python give write_html(calibration, path, rw.evidence.evidence_of(problem, calibration))."
+)
+
 
 def write_html(
     result: Calibration | str | Path,
@@ -150,5 +156,5 @@ def report_page(shown: ShownResult) -> Page:
         tone=TONES[Verdict(shown.tree["verdict"])],  # type: ignore[arg-type]
         sections=sections_of(shown),
         made_by=f"Written by {shown.tree['written_by']}.",
-        warnings=shown.warnings,
+        warnings=shown.warnings or ((WITHOUT_EVIDENCE,) if shown.evidence is None else ()),
     )

@@ -68,6 +68,13 @@ def test_evidence_of_another_kind_is_refused(tmp_path: Path) -> None:
         rw.evidence.read_evidence(tmp_path / "evidence.json")
 
 
+def test_a_page_without_evidence_says_once_how_to_get_it(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "result.json").write_bytes((folder / "result.json").read_bytes())
+    rw.report.write_html(tmp_path, tmp_path / "page.html")
+    assert (tmp_path / "page.html").read_text(encoding="utf-8").count("There is no evidence beside this result") == 1
+    assert "There is no evidence beside" not in (folder / "report.html").read_text(encoding="utf-8")
+
+
 def test_nothing_is_fetched(folder: Path) -> None:
     page = (folder / "report.html").read_text(encoding="utf-8")
     without_script = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
