@@ -33,6 +33,7 @@ def modules() -> Iterator[tuple[str, Path]]:
 TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec": {"test_bad_input.py": "errors"},
     "gtsam_rwhec/calibration": {
+        "calibration/test_turning_of_carriers.py": "turning",
         "calibration/test_calibrating.py": (
             "calibrated choices clock_stage disagreement noise_choice noise_found noise_stage options "
             "outliers run statement_stage"

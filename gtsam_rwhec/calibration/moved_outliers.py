@@ -29,8 +29,9 @@ NEAR = 6.0
 BETTER = 3.0
 #: Smallest spreads: 0.003 degrees and 10 micrometres.
 LEAST = np.array([5e-5, 1e-5])
-#: The share of the measurements that may be on the wrong side of the moment at which the frame moved.
-MISPLACED = 0.1
+#: What moved stays moved: of those that were left out (or kept, if they are fewer) this share may be on the wrong side
+#: of the moment. Outliers of one step that come and go are of another cause: another board was taken for this one.
+MISPLACED = 0.2
 
 
 @dataclass(frozen=True)
@@ -83,13 +84,16 @@ def moved_with_outliers(refined: Refined, measured: Mapping[Pair, Measured]) -> 
     if rivals:
         return None
     of_frame = [one for pair, one in measured.items() if best.frame in pair.frames]
+    fewer = sum(min(int(one.kept.sum()), int((~one.kept).sum())) for one in of_frame)
+    if sum(_moment(one.kept)[1] for one in of_frame) > MISPLACED * fewer:
+        return None
     return TwoPoses(
         frame=best.frame,
         first=best.kept,
         second=best.agreeing,
         angle_rad=float(best.size[0]),
         distance_m=float(best.size[1]),
-        from_row=_moment(of_frame[0].kept) if len(of_frame) == 1 else None,
+        from_row=_moment(of_frame[0].kept)[0] if len(of_frame) == 1 else None,
         is_sensor=best.is_sensor,
     )
 
@@ -126,11 +130,16 @@ def _sizes(twists: Array) -> Array:
     return np.asarray(np.linalg.norm(twists.reshape(-1, 2, 3), axis=2))
 
 
-def _moment(kept: np.ndarray) -> int | None:
-    """The first row, counted from one, after which most are left out (or kept) that were kept (left out) before."""
+def _moment(kept: np.ndarray) -> tuple[int | None, int]:
+    """The row, counted from one, from which most are left out (or kept) that were kept (left out) before.
+
+    And how many are on its wrong side. Where all are kept, or all left out, there is no such row.
+    """
     number = len(kept)
+    if kept.all() or not kept.any():
+        return None, 0
     rows = np.arange(1, number)
     before = np.cumsum(kept)[:-1]  # kept among the first `row` rows
     wrong = np.minimum((rows - before) + (kept.sum() - before), before + (number - rows) - (kept.sum() - before))
     best = int(np.argmin(wrong))
-    return int(rows[best]) + 1 if wrong[best] <= MISPLACED * number else None
+    return int(rows[best]) + 1, int(wrong[best])

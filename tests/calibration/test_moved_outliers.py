@@ -61,6 +61,14 @@ def test_few_outliers_name_none() -> None:
     assert moved_with_outliers(refined, {PAIR: Measured(measured[PAIR].A, measured[PAIR].B, few)}) is None
 
 
+def test_outliers_of_one_step_that_come_and_go_are_no_move() -> None:
+    """Another board was taken for this one in every fifth image: it was said to have moved "from measurement 2 on"."""
+    refined, measured = seen("board", 7)
+    order = np.argsort(np.r_[np.linspace(0.0, 1.0, FIRST), np.linspace(0.05, 0.95, COUNT - FIRST)], kind="stable")
+    one = measured[PAIR]
+    assert moved_with_outliers(refined, {PAIR: Measured(one.A[order], one.B[order], one.kept[order])}) is None
+
+
 def test_calibrate_says_that_a_board_moved_late_in_place_of_outliers() -> None:
     _, measured = seen("board", 6)
     problem = rw.Problem()

@@ -166,7 +166,7 @@ def test_bad_input_is_status_2_and_one_message(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stdout == ""
     error = f"Error: {folder}/tag_0_cam_1_B.csv, line 17: not a finite number: tx is 'oops'."
-    assert without_stages(done.stderr) == [error]
+    assert without_stages(done.stderr) == [error, "More: docs/files.md"]
 
 
 @pytest.mark.parametrize(
