@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.calibration.misreadings import Misreading, are_too_few_to_tell, is_plain, shares_of
+from gtsam_rwhec.calibration.moved_frames import explains_more
 from gtsam_rwhec.calibration.readings import A_INVERTED
 from gtsam_rwhec.calibration.samples import Sampled
 from gtsam_rwhec.calibration.trial_fits import fitted, signal_of
@@ -37,7 +38,7 @@ class Exchange:
     Attributes
     ----------
     misreading : Misreading or None
-        The exchange, where it fits far better.
+        The exchange, where it fits far better, and where a frame that moved once does not fit far better still.
     is_open : bool
         Whether measurements that are too few for any other test do not tell the two apart, or leave residuals that are
         not small.
@@ -61,7 +62,8 @@ def exchange_of(problem: Problem) -> Exchange:
     gain, spread = float(gains.sum()), float(sums.std(ddof=1)) * math.sqrt(len(sums)) if len(sums) > 1 else math.inf
     signal = signal_of(sampled.as_read())
     is_explained = max(shares_of(inverse.residual, signal)) < EXPLAINED
-    if gain > SURELY and gain > SIGMAS * spread and is_explained:
+    is_named = gain > SURELY and gain > SIGMAS * spread and is_explained
+    if is_named and not explains_more(problem, sampled.as_read(), inverse.residual):
         before, after = given.residual, inverse.residual
         return Exchange(
             Misreading(

@@ -3,7 +3,7 @@
 A certificate proves that no other poses fit better; it says nothing about numbers that were misread. So, where
 residuals are not plainly those of a sensor, each likely mistake is undone on a sample, and fitted again. A reading is
 named only if it explains the measurements, and explains them better than the given one by a factor and by more than
-chance allows.
+chance allows; and not where one frame that moved once explains them far better still.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from rwhec_factors.se3 import inverse, so3_logmap
 
 from gtsam_rwhec.calibration.angle_units import readings_of_angles
+from gtsam_rwhec.calibration.moved_frames import explains_more
 from gtsam_rwhec.calibration.readings import AS_READ, DOUBLE, SINGLE, Mistake, Reading, shifted
 from gtsam_rwhec.calibration.samples import Sampled
 from gtsam_rwhec.calibration.trial_fits import Spread, TrialFit, fitted, residual_of, signal_of
@@ -214,16 +215,18 @@ class _Trial:
     def found(self, readings: Iterable[Reading], mode: ScaleMode | None = None) -> tuple[Misreading, ...]:
         """The readings that fit best, if they fit far better than the given one."""
         promising = [reading for reading in readings if self.is_promising(reading, mode)]
-        gains: list[tuple[float, Misreading]] = []
+        gains: list[tuple[float, Misreading, Spread]] = []
         for reading in promising:
             fit = fitted(self.problem, self.sampled.by(reading), mode)
             if fit is None or not (gain := self.gain(reading, fit)):
                 continue
             named = self.named(reading, fit) if mode is None else self.named_with_unit(reading, fit)
             if named is not None:
-                gains.append((gain, named))
-        most = max((gain for gain, _ in gains), default=0.0)
-        return tuple(misreading for gain, misreading in gains if gain > most - math.log(ALIKE))
+                gains.append((gain, named, fit.residual))
+        best = max(gains, key=lambda each: each[0], default=None)
+        if best is None or explains_more(self.problem, self.sampled.as_read(), best[2]):
+            return ()  # of a board that was moved, or a mount that gave way, a step of that frame tells more
+        return tuple(misreading for gain, misreading, _ in gains if gain > best[0] - math.log(ALIKE))
 
     @property
     def is_strange(self) -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from rwhec_factors import se3
 
-from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, TrialFit, fitted
+from gtsam_rwhec.calibration.trial_fits import MEDIAN_OF_CHI, Sample, Spread, TrialFit, fitted
 from gtsam_rwhec.calibration.two_poses import TwoPoses, by_station
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.pairs import Pair
@@ -24,6 +24,8 @@ CUTS = tuple(np.arange(1, 8) / 8.0)
 FEWEST, MOST_FRAMES = 6, 6
 #: The product of the residuals' medians, rotation and translation, falls by this factor at least.
 BETTER = 8.0
+#: And by this factor at least below that of another explanation, where there is one.
+CLEARLY_BETTER = 3.0
 #: The two poses are this many standard deviations of one measurement apart, in rotation or in translation.
 APART = 5.0
 #: Rounds of a fit on trial, and halvings of the interval in which the step is looked for.
@@ -31,7 +33,13 @@ ROUNDS, HALVINGS = 2, 5
 
 
 def moved_frame(problem: Problem, sample: Sample) -> TwoPoses | None:
-    """The frame that moved once, from some measurement of its pairs on; None where none did.
+    """The frame that moved once, from some measurement of its pairs on; None where none did: see `step_of`."""
+    found = step_of(problem, sample)
+    return None if found is None else found[0]
+
+
+def step_of(problem: Problem, sample: Sample) -> tuple[TwoPoses, Spread] | None:
+    """The frame that moved once, and the residuals that remain with its two poses; None where none did.
 
     Parameters
     ----------
@@ -56,7 +64,17 @@ def moved_frame(problem: Problem, sample: Sample) -> TwoPoses | None:
         return None
     name, cut = best[1], _refined_cut(problem, sample, best)
     fit = _split(problem, sample, name, cut)
-    return None if fit is None else _step(name, sample, cut, fit)
+    step = None if fit is None else _step(name, sample, cut, fit)
+    return None if fit is None or step is None else (step, fit.residual)
+
+
+def explains_more(problem: Problem, sample: Sample, remains: Spread) -> bool:
+    """Whether a step of one frame leaves far smaller residuals than another explanation, which left `remains`.
+
+    A step costs six unknowns and a moment; so what it leaves must be smaller by a factor, `CLEARLY_BETTER`.
+    """
+    found = step_of(problem, sample)
+    return found is not None and _product(found[1]) * CLEARLY_BETTER < _product(remains)
 
 
 def _second(name: str) -> str:
@@ -88,7 +106,11 @@ def _split(problem: Problem, sample: Sample, name: str, cut: float) -> TrialFit 
 
 
 def _volume(fit: TrialFit | None) -> float:
-    return np.inf if fit is None else fit.residual.rotation_rad * fit.residual.translation_m
+    return np.inf if fit is None else _product(fit.residual)
+
+
+def _product(residual: Spread) -> float:
+    return residual.rotation_rad * residual.translation_m
 
 
 def _refined_cut(problem: Problem, sample: Sample, best: tuple[float, str, float]) -> float:
