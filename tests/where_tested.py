@@ -141,7 +141,7 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_doubted_intrinsics.py": "seen_corners",
         "pipeline/test_log_findings.py": "output_paths",
         "pipeline/test_real_dataset.py": "driver_detections",
-        "pipeline/test_same_log.py": "log_metadata",
+        "pipeline/test_commands.py": "log_metadata",
         "pipeline/test_verified_log.py": "old_calibration",
         "pipeline/test_synthetic_calibration.py": (
             "carrier_motion cleaning_stage detection_stage detections_in_images image_detections measured_pairs "

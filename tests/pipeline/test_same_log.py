@@ -54,6 +54,7 @@ def check_files(out: Path, expected: Path) -> None:
             assert text_of(path) == text_of(out / path.relative_to(expected))
 
 
+@pytest.mark.slow
 def test_foxglove_json_at_once_and_a_ros2_bag_stage_by_stage(tmp_path: Path) -> None:
     """Six images of each camera."""
     write_twins(tmp_path / "json.mcap", tmp_path / "ros2.mcap", 6)
