@@ -30,8 +30,6 @@ def _write_pages(*_: object) -> None:
 
 def _lead_links(app: Sphinx, docname: str, source: list[str]) -> None:
     page = Path(app.env.doc2path(docname)).resolve()
-    if docname == "index" and (DOCS / "gallery.md").exists():
-        source[0] = source[0].replace("take_good_data\n", "take_good_data\ngallery\n")
     if page.suffix == ".md" and not page.is_relative_to(DOCS / "made"):
         source[0] = with_links_of_the_guide(source[0], page, page.parent)
 
