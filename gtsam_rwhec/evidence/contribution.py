@@ -17,7 +17,7 @@ from gtsam_rwhec.evidence.record import EvidenceRecord, Row
 from gtsam_rwhec.geometry.poses import Array
 
 #: More images are chosen in bundles of neighbours.
-MOST_CHOSEN_FROM = 250
+MOST_CHOSEN_FROM = 125
 #: The choice begins with this share of all information, so that every direction has a finite deviation.
 BEGIN = 1e-6
 #: How much larger the worst standard deviation may be.
