@@ -11,8 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from gtsam_rwhec.files.terminal_text import printable
-
 #: How a paragraph is meant.
 Tone = Literal["plain", "lead", "note", "good", "care", "bad"]
 
@@ -177,8 +175,3 @@ def every(blocks: Iterable[Block]) -> Iterator[Block]:
         yield block
         if isinstance(block, Folded):
             yield from every(block.blocks)
-
-
-def safe(text: str) -> str:
-    """A text without signs that steer a terminal, for who copies it there."""
-    return printable(text)

@@ -69,6 +69,12 @@ class ShownResult:
         """The evidence's JSON; an empty object without evidence."""
         return {} if self.evidence is None else json.loads(evidence_json(self.evidence))
 
+    def why_missing(self, part: object, otherwise: str) -> str:
+        """Why a ``part`` of the evidence is not there; empty where it is."""
+        if self.evidence is None:
+            return "the result has no evidence.json beside it."
+        return otherwise if part is None else ""
+
     def number(self, *path: str | int, times: float = 1.0, spec: str = ".4g", unit: str = "") -> Number:
         """The number at a place of the result's JSON."""
         return _number(self.tree, "result.json", path, times, spec, unit)

@@ -28,15 +28,10 @@ MOVES = 2.0
 
 def contribution_section(shown: ShownResult) -> Section:
     """Information by image, leave-one-out, and how few images tell nearly as much."""
-    evidence = shown.evidence
-    if evidence is None or evidence.contribution is None:
-        why = (
-            "the result has no evidence.json beside it."
-            if evidence is None
-            else "the calibration has no covariances, and so no information to divide."
-        )
+    found = None if shown.evidence is None else shown.evidence.contribution
+    if found is None:
+        why = shown.why_missing(found, "the calibration has no covariances, and so no information to divide.")
         return Section("contribution", TITLE, missing=why)
-    found = evidence.contribution
     what = "images" if found.has_stamps else "measurements"
     blocks: list[Block] = [*_fewer(shown, found, what)]
     blocks.append(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from gtsam_rwhec.evidence.residuals import BEYOND_3_BY_CHANCE, FEWEST, ResidualsEvidence
+from gtsam_rwhec.evidence.seen import SeenCamera
 from gtsam_rwhec.report.page.blocks import Block, Chart, Folded, Paragraph, Section, Table, Words, significant
 from gtsam_rwhec.report.page.residual_charts import (
     boxes_figure,
@@ -26,15 +27,10 @@ MOST_CAMERAS = 8
 
 def residuals_section(shown: ShownResult) -> Section:
     """Residuals, the noise model, correlation, hold-out."""
-    evidence = shown.evidence
-    if evidence is None or evidence.residuals is None:
-        why = (
-            "the result has no evidence.json beside it."
-            if evidence is None
-            else "the calibration has no covariances, and so no noise to compare with."
-        )
+    found = None if shown.evidence is None else shown.evidence.residuals
+    if found is None:
+        why = shown.why_missing(found, "the calibration has no covariances, and so no noise to compare with.")
         return Section("residuals", TITLE, missing=why)
-    found = evidence.residuals
     blocks: list[Block] = [
         Paragraph(
             "A residual is how far a measurement B is from what the answer predicts, Y⁻¹ A X. Its size says how noisy "
@@ -54,7 +50,7 @@ def residuals_section(shown: ShownResult) -> Section:
             time_figure(found),
         ),
     ]
-    cameras = () if evidence.seen is None else tuple(camera for camera in evidence.seen.cameras if camera.x)
+    cameras = _cameras_with_corners(shown)
     if cameras:
         blocks.append(
             Chart(
@@ -69,6 +65,11 @@ def residuals_section(shown: ShownResult) -> Section:
         blocks.append(Paragraph("Not shown: errors over the image, for there are no corners.", "note"))
     blocks += [*_by_configuration(shown, found), *_against_noise(shown, found), *_neighbours(shown, found)]
     return Section("residuals", TITLE, (*blocks, _pairs(shown, found)))
+
+
+def _cameras_with_corners(shown: ShownResult) -> tuple[SeenCamera, ...]:
+    seen = None if shown.evidence is None else shown.evidence.seen
+    return () if seen is None else tuple(camera for camera in seen.cameras if camera.x)
 
 
 def _by_sensor(shown: ShownResult, found: ResidualsEvidence) -> Iterator[Block]:
