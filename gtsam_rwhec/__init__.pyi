@@ -74,7 +74,9 @@ from . import changes as changes
 from . import cleaning as cleaning
 from . import export as export
 from . import first_rig as first_rig
+from . import fleet as fleet
 from . import logs as logs
+from . import odometry as odometry
 from . import pipeline as pipeline
 from . import rig as rig
 from . import trajectories as trajectories

@@ -1,0 +1,3 @@
+# What a sensor says of its own motion.
+from .tracks import OdometryNoise as OdometryNoise
+from .tracks import OdometryTrack as OdometryTrack
