@@ -1,8 +1,8 @@
 """What a fleet's run is made of: tasks that write one file each, in an order, and what carries them out.
 
-A task's function writes its file to the output under the task's key, and returns a receipt. The key is a checksum of all
-that the file depends on (the log, the rig file, the options, the version), so a file that is there already is what the
-task would write: nothing is done twice, and two runs at once write the same bytes.
+A task's function writes its file to the output under the task's key, and returns a receipt. The key is a checksum of
+all that the file depends on (the log, the rig file, the options, the version), so a file that is there already is what
+the task would write: nothing is done twice, and two runs at once write the same bytes.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ class Task:
     arguments : tuple
         Small, and picklable.
     after : tuple of str
-        Keys of the tasks whose receipts it gets, in this order, as its last argument (a tuple). A failure of one of them
-        does not stop it: it gets the Failed.
+        Keys of the tasks whose receipts it gets, in this order, as its last argument (a tuple). A failure of one of
+        them does not stop it: it gets the Failed.
     """
 
     key: str

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gtsam_rwhec.errors import MeasurementError
+from gtsam_rwhec.errors import CountError, StampError
 from gtsam_rwhec.geometry.poses import Array
 
 
@@ -46,8 +46,10 @@ class OdometryTrack:
 
     Raises
     ------
-    MeasurementError
-        Stamps and poses are not as many, or the stamps do not ascend.
+    CountError
+        Stamps and poses are not as many.
+    StampError
+        The stamps do not ascend.
     """
 
     sensor: str
@@ -59,14 +61,14 @@ class OdometryTrack:
     def __post_init__(self) -> None:
         stamps, poses = np.asarray(self.stamps_ns), np.asarray(self.T_start_sensor)
         if poses.shape != (len(stamps), 4, 4):
-            raise MeasurementError(
+            raise CountError(
                 f"the track of {self.sensor} has {len(stamps)} stamps and poses of shape {poses.shape}; "
                 "give one 4 x 4 pose for each stamp"
             )
         backwards = np.flatnonzero(np.diff(stamps) <= 0)
         if len(backwards):
             row = int(backwards[0]) + 1
-            raise MeasurementError(
+            raise StampError(
                 f"the track of {self.sensor} goes back in time at row {row}: {int(stamps[row])} ns after "
                 f"{int(stamps[row - 1])} ns; sort the rows, and keep one pose for each stamp"
             )
