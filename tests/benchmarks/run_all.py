@@ -29,6 +29,7 @@ import cv2
 import edge_summaries
 import few_measurements
 import hand_eye
+import large_graphs
 import long_log
 import many_frames
 import million_measurements
@@ -72,6 +73,7 @@ class Sizes:
     bare_loop_s: float = 45.0
     corrupted_seeds: int = 8
     log_messages: int = 20_000
+    share_of_graphs: float = 1.0
     #: Of the scripts that print tables of their own, the number of --runs.
     runs: tuple[tuple[str, int], ...] = (
         ("coverage.py", 1000),
@@ -109,6 +111,7 @@ QUICK = Sizes(
     bare_loop_s=3.0,
     corrupted_seeds=1,
     log_messages=5_000,
+    share_of_graphs=0.1,
     runs=(),
     neutral_seeds=(),
 )
@@ -134,6 +137,7 @@ def parts(sizes: Sizes, plot: Path | None) -> dict[str, Callable[[], list[Row]]]
         "few measurements": lambda: few_measurements.rows(sizes.few_counts, sizes.few_trials, few_measurements.SEED),
         "a million measurements": lambda: million_measurements.rows(sizes.measurements, sizes.repetitions),
         "many frames": lambda: many_frames.rows(sizes.repetitions),
+        "large graphs": lambda: large_graphs.rows(list(large_graphs.BARS), sizes.share_of_graphs, keep=False),
         "world origin": world_origin.rows,
         "outliers": lambda: outliers.rows(sizes.outlier_seeds, plot),
         "a long log with drift and outliers": long_log.rows,
