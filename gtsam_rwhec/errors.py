@@ -90,6 +90,12 @@ class RigError(FileFormatError):
     page = "docs/rig_file.md"
 
 
+class ManifestError(FileFormatError):
+    """The manifest of a fleet has faults; the message names every fault with its line."""
+
+    page = "docs/fleets.md#the-manifest"
+
+
 class LogError(FileFormatError):
     """A log cannot be read or written, or lacks what is asked of it."""
 

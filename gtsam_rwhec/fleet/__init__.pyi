@@ -1,3 +1,15 @@
+# Which robots, and what came of each.
+from .manifest import LogSource as LogSource
+from .manifest import Manifest as Manifest
+from .manifest import Robot as Robot
+from .manifest import parse_manifest as parse_manifest
+from .manifest import read_manifest as read_manifest
+from .rows import FailedLog as FailedLog
+from .rows import RobotRow as RobotRow
+from .rows import RowFrame as RowFrame
+from .rows import read_rows as read_rows
+from .rows import rows_json as rows_json
+
 # The work of a run, and what carries it out.
 from .tasks import Engine as Engine
 from .tasks import Failed as Failed

@@ -1,0 +1,243 @@
+"""Manifests of fleets: which robot has which logs and which rig file, and which robots see the same targets.
+
+    rig: rigs/arm.yaml                  # of every robot that names no other
+    robots:
+      arm_01: {logs: "s3://logs/arm_01/*.mcap"}
+      arm_02:
+        rig: rigs/arm_02.yaml
+        logs:
+          - s3://logs/arm_02/monday.mcap
+          - {log: "s3://logs/arm_02/tuesday.mcap", rig: rigs/arm_02_new_lens.yaml}
+    sites:                              # these robots see the same targets, and are solved together
+      hall_a: [arm_01, arm_02]
+
+Every path is a URL of fsspec, or a path; relative ones start from the manifest's folder. Names with * ? [ are patterns.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from gtsam_rwhec.errors import FileFormatError, ManifestError
+from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, dotted, parse_yaml, read_text, shown, suggestion
+
+#: Robots and sites name folders of the output; "/" and "@" join names of frames and of units.
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(::|://)")
+_PATTERN = re.compile(r"[*?\[]")
+#: A message names at most this many faults.
+MOST_FAULTS = 20
+
+
+@dataclass(frozen=True)
+class LogSource:
+    """One entry of a robot's logs.
+
+    Attributes
+    ----------
+    url : str
+        A log, or a pattern of logs.
+    rig : str
+        URL of its rig file.
+    place : str
+        Where the manifest has it, for messages.
+    """
+
+    url: str
+    rig: str
+    place: str
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether the URL stands for all logs that match it."""
+        return _PATTERN.search(self.url) is not None
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One robot: its name, its logs, and the site whose targets it sees, if others see them too."""
+
+    name: str
+    logs: tuple[LogSource, ...]
+    site: str | None = None
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """A fleet.
+
+    Attributes
+    ----------
+    where : str
+        The manifest's URL, or the pattern of the command line.
+    robots : tuple of Robot
+        In the manifest's order; names are unique.
+    shared_rig : str or None
+        The rig file of all robots, where the manifest has one.
+    """
+
+    where: str
+    robots: tuple[Robot, ...]
+    shared_rig: str | None = None
+
+    @property
+    def sites(self) -> dict[str, tuple[Robot, ...]]:
+        """The robots of each site."""
+        found: dict[str, tuple[Robot, ...]] = {}
+        for robot in self.robots:
+            if robot.site is not None:
+                found[robot.site] = (*found.get(robot.site, ()), robot)
+        return found
+
+
+def read_manifest(url: str) -> Manifest:
+    """Read a manifest.
+
+    Raises
+    ------
+    ManifestError
+        The file cannot be read, is not YAML, or has faults: the message names every fault with its line.
+    """
+    try:
+        text = read_text(url)
+    except FileFormatError as error:
+        raise ManifestError(str(error)) from error
+    return parse_manifest(text, url)
+
+
+def parse_manifest(text: str, where: str) -> Manifest:
+    """Read the text of a manifest that is at a URL; relative paths start from the folder of that.
+
+    Raises
+    ------
+    ManifestError
+        As `read_manifest`.
+    """
+    try:
+        file = parse_yaml(text, where)
+    except FileFormatError as error:
+        raise ManifestError(str(error)) from error
+    return _Checks(file).manifest()
+
+
+def joined(base: str, url: str) -> str:
+    """A URL as a file at `base` means it: relative ones start from that file's folder."""
+    if _SCHEME.match(url) or url.startswith("/"):
+        return url
+    folder = base.rpartition("/")[0]
+    if not folder and not base.startswith("/"):
+        return url
+    scheme = _SCHEME.match(folder + "/")
+    start = scheme.end() if scheme else 0
+    return folder[:start] + posixpath.normpath(f"{folder[start:]}/{url}")
+
+
+class _Checks:
+    """Reads a manifest and collects its faults."""
+
+    def __init__(self, file: YamlFile) -> None:
+        self.file = file
+        self.faults: list[tuple[int, str]] = []
+
+    def manifest(self) -> Manifest:
+        data = self.file.data
+        if not isinstance(data, dict):
+            raise ManifestError(self.file.fault((), f"{shown(data)} in place of the sections robots and sites"))
+        self._known(data, (), ("rig", "robots", "sites"))
+        shared = self._url(data["rig"], ("rig",)) if "rig" in data else None
+        robots = self._mapping(data, "robots", "of robots by name, each with its logs", is_needed=True)
+        sites = self._sites(data, robots)
+        found = [self._robot(name, value, shared, sites.get(name)) for name, value in robots.items()]
+        if self.faults:
+            words = [said for _, said in sorted(self.faults)]
+            rest = [f"and {len(words) - MOST_FAULTS} more faults"] if len(words) > MOST_FAULTS else []
+            raise ManifestError("\n".join(words[:MOST_FAULTS] + rest))
+        return Manifest(self.file.where, tuple(robot for robot in found if robot is not None), shared)
+
+    def _fault(self, path: KeyPath, words: str) -> None:
+        self.faults.append((self.file.line(path), self.file.fault(path, words)))
+
+    def _known(self, data: Mapping[str, Any], path: KeyPath, keys: tuple[str, ...]) -> None:
+        for key in data:
+            if key not in keys:
+                self._fault((*path, key), suggestion(key, keys))
+
+    def _mapping(self, data: Mapping[str, Any], key: str, what: str, *, is_needed: bool = False) -> dict[str, Any]:
+        value = data.get(key)
+        if isinstance(value, dict) and (value or not is_needed):
+            for name in value:
+                if not _NAME.fullmatch(name):
+                    words = "not a name: letters, digits, _ - and . make names, which are those of folders too"
+                    self._fault((key, name), words)
+            return value
+        if key in data or is_needed:
+            said = f"{shown(value)}; give" if key in data else "is missing: give"
+            self._fault((key,), f"{said} a section {what}")
+        return {}
+
+    def _url(self, value: Any, path: KeyPath) -> str | None:
+        if isinstance(value, str) and value.strip():
+            return joined(self.file.where, value)
+        self._fault(path, f"{shown(value)}; give a path or a URL")
+        return None
+
+    def _sites(self, data: Mapping[str, Any], robots: Mapping[str, Any]) -> dict[str, str]:
+        """The site of each robot that is at one."""
+        found: dict[str, str] = {}
+        for site, names in self._mapping(data, "sites", "of lists of robots by site").items():
+            if site in robots:
+                self._fault(("sites", site), "a robot has this name; give the site another one")
+            if not isinstance(names, tuple) or not names:
+                self._fault(("sites", site), f"{shown(names)}; give a list of robots")
+                continue
+            for i, name in enumerate(names):
+                path: KeyPath = ("sites", site, i)
+                if not isinstance(name, str) or name not in robots:
+                    self._fault(path, f"{shown(name)} is no robot of this manifest; state it under robots")
+                elif name in found:
+                    self._fault(path, f"{name} is at {found[name]} already; a robot is at one site")
+                else:
+                    found[name] = site
+        return found
+
+    def _robot(self, name: str, value: Any, shared: str | None, site: str | None) -> Robot | None:
+        path: KeyPath = ("robots", name)
+        if not isinstance(value, dict):
+            value = {"logs": value}
+            logs_path: KeyPath = path
+        else:
+            self._known(value, path, ("rig", "logs"))
+            logs_path = (*path, "logs")
+        if "logs" not in value:
+            self._fault(path, "its logs are missing: give logs: with a URL, a pattern or a list of them")
+            return None
+        rig = self._url(value["rig"], (*path, "rig")) if "rig" in value else shared
+        entries = value["logs"]
+        is_list = isinstance(entries, tuple)
+        if is_list and not entries:
+            self._fault(logs_path, "an empty list; give at least one log")
+        found = []
+        for i, entry in enumerate(entries if is_list else (entries,)):
+            source = self._log(entry, (*logs_path, i) if is_list else logs_path, rig)
+            if source is not None:
+                found.append(source)
+        if any(source.rig == "" for source in found):
+            self._fault(path, "it has no rig file: give rig: here, or at the top for all robots")
+        return Robot(name, tuple(found), site)
+
+    def _log(self, entry: Any, path: KeyPath, rig: str | None) -> LogSource | None:
+        if isinstance(entry, dict):
+            self._known(entry, path, ("log", "rig"))
+            if "log" not in entry:
+                self._fault(path, "its log is missing: give {log: URL, rig: URL}")
+                return None
+            if "rig" in entry:
+                rig = self._url(entry["rig"], (*path, "rig"))
+            path, entry = (*path, "log"), entry["log"]
+        url = self._url(entry, path)
+        place = f"{self.file.where}, line {self.file.line(path)}: {dotted(path)}"
+        return None if url is None else LogSource(url, rig or "", place)
