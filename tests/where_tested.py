@@ -130,6 +130,10 @@ TABLE: dict[str, dict[str, str]] = {
             "agreement components drift_choice found mixture modelled options prior_knowledge reml settling typical"
         ),
     },
+    "gtsam_rwhec/odometry": {
+        "odometry/test_calibrated.py": "words",
+        "odometry/test_given.py": "options",
+    },
     "gtsam_rwhec/pipeline": {
         "test_gallery.py": "turned_images",
         "pipeline/test_all_stages.py": "image_options log_evidence log_report",

@@ -1,3 +1,14 @@
-# What a sensor says of its own motion.
+# What a sensor says of its own motion, and what a person knows.
 from .tracks import OdometryNoise as OdometryNoise
 from .tracks import OdometryTrack as OdometryTrack
+from .given import Given as Given
+from .given import Ground as Ground
+from .given import KnownDirection as KnownDirection
+from .options import OdometryOptions as OdometryOptions
+
+# The calibration, and what it found.
+from .calibrated import OdometryCalibration as OdometryCalibration
+from .calibrated import JointCertificate as JointCertificate
+from .calibrated import Windows as Windows
+from .calibrated import Influence as Influence
+from .calibrated import OtherAnswer as OtherAnswer
