@@ -51,8 +51,8 @@ def in_words(found: OdometryCalibration) -> str:
         size = max((float(np.linalg.norm(twist[3:])) for twist in number.per_sigma.values()), default=0.0)
         turn = max((float(np.linalg.norm(twist[:3])) for twist in number.per_sigma.values()), default=0.0)
         lines.append(
-            f"given: {number.what} = {number.value:g} +- {number.sigma:g} {number.unit}; one sigma moves a sensor by up "
-            f"to {1e3 * size:.2g} mm and {np.degrees(turn):.2g} deg; the data are {number.off_by:.1f} sigmas from it"
+            f"given: {number.what} = {number.value:g} +- {number.sigma:g} {number.unit}; one sigma moves a sensor by "
+            f"up to {1e3 * size:.2g} mm and {np.degrees(turn):.2g} deg; the data are {number.off_by:.1f} sigmas from it"
         )
     return "\n".join(lines)
 
