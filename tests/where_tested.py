@@ -131,7 +131,7 @@ TABLE: dict[str, dict[str, str]] = {
         ),
     },
     "gtsam_rwhec/odometry": {
-        "odometry/test_calibrated.py": "words",
+        "odometry/test_calibrated.py": "found",
         "odometry/test_given.py": "options",
     },
     "gtsam_rwhec/pipeline": {

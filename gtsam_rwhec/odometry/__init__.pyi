@@ -8,7 +8,7 @@ from .options import OdometryOptions as OdometryOptions
 
 # The calibration, and what it found.
 from .calibrated import OdometryCalibration as OdometryCalibration
-from .calibrated import JointCertificate as JointCertificate
-from .calibrated import Windows as Windows
-from .calibrated import Influence as Influence
-from .calibrated import OtherAnswer as OtherAnswer
+from .found import JointCertificate as JointCertificate
+from .found import Windows as Windows
+from .found import Influence as Influence
+from .found import OtherAnswer as OtherAnswer

@@ -1,134 +1,18 @@
-"""The result of a calibration of sensors that know only their own motion."""
+"""The result of a calibration of sensors that know only their own motion, and its words: the verdict first."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from gtsam_rwhec.cleaning.removed import Removed
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.identifiability.free_directions import FreeDirection, Twist
+from gtsam_rwhec.identifiability.free_directions import FreeDirection
+from gtsam_rwhec.odometry.found import Influence, JointCertificate, OtherAnswer, Windows
 from gtsam_rwhec.odometry.tracks import OdometryNoise
-from gtsam_rwhec.odometry.words import in_words
 from gtsam_rwhec.solver.cause import Status
-
-
-@dataclass(frozen=True)
-class JointCertificate:
-    """The proof for the joint quadratic cost of all sensors (design fact 23).
-
-    The cost is half the squared residuals of the windows' rotation vectors and translations in all sensors at once,
-    with the vehicle's own motion eliminated. The turn of each window inside the lever arms' term, and the length of the
-    way that scales are compared with, are the fused ones. So the proof is of this cost; the exact likelihood is refined
-    from there.
-
-    Attributes
-    ----------
-    status : Status
-    cost : float
-        The cost at the answer.
-    lower_bound : float
-        No answer (of the region) costs less.
-    min_eigenvalue : float
-        A lower bound on the certificate matrix's smallest eigenvalue, after its diagonal was scaled to one.
-    tolerance : float
-        The gap up to which the answer counts as optimal.
-    region_m : float
-        The bound is about all answers whose sensors are at most this far from the reference along each axis.
-    """
-
-    status: Status
-    cost: float
-    lower_bound: float
-    min_eigenvalue: float
-    tolerance: float
-    region_m: float
-
-    @property
-    def gap(self) -> float:
-        """Cost minus lower bound, at least 0."""
-        return max(0.0, self.cost - self.lower_bound)
-
-    @property
-    def is_optimal(self) -> bool:
-        """Whether the cost is proven optimal; other answers may cost the same."""
-        return self.status in (Status.CERTIFIED, Status.CERTIFIED_NOT_UNIQUE)
-
-    def __str__(self) -> str:
-        return (
-            f"{self.status}: joint cost {self.cost:.6g}, no answer within {self.region_m:g} m below "
-            f"{self.lower_bound:.6g}"
-        )
-
-
-@dataclass(frozen=True)
-class Windows:
-    """The windows of time over which motions were compared.
-
-    Attributes
-    ----------
-    seconds : float
-        Length of a window.
-    count : int
-        How many there are.
-    used : dict of sensor to int
-        In how many of them each sensor is used.
-    start_ns, end_ns : (N,) integers
-        Their ends, on the reference's clock.
-    """
-
-    seconds: float
-    count: int
-    used: dict[str, int]
-    start_ns: np.ndarray
-    end_ns: np.ndarray
-
-
-@dataclass(frozen=True)
-class Influence:
-    """How the answer depends on one given number.
-
-    Attributes
-    ----------
-    what : str
-        The number: "height of lidar" and the like.
-    value, sigma : float
-        As it was given; in its unit.
-    unit : "m" or "rad"
-    per_unit : dict of sensor to (6,)
-        Derivative of each pose's tangent [omega, v] by the number.
-    per_sigma : dict of sensor to (6,)
-        How far the pose moves if the number is off by one sigma: rad and m.
-    off_by : float
-        How far the answer is from the number, in the sigmas of their difference; above 3 the data contradict it.
-    """
-
-    what: str
-    value: float
-    sigma: float
-    unit: str
-    per_unit: dict[str, Twist] = field(hash=False)
-    per_sigma: dict[str, Twist] = field(hash=False)
-    off_by: float = 0.0
-
-
-@dataclass(frozen=True)
-class OtherAnswer:
-    """Another answer that fits as well.
-
-    Attributes
-    ----------
-    why : str
-        What leaves it open: "the distance of a and b has two signs".
-    T_reference_sensor : dict of sensor to (4, 4) array
-    cost_above : float
-        Its cost (half a chi-square) above the answer's.
-    """
-
-    why: str
-    T_reference_sensor: dict[str, Array] = field(hash=False)
-    cost_above: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -219,4 +103,73 @@ class OdometryCalibration:
         return pose
 
     def __str__(self) -> str:
-        return in_words(self)
+        return _in_words(self)
+
+
+def _verdict(found: OdometryCalibration) -> str:
+    """The first sentence: whether the poses are to be used."""
+    if not found.certificate.is_optimal:
+        return "Do not use these poses: no proof that they are the best was found."
+    if found.free_directions:
+        return (
+            "Use these poses with care: the drive does not determine all of them. What is free is below; "
+            "drive other turns (slopes, ramps), or give heights, the ground, a direction or a distance."
+        )
+    if found.others:
+        return "Use these poses with care: another answer fits as well. Look which of them is yours."
+    if found.findings:
+        return "Use these poses with care: read the findings first."
+    return "Use these poses."
+
+
+def _in_words(found: OdometryCalibration) -> str:
+    """All of it."""
+    lines = [_verdict(found)]
+    lines += [f"- free: {direction}" for direction in found.free_directions]
+    lines += [f"- another answer: {other.why} (cost {other.cost_above:+.2g})" for other in found.others]
+    lines += [f"- {finding}" for finding in found.findings]
+    lines.append(f"{found.certificate}")
+    lines += [_sensor(found, name) for name in found.order]
+    window = found.windows
+    lines.append(f"{window.count} windows of {window.seconds:.3g} s; used: {_counts(window.used)}")
+    for name in found.sensors:
+        noise, how = found.noise[name], "found" if name in found.noise_was_found else "stated"
+        lines.append(
+            f"noise of {name} ({how}): {np.degrees(noise.rotation_rad_per_sqrt_s):.3g} deg and "
+            f"{1e3 * noise.translation_m_per_sqrt_s:.3g} mm after a second"
+        )
+    for name, removed in found.removed.items():
+        if removed:
+            reasons = Counter(str(item.reason) for item in removed)
+            lines.append(f"removed of {name}: {_counts(dict(reasons))}")
+    for number in found.influences:
+        size = max((float(np.linalg.norm(twist[3:])) for twist in number.per_sigma.values()), default=0.0)
+        turn = max((float(np.linalg.norm(twist[:3])) for twist in number.per_sigma.values()), default=0.0)
+        lines.append(
+            f"given: {number.what} = {number.value:g} +- {number.sigma:g} {number.unit}; one sigma moves a sensor by "
+            f"up to {1e3 * size:.2g} mm and {np.degrees(turn):.2g} deg; the data are {number.off_by:.1f} sigmas from it"
+        )
+    return "\n".join(lines)
+
+
+def _sensor(found: OdometryCalibration, name: str) -> str:
+    T, sigma = found.T_reference_sensor[name], np.sqrt(np.diagonal(found.covariance_of(name)))
+    where = ", ".join(f"{x:.4f}" for x in T[:3, 3])
+    text = (
+        f"{name} in {found.reference}: at ({where}) m +- {_sizes(1e3 * sigma[3:], 'mm')}, turned by "
+        f"{np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))):.2f} deg +- "
+        f"{_sizes(np.degrees(sigma[:3]), 'deg')}"
+    )
+    if name in found.scales:
+        text += f", scale {found.scales[name]:.5g}"
+    if name in found.time_offset_sigmas_s:
+        text += f", clock {1e3 * found.time_offsets_s[name]:+.1f} +- {1e3 * found.time_offset_sigmas_s[name]:.1f} ms"
+    return text
+
+
+def _sizes(sigma: np.ndarray, unit: str) -> str:
+    return "(" + ", ".join(f"{x:.2g}" if np.isfinite(x) else "free" for x in sigma) + f") {unit}"
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "none"

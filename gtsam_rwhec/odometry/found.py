@@ -1,0 +1,128 @@
+"""What a calibration of odometries found beside the poses: proof, windows, dependence, other answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.identifiability.free_directions import Twist
+from gtsam_rwhec.solver.cause import Status
+
+
+@dataclass(frozen=True)
+class JointCertificate:
+    """The proof for the joint quadratic cost of all sensors (design fact 23).
+
+    The cost is half the squared residuals of the windows' rotation vectors and translations in all sensors at once,
+    with the vehicle's own motion eliminated. The turn of each window inside the lever arms' term, and the length of the
+    way that scales are compared with, are the fused ones. So the proof is of this cost; the exact likelihood is refined
+    from there.
+
+    Attributes
+    ----------
+    status : Status
+    cost : float
+        The cost at the answer.
+    lower_bound : float
+        No answer (of the region) costs less.
+    min_eigenvalue : float
+        A lower bound on the certificate matrix's smallest eigenvalue, after its diagonal was scaled to one.
+    tolerance : float
+        The gap up to which the answer counts as optimal.
+    region_m : float
+        The bound is about all answers whose sensors are at most this far from the reference along each axis.
+    """
+
+    status: Status
+    cost: float
+    lower_bound: float
+    min_eigenvalue: float
+    tolerance: float
+    region_m: float
+
+    @property
+    def gap(self) -> float:
+        """Cost minus lower bound, at least 0."""
+        return max(0.0, self.cost - self.lower_bound)
+
+    @property
+    def is_optimal(self) -> bool:
+        """Whether the cost is proven optimal; other answers may cost the same."""
+        return self.status in (Status.CERTIFIED, Status.CERTIFIED_NOT_UNIQUE)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.status}: joint cost {self.cost:.6g}, no answer within {self.region_m:g} m below "
+            f"{self.lower_bound:.6g}"
+        )
+
+
+@dataclass(frozen=True)
+class Windows:
+    """The windows of time over which motions were compared.
+
+    Attributes
+    ----------
+    seconds : float
+        Length of a window.
+    count : int
+        How many there are.
+    used : dict of sensor to int
+        In how many of them each sensor is used.
+    start_ns, end_ns : (N,) integers
+        Their ends, on the reference's clock.
+    """
+
+    seconds: float
+    count: int
+    used: dict[str, int]
+    start_ns: np.ndarray
+    end_ns: np.ndarray
+
+
+@dataclass(frozen=True)
+class Influence:
+    """How the answer depends on one given number.
+
+    Attributes
+    ----------
+    what : str
+        The number: "height of lidar" and the like.
+    value, sigma : float
+        As it was given; in its unit.
+    unit : "m" or "rad"
+    per_unit : dict of sensor to (6,)
+        Derivative of each pose's tangent [omega, v] by the number.
+    per_sigma : dict of sensor to (6,)
+        How far the pose moves if the number is off by one sigma: rad and m.
+    off_by : float
+        How far the answer is from the number, in the sigmas of their difference; above 3 the data contradict it.
+    """
+
+    what: str
+    value: float
+    sigma: float
+    unit: str
+    per_unit: dict[str, Twist] = field(hash=False)
+    per_sigma: dict[str, Twist] = field(hash=False)
+    off_by: float = 0.0
+
+
+@dataclass(frozen=True)
+class OtherAnswer:
+    """Another answer that fits as well.
+
+    Attributes
+    ----------
+    why : str
+        What leaves it open: "the distance of a and b has two signs".
+    T_reference_sensor : dict of sensor to (4, 4) array
+    cost_above : float
+        Its cost (half a chi-square) above the answer's.
+    """
+
+    why: str
+    T_reference_sensor: dict[str, Array] = field(hash=False)
+    cost_above: float = 0.0
