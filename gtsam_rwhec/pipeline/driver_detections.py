@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from gtsam_rwhec.errors import CameraError, LogError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.logs import DetectionRecord, Log
 from gtsam_rwhec.pipeline.carrier_motion import check_order
 from gtsam_rwhec.pipeline.image_detections import message_count
@@ -39,6 +40,7 @@ def read_driver_detections(log: Log, rig: Rig, sensor: str, camera: Camera | Non
     source = rig.sensors[sensor]
     assert source.detections is not None
     result: list[DetectionRecord] = []
+    targets: list[Target] = []
     strangers: Counter[tuple[str, str]] = Counter()
     messages: dict[tuple[int, int], None] = {}
     for record in log.records([source.detections]):
@@ -49,44 +51,69 @@ def read_driver_detections(log: Log, rig: Rig, sensor: str, camera: Camera | Non
         if target is None:
             strangers[record.family or "tag", record.id] += 1
             continue
-        result.append(_made(record, target, camera, sensor))
+        result.append(_as_told(record, target, camera, sensor))
+        targets.append(target)
     check_order(np.array([stamp for _, stamp in messages], dtype=np.int64), f"topic {source.detections}")
+    if camera is not None:
+        result = _by_corners(result, targets, camera)
     return SensorDetections(result, message_count(log, source.detections), strangers)
 
 
-def _made(record: DetectionRecord, target: Target, camera: Camera | None, sensor: str) -> DetectionRecord:
+def _as_told(record: DetectionRecord, target: Target, camera: Camera | None, sensor: str) -> DetectionRecord:
+    """The driver's record with the rig file's names and sizes, and corners in our order if poses come from them."""
     driver_m = record.size_m
     record = replace(record, id=target.name, family=target.family, size_m=target.length_m)
-    if camera is None or record.corners_px is None or len(record.corners_px) != 4:
-        if record.T_camera_tag is None:
-            raise CameraError(
-                f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver gives no pose of {target.name}, and "
-                f"sensor {sensor} has no intrinsics from which to make one"
-            )
-        if driver_m is not None and not np.isclose(driver_m, target.length_m, rtol=SAME_SIZE, atol=0.0):
-            raise LogError(
-                f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver made its pose of {target.name} with a "
-                f"size of {driver_m:g} m, and the rig file says {target.length_m:g} m. Give the driver's size in the "
-                f"rig file, or the intrinsics of sensor {sensor}: with them poses are computed from corners"
-            )
-        return record
-    corners_px = _in_our_order(record.corners_px)
-    record = replace(record, corners_px=corners_px)  # the refinement from corners reads them too
-    poses = plane_poses(camera, [target.corners()], [corners_px], corner_px=CORNER_PX)
-    which = 0
-    if record.T_camera_tag is not None:
-        # Only the direction of the normal tells the two poses apart: drivers choose a tag's axes as they like.
-        normal = record.T_camera_tag[:3, 2]
-        which = int(np.argmax([abs(float(T[:3, 2] @ normal)) for T in np.nan_to_num(poses.T[0])]))
-    T = poses.T[0, which]
-    if not np.isfinite(T).all() or not np.isfinite(poses.covariance[0, which]).all():
-        return replace(record, T_camera_tag=None, covariance=None, reason=Rejection.NO_POSE)
-    return replace(
-        record,
-        T_camera_tag=T,
-        covariance=poses.covariance[0, which],
-        reprojection_px=float(poses.reprojection_px[0, which]),
-    )
+    if _has_corners(record, camera):
+        assert record.corners_px is not None
+        # The refinement from corners reads them too.
+        return replace(record, corners_px=_in_our_order(record.corners_px))
+    if record.T_camera_tag is None:
+        raise CameraError(
+            f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver gives no pose of {target.name}, and "
+            f"sensor {sensor} has no intrinsics from which to make one"
+        )
+    if driver_m is not None and not np.isclose(driver_m, target.length_m, rtol=SAME_SIZE, atol=0.0):
+        raise LogError(
+            f"topic {record.topic}, stamp {record.stamp_ns} ns: the driver made its pose of {target.name} with a "
+            f"size of {driver_m:g} m, and the rig file says {target.length_m:g} m. Give the driver's size in the "
+            f"rig file, or the intrinsics of sensor {sensor}: with them poses are computed from corners"
+        )
+    return record
+
+
+def _has_corners(record: DetectionRecord, camera: Camera | None) -> bool:
+    return camera is not None and record.corners_px is not None and len(record.corners_px) == 4
+
+
+def _by_corners(records: list[DetectionRecord], targets: list[Target], camera: Camera) -> list[DetectionRecord]:
+    """The records with poses from their corners, all at once; those without corners stay as they are."""
+    at = [i for i, record in enumerate(records) if _has_corners(record, camera)]
+    corners_px = [records[i].corners_px for i in at]
+    poses = plane_poses(camera, [targets[i].corners() for i in at], corners_px, corner_px=CORNER_PX)  # type: ignore[arg-type]
+    result = list(records)
+    for row, i in enumerate(at):
+        T, covariance = poses.T[row], poses.covariance[row]
+        which = _nearer(T, records[i].T_camera_tag)
+        if not np.isfinite(T[which]).all() or not np.isfinite(covariance[which]).all():
+            result[i] = replace(records[i], T_camera_tag=None, covariance=None, reason=Rejection.NO_POSE)
+            continue
+        result[i] = replace(
+            records[i],
+            T_camera_tag=T[which],
+            covariance=covariance[which],
+            reprojection_px=float(poses.reprojection_px[row, which]),
+        )
+    return result
+
+
+def _nearer(T: Array, of_driver: Array | None) -> int:
+    """Which of two poses (2, 4, 4) is nearer to the driver's; without one the first, which fits better.
+
+    Only the direction of the normal tells the two poses apart: drivers choose a tag's axes as they like.
+    """
+    if of_driver is None:
+        return 0
+    return int(np.argmax([abs(float(one[:3, 2] @ of_driver[:3, 2])) for one in np.nan_to_num(T)]))
 
 
 def _in_our_order(corners_px: np.ndarray) -> np.ndarray:
