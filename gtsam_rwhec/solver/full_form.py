@@ -15,74 +15,174 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.rounding import gamma
+from gtsam_rwhec.geometry.rounding import SAFETY, UNIT, gamma
 from gtsam_rwhec.problem.moments import ONE, R_A, SWAPPED, T_A, T_B, edge_forms
 from gtsam_rwhec.solver.parts import Part
 
 #: Positions among an edge's 28 numbers: leaf (13), center (13), alpha, h.
 ALPHA, H = 26, 27
+#: Where the rotations are among them, and the tail.
+_ROTATIONS = np.r_[4:13, 17:26, ALPHA, H]
+#: The forms of so many pairs are made at once: a few megabytes.
+PAIRS_AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
 class FullForm:
-    """Blocks of Q over L leaves, P centers and the tail, [alpha, h].
+    """Blocks of Q over n frames (leaves, then centers), their couplings, and the tail, [alpha, h].
 
-    leaf (L, 13, 13); leaf_center (L, P, 13, 13); leaf_tail (L, 13, 2); center (P, 13, 13); center_tail (P, 13, 2);
-    tail (2, 2).
+    frames (n, m, m); tails (n, m, 2); tail (2, 2). The coupling of leaf ``rows[k]`` and center ``columns[k]`` is
+    ``couplings[k]`` (F, m, m); each pair of frames is there once. m is 13, or 9 for rotations alone.
     """
 
-    leaf: Array
-    leaf_center: Array
-    leaf_tail: Array
-    center: Array
-    center_tail: Array
+    frames: Array
+    tails: Array
     tail: Array
-
-    @property
-    def leaves(self) -> int:
-        """Number of leaves."""
-        return len(self.leaf)
+    rows: np.ndarray
+    columns: np.ndarray
+    couplings: Array
+    leaves: int
 
     @property
     def centers(self) -> int:
         """Number of centers."""
-        return len(self.center)
+        return len(self.frames) - self.leaves
+
+    @property
+    def leaf(self) -> Array:
+        """(L, m, m)."""
+        return self.frames[: self.leaves]
+
+    @property
+    def center(self) -> Array:
+        """(P, m, m)."""
+        return self.frames[self.leaves :]
+
+    @property
+    def leaf_tail(self) -> Array:
+        """(L, m, 2)."""
+        return self.tails[: self.leaves]
+
+    @property
+    def center_tail(self) -> Array:
+        """(P, m, 2)."""
+        return self.tails[self.leaves :]
+
+    @property
+    def leaf_center(self) -> Array:
+        """All couplings, also those that are zero: (L, P, m, m), for small parts."""
+        m = self.frames.shape[1]
+        result = np.zeros((self.leaves, self.centers, m, m))
+        result[self.rows, self.columns] = self.couplings
+        return result
 
     def value(self, leaf: Array, center: Array, tail: Array) -> float:
         """x' Q x for leaf (L, 13), center (P, 13), tail (2,); in extended precision, as large terms cancel."""
-        leaf, center, tail = (x.astype(np.longdouble) for x in (leaf, center, tail))
-        of_leaf = np.einsum("lpij,pj->li", self.leaf_center, center) + self.leaf_tail @ tail
-        of_center = self.center_tail @ tail
-        own = (leaf * np.einsum("lij,lj->li", self.leaf, leaf)).sum()
-        own += (center * np.einsum("pij,pj->pi", self.center, center)).sum()
-        coupled = (leaf * of_leaf).sum() + (center * of_center).sum()
-        return float(own + 2.0 * coupled + tail @ self.tail @ tail)
+        frames = np.concatenate([leaf, center]).astype(np.longdouble)
+        tail = tail.astype(np.longdouble)
+        own = (frames * np.einsum("nij,nj->ni", self.frames, frames)).sum()
+        of_tail = (frames * (self.tails @ tail)).sum()
+        first, second = frames[self.rows], frames[self.leaves + self.columns]
+        coupled = (first * np.einsum("fij,fj->fi", self.couplings, second)).sum()
+        return float(own + 2.0 * (of_tail + coupled) + tail @ self.tail @ tail)
 
 
 @dataclass(frozen=True)
 class Slots:
     """What the variables of each pair are in the form.
 
-    ``leaf`` and ``center`` (E,) are indices, one past the last where there is none. ``of_pair`` (E, 25, 28): the 25
-    variables of a pair from the numbers of its leaf (13) and center (13), alpha and h.
+    ``leaf`` and ``center`` (E,) are indices, one past the last where there is none. The 25 variables of a pair come
+    from the numbers of its leaf (13) and center (13), alpha and h, by ``matrices``.
     """
 
     leaf: np.ndarray
     center: np.ndarray
-    of_pair: Array
+    #: (E, 2): where the numbers of target and sensor begin among the 28, 0 or 13; -1 for a fixed frame.
+    first: np.ndarray
+    #: (E, 2): the row of ``poses`` for fixed frames, and else -1.
+    fixed: np.ndarray
+    #: (K, 12): [t, vec R] of the fixed frames, as the form's variables.
+    poses: Array
+    t_of_fixed: int  #: which of the 28 numbers multiplies a fixed frame's translation
+    scale_at: np.ndarray  #: (E,): which of the 28 numbers is the pair's scale variable
+    scale: Array  #: (E,): and times what
+
+    def matrices(self, at: slice | np.ndarray = slice(None)) -> Array:
+        """The pairs' 25 variables from their 28 numbers, (k, 25, 28): k pairs are kilobytes, so take some at a time."""
+        first, fixed = self.first[at], self.fixed[at]
+        k = len(first)
+        S = np.zeros((k, 25, 28))
+        for side, (t, r) in enumerate(((0, 7), (3, 16))):
+            free = np.flatnonzero(first[:, side] >= 0)
+            begin = first[free, side]
+            for i in range(3):
+                S[free, t + i, begin + i] = 1.0
+            for i in range(9):
+                S[free, r + i, begin + 4 + i] = 1.0
+            known = np.flatnonzero(first[:, side] < 0)
+            pose = self.poses[fixed[known, side]]
+            S[known, t : t + 3, self.t_of_fixed] = pose[:, :3]
+            S[known, r : r + 9, H] = pose[:, 3:]
+        S[np.arange(k), 6, self.scale_at[at]] = self.scale[at]
+        return S
+
+    @property
+    def of_pair(self) -> Array:
+        """The matrices of all pairs, (E, 25, 28)."""
+        return self.matrices()
 
 
 def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
-    """Q of a part, and the form of its rotation residuals alone; both with the priors."""
-    translation, rotation = part.moments.translation, part.moments.rotation
-    if part.kind == "inverse":
-        translation = translation[:, SWAPPED[:, None], SWAPPED]
-        rotation = rotation.transpose(0, 2, 1)
-    of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa)
-    full, alone = (_assembled(part, slots, of_edges) for of_edges in (of_translations + of_rotations, of_rotations))
-    for form in (full, alone):
+    """Q of a part, and the form of its rotation residuals over [vec R] alone; both with the priors."""
+    L, n, E = len(part.leaves), len(part.free), len(part.pairs)
+    coupled = (slots.leaf < L) & (slots.center < n - L)
+    where = np.cumsum(coupled) - 1
+    rows, columns = slots.leaf[coupled], slots.center[coupled]
+    forms = [
+        FullForm(
+            np.zeros((n, m, m)), np.zeros((n, m, 2)), np.zeros((2, 2)), rows, columns, np.zeros((len(rows), m, m)), L
+        )
+        for m in (13, 9)
+    ]
+    for begin in range(0, E, PAIRS_AT_ONCE):
+        at = slice(begin, begin + PAIRS_AT_ONCE)
+        translation, rotation = part.moments.translation[at], part.moments.rotation[at]
+        if part.kind == "inverse":
+            translation = translation[:, SWAPPED[:, None], SWAPPED]
+            rotation = rotation.transpose(0, 2, 1)
+        of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa[at])
+        S = slots.matrices(at)
+        leaf, center = slots.leaf[at], L + slots.center[at]
+        to = where[at][coupled[at]]
+        for form, of_edges in zip(forms, (of_translations + of_rotations, of_rotations), strict=True):
+            Q = S.transpose(0, 2, 1) @ of_edges @ S
+            if form.frames.shape[1] == 9:
+                Q = Q[:, _ROTATIONS[:, None], _ROTATIONS]
+            m = (Q.shape[1] - 2) // 2
+            one, two, tail = slice(0, m), slice(m, 2 * m), slice(2 * m, 2 * m + 2)
+            for index, has, side in ((leaf, leaf < L, one), (center, center < n, two)):
+                sum_into(form.frames, index[has], Q[has, side, side])
+                sum_into(form.tails, index[has], Q[has, side, tail])
+            form.couplings[to] = Q[coupled[at], one, two]
+            form.tail[...] += Q[:, tail, tail].sum(axis=0)
+    for form in forms:
         _add_priors(form, part)
-    return full, alone
+    return forms[0], forms[1]
+
+
+def sum_into(result: Array, index: np.ndarray, values: Array) -> None:
+    """Add each of the values (k, ...) to the row of ``result`` that ``index`` (k,) names; rows may be named twice."""
+    if len(index) == 0:
+        return
+    rows, which = np.unique(index, return_inverse=True)
+    if len(rows) == len(index):
+        result[index] += values
+        return
+    from scipy.sparse import csr_array  # slow to import
+
+    k = len(index)
+    sums = csr_array((np.ones(k), (which, np.arange(k))), shape=(len(rows), k)) @ values.reshape(k, -1)
+    result[rows] += sums.reshape(len(rows), *values.shape[1:])
 
 
 def slots_of(part: Part) -> Slots:
@@ -92,33 +192,39 @@ def slots_of(part: Part) -> Slots:
     (its translation times alpha, where t is alpha times the translation); a known scale becomes h; both ends of a
     motion are one frame.
     """
-    place = {name: (0, i) for i, name in enumerate(part.leaves)}
-    place |= {name: (1, i) for i, name in enumerate(part.centers)}
-    edges = len(part.pairs)
-    leaf = np.full(edges, len(part.leaves))
-    center = np.full(edges, len(part.centers))
-    S = np.zeros((edges, 25, 28))
-    t_of_fixed = ALPHA if part.kind == "direct" and part.scale == "shared" else H
-    owners = frozenset(part.scale_owners)
-    for e, (target, sensor) in enumerate(part.pairs):
-        for name, t, r in ((target, 0, 7), (sensor, 3, 16)):
-            if name in place:
-                side, index = place[name]
-                (center if side else leaf)[e] = index
-                first = 13 * side
-                S[e, [t, t + 1, t + 2], [first, first + 1, first + 2]] = 1.0
-                S[e, range(r, r + 9), range(first + 4, first + 13)] = 1.0
-            else:
-                T = as_variable(part.fixed[name], part)
-                S[e, t : t + 3, t_of_fixed] = T[:3, 3]
-                S[e, r : r + 9, H] = T[:3, :3].T.ravel()
-        if part.scale == "shared":
-            S[e, 6, ALPHA] = 1.0
-        elif target in owners:
-            S[e, 6, 13 * place[target][0] + 3] = 1.0
-        else:
-            S[e, 6, H] = 1.0 / part.fixed_scales.get(target, 1.0)
-    return Slots(leaf, center, S)
+    L, P = len(part.leaves), len(part.centers)
+    place = {name: i for i, name in enumerate(part.free)}
+    known = {name: i for i, name in enumerate(part.fixed)}
+    index = np.array([[place.get(name, -1) for name in pair] for pair in part.pairs], dtype=int).reshape(-1, 2)
+    fixed = np.array([[known.get(name, -1) for name in pair] for pair in part.pairs], dtype=int).reshape(-1, 2)
+    is_leaf = (index >= 0) & (index < L)
+    leaf = np.where(is_leaf, index, -1).max(axis=1, initial=-1)
+    center = np.where(index >= L, index - L, -1).max(axis=1, initial=-1)
+    first = np.where(index < 0, -1, np.where(is_leaf, 0, 13))
+    poses = np.empty((len(known), 12))
+    for i, T in enumerate(part.fixed.values()):
+        variable = as_variable(T, part)
+        poses[i] = np.r_[variable[:3, 3], variable[:3, :3].T.ravel()]
+    E = len(part.pairs)
+    scale_at, scale = np.full(E, H), np.ones(E)
+    if part.scale == "shared":
+        scale_at[:] = ALPHA
+    else:
+        owners, of_target = frozenset(part.scale_owners), part.fixed_scales
+        owns = np.array([target in owners for target, _ in part.pairs], dtype=bool)
+        scale_at[owns] = first[owns, 0] + 3
+        scale = np.array([1.0 / of_target.get(target, 1.0) for target, _ in part.pairs])
+        scale[owns] = 1.0
+    return Slots(
+        np.where(leaf < 0, L, leaf),
+        np.where(center < 0, P, center),
+        first,
+        fixed,
+        poses,
+        ALPHA if part.kind == "direct" and part.scale == "shared" else H,
+        scale_at,
+        scale,
+    )
 
 
 def rounding_of_fixed(part: Part) -> Array:
@@ -133,7 +239,7 @@ def rounding_of_fixed(part: Part) -> Array:
     return result
 
 
-def _rounding_of_pairs(part: Part) -> Array:
+def _rounding_of_pairs(part: Part, slots: Slots) -> Array:
     """What rounding did to each pair's form, as diagonals (E, 25) that dominate it.
 
     The form of the measurements in exact arithmetic differs from the form as stored for two reasons: the rounding of
@@ -152,9 +258,13 @@ def _rounding_of_pairs(part: Part) -> Array:
         worst = np.nan_to_num(error[:, T_A].max(axis=1) / length, nan=1.0, posinf=1.0)
     if part.kind == "inverse":
         magnitude, error = magnitude[:, SWAPPED], error[:, SWAPPED]
-    # Sums over the pairs come on top of the sums over their measurements.
-    operations = moments.operations + len(part.pairs) + 20
-    unit = np.array([gamma(int(count)) for count in operations])
+    # Sums over the pairs of a frame come on top of the sums over their measurements; a shared scale has all pairs.
+    meeting = np.full(len(part.pairs), len(part.pairs))
+    if part.scale != "shared":
+        frames = np.stack([slots.leaf, len(part.leaves) + slots.center])
+        meeting = np.bincount(frames.ravel())[frames].sum(axis=0)
+    operations = moments.operations + 2 * meeting + 20
+    unit = SAFETY * operations * UNIT / (1.0 - operations * UNIT)
     # g m m' + m e' + e m' + e e' <= g m m' + (c m + e / c)(c m + e / c)' for any c up to 1.
     c = np.sqrt(np.clip(worst, 1e-30, 1.0))[:, None]
     square = unit[:, None] * magnitude**2 + (c * magnitude + error / c) ** 2  # of the errors of features
@@ -171,13 +281,17 @@ def _rounding_of_pairs(part: Part) -> Array:
 
 def rounding_of(part: Part, slots: Slots) -> Array:
     """What rounding did to Q, as a diagonal (13 n + 1,) over [leaves, centers, alpha] that dominates it."""
-    of_slots = np.einsum("ep,epq->eq", _rounding_of_pairs(part), slots.of_pair**2)
-    L, P = len(part.leaves), len(part.centers)
-    leaves, centers = np.zeros((L + 1, 13)), np.zeros((P + 1, 13))
-    np.add.at(leaves, slots.leaf, of_slots[:, :13])
-    np.add.at(centers, slots.center, of_slots[:, 13:26])
-    result: Array = np.r_[leaves[:L].ravel(), centers[:P].ravel(), of_slots[:, ALPHA].sum()]
-    return result
+    L, n = len(part.leaves), len(part.free)
+    result, of_pairs = np.zeros((n, 13)), _rounding_of_pairs(part, slots)
+    of_alpha = 0.0
+    for begin in range(0, len(of_pairs), PAIRS_AT_ONCE):
+        at = slice(begin, begin + PAIRS_AT_ONCE)
+        of_slots = np.einsum("ep,epq->eq", of_pairs[at], slots.matrices(at) ** 2)
+        leaf, center = slots.leaf[at], L + slots.center[at]
+        for index, has, side in ((leaf, leaf < L, slice(0, 13)), (center, center < n, slice(13, 26))):
+            sum_into(result, index[has], of_slots[has, side])
+        of_alpha += float(of_slots[:, ALPHA].sum())
+    return np.append(result.ravel(), of_alpha)
 
 
 def as_variable(T: Array, part: Part) -> Array:
@@ -190,36 +304,17 @@ def as_variable(T: Array, part: Part) -> Array:
     return inverse
 
 
-def _assembled(part: Part, slots: Slots, of_edges: Array) -> FullForm:
-    """The blocks of Q: the sum of the edges' forms (E, 25, 25)."""
-    L, P = len(part.leaves), len(part.centers)
-    leaf_of, center_of, S = slots.leaf, slots.center, slots.of_pair
-    Q = S.transpose(0, 2, 1) @ of_edges @ S
-    one, two, tail = slice(0, 13), slice(13, 26), slice(26, 28)
-    # One row more than there are frames: where an edge has no leaf or no center, its zeros go there.
-    leaf, leaf_tail = np.zeros((L + 1, 13, 13)), np.zeros((L + 1, 13, 2))
-    center, center_tail = np.zeros((P + 1, 13, 13)), np.zeros((P + 1, 13, 2))
-    leaf_center = np.zeros((L + 1, P + 1, 13, 13))
-    np.add.at(leaf, leaf_of, Q[:, one, one])
-    np.add.at(leaf_tail, leaf_of, Q[:, one, tail])
-    np.add.at(center, center_of, Q[:, two, two])
-    np.add.at(center_tail, center_of, Q[:, two, tail])
-    leaf_center[leaf_of, center_of] = Q[:, one, two]  # each pair of frames has one edge
-    return FullForm(leaf[:L], leaf_center[:L, :P], leaf_tail[:L], center[:P], center_tail[:P], Q[:, tail, tail].sum(0))
-
-
 def _add_priors(form: FullForm, part: Part) -> None:
     """Add kappa |R - R_0|_F^2 / 2 and |t - t_0|^2 / (2 sigma^2), quadratic once multiplied by h (design fact 11)."""
-    place = {name: (form.leaf, form.leaf_tail, i) for i, name in enumerate(part.leaves)}
-    place |= {name: (form.center, form.center_tail, i) for i, name in enumerate(part.centers)}
+    place = {name: i for i, name in enumerate(part.free)}
+    used = slice(13 - form.frames.shape[1], 13)
     for name, priors in part.priors.items():
         if name not in place:
             continue
-        block, tail, index = place[name]
         for prior in priors:
             quadratic = _prior_form(prior.transform, prior.sigma, prior.kappa, part)
-            block[index] += quadratic[:13, :13]
-            tail[index, :, 1] += quadratic[:13, 13]
+            form.frames[place[name]] += quadratic[used, used]
+            form.tails[place[name], :, 1] += quadratic[used, 13]
             form.tail[1, 1] += quadratic[13, 13]
 
 

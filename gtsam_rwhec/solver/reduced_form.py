@@ -121,10 +121,11 @@ def reduce(form: FullForm) -> ReducedForm:
     w = 4 * P + 1
     b = w + 9 * P + 1
     # The border's order: [t, s of the centers], alpha, [vec R of the centers], h.
+    leaf_center = form.leaf_center
     leaf_border = np.empty((L, 13, b))
-    leaf_border[:, :, : 4 * P] = form.leaf_center[..., :4].transpose(0, 2, 1, 3).reshape(L, 13, 4 * P)
+    leaf_border[:, :, : 4 * P] = leaf_center[..., :4].transpose(0, 2, 1, 3).reshape(L, 13, 4 * P)
     leaf_border[:, :, 4 * P] = form.leaf_tail[..., 0]
-    leaf_border[:, :, w : b - 1] = form.leaf_center[..., 4:].transpose(0, 2, 1, 3).reshape(L, 13, 9 * P)
+    leaf_border[:, :, w : b - 1] = leaf_center[..., 4:].transpose(0, 2, 1, 3).reshape(L, 13, 9 * P)
     leaf_border[:, :, b - 1] = form.leaf_tail[..., 1]
     E = np.zeros((b, b))
     for p in range(P):

@@ -21,17 +21,16 @@ def spectral_start(part: Part, rotation_form: FullForm) -> list[Array]:
     priors add terms with h; then both signs are returned, and the cost decides.
     """
     L, P = rotation_form.leaves, rotation_form.centers
+    D = rotation_form.leaf
     if P == 0:  # every center is a fixed frame: each leaf has its own linear problem
-        solution = -np.linalg.solve(rotation_form.leaf[:, 4:, 4:], rotation_form.leaf_tail[:, 4:, 1, None])
-        return [project(unvec(solution))]
-    D = rotation_form.leaf[:, 4:, 4:]
+        return [project(unvec(-np.linalg.solve(D, rotation_form.leaf_tail[:, :, 1, None])))]
     C = np.empty((L, 9, 9 * P + 1))
-    C[:, :, :-1] = rotation_form.leaf_center[..., 4:, 4:].transpose(0, 2, 1, 3).reshape(L, 9, 9 * P)
-    C[:, :, -1] = rotation_form.leaf_tail[:, 4:, 1]
+    C[:, :, :-1] = rotation_form.leaf_center.transpose(0, 2, 1, 3).reshape(L, 9, 9 * P)
+    C[:, :, -1] = rotation_form.leaf_tail[:, :, 1]
     E = np.zeros((9 * P + 1, 9 * P + 1))
-    np.einsum("papb->pab", E[:-1, :-1].reshape(P, 9, P, 9))[...] = rotation_form.center[:, 4:, 4:]
+    np.einsum("papb->pab", E[:-1, :-1].reshape(P, 9, P, 9))[...] = rotation_form.center
     E[-1, -1] = rotation_form.tail[1, 1]
-    E[:-1, -1] = E[-1, :-1] = rotation_form.center_tail[:, 4:, 1].ravel()
+    E[:-1, -1] = E[-1, :-1] = rotation_form.center_tail[:, :, 1].ravel()
     to_border = np.linalg.solve(D, C)
     S = E - arrow.flat(C).T @ arrow.flat(to_border)
     S = 0.5 * (S + S.T)

@@ -67,44 +67,36 @@ class StoredForm:
     @property
     def _unit(self) -> float:
         """At most so many operations make an entry of a product: each block's sums, and the sums over blocks."""
-        return gamma(13 * (self.form.leaves + self.form.centers) + 60, WIDE_UNIT)
+        return gamma(13 * len(self.form.frames) + 60, WIDE_UNIT)
 
     def _times(self, x: Array) -> tuple[Array, Array]:
         """Q x for x (13 n + 2, D), and a bound on its rounding, in doubles."""
-        form = self.form
-        blocks = (form.leaf, form.leaf_center, form.leaf_tail, form.center, form.center_tail, form.tail)
-        return _product(blocks, x), self._unit * self._sizes(x) * (1.0 + 1e-9)
+        return _product(self.form, x, size=False), self._unit * self._sizes(x) * (1.0 + 1e-9)
 
     def _sizes(self, x: Array) -> Array:
         """|Q| |x|, in doubles."""
-        form = self.form
-        blocks = (form.leaf, form.leaf_center, form.leaf_tail, form.center, form.center_tail, form.tail)
-        return _product(tuple(np.abs(block) for block in blocks), np.abs(x).astype(float))
+        return _product(self.form, np.abs(x).astype(float), size=True)
 
 
-def _product(blocks: tuple[Array, ...], x: Array) -> Array:
-    """The form's blocks times x (13 n + 2, D), in the precision of x."""
-    leaf, leaf_center, leaf_tail, center, center_tail, tail = (block.astype(x.dtype) for block in blocks)
-    L, P, D = len(leaf), len(center), x.shape[1]
-    of_leaf, of_center, of_tail = (
-        x[: 13 * L].reshape(L, 13, D),
-        x[13 * L : -2].reshape(P, 13, D),
-        x[-2:],
+def _product(form: FullForm, x: Array, *, size: bool) -> Array:
+    """The form, or the sizes of its entries, times x (13 n + 2, D), in the precision of x."""
+    frames, couplings, tails, tail = (
+        (np.abs(blocks) if size else blocks).astype(x.dtype)
+        for blocks in (form.frames, form.couplings, form.tails, form.tail)
     )
-    # Sums over no frame are left out: numpy's einsum gives anything for them in extended precision.
-    first = np.einsum("lij,ljd->lid", leaf, of_leaf) + np.einsum("lit,td->lid", leaf_tail, of_tail)
-    second = np.einsum("pij,pjd->pid", center, of_center) + np.einsum("pit,td->pid", center_tail, of_tail)
-    third = np.zeros_like(of_tail)
-    if L and P:
-        first += np.einsum("lpij,pjd->lid", leaf_center, of_center)
-        second += np.einsum("lpij,lid->pjd", leaf_center, of_leaf)
-    if L:
-        third += np.einsum("lit,lid->td", leaf_tail, of_leaf)
-    if P:
-        third += np.einsum("pit,pid->td", center_tail, of_center)
-    third += tail @ of_tail
-    result: Array = np.concatenate([first.reshape(13 * L, D), second.reshape(13 * P, D), third])
-    return result
+    n, L, D = len(frames), form.leaves, x.shape[1]
+    of_frames, of_tail = x[:-2].reshape(n, 13, D), x[-2:]
+    result, last = np.zeros((n, 13, D), dtype=x.dtype), tail @ of_tail
+    # A sum over no frame is left out: numpy's einsum gives anything for it in extended precision.
+    if n:
+        result += np.einsum("nij,njd->nid", frames, of_frames) + np.einsum("nit,td->nid", tails, of_tail)
+        last += np.einsum("nit,nid->td", tails, of_frames)
+    if len(couplings):
+        leaf, center = form.rows, L + form.columns
+        np.add.at(result, leaf, np.einsum("fij,fjd->fid", couplings, of_frames[center]))
+        np.add.at(result, center, np.einsum("fij,fid->fjd", couplings, of_frames[leaf]))
+    whole: Array = np.concatenate([result.reshape(13 * n, D), last])
+    return whole
 
 
 def _rounded(values: Array) -> Array:
