@@ -150,6 +150,18 @@ class FetchError(RwhecError):
     """A download failed, or its content is not the expected one."""
 
 
+class FleetError(RwhecError):
+    """A run over many robots cannot go on: its tasks contradict one another, or its engine is gone."""
+
+
+class StoreError(RwhecError):
+    """A store refuses, or has not what was asked of it: a file that is not there, credentials that are not accepted."""
+
+
+class StoreInterruptedError(StoreError, OSError):
+    """A store broke off or does not answer, more than once; it may work later. The message says how far it came."""
+
+
 class RwhecWarning(UserWarning):
     """Root of every warning."""
 

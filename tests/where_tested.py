@@ -88,6 +88,11 @@ TABLE: dict[str, dict[str, str]] = {
         "first_rig/test_folder_proposal.py": "guessed_intrinsics",
         "vision/test_boards_seen.py": "boards_seen",
     },
+    "gtsam_rwhec/fleet": {
+        "fleet/test_in_process.py": "attempts order",
+        "fleet/test_stores.py": "byte_count store_requests",
+        "fleet/test_dask_engine.py": "extras",
+    },
     "gtsam_rwhec/handeye": {
         "handeye/test_certified.py": "chordal_form",
         "handeye/test_cost.py": "motion_costs weights",

@@ -6,6 +6,7 @@ The one file that grows while a run works has lines with checksums (`appending_s
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -84,7 +85,8 @@ def atomic_stream(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
         return
     # Not tempfile.mkstemp: only the owner can read its files, and os.replace would keep that.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # Two threads, or two machines with one disk, may write the same file and have the same number of process.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{secrets.randbelow(10**9):09d}.part")
     try:
         with open(temporary, "wb") as stream:
             yield stream

@@ -15,3 +15,4 @@ from .tasks import Engine as Engine
 from .tasks import Failed as Failed
 from .tasks import Receipt as Receipt
 from .tasks import Task as Task
+from .in_process import InProcess as InProcess

@@ -70,20 +70,20 @@ class Failed:
 
 @dataclass(frozen=True)
 class Task:
-    """One call of ``function(*arguments, done)``, with the receipts or failures of the tasks it comes after.
+    """One call of ``function(*arguments)``, or of ``function(*arguments, done)`` where it comes after others.
 
     Attributes
     ----------
     key : str
         Unique in a run.
     function : callable
-        A function of a module, which other processes can import. It returns a Receipt, raises an error of the library
-        for what no second attempt mends, and any other error for what one may mend (``OSError``).
+        A function of a module, which other processes can import. It returns a Receipt, raises an OSError for what a
+        second attempt may mend, and an error of the library for what none does.
     arguments : tuple
         Small, and picklable.
     after : tuple of str
-        Keys of the tasks whose receipts it gets, in this order, as its last argument (a tuple). A failure of one of
-        them does not stop it: it gets the Failed.
+        Keys of the tasks whose receipts it gets, in this order, as its last argument ``done`` (a tuple), which is not
+        there where this is empty. A failure of one of them does not stop it: it gets the Failed.
     """
 
     key: str

@@ -1,0 +1,149 @@
+"""Requests to a store: tried again where that may help, and every failure told in words without credentials."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import random
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from gtsam_rwhec.errors import StoreError, StoreInterruptedError
+from gtsam_rwhec.fleet.without_secrets import without_secrets
+
+#: A request is made so often before the store counts as gone.
+ATTEMPTS = 4
+#: Seconds before the second request; twice as many before each further one, and up to half as many more by chance.
+PAUSE_S = 0.25
+#: What the codes and classes of stores' libraries mean, by words in them. Only what may pass is asked for again.
+_REFUSED = (
+    "accessdenied", "invalidaccesskeyid", "signaturedoesnotmatch", "expiredtoken", "invalidtoken", "forbidden",
+    "unauthorized", "nocredentials", "partialcredentials", "credentialretrieval", "unable to locate credentials",
+    "authorizationheadermalformed", "anonymous caller", "permission", "tokenrefresh", "requesttimetooskewed",
+)  # fmt: skip
+_ABSENT = (
+    "nosuchbucket",
+    "nosuchkey",
+    "not found",
+    "notfound",
+    "no such",
+    "bucket does not exist",
+    "invalidbucketname",
+)
+_PASSING = (
+    "timeout", "timed out", "slowdown", "slow down", "throttl", "internalerror", "serviceunavailable", "connection",
+    "disconnected", "payload", "incompleteread", "requesttimeout", "reset by peer", "service unavailable",
+    "bad gateway", "too many requests", "ssl", "temporarily", "broken pipe", "endpoint url", "httpclient",
+)  # fmt: skip
+#: Errors of disks that no second attempt mends.
+_OF_DISKS = {errno.ENOSPC, errno.EROFS, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EDQUOT}
+
+Answer = TypeVar("Answer")
+
+
+def requested(
+    ask: Callable[[], Answer],
+    what: str,
+    url: str,
+    options: Mapping[str, Any] | None = None,
+    how_far: Callable[[], str] | None = None,
+    attempts: int | None = None,
+) -> Answer:
+    """What `ask` gives.
+
+    Parameters
+    ----------
+    ask
+        May be called several times; it goes on from where it broke off, if it can.
+    what
+        What is asked for, in words, without credentials.
+    url, options
+        Where, and the storage options: their secrets are taken out of what libraries say.
+    how_far
+        How much has come, in words, for errors.
+    attempts
+        How often it is asked; `ATTEMPTS` if not said.
+
+    Raises
+    ------
+    StoreError
+        The store refuses, or the file is not there.
+    StoreInterruptedError
+        Each attempt broke off.
+    """
+    most = ATTEMPTS if attempts is None else attempts
+    for attempt in range(1, most + 1):
+        try:
+            return ask()
+        except (StoreError, ImportError, MemoryError):
+            raise
+        except Exception as error:  # noqa: BLE001  (stores' libraries have errors of many roots; none is swallowed)
+            fault = _fault(error, what, url, options)
+            if fault is not None:
+                raise fault from None  # the library's own error may repeat credentials
+            if attempt == most:
+                said = without_secrets(_words(error), url, options)
+                came = f" {how_far()}." if how_far is not None else ""
+                raise StoreInterruptedError(
+                    f"{what}: the store broke off or did not answer, {most} times, at last: {said}.{came} Try again "
+                    "when it answers; nothing that is done is lost."
+                ) from None
+            time.sleep(PAUSE_S * 2 ** (attempt - 1) * random.uniform(1.0, 1.5))
+    raise AssertionError("not reached")
+
+
+def _fault(error: Exception, what: str, url: str, options: Mapping[str, Any] | None) -> StoreError | None:
+    """The error of what stays wrong; None if the same request may work later."""
+    words = _words(error)
+    said = without_secrets(words, url, options)
+    # The names in the URL say nothing of the error.
+    names = [name for name in url.lower().replace("?", "/").split("/") if name]
+    text = f"{type(error).__name__} {_code(error)} {words}".lower()
+    for name in sorted(names, key=len, reverse=True):
+        text = text.replace(name, "")
+    status = _status(error)
+    if isinstance(error, PermissionError) or status in (401, 403) or any(word in text for word in _REFUSED):
+        if "://" not in url:
+            return StoreError(f"{what}: no right to it ({said}).")
+        return StoreError(
+            f"{what}: refused ({said}). Check the rights and the credentials: they come from the environment, from the "
+            "store's own configuration files, or from the storage options."
+        )
+    if isinstance(error, FileNotFoundError) or status in (404, 410) or any(word in text for word in _ABSENT):
+        return StoreError(f"{what}: it is not there ({said}).")
+    if isinstance(error, OSError) and error.errno in _OF_DISKS:
+        return StoreError(f"{what}: {error.strerror}.")
+    if isinstance(error, OSError | EOFError | asyncio.TimeoutError) or (status is not None and status >= 429):
+        return None
+    if any(word in text for word in _PASSING):
+        return None
+    return StoreError(f"{what}: {said}.")
+
+
+def _words(error: BaseException) -> str:
+    """What an error says, with those that it came from."""
+    said = str(error).strip() or type(error).__name__
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return error.strerror  # the file is named before it
+    cause = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return said if cause is None or str(cause) in said else f"{said} (from {type(cause).__name__})"
+
+
+def _code(error: BaseException | None) -> str:
+    """The store's own code of an error, such as ``InvalidAccessKeyId``; empty where it has none."""
+    while error is not None:
+        answer = getattr(error, "response", None)
+        if isinstance(answer, dict):
+            return str(answer.get("Error", {}).get("Code", ""))
+        error = error.__cause__
+    return ""
+
+
+def _status(error: Exception) -> int | None:
+    """The number of an answer in HTTP, if the error has one."""
+    status = getattr(error, "status", None)
+    if not isinstance(status, int):
+        answer = getattr(error, "response", None)
+        status = answer.get("ResponseMetadata", {}).get("HTTPStatusCode") if isinstance(answer, dict) else None
+    return status if isinstance(status, int) else None
