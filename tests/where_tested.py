@@ -160,7 +160,8 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/problem": {
         "problem/test_corners.py": "corner_poses nearer_poses",
         "problem/test_moments.py": "accumulation",
-        "problem/test_problem.py": "contents knowledge long_translations measurements",
+        "problem/test_many_measurements.py": "moment_stack packed_moments segmented_moments",
+        "problem/test_problem.py": "checked_arguments contents knowledge long_translations measurements",
         "problem/test_selection.py": "variance_factors",
     },
     "gtsam_rwhec/refinement": {

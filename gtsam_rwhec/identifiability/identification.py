@@ -152,7 +152,7 @@ def _spare_of_rest(part: Part, noise: PairNoise) -> float:
 
 def typical_length(part: Part) -> float:
     """Root mean square of |t_B|, in metres: the length that counts as one radian in a sentence."""
-    square = float(np.einsum("ekk->", part.moments.translation[:, T_B, T_B]))
+    square = float(part.moments.squares(T_B).sum())
     return float(np.sqrt(max(square / float(part.moments.weight.sum()), 1e-12)))
 
 

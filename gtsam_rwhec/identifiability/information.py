@@ -47,7 +47,7 @@ def pair_information(part: Part, poses: PairPoses) -> PairInformation:
     E = len(part.pairs)
     R_X, t_X, R_Y, t_Y, alpha = poses.R_X, poses.t_X, poses.R_Y, poses.t_Y, poses.alpha
     free, owners = frozenset(part.free), frozenset(part.scale_owners)
-    G, W = part.moments.translation, part.moments.weight
+    G, W = np.nan_to_num(part.moments.translation[:]), part.moments.weight
     K = part.moments.kappa
 
     # Moments of c = R_A t_X + t_A - t_Y, linear in A's features: c = [t_X' (x) I, I, -t_Y] f.

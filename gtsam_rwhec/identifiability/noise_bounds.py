@@ -80,7 +80,7 @@ def variance_factors(part: Part, pairs: PairInformation, J_t: Array, J_R: Array)
         return PartVarianceFactors(ones, ones, ones, 0.0, 0.0, 0.0)
     spare_on_arm, spare_rotation = equations_to_spare(part, pairs)
     spare_translation = float(max(3 * N - part.number_of_unknowns + 3 * len(part.free), 0))
-    lengths = np.einsum("eii->e", part.moments.translation[:, T_B, T_B])
+    lengths = part.moments.squares(T_B)
     floor_t = (lengths + 1e-4 * part.moments.weight) * FLOOR**2 / counts  # t_B counts as 1 cm at least
     floor_R = 2.0 * part.moments.kappa * FLOOR**2 / counts
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import BLOCK, Gauge, Moments
+from gtsam_rwhec.problem.packed_moments import PackedMoments
 from gtsam_rwhec.problem.pairs import Pair
+from gtsam_rwhec.problem.segmented_moments import Sorted
 
 #: Up to this number of measurements the gauge moves and all moments are summed again, as one measurement does not tell
 #: the centre of a trajectory. Later measurements are summed about the gauge as it then is.
@@ -36,13 +40,68 @@ class Batch:
         return Moments.of(self.A, self.B, self.weight, self.kappa, gauge, self.pair.is_motion, self.where)
 
 
+@dataclass(frozen=True)
+class Row:
+    """One pair of moments that were made for many pairs at once."""
+
+    many: PackedMoments
+    index: int
+
+    @property
+    def moments(self) -> Moments:
+        """The moments of the pair."""
+        return self.many.one(self.index)
+
+
 class Accumulator:
     """Moments by pair. An accumulator does not change: adding a batch makes a new accumulator."""
 
-    def __init__(self, gauge: Gauge | None = None, moments: dict[Pair, Moments] | None = None) -> None:
+    def __init__(self, gauge: Gauge | None = None, held: dict[Pair, Moments | Row] | None = None) -> None:
         self.gauge = gauge or Gauge()
-        self.moments = moments or {}
+        self._held: dict[Pair, Moments | Row] = {} if held is None else held
         self._opening: list[Batch] | None = [] if gauge is None else None
+
+    def moments(self, pair: Pair) -> Moments:
+        """The moments of a pair."""
+        held = self._held[pair]
+        return held.moments if isinstance(held, Row) else held
+
+    def count(self, pair: Pair) -> int:
+        """The number of measurements of a pair."""
+        held = self._held[pair]
+        return int(held.many.count[held.index]) if isinstance(held, Row) else held.count
+
+    @property
+    def number_of_measurements(self) -> int:
+        """The number of measurements of all pairs."""
+        return sum(map(self.count, self._held))
+
+    def stack(self, pairs: Sequence[Pair]) -> MomentStack:
+        """The moments of some pairs in their order; a view where they are the pairs of one call, in its order."""
+        runs: list[PackedMoments] = []
+        alone: list[Moments] = []
+        held = [self._held[pair] for pair in pairs]
+        e = 0
+        while e < len(held):
+            of_pair = held[e]
+            if isinstance(of_pair, Moments):
+                alone.append(of_pair)
+                e += 1
+                continue
+            if alone:
+                runs.append(PackedMoments.of(alone))
+                alone = []
+            many = of_pair.many
+            index: list[int] = []
+            while e < len(held) and isinstance(other := held[e], Row) and other.many is many:
+                index.append(other.index)
+                e += 1
+            rows = np.array(index)
+            is_run = bool((np.diff(rows) == 1).all())
+            runs.append(many.rows(slice(rows[0], rows[-1] + 1) if is_run else rows))
+        if alone or not runs:
+            runs.append(PackedMoments.of(alone))
+        return MomentStack(PackedMoments.joined(runs), np.array([pair.is_motion for pair in pairs], dtype=bool))
 
     def added(self, batch: Batch) -> tuple[Accumulator, int]:
         """The accumulator with a batch added, and how many of the batch's rotations were projected to SO(3).
@@ -54,26 +113,55 @@ class Accumulator:
             if not batch.pair.is_motion and not self._has_targets():
                 gauge = replace(gauge, target_carrier=Gauge.target_origin(batch.sample, gauge.sensor_carrier))
             fresh = batch.moments(gauge)
-            known = self.moments.get(batch.pair)
-            return Accumulator(gauge, {**self.moments, batch.pair: known + fresh if known else fresh}), fresh.projected
+            total = self.moments(batch.pair) + fresh if batch.pair in self._held else fresh
+            return Accumulator(gauge, {**self._held, batch.pair: total}), fresh.projected
         batches = [*self._opening, batch]
         gauge = Gauge.of(
             np.concatenate([b.sample for b in batches]),
             np.concatenate([np.full(len(b.sample), b.pair.is_motion) for b in batches]),
         )
-        moments: dict[Pair, Moments] = {}
+        held: dict[Pair, Moments | Row] = {}
+        result = Accumulator(gauge, held)
         fresh = Moments.none()
         for b in batches:
             fresh = b.moments(gauge)
-            moments[b.pair] = moments[b.pair] + fresh if b.pair in moments else fresh
-        result = Accumulator(gauge, moments)
+            held[b.pair] = result.moments(b.pair) + fresh if b.pair in held else fresh
         if sum(len(b.A) for b in batches) < OPENING:
             # Copied: the caller's arrays may change before the gauge settles.
             result._opening = [*self._opening, replace(batch, A=batch.A.copy(), B=batch.B.copy())]
         return result, fresh.projected
 
+    def added_many(self, batch: Sorted, *, with_R_B: bool) -> tuple[Accumulator, int]:
+        """The accumulator with the measurements of many pairs, and how many rotations were projected.
+
+        ``with_R_B``: whether sums of B's rotations are kept, as an unknown scale may need.
+        """
+        before, gauge = self, self.gauge
+        still = ~batch.motion
+        if self._opening is not None:
+            step = -(-len(batch.A) // BLOCK)
+            sample, motion = batch.A[::step], np.repeat(batch.motion, batch.counts)[::step]
+            if self._opening:
+                sample = np.concatenate([*(b.sample for b in self._opening), sample])
+                motion = np.concatenate([*(np.full(len(b.sample), b.pair.is_motion) for b in self._opening), motion])
+            gauge = Gauge.of(sample, motion)
+            before = Accumulator(gauge)
+            for b in self._opening:
+                before, _ = before.added(b)
+        elif still.any() and not self._has_targets():
+            of_targets = batch.A[np.repeat(still, batch.counts)]
+            sample = of_targets[:: -(-len(of_targets) // BLOCK)]
+            gauge = replace(gauge, target_carrier=Gauge.target_origin(sample, gauge.sensor_carrier))
+        fresh = batch.moments(gauge, with_R_B=with_R_B)
+        projected = int(fresh.projected.sum())
+        known = np.flatnonzero([pair in before._held for pair in batch.pairs])
+        if len(known):
+            fresh.add_to(known, before.stack([batch.pairs[i] for i in known]).packed)
+        rows = {pair: Row(fresh, i) for i, pair in enumerate(batch.pairs)}
+        return Accumulator(gauge, {**before._held, **rows}), projected
+
     def _has_targets(self) -> bool:
-        return any(not pair.is_motion for pair in self.moments)
+        return any(not pair.is_motion for pair in self._held)
 
     def merged(self, other: Accumulator) -> Accumulator:
         """Both accumulators' moments, about the gauge of the accumulator whose gauge has settled."""
@@ -88,8 +176,8 @@ class Accumulator:
             gauge = replace(gauge, target_carrier=rest.gauge.target_carrier)
         a = gauge.sensor_carrier - rest.gauge.sensor_carrier
         c = gauge.target_carrier - rest.gauge.target_carrier if rest._has_targets() else np.zeros(3)
-        moments = dict(settled.moments)
-        for pair, edge in rest.moments.items():
-            moved = edge.shifted(a, a if pair.is_motion else c)
-            moments[pair] = moments[pair] + moved if pair in moments else moved
-        return Accumulator(gauge, moments)
+        held = dict(settled._held)
+        for pair in rest._held:
+            moved = rest.moments(pair).shifted(a, a if pair.is_motion else c)
+            held[pair] = settled.moments(pair) + moved if pair in held else moved
+        return Accumulator(gauge, held)

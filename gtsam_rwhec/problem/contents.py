@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError
 from gtsam_rwhec.problem.accumulation import Accumulator
 from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
 from gtsam_rwhec.problem.measurements import KeptMeasurements, Measurements
+from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.pairs import Pair
 
@@ -41,7 +43,7 @@ class Contents(Knowledge):
     @property
     def number_of_measurements(self) -> int:
         """The number of measurements of all pairs."""
-        return sum(moments.count for moments in self._accumulator.moments.values())
+        return self._accumulator.number_of_measurements
 
     @property
     def has_covariances(self) -> bool:
@@ -73,7 +75,11 @@ class Contents(Knowledge):
 
     def moments(self, target: str, sensor: str) -> Moments:
         """Moments of a pair, about ``gauge``."""
-        return self._accumulator.moments[self._pair(target, sensor)]
+        return self._accumulator.moments(self._pair(target, sensor))
+
+    def moment_stack(self, pairs: Sequence[Pair]) -> MomentStack:
+        """Moments of some pairs in their order, about ``gauge``, without a copy of what is long."""
+        return self._accumulator.stack(pairs)
 
     def measurements(self, target: str, sensor: str) -> Measurements:
         """Raw measurements of a pair, in the order in which they were added.
@@ -85,7 +91,7 @@ class Contents(Knowledge):
         """
         pair = self._pair(target, sensor)
         kept = self._kept[pair]
-        if kept.count != self._accumulator.moments[pair].count:
+        if kept.count != self._accumulator.count(pair):
             raise MeasurementsNotKeptError(
                 f"the raw measurements of {pair} were not kept (keep_measurements=False); "
                 "make the problem with keep_measurements=True"

@@ -18,6 +18,7 @@ from gtsam_rwhec.geometry.poses import (
     rows_to_transforms,
 )
 from gtsam_rwhec.geometry.real_numbers import real_array
+from gtsam_rwhec.problem.segmented_moments import Sorted
 
 #: sigma and kappa below this are refused: other terms of a sum would be lost to rounding.
 SMALLEST_WEIGHT = 1e-15
@@ -84,19 +85,48 @@ class Measurements:
 
 
 @dataclass(frozen=True)
+class Section:
+    """The measurements of one pair among those of many."""
+
+    many: Sorted
+    index: int
+
+    @property
+    def count(self) -> int:
+        """The number of measurements."""
+        return int(self.many.first[self.index + 1] - self.many.first[self.index])
+
+    @property
+    def measurements(self) -> Measurements:
+        """They themselves, without a copy."""
+        at, many = self.many.section(self.index), self.many
+        sigma, kappa = (
+            np.broadcast_to(value, at.stop - at.start) if value.ndim == 0 else value[at]
+            for value in (many.sigma, many.kappa)
+        )
+        stamps, covariances = (None if each is None else each[at] for each in (many.stamps_ns, many.covariances))
+        return Measurements(many.A[at], many.B[at], sigma, kappa, stamps, covariances)
+
+
+@dataclass(frozen=True)
 class KeptMeasurements:
     """Raw measurements of a pair that are kept, batch by batch, and whether any batch had covariances."""
 
-    batches: tuple[Measurements, ...] = ()
+    stored: tuple[Measurements | Section, ...] = ()
     has_covariances: bool = False
 
     def __add__(self, other: KeptMeasurements) -> KeptMeasurements:
-        return KeptMeasurements(self.batches + other.batches, self.has_covariances or other.has_covariances)
+        return KeptMeasurements(self.stored + other.stored, self.has_covariances or other.has_covariances)
+
+    @property
+    def batches(self) -> tuple[Measurements, ...]:
+        """The measurements of each batch, without a copy."""
+        return tuple(each.measurements if isinstance(each, Section) else each for each in self.stored)
 
     @property
     def count(self) -> int:
         """The number of measurements that are kept."""
-        return sum(len(batch.A) for batch in self.batches)
+        return sum(each.count if isinstance(each, Section) else len(each.A) for each in self.stored)
 
     def joined(self) -> Measurements:
         """All batches in one, in the order in which they were added; stamps only where every batch has them."""

@@ -173,7 +173,7 @@ class Moments:
 
     def shifted(self, a: Array, c: Array) -> Moments:
         """The moments about a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
-        shift = _shift(a, c)
+        shift = shift_of(a, c)
         return replace(
             self,
             translation=shift @ self.translation @ shift.T,
@@ -183,79 +183,13 @@ class Moments:
         )
 
 
-def _shift(a: Array, c: Array) -> Array:
+def shift_of(a: Array, c: Array) -> Array:
     """The matrix of t_A' = t_A + R_A c - a, which is linear in the features; moments change by a congruence with it."""
     shift = np.eye(25)
     for i in range(3):
         shift[T_A, R_A][:, 3 * i : 3 * i + 3] = c[i] * I3
     shift[T_A, ONE] = -a
     return shift
-
-
-@dataclass(frozen=True)
-class MomentStack:
-    """Moments of E pairs: count (E,), kappa (E,), translation (E, 25, 25), rotation (E, 9, 9); motion (E,) booleans.
-
-    ``magnitude``, ``feature_error`` (E, 25), ``operations`` and ``deviation`` (E,) bound the rounding, as in `Moments`.
-    """
-
-    count: np.ndarray
-    kappa: Array
-    translation: Array
-    rotation: Array
-    magnitude: Array
-    feature_error: Array
-    operations: np.ndarray
-    deviation: Array
-    motion: np.ndarray
-
-    @staticmethod
-    def of(moments: list[Moments], motion: list[bool]) -> MomentStack:
-        """Stack the moments of several pairs."""
-        names = ("count", "kappa", "translation", "rotation", "magnitude", "feature_error", "operations", "deviation")
-        stacked = {name: np.array([getattr(pair, name) for pair in moments]) for name in names}
-        return MomentStack(**stacked, motion=np.array(motion))
-
-    @property
-    def weight(self) -> Array:
-        """(E,) sums of 1 / sigma^2."""
-        return self.translation[:, ONE, ONE]
-
-    def best_shift(self) -> tuple[Array, Array]:
-        """The shift (a, c) that centres all pairs together: min sum |t_A + R_A c - a|^2 / sigma^2, minimum norm."""
-        G, still = self.translation, ~self.motion
-        # The sum of R_A': entry (i, k) is R_A[k, i], which vec has at 3 i + k.
-        Rt = G[:, R_A, ONE].reshape(-1, 3, 3)
-        Rt_t = np.einsum("eikk->ei", G[:, R_A, T_A].reshape(-1, 3, 3, 3))
-        t = G[:, T_A, ONE]
-        normal, right = np.zeros((6, 6)), np.zeros(6)
-        normal[:3, :3] = normal[3:, 3:] = self.weight[still].sum() * I3
-        normal[3:, :3] = -Rt[still].sum(axis=0)
-        normal[:3, 3:] = normal[3:, :3].T
-        right[:3], right[3:] = t[still].sum(axis=0), -Rt_t[still].sum(axis=0)
-        if self.motion.any():  # c = a: residual t_A - (I - R_A) a
-            turned = Rt[self.motion].sum(axis=0)
-            normal[:3, :3] += 2.0 * self.weight[self.motion].sum() * I3 - turned - turned.T
-            right[:3] += (t - Rt_t)[self.motion].sum(axis=0)
-        solution: Array = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-        return solution[:3], solution[3:]
-
-    def shifted(self, a: Array, c: Array) -> MomentStack:
-        """The moments about a gauge moved by a (sensor carrier) and c (target carrier), exactly."""
-        shift = np.where(self.motion[:, None, None], _shift(a, a), _shift(a, c))
-        size = np.abs(shift)
-        return replace(
-            self,
-            translation=shift @ self.translation @ shift.transpose(0, 2, 1),
-            magnitude=np.einsum("eij,ej->ei", size, self.magnitude),
-            feature_error=np.einsum("eij,ej->ei", size, self.feature_error),
-            operations=self.operations + SHIFT_OPERATIONS,
-        )
-
-    def spread(self) -> float:
-        """Root mean square of t_A about the gauge, in metres."""
-        square = np.einsum("ekk->", self.translation[:, T_A, T_A])
-        return float(np.sqrt(max(square, 0.0) / self.weight.sum()))
 
 
 def edge_forms(translation: Array, rotation: Array, kappa: Array) -> tuple[Array, Array]:

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 from numpy.typing import ArrayLike
 
-from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError, RotationsProjectedWarning
+from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError, OptionError
 from gtsam_rwhec.files.terminal_text import brief
-from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, PosesLike, QuaternionOrder, as_transforms
+from gtsam_rwhec.geometry.poses import PosesLike, QuaternionOrder, as_transforms
 from gtsam_rwhec.problem.accumulation import Accumulator, Batch
+from gtsam_rwhec.problem.checked_arguments import SIDES, check_measurements, seen_pair, warn_of_projected
 from gtsam_rwhec.problem.contents import Contents
 from gtsam_rwhec.problem.corner_poses import candidates_of
 from gtsam_rwhec.problem.corners import EachImage, check_camera, check_corner_px, check_in_image, seen_corners
 from gtsam_rwhec.problem.knowledge import ScaleMode, check_name
 from gtsam_rwhec.problem.long_translations import LongTranslations, warn_of_millimetres
-from gtsam_rwhec.problem.measurements import GivenMeasurements, KeptMeasurements, Measurements
-from gtsam_rwhec.problem.moments import Moments
+from gtsam_rwhec.problem.many_measurements import GivenMany
+from gtsam_rwhec.problem.measurements import GivenMeasurements, KeptMeasurements, Measurements, Section
+from gtsam_rwhec.problem.moments import BLOCK, Moments
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.vision.camera import Camera
 
@@ -104,7 +106,65 @@ class Problem(Contents):
             A name, pose, weight, stamp or covariance is not valid; nothing of the batch is added then.
         """
         given = GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source)
-        self.add_batch(_seen_pair(target, sensor), given)
+        self.add_batch(seen_pair(target, sensor), given)
+
+    def add_many(
+        self,
+        pairs: Sequence[tuple[str, str]],
+        index: ArrayLike,
+        A: PosesLike,
+        B: PosesLike,
+        sigma: ArrayLike | None = None,
+        kappa: ArrayLike | None = None,
+        *,
+        order: QuaternionOrder | None = None,
+        stamps_ns: ArrayLike | None = None,
+        covariances: ArrayLike | None = None,
+        source: str | None = None,
+    ) -> None:
+        """Add measurements of many pairs at once: much faster than ``add`` for thousands of pairs with few each.
+
+        Parameters
+        ----------
+        pairs : sequence of (target, sensor)
+            Names of the pairs, each once.
+        index : (N,) integers
+            The place in ``pairs`` of each measurement's pair, in any order.
+        A, B, sigma, kappa, order, covariances, source
+            As in ``add``, for all N measurements.
+        stamps_ns : (N,) integers, optional
+            Nanoseconds, which do not go back among the measurements of a pair.
+
+        Raises
+        ------
+        PoseError, CountError, NoiseError, FrameError, StampError
+            As in ``add``, with the measurement's place in the arrays; nothing is added then.
+        """
+        given = GivenMany(pairs, index, GivenMeasurements(A, B, sigma, kappa, order, stamps_ns, covariances, source))
+        if source is not None and not isinstance(source, str):
+            raise OptionError(f"source is a {type(source).__name__}; give text: the name of a file or topic")
+        many = given.checked()
+        kinds: dict[str, Literal["target", "sensor"]] = {}
+        for pair in many.pairs:
+            self._check_names(pair, pair.label)
+            kinds |= zip(pair, SIDES, strict=True)
+        accumulator, projected = self._accumulator.added_many(many, with_R_B=self.scale != "known")
+        if projected:
+            warn_of_projected(given.where, projected, stacklevel=2)
+            many = many.projected()
+        some = many.given.argsort()[:: -(-len(many.given) // BLOCK)]
+        translations = LongTranslations.of(many.A[some], many.B[some], accumulator.gauge, False, given.where)
+        if not translations.sizes.keys() <= self._long:
+            warn_of_millimetres([translations], stacklevel=2)
+        # The problem changes only after all checks and warnings: a warning may be raised as an error.
+        self._accumulator = accumulator
+        self._long |= translations.sizes.keys()
+        self.is_relative = self.is_relative or not given.measurements.has_noise
+        self._kind |= kinds
+        has_covariances = covariances is not None
+        for number, pair in enumerate(many.pairs):
+            section = (Section(many, number),) if self.keep_measurements else ()
+            self._kept[pair] = self._kept.get(pair, KeptMeasurements()) + KeptMeasurements(section, has_covariances)
 
     def add_corners(
         self,
@@ -161,7 +221,7 @@ class Problem(Contents):
         PoseError, NoiseError, FrameError, StampError
             As in ``add``; nothing of the images is added then.
         """
-        pair = _seen_pair(target, sensor)
+        pair = seen_pair(target, sensor)
         where = f"{pair} ({source})" if source else pair.label
         self._check_names(pair, where)
         if not self.keep_measurements:
@@ -215,12 +275,7 @@ class Problem(Contents):
         batch = Batch(pair, raw.A, raw.B, 1.0 / raw.sigma**2, raw.kappa, where)
         accumulator, projected = self._accumulator.added(batch)
         if projected:
-            warnings.warn(
-                f"{where}: {projected} rotations were not exact: R'R differs from I, by less than "
-                f"{ROTATION_TOLERANCE:g}; they were projected to the nearest rotation",
-                RotationsProjectedWarning,
-                stacklevel=3,
-            )
+            warn_of_projected(where, projected, stacklevel=3)
             raw = raw.projected(where)
         translations = LongTranslations.of(
             raw.A, raw.B, accumulator.gauge, pair.is_motion, where, from_corners=given.pixels is not None
@@ -238,7 +293,7 @@ class Problem(Contents):
         self._kept[pair] = self._kept.get(pair, KeptMeasurements()) + kept
 
     def _check_names(self, pair: Pair, where: str) -> None:
-        for name, kind in zip(pair, ("target", "sensor"), strict=True):
+        for name, kind in zip(pair, SIDES, strict=True):
             if not pair.is_motion and self._kind.get(name, kind) != kind:
                 raise FrameError(
                     f"{where}: {name!r} is a {self._kind[name]} already and cannot be a {kind} too; "
@@ -258,7 +313,7 @@ class Problem(Contents):
         CountError
             There are no measurements.
         """
-        _check_measurements(measurements)
+        check_measurements(measurements)
         if not measurements:
             raise CountError(f"nothing is left of {self}: keep at least one measurement")
         moments = {
@@ -273,7 +328,7 @@ class Problem(Contents):
         result._kept = {
             pair: KeptMeasurements((raw,), raw.covariances is not None) for pair, raw in measurements.items()
         }
-        result._accumulator = Accumulator(self.gauge, moments)
+        result._accumulator = Accumulator(self.gauge, dict(moments))
         result._take_knowledge(self, frames=lost_frames, scales=lost_scales)
         return result
 
@@ -313,23 +368,3 @@ class Problem(Contents):
             f"Problem({len(self.targets)} targets, {len(self.sensors)} sensors, {len(self._kept)} pairs, "
             f"{self.number_of_measurements} measurements, scale={self.scale!r})"
         )
-
-
-def _seen_pair(target: str, sensor: str) -> Pair:
-    """A target and the sensor that saw it; a FrameError where their names are none, or one."""
-    check_name(target, "the target's name")
-    check_name(sensor, "the sensor's name")
-    if target == sensor:
-        raise FrameError(f"{target!r} is given as target and as sensor; names are unique across both")
-    return Pair(target, sensor)
-
-
-def _check_measurements(measurements: object) -> None:
-    if not isinstance(measurements, Mapping):
-        raise OptionError(f"measurements is a {type(measurements).__name__}; give {{pair: Measurements}}")
-    for pair, raw in measurements.items():
-        if not isinstance(pair, Pair) or not isinstance(raw, Measurements):
-            raise OptionError(
-                f"measurements has a {type(raw).__name__} for {brief(pair)}; give "
-                "{Pair(target, sensor): Measurements}"
-            )

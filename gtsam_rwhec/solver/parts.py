@@ -10,7 +10,8 @@ import numpy as np
 from gtsam_rwhec.errors import FrameError, PoseError, PriorError, ScaleError, UnderdeterminedError
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.problem.knowledge import Prior, ScaleMode
-from gtsam_rwhec.problem.moments import Gauge, Moments, MomentStack
+from gtsam_rwhec.problem.moment_stack import MomentStack
+from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.solver.given import Given
@@ -156,7 +157,7 @@ def _centred(problem: Problem, pairs: tuple[Pair, ...]) -> tuple[Gauge, MomentSt
     happens when the first measurements were nearly one pose. Then the raw measurements, if kept, are summed again.
     """
     motion = [pair.is_motion for pair in pairs]
-    moments = MomentStack.of([problem.moments(*pair) for pair in pairs], motion)
+    moments = problem.moment_stack(pairs)
     a, c = moments.best_shift()
     gauge, centred = problem.gauge.moved_by(a, c), moments.shifted(a, c)
     far = float(np.hypot(np.linalg.norm(a), np.linalg.norm(c)))
@@ -205,7 +206,7 @@ def _check(part: Part) -> None:
     for name in part.fixed_scales:
         if name not in {target for target, _ in part.pairs}:
             raise ScaleError(f"the scale of {name} is fixed, but nothing measures {name}'s size")
-    bad = np.flatnonzero(~np.isfinite(part.moments.translation).all(axis=(1, 2)))
+    bad = np.flatnonzero(~part.moments.is_finite())
     if bad.size:
         raise PoseError(
             f"the translations of {part.pairs[bad[0]]} are so large that their squares overflow; are they in metres?"

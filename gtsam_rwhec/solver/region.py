@@ -96,7 +96,7 @@ def extent_of(part: Part, point: Point) -> float:
     largest = [reach / scale[0] if part.kind == "direct" else reach]
     if part.given is None:
         for features, per in ((T_A, np.ones_like(scale)), (T_B, scale)):
-            square = np.einsum("ekk->e", moments.translation[:, features, features]) / moments.weight
+            square = moments.squares(features) / moments.weight
             largest.append(float((np.sqrt(np.maximum(square * moments.count, 0.0)) / per).max()))
     else:
         a = part.gauge.sensor_carrier

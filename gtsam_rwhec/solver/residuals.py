@@ -66,7 +66,7 @@ def costs_of_pairs(part: Part, poses: PairPoses) -> tuple[Array, Array]:
     x[:, 0:3], x[:, 3:6], x[:, 6] = alpha * poses.t_X, alpha * poses.t_Y, poses.alpha
     x[:, 7:16] = poses.R_X.transpose(0, 2, 1).reshape(E, 9)
     x[:, 16:25] = poses.R_Y.transpose(0, 2, 1).reshape(E, 9)
-    translation, rotation = edge_forms(part.moments.translation, part.moments.rotation, part.moments.kappa)
+    translation, rotation = edge_forms(part.moments.translation[:], part.moments.rotation[:], part.moments.kappa)
     J_t = np.einsum("ei,eij,ej->e", x, translation, x)
     J_R = np.einsum("ei,eij,ej->e", x, rotation, x)
     return np.maximum(J_t, 0.0), np.maximum(J_R, 0.0)  # zero may round to a negative number

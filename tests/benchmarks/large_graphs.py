@@ -152,9 +152,7 @@ def run(name: str, share: float, keep: bool) -> Measured:
     building = 0.0
     for seen in batches:
         start = time.process_time()
-        for e, pair in enumerate(seen.pairs):
-            own = slice(e * MEASUREMENTS, (e + 1) * MEASUREMENTS)
-            problem.add(*pair, seen.A[own], seen.B[own], noise.sigma_m, noise.kappa)
+        problem.add_many(seen.pairs, seen.index, seen.A, seen.B, noise.sigma_m, noise.kappa)
         building += time.process_time() - start
     size = f"{len(problem.targets)} x {len(problem.sensors)} frames, {len(problem.pairs)} pairs"
     building_gb = _gigabytes()
