@@ -7,7 +7,7 @@ paper, eq. 48), its 1/2 included.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,7 +54,16 @@ class UnitForm:
     @property
     def rotations_alone(self) -> ReducedForm:
         """The form of the rotation residuals alone."""
-        return reduce(self.forms.rotation)
+        form = self.forms.rotation  # over [vec R] of each frame; the numbers before it, [t, s], have no residual here
+        before = (13 - form.frames.shape[1], 0)
+        return reduce(
+            replace(
+                form,
+                frames=np.pad(form.frames, ((0, 0), before, before)),
+                tails=np.pad(form.tails, ((0, 0), before, (0, 0))),
+                couplings=np.pad(form.couplings, ((0, 0), before, before)),
+            )
+        )
 
     def rotations_of(self, X: Poses, Y: Poses) -> Array:
         """Rotations (n, 3, 3) of given poses, as the form has them."""
