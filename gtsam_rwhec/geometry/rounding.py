@@ -27,6 +27,14 @@ def gamma(terms: int, unit: float = UNIT) -> float:
     return SAFETY * terms * unit / (1.0 - terms * unit)
 
 
+def gammas(terms: Array) -> Array:
+    """`gamma` of many numbers of operations."""
+    largest = int(np.max(terms, initial=0))
+    gamma(largest)  # refuses what is too many
+    part = np.asarray(terms, dtype=np.float64) * UNIT
+    return SAFETY * part / (1.0 - part)
+
+
 class Doubled(NamedTuple):
     """Numbers hi + lo; both arrays have the same shape."""
 

@@ -30,7 +30,7 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import UNIT, gamma
-from gtsam_rwhec.solver.arrow import ArrowFactor
+from gtsam_rwhec.solver.block_matrix import BlockFactor
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.null_vectors import NullVectors, free_vectors, point_as_null_vector, stationary_along
 from gtsam_rwhec.solver.part_form import PartForm
@@ -38,13 +38,15 @@ from gtsam_rwhec.solver.point import Evaluation
 from gtsam_rwhec.solver.region import AT_LEAST, LARGER, Region, half_widths, smallest_region
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT, constraint_values
 from gtsam_rwhec.solver.variables import Answer
-from gtsam_rwhec.solver.verified import cholesky_allowance
 from gtsam_rwhec.solver.weakest_rotation import smallest_eigenpair
 
 #: Each entry of R'R - I of an answer in floating point, and of what the other constraints ask, is at most this.
 ROTATION_IN_DOUBLES = 1e-15
 #: Margins of definiteness as parts of the form's diagonal: the largest that is proven costs least.
 ROOMS = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+#: A solution by the factor of a proof is improved at most so many times, until it loses this part of the loss.
+IMPROVEMENTS = 6
+ENOUGH = 1e-6
 #: A factor of the slack between tries.
 MORE_SLACK = 3.0
 #: A loss below this part of the value does not ask for another try.
@@ -94,6 +96,31 @@ def lower_bound(
     lagrangian = _Lagrangian.of(form, evaluation, multipliers, of_scale, contains)
     bound = lagrangian.definite() or lagrangian.semidefinite(enough) or lagrangian.indefinite(enough)
     return bound if np.isfinite(bound.lower_bound) else Bound(value=lagrangian.value, direction=bound.direction)
+
+
+@dataclass(frozen=True)
+class _Room:
+    """A margin (13 n + 1,) by which Z is proven to be definite, with the proof: the factor of nearly Z - margin."""
+
+    Z: Curvature
+    margin: Array
+    factor: BlockFactor
+
+    def solved(self, h: Array, held: np.ndarray) -> Array:
+        """Nearly Z^-1 h: the factor's solution, improved where the margin makes it poor. It is zero where held."""
+        v, rest, size = np.zeros_like(h), h, np.inf
+        for _ in range(IMPROVEMENTS):
+            better = v + self.factor.solve_vector(rest)
+            better[held] = 0.0
+            after = h - self.Z.times(better)
+            after[held] = 0.0
+            after_size = float((after**2 / self.margin).sum())
+            if not after_size < size:
+                break
+            v, rest, size = better, after, after_size
+            if size <= ENOUGH * abs(float(h @ v)):
+                break
+        return v
 
 
 @dataclass(frozen=True)
@@ -149,7 +176,7 @@ class _Lagrangian:
             return None
         none = NullVectors.none(self.Z.size)
         lower = self._lower(none, room, None)
-        return Bound(lower, self._value(none, room, None), True, True, float(room.min()), None, None)
+        return Bound(lower, self._value(none, room, None), True, True, float(room.margin.min()), None, None)
 
     def _definite_but_for_the_point(self) -> Bound | None:
         """The better of two bounds: from the multipliers, and from those that make the gradient vanish along x."""
@@ -163,7 +190,9 @@ class _Lagrangian:
             if of_each is None or room is None:
                 continue
             lower = each._lower(of_each, room, None)
-            bounds.append(Bound(lower, each._value(of_each, room, None), True, True, float(room.min()), None, None))
+            bounds.append(
+                Bound(lower, each._value(of_each, room, None), True, True, float(room.margin.min()), None, None)
+            )
             if self.value - lower <= NEGLIGIBLE * abs(self.value):
                 break
         return max(bounds, key=lambda bound: bound.lower_bound, default=None)
@@ -190,7 +219,7 @@ class _Lagrangian:
             lower, region = better._over_region(nulls, room, enough)
             value = better._value(nulls, room, region)
             step = self._step_along(nulls, enough)
-            bounds.append(Bound(lower, value, False, True, -float(room.min()), None, region, step))
+            bounds.append(Bound(lower, value, False, True, -float(room.margin.min()), None, region, step))
             if self.value - lower <= OPEN * abs(self.value) + enough:
                 break
         return max(bounds, key=lambda bound: bound.lower_bound, default=None)
@@ -241,17 +270,16 @@ class _Lagrangian:
 
     # -- parts of a proof ---------------------------------------------------------------------------------------
 
-    def _room(self, Z: Curvature) -> Array | None:
-        """A margin (13 n + 1,) by which Z is proven to be definite; None where it is not proven."""
+    def _room(self, Z: Curvature) -> _Room | None:
+        """A margin by which Z is proven to be definite; None where it is not proven."""
         scale = np.abs(self.form.curvature.diagonal)
-        for part in ROOMS:
-            room = np.maximum(part * scale, 1e-290)
-            if Z.exceeds(room):
-                return room
-        room = 0.25 * cholesky_allowance(scale, Z.size)
-        return room if Z.exceeds(room) else None
+        for room in (*(np.maximum(part * scale, 1e-290) for part in ROOMS), 0.25 * Z.allowance(scale)):
+            factor = Z.proof_that_it_exceeds(room)
+            if factor is not None:
+                return _Room(Z, room, factor)
+        return None
 
-    def _over_region(self, nulls: NullVectors, room: Array, enough: float) -> tuple[float, Region | None]:
+    def _over_region(self, nulls: NullVectors, room: _Room, enough: float) -> tuple[float, Region | None]:
         """The bound over the largest region that costs little, or over all of space where no region is needed."""
         if self.Z.is_rotation[nulls.held].all():
             return self._lower(nulls, room, None), None
@@ -264,31 +292,24 @@ class _Lagrangian:
                 return lower, region
         return best, smallest
 
-    def _lower(self, nulls: NullVectors, room: Array, region: Region | None) -> float:
+    def _lower(self, nulls: NullVectors, room: _Room, region: Region | None) -> float:
         """The lower bound, rounded down."""
         lower = self._value_less_loss(nulls, room, region)
         lower = max(lower - self._slack_by_multipliers(), self._less_rounding_of_rotations(lower))
         return float(np.nextafter(lower, -np.inf))
 
-    def _value_less_loss(self, nulls: NullVectors, room: Array, region: Region | None) -> float:
+    def _value_less_loss(self, nulls: NullVectors, room: _Room, region: Region | None) -> float:
         """The smallest value of L, less the errors of what it is made of."""
-        held = self.Z.with_held(nulls.held)
-        factor = held.factor()
-        if factor is None:
-            return -np.inf
         point = self.evaluation.point
         width = half_widths(self.form.part, point, region or Region(0.0, 0.0))[nulls.held]
-        root = _root_of_loss(held, factor, self.g, self.g_error, nulls.held, room)
+        root = _root_of_loss(room, self.g, self.g_error, nulls.held)
         of_nulls = np.array(
-            [
-                _root_of_loss(held, factor, nulls.ZV[:, k], nulls.ZV_error[:, k], nulls.held, room)
-                for k in range(len(width))
-            ]
+            [_root_of_loss(room, nulls.ZV[:, k], nulls.ZV_error[:, k], nulls.held) for k in range(len(width))]
         )
         loss = root * root + _loss_along(nulls, root, of_nulls, width)
         return self.value - self.value_error - loss * (1.0 + 1e-9)
 
-    def _value(self, nulls: NullVectors, room: Array, region: Region | None) -> float:
+    def _value(self, nulls: NullVectors, room: _Room, region: Region | None) -> float:
         """The bound without any allowance for rounding: an estimate of what exact arithmetic gives."""
         exact = replace(self, value_error=0.0, g_error=np.zeros_like(self.g))
         return exact._value_less_loss(nulls.without_errors(), room, region)
@@ -352,18 +373,17 @@ def _loss_along(nulls: NullVectors, root: float, of_nulls: Array, width: Array) 
     return loss * (1.0 + 1e-9)
 
 
-def _root_of_loss(Z: Curvature, factor: ArrowFactor, h: Array, h_error: Array, held: np.ndarray, room: Array) -> float:
+def _root_of_loss(room: _Room, h: Array, h_error: Array, held: np.ndarray) -> float:
     """The root of an upper bound on -min 2 h'z + z'Z z, over z whose ``held`` entries are zero."""
     h, h_error = h.copy(), h_error.copy()
     h[held], h_error[held] = 0.0, 0.0
-    v = factor.solve_vector(h)
-    v[held] = 0.0
-    Zv, error = Z.times(v), Z.rounding_of_product(v)
+    v = room.solved(h, held)
+    Zv, error = room.Z.times(v), room.Z.rounding_of_product(v)
     rest = h - Zv
     rest[held], error[held] = 0.0, 0.0
     taken = float((h + rest) @ v) + gamma(len(v) + 8) * float((np.abs(h) + np.abs(rest)) @ np.abs(v))
     taken += float(error @ np.abs(v))
     rho = np.abs(rest) * (1.0 + 4.0 * UNIT) + error
-    square = max(taken, 0.0) + float((rho**2 / room).sum())
-    root = np.sqrt(square) + np.sqrt(float((h_error**2 / room).sum()))
+    square = max(taken, 0.0) + float((rho**2 / room.margin).sum())
+    root = np.sqrt(square) + np.sqrt(float((h_error**2 / room.margin).sum()))
     return float(root) * (1.0 + 1e-9)

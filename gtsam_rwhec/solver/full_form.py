@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.rounding import SAFETY, UNIT, gamma
+from gtsam_rwhec.geometry.rounding import gamma, gammas
 from gtsam_rwhec.problem.moments import ONE, R_A, SWAPPED, T_A, T_B, edge_forms
+from gtsam_rwhec.solver.block_matrix import sum_into
 from gtsam_rwhec.solver.parts import Part
 
 #: Positions among an edge's 28 numbers: leaf (13), center (13), alpha, h.
@@ -170,21 +171,6 @@ def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
     return forms[0], forms[1]
 
 
-def sum_into(result: Array, index: np.ndarray, values: Array) -> None:
-    """Add each of the values (k, ...) to the row of ``result`` that ``index`` (k,) names; rows may be named twice."""
-    if len(index) == 0:
-        return
-    rows, which = np.unique(index, return_inverse=True)
-    if len(rows) == len(index):
-        result[index] += values
-        return
-    from scipy.sparse import csr_array  # slow to import
-
-    k = len(index)
-    sums = csr_array((np.ones(k), (which, np.arange(k))), shape=(len(rows), k)) @ values.reshape(k, -1)
-    result[rows] += sums.reshape(len(rows), *values.shape[1:])
-
-
 def slots_of(part: Part) -> Slots:
     """The slots of a part's pairs.
 
@@ -264,7 +250,7 @@ def _rounding_of_pairs(part: Part, slots: Slots) -> Array:
         frames = np.stack([slots.leaf, len(part.leaves) + slots.center])
         meeting = np.bincount(frames.ravel())[frames].sum(axis=0)
     operations = moments.operations + 2 * meeting + 20
-    unit = SAFETY * operations * UNIT / (1.0 - operations * UNIT)
+    unit = gammas(operations)
     # g m m' + m e' + e m' + e e' <= g m m' + (c m + e / c)(c m + e / c)' for any c up to 1.
     c = np.sqrt(np.clip(worst, 1e-30, 1.0))[:, None]
     square = unit[:, None] * magnitude**2 + (c * magnitude + error / c) ** 2  # of the errors of features

@@ -19,7 +19,6 @@ from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.point import Action, Evaluation
 from gtsam_rwhec.solver.rotations import CONSTRAINTS, CONSTRAINTS_FLAT, WITH_CONSTANT
-from gtsam_rwhec.solver.verified import cholesky_allowance
 
 #: Eigenvalues up to this many times the test's allowance for rounding count as zero.
 REACH = 100.0
@@ -122,7 +121,7 @@ def free_vectors(
     undetermined = Z.rounding > UNDETERMINED * scale
     lowered = scale + Z.rounding / LOWERED if by_rounding else np.where(undetermined, Z.rounding / LOWERED, scale)
     unit = 1.0 / np.sqrt(np.maximum(lowered, 1e-290))
-    allowance = float((cholesky_allowance(scale, Z.size) * unit**2).max())
+    allowance = float((Z.allowance(scale) * unit**2).max())
     zero = max(REACH * allowance, SMALLEST)
     values, vectors = Z.weakest(unit, zero)
     if len(values) == 0 or values[0] < -zero:

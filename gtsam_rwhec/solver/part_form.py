@@ -9,6 +9,7 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.curvature import Curvature
+from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.full_form import FullForm, Slots, full_forms, rounding_of, slots_of
 from gtsam_rwhec.solver.measured_form import MeasuredForm
 from gtsam_rwhec.solver.parts import Part
@@ -39,6 +40,12 @@ class PartForm:
         return PartForm(part, slots, *full_forms(part, slots))
 
     @cached_property
+    def order(self) -> Elimination:
+        """The order in which frames are eliminated where their graph is followed."""
+        full = self.full
+        return Elimination.of(len(full.frames), full.rows, full.leaves + full.columns)
+
+    @cached_property
     def reduced(self) -> ReducedForm:
         """Translations and scales eliminated: where the search looks for answers."""
         return reduce(self.full)
@@ -46,7 +53,8 @@ class PartForm:
     @cached_property
     def curvature(self) -> Curvature:
         """Q without h, with what dominates its rounding."""
-        return Curvature.of(self.full, None if self.part.given is None else rounding_of(self.part, self.slots))
+        rounding = None if self.part.given is None else rounding_of(self.part, self.slots)
+        return Curvature.of(self.full, self.order, rounding)
 
     @cached_property
     def cost(self) -> Form:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.point import Evaluation, Point
 from gtsam_rwhec.solver.rotations import kkt_multipliers, retract, tangent_basis, vec
@@ -39,30 +38,15 @@ def newton_step(curvature: Curvature, evaluation: Evaluation) -> Point | None:
     """The point after one Newton step; None where the Hessian is not positive definite, or the step is long."""
     point = evaluation.point
     R = point.rotations
-    n, L = len(R), curvature.leaves
+    n = len(R)
     gradient = evaluation.gradient[:-1].reshape(n, 13)[:, 4:]
-    Z = curvature.less(kkt_multipliers(R, gradient))
     T = np.zeros((n, 13, 7))
     T[:, :4, :4] = np.eye(4)
     T[:, 4:, 4:] = tangent_basis(R)
-    Tt = T.transpose(0, 2, 1)
-    P = n - L
-    leaf = Tt[:L] @ Z.leaf @ T[:L]
-    coupling = np.empty((L, 7, 7 * P + 1))
-    half = Tt[:L] @ Z.coupling
-    coupling[:, :, -1] = half[:, :, -1]
-    by_center = half[:, :, :-1].reshape(L, 7, P, 13)
-    coupling[:, :, :-1] = np.einsum("lapj,pjb->lapb", by_center, T[L:]).reshape(L, 7, 7 * P)
-    wide = np.zeros((13 * P + 1, 7 * P + 1))
-    for p in range(P):
-        wide[13 * p : 13 * p + 13, 7 * p : 7 * p + 7] = T[L + p]
-    wide[-1, -1] = 1.0
-    border = wide.T @ Z.border @ wide
-    factor = arrow.cholesky(leaf, coupling, border)
+    hessian = curvature.less(kkt_multipliers(R, gradient)).matrix.congruent(T)
+    factor = hessian.factor()
     if factor is None:
-        np.einsum("lii->li", leaf)[...] *= 1.0 + DAMPING
-        np.einsum("ii->i", border)[...] *= 1.0 + DAMPING
-        factor = arrow.cholesky(leaf, coupling, border)
+        factor = hessian.plus(DAMPING * hessian.diagonal).factor()
     if factor is None:
         return None
     step = factor.solve_vector(_tangent_gradient(evaluation))

@@ -1,14 +1,16 @@
-"""Verified tests of positive definiteness in floating point (Rump 2006), for arrow matrices and dense matrices.
+"""Verified tests of positive definiteness in floating point (Rump 2006), for matrices that follow a graph.
 
 A Cholesky factorisation that completes in double precision proves that the matrix plus its backward error is positive
 definite. The backward error has an a-priori bound (Higham 2002, theorem 10.3, any order of summation; Rump 2006,
 "Verification of positive definiteness", lemma 2.1), entry by entry::
 
-    |dA_ij| <= g / (1 - g) sqrt(a_ii a_jj),   g = gamma_{N+1} = (N + 1) u / (1 - (N + 1) u)
+    |dA_ij| <= g / (1 - g) sqrt(a_ii a_jj),   g = gamma_{k+1} = (k + 1) u / (1 - (k + 1) u)
 
-so the diagonal matrix N g / (1 - g) a_ii dominates dA. This matrix, and a bound on the rounding of forming the matrix,
-are subtracted from the diagonal first. If the factorisation then succeeds, the matrix as stated is positive definite. A
-failure proves nothing.
+with k the number of terms in the sum that makes the entry of the factor, and dA_ij = 0 outside the fill. So the
+diagonal matrix of a_ii times the row sums of g / (1 - g) dominates dA (`elimination.Elimination.spread`): in a star, a
+leaf's rows lose what few terms lose, however many leaves there are. This matrix, and a bound on the rounding of forming
+the matrix, are subtracted from the diagonal first. If the factorisation then succeeds, the matrix as stated is positive
+definite. A failure proves nothing.
 """
 
 from __future__ import annotations
@@ -16,45 +18,27 @@ from __future__ import annotations
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.geometry.rounding import SAFETY, UNIT, gamma
-from gtsam_rwhec.solver import arrow
+from gtsam_rwhec.geometry.rounding import UNIT
+from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
 
 #: This number is added to a bound; underflow can lose less.
 _TINY = 1e-290
 
 
-def cholesky_allowance(diagonal: Array, size: int) -> Array:
-    """A bound on the rounding in the factorisation of a matrix of this size and diagonal, as a diagonal matrix."""
-    g = gamma(size + 1)
-    allowance: Array = SAFETY * size * g / (1.0 - g) * np.abs(diagonal) + _TINY
+def cholesky_allowance(matrix: BlockMatrix, diagonal: Array) -> Array:
+    """A bound on the rounding in the factorisation of a matrix with this graph and diagonal, as a diagonal matrix."""
+    _, m, q = matrix.tails.shape
+    of_frames, of_tail = matrix.order.spread(m, q)
+    allowance: Array = np.r_[np.repeat(of_frames, m), np.full(q, of_tail)] * np.abs(diagonal) + _TINY
     return allowance
 
 
-def is_positive_definite(matrix: Array, margin: Array | float = 0.0) -> bool:
-    """Whether a symmetric matrix, exactly as stored, minus diag(margin) is proven positive definite.
+def proof_that_it_exceeds(matrix: BlockMatrix, margin: Array | float = 0.0) -> BlockFactor | None:
+    """The proof that a matrix, exactly as stored, minus diag(margin) is positive definite: the factor of a smaller one.
 
-    Only its lower triangle is read. False proves nothing.
+    None proves nothing. A negative margin makes a weaker test.
     """
-    size = len(matrix)
-    leaves = np.zeros((0, 1, 1)), np.zeros((0, 1, size))
-    return arrow_is_positive_definite(*leaves, matrix, np.zeros((0, 1)), np.broadcast_to(margin, size))
-
-
-def arrow_is_positive_definite(D: Array, C: Array, E: Array, leaf_margin: Array, border_margin: Array) -> bool:
-    """Whether arrow(D, C, E) - diag(margin) is proven positive definite.
-
-    D (L, m, m), C (L, m, b), E (b, b). The margins (L, m) and (b,) are subtracted from the diagonal; they are negative
-    for a weaker test.
-    """
-    size = D.shape[0] * D.shape[1] + len(E)
-    leaf_diagonal = np.einsum("lii->li", D)
-    border_diagonal = np.diagonal(E)
-    D_shifted, E_shifted = D.copy(), E.copy()
-    for shifted, diagonal, margin in (
-        (np.einsum("lii->li", D_shifted), leaf_diagonal, leaf_margin),
-        (np.einsum("ii->i", E_shifted), border_diagonal, border_margin),
-    ):
-        # The subtraction rounds by at most u times its result.
-        reach = np.abs(diagonal) + np.abs(margin)
-        shifted -= margin + cholesky_allowance(reach, size) + 4.0 * UNIT * reach
-    return arrow.cholesky(D_shifted, C, E_shifted) is not None
+    diagonal = matrix.diagonal
+    # The subtraction rounds by at most u times its result.
+    reach = np.abs(diagonal) + np.abs(margin)
+    return matrix.plus(-(margin + cholesky_allowance(matrix, reach) + 4.0 * UNIT * reach)).factor()

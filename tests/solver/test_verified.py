@@ -11,14 +11,30 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.rounding import UNIT, gamma
 from gtsam_rwhec.solver import arrow
-from gtsam_rwhec.solver.verified import (
-    UNIT,
-    arrow_is_positive_definite,
-    cholesky_allowance,
-    gamma,
-    is_positive_definite,
-)
+from gtsam_rwhec.solver.block_matrix import BlockMatrix
+from gtsam_rwhec.solver.elimination import Elimination
+from gtsam_rwhec.solver.verified import cholesky_allowance, proof_that_it_exceeds
+
+
+def arrow_matrix(D: Array, C: Array, E: Array) -> BlockMatrix:
+    """An arrow matrix whose leaves are eliminated one by one, and whose border is dense."""
+    none = np.zeros(0, dtype=int)
+    order = Elimination.of(len(D), none, none, few=0)
+    return BlockMatrix(order, D, np.zeros((0, *D.shape[1:])), C, E)
+
+
+def dense_matrix(matrix: Array) -> BlockMatrix:
+    return arrow_matrix(np.zeros((0, 1, 1)), np.zeros((0, 1, len(matrix))), matrix)
+
+
+def is_positive_definite(matrix: Array) -> bool:
+    return proof_that_it_exceeds(dense_matrix(matrix)) is not None
+
+
+def arrow_is_positive_definite(D: Array, C: Array, E: Array, of_leaves: Array, of_border: Array) -> bool:
+    return proof_that_it_exceeds(arrow_matrix(D, C, E), np.r_[of_leaves.ravel(), of_border]) is not None
 
 
 def singular_integers(size: int, rank: int, seed: int, largest: int = 3) -> Array:
@@ -178,7 +194,7 @@ def test_arrow_and_dense_agree(seed: int, leaves: int, m: int, b: int, exponent:
     full = arrow.dense(D, C, E)
     by_arrow = arrow_is_positive_definite(D, C, E, np.zeros((leaves, m)), np.zeros(b))
     by_dense = is_positive_definite(full)
-    room = 4.0 * cholesky_allowance(np.array([np.diagonal(full).max()]), len(full))[0]
+    room = 4.0 * float(cholesky_allowance(dense_matrix(full), np.full(len(full), np.diagonal(full).max())).max())
     if 2.0**-exponent > room:
         assert by_arrow
         assert by_dense
@@ -231,4 +247,4 @@ def test_the_allowance_covers_the_factorisations_error(size: int) -> None:
     g = gamma(size + 1)
     assert (error <= g / (1.0 - g) * np.outer(d, d)).all()
     assert error.any()
-    assert (np.linalg.norm(error, 2) <= cholesky_allowance(np.diagonal(matrix), size)).all()
+    assert (np.linalg.norm(error, 2) <= cholesky_allowance(dense_matrix(matrix), np.diagonal(matrix))).all()

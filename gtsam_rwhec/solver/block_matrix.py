@@ -1,0 +1,315 @@
+"""Symmetric matrices that follow a graph: a block for each frame and each coupling, and a dense tail.
+
+Cholesky factorisation in the order of `elimination`. Frames that are eliminated at once are stacks of small matrices,
+so numpy's and BLAS's loops do the work. Each entry of the factor is that of the textbook, in some order of summation:
+the bounds on its rounding hold (`verified`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.arrow import backward_substitution, forward_substitution
+from gtsam_rwhec.solver.elimination import Elimination, Group
+
+#: So many numbers are worked on at once: 16 MB.
+AT_ONCE = 2_000_000
+#: The same where frames have the same neighbours: what stays in the processor's cache.
+ALIKE_AT_ONCE = 100_000
+
+
+@dataclass(frozen=True)
+class BlockMatrix:
+    """frames (n, m, m) and couplings (F, m, m) of an order's given couplings, tails (n, m, q), tail (q, q)."""
+
+    order: Elimination
+    frames: Array
+    couplings: Array
+    tails: Array
+    tail: Array
+
+    @property
+    def size(self) -> int:
+        """n m + q."""
+        n, m, q = self.tails.shape
+        return int(n * m + q)
+
+    @property
+    def diagonal(self) -> Array:
+        """(n m + q,)."""
+        result: Array = np.r_[np.einsum("nii->ni", self.frames).ravel(), np.diagonal(self.tail)]
+        return result
+
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """The frames of each coupling."""
+        return self.order.first[: self.order.given], self.order.second[: self.order.given]
+
+    def plus(self, diagonal: Array) -> BlockMatrix:
+        """The matrix with a diagonal (n m + q,) added."""
+        n, m, _ = self.tails.shape
+        frames, tail = self.frames.copy(), self.tail.copy()
+        np.einsum("nii->ni", frames)[...] += diagonal[: n * m].reshape(n, m)
+        np.einsum("ii->i", tail)[...] += diagonal[n * m :]
+        return replace(self, frames=frames, tail=tail)
+
+    def scaled(self, unit: Array) -> BlockMatrix:
+        """diag(unit) A diag(unit)."""
+        n, m, _ = self.tails.shape
+        of_frames, of_tail = unit[: n * m].reshape(n, m), unit[n * m :]
+        first, second = self.ends
+        return replace(
+            self,
+            frames=self.frames * of_frames[:, :, None] * of_frames[:, None, :],
+            couplings=self.couplings * of_frames[first][:, :, None] * of_frames[second][:, None, :],
+            tails=self.tails * of_frames[:, :, None] * of_tail,
+            tail=self.tail * of_tail[:, None] * of_tail,
+        )
+
+    def congruent(self, T: Array) -> BlockMatrix:
+        """T_i' A_ij T_j for bases T (n, m, l) of the frames."""
+        first, second = self.ends
+        Tt = T.transpose(0, 2, 1)
+        return replace(
+            self,
+            frames=Tt @ self.frames @ T,
+            couplings=products_of(Tt[first], self.couplings, T[second]),
+            tails=Tt @ self.tails,
+        )
+
+    def times(self, v: Array) -> Array:
+        """A v for v (n m + q,)."""
+        return self._product(v, self.frames, self.couplings, self.tails, self.tail)
+
+    def sizes(self, v: Array) -> Array:
+        """|A| |v|."""
+        return self._product(
+            np.abs(v), np.abs(self.frames), self.couplings, np.abs(self.tails), np.abs(self.tail), True
+        )
+
+    def _product(
+        self, v: Array, frames: Array, couplings: Array, tails: Array, tail: Array, absolute: bool = False
+    ) -> Array:
+        n, m, _ = self.tails.shape
+        of_frames, of_tail = v[: n * m].reshape(n, m), v[n * m :]
+        result = np.matmul(frames, of_frames[:, :, None])[:, :, 0] + tails @ of_tail
+        last = tail @ of_tail + np.einsum("niq,ni->q", tails, of_frames)
+        first, second = self.ends
+        step = max(1, AT_ONCE // (m * m))
+        for begin in range(0, len(couplings), step):
+            at = slice(begin, begin + step)
+            blocks = np.abs(couplings[at]) if absolute else couplings[at]
+            sum_into(result, first[at], np.matmul(blocks, of_frames[second[at], :, None])[:, :, 0])
+            sum_into(result, second[at], np.matmul(of_frames[first[at], None, :], blocks)[:, 0])
+        whole: Array = np.concatenate([result.ravel(), last])
+        return whole
+
+    def dense(self) -> Array:
+        """As one array; for small matrices."""
+        n, m, _ = self.tails.shape
+        full = np.zeros((self.size, self.size))
+        blocks = full[: n * m, : n * m].reshape(n, m, n, m).transpose(0, 2, 1, 3)
+        at, (first, second) = np.arange(n), self.ends
+        blocks[at, at] = self.frames
+        blocks[first, second] = self.couplings
+        blocks[second, first] = self.couplings.transpose(0, 2, 1)
+        full[: n * m, n * m :] = self.tails.reshape(n * m, -1)
+        full[n * m :, : n * m] = full[: n * m, n * m :].T
+        full[n * m :, n * m :] = self.tail
+        return full
+
+    def factor(self) -> BlockFactor | None:
+        """The Cholesky factor; None when a pivot is not a positive, finite number."""
+        return _Factorisation(self).run()
+
+
+@dataclass(frozen=True)
+class BlockFactor:
+    """The Cholesky factor: for each group of the order the frames' factors and rows, and that of the dense rest."""
+
+    order: Elimination
+    shape: tuple[int, int, int]
+    frames: list[Array]
+    rows: list[Array]
+    rest: Array
+
+    @property
+    def pivots(self) -> Array:
+        """(n m + q,): the diagonal of the factor."""
+        n, m, q = self.shape
+        result = np.empty((n, m))
+        for group, lower in zip(self.order.groups, self.frames, strict=True):
+            result[group.frames] = np.einsum("kii->ki", lower)
+        last = np.diagonal(self.rest)
+        result[self.order.rest] = last[: len(last) - q].reshape(-1, m)
+        whole: Array = np.append(result.ravel(), last[len(last) - q :])
+        return whole
+
+    def solve_vector(self, v: Array) -> Array:
+        """Solve for one vector (n m + q,)."""
+        n, m, q = self.shape
+        x = np.zeros((n + 1, m))
+        x[:n] = v[: n * m].reshape(n, m)
+        tail = v[n * m :].copy()
+        for group, lower, rows in zip(self.order.groups, self.frames, self.rows, strict=True):
+            y = forward_substitution(lower, x[group.frames, :, None])
+            x[group.frames] = y[:, :, 0]
+            passed = np.matmul(y.transpose(0, 2, 1), rows)[:, 0]
+            k, d = group.neighbours.shape
+            sum_into(x, group.neighbours.ravel(), passed[:, : d * m].reshape(k * d, m), -1.0)
+            x[n] = 0.0
+            tail -= passed[:, d * m :].sum(axis=0)
+        rest = np.concatenate([x[self.order.rest].ravel(), tail])
+        rest = scipy.linalg.cho_solve((self.rest, True), rest, check_finite=False)
+        x[self.order.rest], tail = rest[: len(rest) - q].reshape(-1, m), rest[len(rest) - q :]
+        for group, lower, rows in zip(
+            reversed(self.order.groups), reversed(self.frames), reversed(self.rows), strict=True
+        ):
+            k, d = group.neighbours.shape
+            known = np.concatenate([x[group.neighbours].reshape(k, d * m), np.broadcast_to(tail, (k, q))], axis=1)
+            z = x[group.frames, :, None] - np.matmul(rows, known[:, :, None])
+            x[group.frames] = backward_substitution(lower, z)[:, :, 0]
+        whole: Array = np.concatenate([x[:n].ravel(), tail])
+        return whole
+
+
+class _Factorisation:
+    """What is left of a matrix while it is factored."""
+
+    def __init__(self, matrix: BlockMatrix) -> None:
+        self.matrix, self.order = matrix, matrix.order
+        n, m, q = matrix.tails.shape
+        self.shape = n, m, q
+        # One row more than there are: what is summed for no frame goes there.
+        self.frames = np.concatenate([matrix.frames, np.zeros((1, m, m))])
+        self.tails = np.concatenate([matrix.tails, np.zeros((1, m, q))])
+        self.tail = matrix.tail.copy()
+        self.changes = np.zeros((self.order.number_changed + 1, m, m))
+        #: The place of each coupling among the changes; and for no coupling.
+        last = self.order.number_changed
+        self.place = np.append(np.where(self.order.changed < len(self.order.changed), self.order.changed, last), last)
+
+    def run(self) -> BlockFactor | None:
+        _, m, q = self.shape
+        frames, rows = [], []
+        try:
+            for group in self.order.groups:
+                lower = np.linalg.cholesky(self.frames[group.frames])
+                if not np.isfinite(np.einsum("kii->ki", lower)).all():
+                    return None
+                k, d = group.neighbours.shape
+                of_group = np.empty((k, m, d * m + q))
+                for at in _portions(group, m * d + q):
+                    of_group[at] = forward_substitution(lower[at], self._couplings(group, at))
+                    self._take_off(group, at, of_group[at])
+                frames.append(lower)
+                rows.append(of_group)
+            rest = self._dense_rest()
+            del self.changes, self.frames
+            # LAPACK's own routine, in place; its upper triangle is zero afterwards.
+            factor, failed = scipy.linalg.lapack.dpotrf(rest, lower=1, clean=1, overwrite_a=1)
+        except np.linalg.LinAlgError:
+            return None
+        # LAPACK may let NaN and infinity pass as pivots; the diagonal then has them.
+        if failed or not np.isfinite(np.diagonal(factor)).all():
+            return None
+        return BlockFactor(self.order, self.shape, frames, rows, factor)
+
+    def _blocks(self, edges: np.ndarray) -> Array:
+        """Couplings (k,) as they are now, (k, m, m); one past the last for none."""
+        order = self.order
+        result: Array = self.changes[self.place[edges]]
+        given = np.flatnonzero(edges < order.given)
+        result[given] += self.matrix.couplings[edges[given]]
+        return result
+
+    def _couplings(self, group: Group, at: slice) -> Array:
+        """The rows (k, m, d m + q) of a group's frames beside their diagonal blocks."""
+        _, m, q = self.shape
+        edges, flipped = group.edges[at], group.flipped[at]
+        k, d = edges.shape
+        blocks = self._blocks(edges.ravel())
+        turned = flipped.ravel()
+        blocks[turned] = blocks[turned].transpose(0, 2, 1)
+        result = np.empty((k, m, d * m + q))
+        result[:, :, : d * m].reshape(k, m, d, m)[...] = blocks.reshape(k, d, m, m).transpose(0, 2, 1, 3)
+        result[:, :, d * m :] = self.tails[group.frames[at]]
+        return result
+
+    def _take_off(self, group: Group, at: slice, rows: Array) -> None:
+        """Subtract what the elimination of frames takes from their neighbours."""
+        _, m, q = self.shape
+        neighbours = group.neighbours[at]
+        d = neighbours.shape[1]
+        if group.are_alike:
+            neighbours = neighbours[:1]
+            flat = rows.reshape(len(rows) * m, d * m + q)
+            square = (flat.T @ flat)[None]
+        else:
+            square = np.matmul(rows.transpose(0, 2, 1), rows)
+        k = len(square)
+        blocks = square[:, : d * m, : d * m].reshape(k, d, m, d, m)
+        each = np.arange(d)
+        sum_into(self.frames, neighbours.ravel(), blocks[:, each, :, each].swapaxes(0, 1).reshape(k * d, m, m), -1.0)
+        sum_into(self.tails, neighbours.ravel(), square[:, : d * m, d * m :].reshape(k * d, m, q), -1.0)
+        self.tail -= square[:, d * m :, d * m :].sum(axis=0)
+        a, b = np.triu_indices(d, 1)
+        if len(a):
+            edges = self.order.couplings_of(neighbours[:, a], neighbours[:, b])
+            pairs = blocks[:, a, :, b].swapaxes(0, 1).reshape(-1, m, m)
+            sum_into(self.changes, self.place[edges].ravel(), pairs, -1.0)
+
+    def _dense_rest(self) -> Array:
+        """The frames that are left, and the tail, as one array in Fortran's order: (r m + q, r m + q)."""
+        _, m, q = self.shape
+        order, rest = self.order, self.order.rest
+        r = len(rest)
+        full = np.zeros((r * m + q, r * m + q))
+        place = np.full(order.n, -1)
+        place[rest] = np.arange(r)
+        inside = np.flatnonzero((place[order.first] >= 0) & (place[order.second] >= 0))
+        blocks = full[: r * m, : r * m].reshape(r, m, r, m).transpose(0, 2, 1, 3)
+        blocks[np.arange(r), np.arange(r)] = self.frames[rest]
+        blocks[place[order.first[inside]], place[order.second[inside]]] = self._blocks(inside)
+        full[: r * m, r * m :] = self.tails[rest].reshape(r * m, q)
+        full[r * m :, r * m :] = self.tail
+        return full.T  # only the lower triangle of this is read
+
+
+def _portions(group: Group, width: int) -> Iterator[slice]:
+    """The frames of a group, so many at a time that what is made of them fits."""
+    count, m = len(group.frames), 13
+    step = ALIKE_AT_ONCE // (m * max(width, 1)) if group.are_alike else AT_ONCE // max(width * width, 1)
+    step = max(1, step)
+    return (slice(begin, begin + step) for begin in range(0, count, step))
+
+
+def products_of(left: Array, middle: Array, right: Array) -> Array:
+    """left (F, a, m) times middle (F, m, m) times right (F, m, b)."""
+    return left @ middle @ right
+
+
+def sum_into(result: Array, index: np.ndarray, values: Array, factor: float = 1.0) -> None:
+    """Add ``factor`` times each of the values (k, ...) to the row of ``result`` that ``index`` (k,) names.
+
+    Rows may be named more than once.
+    """
+    k = len(index)
+    if k == 0 or values.size == 0:
+        return
+    order = np.argsort(index, kind="stable")
+    sorted_index = index[order]
+    begin = np.flatnonzero(np.r_[True, sorted_index[1:] != sorted_index[:-1]])
+    rows = sorted_index[begin]
+    if len(rows) == k:
+        result[index] += factor * values if factor != 1.0 else values
+        return
+    from scipy.sparse import csr_array  # slow to import
+
+    sums = csr_array((np.full(k, factor), order, np.r_[begin, k]), shape=(len(rows), k)) @ values.reshape(k, -1)
+    result[rows] += sums.reshape(len(rows), *values.shape[1:])

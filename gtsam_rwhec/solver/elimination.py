@@ -1,0 +1,255 @@
+"""In which order the frames of a graph are eliminated, and what fill that makes.
+
+Frames that have no coupling with one another are eliminated at once, those with few neighbours first: in each round,
+the frames that have fewer neighbours than any of theirs (multiple minimum degree, Liu 1985). For a star that is one
+round: the leaves. What is left when nearly all is coupled with all, or little is left, is dense.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.geometry.rounding import SAFETY, gammas
+
+#: In a round frames with up to this many times the fewest neighbours are eliminated, and a few more.
+TIMES_FEWEST, MORE = 2, 2
+#: Where this part of all couplings is there, the rest is dense.
+DENSE = 0.8
+#: So few frames are dense in any case: to eliminate them singly takes longer.
+FEW = 30
+#: Frames with fewer neighbours are counted as if they had more, where that makes fewer groups at little cost: in
+#: numbers of blocks, squared.
+PADDING = 12_000
+#: So many frames with the same neighbours are eliminated by one product.
+ALIKE = 8
+#: Frames with the same number of neighbours are tried in a random order, drawn once and for all.
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Group:
+    """k frames with d neighbours each that are eliminated at once; the number of frames stands for no neighbour.
+
+    ``edges`` (k, d) are the couplings with the neighbours, which are stored ``flipped`` where the neighbour comes first
+    by number; ``are_alike`` says that all have the same neighbours.
+    """
+
+    frames: np.ndarray
+    neighbours: np.ndarray
+    edges: np.ndarray
+    flipped: np.ndarray
+    are_alike: bool
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """The order of n frames, and all couplings that there are at some time.
+
+    Couplings are pairs ``first`` < ``second`` of frames: the ``given`` ones, in their order, and then the fill.
+    ``changed`` is the place of each coupling among those that the elimination of other frames changes, or one past the
+    last. ``rest`` are the frames that are dense at the end, in ascending order.
+    """
+
+    n: int
+    first: np.ndarray
+    second: np.ndarray
+    given: int
+    changed: np.ndarray
+    groups: tuple[Group, ...]
+    rest: np.ndarray
+    _spreads: dict[tuple[int, int], tuple[Array, float]] = field(default_factory=dict, compare=False, repr=False)
+
+    @staticmethod
+    def of(n: int, first: np.ndarray, second: np.ndarray, few: int = FEW) -> Elimination:
+        """The order for frames 0 to n - 1 with couplings of ``first`` and ``second`` (F,), each first < second, once.
+
+        As soon as no more than ``few`` frames are left, they are dense.
+        """
+        return _Ordering(n, np.asarray(first, dtype=np.int64), np.asarray(second, dtype=np.int64)).run(few)
+
+    @cached_property
+    def number_changed(self) -> int:
+        """How many couplings are changed by the elimination of other frames."""
+        return int((self.changed < len(self.changed)).sum())
+
+    @cached_property
+    def neighbours(self) -> np.ndarray:
+        """How many frames each frame is coupled with at first, (n,)."""
+        return np.bincount(np.r_[self.first[: self.given], self.second[: self.given]], minlength=self.n)
+
+    @cached_property
+    def key_order(self) -> tuple[np.ndarray, np.ndarray]:
+        """The couplings' keys, ascending, and which couplings they are."""
+        keys = self.first * (self.n + 1) + self.second
+        order = np.argsort(keys)
+        return keys[order], order
+
+    def couplings_of(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """The numbers of couplings by their frames; for pairs with the frame n, one past the last."""
+        keys, order = self.key_order
+        wanted = first * (self.n + 1) + second
+        place = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
+        none = (first >= self.n) | (second >= self.n)
+        if len(keys) == 0:
+            return np.zeros(wanted.shape, dtype=np.int64)
+        return np.where(none, len(keys), order[place])
+
+    @cached_property
+    def terms(self) -> np.ndarray:
+        """How many frames, its own included, a frame's rows of the factor reach to, (n,); without the tail."""
+        result = np.ones(self.n + 1, dtype=np.int64)
+        for group in self.groups:
+            np.add.at(result, group.neighbours, 1)
+        result[self.rest] += len(self.rest) - 1
+        return result[: self.n]
+
+    def spread(self, m: int, q: int) -> tuple[Array, float]:
+        """What a factorisation in blocks of m, and a tail of q, may take from the diagonal, as a part of it: (n,), one.
+
+        Higham 2002, theorem 10.3, for any order of summation: dA_ij is at most g_ij sqrt(a_ii a_jj), g = gamma_(k+1) /
+        (1 - gamma_(k+1)) for k terms in the sum, and zero outside the fill. A symmetric matrix of numbers that are not
+        negative is dominated by the diagonal matrix of its row sums.
+        """
+        if (m, q) not in self._spreads:
+            self._spreads[m, q] = self._spread(m, q)
+        return self._spreads[m, q]
+
+    def _spread(self, m: int, q: int) -> tuple[Array, float]:
+        terms = np.append(m * self.terms, 0)
+        terms[self.rest] += q
+        of_tail = int(m * self.n + q)
+        g = gammas(np.append(terms, of_tail) + 3)
+        g /= 1.0 - g
+        g, last = g[:-1], float(g[-1])
+        sums = m * g + q * g
+        for group in self.groups:
+            fewer = np.minimum(g[group.frames][:, None], g[group.neighbours])
+            fewer[group.neighbours == self.n] = 0.0
+            sums[group.frames] += m * fewer.sum(axis=1)
+            np.add.at(sums, group.neighbours, m * fewer)
+        sums[self.rest] += m * max(len(self.rest) - 1, 0) * g[self.rest]
+        return SAFETY * sums[: self.n], SAFETY * float(m * g[: self.n].sum() + q * last)
+
+
+class _Ordering:
+    """The state of the symbolic elimination."""
+
+    def __init__(self, n: int, first: np.ndarray, second: np.ndarray) -> None:
+        self.n, self.given = n, len(first)
+        self.first, self.second = first, second
+        self.alive = np.ones(n, dtype=bool)
+        self.current = np.arange(len(first))  # couplings between frames that are alive
+        self.keys = np.sort(first * (n + 1) + second)
+        self.priority = np.random.default_rng(SEED).permutation(n) / max(n, 1)
+        self.is_changed = np.zeros(len(first), dtype=bool)
+
+    def run(self, few: int) -> Elimination:
+        groups: list[tuple[np.ndarray, np.ndarray, bool]] = []
+        while True:
+            left = int(self.alive.sum())
+            if left <= few or len(self.current) >= DENSE * left * (left - 1) / 2:
+                break
+            chosen = self._chosen()
+            groups += self._eliminated(chosen)
+        total = len(self.first)
+        changed = np.full(total, total)
+        changed[self.is_changed] = np.arange(int(self.is_changed.sum()))
+        order = Elimination(self.n, self.first, self.second, self.given, changed, (), np.flatnonzero(self.alive))
+        made = []
+        for frames, neighbours, are_alike in groups:
+            flipped = neighbours < frames[:, None]
+            edges = order.couplings_of(np.minimum(frames[:, None], neighbours), np.maximum(frames[:, None], neighbours))
+            made.append(Group(frames, neighbours, edges, flipped, are_alike))
+        return Elimination(
+            self.n, self.first, self.second, self.given, changed, tuple(made), np.flatnonzero(self.alive)
+        )
+
+    def _chosen(self) -> np.ndarray:
+        """Frames with no couplings among them, and fewer neighbours than all of theirs that are not chosen."""
+        ends = np.concatenate([self.first[self.current], self.second[self.current]])
+        others = np.concatenate([self.second[self.current], self.first[self.current]])
+        degree = np.bincount(ends, minlength=self.n)
+        fewest = int(degree[self.alive].min())
+        value = degree + self.priority
+        open_ = self.alive & (degree <= TIMES_FEWEST * fewest + MORE)
+        chosen = np.zeros(self.n, dtype=bool)
+        while open_.any():
+            lowest = np.full(self.n, np.inf)
+            np.minimum.at(lowest, ends, np.where(open_[others], value[others], np.inf))
+            new = open_ & (value < lowest)
+            chosen |= new
+            open_ &= ~new
+            open_[ends[new[others]]] = False
+        return chosen
+
+    def _eliminated(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, bool]]:
+        """Take the chosen frames out; their groups."""
+        first, second = self.first[self.current], self.second[self.current]
+        ends, others = np.concatenate([first, second]), np.concatenate([second, first])
+        mine = chosen[ends]
+        ends, others = ends[mine], others[mine]
+        order = np.lexsort((others, ends))
+        ends, others = ends[order], others[order]
+        frames = np.flatnonzero(chosen)
+        begin = np.searchsorted(ends, frames)
+        degree = np.searchsorted(ends, frames, side="right") - begin
+        groups, fill = [], []
+        for members in _padded(degree):
+            d = int(degree[members].max(initial=0))
+            at = np.minimum(begin[members, None] + np.arange(d), max(len(others) - 1, 0))
+            has = np.arange(d) < degree[members, None]
+            neighbours = np.where(has, others[at] if len(others) else self.n, self.n)
+            sort = np.lexsort(neighbours.T[::-1]) if d else np.arange(len(members))
+            groups += _alike(frames[members][sort], neighbours[sort])
+            a, b = np.triu_indices(d, 1)
+            distinct = np.unique(neighbours, axis=0) if d else neighbours[:0]
+            keys = (distinct[:, a] * (self.n + 1) + distinct[:, b]).ravel()
+            fill.append(np.unique(keys[(distinct[:, b] < self.n).ravel()]))
+        self.alive &= ~chosen
+        self.current = self.current[~(chosen[first] | chosen[second])]
+        self._add(np.unique(np.concatenate(fill)) if fill else np.zeros(0, dtype=np.int64))
+        return groups
+
+    def _add(self, keys: np.ndarray) -> None:
+        """Couplings that an elimination changes, of which some are new."""
+        of_current = self.first[self.current] * (self.n + 1) + self.second[self.current]
+        self.is_changed[self.current[np.isin(of_current, keys)]] = True
+        new = np.setdiff1d(keys, of_current, assume_unique=True)
+        start = len(self.first)
+        self.first = np.concatenate([self.first, new // (self.n + 1)])
+        self.second = np.concatenate([self.second, new % (self.n + 1)])
+        self.is_changed = np.concatenate([self.is_changed, np.ones(len(new), dtype=bool)])
+        self.current = np.concatenate([self.current, start + np.arange(len(new))])
+
+
+def _padded(degree: np.ndarray) -> list[np.ndarray]:
+    """Groups of frames with about the same number of neighbours."""
+    order = np.argsort(-degree, kind="stable")
+    sizes = degree[order]
+    groups, begin, cost = [], 0, 0.0
+    for start in np.flatnonzero(np.diff(sizes, prepend=-1)):
+        stop = int(np.searchsorted(-sizes, -sizes[start], side="right"))
+        more = float((stop - start) * (sizes[begin] ** 2 - sizes[start] ** 2))
+        if start > begin and cost + more > PADDING:
+            groups.append(order[begin:start])
+            begin, cost, more = int(start), 0.0, 0.0
+        cost += more
+    groups.append(order[begin:])
+    return groups
+
+
+def _alike(frames: np.ndarray, neighbours: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, bool]]:
+    """Split a group, sorted by neighbours, into sets of many frames with the same neighbours, and the others."""
+    differs = np.r_[True, (neighbours[1:] != neighbours[:-1]).any(axis=1)]
+    begin = np.flatnonzero(differs)
+    count = np.diff(np.r_[begin, len(frames)])
+    large = count >= ALIKE
+    groups = [(frames[b : b + c], neighbours[b : b + c], True) for b, c in zip(begin[large], count[large], strict=True)]
+    others = np.repeat(~large, count)
+    if others.any():
+        groups.append((frames[others], neighbours[others], False))
+    return groups
