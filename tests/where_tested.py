@@ -138,6 +138,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/odometry": {
         "odometry/test_calibrated.py": "found",
         "odometry/test_given.py": "options",
+        "odometry/test_odometry_tracks.py": "tracks",
     },
     "gtsam_rwhec/pipeline": {
         "test_gallery.py": "turned_images",

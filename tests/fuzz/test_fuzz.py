@@ -34,7 +34,7 @@ HARNESS = Harness(read, lambda: [b"loop", b"pine", b"too long"], limit_s=1.0)
 """
 
 
-@pytest.mark.parametrize("part", [4, pytest.param(1, marks=pytest.mark.slow)], ids=["quarter", "whole"])
+@pytest.mark.parametrize("part", [10, pytest.param(1, marks=pytest.mark.slow)], ids=["tenth", "whole"])
 @pytest.mark.parametrize("reader", run.READERS)
 def test_only_our_errors_leave_a_reader(reader: str, part: int, tmp_path: Path) -> None:
     most = EXECUTIONS[reader] // part

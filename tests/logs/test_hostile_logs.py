@@ -39,7 +39,9 @@ ALL |= {f"{name} (index)": case for name, case in INDEX.items()} | {
 }
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "huger zstd" else name for name in ALL]
+)
 def test_a_hostile_log_is_refused_within_its_budget(reader: Reader, tmp_path: Path, name: str) -> None:
     make, words = ALL[name]
     path = tmp_path / "a.mcap"

@@ -85,7 +85,7 @@ def test_rounding_undoes_the_vector() -> None:
     np.testing.assert_allclose(again_t, t, atol=1e-13)
 
 
-@pytest.mark.parametrize("noise", [Noise(0.01, 125.0, "released"), LARGE])
+@pytest.mark.parametrize("noise", [Noise(0.01, 125.0, "released"), pytest.param(LARGE, marks=pytest.mark.slow)])
 def test_the_relaxation_is_tight_and_its_bound_is_one(noise: Noise) -> None:
     stack = Stack.of(four_targets(noise).problem)
     answer = solve_dual_quaternions(stack)

@@ -96,8 +96,15 @@ def calibrated_before(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
-@pytest.mark.parametrize("name", ["detected.mcap", "clean.mcap", "result.json", "tf.yaml", "residuals.png"])
+@pytest.mark.parametrize(
+    ("name", "stop"),
+    [
+        *((name, KeyboardInterrupt()) for name in ("detected.mcap", "clean.mcap", "tf.yaml")),
+        *((name, OSError(errno.ENOSPC, "No space left on device")) for name in ("clean.mcap", "result.json")),
+        pytest.param("residuals.png", KeyboardInterrupt(), marks=pytest.mark.slow),
+        pytest.param("residuals.png", OSError(errno.ENOSPC, "No space left on device"), marks=pytest.mark.slow),
+    ],
+)
 def test_a_calibration_that_ends_early_leaves_whole_files(
     calibrated_before: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, stop: BaseException
 ) -> None:

@@ -29,6 +29,7 @@ def judged(folder: Path, messages: Iterable[made.Message], text: str) -> rw.Judg
     return made.solved(folder, messages, text).judgement
 
 
+@pytest.mark.slow
 def test_exchanged_carriers_are_named_with_their_lines_though_clocks_are_estimated(tmp_path: Path) -> None:
     text = EXCHANGED
     for number in range(2):
@@ -66,6 +67,7 @@ def test_poses_of_a_topic_that_are_the_inverse_of_what_the_rig_file_says(tmp_pat
     assert "rig.yaml, line 4: carriers.poses.parent" in said
 
 
+@pytest.mark.slow
 def test_the_order_of_the_frames_of_tf_changes_nothing(tmp_path: Path) -> None:
     messages, found = made.recording(2.5), []
     for order in ("[base, hand]", "[hand, base]"):
@@ -95,6 +97,7 @@ def test_a_size_that_was_corrected_by_the_others_asks_for_care(tmp_path: Path) -
     assert "rig.yaml, line 13: targets.tag_1: the motion says 102." in said
 
 
+@pytest.mark.slow
 def test_two_clocks_that_are_both_late_are_named(tmp_path: Path) -> None:
     log = made.recording(8.0, offsets_s=dict.fromkeys(made.CAMERAS, 0.3))
     judgement = judged(tmp_path, log, made.rig_text(sizes="sizes: check"))

@@ -359,6 +359,7 @@ def test_weights_go_from_one_to_zero_without_a_step(mu: float, c2: float) -> Non
     assert (np.diff(w[5:]) <= 1e-12).all()
 
 
+@pytest.mark.slow
 def test_the_real_dataset_with_thirty_percent_corrupted(utias_folder: object) -> None:
     problem = rw.read_csv(str(utias_folder))
     generator = np.random.default_rng(0)
