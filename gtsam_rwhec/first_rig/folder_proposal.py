@@ -167,7 +167,7 @@ def _text(
     carriers, remarks["carriers", "poses"] = _carriers(reading)
     origin = origin_of([f for camera in cameras if camera.poses for f in camera.poses.path.split("/")])
     notes.append(f"poses: {origin.words}; their noise is left out, and residuals tell it")
-    rig = Rig(carriers=carriers, sensors=sensors, targets=targets)
+    rig = Rig(carriers=carriers, sensors={**sensors}, targets=targets)
     where = folder.resolve().name
     head = (
         f"# A first rig file, made from the folder {where if is_text(where) else repr(where)}; paths start from it.\n"

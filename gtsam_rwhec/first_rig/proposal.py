@@ -143,7 +143,7 @@ def _text(
             f"TODO errors of these poses, a guess: {of_log.origin.words}. Leave the line out if you do not know them: "
             "residuals tell too"
         )
-    rig = Rig(carriers=carriers, sensors=sensors, targets=targets)
+    rig = Rig(carriers=carriers, sensors={**sensors}, targets=targets)
     file = log.files[0].path.name
     head = (
         f"# A first rig file, made from the log {file if is_text(file) else repr(file)}.\n"

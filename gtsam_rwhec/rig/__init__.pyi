@@ -17,6 +17,13 @@ from .unfinished import todo_lines as todo_lines
 
 # The sections of a rig file.
 from .intrinsics_section import Intrinsics as Intrinsics
+from .given_section import GivenDirection as GivenDirection
+from .given_section import GivenDistance as GivenDistance
+from .given_section import GivenGround as GivenGround
+from .given_section import GivenSection as GivenSection
+from .odometry_section import OdometryNoiseSection as OdometryNoiseSection
+from .odometry_section import OdometrySensor as OdometrySensor
+from .odometry_section import OdometrySource as OdometrySource
 from .sections import Carriers as Carriers
 from .sections import Cleaning as Cleaning
 from .sections import DetectionNoise as DetectionNoise

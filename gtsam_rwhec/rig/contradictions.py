@@ -8,6 +8,7 @@ from typing import Any
 
 from gtsam_rwhec.errors import OptionError, TargetError
 from gtsam_rwhec.files.yaml_lines import KeyPath, suggestion
+from gtsam_rwhec.rig.odometry_section import OdometrySensor
 from gtsam_rwhec.rig.sections import Carriers, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.options import DetectionOptions
@@ -18,23 +19,27 @@ Fault = tuple[KeyPath, str]
 
 def contradictions(
     carriers: Carriers,
-    sensors: Mapping[str, Sensor],
+    all_sensors: Mapping[str, Sensor | OdometrySensor],
     targets: Mapping[str, TargetSection],
     detection: Mapping[str, Any],
+    reference: str | None = None,
 ) -> Iterator[Fault]:
     """Yield every fault of a rig file's sections, as the path of the value and what is wrong with it."""
+    sensors = {name: sensor for name, sensor in all_sensors.items() if isinstance(sensor, Sensor)}
     yield from _carriers(carriers)
-    yield from _sensors(sensors)
+    yield from _sensors(sensors, all_sensors)
     yield from _poses(carriers, sensors)
     printed = []
-    if not targets:
+    if not targets and (sensors or not all_sensors):
         yield ("targets",), "none; give at least one target"
+    if targets and all_sensors and not sensors:
+        yield ("targets",), "no sensor sees them: all have odometry; leave targets out, or give a camera"
     for name, section in targets.items():
         try:
             printed.append(section.target(name))
         except TargetError as error:
             yield ("targets", name), error.fault
-    yield from _names(carriers, sensors, targets)
+    yield from _names(carriers, {name: s for name, s in all_sensors.items() if name != reference}, targets)
     yield from _detection(detection)
     yield from _lookalikes(printed)
 
@@ -53,8 +58,8 @@ def _carriers(carriers: Carriers) -> Iterator[Fault]:
         )
 
 
-def _sensors(sensors: Mapping[str, Sensor]) -> Iterator[Fault]:
-    if not sensors:
+def _sensors(sensors: Mapping[str, Sensor], all_sensors: Mapping[str, Sensor | OdometrySensor]) -> Iterator[Fault]:
+    if not all_sensors:
         yield ("sensors",), "none; give at least one sensor"
     for key in ("images", "detections"):
         first: dict[str, str] = {}
@@ -76,7 +81,9 @@ def _poses(carriers: Carriers, sensors: Mapping[str, Sensor]) -> Iterator[Fault]
             )
 
 
-def _names(carriers: Carriers, sensors: Mapping[str, Sensor], targets: Mapping[str, TargetSection]) -> Iterator[Fault]:
+def _names(
+    carriers: Carriers, sensors: Mapping[str, Sensor | OdometrySensor], targets: Mapping[str, TargetSection]
+) -> Iterator[Fault]:
     """Names that two frames have."""
     named: list[tuple[str, KeyPath, str]] = [(carriers.sensors, ("carriers", "sensors"), "the sensors' carrier")]
     if carriers.targets != carriers.sensors:
@@ -85,7 +92,7 @@ def _names(carriers: Carriers, sensors: Mapping[str, Sensor], targets: Mapping[s
         named.append((name, ("sensors", name), f"sensor {name}"))
         if sensor.frame not in (None, name):
             named.append((str(sensor.frame), ("sensors", name, "frame"), f"the frame of sensor {name}"))
-        if sensor.link is not None:
+        if isinstance(sensor, Sensor) and sensor.link is not None:
             named.append((sensor.link.frame, ("sensors", name, "link"), f"the link of sensor {name}"))
     named += [(name, ("targets", name), f"target {name}") for name in targets]
     first: dict[str, str] = {}

@@ -9,9 +9,12 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from gtsam_rwhec.rig.field_types import in_yaml, unit_of
+from gtsam_rwhec.rig.given_section import GivenDirection, GivenDistance, GivenGround, GivenSection
 from gtsam_rwhec.rig.intrinsics_section import Intrinsics
 from gtsam_rwhec.rig.json_schema import detection_keys, rig_file_schema
+from gtsam_rwhec.rig.odometry_section import OdometryNoiseSection, OdometrySensor, OdometrySource
 from gtsam_rwhec.rig.rig import RigFile
+from gtsam_rwhec.rig.section import keys_of
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Link, PoseNoise, PoseSource, Sensor
 from gtsam_rwhec.rig.target_sections import BundleTagPlace, TargetSection
 from gtsam_rwhec.vision.targets import FAMILIES
@@ -45,12 +48,19 @@ SECTIONS: tuple[tuple[str, type[BaseModel]], ...] = (
     ("sensors: NAME", Sensor),
     ("sensors: NAME: intrinsics", Intrinsics),
     ("sensors: NAME: link", Link),
+    ("sensors: NAME (with odometry)", OdometrySensor),
+    ("sensors: NAME: odometry", OdometrySource),
+    ("sensors: NAME: odometry: noise", OdometryNoiseSection),
 )
 #: Sections that come after the targets.
 LAST: tuple[tuple[str, type[BaseModel]], ...] = (
     ("targets: NAME: layout", BundleTagPlace),
     ("noise", DetectionNoise),
     ("cleaning", Cleaning),
+    ("given", GivenSection),
+    ("given: ground", GivenGround),
+    ("given: directions", GivenDirection),
+    ("given: distances", GivenDistance),
 )
 
 
@@ -90,7 +100,7 @@ def _about(section: type[BaseModel]) -> str:
 
 def _table(section: type[BaseModel], schema: dict[str, Any]) -> str:
     rows = []
-    for key, field in section.model_fields.items():
+    for key, field in keys_of(section).items():
         said = schema["properties"][key]
         rows.append((
             f"`{key}`", field.description or _kind(said), _kind(said), unit_of(key, field), _default(field),

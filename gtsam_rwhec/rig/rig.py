@@ -6,28 +6,55 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import Discriminator, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Discriminator, Field, ValidationError, model_validator
 from pydantic import Tag as UnionTag
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from gtsam_rwhec.files.yaml_lines import KeyPath, dotted
 from gtsam_rwhec.rig.contradictions import contradictions
 from gtsam_rwhec.rig.field_types import Name
+from gtsam_rwhec.rig.given_section import GivenSection
+from gtsam_rwhec.rig.odometry_contradictions import odometry_contradictions
+from gtsam_rwhec.rig.odometry_section import OdometrySensor
+from gtsam_rwhec.rig.reference_carrier import with_what_follows
 from gtsam_rwhec.rig.section import Section
 from gtsam_rwhec.rig.sections import Carriers, Cleaning, DetectionNoise, Sensor
 from gtsam_rwhec.rig.target_sections import TargetSection
 from gtsam_rwhec.vision.options import DetectionOptions
 from gtsam_rwhec.vision.targets import Target
 
+#: Sensors that see targets have images or detections; others have odometry.
+AnySensor: TypeAlias = Annotated[
+    Annotated[Sensor, UnionTag("sees")] | Annotated[OdometrySensor, UnionTag("moves")],
+    Discriminator(
+        lambda given: "moves" if "odometry" in (given if isinstance(given, dict) else dir(given)) else "sees"
+    ),
+]
+
+
+def _may_leave_out(schema: dict[str, Any]) -> None:
+    """In the JSON Schema: a reference takes the place of carriers, and odometries alone need no targets."""
+    schema["required"] = ["sensors"]
+    schema["oneOf"] = [{"required": ["carriers"]}, {"required": ["reference"]}]
+    alone = {"properties": {"sensors": {"additionalProperties": {"required": ["odometry"]}}}}
+    schema |= {"if": alone, "then": {}, "else": {"required": ["targets"]}}
+
 
 class RigFile(Section):
     """The content of a rig file."""
 
+    model_config = ConfigDict(json_schema_extra=_may_leave_out)
+
     carriers: Carriers = Field(description="the frames that carry the sensors and the targets, and their poses")
-    sensors: dict[Name, Sensor] = Field(description="by name, each with images or detections")
-    targets: dict[Name, TargetSection] = Field(description="by name, each with type and sizes")
+    all_sensors: dict[Name, AnySensor] = Field(
+        alias="sensors",
+        description="by name, each with images or detections of targets, or with the odometry of its own motion",
+    )
+    targets: dict[Name, TargetSection] = Field(
+        description="by name, each with type and sizes; sensors that all have odometry need none"
+    )
     sizes: Literal["known", "check", "estimate"] = Field(
         default="check",
         description="known: the targets' sizes are right. check: they are taken as stated if the motion agrees, else "
@@ -50,6 +77,31 @@ class RigFile(Section):
         description="which measurements are left out before solving",
         examples=[{"max_rotation_deg_s": 60.0}],
     )
+    reference: Name | None = Field(
+        default=None,
+        description="in place of carriers: the sensor with odometry in whose frame all others are calibrated",
+        examples=["lidar_front"],
+    )
+    given: GivenSection = Field(
+        default=GivenSection(),
+        description="what a person measured where the motion does not tell: heights, directions, distances",
+        examples=[{"heights_m": {"lidar_front": 0.52, "lidar_rear": 0.71}}],
+    )
+
+    @cached_property
+    def sensors(self) -> dict[str, Sensor]:
+        """The sensors that see targets, by name."""
+        return {name: sensor for name, sensor in self.all_sensors.items() if isinstance(sensor, Sensor)}
+
+    @cached_property
+    def odometries(self) -> dict[str, OdometrySensor]:
+        """The sensors that know only their own motion, by name; with the reference."""
+        return {name: sensor for name, sensor in self.all_sensors.items() if isinstance(sensor, OdometrySensor)}
+
+    @cached_property
+    def calibrated(self) -> tuple[str, ...]:
+        """The names of all sensors whose poses are asked for: all but the reference, which carries them."""
+        return tuple(name for name in self.all_sensors if name != self.reference)
 
     @cached_property
     def target_list(self) -> tuple[Target, ...]:
@@ -68,14 +120,22 @@ class RigFile(Section):
 
     def frame_of(self, sensor: str) -> str:
         """The name of a sensor's frame."""
-        return self.sensors[sensor].frame or sensor
+        return self.carriers.sensors if sensor == self.reference else self.all_sensors[sensor].frame or sensor
+
+    @model_validator(mode="before")
+    @classmethod
+    def _what_follows(cls, data: Any) -> Any:
+        return with_what_follows(data)
 
     @model_validator(mode="after")
     def _is_consistent(self) -> RigFile:
         # pydantic keeps the places of the faults of a ValidationError that is raised here.
         faults = [
             InitErrorDetails(type=PydanticCustomError("value_error", "{words}", {"words": words}), loc=path, input=None)
-            for path, words in contradictions(self.carriers, self.sensors, self.targets, self.detection)
+            for path, words in (
+                *contradictions(self.carriers, self.all_sensors, self.targets, self.detection, self.reference),
+                *odometry_contradictions(self.carriers, self.odometries, len(self.sensors), self.reference, self.given),
+            )
         ]
         if faults:
             raise ValidationError.from_exception_data("rig", faults)

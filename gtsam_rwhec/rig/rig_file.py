@@ -12,10 +12,11 @@ from pydantic_core import ErrorDetails
 
 from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, parse_yaml, read_text, shown, suggestion
-from gtsam_rwhec.rig import intrinsics_section, sections, target_sections
+from gtsam_rwhec.rig import given_section, intrinsics_section, odometry_section, sections, target_sections
 from gtsam_rwhec.rig.field_types import in_yaml, unit_of
 from gtsam_rwhec.rig.kalibr_targets import with_kalibr_targets
 from gtsam_rwhec.rig.rig import Lines, Rig, RigFile
+from gtsam_rwhec.rig.section import keys_of
 from gtsam_rwhec.rig.unfinished import todo_lines
 
 #: A message names at most this many faults.
@@ -37,11 +38,16 @@ _SECTIONS: dict[KeyPath, type[BaseModel]] = {
     ("carriers",): sections.Carriers,
     ("carriers", "poses"): sections.PoseSource,
     ("carriers", "noise"): sections.PoseNoise,
-    ("sensors", "*"): sections.Sensor,
     ("sensors", "*", "intrinsics"): intrinsics_section.Intrinsics,
     ("sensors", "*", "link"): sections.Link,
+    ("sensors", "*", "odometry"): odometry_section.OdometrySource,
+    ("sensors", "*", "odometry", "noise"): odometry_section.OdometryNoiseSection,
     ("noise",): sections.DetectionNoise,
     ("cleaning",): sections.Cleaning,
+    ("given",): given_section.GivenSection,
+    ("given", "ground"): given_section.GivenGround,
+    ("given", "directions", "*"): given_section.GivenDirection,
+    ("given", "distances", "*"): given_section.GivenDistance,
 }
 #: These words say what to do about a fault, by pydantic's name for its kind.
 _KINDS = {
@@ -118,7 +124,7 @@ def parse_rig(text: str, where: str, folder: Path = Path()) -> Rig:
         said = RigFile.model_validate(file.data)
     except ValidationError as error:
         raise RigError(_in_words(error, file)) from error
-    content = {name: getattr(said, name) for name in RigFile.model_fields}
+    content = {field.alias or name: getattr(said, name) for name, field in RigFile.model_fields.items()}
     return Rig(**content, folder=folder, source=Lines(where, file.lines))
 
 
@@ -143,7 +149,7 @@ def _place(fault: ErrorDetails) -> KeyPath:
 
 def _path(loc: tuple[str | int, ...]) -> KeyPath:
     """The place of a fault, without pydantic's names for the choices of a union and for keys."""
-    if loc[:1] == ("targets",) and len(loc) > 2:
+    if (loc[:1] == ("targets",) and len(loc) > 2) or (loc[:1] == ("sensors",) and loc[2:3] in (("sees",), ("moves",))):
         loc = (*loc[:2], *loc[3:])
     elif loc[:1] == ("noise",) and len(loc) > 1:
         loc = (*loc[:1], *loc[2:])
@@ -155,14 +161,14 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
     context: dict[str, Any] = fault.get("ctx", {})
     if kind == "missing":
         model = _section(path[:-1], file.data)
-        field = model.model_fields.get(str(path[-1])) if model else None
+        field = keys_of(model).get(str(path[-1])) if model else None
         return f"is missing{'' if field is None else _about(str(path[-1]), field)}"
     if kind == "extra_forbidden":
         model = _section(path[:-1], file.data)
         counted = getattr(model, "counted", "")
         if counted and path[-1] in ("columns", "rows"):
             return f"not a key any more; {_counts_before(file.data['targets'][path[1]], counted)}"
-        return suggestion(str(path[-1]), list(model.model_fields) if model else [])
+        return suggestion(str(path[-1]), list(keys_of(model)) if model else [])
     if kind == "literal_error":
         section = " or a section" if path == ("noise",) else ""
         return f"{shown(given)}; give {context['expected']}{section}"
@@ -172,7 +178,7 @@ def _words(fault: ErrorDetails, path: KeyPath, file: YamlFile) -> str:
         return f"is missing: give one of {', '.join(_TARGETS)}"
     if kind in ("model_type", "model_attributes_type"):
         model = _section(path, file.data)
-        keys = f" with {', '.join(model.model_fields)}" if model else " with type and sizes"
+        keys = f" with {', '.join(keys_of(model))}" if model else " with type and sizes"
         return f"{shown(given)}; give a section{keys}"
     if kind in _KINDS:
         return f"{shown(given)}; {_KINDS[kind]}"
@@ -202,5 +208,12 @@ def _section(path: KeyPath, data: Any) -> type[BaseModel] | None:
         return _TARGETS.get(kind) if isinstance(kind, str) else None
     if len(path) == 4 and path[0] == "targets" and path[2] == "layout":
         return target_sections.BundleTagPlace
-    general = tuple("*" if i == 1 and path[0] == "sensors" else key for i, key in enumerate(path))
+    if len(path) == 2 and path[0] == "sensors":
+        sensor = data["sensors"][path[1]]
+        has_odometry = isinstance(sensor, dict) and "odometry" in sensor
+        return odometry_section.OdometrySensor if has_odometry else sections.Sensor
+    lists = path[:1] == ("given",)
+    general = tuple(
+        "*" if (i == 1 and path[0] == "sensors") or (i == 2 and lists) else key for i, key in enumerate(path)
+    )
     return _SECTIONS.get(general)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
+from pydantic.fields import FieldInfo
 
 
 class Section(BaseModel):
@@ -26,3 +27,8 @@ def one_of(*choices: str | tuple[str, ...], together: tuple[tuple[str, ...], ...
     if together:
         said["dependencies"] = {first: others for first, *others in together}
     return ConfigDict(json_schema_extra=said)
+
+
+def keys_of(section: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The fields of a section by the keys that rig files have for them."""
+    return {field.alias or name: field for name, field in section.model_fields.items()}

@@ -224,7 +224,7 @@ class Sensor(Section):
         if len(given) != 1:
             raise ValueError(
                 f"{' and '.join(given) or 'nothing'} given; give one of images (a topic of a log, or a path in a "
-                "folder) and detections (a topic)"
+                "folder) and detections (a topic); a sensor that knows only its own motion has odometry"
             )
         if self.poses is not None and self.images is None:
             raise ValueError("poses go with images in a folder; poses of detections are in the log")

@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from gtsam_rwhec.files.yaml_lines import KeyPath
+from gtsam_rwhec.rig.given_section import GivenSection
 from gtsam_rwhec.rig.intrinsics_section import ESTIMATE, Intrinsics
 from gtsam_rwhec.rig.rig import RigFile
 
@@ -21,7 +22,9 @@ _COLUMN = 30
 #: A line has at most this many characters; longer comments stand on lines of their own.
 _WIDTH = 120
 #: These sections are written key by key, each on its line. All others are written in one line.
-_BLOCKS = ("carriers", "sensors", "targets", "detection", "cleaning")
+_BLOCKS = ("carriers", "sensors", "targets", "detection", "cleaning", "given")
+#: This section is not written: nothing is given.
+NONE = GivenSection()
 #: Each line gets this comment.
 _REMARKS: dict[KeyPath, str] = {
     ("carriers",): "the frames that carry the sensors and the targets",
@@ -30,6 +33,8 @@ _REMARKS: dict[KeyPath, str] = {
     ("targets",): "lengths in metres, as measured on the print",
     ("sizes",): "of the targets: known, check or estimate",
     ("noise",): "of the detections: estimate, {rotation_deg, translation_mm} or {corner_px}",
+    ("reference",): "the sensor that carries the others: poses are in its frame",
+    ("given",): "what a person measured",
     ("cleaning", "max_rotation_deg_s"): "measurements in faster motion are removed; null: none is",
 }
 
@@ -46,7 +51,7 @@ def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
     """
     said = {**_REMARKS, **(remarks or {})}
     lines = []
-    for path, text in _lines((name, getattr(rig, name)) for name in RigFile.model_fields):
+    for path, text in _lines(_sections(rig)):
         remark = said.get(path)
         if remark is None and path[:1] == ("sensors",) and path[2:] == ("time_offset",):
             remark = "s: the sensor's stamp t is the carriers' t + offset; or the word estimate"
@@ -57,6 +62,14 @@ def rig_text(rig: RigFile, remarks: Mapping[KeyPath, str] | None = None) -> str:
             line = text
         lines.append(line)
     return "\n".join(lines) + "\n"
+
+
+def _sections(rig: RigFile) -> Iterator[tuple[str, Any]]:
+    """The sections by their keys, without what follows from the others."""
+    for name, field in RigFile.model_fields.items():
+        follows = name == "carriers" and rig.reference is not None
+        if not follows and not (name == "targets" and not rig.targets) and not (name == "given" and rig.given == NONE):
+            yield field.alias or name, getattr(rig, name)
 
 
 def _lines(items: Iterable[tuple[str, Any]], path: KeyPath = ()) -> Iterator[tuple[KeyPath, str]]:
@@ -78,6 +91,8 @@ def _value(value: Any) -> str:
         return ESTIMATE
     if isinstance(value, BaseModel):  # in one line, without what is not given
         return "{" + ", ".join(f"{key}: {_value(item)}" for key, item in value if item is not None) + "}"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_value(item)}" for key, item in value.items()) + "}"
     if isinstance(value, tuple):
         return "[" + ", ".join(map(_value, value)) + "]"
     return _scalar(value)

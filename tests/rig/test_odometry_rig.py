@@ -1,0 +1,124 @@
+"""Rig files with sensors that know only their own motion: what they say, and every fault with its line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jsonschema
+import pytest
+from rig_texts import MINIMAL
+
+from gtsam_rwhec.errors import RigError
+from gtsam_rwhec.files.yaml_lines import parse_yaml
+from gtsam_rwhec.rig import GivenDistance, OdometryNoiseSection, parse_rig, rig_file_schema, rig_text
+
+VEHICLE = """\
+reference: lidar_front
+sensors:
+  lidar_front: {odometry: {topic: /front/odom}}
+  lidar_rear:
+    odometry: {topic: /rear/odom, noise: {rotation_deg_per_sqrt_s: 0.05, translation_mm_per_sqrt_s: 4}}
+    time_offset: estimate
+  camera_left: {odometry: {tf: [vo, cam], scale: estimate, noise: estimate}, frame: cam_left_optical}
+  wheels: {odometry: {file: wheels.tum}}
+given:
+  heights_m: {lidar_front: 0.52, lidar_rear: 0.71}
+  ground: {up: [0, 0, 2], below_m: 0.52}
+  directions: [{sensor: wheels, of: lever_arm, in_reference: [1, 0, 0]}]
+  distances:
+    - {between: [lidar_front, lidar_rear], distance_m: 2.41}
+"""
+MIXED = MINIMAL.replace("sensors: {", "sensors: {wheels: {odometry: {topic: /odom}}, ")
+VALIDATOR = jsonschema.Draft7Validator(rig_file_schema())
+
+
+def lists(node: Any) -> Any:
+    if isinstance(node, dict):
+        return {key: lists(value) for key, value in node.items()}
+    return [lists(value) for value in node] if isinstance(node, tuple) else node
+
+
+def schema_faults(text: str) -> list[str]:
+    return [error.message for error in VALIDATOR.iter_errors(lists(parse_yaml(text, "rig.yaml").data))]
+
+
+def test_the_reference_carries_the_others() -> None:
+    rig = parse_rig(VEHICLE, "rig.yaml")
+    assert (rig.carriers.sensors, rig.carriers.targets) == ("lidar_front", "lidar_front_start")
+    assert rig.carriers.poses.topic == "/front/odom"
+    assert rig.calibrated == ("lidar_rear", "camera_left", "wheels")
+    assert (list(rig.sensors), len(rig.odometries), rig.targets) == ([], 4, {})
+    assert (rig.frame_of("lidar_front"), rig.frame_of("camera_left")) == ("lidar_front", "cam_left_optical")
+    assert rig.odometries["lidar_rear"].odometry.noise == OdometryNoiseSection(
+        rotation_deg_per_sqrt_s=0.05, translation_mm_per_sqrt_s=4.0
+    )
+    assert rig.odometries["camera_left"].odometry.noise is None
+    assert rig.given.ground is not None
+    assert rig.given.ground.up == (0.0, 0.0, 1.0)
+    assert rig.given.distances == (GivenDistance(between=("lidar_front", "lidar_rear"), distance_m=2.41),)
+
+
+@pytest.mark.parametrize("text", [VEHICLE, MIXED], ids=["vehicle", "mixed"])
+def test_what_is_written_reads_back_equal_and_the_schema_takes_it(text: str) -> None:
+    rig = parse_rig(text, "rig.yaml")
+    assert parse_rig(rig_text(rig), "written") == rig
+    assert schema_faults(text) == []
+    assert schema_faults(rig_text(rig)) == []
+
+
+def test_a_reference_of_tf_names_both_frames() -> None:
+    text = VEHICLE.replace("reference: lidar_front", "reference: wheels").replace("{file: wheels.tum}", "{tf: [o, w]}")
+    rig = parse_rig(text.partition("given:")[0], "rig.yaml")
+    assert (rig.carriers.sensors, rig.carriers.targets, rig.carriers.poses.tf) == ("w", "o", ("o", "w"))
+
+
+def test_cameras_and_odometries_are_told_apart_in_a_mixed_rig() -> None:
+    rig = parse_rig(MIXED, "rig.yaml")
+    assert (list(rig.sensors), list(rig.odometries), rig.calibrated) == (["cam"], ["wheels"], ("wheels", "cam"))
+    with pytest.raises(RigError, match=r"line 3: targets: none; give at least one target"):
+        parse_rig(MIXED.replace("{tag: {type: tag, family: tag36h11, id: 3, size_m: 0.1}}", "{}"), "rig.yaml")
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "line", "words"),
+    [
+        ("reference: lidar_front", "reference: lidar_frnt", 1, "reference: there is no sensor 'lidar_frnt'; did you"),
+        ("reference: lidar_front\n", "", 1, "carriers: is missing: .* such as reference: lidar_front"),
+        ("reference: lidar_front", "reference: 3", 1, "reference: 3; give the name of a sensor"),
+        ("reference: lidar_front", "reference: camera_left", 1, "reference: lengths of camera_left are not known"),
+        (
+            "sensors:",
+            "carriers: {sensors: a, targets: b, poses: {tf: [a, b]}}\nsensors:",
+            1,
+            "reference: lidar_front carries the sensors, and so does a of carriers",
+        ),
+        ("scale: estimate", "scale: guess", 7, "odometry.scale: 'guess'; give 'known' or 'estimate'"),
+        ("scale: estimate", "scal: estimate", 7, r"odometry.scal: unknown key; did you mean scale\?"),
+        ("/rear/odom", "/front/odom", 5, "topic /front/odom is also the odometry of sensor lidar_front"),
+        ("topic: /rear/odom, ", "topic: /r, file: x, ", 5, "odometry: topic and file given; give one of topic"),
+        ("{file: wheels.tum}", "3", 8, "sensors.wheels.odometry: 3; give a section with topic, tf, file, scale"),
+        ("    time_offset", "    images: /i\n    time_offset", 6, "lidar_rear.images: unknown key; known keys are odom"),
+        ("/front/odom}}", "/front/odom}, time_offset: 0.1}", 3, "time_offset: 0.1, and its clock is the one"),
+        ("lidar_rear: 0.71", "lidar_rare: 0.71", 10, "lidar_rare: there is no sensor lidar_rare .* mean lidar_rear"),
+        ("below_m: 0.52", "below_m: 0.62", 10, "heights_m.lidar_front: 0.52 m above the ground, and given.ground"),
+        ("{lidar_front: 0.52, lidar_rear: 0.71}\n  ground: {up: [0, 0, 2], below_m: 0.52}", "{lidar_rear: 1}", 10,
+         "heights are compared with that of the reference"),
+        ("[0, 0, 2]", "[0, 0, 0]", 11, "given.ground.up: .* no direction; give three numbers"),
+        ("sensor: wheels", "sensor: lidar_front", 12, "lidar_front is the reference, in whose axes"),
+        ("of: lever_arm", "of: w", 12, r"given.directions\[0\].of: 'w'; give 'x', 'y', 'z' or 'lever_arm'"),
+        ("distance_m: 2.41", "distance_m: 0.1", 14, "the heights of lidar_front and lidar_rear differ by 0.19 m"),
+        ("distance_m: 2.41", "distance: 2.41", 14, r"distance: unknown key; did you mean distance_m\?"),
+        ("[lidar_front, lidar_rear]", "[wheels, wheels]", 14, "wheels twice; name two sensors"),
+        ("given:", "targets: {t: {type: tag, family: tag36h11, id: 3, size_m: 0.1}}\ngiven:", 9, "no sensor sees them"),
+    ],
+    ids=lambda value: str(value).split("\n")[0][:40],
+)  # fmt: skip
+def test_every_fault_has_its_line(right: str, wrong: str, line: int, words: str) -> None:
+    assert right in VEHICLE
+    with pytest.raises(RigError, match=rf"rig\.yaml, line {line}: .*{words}"):
+        parse_rig(VEHICLE.replace(right, wrong, 1), "rig.yaml")
+
+
+def test_given_needs_a_reference() -> None:
+    with pytest.raises(RigError, match=r"line 4: given: is used with reference: NAME"):
+        parse_rig(MIXED + "given: {heights_m: {wheels: 0.3}}\n", "rig.yaml")
