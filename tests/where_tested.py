@@ -153,6 +153,7 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_real_dataset.py": "driver_detections",
         "pipeline/test_commands.py": "log_metadata",
         "pipeline/test_verified_log.py": "old_calibration",
+        "pipeline/test_mixed_odometry.py": "comparable_noise odometry_pairs odometry_tracks odometry_windows",
         "pipeline/test_synthetic_calibration.py": (
             "carrier_motion cleaning_stage detection_stage detections_in_images image_detections measured_pairs "
             "sensor_detections settled_poses solution_frames solution_plots solved_log solving_rounds solving_stage"
@@ -218,6 +219,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/rig": {
         "rig/test_rig_faults.py": "contradictions",
+        "rig/test_odometry_rig.py": "given_section odometry_contradictions odometry_section reference_carrier",
         "export/test_exported_files.py": "camera_link",
         "reprojection/test_corners_in_files.py": "refined_frames",
         "rig/test_rig_file.py": "field_types intrinsics_section rig section sections target_sections written_rig",

@@ -24,6 +24,8 @@ class RemovalReason(StrEnum):
     NO_CONSENSUS = "the pair has no consensus (share that agrees)"
     ROTATION_OFF = "rotation off the pair's consensus (rad)"
     TRANSLATION_OFF = "translation off the pair's consensus (m)"
+    ODOMETRY_GAP = "gap in the odometry"
+    ODOMETRY_STEP = "step of the odometry that nothing drives (lost tracking)"
     OUTLIER = "outlier (robust estimation)"
     STAMPS_APART = "stamps apart (s)"
     FIRST_SENSOR_STEP_M = "step of the first sensor (m)"

@@ -79,13 +79,13 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     parent, child = source.parent_and_child
     if source.topic is None:
         try:
-            parent, child, stamps, T = _from_tf(log, parent, child, rig.carriers.sensors)
+            parent, child, stamps, T = poses_of_tf(log, parent, child, rig.carriers.sensors)
         except TransformError as error:
             raise TransformError(f"{error} ({rig.source.place(('carriers', 'poses'))})") from error
         where = f"tf {parent} to {child}"
     else:
         where = f"topic {source.topic}"
-        stamps, T = _from_topic(log, source.topic)
+        stamps, T = poses_of_topic(log, source.topic)
     if len(log.files) > 1:
         _check_one_pose_a_stamp(log, source.topic)
     # The pose of a child frame is noisy about and along the child's own axes.
@@ -98,7 +98,7 @@ def read_carrier_motion(log: Log, rig: Rig) -> CarrierMotion:
     return CarrierMotion(Trajectory.of(stamps, T, where), carrier_noise, about)
 
 
-def _from_tf(log: Log, parent: str, child: str, of_sensors: str) -> tuple[str, str, np.ndarray, Array]:
+def poses_of_tf(log: Log, parent: str, child: str, of_sensors: str) -> tuple[str, str, np.ndarray, Array]:
     """The frames, the upper one in tf first, whatever the order in which they were named; stamps and poses.
 
     Of frames on two branches of the tree, the carrier of the sensors is the child.
@@ -140,7 +140,8 @@ def _no_transforms(log: Log, topics: list[Topic]) -> str:
     )
 
 
-def _from_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
+def poses_of_topic(log: Log, topic: str) -> tuple[np.ndarray, Array]:
+    """Stamps and poses of a topic; `StampError` as `check_order`."""
     in_order = [r.stamp_ns for r in log.records([topic]) if isinstance(r, PoseRecord)]
     check_order(np.array(in_order, dtype=np.int64), f"topic {topic}")
     series = log.poses(topic)
@@ -161,7 +162,7 @@ def _check_one_pose_a_stamp(log: Log, topic: str | None) -> None:
         if topic is None:
             links.update(TfBuffer(alone.records(names)).moving_links())
         else:
-            links[topic] = _from_topic(alone, topic)
+            links[topic] = poses_of_topic(alone, topic)
         for other, theirs in before:
             for name in links.keys() & theirs.keys():
                 (stamps, T), (their_stamps, their_T) = links[name], theirs[name]

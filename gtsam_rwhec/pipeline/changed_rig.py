@@ -97,6 +97,11 @@ def _of_cleaning(made_with: Rig, rig: Rig) -> Iterator[str]:
     for name, sensor in rig.sensors.items():
         if name in made_with.sensors and made_with.sensors[name].time_offset != sensor.time_offset:
             yield f"sensors.{name}.time_offset"
+    for name, odometry in rig.odometries.items():
+        if made_with.odometries.get(name) != odometry:
+            yield f"sensors.{name}"
+    if made_with.reference != rig.reference:
+        yield "reference"
     if made_with.cleaning.model_copy(update={"robust": rig.cleaning.robust}) != rig.cleaning:
         yield "cleaning"
 

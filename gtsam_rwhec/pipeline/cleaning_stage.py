@@ -29,6 +29,8 @@ from gtsam_rwhec.pipeline.clocks_by_turning import offset_of_either_direction
 from gtsam_rwhec.pipeline.log_contract import topics_up_to_detection
 from gtsam_rwhec.pipeline.log_metadata import read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, write_pairs
+from gtsam_rwhec.pipeline.odometry_pairs import odometry_pairs
+from gtsam_rwhec.pipeline.odometry_tracks import write_files
 from gtsam_rwhec.pipeline.output_paths import check_writable
 from gtsam_rwhec.pipeline.tracks import Track, read_tracks
 from gtsam_rwhec.results.log_history import CleaningReport
@@ -82,7 +84,8 @@ def clean_log(
         rig = rig_for_cleaning(log, rig)
         metadata = read_metadata(log)
         tell("reading the carriers' poses")
-        path = read_carrier_motion(log, rig).trajectory
+        motion = read_carrier_motion(log, rig)
+        path = motion.trajectory
         pairs: list[MeasuredPairs] = []
         offsets_s: dict[str, float] = {}
         sigmas_s: dict[str, float] = {}
@@ -100,6 +103,12 @@ def clean_log(
                 sigmas_s[sensor] = sigma_s
             _check_overlap(tracks, path, sensor, offsets_s[sensor])
             pairs += [clean_track(track, path, rig, offsets_s[sensor]) for track in tracks]
+        for sensor in (name for name in rig.odometries if name != rig.reference):
+            tell(f"comparing the motions of {sensor}")
+            motions, offsets_s[sensor], sigma_s = odometry_pairs(log, rig, sensor, motion)
+            if sigma_s is not None:
+                sigmas_s[sensor] = sigma_s
+            pairs.append(motions)
         report = CleaningReport(
             tracks=tuple(measured.count for measured in pairs), time_offsets_s=offsets_s, coarse_sigma_s=sigmas_s
         )
@@ -114,6 +123,7 @@ def clean_log(
         tell("writing pairs")
         with LogWriter(out_path) as out:
             out.copy(log, topics_up_to_detection(log), images)
+            write_files(out, log, rig)
             write_pairs(out, pairs)
             replace(metadata, rig=rig, cleaning=report).write(out)
     return report

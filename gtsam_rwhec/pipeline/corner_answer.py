@@ -71,6 +71,8 @@ def _from_corners(
 ) -> CornersFound:
     rig, motion = rounds.rig, rounds.motion
     used = {pair: measured for pair, measured in settled.pairs.pairs.items() if measured.used.any()}
+    if rig.odometries and any(pair.is_motion for pair in used):
+        return CornersFound.none("the poses of targets are solved together with the motions of odometries")
     without = [name for name in dict.fromkeys(pair.sensor for pair in used) if name not in cameras]
     if without:
         return CornersFound.none(f"the log has no intrinsics of {', '.join(without)}")

@@ -28,6 +28,7 @@ from gtsam_rwhec.pipeline.likely_causes import likely_causes
 from gtsam_rwhec.pipeline.log_contract import annotations_topic, detections_topic, poses_topic, raw_topics
 from gtsam_rwhec.pipeline.log_metadata import LogMetadata
 from gtsam_rwhec.pipeline.no_detections import no_detections
+from gtsam_rwhec.pipeline.odometry_tracks import write_files
 from gtsam_rwhec.pipeline.output_paths import check_is_not_read, check_writable
 from gtsam_rwhec.pipeline.seen_sheet import write_contact_sheet
 from gtsam_rwhec.pipeline.sensor_detections import detection_report
@@ -116,13 +117,14 @@ def detect_log(
         tell("looking for what hides targets")
         blurred, likely = blurred_images(log, rig, cameras, found), likely_causes(log, rig, cameras, found)
         report = report.model_copy(update={"likely": likely, "blurred": blurred})
-        if not any(track.used for track in report.tracks):
+        if rig.sensors and not any(track.used for track in report.tracks):
             report = report.model_copy(update={"likely": (*(f"{words}." for words in blurred), *likely)})
             shown = f" {sheet} shows some of the images." if has_sheet else ""
             raise LogError(f"{no_detections(log, report)}{shown}")
         tell("writing detections")
         with LogWriter(out_path) as out:
             out.copy(log, raw_topics(log), images)
+            write_files(out, log, rig)
             for sensor, of_sensor in found.items():
                 _write_detections(out, sensor, of_sensor.records)
             LogMetadata(rig, cameras, report, image_names=image_names(log)).write(out)

@@ -1,6 +1,7 @@
 """The contract of the stages: the names under which one stage writes and the next stage reads.
 
-Detection copies the raw log and adds `detections_topic`, `annotations_topic` and `poses_topic` of each sensor. Cleaning
+Detection copies the raw log and adds `detections_topic`, `annotations_topic` and `poses_topic` of each sensor, and the
+odometries that are in files. Cleaning
 copies the detected log and adds `pairs_topic` of each sensor. Solving copies the cleaned log, replaces its pairs by the
 pairs that the answer was computed from, and adds `SOLUTION_TOPIC`. Each stage writes the metadata of the stages before
 it again.
@@ -19,7 +20,7 @@ Kind = TypeVar("Kind", bound=Record)
 #: This topic has the calibrated frames as static transforms, which viewers show at any time.
 SOLUTION_TOPIC = "/calibration/tf_static"
 #: Detection writes topics with these names.
-_OF_DETECTION = re.compile(r"/calibration/.+/(detections|annotations|poses)")
+_OF_DETECTION = re.compile(r"/calibration/.+/(detections|annotations|poses|odometry)")
 #: Cleaning and solving write topics with these names.
 _OF_CLEANING_AND_SOLVING = re.compile(r"/calibration/(.+/pairs|tf_static)")
 

@@ -19,10 +19,16 @@ from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.trajectories.trajectory import Trajectory
 from gtsam_rwhec.vision.rejection import Rejection
 
+#: Noise of a target's poses where nothing is known yet: 5 mm and half a degree. It is estimated from there.
+BEFORE_ESTIMATE = {"sigma": 0.005, "kappa": 1.0 / (2.0 * np.radians(0.5) ** 2)}
+
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPairs(Track):
-    """A track with the carriers' pose at each stamp: A (N, 4, 4), T_sensorcarrier_targetcarrier, metres."""
+    """A track with the carriers' pose at each stamp: A (N, 4, 4), T_sensorcarrier_targetcarrier, metres.
+
+    Of a sensor with odometry, whose name is also the target's, A and B are motions over windows that end at the stamps.
+    """
 
     A: Array
 
@@ -58,8 +64,9 @@ def write_pairs(out: LogWriter, pairs: Iterable[MeasuredPairs]) -> None:
 def read_pairs(log: Log, rig: Rig) -> dict[Pair, MeasuredPairs]:
     """Read the pairs of the rig file's sensors and targets from a cleaned log, in order of time."""
     found: dict[Pair, list[PairRecord]] = defaultdict(list)
-    for record in records_of(log, map(pairs_topic, rig.sensors), PairRecord):
-        if record.target in rig.targets and record.sensor in rig.sensors:
+    for record in records_of(log, map(pairs_topic, rig.all_sensors), PairRecord):
+        of_motion = record.target == record.sensor and record.sensor in rig.odometries
+        if of_motion or (record.target in rig.targets and record.sensor in rig.sensors):
             found[Pair(record.target, record.sensor)].append(record)
     return {pair: _stacked(pair, sorted(found[pair], key=lambda r: r.stamp_ns)) for pair in sorted(found)}
 
@@ -99,15 +106,28 @@ def problem_of(
     targets `free_sizes` are estimated. Raises `NoiseError` if the rig file says ``noise: {corner_px: ...}`` and a
     measurement has no covariance, or a covariance is not positive definite.
     """
-    problem = Problem("per_target" if free_sizes else "known")
+    free = {*free_sizes, *(name for name, one in rig.odometries.items() if one.odometry.scale == "estimate")}
+    problem = Problem("per_target" if free else "known")
     noise = rig.noise
     stated: dict[str, object] = {}
     if noise != "estimate" and noise.rotation_deg is not None and noise.translation_mm is not None:
         stated = {"sigma": 1e-3 * noise.translation_mm, "kappa": 1.0 / (2.0 * np.radians(noise.rotation_deg) ** 2)}
     has_covariances = all(measured.covariance is not None for measured in pairs.values())
+    if rig.odometries and not has_covariances and noise == "estimate":
+        stated = BEFORE_ESTIMATE  # motions have weights, beside which measurements without any are lost
     for pair, measured in pairs.items():
         used = measured.used
         if not used.any():
+            continue
+        if pair.is_motion:
+            problem.add_motion(
+                pair.sensor,
+                measured.A[used],
+                measured.B[used],
+                stamps_ns=measured.stamps_ns[used] + round(1e9 * offsets_s.get(pair.sensor, 0.0)),
+                covariances=measured.covariance[used] if measured.covariance is not None else None,
+                source="the cleaned log",
+            )
             continue
         weights = stated
         if not stated and has_covariances:
@@ -132,8 +152,8 @@ def problem_of(
                 f"{error}. The covariances are the log's; to replace them, give noise: {{rotation_deg: ..., "
                 "translation_mm: ...}} in the rig file"
             ) from error
-    if free_sizes:
-        for target in problem.targets:
-            if target not in free_sizes:
-                problem.fix_scale(target)
+    if free:
+        for name in dict.fromkeys(pair.target for pair in problem.pairs):
+            if name not in free:
+                problem.fix_scale(name)
     return problem

@@ -63,6 +63,7 @@ def seen_in_log(solved: Solved, log_path: str | Path, pictures: Pictures | None)
         lambda target, sensor: of_tracks.get(f"{target}/{sensor}") if found is None else found.corner_px,
     )
     topics = {sensor: source.images or "" for sensor, source in solved.rig.sensors.items()}
+    topics |= dict.fromkeys(solved.rig.odometries, "")
 
     worst = worst_views(rated)
     images, names, why_not = images_of(pictures, solved.rig, worst)

@@ -19,7 +19,7 @@ BOARDS_ALONE = "estimated from views of boards alone, before the poses; standard
 def frames_of(solved: Solved) -> RigFrames:
     """The calibrated frames; a sensor has the name of its frame, and estimated intrinsics if there are any."""
     rig, refined = solved.rig, solved.refined
-    missing = [name for name in (*rig.sensors, *rig.targets) if name not in refined.X and name not in refined.Y]
+    missing = [name for name in (*rig.calibrated, *rig.targets) if name not in refined.X and name not in refined.Y]
     frame = {name: rig.frame_of(name) for name in refined.Y}
     cameras, of_corners = known_cameras(solved.cameras, refined.intrinsics)
     origins = origins_before_corners(rig, cameras) | of_corners

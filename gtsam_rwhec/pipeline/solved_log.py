@@ -80,7 +80,7 @@ def read_solved(path: str | Path) -> Solved:
             raise LogError(f"{path}, attachment {RESULT_FILE}: it is not the refined calibration of a log")
         rig = read_embedded_rig(log)
         refined, pairs = result.refined, read_pairs(log, rig)
-    strangers = [*(set(refined.X) - set(rig.targets)), *(set(refined.Y) - set(rig.sensors))]
+    strangers = [*(set(refined.X) - set(rig.targets)), *(set(refined.Y) - set(rig.all_sensors))]
     if strangers or not pairs:
         why = f"frames that its rig file lacks: {', '.join(sorted(strangers)[:10])}" if strangers else "no measurements"
         raise LogError(f"{path} has a {RESULT_FILE}, and {why}: they are not of one calibration")

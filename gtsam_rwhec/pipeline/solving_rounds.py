@@ -226,6 +226,7 @@ class SolvingRounds:
                 is_free=False,
             )
             for target, scale in refined.scale.items()
+            if target in stated  # odometries have a scale of their own, and no size
         )
 
 

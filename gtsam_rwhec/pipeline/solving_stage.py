@@ -17,6 +17,7 @@ from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.logs import open_log
 from gtsam_rwhec.pipeline.carrier_motion import read_carrier_motion
 from gtsam_rwhec.pipeline.changed_rig import rig_for_solving
+from gtsam_rwhec.pipeline.comparable_noise import with_comparable_noise
 from gtsam_rwhec.pipeline.doubted_intrinsics import doubted_intrinsics, finding_against
 from gtsam_rwhec.pipeline.doubted_shapes import continued_boards, doubted_shapes
 from gtsam_rwhec.pipeline.first_answer import first_answer
@@ -42,7 +43,7 @@ from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind
 from gtsam_rwhec.results.judging import judge
 from gtsam_rwhec.results.log_history import LogFields, OutlierCount, SizeFields, TimeOffsetFields, contradictions
 from gtsam_rwhec.results.unanswered import short_of_measurements
-from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig import GivenSection, Rig
 from gtsam_rwhec.solving.solution import Solution
 from gtsam_rwhec.vision.camera import Camera
 
@@ -116,6 +117,11 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     """
     with open_log(clean_path) as log:
         rig = rig_for_solving(log, rig)
+        if rig.given != GivenSection():
+            raise LogError(
+                f"{rig.source.place(('given',))}: what is given is not used where cameras see targets beside odometries; "
+                "leave it out, or calibrate the odometries alone"
+            )
         metadata, cleaning = read_metadata(log), read_cleaning_report(log)
         pairs = read_pairs(log, rig)
         used_sensors = {measured.sensor for measured in pairs.values() if measured.used.any()}
@@ -133,7 +139,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     if missing:
         raise LogError(f"{clean_path}, metadata {CLEANING_METADATA}: no time offset of {', '.join(missing)}")
     rounds = SolvingRounds(rig, motion, estimated, progress or silent)
-    given = rounds.at(without_outlier_marks(pairs), cleaning.time_offsets_s)
+    given = with_comparable_noise(rounds, rounds.at(without_outlier_marks(pairs), cleaning.time_offsets_s))
     stated = [name for name in rig.sensors if name in used_sensors and name not in estimated]
     stated_s = {name: given.offsets_s.get(name, 0.0) for name in stated}
     first = first_answer(rounds, given, logged, metadata.cameras, stated_s, doubted)
@@ -178,6 +184,15 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
             )
             for name in rig.sensors
             if name in offsets
+        )
+        + tuple(
+            TimeOffsetFields(
+                sensor=name,
+                offset_s=cleaning.time_offsets_s[name],
+                sigma_s=cleaning.coarse_sigma_s.get(name),
+            )
+            for name in rig.odometries
+            if name in cleaning.time_offsets_s
         ),
         contradicted=contradictions(outliers),
     )

@@ -34,7 +34,10 @@ def check_topics(log: Log, rig: Rig) -> None:
     there = {topic.name for topic in log.topics()}
     _check_types(log, rig)
     for path, topic in _named(rig):
-        if topic not in there and path[-1] != "topic":  # the reader of intrinsics says what else there is
+        if topic not in there and path[-2:] != (
+            "intrinsics",
+            "topic",
+        ):  # the reader of intrinsics says what else there is
             raise LogError(
                 f"{rig.source.place(path)}: {log.files[0].path} has no topic {topic}; it has: {log.topics_in_words()}."
             )
@@ -59,7 +62,13 @@ def _check_types(log: Log, rig: Rig) -> None:
     for path, name in named:
         topic = of_topic.get(name)
         if topic is not None and topic.unreadable:
-            what = "poses" if path[0] == "carriers" else "intrinsics" if path[-1] == "topic" else str(path[-1])
+            what = (
+                "poses"
+                if path[0] == "carriers" or path[-2] == "odometry"
+                else "intrinsics"
+                if path[-1] == "topic"
+                else str(path[-1])
+            )
             can = [each.name for each in of_topic.values() if each.schema.replace("/msg/", "/") in READ[what]]
             raise LogError(
                 f"{rig.source.place(path)}: {log.files[0].path}, topic {name}: {topic.unreadable}. The types of {what} "
@@ -75,6 +84,9 @@ def _named(rig: Rig) -> Iterator[tuple[KeyPath, str]]:
                 yield ("sensors", name, key), topic
         if sensor.intrinsics is not None and sensor.intrinsics.topic is not None:
             yield ("sensors", name, "intrinsics", "topic"), sensor.intrinsics.topic
+    for name, moving in rig.odometries.items():
+        if moving.odometry.topic is not None:
+            yield ("sensors", name, "odometry", "topic"), moving.odometry.topic
 
 
 def _frame_of(log: Log, topic: str) -> str:
