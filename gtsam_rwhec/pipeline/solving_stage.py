@@ -119,7 +119,7 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
         rig = rig_for_solving(log, rig)
         if rig.given != GivenSection():
             raise LogError(
-                f"{rig.source.place(('given',))}: what is given is not used where cameras see targets beside odometries; "
+                f"{rig.source.place(('given',))}: what is given is not used where cameras see targets; "
                 "leave it out, or calibrate the odometries alone"
             )
         metadata, cleaning = read_metadata(log), read_cleaning_report(log)
