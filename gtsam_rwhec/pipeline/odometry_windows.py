@@ -67,7 +67,7 @@ def odometry_windows(
     """
     own = Trajectory(np.asarray(track.stamps_ns), np.asarray(track.T_start_sensor), track.sensor)
     step = float(np.median(np.diff(own.stamps_ns))) * 1e-9
-    best: tuple[float, tuple[Array, ...]] | None = None
+    best: tuple[float, tuple[np.ndarray, np.ndarray, Array, Array]] | None = None
     chosen_s = LENGTHS_S[0]
     for length_s in LENGTHS_S:
         if length_s < 2.0 * step and length_s != LENGTHS_S[-1]:
@@ -131,7 +131,9 @@ def found_noise(A: Array, B: Array, window_s: float, *, has_unknown_scale: bool)
     )
 
 
-def _motions(own: Trajectory, path: Trajectory, offset_s: float, length_s: float) -> tuple[Array, ...]:
+def _motions(
+    own: Trajectory, path: Trajectory, offset_s: float, length_s: float
+) -> tuple[np.ndarray, np.ndarray, Array, Array]:
     """Ends of windows (N, 2) on both clocks, A and B; windows in the time that both have."""
     shift_ns, length_ns = round(1e9 * offset_s), round(1e9 * length_s)
     first = max(int(own.stamps_ns[0]), int(path.stamps_ns[0]) - shift_ns)
@@ -145,8 +147,8 @@ def _motions(own: Trajectory, path: Trajectory, offset_s: float, length_s: float
 def _reasons(
     own: Trajectory,
     path: Trajectory,
-    edges_ns: Array,
-    edges_of_path_ns: Array,
+    edges_ns: np.ndarray,
+    edges_of_path_ns: np.ndarray,
     A: Array,
     window_s: float,
     source: OdometrySource,
@@ -172,28 +174,28 @@ def _reasons(
     return tuple(reasons.tolist())
 
 
-def _lost(own: Trajectory, edges_ns: Array, source: OdometrySource) -> np.ndarray:
+def _lost(own: Trajectory, edges_ns: np.ndarray, source: OdometrySource) -> np.ndarray:
     """Windows (N,) with a step beyond the gates (DQ paper, Appendix D.1, as speeds)."""
     step = se3.inverse(own.T[:-1]) @ own.T[1:]
     seconds = np.diff(own.stamps_ns) * 1e-9
     turned = np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1)
     wrong = turned > np.radians(source.max_turn_deg_s) * seconds
     if source.scale == "known":
-        wrong |= np.linalg.norm(step[:, :3, 3], axis=1) > source.max_speed_m_s * seconds
+        wrong = wrong | (np.linalg.norm(step[:, :3, 3], axis=1) > source.max_speed_m_s * seconds)
     return _contains(own.stamps_ns, wrong, edges_ns)
 
 
-def _gap(own: Trajectory, edges_ns: Array, max_gap_s: float) -> np.ndarray:
+def _gap(own: Trajectory, edges_ns: np.ndarray, max_gap_s: float) -> np.ndarray:
     return _contains(own.stamps_ns, np.diff(own.stamps_ns) > 1e9 * max_gap_s, edges_ns)
 
 
-def _unknown(path: Trajectory, edges_ns: Array, max_gap_s: float) -> np.ndarray:
+def _unknown(path: Trajectory, edges_ns: np.ndarray, max_gap_s: float) -> np.ndarray:
     """Windows (N,) at an end of which the carriers' pose is not known."""
     missing: np.ndarray = (path.gaps(edges_ns.reshape(-1)) > max_gap_s).reshape(-1, 2).any(axis=1)
     return missing
 
 
-def _contains(stamps_ns: np.ndarray, wrong: np.ndarray, edges_ns: Array) -> np.ndarray:
+def _contains(stamps_ns: np.ndarray, wrong: np.ndarray, edges_ns: np.ndarray) -> np.ndarray:
     """Windows (N,) that have a part of a wrong step (M - 1,)."""
     count = np.r_[0, np.cumsum(wrong)]
     first = np.clip(np.searchsorted(stamps_ns, edges_ns[:, 0], side="right") - 1, 0, len(wrong))
