@@ -179,9 +179,8 @@ def _lost(own: Trajectory, edges_ns: np.ndarray, source: OdometrySource) -> np.n
     step = se3.inverse(own.T[:-1]) @ own.T[1:]
     seconds = np.diff(own.stamps_ns) * 1e-9
     turned = np.linalg.norm(se3.so3_logmap(step[:, :3, :3]), axis=1)
-    wrong = turned > np.radians(source.max_turn_deg_s) * seconds
-    if source.scale == "known":
-        wrong = wrong | (np.linalg.norm(step[:, :3, 3], axis=1) > source.max_speed_m_s * seconds)
+    moved = np.linalg.norm(step[:, :3, 3], axis=1) if source.scale == "known" else np.zeros(len(step))
+    wrong = (turned > np.radians(source.max_turn_deg_s) * seconds) | (moved > source.max_speed_m_s * seconds)
     return _contains(own.stamps_ns, wrong, edges_ns)
 
 
