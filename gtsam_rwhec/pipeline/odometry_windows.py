@@ -190,8 +190,7 @@ def _gap(own: Trajectory, edges_ns: np.ndarray, max_gap_s: float) -> np.ndarray:
 
 def _unknown(path: Trajectory, edges_ns: np.ndarray, max_gap_s: float) -> np.ndarray:
     """Windows (N,) at an end of which the carriers' pose is not known."""
-    missing: np.ndarray = (path.gaps(edges_ns.reshape(-1)) > max_gap_s).reshape(-1, 2).any(axis=1)
-    return missing
+    return np.asarray((path.gaps(edges_ns.reshape(-1)) > max_gap_s).reshape(-1, 2).any(axis=1))
 
 
 def _contains(stamps_ns: np.ndarray, wrong: np.ndarray, edges_ns: np.ndarray) -> np.ndarray:
