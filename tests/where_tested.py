@@ -46,6 +46,8 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/changes": {
         "changes/test_comparing.py": "calibration_files comparable constant_errors quantities",
+        "changes/test_control_chart.py": "chart_limits nights",
+        "changes/test_charting.py": "change_found night_spread",
         "changes/test_verifying.py": "near_answer predictions verification",
     },
     "gtsam_rwhec/cleaning": {
@@ -92,6 +94,7 @@ TABLE: dict[str, dict[str, str]] = {
         "fleet/test_in_process.py": "attempts order",
         "fleet/test_stores.py": "byte_count store_requests",
         "fleet/test_dask_engine.py": "extras",
+        "fleet/test_watching.py": "night_rows watch_events watch_stream",
     },
     "gtsam_rwhec/handeye": {
         "handeye/test_certified.py": "chordal_form",

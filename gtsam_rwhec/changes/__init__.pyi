@@ -3,6 +3,8 @@ from .calibration_files import result_path as result_path
 from .change_test import LEVEL as LEVEL
 from .change_test import ChangeTest as ChangeTest
 from .change_test import GroupChange as GroupChange
+from .chart_limits import RATE as RATE
+from .chart_limits import checked_rate as checked_rate
 from .comparing import Difference as Difference
 from .comparing import NumberChange as NumberChange
 from .comparing import difference as difference

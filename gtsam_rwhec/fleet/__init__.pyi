@@ -16,3 +16,10 @@ from .tasks import Failed as Failed
 from .tasks import Receipt as Receipt
 from .tasks import Task as Task
 from .in_process import InProcess as InProcess
+
+# Drift of each robot over time.
+from .watching import RobotChart as RobotChart
+from .watching import Watched as Watched
+from .watching import watch as watch
+from .watch_events import AlarmEvent as AlarmEvent
+from .watch_stream import stream as stream
