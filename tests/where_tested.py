@@ -140,8 +140,14 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/odometry": {
         "odometry/test_calibrated.py": "found",
+        "odometry/test_calibrating.py": (
+            "clocks findings freedom given_rows other_answers refining result solved_windows up"
+        ),
+        "odometry/test_gates.py": "motions sampling window_choice",
         "odometry/test_given.py": "options",
         "odometry/test_odometry_tracks.py": "tracks",
+        "odometry/test_joint_solution.py": "joint_form",
+        "odometry/test_likelihood.py": "noise_by_residuals outlying unknowns window_motions",
     },
     "gtsam_rwhec/pipeline": {
         "test_gallery.py": "turned_images",

@@ -7,6 +7,9 @@ from .given import KnownDirection as KnownDirection
 from .options import OdometryOptions as OdometryOptions
 
 # The calibration, and what it found.
+from .calibrating import calibrate_odometries as calibrate_odometries
+from .motions import Motions as Motions
+from .motions import odometry_motions as odometry_motions
 from .calibrated import OdometryCalibration as OdometryCalibration
 from .found import JointCertificate as JointCertificate
 from .found import Windows as Windows

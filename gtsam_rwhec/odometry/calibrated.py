@@ -56,7 +56,9 @@ class OdometryCalibration:
     others : tuple of OtherAnswer
         Other answers that fit alike.
     findings : tuple of str
-        What a person should know, in sentences.
+        What is doubtful, in sentences: the verdict is to use the poses with care.
+    remarks : tuple of str
+        What was assumed, in sentences.
     """
 
     reference: str
@@ -77,6 +79,7 @@ class OdometryCalibration:
     influences: tuple[Influence, ...] = ()
     others: tuple[OtherAnswer, ...] = ()
     findings: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def status(self) -> Status:
@@ -128,6 +131,7 @@ def _in_words(found: OdometryCalibration) -> str:
     lines += [f"- free: {direction}" for direction in found.free_directions]
     lines += [f"- another answer: {other.why} (cost {other.cost_above:+.2g})" for other in found.others]
     lines += [f"- {finding}" for finding in found.findings]
+    lines += [f"- {remark}" for remark in found.remarks]
     lines.append(f"{found.certificate}")
     lines += [_sensor(found, name) for name in found.order]
     window = found.windows

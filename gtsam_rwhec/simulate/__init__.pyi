@@ -1,4 +1,7 @@
 from .camera_on_sphere import sphere as sphere
+from .drives import Drive as Drive
+from .drives import SimulatedOdometry as SimulatedOdometry
+from .drives import drive as drive
 from .fixed_cameras import cameras as cameras
 from .motion import Motion as Motion
 from .motion import carrier_poses as carrier_poses

@@ -1,0 +1,251 @@
+"""Calibrate sensors that know only their own motion, all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gtsam_rwhec.cleaning.removed import RemovalReason, Removed
+from gtsam_rwhec.errors import (
+    CountError,
+    FrameError,
+    OptionError,
+    OutlierError,
+    ScaleError,
+    StampError,
+    UnderdeterminedError,
+)
+from gtsam_rwhec.files.progress import Progress, check_progress, silent
+from gtsam_rwhec.geometry.blas_threads import one_blas_thread
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.odometry.calibrated import OdometryCalibration
+from gtsam_rwhec.odometry.clocks import Clock, first_offset
+from gtsam_rwhec.odometry.gates import gated
+from gtsam_rwhec.odometry.given import Given
+from gtsam_rwhec.odometry.given_rows import GivenRows
+from gtsam_rwhec.odometry.noise_by_residuals import first_rotation_variances
+from gtsam_rwhec.odometry.options import OdometryOptions
+from gtsam_rwhec.odometry.result import calibration_of
+from gtsam_rwhec.odometry.sampling import SampledTrack
+from gtsam_rwhec.odometry.solved_windows import FEWEST, Answer, Task, solve_windows, too_few
+from gtsam_rwhec.odometry.tracks import OdometryTrack
+from gtsam_rwhec.odometry.unknowns import Layout
+from gtsam_rwhec.odometry.up import up_direction
+from gtsam_rwhec.odometry.window_choice import best_edges, edges_near
+from gtsam_rwhec.odometry.window_motions import WindowMotions
+
+#: A time offset that the drive does not tell stays within about so many seconds of the first guess.
+CLOCK_SIGMA_S = 0.05
+#: The windows are made again with new offsets until these change by less than this, s, and so often at most.
+SAME_CLOCK_S = 2e-4
+CLOCK_ROUNDS = 4
+#: A start for the translation's noise: this part of the median way of a second, in metres a root of a second.
+WAY_SHARE = 0.01
+#: The mean square turn about an axis is less than this, in units of its noise: it did not turn. The noise is that of
+#: angles, which pure noise makes 2.2 times too small.
+LEAST_TURNS = 6.0
+#: The mean square turn of a sensor's windows is at least so many times the variance that its disagreement asks for.
+LEAST_AGREEMENT = 3.0
+#: Windows for the question whether it turned are about this long, s: short windows hide slow turns in noise.
+LONG_S = 2.0
+
+
+@one_blas_thread()
+def calibrate_odometries(
+    tracks: Sequence[OdometryTrack],
+    *,
+    reference: str,
+    given: Given | None = None,
+    options: OdometryOptions | None = None,
+    progress: Progress | None = None,
+) -> OdometryCalibration:
+    """Find where sensors are on a vehicle, each of which knows only its own motion.
+
+    All sensors are solved at once (design fact 23): the joint cost is certified, then the exact likelihood of all
+    windows is refined, with the vehicle's motion as unknowns. What the drive leaves free is said.
+
+    Parameters
+    ----------
+    tracks : sequence of OdometryTrack
+        Two or more, of different sensors; at least one of known scale.
+    reference : str
+        The sensor in whose frame the poses are.
+    given : Given, optional
+        What is known beside the tracks.
+    options : OdometryOptions, optional
+    progress : callable, optional
+        Takes the name of each stage.
+
+    Raises
+    ------
+    CountError, FrameError, StampError
+        Fewer than two tracks, a sensor twice or not there, no common time.
+    ScaleError
+        No sensor has a known scale.
+    UnderdeterminedError
+        The vehicle did not turn, or the tracks share too few windows of time.
+    OutlierError
+        A sensor contradicts the others most of the time.
+    NoiseError, OptionError
+        What is given is no number, or not of these sensors.
+    """
+    given, options = given or Given(), options or OdometryOptions()
+    check_progress(progress)
+    tell = progress or silent
+    tracks = _ordered(tracks, reference, given)
+    given.checked([track.sensor for track in tracks], reference)
+    names = tuple(track.sensor for track in tracks)
+    tell("comparing clocks")
+    gates = [gated(track, options) for track in tracks]
+    clocks = [Clock(0.0)] + [
+        first_offset(gates[0].track, gate.track, options) if options.estimate_time_offsets else Clock(0.0)
+        for gate in gates[1:]
+    ]
+    origin = int(tracks[0].stamps_ns[0])
+    offsets = np.array([clock.offset_s for clock in clocks])
+    scaled = np.array([track.has_unknown_scale for track in tracks])
+
+    def sampled() -> list[SampledTrack]:
+        return [
+            SampledTrack(gate.track, origin, float(offset), gate.good)
+            for offset, gate in zip(offsets, gates, strict=True)
+        ]
+
+    tell("choosing windows")
+    _check_common_time(sampled())
+    answer: Answer | None = None
+    variances: Array = np.zeros((0, 2))
+    for _ in range(CLOCK_ROUNDS):
+        samples = sampled()
+        edges = (
+            best_edges(samples, options.max_gap_s)
+            if options.window_s is None
+            else edges_near(samples, options.window_s)
+        )
+        windows = WindowMotions.of(samples, edges, options.max_gap_s)
+        _check_windows(windows, names)
+        if answer is None:
+            variances = _first_variances(windows, tracks)
+            _check_turning(samples, options, variances)
+        normal, sigma = up_direction(given, windows, variances, reference)
+        rows = GivenRows(given, {name: k for k, name in enumerate(names)}, normal, sigma, CLOCK_SIGMA_S)
+        layout = Layout.of(scaled, clocks=options.estimate_time_offsets, has_ground=rows.has_ground)
+        stated = np.array([track.noise is not None for track in tracks])
+        task = Task(names, scaled, stated, layout, rows, options.reject_outliers)
+        answer = solve_windows(windows, variances, task, answer.fit.state if answer else None, tell)
+        variances = answer.variances
+        change = answer.fit.state.offset
+        offsets = offsets + change
+        if float(np.abs(change).max()) < SAME_CLOCK_S:
+            break
+    if answer is None:
+        raise UnderdeterminedError("no windows were solved")
+    _check_agreement(answer, names)
+    removed = {
+        name: gate.removed + _outlying(answer, windows, k, origin)
+        for k, (name, gate) in enumerate(zip(names, gates, strict=True))
+    }
+    tell("gathering")
+    return calibration_of(answer, task, tracks, reference, offsets, clocks, removed, origin)
+
+
+def _ordered(tracks: Sequence[OdometryTrack], reference: str, given: Given) -> list[OdometryTrack]:
+    """The reference first; or, if its scale is unknown, the first sensor of known scale."""
+    tracks = list(tracks)
+    names = [track.sensor for track in tracks]
+    if len(tracks) < 2:
+        raise CountError(
+            f"{len(tracks)} track is given; sensors are calibrated against one another, so give two tracks or more"
+        )
+    for track in tracks:
+        if names.count(track.sensor) > 1:
+            raise FrameError(f"two tracks are of {track.sensor!r}; give each sensor its own name and one track")
+        if len(track.stamps_ns) < 3:
+            raise CountError(f"the track of {track.sensor} has {len(track.stamps_ns)} poses; at least three are needed")
+    if reference not in names:
+        raise FrameError(f"the reference is {reference!r}, and no track is of it; the sensors are {', '.join(names)}")
+    if all(track.has_unknown_scale for track in tracks):
+        raise ScaleError(
+            "all tracks have an unknown scale: nothing says how long a metre is. Give one of known scale (wheels, "
+            "LiDAR, stereo, inertial)"
+        )
+    first = next(track for track in tracks if track.sensor == reference)
+    if first.has_unknown_scale:
+        if given.ground is not None or given.directions:
+            raise OptionError(
+                f"the ground or a direction is given in the frame of {reference}, whose scale is unknown; choose a "
+                "reference of known scale, and give them in its frame"
+            )
+        first = next(track for track in tracks if not track.has_unknown_scale)
+    return [first, *(track for track in tracks if track is not first)]
+
+
+def _check_common_time(samples: list[SampledTrack]) -> None:
+    first = samples[0]
+    for other in samples[1:]:
+        if other.times[-1] <= first.times[0] or other.times[0] >= first.times[-1]:
+            raise StampError(
+                f"the tracks of {first.track.sensor} ({first.track.stamps_ns[0] * 1e-9:.3f} to "
+                f"{first.track.stamps_ns[-1] * 1e-9:.3f} s) and {other.track.sensor} "
+                f"({other.track.stamps_ns[0] * 1e-9:.3f} to {other.track.stamps_ns[-1] * 1e-9:.3f} s) have no common "
+                "time; are they of one drive and one clock?"
+            )
+
+
+def _check_windows(windows: WindowMotions, names: tuple[str, ...]) -> None:
+    if len(windows) < FEWEST:
+        raise too_few(len(windows))
+    for k, name in enumerate(names):
+        if windows.used[k].sum() < FEWEST:
+            raise UnderdeterminedError(
+                f"{name} has {int(windows.used[k].sum())} windows with another sensor; at least {FEWEST} are needed. "
+                "Look for gaps in its track, and for steps that are too fast (max_speed_m_per_s, max_turn_rad_per_s)"
+            )
+
+
+def _first_variances(windows: WindowMotions, tracks: list[OdometryTrack]) -> Array:
+    """Starts (m, 2), or what is stated."""
+    variances = np.c_[first_rotation_variances(windows), np.zeros(len(tracks))]
+    for k, track in enumerate(tracks):
+        used = windows.used[k]
+        way = np.linalg.norm(windows.M[k, used, :3, 3], axis=1) / windows.length[k, used]
+        variances[k, 1] = (WAY_SHARE * max(float(np.median(way)), 1e-3)) ** 2
+        if track.noise is not None:
+            variances[k] = track.noise.rotation_rad_per_sqrt_s**2, track.noise.translation_m_per_sqrt_s**2
+    floor: Array = np.maximum(variances, 1e-16)
+    return floor
+
+
+def _check_turning(samples: list[SampledTrack], options: OdometryOptions, variances: Array) -> None:
+    windows = WindowMotions.of(samples, edges_near(samples, LONG_S), options.max_gap_s)
+    w = windows.rotation_vectors()
+    noise = variances[:, :1] * windows.length
+    mean_square = float(((w**2).sum(axis=2) / noise)[windows.used].mean()) / 3.0 if len(windows) else np.inf
+    if mean_square < LEAST_TURNS:
+        raise UnderdeterminedError(
+            f"the vehicle did not turn: over {LONG_S:g} s the tracks turn by {np.sqrt(mean_square):.1f} times their "
+            "noise. Without turning nothing tells where a sensor is; drive curves to both sides"
+        )
+
+
+def _check_agreement(answer: Answer, names: tuple[str, ...]) -> None:
+    """A track of another drive fits nothing but a noise as large as its turns."""
+    windows = answer.windows
+    square = (windows.rotation_vectors() ** 2).sum(axis=2) / 3.0
+    for k, name in enumerate(names):
+        used = windows.used[k]
+        noise = float((answer.variances[k, 0] * windows.length[k, used]).mean())
+        if float(square[k, used].mean()) < LEAST_AGREEMENT * noise:
+            raise OutlierError(
+                f"the turns of {name} do not agree with the other sensors': they differ by "
+                f"{np.degrees(np.sqrt(noise)):.2g} degrees a window, and are themselves not much larger. Is it a track "
+                "of this drive, on the same clock, with poses T_start_sensor that are not inverted?"
+            )
+
+
+def _outlying(answer: Answer, windows: WindowMotions, k: int, origin: int) -> tuple[Removed, ...]:
+    return tuple(
+        Removed(RemovalReason.OUTLIER, i, origin + round(float(windows.start[i]) * 1e9), 1.0, 1.0)
+        for i in np.flatnonzero(answer.left_out[k]).tolist()
+    )

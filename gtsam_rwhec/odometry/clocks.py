@@ -1,0 +1,54 @@
+"""The first guess of each sensor's time offset to the reference, from their turning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.cleaning.time_offset import estimate_time_offset
+from gtsam_rwhec.errors import StampError
+from gtsam_rwhec.odometry.options import OdometryOptions
+from gtsam_rwhec.odometry.tracks import OdometryTrack
+from gtsam_rwhec.trajectories.trajectory import Trajectory
+
+#: The search takes so many seconds of two tracks, from the middle of what they share, at most.
+MOST_S = 180.0
+#: About so many of its poses are enough for a first guess; all are taken where these do not tell.
+ENOUGH = 400
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A sensor's stamp t is the reference's t + offset_s; ``unknown`` says in words why it was not found."""
+
+    offset_s: float
+    unknown: str = ""
+
+
+def first_offset(reference: OdometryTrack, track: OdometryTrack, options: OdometryOptions) -> Clock:
+    """By `cleaning.time_offset`: the sensor's start is a target that stands still, the reference's is the world."""
+    first = max(reference.stamps_ns[0], track.stamps_ns[0])
+    last = min(reference.stamps_ns[-1], track.stamps_ns[-1])
+    middle, half = (int(first) + int(last)) // 2, round(0.5e9 * MOST_S)
+    part = np.abs(np.asarray(track.stamps_ns) - middle) <= half
+    near = np.abs(np.asarray(reference.stamps_ns) - middle) <= half + round(2e9 * options.search_s)
+    carrier = Trajectory.of(
+        np.asarray(reference.stamps_ns)[near],
+        se3.inverse(np.asarray(reference.T_start_sensor)[near]),
+        where=f"the track of {reference.sensor}",
+    )
+    few = max(1, int(part.sum()) // ENOUGH)
+    for every in {few: None, 1: None}:
+        seen = np.flatnonzero(part)[::every]
+        track_seen = (np.asarray(track.stamps_ns)[seen], se3.inverse(np.asarray(track.T_start_sensor)[seen]))
+        try:
+            found = estimate_time_offset(
+                carrier, [track_seen], search_s=options.search_s, max_gap_s=options.max_gap_s, where=track.sensor
+            )
+        except StampError as error:
+            unknown = str(error)
+        else:
+            return Clock(found.offset_s)
+    return Clock(0.0, unknown)

@@ -1,0 +1,105 @@
+"""What a person should know of a calibration of odometries, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gtsam_rwhec.odometry.clocks import Clock
+from gtsam_rwhec.odometry.solved_windows import Answer, Task
+from gtsam_rwhec.odometry.tracks import OdometryTrack
+
+#: Correlation of neighbouring windows' residuals above which errors are not independent from step to step.
+CORRELATED = 0.3
+#: Stated noise is doubted when residuals are so many times as large, or as small.
+DOUBTED = 1.5
+#: More of a track than this left out is said.
+MANY = 0.1
+
+
+def residual_sizes(answer: Answer, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Root mean square of each sensor's residuals in their standard deviations, rotation and translation.
+
+    A residual r against the fused motion of all sensors is smaller than the sensor's noise: the mean square of each
+    entry is compared with the expected one.
+    """
+    windows, r, B = answer.windows, answer.fit.linear.r, answer.fit.linear.B
+    V = np.linalg.inv(answer.W + ~windows.used[:, :, None, None] * np.eye(6))
+    fused = np.linalg.inv(answer.fit.normal.D)
+    expected = np.einsum("mnii->mni", V - B @ fused @ np.swapaxes(B, 2, 3))
+    sizes = {}
+    for k, name in enumerate(names):
+        used = windows.used[k]
+        square, mean = (r[k, used] ** 2).sum(axis=0), np.maximum(expected[k, used], 0.0).sum(axis=0)
+        sizes[name] = tuple(
+            float(np.sqrt(square[part].sum() / max(mean[part].sum(), 1e-300))) for part in (slice(0, 3), slice(3, 6))
+        )
+    return sizes  # type: ignore[return-value]
+
+
+def findings_of(
+    answer: Answer,
+    task: Task,
+    tracks: Sequence[OdometryTrack],
+    clocks: Sequence[Clock],
+) -> tuple[str, ...]:
+    """The sentences; none where all is well."""
+    said: list[str] = []
+    sizes = residual_sizes(answer, task.names)
+    for k, name in enumerate(task.names):
+        if task.stated[k] and not 1.0 / DOUBTED < max(sizes[name]) < DOUBTED:
+            said.append(
+                f"the residuals of {name} are {max(sizes[name]):.2g} times what its stated noise makes; state its true "
+                "noise, or leave it out: it is estimated then"
+            )
+        share = correlation(answer, k)
+        if share > CORRELATED:
+            factor = np.sqrt((1.0 + share) / (1.0 - share))
+            said.append(
+                f"the errors of {name} are alike from window to window (correlation {share:.2f}): they are no random "
+                f"walk but drift (a wrong scale or a bias), and standard deviations may be {factor:.1f} times too small"
+            )
+        lost = int(answer.left_out[k].sum())
+        if lost > MANY * answer.left_out.shape[1]:
+            said.append(f"{name} contradicts the other sensors in {lost} of {answer.left_out.shape[1]} windows")
+    said += [
+        f"the clock of {track.sensor} was not found from its turning, and its offset was searched near "
+        f"zero: {clock.unknown}"
+        for track, clock in zip(tracks, clocks, strict=True)
+        if clock.unknown
+    ]
+    if not answer.fit.converged:
+        said.append("the refinement stopped before it converged; the poses may be off by more than they say")
+    return tuple(said)
+
+
+def remarks_of(task: Task) -> tuple[str, ...]:
+    """What was assumed."""
+    said: list[str] = []
+    if len(task.names) == 2 and not task.stated.any():
+        said.append(
+            "the noise of two tracks cannot be told apart: both count as equally noisy. State the noise of one, or add "
+            "a third sensor"
+        )
+    ground = task.given.given.ground
+    if task.given.has_ground and ground is None:
+        n = task.given.normal
+        said.append(
+            "heights count along the axis that the vehicle turned about, with up along "
+            f"({', '.join(f'{x:.2f}' for x in n)}) of {task.names[0]}; give the ground if up is another way"
+        )
+    return tuple(said)
+
+
+def correlation(answer: Answer, k: int) -> float:
+    """The correlation of a sensor's residuals with those of the window before, of rotations or translations."""
+    windows, r = answer.windows, answer.fit.linear.r[k]
+    follows = windows.used[k, 1:] & windows.used[k, :-1] & (np.abs(windows.start[1:] - windows.end[:-1]) < 1e-6)
+    if follows.sum() < 20:
+        return 0.0
+    found = 0.0
+    for part in (slice(0, 3), slice(3, 6)):
+        a, b = r[:-1][follows][:, part], r[1:][follows][:, part]
+        found = max(found, float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-300)))
+    return found

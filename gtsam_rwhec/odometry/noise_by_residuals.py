@@ -1,0 +1,141 @@
+"""The noise of odometries, found by restricted likelihood of their residuals against one another.
+
+The windows' motions are unknown, so what is left of the residuals are contrasts between sensors. Three sensors tell the
+noise of each; two tell the sum only, and then both count as equally noisy. With V the covariance of all sensors'
+residuals of a window, B the derivative by its motion and S = V^-1 - V^-1 B (B' V^-1 B)^-1 B' V^-1, the score of a
+variance v_c with V_c = dV / dv_c is (r' S V_c S r - tr S V_c) / 2, and the information tr(S V_c S V_d) / 2
+(Patterson and Thompson 1971). The few unknowns of poses take p equations, for which the residuals are scaled up.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.odometry.likelihood import Linear, weights
+from gtsam_rwhec.odometry.window_motions import WindowMotions
+
+#: A step changes a standard deviation at most by this factor.
+LARGEST_CHANGE = 3.0
+#: Scoring has converged when no variance changes by more than this part.
+CONVERGED = 1e-3
+#: Rounds of scoring at one linearisation.
+ROUNDS = 30
+#: A prior on the logarithm of each variance keeps what the data do not tell near where it was: its deviation.
+PRIOR = 4.0
+
+
+def groups_of(stated: np.ndarray) -> np.ndarray:
+    """(m,) which sensors share a noise: each its own, or two sensors one together, where neither is stated."""
+    groups = np.arange(len(stated))
+    if len(stated) == 2 and not stated.any():
+        groups[:] = 0
+    return groups
+
+
+def found_variances(
+    windows: WindowMotions,
+    linear: Linear,
+    variances: Array,
+    stated: np.ndarray,
+    scale: Array,
+    unknowns: int,
+) -> Array:
+    """Variances a second (m, 2), of rotation (rad^2/s) and translation (m^2/s), from residuals at an answer.
+
+    ``variances`` (m, 2) is the start, and stays for sensors whose noise is ``stated`` (m,). Of a sensor of unknown
+    scale the translation's is in its own lengths; ``scale`` (m,) brings two sensors to one unit.
+    """
+    m, n = windows.used.shape
+    parts = np.array(windows.covariance_parts())  # (2, m, n, 6, 6)
+    groups = groups_of(stated)
+    names = [group for group in np.unique(groups) if not stated[groups == group].all()]
+    if not names or n == 0:
+        return variances
+    # Units: the translation's variance of a sensor is that of true lengths times its scale squared.
+    unit = np.ones((m, 2))
+    unit[:, 1] = scale**2
+    current = variances / unit
+    equations = 6.0 * float((windows.used.sum(axis=0) - 1).sum())
+    taken = equations / max(equations - unknowns, 1.0)
+    previous = np.log(current.copy())
+    for _ in range(ROUNDS):
+        W = weights(windows, *(current * unit).T)
+        score, information = _score(windows, linear, W, parts, unit, taken)
+        # by the logarithm of each group's variance
+        rows = np.array([[np.where((groups == g), current[:, c], 0.0) for c in range(2)] for g in names]).reshape(-1, m)
+        component = np.tile([0, 1], len(names))
+        by_sensor = np.zeros((len(rows), m, 2))
+        by_sensor[np.arange(len(rows)), :, component] = rows
+        select = by_sensor.reshape(len(rows), 2 * m)
+        gradient = select @ score.ravel()
+        curvature = select @ information @ select.T
+        first = [np.argmax(groups == g) for g in names]
+        deviation = np.array([np.log(current[f, c]) - previous[f, c] for f in first for c in range(2)])
+        gradient -= deviation / PRIOR**2
+        curvature += np.eye(len(rows)) / PRIOR**2
+        limit = 2.0 * np.log(LARGEST_CHANGE)
+        step = np.clip(np.linalg.solve(curvature, gradient), -limit, limit).reshape(-1, 2)
+        for g, change in zip(names, step, strict=True):
+            current[groups == g] *= np.exp(change)
+        if np.abs(step).max() < CONVERGED:
+            break
+    result: Array = current * unit
+    return result
+
+
+def _score(
+    windows: WindowMotions, linear: Linear, W: Array, parts: Array, unit: Array, taken: float
+) -> tuple[Array, Array]:
+    """Score (m, 2) and expected information (2 m, 2 m) of the variances, over all windows."""
+    m = windows.sensors
+    WB = W @ linear.B
+    inner = np.linalg.inv(np.einsum("mnia,mnib->nab", linear.B, WB, optimize=True))
+    parts = parts * unit.T[:, :, None, None, None]
+    Wr = np.einsum("mnij,mnj->mni", W, linear.r)
+    fitted = np.einsum("nab,mnib,mni->na", inner, linear.B, Wr, optimize=True)
+    Sr = Wr - np.einsum("mnia,na->mni", WB, fitted)
+    squares = taken * np.einsum("mni,cmnij,mnj->mc", Sr, parts, Sr, optimize=True)
+    # S V_c has the blocks S_jk V_c,k; its trace needs S_kk.
+    S_own = W - WB @ inner @ np.swapaxes(WB, 2, 3)
+    traces = np.einsum("mnij,cmnji->mc", S_own, parts, optimize=True)
+    information = np.zeros((m, 2, m, 2))
+    for j in range(m):
+        for k in range(j, m):
+            S = S_own[j] if j == k else -WB[j] @ inner @ np.swapaxes(WB[k], 1, 2)
+            left = [parts[c, j] @ S for c in range(2)]
+            right = [parts[c, k] @ np.swapaxes(S, 1, 2) for c in range(2)]
+            for c in range(2):
+                for d in range(2):
+                    value = 0.5 * float(np.einsum("nij,nji->", left[c], right[d]))
+                    information[j, c, k, d] = information[k, d, j, c] = value
+    return 0.5 * (squares - traces), information.reshape(2 * m, 2 * m)
+
+
+def first_rotation_variances(windows: WindowMotions) -> Array:
+    """A start (m,), rad^2/s: the turn's angle is the same in all sensors, whatever their poses.
+
+    The difference of two sensors' angles has the sum of their variances; medians, so that outliers do not count.
+    """
+    angles = np.linalg.norm(windows.rotation_vectors(), axis=2)
+    m = windows.sensors
+    rows, right = [], []
+    for j in range(m):
+        for k in range(j + 1, m):
+            both = windows.used[j] & windows.used[k]
+            if both.sum() < 5:
+                continue
+            length = 0.5 * (windows.length[j] + windows.length[k])[both]
+            row = np.zeros(m)
+            row[[j, k]] = 1.0
+            rows.append(row)
+            right.append((np.median(np.abs(angles[j, both] - angles[k, both]) / np.sqrt(length)) / 0.6745) ** 2)
+    if not rows:
+        return np.full(m, 1e-6)
+    mean = float(np.mean(right)) / 2.0
+    # A little towards the mean: two sensors tell only the sum.
+    ridge = 1e-3 * np.eye(m)
+    found = np.linalg.lstsq(np.vstack([rows, ridge]), np.r_[right, np.full(m, 1e-3 * mean)], rcond=None)[0]
+    floor = max(0.05 * mean, 1e-16)
+    result: Array = np.maximum(found, floor)
+    return result

@@ -1,0 +1,214 @@
+"""One set of windows: the certified joint answer, the noise, outlying windows, what is free, the exact likelihood."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from rwhec_factors import se3
+
+from gtsam_rwhec.errors import OutlierError, ScaleError, UnderdeterminedError
+from gtsam_rwhec.files.progress import Progress
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.odometry.found import JointCertificate
+from gtsam_rwhec.odometry.freedom import Freedom, freedom
+from gtsam_rwhec.odometry.given_rows import GivenRows
+from gtsam_rwhec.odometry.joint_form import joint_form
+from gtsam_rwhec.odometry.joint_solution import solved, star_starts
+from gtsam_rwhec.odometry.likelihood import eliminated, information_of_noise, linearised, weights
+from gtsam_rwhec.odometry.noise_by_residuals import found_variances
+from gtsam_rwhec.odometry.outlying import outlying
+from gtsam_rwhec.odometry.refining import Fit, motions_fitted, refined, settled
+from gtsam_rwhec.odometry.unknowns import Layout, State
+from gtsam_rwhec.odometry.window_motions import WindowMotions
+
+#: Rounds of the certified form: its turns, ways and weights are those of the round before.
+ROUNDS = 8
+#: The form has settled when no variance changes by more than this part.
+SETTLED = 0.02
+#: Rounds of noise, freedom and refinement after it.
+REFINED = 3
+#: At least so many windows must be left, and so large a part of those of a sensor.
+FEWEST, LEAST_SHARE = 6, 0.3
+
+
+@dataclass(frozen=True)
+class Task:
+    """What does not change with the windows.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Sensors; the poses are in the frame of the first.
+    scaled, stated : (m,) booleans
+        Whose scale is unknown, and whose noise was stated.
+    layout : Layout
+    given : GivenRows
+    reject : bool
+    """
+
+    names: tuple[str, ...]
+    scaled: np.ndarray
+    stated: np.ndarray
+    layout: Layout
+    given: GivenRows
+    reject: bool
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was found on one set of windows.
+
+    Attributes
+    ----------
+    windows : WindowMotions
+        Those that are used.
+    left_out : (m, n') booleans
+        Outlying windows of the set that was given.
+    variances : (m, 2) array
+    fit : Fit
+    W : (m, n, 6, 6) array
+    freedom : Freedom
+    certificate : JointCertificate
+    certified : State
+        The certified answer, before the exact likelihood.
+    """
+
+    windows: WindowMotions
+    left_out: np.ndarray
+    variances: Array
+    fit: Fit
+    W: Array
+    freedom: Freedom
+    certificate: JointCertificate
+    certified: State
+
+
+def solve_windows(
+    windows: WindowMotions, variances: Array, task: Task, start: State | None, progress: Progress
+) -> Answer:
+    """All of it for one set of windows; ``start`` is an answer for other windows."""
+    progress("solving jointly")
+    every = windows
+    left_out = np.zeros_like(windows.used)
+    state, certificate, variances, left_out, windows = _certified(every, left_out, variances, task, start)
+    certified = state
+    progress("refining the joint likelihood")
+    for _ in range(REFINED):
+        W = weights(windows, *variances.T)
+        free = freedom_at(windows, W, motions_fitted(windows, W, state, task.layout), task)
+        state = settled(state, free.left, task.layout)
+        determined = free.complement()
+        fit = refined(windows, W, state, task.layout, task.given, determined)
+        state = fit.state
+        new = outlying(windows, fit.linear, W, task.stated) if task.reject else np.zeros_like(windows.used)
+        found = found_variances(windows, fit.linear, variances, task.stated, state.scale, task.layout.size)
+        change = float(np.abs(np.log(found / variances)).max())
+        variances = found
+        if new.any():
+            left_out, windows = _left_out(every, windows, left_out, new, task)
+            state = State.at(state.T, state.scale, windows, state.height)
+        elif change < 0.2 * SETTLED:
+            break
+    W = weights(windows, *variances.T)
+    fit = refined(windows, W, state, task.layout, task.given, determined)
+    free = freedom_at(windows, W, fit.state, task)
+    return Answer(windows, left_out, variances, fit, W, free, certificate, certified)
+
+
+def _certified(
+    every: WindowMotions, left_out: np.ndarray, variances: Array, task: Task, start: State | None
+) -> tuple[State, JointCertificate, Array, np.ndarray, WindowMotions]:
+    windows = every
+    w, s = windows.rotation_vectors(), windows.M[..., :3, 3]
+    starts = star_starts(w, s, windows.used)
+    if start is None:
+        rough = np.tile(np.eye(4), (len(task.names), 1, 1))
+        rough[1:, :3, :3] = starts[1]
+        sizes = np.array([np.median(np.linalg.norm(s[k, windows.used[k]], axis=1)) for k in range(len(rough))])
+        metric = float(np.median(sizes[~task.scaled]))
+        scale = np.where(task.scaled, sizes / max(metric, 1e-12), 1.0)
+        if not (scale > 0.0).all():
+            name = task.names[int(np.argmin(scale))]
+            raise ScaleError(f"the track of {name} does not move, so its scale cannot be told; is it the right topic?")
+        state = State.at(rough, scale, windows, _height(task.given))
+    else:
+        state = State.at(start.T, start.scale, windows, start.height)
+        state = replace(state, tilt=start.tilt)
+        starts = [start.T[1:, :3, :3], *starts]
+    certificate = None
+    for _ in range(ROUNDS):
+        axis = _main_axis(state.motion)
+        form = joint_form(windows, state, variances, task.scaled, task.given.form_rows(state, task.scaled))
+        solution = solved(form, starts, axis=axis)
+        T, scales = form.poses(solution.y)
+        if not (scales > 0.0).all():
+            raise ScaleError(
+                f"the scale of {task.names[1 + int(np.argmin(scales))]} is {scales.min():.3g} at the optimum; its "
+                "motion does not fit the others': are its poses inverted?"
+            )
+        certificate = solution.certificate
+        state = State.at(np.concatenate([np.eye(4)[None], T]), np.r_[1.0, scales], windows, state.height)
+        W = weights(windows, *variances.T)
+        state = motions_fitted(windows, W, state, task.layout)
+        linear = linearised(windows, state)
+        new = outlying(windows, linear, W, task.stated) if task.reject else np.zeros_like(windows.used)
+        found = found_variances(windows, linear, variances, task.stated, state.scale, task.layout.size)
+        change = float(np.abs(np.log(found / variances)).max())
+        variances = found
+        starts = [T[:, :3, :3], *starts[:3]]
+        if new.any():
+            left_out, windows = _left_out(every, windows, left_out, new, task)
+            state = State.at(state.T, state.scale, windows, state.height)
+        elif change < SETTLED:
+            break
+    assert certificate is not None
+    return state, certificate, variances, left_out, windows
+
+
+def freedom_at(windows: WindowMotions, W: Array, state: State, task: Task) -> Freedom:
+    """What is free at a state."""
+    linear = linearised(windows, state)
+    normal = eliminated(linear, W, task.layout)
+    N = information_of_noise(linear, W, task.layout, state, normal.D)
+    rows = task.given.rows(state, task.layout)
+    squares = 2.0 * len(windows)
+    spare = 6.0 * float((windows.used.sum(axis=0) - 1).sum()) - task.layout.size
+    return freedom(normal.H, N, rows.information, task.layout, squares, spare)
+
+
+def _left_out(
+    every: WindowMotions, windows: WindowMotions, left_out: np.ndarray, new: np.ndarray, task: Task
+) -> tuple[np.ndarray, WindowMotions]:
+    """The outlying windows with new ones, in the numbers of all windows."""
+    at = np.searchsorted(every.start, windows.start)
+    left_out = left_out.copy()
+    left_out[:, at] |= new
+    windows = every.without(left_out)
+    for k, name in enumerate(task.names):
+        used, had = int(windows.used[k].sum()), int(every.used[k].sum())
+        if len(windows) < FEWEST or used < LEAST_SHARE * had:
+            raise OutlierError(
+                f"{name} contradicts the other sensors in {had - used} of {had} windows; does its track belong to this "
+                "drive, is its clock the same, are its poses T_start_sensor and not inverted?"
+            )
+    return left_out, windows
+
+
+def _height(given: GivenRows) -> float:
+    return given.first_height if given.has_ground else 0.0
+
+
+def _main_axis(motion: Array) -> Array:
+    """The axis (3,) about which the vehicle turned most."""
+    w = se3.so3_logmap(motion[:, :3, :3])
+    axis: Array = np.linalg.eigh(w.T @ w)[1][:, -1]
+    return axis
+
+
+def too_few(count: int) -> UnderdeterminedError:
+    """The error for a drive with too few windows."""
+    return UnderdeterminedError(
+        f"the tracks share {count} windows of time; at least {FEWEST} are needed. Record a longer drive, or look for "
+        "gaps and for clocks that are apart"
+    )

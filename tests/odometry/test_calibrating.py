@@ -1,0 +1,141 @@
+"""All sensors of a drive at once: poses within their covariances, what is free is named, and bad input in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drives_with_sensors import drive, squares, tracks
+from scipy.stats import chi2
+
+from gtsam_rwhec import odometry
+from gtsam_rwhec.errors import (
+    CountError,
+    FrameError,
+    OptionError,
+    OutlierError,
+    ScaleError,
+    StampError,
+    UnderdeterminedError,
+)
+from gtsam_rwhec.simulate.drives import Drive
+
+ONE_CLOCK = odometry.OdometryOptions(estimate_time_offsets=False, window_s=0.5)
+
+
+@pytest.fixture(scope="module")
+def hilly() -> Drive:
+    return drive("3d", 1)
+
+
+@pytest.fixture(scope="module")
+def planar() -> Drive:
+    return drive("planar", 2)
+
+
+@pytest.fixture(scope="module")
+def found(hilly: Drive) -> odometry.OdometryCalibration:
+    return odometry.calibrate_odometries(tracks(hilly), reference="lidar", options=ONE_CLOCK)
+
+
+def test_poses_scale_and_noise_of_a_drive_with_hills(hilly: Drive, found: odometry.OdometryCalibration) -> None:
+    assert found.certificate.is_optimal
+    assert found.is_unique
+    square, degrees = squares(found, hilly)
+    assert degrees == 18
+    assert square < chi2.ppf(1.0 - 1e-4, degrees)
+    assert found.scales["camera"] == pytest.approx(0.4, abs=5.0 * 0.4 * np.sqrt(found.covariance[-1, -1]))
+    for name, sensor in hilly.sensors.items():
+        assert found.noise[name].rotation_rad_per_sqrt_s == pytest.approx(sensor.rotation_rad_per_sqrt_s, rel=0.3)
+    assert str(found).splitlines()[0] == "Use these poses."
+
+
+def test_a_reference_of_unknown_scale_gives_the_same_poses(hilly: Drive, found: odometry.OdometryCalibration) -> None:
+    seen_from_camera = odometry.calibrate_odometries(tracks(hilly), reference="camera", options=ONE_CLOCK)
+    np.testing.assert_allclose(seen_from_camera.T("lidar", "rear"), found.T_reference_sensor["rear"], atol=1e-6)
+    square, degrees = squares(seen_from_camera, hilly)
+    assert square < chi2.ppf(1.0 - 1e-4, degrees)
+
+
+def test_a_drive_on_a_plane_leaves_every_height_free_and_says_so(planar: Drive) -> None:
+    found = odometry.calibrate_odometries(tracks(planar), reference="lidar", options=ONE_CLOCK)
+    assert len(found.free_directions) == 3
+    assert {name for free in found.free_directions for name in free.frames} == {"rear", "stereo", "camera"}
+    for free in found.free_directions:
+        (name,) = free.frames
+        shift = np.array(free.frames[name][3:])
+        up = found.T_reference_sensor[name][:3, :3] @ shift / np.linalg.norm(shift)
+        assert abs(up[2]) > 0.99
+        assert "turned about one axis only" in str(free)
+    assert found.status == "certified_not_unique"
+    assert str(found).startswith("Use these poses with care: the drive does not determine all")
+
+
+def test_heights_hold_it_and_the_answer_says_how_it_depends_on_them(planar: Drive) -> None:
+    heights = {name: (2.0 + float(sensor.T_vehicle_sensor[2, 3]), 0.01) for name, sensor in planar.sensors.items()}
+    given = odometry.Given(heights_m=heights)
+    found = odometry.calibrate_odometries(tracks(planar), reference="lidar", given=given, options=ONE_CLOCK)
+    assert found.is_unique
+    assert found.certificate.is_optimal
+    square, degrees = squares(found, planar)
+    assert degrees == 18
+    assert square < chi2.ppf(1.0 - 1e-4, degrees)
+    (of_rear,) = [number for number in found.influences if number.what == "height of rear"]
+    up = found.T_reference_sensor["rear"][:3, :3] @ np.array(of_rear.per_unit["rear"][3:])
+    np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=0.02)  # a metre up moves it a metre up
+    assert np.linalg.norm(of_rear.per_sigma["stereo"]) < 1e-3
+
+
+def test_a_distance_has_two_signs_and_both_are_said(planar: Drive) -> None:
+    pair = [track for track in tracks(planar) if track.sensor in ("lidar", "rear")]
+    true = planar.T("lidar", "rear")
+    given = odometry.Given(distances_m={("lidar", "rear"): (float(np.linalg.norm(true[:3, 3])), 0.002)})
+    found = odometry.calibrate_odometries(pair, reference="lidar", given=given, options=ONE_CLOCK)
+    assert not found.free_directions
+    (other,) = found.others
+    heights = sorted([found.T_reference_sensor["rear"][2, 3], other.T_reference_sensor["rear"][2, 3]])
+    assert heights[0] == pytest.approx(-heights[1], abs=0.02)
+    assert any(height == pytest.approx(true[2, 3], abs=0.05) for height in heights)
+    assert "two signs" in str(found)
+
+
+@pytest.mark.slow
+def test_clocks_and_outliers() -> None:
+    driven = drive("3d", 3, seconds=80.0, outliers=0.01, clocks=True)
+    found = odometry.calibrate_odometries(tracks(driven), reference="lidar")
+    for name, sensor in driven.sensors.items():
+        if name != "lidar":
+            sigma = found.time_offset_sigmas_s[name]
+            assert found.time_offsets_s[name] == pytest.approx(sensor.clock_offset_s, abs=5.0 * sigma)
+            assert sigma < 0.005
+    square, degrees = squares(found, driven)
+    assert square < chi2.ppf(1.0 - 1e-4, degrees)
+    assert all(found.removed.values())
+
+
+def test_bad_input_is_refused_in_words(hilly: Drive) -> None:
+    known = tracks(hilly)
+
+    def refused(error: type[Exception], words: str, of: list[odometry.OdometryTrack], **more: object) -> None:
+        with pytest.raises(error, match=words):
+            odometry.calibrate_odometries(of, **{"reference": "lidar", "options": ONE_CLOCK} | more)  # type: ignore[arg-type]
+
+    refused(CountError, "two tracks or more", known[:1])
+    refused(FrameError, "two tracks are of 'lidar'", [known[0], known[0]])
+    refused(FrameError, "no track is of it", known, reference="radar")
+    refused(FrameError, "no track is of that sensor", known, given=odometry.Given(heights_m={"radar": (1.0, 0.1)}))
+    refused(ScaleError, "how long a metre is", [replace(track, has_unknown_scale=True) for track in known])
+    later = replace(known[1], stamps_ns=known[1].stamps_ns + 10**12)
+    refused(StampError, "no common time", [known[0], later])
+    ground = odometry.Ground((0.0, 0.0, 1.0), 1.0, 0.01, 0.01)
+    refused(OptionError, "reference of known scale", known, reference="camera", given=odometry.Given(ground=ground))
+    straight = drive("straight", 4)
+    refused(UnderdeterminedError, "did not turn", tracks(straight))
+
+
+def test_a_track_of_another_drive_is_refused(hilly: Drive) -> None:
+    other = tracks(drive("3d", 5))
+    mixed = [*tracks(hilly)[:3], replace(other[1], sensor="alien")]
+    with pytest.raises(OutlierError, match="alien"):
+        odometry.calibrate_odometries(mixed, reference="lidar", options=ONE_CLOCK)

@@ -1,0 +1,87 @@
+"""Steps that no vehicle makes, poses between stamps, windows, and motions of two tracks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drives_with_sensors import drive, tracks
+from rwhec_factors import se3
+
+import gtsam_rwhec as rw
+from gtsam_rwhec import odometry
+from gtsam_rwhec.errors import UnderdeterminedError
+from gtsam_rwhec.odometry.gates import gated
+from gtsam_rwhec.odometry.sampling import SampledTrack
+from gtsam_rwhec.odometry.window_choice import best_edges
+
+
+def test_a_jump_is_one_bad_step_and_the_track_goes_on_without_it() -> None:
+    track = tracks(drive("3d", 1))[0]
+    T = track.T_start_sensor.copy()
+    jump = se3.expmap(np.array([[0.3, 0.0, 0.0, 0.0, 2.0, 0.0]]))[0]
+    T[200:] = T[199] @ jump @ se3.inverse(T[199][None])[0] @ T[200:]
+    found = gated(replace(track, T_start_sensor=T), odometry.OdometryOptions())
+    np.testing.assert_array_equal(np.flatnonzero(~found.good), [199])
+    assert found.removed[0].index == 200
+    step = se3.inverse(found.track.T_start_sensor[199][None])[0] @ found.track.T_start_sensor[200]
+    true = se3.inverse(track.T_start_sensor[199][None])[0] @ track.T_start_sensor[200]
+    np.testing.assert_allclose(step, true, atol=0.05)
+    later = se3.inverse(found.track.T_start_sensor[200][None])[0] @ found.track.T_start_sensor[300]
+    np.testing.assert_allclose(later, se3.inverse(T[200][None])[0] @ T[300], atol=1e-9)
+
+
+def test_speeds_are_limited_by_rate() -> None:
+    track = tracks(drive("3d", 1))[0]
+    found = gated(track, odometry.OdometryOptions(max_speed_m_per_s=3.0))
+    assert 0 < found.good.sum() < len(found.good)
+    assert not gated(track, odometry.OdometryOptions()).removed
+
+
+def test_poses_between_stamps() -> None:
+    track = tracks(drive("3d", 1))[0]
+    coarse = replace(track, stamps_ns=track.stamps_ns[::2], T_start_sensor=track.T_start_sensor[::2])
+    sampled = SampledTrack(coarse, 0, 0.25, np.ones(len(coarse.stamps_ns) - 1, dtype=bool))
+    at = track.stamps_ns[21:60:2] * 1e-9
+    off = se3.logmap(se3.inverse(sampled.poses(at + 0.25)) @ track.T_start_sensor[21:60:2])
+    assert np.abs(off).max() < 0.02
+    np.testing.assert_allclose(
+        sampled.poses(coarse.stamps_ns[10:12] * 1e-9 + 0.25), coarse.T_start_sensor[10:12], atol=1e-9
+    )
+    covered = sampled.covers(np.array([0.0, 0.3, 39.0]), np.array([0.1, 0.4, 50.0]), 0.5)
+    np.testing.assert_array_equal(covered, [False, True, False])
+
+
+def test_windows_are_longer_where_the_noise_is_larger() -> None:
+    lengths = []
+    for factor in (1.0, 30.0):
+        driven = drive("3d", 2)
+        generator = np.random.default_rng(0)
+        samples = []
+        for track in tracks(driven)[:2]:
+            T = track.T_start_sensor
+            steps = se3.inverse(T[:-1]) @ T[1:] @ se3.expmap(generator.normal(0.0, 3e-4 * factor, (len(T) - 1, 6)))
+            noisy = [T[0]]
+            for step in steps:
+                noisy.append(noisy[-1] @ step)
+            good = np.ones(len(T) - 1, dtype=bool)
+            samples.append(SampledTrack(replace(track, T_start_sensor=np.array(noisy)), 0, 0.0, good))
+        lengths.append(float(np.median(np.diff(best_edges(samples, 0.5)))))
+    assert lengths[1] > lengths[0] >= 0.1
+
+
+def test_motions_of_two_tracks_are_solved_by_the_problem_of_pairs() -> None:
+    driven = drive("3d", 3)
+    first, second = tracks(driven)[:2]
+    motions = odometry.odometry_motions(first, second, odometry.OdometryOptions(estimate_time_offsets=False))
+    problem = rw.Problem()
+    problem.add_motion("rear", motions.A, motions.B, motions.sigma, motions.kappa, stamps_ns=motions.start_ns)
+    solution = rw.solve(problem)
+    off = se3.logmap(se3.inverse(driven.T("lidar", "rear")[None]) @ solution.Y["rear"].matrix())[0]
+    assert np.linalg.norm(off[:3]) < 0.01
+    assert np.linalg.norm(off[3:]) < 0.15
+    assert (motions.kappa > 0.0).all()
+    far = replace(second, stamps_ns=second.stamps_ns + 10**12)
+    with pytest.raises(UnderdeterminedError, match="share 0 windows"):
+        odometry.odometry_motions(first, far, odometry.OdometryOptions(estimate_time_offsets=False))

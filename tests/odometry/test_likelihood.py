@@ -1,0 +1,119 @@
+"""Residuals, derivatives, noise and information of the joint likelihood, against what they are defined by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drives_with_sensors import drive
+from rwhec_factors import se3
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.odometry import OdometryTrack
+from gtsam_rwhec.odometry.likelihood import eliminated, information_of_noise, linearised, predicted, weights
+from gtsam_rwhec.odometry.noise_by_residuals import first_rotation_variances, found_variances
+from gtsam_rwhec.odometry.outlying import deletion_squares
+from gtsam_rwhec.odometry.sampling import SampledTrack
+from gtsam_rwhec.odometry.unknowns import Layout, State
+from gtsam_rwhec.odometry.window_motions import WindowMotions
+from gtsam_rwhec.simulate.drives import Drive
+
+
+def windows_of(driven: Drive, every: int) -> WindowMotions:
+    samples = [
+        SampledTrack(OdometryTrack(name, stamps, T), 0, 0.0, np.ones(len(stamps) - 1, dtype=bool))
+        for name, (stamps, T) in driven.tracks.items()
+    ]
+    return WindowMotions.of(samples, driven.stamps_ns[::every] * 1e-9, 0.5)
+
+
+def truth(driven: Drive, windows: WindowMotions, every: int) -> tuple[State, Array]:
+    """The true state and variances (m, 2)."""
+    T = np.array([driven.T("lidar", name) for name in driven.sensors])
+    scale = np.array([sensor.scale for sensor in driven.sensors.values()])
+    at = (driven.T_world_vehicle @ driven.sensors["lidar"].T_vehicle_sensor)[::every]
+    motion = (se3.inverse(at[:-1]) @ at[1:])[: len(windows)]
+    sigma = np.array(
+        [(s.rotation_rad_per_sqrt_s, s.translation_m_per_sqrt_s * s.scale) for s in driven.sensors.values()]
+    )
+    return State(T, scale, np.zeros(len(T)), motion, np.zeros(2), 0.0), sigma**2
+
+
+@pytest.fixture(scope="module")
+def hilly() -> Drive:
+    return drive("3d", 7)
+
+
+SCALED = np.array([False, False, False, True])
+
+
+def test_derivatives_are_those_of_the_residuals(hilly: Drive) -> None:
+    windows = windows_of(hilly, 10)
+    state, _ = truth(hilly, windows, 10)
+    # At exact measurements, so that the residual's own Jacobian is the identity.
+    windows = replace(windows, M=predicted(state))
+    layout = Layout.of(SCALED, clocks=True, has_ground=False)
+    linear = linearised(windows, state)
+    np.testing.assert_allclose(linear.r, 0.0, atol=1e-12)
+    still = np.zeros((len(windows), 6))
+    for i in range(layout.size):
+        step = np.zeros(layout.size)
+        step[i] = 1e-6
+        moved = linearised(windows, state.moved(layout, step, still)).r
+        expected = -np.einsum("mnij,mj->mni", linear.J, layout.spread(step))
+        np.testing.assert_allclose(moved, expected, atol=1e-10)
+    shift = np.random.default_rng(0).normal(0.0, 1e-6, (len(windows), 6))
+    moved = linearised(windows, state.moved(layout, np.zeros(layout.size), shift)).r
+    np.testing.assert_allclose(moved, -np.einsum("mnij,nj->mni", linear.B, shift), atol=1e-9)
+
+
+def test_residuals_at_the_truth_have_the_covariance_that_grows_with_the_window(hilly: Drive) -> None:
+    windows = windows_of(hilly, 5)
+    state, variances = truth(hilly, windows, 5)
+    linear, W = linearised(windows, state), weights(windows, *variances.T)
+    squares = np.einsum("mni,mnij,mnj->m", linear.r, W, linear.r) / (6.0 * windows.used.sum(axis=1))
+    np.testing.assert_allclose(squares, 1.0, atol=5.0 * np.sqrt(2.0 / (6.0 * len(windows))))
+    # With the windows' motions eliminated three of the four sensors' numbers are left.
+    layout = Layout.of(SCALED, clocks=False, has_ground=False)
+    step = np.zeros(layout.size)
+    normal = eliminated(linear, W, layout)
+    left = linear.r - np.einsum("mnij,nj->mni", linear.B, normal.motions(step))
+    assert np.einsum("mni,mnij,mnj->", left, W, left) == pytest.approx(18.0 * len(windows), rel=0.15)
+    by_deletion = deletion_squares(linear, W)
+    assert by_deletion.mean() == pytest.approx(6.0, rel=0.1)
+
+
+def test_the_noise_of_each_sensor_is_found(hilly: Drive) -> None:
+    windows = windows_of(hilly, 5)
+    state, variances = truth(hilly, windows, 5)
+    start = np.tile(np.median(variances, axis=0), (4, 1))
+    nobody = np.zeros(4, dtype=bool)
+    found = found_variances(windows, linearised(windows, state), start, nobody, state.scale, 0)
+    np.testing.assert_allclose(np.sqrt(found / variances), 1.0, atol=0.35)
+    stated = np.array([True, False, False, False])
+    kept = found_variances(windows, linearised(windows, state), start, stated, state.scale, 0)
+    np.testing.assert_array_equal(kept[0], start[0])
+    rough = np.sqrt(first_rotation_variances(windows) / variances[:, 0])
+    assert (rough < 3.0).all()
+
+
+def test_what_noise_alone_adds_to_the_information(hilly: Drive) -> None:
+    """H at motions that are off by their own noise, minus H at the true ones, is N on average."""
+    windows = windows_of(hilly, 5)
+    state, variances = truth(hilly, windows, 5)
+    variances = variances * 400.0  # so that it shows
+    layout = Layout.of(SCALED, clocks=False, has_ground=False)
+    W = weights(windows, *variances.T)
+    at_truth = eliminated(linearised(windows, state), W, layout)
+    N = information_of_noise(linearised(windows, state), W, layout, state, at_truth.D)
+    generator = np.random.default_rng(1)
+    root = np.linalg.inv(np.swapaxes(np.linalg.cholesky(at_truth.D), 1, 2))
+    added = np.zeros_like(N)
+    for _ in range(10):
+        noise = np.einsum("nij,nj->ni", root, generator.standard_normal((len(windows), 6)))
+        for sign in (1.0, -1.0):  # what is linear in the noise cancels
+            off = state.moved(layout, np.zeros(layout.size), sign * noise)
+            added += (eliminated(linearised(windows, off), W, layout).H - at_truth.H) / 20
+    unit = 1.0 / np.sqrt(np.diagonal(N))
+    np.testing.assert_allclose(np.diagonal(added) * unit**2, 1.0, atol=0.3)
