@@ -9,6 +9,8 @@ from .rows import RobotRow as RobotRow
 from .rows import RowFrame as RowFrame
 from .rows import read_rows as read_rows
 from .rows import rows_json as rows_json
+from .parquet import read_parquet as read_parquet
+from .parquet import rows_parquet as rows_parquet
 
 # The work of a run, and what carries it out.
 from .tasks import Engine as Engine
