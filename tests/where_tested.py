@@ -95,6 +95,11 @@ TABLE: dict[str, dict[str, str]] = {
         "fleet/test_stores.py": "byte_count store_requests",
         "fleet/test_dask_engine.py": "extras",
         "fleet/test_watching.py": "night_rows watch_events watch_stream",
+        "fleet/test_pair_moments.py": "merging",
+        "fleet/test_running.py": (
+            "log_facts log_parts map_log planning receipts rig_source solve_robot unit_calibration unit_rows"
+        ),
+        "fleet/test_partial.py": "container measured_problem",
     },
     "gtsam_rwhec/handeye": {
         "handeye/test_certified.py": "chordal_form",
@@ -174,6 +179,7 @@ TABLE: dict[str, dict[str, str]] = {
         "problem/test_many_measurements.py": "moment_stack packed_moments segmented_moments",
         "problem/test_problem.py": "checked_arguments contents knowledge long_translations measurements",
         "problem/test_selection.py": "variance_factors",
+        "fleet/test_pair_moments.py": "of_moments",
     },
     "gtsam_rwhec/refinement": {
         "refinement/test_bad_refinement.py": "input_checks",

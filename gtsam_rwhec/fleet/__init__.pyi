@@ -12,6 +12,12 @@ from .rows import rows_json as rows_json
 from .parquet import read_parquet as read_parquet
 from .parquet import rows_parquet as rows_parquet
 
+# A run over all of them.
+from .planning import FleetOptions as FleetOptions
+from .running import FleetRun as FleetRun
+from .running import read_fleet as read_fleet
+from .running import run as run
+
 # The work of a run, and what carries it out.
 from .tasks import Engine as Engine
 from .tasks import Failed as Failed

@@ -7,7 +7,7 @@
         rig: rigs/arm_02.yaml
         logs:
           - s3://logs/arm_02/monday.mcap
-          - {log: "s3://logs/arm_02/tuesday.mcap", rig: rigs/arm_02_new_lens.yaml}
+          - {log: "s3://logs/arm_02/tuesday.mcap", rig: rigs/arm_02_new_camera.yaml}
     sites:                              # these robots see the same targets, and are solved together
       hall_a: [arm_01, arm_02]
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
@@ -30,7 +32,8 @@ class RigSource:
         Where it is.
     text : str
     files : tuple of (str, bytes)
-        The files with intrinsics and targets that it names: the path as it has it, and the content.
+        The files with intrinsics and targets that it names: the path as it has it, and the content. Those of absolute
+        paths are read where they are, by every worker.
     """
 
     url: str
@@ -46,18 +49,37 @@ class RigSource:
         return digest.hexdigest()
 
     def rig(self, folder: Path) -> Rig:
-        """The rig; the files that it names are written into a folder of this process, if it names any.
+        """The rig; the files that it names are written below a folder of this process, if it names any.
 
         Raises `RigError` as ``read_rig`` does.
         """
-        text = self.text
-        for i, (name, content) in enumerate(self.files):
-            place = folder / f"rig_{i}{Path(name).suffix}"
-            place.write_bytes(content)
-            text = text.replace(name, str(place))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UnfinishedRigWarning)
-            return parse_rig(text, shown(self.url), folder)
+        if not self.files:
+            return _parsed(self.text, shown(self.url))
+        up = max(PurePosixPath(name).parts.count("..") for name, _ in self.files)
+        base = folder.joinpath(*["rig"] * (up + 1))
+        for name, content in self.files:
+            if not PurePosixPath(name).is_absolute():
+                place = base / name
+                place.parent.mkdir(parents=True, exist_ok=True)
+                place.write_bytes(content)
+        return _in_words(self.text, shown(self.url), base)
+
+    def parsed(self) -> None:
+        """Check it before anything is done; `RigError` as `rig`."""
+        with TemporaryDirectory(prefix="gtsam-rwhec-") as folder:
+            self.rig(Path(folder))
+
+
+@lru_cache(maxsize=8)
+def _parsed(text: str, where: str) -> Rig:
+    """A rig file that names no others: a worker parses it once."""
+    return _in_words(text, where, Path())
+
+
+def _in_words(text: str, where: str, folder: Path) -> Rig:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnfinishedRigWarning)
+        return parse_rig(text, where, folder)
 
 
 def read_rig_source(url: str) -> RigSource:

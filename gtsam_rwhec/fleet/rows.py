@@ -100,7 +100,7 @@ class RobotRow:
     findings : tuple of str
         What the logs said of themselves, in words.
     cpu_s, bytes_read, peak_bytes : float, int, int
-        Of all tasks of the unit together, also of those that an earlier run did; `peak_bytes` is the largest.
+        Of its logs' tasks and the unit's own, also where an earlier run did them; of the logs' stores; the largest.
     receipts : tuple of str
         Keys of the tasks whose files it was made from.
     result : str or None

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from gtsam_rwhec.errors import LogError, LogWarning
 from gtsam_rwhec.files.yaml_lines import KeyPath
 from gtsam_rwhec.logs import DetectionRecord, ImageRecord, IntrinsicsRecord, Log, ros2_detections
-from gtsam_rwhec.logs.message_kinds import TAG_DETECTIONS
+from gtsam_rwhec.logs.message_kinds import TAG_DETECTIONS, TF_TOPICS
+from gtsam_rwhec.pipeline.log_contract import detections_topic, pairs_topic
 from gtsam_rwhec.rig import Rig
 
 #: The types of messages that are read, by what the rig file takes from them.
@@ -51,6 +52,14 @@ def check_topics(log: Log, rig: Rig) -> None:
                 LogWarning,
                 stacklevel=2,
             )
+
+
+def wanted_topics(rig: Rig) -> tuple[str, ...]:
+    """The topics that the stages read of a log, raw or with detections in it; those of tf under their usual names."""
+    poses = rig.carriers.poses.topic
+    own = (poses,) if poses is not None else tuple(f"/{name}" for name in TF_TOPICS)
+    of_stage = (topic(sensor) for sensor in rig.sensors for topic in (detections_topic, pairs_topic))
+    return tuple(dict.fromkeys((*own, *(topic for _, topic in _named(rig)), *of_stage)))
 
 
 def _check_types(log: Log, rig: Rig) -> None:
