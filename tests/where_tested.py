@@ -167,7 +167,8 @@ TABLE: dict[str, dict[str, str]] = {
         "pipeline/test_real_dataset.py": "driver_detections",
         "pipeline/test_commands.py": "log_metadata",
         "pipeline/test_verified_log.py": "old_calibration",
-        "pipeline/test_mixed_odometry.py": "comparable_noise odometry_pairs odometry_tracks odometry_windows",
+        "pipeline/test_mixed_odometry.py": "comparable_noise odometry_pairs odometry_windows",
+        "pipeline/test_odometry_road.py": "odometry_cleaning odometry_solving odometry_tracks",
         "pipeline/test_synthetic_calibration.py": (
             "carrier_motion cleaning_stage detection_stage detections_in_images image_detections measured_pairs "
             "sensor_detections settled_poses solution_frames solution_plots solved_log solving_rounds solving_stage"

@@ -32,6 +32,7 @@ from gtsam_rwhec.cli.options import (
     WorkersOption,
     exported,
     show,
+    show_odometries,
 )
 from gtsam_rwhec.cli.report import report_path
 from gtsam_rwhec.cli.roads import command_of, refuse
@@ -56,6 +57,11 @@ OF_SOLVE = frozenset({"method", "initial"})
 NOT_FOR_A_LOG = {
     "not for a log. Its rig file states sizes, noise and names, and its calibration is always refined. Change the rig "
     "file, or leave the option out.": (OF_FOLDER | OF_CHOICES | OF_SOLVE) - OF_LOG,
+}
+NOT_FOR_ODOMETRIES = {
+    "counts only for images, and every sensor of the rig file has odometry. Leave it out.": frozenset(
+        {"images", "no_report_images", "workers"}
+    )
 }
 NOT_FOR_A_FOLDER = {
     "only for a log. A folder of CSV files has no images, and its result is one file, which is replaced: leave the "
@@ -172,11 +178,16 @@ def calibrate(
     """
     if rig is not None or is_log(source):
         refuse(context, NOT_FOR_A_LOG)
+        described = None if rig is None else rw.rig.read_rig(rig)
+        if rw.pipeline.is_of_odometries(described, source):
+            refuse(context, NOT_FOR_ODOMETRIES)
         if output is None:
             needed = "give -o FOLDER"
             if rig is None:
                 needed += " and --rig FILE (a log that detect or clean wrote holds its own rig file)"
             raise typer.BadParameter(f"the calibration of a log writes several files: {needed}")
+        if rw.pipeline.is_of_odometries(described, source):
+            return calibrate_odometries(source, described, output, anyway=anyway, force=force, verbose=verbose)
         return calibrate_log(
             source,
             rig,
@@ -317,3 +328,12 @@ def calibrate_log(
     page = output / rw.pipeline.REPORT_FILE if rw.pipeline.REPORT_FILE in written else None
     messages = [f"Written to {shown_path(output)}: {', '.join(written)}.", *exported(calibrated, anyway=anyway)]
     return show(calibrated, messages, verbose=verbose, page=page)
+
+
+def calibrate_odometries(
+    source: Path, rig: rw.rig.Rig | None, output: Path, *, anyway: bool, force: bool, verbose: bool
+) -> ExitStatus:
+    """Run all stages of sensors that know only their own motion, and print the report."""
+    with StageDisplay() as stage, said_in_the_report():
+        solved = rw.pipeline.calibrate_odometry_log(source, rig, output, anyway=anyway, replace=force, progress=stage)
+    return show_odometries(solved, output, anyway=anyway, verbose=verbose)

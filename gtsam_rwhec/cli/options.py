@@ -10,7 +10,7 @@ import typer
 
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
-from gtsam_rwhec.files.terminal_text import say
+from gtsam_rwhec.files.terminal_text import say, shown_path
 
 FOLDER_OF_CSV = "folder of CSV files such as tag_0_cam_0_A.csv and tag_0_cam_0_B.csv"
 #: Headings in the help.
@@ -95,7 +95,7 @@ VerboseOption = Annotated[
 WHOLE = "--verbose"
 
 
-def exported(solved: rw.pipeline.Solved, *, anyway: bool) -> list[str]:
+def exported(solved: rw.pipeline.Solved | rw.pipeline.OdometrySolved, *, anyway: bool) -> list[str]:
     """The message that files of poses that are not to be used were written, or that they were not; or none."""
     if solved.judgement.verdict is not rw.Verdict.DO_NOT_USE:
         return []
@@ -120,3 +120,14 @@ def show(
     for message in messages:
         say(message, to_errors=True)
     return exit_status(calibrated.judgement, of_rig=True)
+
+
+def show_odometries(solved: rw.pipeline.OdometrySolved, output: Path, *, anyway: bool, verbose: bool) -> ExitStatus:
+    """Print the report of sensors that know only their own motion, and where the files are; its exit status."""
+    written = [name for name in rw.pipeline.OUTPUTS if (output / name).exists()]
+    page = output / rw.pipeline.REPORT_FILE if rw.pipeline.REPORT_FILE in written else None
+    rw.report.print_odometry(solved.result, verbose=verbose, page=page)
+    messages = [f"Written to {shown_path(output)}: {', '.join(written)}.", *exported(solved, anyway=anyway)]
+    for message in messages:
+        say(message, to_errors=True)
+    return exit_status(solved.judgement, of_rig=True)

@@ -38,7 +38,10 @@ def report(
     check_output(output, *read_of(result))
     with StageDisplay() as stage:
         stage("writing the report")
-        rw.report.write_html(result, output, images=images, figures=figures)
+        if rw.report.is_page_of_odometries(result):
+            rw.report.write_odometry_page(result, output)
+        else:
+            rw.report.write_html(result, output, images=images, figures=figures)
     beside = "" if figures is None else f"; figures: {shown_path(figures)}"
     say(f"Written to {shown_path(output)}{beside}.", to_errors=True)
     return ExitStatus.DONE

@@ -10,7 +10,7 @@ import typer
 import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import said_in_the_report
-from gtsam_rwhec.cli.options import RigOption, VerboseOption, show
+from gtsam_rwhec.cli.options import RigOption, VerboseOption, show, show_odometries
 from gtsam_rwhec.cli.stage_display import StageDisplay
 from gtsam_rwhec.files.terminal_text import shown_path
 
@@ -22,10 +22,13 @@ def solve(
     verbose: VerboseOption = False,
 ) -> ExitStatus:
     """Third stage: find the certified poses, refine them, and print covariances."""
+    described = None if rig is None else rw.rig.read_rig(rig)
+    if rw.pipeline.is_of_odometries(described, cleaned):
+        with StageDisplay() as stage, said_in_the_report():
+            solved = rw.pipeline.solve_odometries_into(cleaned, described, output, progress=stage)
+        return show_odometries(solved, output, anyway=False, verbose=verbose)
     with StageDisplay() as stage, said_in_the_report():
-        calibrated = rw.pipeline.solve_into(
-            cleaned, None if rig is None else rw.rig.read_rig(rig), output, progress=stage
-        )
+        calibrated = rw.pipeline.solve_into(cleaned, described, output, progress=stage)
     messages = (
         f"Written: {shown_path(output / rw.pipeline.RESULT_FILE)}, {shown_path(output / rw.pipeline.CLEAN_LOG)}.",
         f"Next: gtsam-rwhec export {shown_path(output / rw.pipeline.CLEAN_LOG)} -o FOLDER",

@@ -13,6 +13,7 @@ from gtsam_rwhec.first_rig.guessed_intrinsics import STATED
 from gtsam_rwhec.first_rig.log_contents import DriverTopic, ImageTopic, LogContents, read_contents
 from gtsam_rwhec.first_rig.log_evidence import evidence_of_log
 from gtsam_rwhec.first_rig.names import camera_name, free_name
+from gtsam_rwhec.first_rig.odometry_proposal import propose_odometries
 from gtsam_rwhec.first_rig.pose_origin import Origin
 from gtsam_rwhec.first_rig.roles import RoleEvidence
 from gtsam_rwhec.first_rig.targets import TODO as _TODO_SIZE
@@ -68,6 +69,10 @@ def propose_rig(log: Log, path: str | Path) -> tuple[str, tuple[str, ...]]:
     notes: list[str] = []
     cameras = _cameras(contents, notes)
     if not cameras:
+        proposed = propose_odometries(contents.poses.values(), log.files[0].path.name)
+        if proposed is not None:
+            parse_rig(proposed[0], str(path))
+            return proposed
         raise RigError(f"{_where(log)}: no images and no detections that can be read; {_topics(contents)}")
     pairs, remarks = moving_pairs(contents.poses.values(), [camera.frame for camera in cameras])
     notes += remarks

@@ -133,6 +133,11 @@ class LogWriter:
         message = {"timestamp": _time(stamp_ns), "frame_id": frame, "poses": [_pose(pose) for pose in T]}
         self._write(topic, "foxglove.PosesInFrame", stamp_ns, message)
 
+    def pose(self, topic: str, stamp_ns: int, frame: str, T: Array) -> None:
+        """Write a ``foxglove.PoseInFrame`` of one pose (4, 4)."""
+        message = {"timestamp": _time(stamp_ns), "frame_id": frame, "pose": _pose(T)}
+        self._write(topic, "foxglove.PoseInFrame", stamp_ns, message)
+
     def compressed_image(self, topic: str, stamp_ns: int, frame: str, encoding: str, data: bytes) -> None:
         """Write a ``foxglove.CompressedImage``; `encoding` is ``jpeg``, ``png`` or the like."""
         content = base64.b64encode(data).decode()

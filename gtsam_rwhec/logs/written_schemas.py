@@ -58,6 +58,7 @@ _DETECTION = _message(
 
 _SCHEMAS = {
     "foxglove.FrameTransforms": _message(transforms=_several(_TRANSFORM)),
+    "foxglove.PoseInFrame": _message(timestamp=_TIME, frame_id=_STRING, pose=_POSE),
     "foxglove.PosesInFrame": _message(timestamp=_TIME, frame_id=_STRING, poses=_several(_POSE)),
     "foxglove.ImageAnnotations": _message(
         circles=_several(_message()), points=_several(_POINTS), texts=_several(_TEXT)

@@ -19,6 +19,16 @@ from .samples_log import samples_of_rig as samples_of_rig
 from .samples_log import samples_problem as samples_problem
 from .samples_log import write_samples_log as write_samples_log
 
+# Sensors that know only their own motion.
+from .odometry_road import calibrate_odometry_log as calibrate_odometry_log
+from .odometry_road import export_odometries as export_odometries
+from .odometry_road import is_of_odometries as is_of_odometries
+from .odometry_solving import OdometrySolved as OdometrySolved
+from .odometry_solving import read_odometries as read_odometries
+from .odometry_solving import solve_odometries as solve_odometries
+from .odometry_solving import solve_odometries_into as solve_odometries_into
+from .odometry_tracks import read_odometry as read_odometry
+
 # What comes out, and what a log that a stage wrote holds.
 from .earlier_output import earlier_run as earlier_run
 from .image_options import check_drawable as check_drawable

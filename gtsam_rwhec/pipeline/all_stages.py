@@ -125,6 +125,11 @@ def calibrate_log(
     RwhecError
         As each stage does.
     """
+    if rig is not None and rig.is_of_odometries:
+        raise LogError(
+            f"{rig.source.place(('sensors',))}: no sensor sees a target, and each knows only its own motion; calibrate "
+            "with rw.pipeline.calibrate_odometry_log"
+        )
     check_is_no_other_folder(log_path, rig)
     choices = _Choices(images, workers, anyway, report_images)
     if rig is not None and (is_folder_of_images(log_path, rig) or is_file_of_samples(log_path, rig)):

@@ -29,8 +29,9 @@ from gtsam_rwhec.pipeline.clocks_by_turning import offset_of_either_direction
 from gtsam_rwhec.pipeline.log_contract import topics_up_to_detection
 from gtsam_rwhec.pipeline.log_metadata import read_metadata
 from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, write_pairs
+from gtsam_rwhec.pipeline.odometry_cleaning import odometry_steps
 from gtsam_rwhec.pipeline.odometry_pairs import odometry_pairs
-from gtsam_rwhec.pipeline.odometry_tracks import write_files
+from gtsam_rwhec.pipeline.odometry_tracks import read_odometry, write_files
 from gtsam_rwhec.pipeline.output_paths import check_writable
 from gtsam_rwhec.pipeline.tracks import Track, read_tracks
 from gtsam_rwhec.results.log_history import CleaningReport
@@ -103,7 +104,14 @@ def clean_log(
                 sigmas_s[sensor] = sigma_s
             _check_overlap(tracks, path, sensor, offsets_s[sensor])
             pairs += [clean_track(track, path, rig, offsets_s[sensor]) for track in tracks]
-        for sensor in (name for name in rig.odometries if name != rig.reference):
+        if rig.is_of_odometries:
+            assert rig.reference is not None
+            reference = read_odometry(log, rig, rig.reference)
+            for sensor, section in rig.odometries.items():
+                tell(f"cleaning {sensor}")
+                pairs.append(odometry_steps(log, rig, reference, sensor))
+                offsets_s[sensor] = 0.0 if section.time_offset == "estimate" else float(section.time_offset)
+        for sensor in (name for name in rig.odometries if name != rig.reference and not rig.is_of_odometries):
             tell(f"comparing the motions of {sensor}")
             motions, offsets_s[sensor], sigma_s = odometry_pairs(log, rig, sensor, motion)
             if sigma_s is not None:

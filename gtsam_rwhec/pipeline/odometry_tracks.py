@@ -94,4 +94,4 @@ def write_files(out: LogWriter, log: Log | None, rig: Rig) -> None:
         stamps, T = read_file(rig, sensor)
         frame = rig.frame_of(sensor)
         for stamp, pose in zip(stamps.tolist(), T, strict=True):
-            out.transforms(topic, stamp, [(f"{frame}_start", frame, pose)])
+            out.pose(topic, stamp, f"{frame}_start", pose)

@@ -117,6 +117,8 @@ def solve_log(clean_path: str | Path, rig: Rig | None = None, *, progress: Progr
     """
     with open_log(clean_path) as log:
         rig = rig_for_solving(log, rig)
+        if rig.is_of_odometries:
+            raise LogError(f"{clean_path}: no sensor sees a target; solve it with solve_odometries")
         if rig.given != GivenSection():
             raise LogError(
                 f"{rig.source.place(('given',))}: what is given is not used where cameras see targets; "

@@ -98,6 +98,11 @@ class RigFile(Section):
         """The sensors that know only their own motion, by name; with the reference."""
         return {name: sensor for name, sensor in self.all_sensors.items() if isinstance(sensor, OdometrySensor)}
 
+    @property
+    def is_of_odometries(self) -> bool:
+        """Whether no sensor sees a target, and only the sensors' own motions are known."""
+        return self.reference is not None and not self.sensors
+
     @cached_property
     def calibrated(self) -> tuple[str, ...]:
         """The names of all sensors whose poses are asked for: all but the reference, which carries them."""

@@ -120,6 +120,12 @@ def transform(stamp_ns: int, parent: str, child: str, T: Array, topic: str = "/t
     return Message(topic, "foxglove.FrameTransforms", {"transforms": [content]}, stamp_ns)
 
 
+def pose_in_frame(stamp_ns: int, frame: str, T: Array, topic: str) -> Message:
+    time = {"sec": stamp_ns // 10**9, "nsec": stamp_ns % 10**9}
+    content = {"timestamp": time, "frame_id": frame, "pose": _pose(T)}
+    return Message(topic, "foxglove.PoseInFrame", content, stamp_ns)
+
+
 def tag(
     number: int, T: Array, *, family: str = "tag36h11", size_m: float = SIZE_M, corners_px: Array | None = None
 ) -> dict[str, Any]:

@@ -1,0 +1,284 @@
+"""The result file of a calibration of odometries: poses, covariances, what is free, what was given, the proof.
+
+It is another kind of file than the result of cameras that see targets: it has one certificate of a joint cost, and no
+targets. ``null`` stands for what is infinite: a standard deviation along a free direction.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
+from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.files.atomic_write import write_atomically
+from gtsam_rwhec.files.whole_files import read_whole
+from gtsam_rwhec.geometry.poses import Array, one_transform
+from gtsam_rwhec.geometry.quaternions import of_rotations
+from gtsam_rwhec.odometry.calibrated import OdometryCalibration
+from gtsam_rwhec.odometry.found import JointCertificate
+from gtsam_rwhec.odometry.judging import free_in_words, judgement_of
+
+FORMAT, FORMAT_VERSION = "gtsam_rwhec.odometry_calibration", 1
+#: A result is at most so many bytes.
+MOST_BYTES = 50_000_000
+CONVENTIONS = (
+    "T_reference_sensor maps coordinates in the sensor's frame to those of the reference. Covariances are of right "
+    "perturbations T Expmap([omega, v]), rad and m, in the sensor's own axes; null is infinite. A scale is measured "
+    "length / true length. A sensor's stamp t is the reference's t + time_offset_s."
+)
+
+Row3 = tuple[float, float, float]
+Row4 = tuple[float, float, float, float]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class NoiseRecord(_Record):
+    """How the errors of an odometry grow."""
+
+    rotation_deg_per_sqrt_s: float
+    translation_mm_per_sqrt_s: float
+    was_found: bool
+
+
+class SensorRecord(_Record):
+    """One sensor; of the reference the pose is the identity."""
+
+    sensor: str
+    frame: str
+    translation_m: Row3
+    quaternion_xyzw: Row4
+    T_reference_sensor: tuple[Row4, Row4, Row4, Row4]
+    standard_deviations_deg: tuple[float | None, float | None, float | None]
+    standard_deviations_mm: tuple[float | None, float | None, float | None]
+    covariance: tuple[tuple[float | None, ...], ...]
+    scale: float | None = Field(description="measured / true length; null where it is known, 1")
+    scale_sigma: float | None
+    time_offset_s: float
+    time_offset_sigma_s: float | None
+    noise: NoiseRecord
+    residual_rotation: float = Field(description="root mean square, in standard deviations")
+    residual_translation: float
+    windows: int = Field(description="windows in which it is used")
+    removed: dict[str, int] = Field(description="poses and windows that are not used, by reason")
+
+
+class FreeRecord(_Record):
+    """One direction in which the answer may move while the motions fit as well."""
+
+    kind: str
+    reason: str | None
+    frames: dict[str, tuple[float, ...]]
+    own_scales: dict[str, float]
+    sentence: str
+
+
+class GivenRecord(_Record):
+    """A number that a person gave, and how the answer depends on it."""
+
+    what: str
+    value: float
+    sigma: float
+    unit: str
+    off_by_sigmas: float
+    per_unit: dict[str, tuple[float, ...]]
+    moved_mm_per_sigma: dict[str, float]
+    turned_deg_per_sigma: dict[str, float]
+
+
+class OtherRecord(_Record):
+    """Another answer that fits as well."""
+
+    why: str
+    cost_above: float
+    T_reference_sensor: dict[str, tuple[Row4, Row4, Row4, Row4]]
+
+
+class CertificateRecord(_Record):
+    """The proof of the joint cost."""
+
+    status: str
+    cost: float
+    lower_bound: float | None
+    tolerance: float
+    region_m: float | None = Field(description="null: the bound is about all answers")
+    sentence: str
+
+
+class OdometryResult(_Record):
+    """A result file."""
+
+    format: Literal["gtsam_rwhec.odometry_calibration"] = FORMAT
+    format_version: Annotated[int, Field(ge=1, le=FORMAT_VERSION)] = FORMAT_VERSION
+    written_by: str
+    verdict: Verdict
+    verdict_reason: str
+    verdict_grounds: tuple[Ground, ...]
+    not_determined: tuple[str, ...]
+    conventions: str
+    reference: str
+    sensors: tuple[SensorRecord, ...]
+    window_s: float
+    windows: int
+    free_directions: tuple[FreeRecord, ...]
+    given: tuple[GivenRecord, ...]
+    other_answers: tuple[OtherRecord, ...]
+    findings: tuple[str, ...]
+    certificate: CertificateRecord
+    sources: tuple[str, ...]
+
+    @property
+    def judgement(self) -> Judgement:
+        """The verdict with its grounds."""
+        return Judgement(self.verdict, self.verdict_grounds, self.verdict_reason)
+
+    def pose(self, sensor: str) -> Array:
+        """T_reference_sensor (4, 4), metres."""
+        (found,) = (one.T_reference_sensor for one in self.sensors if one.sensor == sensor)
+        return one_transform(np.array(found), f"the pose of {sensor}")
+
+
+def result_of(
+    found: OdometryCalibration, frames: Mapping[str, str] | None = None, sources: tuple[str, ...] = ()
+) -> OdometryResult:
+    """The record of a calibration; `frames` has the names of frames by sensor, `sources` the logs' file names."""
+    judgement = judgement_of(found)
+    return OdometryResult(
+        written_by=f"gtsam-rwhec {version('gtsam-rwhec')}",
+        verdict=judgement.verdict,
+        verdict_reason=judgement.reason,
+        verdict_grounds=judgement.grounds,
+        not_determined=free_in_words(found),
+        conventions=CONVENTIONS,
+        reference=found.reference,
+        sensors=tuple(_sensor(found, name, (frames or {}).get(name, name)) for name in found.sensors),
+        window_s=found.windows.seconds,
+        windows=found.windows.count,
+        free_directions=tuple(
+            FreeRecord(
+                kind=one.kind.value,
+                reason=None if one.reason is None else one.reason.value,
+                frames=one.frames,  # type: ignore[arg-type]
+                own_scales=one.own_scales,
+                sentence=str(one),
+            )
+            for one in found.free_directions
+        ),
+        given=tuple(
+            GivenRecord(
+                what=one.what,
+                value=one.value,
+                sigma=one.sigma,
+                unit=one.unit,
+                off_by_sigmas=one.off_by,
+                per_unit=dict(one.per_unit),
+                moved_mm_per_sigma={n: 1e3 * float(np.linalg.norm(t[3:])) for n, t in one.per_sigma.items()},
+                turned_deg_per_sigma={n: float(np.degrees(np.linalg.norm(t[:3]))) for n, t in one.per_sigma.items()},
+            )
+            for one in found.influences
+        ),
+        other_answers=tuple(
+            OtherRecord(
+                why=one.why,
+                cost_above=one.cost_above,
+                T_reference_sensor={name: _rows(T) for name, T in one.T_reference_sensor.items()},  # type: ignore[misc]
+            )
+            for one in found.others
+        ),
+        findings=found.findings,
+        certificate=CertificateRecord(
+            status=found.certificate.status.value,
+            cost=found.certificate.cost,
+            lower_bound=_finite(found.certificate.lower_bound),
+            tolerance=found.certificate.tolerance,
+            region_m=_finite(found.certificate.region_m),
+            sentence=_proof(found.certificate),
+        ),
+        sources=sources,
+    )
+
+
+def result_json(result: OdometryResult) -> bytes:
+    """What `write_odometry_result` writes."""
+    return (json.dumps(result.model_dump(mode="json"), indent=2, ensure_ascii=False) + "\n").encode()
+
+
+def write_odometry_result(result: OdometryResult, path: str | Path) -> None:
+    """Write a result file; an existing one is replaced. Raises `FileFormatError` if it cannot be written."""
+    write_atomically(path, result_json(result))
+
+
+def read_odometry_result(path: str | Path) -> OdometryResult:
+    """Read a result file; `FileFormatError` if it cannot be read, or is another kind of file."""
+    return parse_odometry_result(read_whole(path, MOST_BYTES, "A result was"), path)
+
+
+def parse_odometry_result(content: bytes, path: str | Path) -> OdometryResult:
+    """Read the content of a file; messages name `path`."""
+    try:
+        return OdometryResult.model_validate_json(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"])) or "$"
+        raise FileFormatError(f"{path} is no result of a calibration of odometries: {place}: {first['msg']}") from error
+
+
+def is_odometry_result(content: bytes) -> bool:
+    """Whether this is the content of such a file, whole or not."""
+    return FORMAT.encode() in content[:1000]
+
+
+def _sensor(found: OdometryCalibration, name: str, frame: str) -> SensorRecord:
+    T, covariance = found.T_reference_sensor[name], found.covariance_of(name)
+    sigma = [_finite(float(x)) for x in np.sqrt(np.diagonal(covariance))]
+    noise, scales = found.noise[name], list(found.scales)
+    scale_sigma = None
+    if name in found.scales:
+        at = 6 * len(found.order) + scales.index(name)
+        scale_sigma = _finite(found.scales[name] * float(np.sqrt(found.covariance[at, at])))
+    return SensorRecord(
+        sensor=name,
+        frame=frame,
+        translation_m=tuple(T[:3, 3].tolist()),
+        quaternion_xyzw=tuple(of_rotations(T[None, :3, :3])[0].tolist()),
+        T_reference_sensor=_rows(T),  # type: ignore[arg-type]
+        standard_deviations_deg=tuple(None if x is None else float(np.degrees(x)) for x in sigma[:3]),  # type: ignore[arg-type]
+        standard_deviations_mm=tuple(None if x is None else 1e3 * x for x in sigma[3:]),  # type: ignore[arg-type]
+        covariance=tuple(tuple(_finite(x) for x in row) for row in covariance.tolist()),
+        scale=found.scales.get(name),
+        scale_sigma=scale_sigma,
+        time_offset_s=found.time_offsets_s.get(name, 0.0),
+        time_offset_sigma_s=_finite(found.time_offset_sigmas_s.get(name, np.inf)),
+        noise=NoiseRecord(
+            rotation_deg_per_sqrt_s=float(np.degrees(noise.rotation_rad_per_sqrt_s)),
+            translation_mm_per_sqrt_s=1e3 * noise.translation_m_per_sqrt_s,
+            was_found=name in found.noise_was_found,
+        ),
+        residual_rotation=found.residuals[name][0],
+        residual_translation=found.residuals[name][1],
+        windows=found.windows.used[name],
+        removed=dict(Counter(str(one.reason) for one in found.removed.get(name, ()))),
+    )
+
+
+def _proof(found: JointCertificate) -> str:
+    where = "no answer" if np.isinf(found.region_m) else f"no answer within {found.region_m:g} m"
+    return f"{found.status}: the joint cost is {found.cost:.6g}, and {where} costs less than {found.lower_bound:.6g}"
+
+
+def _rows(T: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in T.tolist())
+
+
+def _finite(number: float) -> float | None:
+    return number if np.isfinite(number) else None

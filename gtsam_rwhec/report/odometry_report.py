@@ -1,0 +1,121 @@
+"""The report of a calibration of odometries, as people read it: verdict, what to do, poses, what is free, the proof."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from gtsam_rwhec.files.terminal_text import shown_path
+from gtsam_rwhec.odometry.odometry_file import OdometryResult, SensorRecord
+from gtsam_rwhec.report.covariance_report import DEVIATION_HEADINGS
+from gtsam_rwhec.report.pose_table import POSE_HEADINGS, FrameTable, pose_cells
+from gtsam_rwhec.report.printing import (
+    STYLES,
+    print_heading,
+    print_list,
+    print_sentence,
+    print_tables,
+    report_console,
+)
+
+LEGEND = (
+    "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation along "
+    "and about the sensor's own axes; free: not determined."
+)
+
+
+def print_odometry(result: OdometryResult, *, verbose: bool = False, page: Path | None = None) -> None:
+    """Print the report of a calibration of odometries."""
+    console = report_console()
+    print_sentence(console, str(result.judgement), STYLES[result.verdict])
+    if page is not None:
+        print_sentence(console, f"The report: {shown_path(page)}")
+    console.print()
+    print_tables(console, [pose_table(result)], LEGEND)
+    print_list(console, scales_and_clocks(result))
+    if result.given:
+        print_heading(console, "What was given, and how the answer depends on it", tight=True)
+        print_list(console, given_in_words(result))
+    print_heading(console, "The proof and the noise", tight=True)
+    print_list(console, proof_in_words(result))
+    removed = removed_in_words(result)
+    if removed:
+        print_list(console, removed if verbose else removed[:4])
+    if verbose:
+        print_list(console, [one.sentence for one in result.free_directions])
+
+
+def pose_table(result: OdometryResult) -> FrameTable:
+    """Poses in the frame of the reference, with their standard deviations."""
+    rows = {
+        one.sensor: (*pose_cells(gtsam.Pose3(np.array(one.T_reference_sensor))), *deviations(one))
+        for one in result.sensors
+        if one.sensor != result.reference
+    }
+    title = f"Sensors in the frame of {result.reference}"
+    return FrameTable(title, "sensor", (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows, tight=True)
+
+
+def deviations(one: SensorRecord) -> tuple[str, ...]:
+    """Standard deviations in mm, then in degrees."""
+    millimetres = ("free" if x is None else f"{x:.2f}" for x in one.standard_deviations_mm)
+    degrees = ("free" if x is None else f"{x:.3f}" for x in one.standard_deviations_deg)
+    return (*millimetres, *degrees)
+
+
+def scales_and_clocks(result: OdometryResult) -> list[str]:
+    """Scales and time offsets, in a sentence each."""
+    said = []
+    for one in result.sensors:
+        if one.scale is not None:
+            sigma = "not determined" if one.scale_sigma is None else f"± {one.scale_sigma:.2g}"
+            said.append(f"scale of {one.sensor}: {one.scale:.5g} {sigma} (measured length / true length).")
+        if one.time_offset_sigma_s is not None and one.sensor != result.reference:
+            said.append(
+                f"clock of {one.sensor}: its stamp t is t {1e3 * one.time_offset_s:+.2f} ms of {result.reference}, ± "
+                f"{1e3 * one.time_offset_sigma_s:.2g} ms."
+            )
+    return said
+
+
+def given_in_words(result: OdometryResult) -> list[str]:
+    """Each given number, what it moves, and whether the motions agree to it."""
+    said = []
+    for one in result.given:
+        moved = [(size, name) for name, size in one.moved_mm_per_sigma.items()]
+        turned = max(one.turned_deg_per_sigma.values(), default=0.0)
+        most, name = max(moved, default=(0.0, ""))
+        effect = "moves no pose" if not name else f"moves {name} by {most:.2g} mm"
+        effect += f" and turns a sensor by {turned:.2g}°" if turned > 1e-4 else ""
+        said.append(
+            f"{one.what} = {one.value:g} ± {one.sigma:.2g} {one.unit}: an error of one standard deviation {effect}; "
+            f"the motions are {one.off_by_sigmas:.1f} standard deviations away."
+        )
+    return said
+
+
+def proof_in_words(result: OdometryResult) -> list[str]:
+    """The certificate, the windows, and the noise of each sensor."""
+    said = [
+        f"{result.certificate.sentence}.",
+        f"{result.windows} windows of {result.window_s:.3g} s, all sensors at once.",
+    ]
+    for one in result.sensors:
+        noise, how = one.noise, "found" if one.noise.was_found else "stated"
+        said.append(
+            f"noise of {one.sensor} ({how}): {noise.rotation_deg_per_sqrt_s:.2g}° and "
+            f"{noise.translation_mm_per_sqrt_s:.3g} mm after a second; residuals {one.residual_rotation:.2f} and "
+            f"{one.residual_translation:.2f} times it, in {one.windows} windows."
+        )
+    return said
+
+
+def removed_in_words(result: OdometryResult) -> list[str]:
+    """What is not used, by sensor and reason."""
+    return [
+        f"not used of {one.sensor}: {', '.join(f'{count} {why}' for why, count in one.removed.items())}."
+        for one in result.sensors
+        if one.removed
+    ]
