@@ -88,6 +88,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/first_rig": {
         "first_rig/test_first_rig.py": "carriers log_contents names proposal targets",
         "first_rig/test_folder_proposal.py": "guessed_intrinsics",
+        "pipeline/test_odometry_road.py": "odometry_proposal",
         "vision/test_boards_seen.py": "boards_seen",
     },
     "gtsam_rwhec/fleet": {
@@ -145,6 +146,7 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/odometry": {
         "odometry/test_calibrated.py": "found",
+        "pipeline/test_odometry_road.py": "judging odometry_file",
         "odometry/test_calibrating.py": (
             "clocks findings freedom given_rows other_answers refining result solved_windows up"
         ),
@@ -194,6 +196,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/report": {
         "calibration/test_cross_validation.py": "cross_validation_table",
         "cli/test_diff.py": "change_report",
+        "pipeline/test_odometry_road.py": "odometry_report",
         "pipeline/test_verified_log.py": "verification_report",
         "cli/test_wheel.py": "advice",
         "methods/test_comparison.py": "comparison_report",
@@ -213,6 +216,7 @@ TABLE: dict[str, dict[str, str]] = {
         "report/page/test_seen.py": "empty_regions seen_figures",
         "report/page/test_residual_sections.py": "residual_charts",
         "cli/test_diff.py": "changes_page",
+        "pipeline/test_odometry_road.py": "odometry_page",
         "report/page/test_figures.py": "figure_files",
         "report/page/test_written.py": "blocks html shown_result",
     },

@@ -58,7 +58,10 @@ def free_in_words(found: OdometryCalibration) -> tuple[str, ...]:
 
 def _of_frames(direction: FreeDirection, found: OdometryCalibration) -> list[str]:
     turns, shifts = (
-        {name: _in_reference(found.T_reference_sensor, name, twist[part]) for name, twist in direction.frames.items()}
+        {
+            name: _in_reference(found.T_reference_sensor, name, np.array(twist)[part])
+            for name, twist in direction.frames.items()
+        }
         for part in (slice(0, 3), slice(3, 6))
     )
     said = []
@@ -92,8 +95,8 @@ def _why(direction: FreeDirection) -> str:
     return "unknown why" if direction.reason is None else direction.reason.words
 
 
-def _in_reference(T_reference_sensor: Mapping[str, Array], name: str, v: tuple[float, ...]) -> Array:
-    turned: Array = T_reference_sensor[name][:3, :3] @ np.array(v)
+def _in_reference(T_reference_sensor: Mapping[str, Array], name: str, v: Array) -> Array:
+    turned: Array = T_reference_sensor[name][:3, :3] @ v
     return turned
 
 

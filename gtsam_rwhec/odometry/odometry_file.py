@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -26,7 +26,8 @@ from gtsam_rwhec.odometry.calibrated import OdometryCalibration
 from gtsam_rwhec.odometry.found import JointCertificate
 from gtsam_rwhec.odometry.judging import free_in_words, judgement_of
 
-FORMAT, FORMAT_VERSION = "gtsam_rwhec.odometry_calibration", 1
+FORMAT: Final = "gtsam_rwhec.odometry_calibration"
+FORMAT_VERSION: Final = 1
 #: A result is at most so many bytes.
 MOST_BYTES = 50_000_000
 CONVENTIONS = (

@@ -149,9 +149,8 @@ def solve_odometries_into(
         replace(read_metadata(log), rig=solved.rig).write(writer)
         first_ns = min(int(one.stamps_ns[0]) for one in pairs.values())
         frames = frames_of_odometries(solved)
-        writer.transforms(
-            SOLUTION_TOPIC, first_ns, [(frames.sensor_carrier, name, T) for name, T in frames.sensors.items()]
-        )
+        named = [(parent, child, np.asarray(T, dtype=np.float64)) for parent, child, T in frames.sensor_frames()]
+        writer.transforms(SOLUTION_TOPIC, first_ns, named)
         writer.attachment(RESULT_FILE, "application/json", result_json(solved.result), first_ns)
     list_written(out, solved.result.sources, [out / name for name in (RESULT_FILE, REPORT_FILE, CLEAN_LOG)])
     return solved
