@@ -112,7 +112,10 @@ TABLE: dict[str, dict[str, str]] = {
         "handeye/test_refusals.py": "request",
         "methods/test_chained.py": "on_pairs",
     },
-    "gtsam_rwhec/identifiability": {"identifiability/test_identification.py": "threshold verdicts"},
+    "gtsam_rwhec/identifiability": {
+        "identifiability/test_identification.py": "threshold verdicts",
+        "identifiability/test_large_identification.py": "pairs_alone weak_directions",
+    },
     "gtsam_rwhec/logs": {
         "logs/test_hostile_bags.py": "bag_definitions ros1_checks ros2_checks",
         "logs/test_hostile_logs.py": "mcap_chunks mcap_index mcap_records",

@@ -12,12 +12,15 @@ c_i = R_A t_X + t_A - t_Y (the true translation that B sees, in the sensor carri
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.moments import ONE, R_A, T_A
+from gtsam_rwhec.problem.moments import R_A, T_A
+from gtsam_rwhec.solver.block_matrix import BlockMatrix, sum_into
+from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses
 from gtsam_rwhec.solver.rotations import HATS
@@ -25,126 +28,196 @@ from gtsam_rwhec.solver.rotations import HATS
 #: A pair has 15 parameters: seven of the target, seven of the sensor, the logarithm of the shared scale. A frame has
 #: seven: rotation, translation, logarithm of its own scale.
 OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
+#: The information of so many pairs is made at once: some megabytes.
+PAIRS_AT_ONCE = 2048
+
+#: Which of them are rotations.
+IS_ROTATION = np.isin(np.arange(15), (0, 1, 2, 7, 8, 9))
 
 _UPPER = np.triu_indices(15, 1)
+#: The features of A, among those without R_B.
+_OF_A = np.r_[R_A, T_A, 15]
+_EYE = np.eye(3)
 
 
 @dataclass(frozen=True)
 class PairInformation:
-    """Of every pair: the information of its rotation and translation residuals (E, 15, 15)."""
+    """What each pair's information is made of; the matrices themselves are made for some pairs at a time."""
 
-    rotation: Array
-    translation: Array
-    #: (E, 15): whether the pair has the parameter.
-    used: np.ndarray
+    kappa: Array  #: (E,)
+    weight: Array  #: (E,)
+    alpha: Array  #: (E,), the scale
+    R_Y: Array  #: (E, 3, 3)
+    turned: Array  #: (E, 3, 3): sum w (R_Y' R_A R_X)'
+    arm: Array  #: (E, 3, 3): sum w R_X' R_A' c^ R_Y
+    along: Array  #: (E, 3): sum w R_X' R_A' c
     #: (E, 3) and (E, 3, 3): sum w c and sum w c c', in the sensor carrier's frame.
     lever: Array
     lever_squares: Array
+    #: (E, 15): whether the pair has the parameter.
+    used: np.ndarray
+    motion: np.ndarray  #: (E,): whether both ends are one frame
+    owns: np.ndarray  #: (E,): whether the target (or the sensor of motions) has a scale of its own
+
+    def rotation(self, at: slice | np.ndarray = slice(None)) -> Array:
+        """The information of some pairs' rotation residuals, (k, 15, 15)."""
+        K = self.kappa[at]
+        full = np.zeros((len(K), 15, 15))
+        full[:, OMEGA_X, OMEGA_X] = full[:, OMEGA_Y, OMEGA_Y] = 2.0 * K[:, None, None] * _EYE
+        full[:, OMEGA_X, OMEGA_Y] = -2.0 * (K / self.weight[at])[:, None, None] * self.turned[at]
+        self._fold(full, at)
+        return full
+
+    def translation(self, at: slice | np.ndarray = slice(None)) -> Array:
+        """The information of some pairs' translation residuals, (k, 15, 15)."""
+        R_Y, c, cc = self.R_Y[at], self.lever[at], self.lever_squares[at]
+        R_Yt = R_Y.transpose(0, 2, 1)
+        full = np.zeros((len(c), 15, 15))
+        full[:, V_X, V_X] = full[:, V_Y, V_Y] = self.weight[at][:, None, None] * _EYE
+        full[:, V_X, V_Y] = -self.turned[at]
+        full[:, V_X, OMEGA_Y] = self.arm[at]
+        skew = np.einsum("em,kjm->ekj", c, HATS)  # sum w c^
+        full[:, OMEGA_Y, V_Y] = -(R_Yt @ skew @ R_Y).transpose(0, 2, 1)
+        square = np.einsum("eii->e", cc)
+        full[:, OMEGA_Y, OMEGA_Y] = R_Yt @ (square[:, None, None] * _EYE - cc) @ R_Y
+        full[:, V_X, SHARED] = self.along[at]
+        full[:, V_Y, SHARED] = -np.einsum("eij,ej->ei", R_Yt, c)
+        full[:, SHARED, SHARED] = square  # c^ c = 0: nothing with omega_Y
+        full *= (self.alpha[at] ** 2)[:, None, None]
+        self._fold(full, at)
+        for owns, place in ((self.owns & ~self.motion, OWN_X), (self.owns & self.motion, 13)):
+            rows = np.flatnonzero(owns[at])
+            full[rows, place] += full[rows, SHARED]
+            full[rows, :, place] += full[rows, :, SHARED]
+            full[rows, place, place] = full[rows, SHARED, SHARED]
+        return full
+
+    def _fold(self, full: Array, at: slice | np.ndarray) -> None:
+        """Fill the lower triangles; of motions, whose ends are one frame, fold the first end onto the second."""
+        full[:, _UPPER[1], _UPPER[0]] = full[:, _UPPER[0], _UPPER[1]]
+        rows = np.flatnonzero(self.motion[at])
+        if len(rows):
+            one = full[rows]
+            one[:, 7:14] += one[:, :7]
+            one[:, :, 7:14] += one[:, :, :7]
+            one[:, :7] = one[:, :, :7] = 0.0
+            full[rows] = one
 
 
 def pair_information(part: Part, poses: PairPoses) -> PairInformation:
-    """The information of every pair, all pairs at once."""
+    """The information of every pair, from the moments of some pairs at a time."""
     E = len(part.pairs)
-    R_X, t_X, R_Y, t_Y, alpha = poses.R_X, poses.t_X, poses.R_Y, poses.t_Y, poses.alpha
-    free, owners = frozenset(part.free), frozenset(part.scale_owners)
-    G, W = np.nan_to_num(part.moments.translation[:]), part.moments.weight
-    K = part.moments.kappa
-
-    # Moments of c = R_A t_X + t_A - t_Y, linear in A's features: c = [t_X' (x) I, I, -t_Y] f.
-    linear = np.zeros((E, 3, 25))
-    linear[:, :, R_A] = np.einsum("ej,ik->eijk", t_X, np.eye(3)).reshape(E, 3, 9)
-    linear[:, :, T_A] = np.eye(3)
-    linear[:, :, ONE] = -t_Y
-    Gc = G @ linear.transpose(0, 2, 1)  # sum w f c'
-    cc = linear @ Gc
-    c = Gc[:, ONE]
-    Rt = G[:, R_A, ONE].reshape(E, 3, 3)  # sum w R_A'
-    Rt_c = Gc[:, R_A].reshape(E, 3, 3, 3)  # [i, k, m]: sum w R_A[k, i] c[m]
-
-    R_Xt, R_Yt = R_X.transpose(0, 2, 1), R_Y.transpose(0, 2, 1)
-    turned = R_Xt @ Rt @ R_Y  # sum w (R_Y' R_A R_X)'
-    eye = np.eye(3)
-    rotation = np.zeros((E, 15, 15))
-    rotation[:, OMEGA_X, OMEGA_X] = rotation[:, OMEGA_Y, OMEGA_Y] = 2.0 * K[:, None, None] * eye
-    rotation[:, OMEGA_X, OMEGA_Y] = -2.0 * (K / W)[:, None, None] * turned
-    translation = np.zeros((E, 15, 15))
-    translation[:, V_X, V_X] = translation[:, V_Y, V_Y] = W[:, None, None] * eye
-    translation[:, V_X, V_Y] = -turned
-    # (c^)_{kj} = -eps_{kjm} c_m, so sum w (R_A' c^)_{ij} = -sum w R_A[k, i] eps_{kjm} c_m.
-    Rt_skew = np.einsum("eikm,kjm->eij", Rt_c, HATS)
-    translation[:, V_X, OMEGA_Y] = R_Xt @ Rt_skew @ R_Y
-    skew = np.einsum("em,kjm->ekj", c, HATS)  # sum w c^
-    translation[:, OMEGA_Y, V_Y] = -(R_Yt @ skew @ R_Y).transpose(0, 2, 1)
-    square = np.einsum("eii->e", cc)
-    translation[:, OMEGA_Y, OMEGA_Y] = R_Yt @ (square[:, None, None] * eye - cc) @ R_Y
-    translation[:, V_X, SHARED] = np.einsum("eij,ej->ei", R_Xt, np.einsum("eikk->ei", Rt_c))
-    translation[:, V_Y, SHARED] = -np.einsum("eij,ej->ei", R_Yt, c)
-    translation[:, SHARED, SHARED] = square  # c^ c = 0: nothing with omega_Y
-    for full in (rotation, translation):
-        full[:, _UPPER[1], _UPPER[0]] = full[:, _UPPER[0], _UPPER[1]]
-    translation *= (alpha**2)[:, None, None]
-
+    moments = part.moments
+    turned, arm, along = np.empty((E, 3, 3)), np.empty((E, 3, 3)), np.empty((E, 3))
+    lever, lever_squares = np.empty((E, 3)), np.empty((E, 3, 3))
+    for at in moments.blocks():
+        G = moments.fronts(at)[:, _OF_A[:, None], _OF_A]
+        R_Xt, R_Y = poses.R_X[at].transpose(0, 2, 1), poses.R_Y[at]
+        k = len(G)
+        # Moments of c = R_A t_X + t_A - t_Y, linear in A's features: c = [t_X' (x) I, I, -t_Y] f.
+        linear = np.zeros((k, 3, 13))
+        linear[:, :, :9] = np.einsum("ej,ik->eijk", poses.t_X[at], _EYE).reshape(k, 3, 9)
+        linear[:, :, 9:12] = _EYE
+        linear[:, :, 12] = -poses.t_Y[at]
+        Gc = G @ linear.transpose(0, 2, 1)  # sum w f c'
+        lever_squares[at] = linear @ Gc
+        lever[at] = Gc[:, 12]
+        Rt = G[:, :9, 12].reshape(k, 3, 3)  # sum w R_A'
+        Rt_c = Gc[:, :9].reshape(k, 3, 3, 3)  # [i, k, m]: sum w R_A[k, i] c[m]
+        turned[at] = R_Xt @ Rt @ R_Y
+        # (c^)_{kj} = -eps_{kjm} c_m, so sum w (R_A' c^)_{ij} = -sum w R_A[k, i] eps_{kjm} c_m.
+        arm[at] = R_Xt @ np.einsum("eikm,kjm->eij", Rt_c, HATS) @ R_Y
+        along[at] = np.einsum("eij,ej->ei", R_Xt, np.einsum("eikk->ei", Rt_c))
+    free, owners = part.ends < len(part.free), frozenset(part.scale_owners)
+    owns = np.array([target in owners for target, _ in part.pairs], dtype=bool) if owners else np.zeros(E, dtype=bool)
+    motion = moments.motion
     used = np.zeros((E, 15), dtype=bool)
-    for e, pair in enumerate(part.pairs):
-        if pair.is_motion:  # both ends are one frame: fold the first onto the second
-            for full in (rotation[e], translation[e]):
-                full[7:14] += full[:7]
-                full[:, 7:14] += full[:, :7]
-                full[:7] = full[:, :7] = 0.0
-        used[e, :6] = pair.target in free and not pair.is_motion
-        used[e, 7:13] = pair.sensor in free
-        used[e, SHARED] = part.scale == "shared"
-        if pair.target in owners:
-            at = 13 if pair.is_motion else OWN_X
-            for full in (translation[e], translation[e].T):
-                full[at] += full[SHARED]
-            translation[e, at, at] = alpha[e] ** 2 * square[e]
-            used[e, at] = True
-    return PairInformation(rotation, translation, used, c, cc)
+    used[:, :6] = (free[:, 0] & ~motion)[:, None]
+    used[:, 7:13] = free[:, 1, None]
+    used[:, SHARED] = part.scale == "shared"
+    used[:, OWN_X], used[:, 13] = owns & ~motion, owns & motion
+    return PairInformation(
+        kappa=moments.kappa,
+        weight=moments.weight,
+        alpha=poses.alpha,
+        R_Y=poses.R_Y,
+        turned=turned,
+        arm=arm,
+        along=along,
+        lever=lever,
+        lever_squares=lever_squares,
+        used=used,
+        motion=motion,
+        owns=owns,
+    )
 
 
 @dataclass(frozen=True)
 class Information:
-    """Arrow matrix: leaf (L, 7, 7), coupling (L, 7, 7 P + 1), border (7 P + 1 square); and the diagonal of the noise.
+    """The information of all frames, seven parameters each, and of the logarithm of the shared scale, the tail.
 
-    The border has seven parameters of each center, then the logarithm of the shared scale. ``noise`` and ``used`` have
-    one entry for each parameter, (7 L + 7 P + 1,).
+    ``noise`` and ``used`` have one entry for each parameter, (7 n + 1,).
     """
 
-    leaf: Array
-    coupling: Array
-    border: Array
+    matrix: BlockMatrix
     noise: Array
     used: np.ndarray
 
 
-def information(part: Part, by_pair: Array, noise: Array, used: np.ndarray, priors: Array) -> Information:
-    """Add up pairs' information (E, 15, 15) and noise (E, 15), and the priors' (n, 7) diagonal, along the graph."""
-    L, P = len(part.leaves), len(part.centers)
-    n = L + P
-    place = {name: i for i, name in enumerate(part.free)}
-    ends = np.array([[place.get(name, n) for name in pair] for pair in part.pairs])  # n: a fixed frame
-    # Each frame has a row; one row more takes what the fixed frames would get.
-    own, with_scale = np.zeros((n + 1, 7, 7)), np.zeros((n + 1, 7))
-    frame_noise, frame_used = np.zeros((n + 1, 7)), np.zeros((n + 1, 7), dtype=bool)
+def order_of(part: Part) -> Elimination:
+    """In which order the frames of a part are eliminated: the couplings are its pairs of two free frames."""
+    ends = np.sort(part.ends[_coupled(part)], axis=1)
+    return Elimination.of(len(part.free), ends[:, 0], ends[:, 1])
+
+
+def _coupled(part: Part) -> np.ndarray:
+    """(E,): whether a pair has two free frames."""
+    coupled: np.ndarray = (part.ends < len(part.free)).all(axis=1) & ~part.moments.motion
+    return coupled
+
+
+def information(
+    part: Part,
+    order: Elimination,
+    by_pairs: Sequence[Callable[[slice], Array]],
+    noise: Array,
+    used: np.ndarray,
+    priors: Array,
+) -> Information:
+    """Add up pairs' information and noise (E, 15), and the priors' (n, 7) diagonal, along the graph.
+
+    ``by_pairs`` give the information of some pairs (k, 15, 15), as `PairInformation` does; it is summed.
+    """
+    n, E = len(part.free), len(part.pairs)
+    coupled = _coupled(part)
+    place = np.cumsum(coupled) - 1
+    frames, tails, tail = np.zeros((n, 7, 7)), np.zeros((n, 7, 1)), np.zeros((1, 1))
+    frame_noise, frame_used = np.zeros((n, 7)), np.zeros((n, 7))
+    couplings = np.zeros((int(coupled.sum()), 7, 7))
     sides = slice(0, 7), slice(7, 14)
-    for frames, at in zip(ends.T, sides, strict=True):
-        np.add.at(own, frames, by_pair[:, at, at])
-        np.add.at(with_scale, frames, by_pair[:, at, 14])
-        np.add.at(frame_noise, frames, noise[:, at])
-        np.logical_or.at(frame_used, frames, used[:, at])
-    coupling, border = np.zeros((L, 7, 7 * P + 1)), np.zeros((7 * P + 1, 7 * P + 1))
-    for e in np.flatnonzero((ends < n).all(axis=1) & (ends[:, 0] != ends[:, 1])):
-        (i, at_i), (j, at_j) = sorted(zip(ends[e], sides, strict=True))  # the leaf before the center
-        coupling[i, :, 7 * (j - L) : 7 * (j - L) + 7] += by_pair[e, at_i, at_j]
-    coupling[:, :, -1] = with_scale[:L]
-    np.einsum("papb->pab", border[:-1, :-1].reshape(P, 7, P, 7))[...] = own[L:n]
-    border[-1, :-1] = border[:-1, -1] = with_scale[L:n].ravel()
-    border[-1, -1] = by_pair[:, 14, 14].sum()
-    np.einsum("lii->li", own)[:L] += priors[:L]
-    np.einsum("ii->i", border)[:-1] += priors[L:].ravel()
-    all_noise = np.r_[frame_noise[:n].ravel(), noise[:, 14].sum()]
-    return Information(own[:L], coupling, border, all_noise, np.r_[frame_used[:n].ravel(), used[:, 14].any()])
+    for begin in range(0, E, PAIRS_AT_ONCE):
+        at = slice(begin, begin + PAIRS_AT_ONCE)
+        by_pair = by_pairs[0](at)
+        for more in by_pairs[1:]:
+            by_pair = by_pair + more(at)
+        ends = part.ends[at]
+        for side, of in enumerate(sides):
+            has = np.flatnonzero(ends[:, side] < n)
+            index = ends[has, side]
+            sum_into(frames, index, by_pair[has, of, of])
+            sum_into(tails, index, by_pair[has, of, 14:])
+            sum_into(frame_noise, index, noise[at][has, of])
+            sum_into(frame_used, index, used[at][has, of].astype(float))
+        tail += by_pair[:, 14, 14].sum()
+        both = np.flatnonzero(coupled[at])
+        blocks = by_pair[both, :7, 7:14]
+        swapped = ends[both, 0] > ends[both, 1]
+        blocks[swapped] = blocks[swapped].transpose(0, 2, 1)
+        couplings[place[at][both]] = blocks
+    np.einsum("nii->ni", frames)[...] += priors
+    matrix = BlockMatrix(order, frames, couplings, tails, tail)
+    all_noise = np.r_[frame_noise.ravel(), noise[:, 14].sum()]
+    return Information(matrix, all_noise, np.r_[frame_used.ravel() > 0.0, used[:, 14].any()])
 
 
 def prior_information(part: Part) -> tuple[Array, Array]:

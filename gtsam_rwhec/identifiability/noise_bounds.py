@@ -30,11 +30,11 @@ from gtsam_rwhec.identifiability.information import (
     V_Y,
     PairInformation,
     information,
+    order_of,
     prior_information,
 )
 from gtsam_rwhec.identifiability.threshold import free_threshold
 from gtsam_rwhec.problem.moments import ONE, R_A, T_B
-from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses
 
@@ -110,14 +110,17 @@ def equations_to_spare(part: Part, pairs: PairInformation) -> tuple[float, float
         return worst
     priors = prior_information(part)
     unweighed = np.zeros((len(part.pairs), 15))
+    if rotations > DENSE_PARAMETERS:
+        return max(worst[0], 0.0), max(worst[1], 0.0)
+    order = order_of(part)
     of_R, of_t = (
-        information(part, by_pair, unweighed, pairs.used, prior)
+        information(part, order, [by_pair], unweighed, pairs.used, prior)
         for by_pair, prior in zip((pairs.rotation, pairs.translation), priors, strict=True)
     )
     used = of_R.used
     if used.sum() > DENSE_PARAMETERS:
         return max(worst[0], 0.0), max(worst[1], 0.0)
-    I_R, I_t = (arrow.dense(each.leaf, each.coupling, each.border)[used][:, used] for each in (of_R, of_t))
+    I_R, I_t = (each.matrix.dense()[used][:, used] for each in (of_R, of_t))
     unit = 1.0 / np.sqrt(np.maximum(np.diagonal(I_R) + np.diagonal(I_t), 1e-300))
     I_R, I_t = I_R * unit[:, None] * unit, I_t * unit[:, None] * unit
     if not np.isfinite(I_R + I_t).all():  # lengths or scales whose squares overflow
@@ -184,14 +187,11 @@ def pair_noise(
         translation[:, omega] = (noise.translation * n)[:, None]
         translation[:, v] = (alpha**2 * W * q2)[:, None]
     translation[:, SHARED] = 3.0 * noise.translation * n
-    owners = frozenset(part.scale_owners)
-    for e, pair in enumerate(part.pairs):
-        if pair.is_motion:  # both ends are one frame
-            for full in (rotation[e], translation[e]):
-                full[7:14] += full[:7]
-                full[:7] = 0.0
-        if pair.target in owners:
-            translation[e, 13 if pair.is_motion else OWN_X] = translation[e, SHARED]
+    for full in (rotation, translation):  # both ends of a motion are one frame
+        full[pairs.motion, 7:14] += full[pairs.motion, :7]
+        full[pairs.motion, :7] = 0.0
+    for owns, place in ((pairs.owns & ~pairs.motion, OWN_X), (pairs.owns & pairs.motion, 13)):
+        translation[owns, place] = translation[owns, SHARED]
     spare = np.where(arm_counts, of_arms, noise.spare_rotation)
     return PairNoise(rotation, translation, q2, spare, noise.spare_translation, few)
 
@@ -201,8 +201,9 @@ def fitted_squares(part: Part) -> Array:
 
     A direction may tilt at each free end, about two axes.
     """
-    free = frozenset(part.free)
-    return np.array([2.0 * len(free & set(pair)) for pair in part.pairs])
+    free = part.ends < len(part.free)
+    fitted: Array = 2.0 * np.where(part.moments.motion, free[:, 0], free.sum(axis=1))
+    return fitted
 
 
 def common_axes(part: Part) -> tuple[Array, Array, Array]:
@@ -210,7 +211,7 @@ def common_axes(part: Part) -> tuple[Array, Array, Array]:
 
     Also the singular values (E, 3) of the mean of R_A, descending; 1 where all of them keep the axis.
     """
-    transposed = part.moments.translation[:, R_A, ONE].reshape(-1, 3, 3) / part.moments.weight[:, None, None]
+    transposed = part.moments.entries(R_A, np.array([ONE])).reshape(-1, 3, 3) / part.moments.weight[:, None, None]
     U, s, Vt = np.linalg.svd(transposed)
     return U[:, :, 0], Vt[:, 0], s
 
@@ -222,7 +223,8 @@ def _lever_arms(part: Part, poses: PairPoses, pairs: PairInformation, across: tu
     sensor carrier, and c if about the sensor. The shortest one gives the safe bound: the whole arm, or its part
     ``across`` the common axes in the target and in the sensor carrier.
     """
-    shift_X, shift_Y = (np.array([part.frame_shift(name) for name in side]) for side in zip(*part.pairs, strict=True))
+    of_frames = np.array([part.frame_shift(name) for name in (*part.free, *part.fixed)])
+    shift_X, shift_Y = of_frames[part.ends[:, 0]], of_frames[part.ends[:, 1]]
     t_X, t_Y, W = poses.t_X + shift_X, poses.t_Y + shift_Y, part.moments.weight[:, None, None]
     of_c = pairs.lever_squares / W
     mean_t = np.einsum("ei,ej->eij", pairs.lever, t_Y) / W

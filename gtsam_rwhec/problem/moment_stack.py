@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.moments import ONE, R_A, SHIFT_OPERATIONS, T_A, Moments, shift_of
+from gtsam_rwhec.problem.moments import ONE, R_A, SHIFT_OPERATIONS, T_A, T_B, Moments, shift_of
 from gtsam_rwhec.problem.packed_moments import PAIRS_AT_ONCE, PackedMoments
 
 I3 = np.eye(3)
@@ -122,17 +122,30 @@ class MomentStack:
 
     def translations(self, index: np.ndarray | slice) -> Array:
         """``translation`` of some pairs (e, 25, 25): t_A becomes t_A + R_A c - a, in rows and then in columns."""
-        G = self.packed.matrices(index)
+        return self._moved(self.packed.matrices(index), index, ONE)
+
+    def fronts(self, index: np.ndarray | slice) -> Array:
+        """The entries of `translations` without R_B, (e, 16, 16), in the order of `FRONT`."""
+        return self._moved(self.packed.fronts(index), index, 15)
+
+    def entries(self, rows: np.ndarray | slice, columns: np.ndarray | slice) -> Array:
+        """Entries (rows[k], columns[k]) of all pairs, (E, k), of features that the gauge does not move (not t_A)."""
+        features = np.arange(25)
+        of_rows, of_columns = np.broadcast_arrays(features[rows], features[columns])
+        return self.packed.entries(of_rows, of_columns)
+
+    def _moved(self, G: Array, index: np.ndarray | slice, one: int) -> Array:
+        """Sums with R_A in 0:9, t_A in 9:12 and 1 in ``one``, about the gauge."""
         if self.a is None or self.c is None:
             return G
         a = np.broadcast_to(self.a, (len(G), 3))
         c = np.where(self.motion[index][:, None], a, self.c)
         rows = G[:, 0:3] * c[:, 0, None, None] + G[:, 3:6] * c[:, 1, None, None] + G[:, 6:9] * c[:, 2, None, None]
-        G[:, T_A] += rows - a[:, :, None] * G[:, ONE, None, :]
+        G[:, T_A] += rows - a[:, :, None] * G[:, one, None, :]
         columns = G[:, :, 0:3] * c[:, None, 0, None]
         columns += G[:, :, 3:6] * c[:, None, 1, None]
         columns += G[:, :, 6:9] * c[:, None, 2, None]
-        G[:, :, T_A] += columns - G[:, :, ONE, None] * a[:, None, :]
+        G[:, :, T_A] += columns - G[:, :, one, None] * a[:, None, :]
         return G
 
     def blocks(self) -> Iterator[slice]:
@@ -145,20 +158,21 @@ class MomentStack:
         return np.concatenate([np.isfinite(self.packed.front[at]).all(axis=1) for at in self.blocks()])
 
     def squares(self, features: slice) -> Array:
-        """(E,): the sum of the weighted squares of some features."""
-        return np.concatenate(
-            [np.einsum("ekk->e", self.translations(at)[:, features, features]) for at in self.blocks()]
-        )
+        """(E,): the sum of the weighted squares of t_A or t_B."""
+        if features == T_B:
+            squares: Array = self.entries(T_B, T_B).sum(axis=1)
+            return squares
+        return np.concatenate([np.einsum("ekk->e", self.fronts(at)[:, features, features]) for at in self.blocks()])
 
     def best_shift(self) -> tuple[Array, Array]:
         """The shift (a, c) that centres all pairs together: min sum |t_A + R_A c - a|^2 / sigma^2, minimum norm."""
         of_two = np.zeros((2, 3, 3)), np.zeros((2, 3)), np.zeros((2, 3))  # of pairs, and of motions
         for at in self.blocks():
-            G, motion = self.translations(at), self.motion[at]
+            G, motion = self.fronts(at), self.motion[at]
             # The sum of R_A': entry (i, k) is R_A[k, i], which vec has at 3 i + k.
-            Rt = G[:, R_A, ONE].reshape(-1, 3, 3)
+            Rt = G[:, R_A, 15].reshape(-1, 3, 3)
             Rt_t = np.einsum("eikk->ei", G[:, R_A, T_A].reshape(-1, 3, 3, 3))
-            for total, each in zip(of_two, (Rt, Rt_t, G[:, T_A, ONE]), strict=True):
+            for total, each in zip(of_two, (Rt, Rt_t, G[:, T_A, 15]), strict=True):
                 total[0] += each[~motion].sum(axis=0)
                 total[1] += each[motion].sum(axis=0)
         (Rt_still, turned), (Rt_t_still, Rt_t_moving), (t_still, t_moving) = of_two

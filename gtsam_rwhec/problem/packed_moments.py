@@ -24,6 +24,10 @@ _BACK = _IS_BACK[_ROWS] | _IS_BACK[_COLUMNS]
 #: Rows and columns of the entries that are kept always, and of those with B's rotation.
 FRONT_ENTRIES = _ROWS[~_BACK], _COLUMNS[~_BACK]
 BACK_ENTRIES = _ROWS[_BACK], _COLUMNS[_BACK]
+#: Where each of 16 x 16 entries is in a row of 136.
+_UPPER = np.zeros((16, 16), dtype=int)
+_UPPER[np.triu_indices(16)] = np.arange(136)
+_FULL: np.ndarray = np.maximum(_UPPER, _UPPER.T).ravel()
 #: Fields with one entry, or one short row, for each pair; and those with a long one.
 _SHORT = ("count", "kappa", "magnitude", "feature_error", "operations", "deviation", "projected")
 _LONG = ("front", "rotation")
@@ -50,8 +54,8 @@ class Rows:
             result[own] = self.arrays[i][wanted[own] - (ends[i - 1] if i else 0)]
         return result
 
-    def column(self, at: int) -> Array:
-        """One entry of each row."""
+    def columns(self, at: np.ndarray) -> Array:
+        """Some entries of each row."""
         return np.concatenate([array[:, at] for array in self.arrays])
 
 
@@ -108,7 +112,7 @@ class PackedMoments:
     @property
     def weight(self) -> Array:
         """(E,) sums of 1 / sigma^2, the last entry of each triangle."""
-        return self.front.column(-1) if isinstance(self.front, Rows) else self.front[:, -1]
+        return self.entries(np.array([ONE]), np.array([ONE]))[:, 0]
 
     def __len__(self) -> int:
         return len(self.count)
@@ -120,13 +124,24 @@ class PackedMoments:
 
     def matrices(self, index: np.ndarray | slice) -> Array:
         """``translation`` of some pairs, (e, 25, 25); nan in the entries of R_B where these are not kept."""
-        front = self.front[index]
-        result = np.full((len(front), 25, 25), np.nan) if self.back is None else np.empty((len(front), 25, 25))
-        parts = [(FRONT_ENTRIES, front)] + ([] if self.back is None else [(BACK_ENTRIES, self.back[index])])
-        for (rows, columns), values in parts:
+        fronts = self.fronts(index)
+        result = np.full((len(fronts), 25, 25), np.nan) if self.back is None else np.empty((len(fronts), 25, 25))
+        result[:, FRONT[:, None], FRONT] = fronts
+        if self.back is not None:
+            (rows, columns), values = BACK_ENTRIES, self.back[index]
             result[:, rows, columns] = values
             result[:, columns, rows] = values
         return result
+
+    def fronts(self, index: np.ndarray | slice) -> Array:
+        """The entries of ``translation`` without R_B, of some pairs, (e, 16, 16) in the order of `FRONT`."""
+        result: Array = np.take(self.front[index], _FULL, axis=1)
+        return result.reshape(-1, 16, 16)
+
+    def entries(self, rows: np.ndarray, columns: np.ndarray) -> Array:
+        """Some entries of ``translation``, none of them of R_B, of all pairs, (E, k)."""
+        chosen = _FULL.reshape(16, 16)[np.searchsorted(FRONT, rows), np.searchsorted(FRONT, columns)]
+        return self.front.columns(chosen) if isinstance(self.front, Rows) else self.front[:, chosen]
 
     def one(self, index: int) -> Moments:
         """The moments of one pair."""

@@ -8,7 +8,8 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeKind, FreeReason
-from gtsam_rwhec.identifiability.identification import identify_with_basis, typical_length
+from gtsam_rwhec.identifiability.identification import identify_with_basis
+from gtsam_rwhec.identifiability.pairs_alone import typical_length
 from gtsam_rwhec.refinement.pair_data import PairData
 from gtsam_rwhec.refinement.unknowns import Unknown, UnknownKind, slots_of
 from gtsam_rwhec.refinement.variables import State, Variables

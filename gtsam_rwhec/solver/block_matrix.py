@@ -118,7 +118,7 @@ class BlockMatrix:
         blocks[at, at] = self.frames
         blocks[first, second] = self.couplings
         blocks[second, first] = self.couplings.transpose(0, 2, 1)
-        full[: n * m, n * m :] = self.tails.reshape(n * m, -1)
+        full[: n * m, n * m :] = self.tails.reshape(n * m, len(self.tail))
         full[n * m :, : n * m] = full[: n * m, n * m :].T
         full[n * m :, n * m :] = self.tail
         return full

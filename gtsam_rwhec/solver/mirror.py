@@ -17,7 +17,7 @@ from gtsam_rwhec.solver.parts import Part
 
 def mirrored(part: Part, R: Array) -> Array:
     """Rotations (n, 3, 3) of the form's variables after a half turn of all frames about the motions' main axis."""
-    sums = part.moments.translation[:, R_A, ONE].reshape(-1, 3, 3).transpose(0, 2, 1)
+    sums = part.moments.entries(R_A, np.array([ONE])).reshape(-1, 3, 3).transpose(0, 2, 1)
     still = ~part.moments.motion
     if still.any():
         U, _, Vt = np.linalg.svd(sums[still].sum(axis=0))

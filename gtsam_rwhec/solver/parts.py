@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -53,12 +54,22 @@ class Part:
         """All frames of the part."""
         return self.targets + self.sensors
 
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """(E, 2): each pair's target and sensor, by their places in ``free``; fixed frames, as in ``fixed``, follow."""
+        place = {name: i for i, name in enumerate((*self.free, *self.fixed))}
+        return np.array([(place[target], place[sensor]) for target, sensor in self.pairs]).reshape(-1, 2)
+
+    @cached_property
+    def _of_target_carrier(self) -> frozenset[str]:
+        return frozenset(self.targets)
+
     @property
     def number_of_measurements(self) -> int:
         """The sum over all pairs."""
         return int(self.moments.count.sum())
 
-    @property
+    @cached_property
     def scale_owners(self) -> tuple[str, ...]:
         """Frames with an unknown scale of their own: targets, and sensors with motions of their own."""
         if self.scale != "per_target":
@@ -72,7 +83,7 @@ class Part:
 
     def frame_shift(self, name: str) -> Array:
         """The translation that the gauge has subtracted from a frame's, in metres."""
-        return self.gauge.target_carrier if name in self.targets else self.gauge.sensor_carrier
+        return self.gauge.target_carrier if name in self._of_target_carrier else self.gauge.sensor_carrier
 
 
 def parts_of(problem: Problem) -> list[Part]:
@@ -84,14 +95,22 @@ def parts_of(problem: Problem) -> list[Part]:
     """
     problem.require_pairs()
     frames = problem.targets + problem.sensors
+    order = {name: i for i, name in enumerate(frames)}
     for what, names in (("fixed", problem.fixed), ("given a prior", problem.priors), ("scaled", problem.fixed_scales)):
         for name in names:
-            if name not in frames:
+            if name not in order:
                 raise FrameError(f"{name!r} is {what}, but no measurement mentions it; there are {', '.join(frames)}")
     components = connected_components(problem.pairs)
     if problem.scale == "shared":
         components = [[name for component in components for name in component]]
-    return [_part(problem, frozenset(component)) for component in components]
+    where = {name: i for i, component in enumerate(components) for name in component}
+    pairs: list[list[Pair]] = [[] for _ in components]
+    for pair in problem.pairs:
+        pairs[where[pair.sensor]].append(pair)
+    return [
+        _part(problem, sorted(component, key=order.__getitem__), tuple(of_component))
+        for component, of_component in zip(components, pairs, strict=True)
+    ]
 
 
 def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
@@ -116,10 +135,11 @@ def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
     return components
 
 
-def _part(problem: Problem, members: frozenset[str]) -> Part:
-    pairs = tuple(pair for pair in problem.pairs if pair.sensor in members)
-    targets = tuple(name for name in problem.targets if name in members)
-    sensors = tuple(name for name in problem.sensors if name in members)
+def _part(problem: Problem, names: list[str], pairs: tuple[Pair, ...]) -> Part:
+    """A part of these frames, targets before sensors, as the problem orders them."""
+    members, seen = frozenset(names), {pair.target for pair in pairs if not pair.is_motion}
+    targets = tuple(name for name in names if name in seen)
+    sensors = tuple(name for name in names if name not in seen)
     gauge, moments = _centred(problem, pairs)
     priors = {name: problem.priors[name] for name in problem.priors if name in members}
     is_inverse = problem.scale == "per_target" or (
@@ -203,8 +223,9 @@ def _check(part: Part) -> None:
                 f"the pose of {name} is fixed and its scale is unknown, which the certified form cannot hold; "
                 f"fix the scale too (fix_scale), or give the pose as a tight prior (add_prior)"
             )
+    measured = {target for target, _ in part.pairs} if part.fixed_scales else set()
     for name in part.fixed_scales:
-        if name not in {target for target, _ in part.pairs}:
+        if name not in measured:
             raise ScaleError(f"the scale of {name} is fixed, but nothing measures {name}'s size")
     bad = np.flatnonzero(~part.moments.is_finite())
     if bad.size:

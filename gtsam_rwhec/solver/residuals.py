@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
-from gtsam_rwhec.problem.moments import edge_forms
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.variables import Answer, scales_of
@@ -48,27 +47,32 @@ class PairPoses:
     @staticmethod
     def of(part: Part, answer: Answer) -> PairPoses:
         """Free frames from the answer, fixed ones from the part."""
-        frames = {name: (R, t) for name, R, t in zip(part.free, answer.R, answer.t, strict=True)}
-        frames |= {name: (T[:3, :3], T[:3, 3]) for name, T in part.fixed.items()}
+        fixed = np.array(list(part.fixed.values())).reshape(-1, 4, 4)
+        R, t = np.concatenate([answer.R, fixed[:, :3, :3]]), np.concatenate([answer.t, fixed[:, :3, 3]])
+        target, sensor = part.ends.T
         alphas = scales_of(part, answer)
-        (R_X, t_X), (R_Y, t_Y) = (
-            [np.array(each) for each in zip(*(frames[name] for name in side), strict=True)]
-            for side in zip(*part.pairs, strict=True)
-        )
-        return PairPoses(R_X, t_X, R_Y, t_Y, np.array([alphas[target] for target, _ in part.pairs]))
+        return PairPoses(R[target], t[target], R[sensor], t[sensor], np.array([alphas[name] for name, _ in part.pairs]))
 
 
 def costs_of_pairs(part: Part, poses: PairPoses) -> tuple[Array, Array]:
     """J_t and J_R of each pair (E,), eq. 18."""
-    E = len(part.pairs)
-    x = np.empty((E, 25))  # [alpha t_X, alpha t_Y, alpha, vec R_X, vec R_Y]
-    alpha = poses.alpha[:, None]
-    x[:, 0:3], x[:, 3:6], x[:, 6] = alpha * poses.t_X, alpha * poses.t_Y, poses.alpha
-    x[:, 7:16] = poses.R_X.transpose(0, 2, 1).reshape(E, 9)
-    x[:, 16:25] = poses.R_Y.transpose(0, 2, 1).reshape(E, 9)
-    translation, rotation = edge_forms(part.moments.translation[:], part.moments.rotation[:], part.moments.kappa)
-    J_t = np.einsum("ei,eij,ej->e", x, translation, x)
-    J_R = np.einsum("ei,eij,ej->e", x, rotation, x)
+    E, moments = len(part.pairs), part.moments
+    J_t, J_R = np.empty(E), np.empty(E)
+    for at in moments.blocks():
+        G = moments.fronts(at)
+        R_X, R_Y, alpha = poses.R_X[at], poses.R_Y[at], poses.alpha[at, None]
+        k = len(G)
+        # The residual alpha (R_A t_X + t_A - t_Y) - R_Y t_B is linear in the features [vec R_A, t_A, t_B, 1].
+        linear = np.zeros((k, 3, 16))
+        linear[:, :, :9] = np.einsum("ej,ik->eijk", alpha * poses.t_X[at], np.eye(3)).reshape(k, 3, 9)
+        linear[:, :, 9:12] = alpha[:, :, None] * np.eye(3)
+        linear[:, :, 12:15] = -R_Y
+        linear[:, :, 15] = -alpha * poses.t_Y[at]
+        J_t[at] = 0.5 * ((linear @ G) * linear).sum(axis=(1, 2))
+        # |R_A R_X|^2 + |R_Y R_B|^2 - 2 <R_A R_X, R_Y R_B>, with sum kappa R_A[k, i] R_B[q, p] at [i, k, p, q].
+        squares = moments.kappa[at] * ((R_X**2).sum(axis=(1, 2)) + (R_Y**2).sum(axis=(1, 2)))
+        cross = moments.rotation[at].reshape(k, 3, 3, 3, 3)
+        J_R[at] = 0.5 * squares - np.einsum("ekp,ekp->e", np.einsum("eikpq,eip->ekq", cross, R_X), R_Y)
     return np.maximum(J_t, 0.0), np.maximum(J_R, 0.0)  # zero may round to a negative number
 
 

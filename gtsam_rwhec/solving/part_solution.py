@@ -41,7 +41,7 @@ class PartSolution:
             _check_scale(part, answer, found.is_closed)
             poses = PairPoses.of(part, answer)
             J_t, J_R = costs_of_pairs(part, poses)
-            known = identify(part, poses, J_t, J_R)
+            known = identify(part, poses, J_t, J_R, search.whole.order)
         bound = found.bound
         if not (np.isfinite(bound.lower_bound) and np.isfinite(found.cost)):
             found = replace(found, cause=Cause.NO_BOUND, figures={})

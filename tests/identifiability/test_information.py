@@ -10,10 +10,9 @@ import pytest
 from rwhec_factors.se3 import inverse
 
 import gtsam_rwhec as rw
-from gtsam_rwhec.identifiability.information import information, pair_information, prior_information
+from gtsam_rwhec.identifiability.information import information, order_of, pair_information, prior_information
 from gtsam_rwhec.simulate import Noise, general
 from gtsam_rwhec.simulate.transforms import random_poses
-from gtsam_rwhec.solver import arrow
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.residuals import PairPoses, costs_of_pairs
 from gtsam_rwhec.solver.variables import Answer
@@ -106,12 +105,13 @@ def our_information(part: Part, answer: Answer) -> np.ndarray:
     rotation_prior, translation_prior = prior_information(part)
     info = information(
         part,
-        pairs.rotation + pairs.translation,
+        order_of(part),
+        [pairs.rotation, pairs.translation],
         np.zeros_like(pairs.used, dtype=float),
         pairs.used,
         rotation_prior + translation_prior,
     )
-    full = arrow.dense(info.leaf, info.coupling, info.border)
+    full = info.matrix.dense()
     return np.where(info.used[:, None] & info.used, full, 0.0)
 
 

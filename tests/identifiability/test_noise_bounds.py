@@ -127,7 +127,7 @@ def test_noise_feigns_what_it_is_said_to() -> None:
         )
         together = np.zeros(15)
         together[[2, 9]] = 1.0  # both frames about z
-        ratios.append((together @ pairs.rotation[0] @ together) / (together**2 @ feigned.rotation[0]))
+        ratios.append((together @ pairs.rotation()[0] @ together) / (together**2 @ feigned.rotation[0]))
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.1)
 
 
