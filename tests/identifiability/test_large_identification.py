@@ -61,7 +61,8 @@ def rig(
     return problem, X, Y
 
 
-def test_each_unconnected_part_of_a_thousand_frames_says_what_is_free() -> None:
+def test_each_unconnected_part_of_a_thousand_frames_says_what_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(identification, "AT_ONCE", 0)
     problem, X, Y = rig([("general", 500, 40), ("planar", 400, 60), ("single_axis", 300, 30), ("none", 60, 20)])
     general_, planar, single, still = known_at(problem, X, Y)
     assert general_.is_unique
