@@ -105,9 +105,23 @@ def test_certified_start_then_refinement_is_short_and_goes_on(tmp_path: Path) ->
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
+def test_a_vehicle_without_targets_needs_heights(tmp_path: Path) -> None:
+    script = EXAMPLES / "vehicle_odometries.py"
+    done = subprocess.run([sys.executable, str(script), str(tmp_path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    without, _, with_heights = done.stdout.partition("With heights:")
+    assert "Do not use these poses: the heights of lidar_rear, camera_left and wheels over lidar_front" in without
+    assert "Use these poses: the motions of all sensors agree" in with_heights
+    assert all(float(off) < 40.0 for off in re.findall(r" is (\d+) mm and ", with_heights))
+    assert (tmp_path / "with_heights" / "tf.yaml").exists()
+
+
 def test_no_example_is_left_out() -> None:
     scripts = {path.stem for path in EXAMPLES.glob("*.py")} - {"figures"}
-    assert scripts == set(RUNS) | {"figure_8_grid", "certified_init_then_refine", "from_corners", "one_call"}
+    assert scripts == set(RUNS) | {"figure_8_grid", "certified_init_then_refine", "from_corners", "one_call"} | {
+        "vehicle_odometries"
+    }
 
 
 def test_committed_pictures_are_small_and_made_by_an_example() -> None:

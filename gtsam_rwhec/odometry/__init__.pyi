@@ -15,3 +15,11 @@ from .found import JointCertificate as JointCertificate
 from .found import Windows as Windows
 from .found import Influence as Influence
 from .found import OtherAnswer as OtherAnswer
+
+# The verdict, and the result file.
+from .judging import free_in_words as free_in_words
+from .judging import judgement_of as judgement_of
+from .odometry_file import OdometryResult as OdometryResult
+from .odometry_file import read_odometry_result as read_odometry_result
+from .odometry_file import result_of as result_of
+from .odometry_file import write_odometry_result as write_odometry_result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,11 @@ CONTRADICTED = 4.0
 TAKES_PART = 0.05
 #: An axis of the reference is named where the direction is within 8 degrees of it.
 NEAR_AXIS = float(np.cos(np.radians(8.0)))
+#: What to do where something is free.
+WHAT_TO_DO = (
+    "state the missing heights in the rig file (given: {heights_m: {SENSOR: 0.5, ...}}, with that of the reference), "
+    "or the ground, directions or distances; or drive other turns and a ramp, and calibrate again"
+)
 PRAISE = "the motions of all sensors agree, their joint cost is certified, and they determine every pose"
 
 
@@ -37,26 +43,26 @@ def judgement_of(found: OdometryCalibration) -> Judgement:
         if one.off_by > CONTRADICTED
     ]
     findings += [Finding(Ground.COVARIANCE_DOUBTED, words) for words in found.findings]
-    return Judgement.of(findings, PRAISE)
+    judgement = Judgement.of(findings, PRAISE)
+    return replace(judgement, reason=judgement.reason.replace(Ground.NOT_UNIQUE.advice, WHAT_TO_DO))
 
 
 def free_in_words(found: OdometryCalibration) -> tuple[str, ...]:
-    """A sentence for each sensor whose pose, or scale, is not determined: what, why, and what to state."""
-    said = []
+    """What is not determined of which sensors, and why: a sentence for the heights, and for each other direction."""
+    said: list[str] = []
+    heights: dict[str, list[str]] = {}
     for direction in found.free_directions:
         if not direction.frames and not direction.own_scales:
             said.append(str(direction))
             continue
-        said += _of_frames(direction, found)
-        said += [
-            f"the scale of {name} is not determined: {_why(direction)}. Where its lengths are "
-            "metres leave scale: estimate out, or drive a way that another sensor measures"
-            for name in direction.own_scales
-        ]
-    return tuple(dict.fromkeys(said))
+        said += _of_frames(direction, found, heights)
+        said += [f"the scale of {name} is not determined: {_why(direction)}" for name in direction.own_scales]
+    of_heights = [_of_heights(axis, list(dict.fromkeys(names)), found.reference) for axis, names in heights.items()]
+    return tuple(dict.fromkeys((*of_heights, *said)))
 
 
-def _of_frames(direction: FreeDirection, found: OdometryCalibration) -> list[str]:
+def _of_frames(direction: FreeDirection, found: OdometryCalibration, heights: dict[str, list[str]]) -> list[str]:
+    """The sentences of a direction; heights, which a plane leaves free, go by their axis into `heights`."""
     turns, shifts = (
         {
             name: _in_reference(found.T_reference_sensor, name, np.array(twist)[part])
@@ -71,24 +77,24 @@ def _of_frames(direction: FreeDirection, found: OdometryCalibration) -> list[str
         if largest_turn > TAKES_PART and np.linalg.norm(turns[name]) > TAKES_PART * largest_turn:
             said.append(
                 f"the turn of {name} about {_axis(turns[name])} of {found.reference} is not determined: "
-                f"{_why(direction)}. Drive other turns, or state given: directions for {name}"
+                f"{_why(direction)}"
             )
         elif largest_turn <= TAKES_PART and np.linalg.norm(shifts[name]) > TAKES_PART * largest_shift:
-            said.append(_shift(name, shifts[name], direction, found.reference))
+            axis = _axis(shifts[name])
+            # A vehicle in a plane turns about one axis, along which nothing tells where a sensor is: its height.
+            if direction.reason is FreeReason.ONE_AXIS:
+                heights.setdefault(axis, []).append(name)
+            else:
+                place = f"the place of {name} along {axis} of {found.reference}"
+                said.append(f"{place} is not determined: {_why(direction)}")
     return said
 
 
-def _shift(name: str, v: Array, direction: FreeDirection, reference: str) -> str:
-    """A vehicle in a plane turns about one axis, along which nothing tells where a sensor is: its height."""
-    if direction.reason is FreeReason.ONE_AXIS:
-        return (
-            f"the height of {name} over {reference} (along {_axis(v)} of {reference}) is not determined: the vehicle "
-            f"moved in a plane. Drive over a ramp, or state given: heights_m for {reference} and {name}"
-        )
-    return (
-        f"the place of {name} along {_axis(v)} of {reference} is not determined: {_why(direction)}. Drive other turns, "
-        f"or state given: distances or heights_m for {name}"
-    )
+def _of_heights(axis: str, names: list[str], reference: str) -> str:
+    many = len(names) > 1
+    listed = f"{', '.join(names[:-1])} and {names[-1]}" if many else names[0]
+    heights = f"the height{'s' * many} of {listed} over {reference} (along {axis} of {reference})"
+    return f"{heights} {'are' if many else 'is'} not determined: the vehicle moved in a plane"
 
 
 def _why(direction: FreeDirection) -> str:

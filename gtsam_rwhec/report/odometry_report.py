@@ -89,9 +89,12 @@ def given_in_words(result: OdometryResult) -> list[str]:
         most, name = max(moved, default=(0.0, ""))
         effect = "moves no pose" if not name else f"moves {name} by {most:.2g} mm"
         effect += f" and turns a sensor by {turned:.2g}°" if turned > 1e-4 else ""
+        agreement = f"the motions are {one.off_by_sigmas:.1f} standard deviations away"
+        if one.off_by_sigmas == 0.0:
+            agreement = "the motions do not measure it"
         said.append(
             f"{one.what} = {one.value:g} ± {one.sigma:.2g} {one.unit}: an error of one standard deviation {effect}; "
-            f"the motions are {one.off_by_sigmas:.1f} standard deviations away."
+            f"{agreement}."
         )
     return said
 
@@ -115,7 +118,7 @@ def proof_in_words(result: OdometryResult) -> list[str]:
 def removed_in_words(result: OdometryResult) -> list[str]:
     """What is not used, by sensor and reason."""
     return [
-        f"not used of {one.sensor}: {', '.join(f'{count} {why}' for why, count in one.removed.items())}."
+        f"not used of {one.sensor}: {', '.join(f'{why}: {count}' for why, count in one.removed.items())}."
         for one in result.sensors
         if one.removed
     ]

@@ -28,7 +28,7 @@ IN_PAGES = [
     pytest.param(block, id=f"{page.stem}-{i}")
     for page in sorted((REPOSITORY / "docs").glob("*.md"))
     for i, block in enumerate(re.findall(r"```yaml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL))
-    if "carriers:" in block
+    if "carriers:" in block or "reference:" in block
 ]
 
 
