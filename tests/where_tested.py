@@ -94,7 +94,7 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/fleet": {
         "fleet/test_in_process.py": "attempts order",
         "fleet/test_stores.py": "byte_count store_requests",
-        "fleet/test_dask_engine.py": "extras",
+        "fleet/test_dask_engine.py": "dask_cluster dask_process extras",
         "fleet/test_watching.py": "night_rows watch_events watch_stream",
         "fleet/test_pair_moments.py": "merging",
         "fleet/test_running.py": (

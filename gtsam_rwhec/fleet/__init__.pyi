@@ -23,6 +23,7 @@ from .tasks import Engine as Engine
 from .tasks import Failed as Failed
 from .tasks import Receipt as Receipt
 from .tasks import Task as Task
+from .dask_engine import DaskEngine as DaskEngine
 from .in_process import InProcess as InProcess
 
 # Drift of each robot over time.

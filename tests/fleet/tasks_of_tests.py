@@ -37,8 +37,8 @@ def refuses(folder: str, name: str) -> Receipt:
     raise LogError(f"{name} is not an MCAP file; give another.")
 
 
-def breaks_off_twice(folder: str, name: str) -> Receipt:
-    if tried(folder, name) < 3:
+def breaks_off_once(folder: str, name: str) -> Receipt:
+    if tried(folder, name) < 2:
         raise ConnectionResetError("the store went away")
     return Receipt(name, f"{name}.bin", "")
 
@@ -77,9 +77,17 @@ def mixed(folder: str) -> list[Task]:
     faults = [
         Task(name, function, (folder, name))
         for name, function in (
-            ("refused", refuses), ("twice", breaks_off_twice), ("always", always_breaks_off), ("fault", is_at_fault)
+            ("refused", refuses), ("once", breaks_off_once), ("always", always_breaks_off), ("fault", is_at_fault)
         )
     ]  # fmt: skip
     low = Task("low", joins, (folder, "low"), after=("w1", "w0"))
     high = Task("high", joins, (folder, "high"), after=("low", "refused", "w3"))
     return [high, low, *leaves, *faults]
+
+
+def waits_for(folder: str, name: str) -> Receipt:
+    """Until the file of this name is there."""
+    tried(folder, name)
+    while not (Path(folder) / name).exists():
+        time.sleep(0.01)
+    return Receipt(name, f"{name}.bin", "")
