@@ -59,6 +59,7 @@ TABLE: dict[str, dict[str, str]] = {
         "cli/test_command.py": "app exit_status failures fetch options",
         "cli/test_roads.py": "calibrate",
         "cli/test_wheel.py": "demo",
+        "fleet/test_fleet_report.py": "fleet",
         "pipeline/test_commands.py": "clean convert detect export init solve",
         "pipeline/test_verified_log.py": "verify",
     },
@@ -97,10 +98,10 @@ TABLE: dict[str, dict[str, str]] = {
         "fleet/test_dask_engine.py": "dask_cluster dask_process extras",
         "fleet/test_watching.py": "night_rows watch_events watch_stream",
         "fleet/test_pair_moments.py": "merging",
-        "fleet/test_running.py": (
-            "log_facts log_parts map_log planning receipts rig_source solve_robot unit_calibration unit_rows"
-        ),
+        "fleet/test_running.py": ("log_facts log_parts map_log receipts solve_robot unit_calibration unit_rows"),
         "fleet/test_partial.py": "container measured_problem",
+        "fleet/test_fleet_report.py": "engines",
+        "fleet/test_bad_fleets.py": "planning rig_source",
     },
     "gtsam_rwhec/handeye": {
         "handeye/test_certified.py": "chordal_form",

@@ -24,6 +24,7 @@ from gtsam_rwhec.cli.exit_status import HELP, ExitStatus
 from gtsam_rwhec.cli.export import export
 from gtsam_rwhec.cli.failures import failures_in_words
 from gtsam_rwhec.cli.fetch import utias
+from gtsam_rwhec.cli.fleet import run
 from gtsam_rwhec.cli.init import init
 from gtsam_rwhec.cli.report import report
 from gtsam_rwhec.cli.solve import solve
@@ -67,6 +68,8 @@ app = typer.Typer(
 )
 fetch_app = typer.Typer(help="Download public measurements.", no_args_is_help=True)
 app.add_typer(fetch_app, name="fetch")
+fleet_app = typer.Typer(help="Many robots: calibrate all of them from their logs.", no_args_is_help=True)
+app.add_typer(fleet_app, name="fleet")
 
 
 def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
@@ -84,6 +87,7 @@ def add(subcommand: Callable[..., ExitStatus], to: typer.Typer) -> None:
 for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export, report, compare, diff, verify):
     add(subcommand, app)
 add(utias, fetch_app)
+add(run, fleet_app)
 
 
 def _print_version(wanted: bool) -> None:

@@ -2,6 +2,7 @@
 from .manifest import LogSource as LogSource
 from .manifest import Manifest as Manifest
 from .manifest import Robot as Robot
+from .manifest import manifest_of_pattern as manifest_of_pattern
 from .manifest import parse_manifest as parse_manifest
 from .manifest import read_manifest as read_manifest
 from .rows import FailedLog as FailedLog
@@ -17,14 +18,19 @@ from .planning import FleetOptions as FleetOptions
 from .running import FleetRun as FleetRun
 from .running import read_fleet as read_fleet
 from .running import run as run
+from .fleet_report import print_fleet as print_fleet
 
 # The work of a run, and what carries it out.
+from .engines import StartedLate as StartedLate
+from .engines import bytes_of as bytes_of
+from .engines import engine_of as engine_of
 from .tasks import Engine as Engine
 from .tasks import Failed as Failed
 from .tasks import Receipt as Receipt
 from .tasks import Task as Task
 from .dask_engine import DaskEngine as DaskEngine
 from .in_process import InProcess as InProcess
+from .without_secrets import shown as shown
 
 # Drift of each robot over time.
 from .watching import RobotChart as RobotChart

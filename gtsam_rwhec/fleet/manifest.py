@@ -22,13 +22,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gtsam_rwhec.errors import FileFormatError, ManifestError
+from gtsam_rwhec.errors import FileFormatError, ManifestError, StoreError
 from gtsam_rwhec.files.yaml_lines import KeyPath, YamlFile, dotted, parse_yaml, read_text, shown, suggestion
+from gtsam_rwhec.fleet.stores import listed, local_path, read_bytes
+from gtsam_rwhec.fleet.without_secrets import shown as shown_url
 
 #: Robots and sites name folders of the output; "/" and "@" join names of frames and of units.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(::|://)")
 _PATTERN = re.compile(r"[*?\[]")
+#: A manifest has at most this many bytes.
+MOST_BYTES = 1_000_000
 #: A message names at most this many faults.
 MOST_FAULTS = 20
 
@@ -103,10 +107,40 @@ def read_manifest(url: str) -> Manifest:
         The file cannot be read, is not YAML, or has faults: the message names every fault with its line.
     """
     try:
-        text = read_text(url)
-    except FileFormatError as error:
+        path = local_path(url)
+        if path is not None:
+            return parse_manifest(read_text(path), url)
+        return parse_manifest(read_bytes(url, most_bytes=MOST_BYTES).decode("utf-8-sig"), url)
+    except UnicodeDecodeError as error:
+        raise ManifestError(f"{shown_url(url)} is not a text file in UTF-8; YAML was expected.") from error
+    except ManifestError:
+        raise
+    except (FileFormatError, StoreError) as error:
         raise ManifestError(str(error)) from error
-    return parse_manifest(text, url)
+
+
+def manifest_of_pattern(pattern: str, rig: str) -> Manifest:
+    """The fleet of all logs that a pattern names; a robot has the name of its logs' folder.
+
+    Raises
+    ------
+    ManifestError
+        No log matches, or a folder has a name that no robot can have.
+    """
+    logs: dict[str, list[LogSource]] = {}
+    for url in listed(pattern):
+        name = url.rpartition("/")[0].rpartition("/")[2]
+        if not _NAME.fullmatch(name):
+            raise ManifestError(
+                f"{shown_url(url)}: its folder's name {name!r} is no name of a robot (letters, digits, _ - and .); "
+                "rename the folder, or write a manifest"
+            )
+        logs.setdefault(name, []).append(LogSource(url, rig, shown_url(pattern)))
+    if not logs:
+        raise ManifestError(
+            f"no log matches {shown_url(pattern)}; put quotes around it, so that the shell leaves it alone"
+        )
+    return Manifest(pattern, tuple(Robot(name, tuple(found)) for name, found in sorted(logs.items())), rig)
 
 
 def parse_manifest(text: str, where: str) -> Manifest:
@@ -118,10 +152,10 @@ def parse_manifest(text: str, where: str) -> Manifest:
         As `read_manifest`.
     """
     try:
-        file = parse_yaml(text, where)
+        file = parse_yaml(text, shown_url(where))
     except FileFormatError as error:
         raise ManifestError(str(error)) from error
-    return _Checks(file).manifest()
+    return _Checks(file, where).manifest()
 
 
 def joined(base: str, url: str) -> str:
@@ -139,8 +173,8 @@ def joined(base: str, url: str) -> str:
 class _Checks:
     """Reads a manifest and collects its faults."""
 
-    def __init__(self, file: YamlFile) -> None:
-        self.file = file
+    def __init__(self, file: YamlFile, url: str) -> None:
+        self.file, self.url = file, url
         self.faults: list[tuple[int, str]] = []
 
     def manifest(self) -> Manifest:
@@ -156,7 +190,7 @@ class _Checks:
             words = [said for _, said in sorted(self.faults)]
             rest = [f"and {len(words) - MOST_FAULTS} more faults"] if len(words) > MOST_FAULTS else []
             raise ManifestError("\n".join(words[:MOST_FAULTS] + rest))
-        return Manifest(self.file.where, tuple(robot for robot in found if robot is not None), shared)
+        return Manifest(self.url, tuple(robot for robot in found if robot is not None), shared)
 
     def _fault(self, path: KeyPath, words: str) -> None:
         self.faults.append((self.file.line(path), self.file.fault(path, words)))
@@ -181,7 +215,7 @@ class _Checks:
 
     def _url(self, value: Any, path: KeyPath) -> str | None:
         if isinstance(value, str) and value.strip():
-            return joined(self.file.where, value)
+            return joined(self.url, value)
         self._fault(path, f"{shown(value)}; give a path or a URL")
         return None
 

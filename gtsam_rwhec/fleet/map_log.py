@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
-from gtsam_rwhec.errors import LogError, RwhecWarning
+from gtsam_rwhec.errors import LogError, RigError, RwhecWarning
 from gtsam_rwhec.fleet.container import FORMAT_VERSION
 from gtsam_rwhec.fleet.log_facts import LogFacts, Weighting, camera_fields
 from gtsam_rwhec.fleet.log_parts import local_copy_of_topics
@@ -40,6 +40,7 @@ from gtsam_rwhec.pipeline.measured_pairs import MeasuredPairs, poses_used, probl
 from gtsam_rwhec.pipeline.topics_of_rig import wanted_topics
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.rig import Rig
+from gtsam_rwhec.rig.odometry_section import OdometrySensor
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,7 @@ def map_log(task: LogTask, output: str) -> Receipt:
 
 def _partial(task: LogTask, folder: Path) -> tuple[Partial, KeptLog]:
     rig = task.rig.rig(folder)
+    _refuse_odometry(rig)
     said: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", RwhecWarning)
@@ -135,6 +137,16 @@ def _partial(task: LogTask, folder: Path) -> tuple[Partial, KeptLog]:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     facts = partial.facts.model_copy(update={"warnings": list(dict.fromkeys(said))})
     return replace(partial, facts=facts), kept
+
+
+def _refuse_odometry(rig: Rig) -> None:
+    """A RigError for sensors that know only their own motion: their motions are not in partial results."""
+    names = [name for name, sensor in rig.sensors.items() if isinstance(sensor, OdometrySensor)]
+    if names:
+        raise RigError(
+            f"{rig.source.place(('sensors', names[0]))}: {names[0]} knows only its own motion, and a fleet's partial "
+            "results have no motions: leave it out of the fleet's rig file, or run gtsam-rwhec calibrate on each log"
+        )
 
 
 def _summed(task: LogTask, log: Log, rig: Rig) -> tuple[Partial, KeptLog]:

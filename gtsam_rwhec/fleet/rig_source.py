@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from gtsam_rwhec.errors import FileFormatError, RigError, UnfinishedRigWarning
+from gtsam_rwhec.errors import FileFormatError, RigError, StoreError, UnfinishedRigWarning
 from gtsam_rwhec.files.yaml_lines import parse_yaml
 from gtsam_rwhec.fleet.manifest import joined
 from gtsam_rwhec.fleet.stores import read_bytes
@@ -97,7 +97,7 @@ def read_rig_source(url: str) -> RigSource:
         files = tuple((name, read_bytes(joined(url, name), most_bytes=MOST_BYTES)) for name in named)
     except UnicodeDecodeError as error:
         raise RigError(f"{shown(url)} is not a text file in UTF-8 (byte {error.start}); YAML was expected.") from error
-    except FileFormatError as error:
+    except (FileFormatError, StoreError) as error:
         raise RigError(str(error)) from error
     return RigSource(url, text, files)
 

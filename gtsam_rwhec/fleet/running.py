@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 
-from gtsam_rwhec.errors import FileFormatError, ResultVersionError
-from gtsam_rwhec.files.progress import Counted, Progress, Remark, silent
+from gtsam_rwhec.errors import FileFormatError, ResultVersionError, StoreError, StoreInterruptedError
+from gtsam_rwhec.files.progress import Counted, Progress, Remark, check_progress, silent
+from gtsam_rwhec.fleet.in_process import InProcess
 from gtsam_rwhec.fleet.manifest import Manifest
 from gtsam_rwhec.fleet.map_log import LogTask, map_log
 from gtsam_rwhec.fleet.merging import MergeTask, in_order, merge_task
@@ -97,12 +98,17 @@ def run(
     StoreError
         The output cannot be written.
     """
-    from gtsam_rwhec.fleet.in_process import InProcess
+    check_progress(progress)
+    try:
+        return _run(manifest, output, options or FleetOptions(), engine or InProcess(), progress or silent)
+    except StoreInterruptedError as error:
+        raise StoreError(f"{error}. What is done is kept: run again to go on from there") from error
 
+
+def _run(manifest: Manifest, output: str, options: FleetOptions, engine: Engine, tell: Progress) -> FleetRun:
     began_s = time.monotonic()
-    tell = progress or silent
     tell("looking for logs")
-    plan = planned(manifest, options or FleetOptions())
+    plan = planned(manifest, options)
     remarks = _of_earlier_rows(output)
     for remark in remarks:
         tell(Remark(remark))
@@ -110,7 +116,7 @@ def run(
     outcomes = _earlier(plan, output)
     tasks = _tasks(plan, output, outcomes)
     if tasks:
-        _carry_out(tasks, engine or InProcess(), outcomes, plan, tell)
+        _carry_out(tasks, engine, outcomes, plan, tell)
     tell("putting the rows together")
     rows = _rows(manifest, plan, output, outcomes)
     write_once(below(output, ROWS_FILE), rows_json(rows))

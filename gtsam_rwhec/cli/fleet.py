@@ -1,0 +1,79 @@
+"""``gtsam-rwhec fleet run``: every robot of a fleet, from its logs to its calibration."""
+
+from __future__ import annotations
+
+import os
+from typing import Annotated, Literal
+
+import typer
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.cli.exit_status import ExitStatus
+from gtsam_rwhec.cli.failures import said_in_the_report
+from gtsam_rwhec.cli.stage_display import StageDisplay
+
+Each = Literal["robot", "day", "log"]
+EngineName = Literal["dask", "ray"]
+WORK_PANEL = "Who does the work"
+
+
+def run(
+    manifest: Annotated[
+        str,
+        typer.Argument(
+            help="Manifest (YAML) of robots with their logs, or a pattern of logs with --rig, such as "
+            "'s3://logs/*/*.mcap' (a robot has the name of its logs' folder). Paths, or URLs of fsspec."
+        ),
+    ],
+    output: Annotated[str, typer.Option("--output", "-o", help="Folder or URL for all results. It is made.")],
+    rig: Annotated[
+        str | None, typer.Option(help="With a pattern: the rig file of all robots, a path or a URL.")
+    ] = None,
+    each: Annotated[
+        Each, typer.Option(help="What is solved together: all logs of a robot, those of a day (UTC), or each alone.")
+    ] = "robot",
+    refine: Annotated[
+        bool,
+        typer.Option(
+            "--refine",
+            help="Calibrate from the measurements and corners, with all that calibrate does. Without it the moments "
+            "are solved, which is fast: no outliers beyond cleaning, no noise of the carriers' poses.",
+        ),
+    ] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            show_default="one for each core",
+            rich_help_panel=WORK_PANEL,
+            help="Processes of this machine. 0: this process alone.",
+        ),
+    ] = None,
+    engine: Annotated[EngineName, typer.Option(rich_help_panel=WORK_PANEL, help="What spreads the work.")] = "dask",
+    scheduler: Annotated[
+        str | None,
+        typer.Option(rich_help_panel=WORK_PANEL, help="Address of a Dask scheduler, or of a Ray cluster, that runs."),
+    ] = None,
+    memory_per_worker: Annotated[
+        str, typer.Option(rich_help_panel=WORK_PANEL, help="Memory that a worker may take, such as 2GB.")
+    ] = "2GB",
+) -> ExitStatus:
+    """Calibrate every robot of a fleet; print the verdicts, the worst robots and what failed.
+
+    What an earlier run did is not done again. One log's failure is a row of the report; exit status 1 says that
+    something failed, or that poses are not to be used.
+    """
+    memory_bytes = rw.fleet.bytes_of(memory_per_worker)
+    is_pattern = any(sign in manifest for sign in "*?[")
+    if is_pattern != (rig is not None):
+        needed = "a pattern of logs needs --rig FILE" if is_pattern else "--rig goes with a pattern of logs"
+        raise typer.BadParameter(f"{needed}; a manifest names its rig files itself")
+    count = (os.cpu_count() or 1) if workers is None else workers
+    with StageDisplay() as stage, said_in_the_report():
+        stage(f"reading {rw.fleet.shown(manifest)}")
+        fleet = rw.fleet.manifest_of_pattern(manifest, rig) if rig is not None else rw.fleet.read_manifest(manifest)
+        options = rw.fleet.FleetOptions(each=each, refine=refine)
+        with rw.fleet.StartedLate(lambda: rw.fleet.engine_of(engine, count, memory_bytes, scheduler), stage) as started:
+            done = rw.fleet.run(fleet, output, options, started, stage)
+    rw.fleet.print_fleet(done)
+    return ExitStatus.DONE if done.is_fine else ExitStatus.CHANGED
