@@ -32,7 +32,7 @@ from gtsam_rwhec.solver.mirror import mirrored
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.parts import Part, parts_of
 from gtsam_rwhec.solver.search import MIRROR_COST, Search
-from gtsam_rwhec.solver.start import spectral_start, unconstrained_start
+from gtsam_rwhec.solver.start import unconstrained_start
 from gtsam_rwhec.solver.variables import Answer, answer_of, rotations_as_variables, scales_of
 
 #: So many Newton steps lead from a start to its optimum; three to ten are usual.
@@ -112,7 +112,7 @@ def _solve(part: Part, previous: WeightedFit | None) -> Answer:
     """A part's answer: the lowest end of the descents, or its mirror image where only that has positive scales."""
     search = Search.of(part, SolveOptions())
     form = search.form
-    starts = spectral_start(part, search.whole.rotation)
+    starts = search.whole.spectral_starts()
     if previous is not None and all(name in previous.poses for name in part.free):
         before = np.array([previous.poses[name][:3, :3] for name in part.free]).reshape(-1, 3, 3)
         starts.append(rotations_as_variables(part, before))

@@ -75,12 +75,15 @@ class BlockMatrix:
         """T_i' A_ij T_j for bases T (n, m, l) of the frames."""
         first, second = self.ends
         Tt = T.transpose(0, 2, 1)
-        return replace(
-            self,
-            frames=Tt @ self.frames @ T,
-            couplings=products_of(Tt[first], self.couplings, T[second]),
-            tails=Tt @ self.tails,
-        )
+        couplings = np.empty((len(first), T.shape[2], T.shape[2]))
+        for at in self._portions():
+            couplings[at] = Tt[first[at]] @ self.couplings[at] @ T[second[at]]
+        return replace(self, frames=Tt @ self.frames @ T, couplings=couplings, tails=Tt @ self.tails)
+
+    def _portions(self) -> Iterator[slice]:
+        """The couplings, so many at a time that what is made of them fits."""
+        step = max(1, AT_ONCE // max(self.frames.shape[1] ** 2, 1))
+        return (slice(begin, begin + step) for begin in range(0, len(self.couplings), step))
 
     def times(self, v: Array) -> Array:
         """A v for v (n m + q,)."""
@@ -100,9 +103,7 @@ class BlockMatrix:
         result = np.matmul(frames, of_frames[:, :, None])[:, :, 0] + tails @ of_tail
         last = tail @ of_tail + np.einsum("niq,ni->q", tails, of_frames)
         first, second = self.ends
-        step = max(1, AT_ONCE // (m * m))
-        for begin in range(0, len(couplings), step):
-            at = slice(begin, begin + step)
+        for at in self._portions():
             blocks = np.abs(couplings[at]) if absolute else couplings[at]
             sum_into(result, first[at], np.matmul(blocks, of_frames[second[at], :, None])[:, :, 0])
             sum_into(result, second[at], np.matmul(of_frames[first[at], None, :], blocks)[:, 0])
@@ -287,11 +288,6 @@ def _portions(group: Group, width: int) -> Iterator[slice]:
     step = ALIKE_AT_ONCE // (m * max(width, 1)) if group.are_alike else AT_ONCE // max(width * width, 1)
     step = max(1, step)
     return (slice(begin, begin + step) for begin in range(0, count, step))
-
-
-def products_of(left: Array, middle: Array, right: Array) -> Array:
-    """left (F, a, m) times middle (F, m, m) times right (F, m, b)."""
-    return left @ middle @ right
 
 
 def sum_into(result: Array, index: np.ndarray, values: Array, factor: float = 1.0) -> None:

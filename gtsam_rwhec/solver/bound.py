@@ -226,9 +226,9 @@ class _Lagrangian:
 
     def indefinite(self, enough: float) -> Bound:
         """Z has a negative eigenvalue: rotations are limited, so a slack on their entries costs a limited amount."""
-        smallest, direction = smallest_eigenpair(self.form.reduced, self.multipliers)
-        slack = max(-1.01 * smallest, 4.0 * UNIT * self.form.reduced.magnitude)
-        limit = 1e3 * self.form.reduced.magnitude
+        smallest, direction = smallest_eigenpair(self.form.form, self.multipliers)
+        slack = max(-1.01 * smallest, 4.0 * UNIT * self.form.form.magnitude)
+        limit = 1e3 * self.form.form.magnitude
         # The first of slack, 3 slack, 9 slack, ... that is proven: by doubling of the exponent, then by halving.
         last = math.ceil(math.log(limit / slack, MORE_SLACK)) - 1 if 0.0 < slack < limit else -1
         failed, exponent, best = -1, 0, None

@@ -22,8 +22,6 @@ from gtsam_rwhec.solver.parts import Part
 
 #: Positions among an edge's 28 numbers: leaf (13), center (13), alpha, h.
 ALPHA, H = 26, 27
-#: Where the rotations are among them, and the tail.
-_ROTATIONS = np.r_[4:13, 17:26, ALPHA, H]
 #: The forms of so many pairs are made at once: a few megabytes.
 PAIRS_AT_ONCE = 1024
 
@@ -139,10 +137,10 @@ def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
     coupled = (slots.leaf < L) & (slots.center < n - L)
     where = np.cumsum(coupled) - 1
     rows, columns = slots.leaf[coupled], slots.center[coupled]
+    couplings = np.zeros((len(rows), 13, 13))
+    # The residuals of translations have no rotation of the front pose: rotations are coupled by their own alone.
     forms = [
-        FullForm(
-            np.zeros((n, m, m)), np.zeros((n, m, 2)), np.zeros((2, 2)), rows, columns, np.zeros((len(rows), m, m)), L
-        )
+        FullForm(np.zeros((n, m, m)), np.zeros((n, m, 2)), np.zeros((2, 2)), rows, columns, couplings[:, -m:, -m:], L)
         for m in (13, 9)
     ]
     for begin in range(0, E, PAIRS_AT_ONCE):
@@ -154,17 +152,15 @@ def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
         of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa[at])
         S = slots.matrices(at)
         leaf, center = slots.leaf[at], L + slots.center[at]
-        to = where[at][coupled[at]]
         for form, of_edges in zip(forms, (of_translations + of_rotations, of_rotations), strict=True):
+            m = form.frames.shape[1]
             Q = S.transpose(0, 2, 1) @ of_edges @ S
-            if form.frames.shape[1] == 9:
-                Q = Q[:, _ROTATIONS[:, None], _ROTATIONS]
-            m = (Q.shape[1] - 2) // 2
-            one, two, tail = slice(0, m), slice(m, 2 * m), slice(2 * m, 2 * m + 2)
+            one, two, tail = slice(13 - m, 13), slice(26 - m, 26), slice(26, 28)
             for index, has, side in ((leaf, leaf < L, one), (center, center < n, two)):
                 sum_into(form.frames, index[has], Q[has, side, side])
                 sum_into(form.tails, index[has], Q[has, side, tail])
-            form.couplings[to] = Q[coupled[at], one, two]
+            if m == 13:
+                couplings[where[at][coupled[at]]] = Q[coupled[at], one, two]
             form.tail[...] += Q[:, tail, tail].sum(axis=0)
     for form in forms:
         _add_priors(form, part)

@@ -56,7 +56,7 @@ def run_with_nonnegative_scale(search: Search) -> Found:
             f"nonnegative_scale solves a constrained relaxation of up to {MAX_FRAMES} frames; there are "
             f"{search.form.rotations}, and the unconstrained optimum has a negative scale"
         )
-    options, form = search.options, search.form
+    options, form = search.options, search.whole.reduced
     with search.stages.of("semidefinite relaxation"):
         relaxation = solve_with_scale(
             form.dense(),
@@ -114,7 +114,7 @@ def _descend(form: ReducedForm, starts: list[Array], max_iterations: int) -> lis
 
 def _bounds(search: Search, relaxation: Relaxation, at_zero: Array, positive: Array | None) -> list[Bound]:
     """Bounds from the relaxation's multipliers, about the best answer, and about the best point of scale zero."""
-    whole, form = search.whole, search.form
+    whole, form = search.whole, search.whole.reduced
     leaf, center, _ = without_scale(form).recover(homogeneous(at_zero))
     numbers = np.c_[np.concatenate([leaf, center]), vec(at_zero)]
     zero = whole.cost.at(Point(numbers, 0.0))

@@ -9,17 +9,25 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.curvature import Curvature
+from gtsam_rwhec.solver.descent import SearchForm
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.full_form import FullForm, Slots, full_forms, rounding_of, slots_of
+from gtsam_rwhec.solver.graph_form import GraphForm
+from gtsam_rwhec.solver.graph_start import graph_spectral_start
 from gtsam_rwhec.solver.measured_form import MeasuredForm
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.point import Evaluation, Form
 from gtsam_rwhec.solver.polish import is_worth_a_step, newton_step
 from gtsam_rwhec.solver.reduced_form import ReducedForm, reduce
 from gtsam_rwhec.solver.rotations import project, unvec
+from gtsam_rwhec.solver.start import spectral_start
 from gtsam_rwhec.solver.stored_form import StoredForm
 from gtsam_rwhec.solver.variables import Answer, answer_at, answer_of, as_point
 
+#: An arrow of fewer numbers is quick enough.
+SMALL_ARROW = 4_000_000
+#: The graph is followed where it makes no more numbers than this many times those of the arrow.
+AS_LARGE = 1.2
 #: Newton steps that follow the elimination; one is usual with extreme weights, and none without.
 STEPS = 6
 
@@ -47,8 +55,27 @@ class PartForm:
 
     @cached_property
     def reduced(self) -> ReducedForm:
-        """Translations and scales eliminated: where the search looks for answers."""
+        """Translations and scales eliminated, as an arrow: for all that needs Q' as a matrix."""
         return reduce(self.full)
+
+    @cached_property
+    def form(self) -> SearchForm:
+        """Where the search looks for answers: Q' as an arrow, or by the graph where that is much smaller."""
+        full, order = self.full, self.order
+        arrow = full.leaves * 13 * (13 * full.centers + 2) + (13 * full.centers + 2) ** 2
+        by_graph = 169 * len(order.first) + (13 * len(order.rest)) ** 2
+        found = None
+        if arrow > SMALL_ARROW and by_graph < arrow * AS_LARGE:
+            found = GraphForm.of(full, order, has_scales=self.part.scale != "known")
+        return found or self.reduced
+
+    def spectral_starts(self) -> list[Array]:
+        """Rotations (n, 3, 3) to begin a descent with, as the form has them."""
+        if isinstance(self.form, GraphForm):
+            return graph_spectral_start(self.part, self.rotation, self.order) or [
+                np.tile(np.eye(3), (len(self.part.free), 1, 1))
+            ]
+        return spectral_start(self.part, self.rotation)
 
     @cached_property
     def curvature(self) -> Curvature:
@@ -79,7 +106,7 @@ class PartForm:
 
     def answer_near(self, R: Array) -> tuple[Answer, Evaluation]:
         """The answer with the best translations and scales for rotations of the form, polished, and its cost."""
-        return self._polished(answer_of(self.part, self.reduced, R))
+        return self._polished(answer_of(self.part, self.form, R))
 
     def moved(self, evaluation: Evaluation, step: Array) -> tuple[Answer, Evaluation]:
         """The answer after a step (13 n + 1,) in the form's variables, with its rotations projected, and polished."""

@@ -11,18 +11,17 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver import small_dual
 from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start
-from gtsam_rwhec.solver.descent import Descent, descend
+from gtsam_rwhec.solver.descent import Descent, SearchForm, descend
 from gtsam_rwhec.solver.interior_point import Relaxation
 from gtsam_rwhec.solver.mirror import mirrored
 from gtsam_rwhec.solver.options import Method, SolveOptions
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.point import Evaluation
-from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_relaxation
 from gtsam_rwhec.solver.rotations import kkt_multipliers, project, random_rotations, unvec
 from gtsam_rwhec.solver.stages import Stages
-from gtsam_rwhec.solver.start import spectral_start, unconstrained_start
+from gtsam_rwhec.solver.start import unconstrained_start
 from gtsam_rwhec.solver.variables import Answer, answer_of
 
 #: A mirror image may cost this part more, and the measurements may still mean it. Above, it is another answer.
@@ -87,13 +86,13 @@ class Search:
         stages = Stages(progress)
         with stages.of("quadratic form"):
             whole = PartForm.of(part)
-            _ = whole.reduced
+            _ = whole.form
         return Search(part, options, stages, whole, contains)
 
     @property
-    def form(self) -> ReducedForm:
+    def form(self) -> SearchForm:
         """Q'."""
-        return self.whole.reduced
+        return self.whole.form
 
     @property
     def is_large(self) -> bool:
@@ -141,7 +140,7 @@ class Search:
             attempt = _Attempt(self, [initial], Start.GIVEN)
         else:
             with self.stages.of("spectral start"):
-                starts = spectral_start(self.part, self.whole.rotation)
+                starts = self.whole.spectral_starts()
             attempt = _Attempt(self, starts, Start.SPECTRAL)
         if attempt.certify() or method == "local" or attempt.is_closed_but_for_rounding:
             return attempt.found()
@@ -204,7 +203,10 @@ class Search:
         options = self.options
         with self.stages.of("semidefinite relaxation"):
             return solve_relaxation(
-                self.form.dense(), options.relaxation_tolerance, options.max_relaxation_iterations, self.stages.progress
+                self.whole.reduced.dense(),
+                options.relaxation_tolerance,
+                options.max_relaxation_iterations,
+                self.stages.progress,
             )
 
 
@@ -266,7 +268,7 @@ class _Attempt:
         if self.is_closed or self.search.is_large:
             return self.is_closed
         with self.stages.of("small dual"):
-            multipliers, _ = small_dual.improve(self.form, R, kkt)
+            multipliers, _ = small_dual.improve(self.search.whole.reduced, R, kkt)
             self._add(Multipliers.ALL_CONSTRAINTS, multipliers)
         if self.is_closed or relaxation is None:
             return self.is_closed

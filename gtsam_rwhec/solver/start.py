@@ -7,9 +7,11 @@ import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver import arrow
+from gtsam_rwhec.solver.descent import SearchForm
 from gtsam_rwhec.solver.full_form import FullForm
+from gtsam_rwhec.solver.graph_form import GraphForm
+from gtsam_rwhec.solver.graph_start import graph_unconstrained_start
 from gtsam_rwhec.solver.parts import Part, connected_components
-from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import project, unvec, vec
 
 
@@ -74,12 +76,14 @@ def _center_blocks(part: Part) -> list[np.ndarray]:
     return [np.array(block) for block in blocks if block]
 
 
-def unconstrained_start(form: ReducedForm) -> list[Array]:
+def unconstrained_start(form: SearchForm) -> list[Array]:
     """Minimisers of x'Q'x over all matrices. Where Q' has linear terms, h = 1; else it is the smallest eigenvector.
 
     Q' has the translation residuals too, so these starts can be better where rotations alone are poorly excited. The
     eigenvector comes from inverse iteration on the arrow factor.
     """
+    if isinstance(form, GraphForm):
+        return graph_unconstrained_start(form)
     C, E = form.C[:, :, :-1], form.E[:-1, :-1]
     shift = 1e-12 * form.magnitude
     border, square = arrow.with_low_rank(C, E + shift * np.eye(len(E)), form.G_leaf, form.G_border[:, :-1])

@@ -11,10 +11,9 @@ from gtsam_rwhec.errors import ScaleError
 from gtsam_rwhec.files.terminal_text import shown
 from gtsam_rwhec.geometry.poses import Array, PoseLike, one_transform
 from gtsam_rwhec.problem.knowledge import checked_scale
-from gtsam_rwhec.solver.descent import homogeneous
+from gtsam_rwhec.solver.descent import SearchForm, homogeneous
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.point import Point
-from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.rotations import vec
 
 
@@ -38,7 +37,7 @@ class Answer:
         return bool(((scales > 0.0) & np.isfinite(scales)).all())
 
 
-def answer_of(part: Part, form: ReducedForm, R: Array) -> Answer:
+def answer_of(part: Part, form: SearchForm, R: Array) -> Answer:
     """The answer with the optimal translations and scales for given rotations of the form (eq. 47)."""
     leaf, center, alpha = form.recover(homogeneous(R))
     return answer_at(part, R, np.concatenate([leaf, center]), float(alpha[0]))

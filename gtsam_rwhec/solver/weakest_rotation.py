@@ -7,19 +7,23 @@ import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver import arrow
-from gtsam_rwhec.solver.reduced_form import ReducedForm
+from gtsam_rwhec.solver.descent import SearchForm
+from gtsam_rwhec.solver.graph_form import GraphForm
+from gtsam_rwhec.solver.graph_start import graph_smallest_eigenpair
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
 
 #: Above this size Lanczos finds the eigenvalue; below it, a dense decomposition does.
 DENSE_EIGEN_SIZE = 700
 
 
-def smallest_eigenpair(form: ReducedForm, multipliers: Array) -> tuple[float, Array]:
+def smallest_eigenpair(form: SearchForm, multipliers: Array) -> tuple[float, Array]:
     """The smallest eigenvalue of Q' - Lambda without h, and its vector (9 n,)."""
     L, n = form.leaves, form.rotations
     if n == 0:  # every frame is fixed
         return 0.0, np.zeros(0)
     Lambda = (multipliers @ CONSTRAINTS_FLAT).reshape(n, 10, 10)[:, :9, :9]
+    if isinstance(form, GraphForm):
+        return graph_smallest_eigenpair(form, Lambda)
     D, C, E, G = form.D - Lambda[:L], form.C[:, :, :-1], form.E[:-1, :-1].copy(), form.G[:, :-1]
     for p in range(n - L):
         block = slice(9 * p, 9 * p + 9)

@@ -1,0 +1,128 @@
+"""Starting points of descents where the graph is followed: eigenvectors by inverse iteration with a sparse factor."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
+from gtsam_rwhec.solver.elimination import Elimination
+from gtsam_rwhec.solver.full_form import FullForm
+from gtsam_rwhec.solver.graph_form import GraphForm
+from gtsam_rwhec.solver.parts import Part, connected_components
+from gtsam_rwhec.solver.rotations import project, unvec
+
+#: With a unit diagonal, this is added to it: exact data make the form singular.
+SHIFT = 1e-9
+#: Inverse iterations at most, and the change of a unit vector at which they end: the start need not be exact.
+ITERATIONS, SMALL = 40, 1e-3
+#: Inverse iterations with Q' as a whole.
+FEW_ITERATIONS = 8
+#: Iterations for the smallest eigenvalue, which the search for a bound then corrects.
+LOBPCG_ITERATIONS = 60
+
+
+def graph_spectral_start(part: Part, rotation_form: FullForm, order: Elimination) -> list[Array]:
+    """Rotations that minimise the rotation residuals over all matrices, projected to SO(3); (n, 3, 3) each.
+
+    As `start.spectral_start`, with all frames in the eigenvector, each in units of its own diagonal.
+    """
+    n = len(rotation_form.frames)
+    frames = 0.5 * (rotation_form.frames + rotation_form.frames.transpose(0, 2, 1))
+    of_h, tail = rotation_form.tails[:, :, 1:], rotation_form.tail[1:, 1:]
+    anchored = bool(np.abs(of_h).max(initial=0.0) > 0.0)
+    if not anchored:
+        of_h, tail = np.zeros_like(of_h), np.ones((1, 1))
+    P = BlockMatrix(order, frames, rotation_form.couplings, of_h, tail)
+    weights = np.maximum(np.einsum("nii->n", frames) / 9.0, 1e-290)
+    unit = np.append(np.repeat(1.0 / np.sqrt(weights), 9), 1.0 / np.sqrt(max(float(tail[0, 0]), 1e-290)))
+    factor = P.scaled(unit).plus(np.full(P.size, SHIFT)).factor()
+    if factor is None:
+        return []
+    r = np.zeros(P.size)
+    if anchored:
+        r = _smallest(factor, np.ones(P.size)) * unit
+        return [project(unvec(sign * r[:-1])) for sign in (1.0, -1.0)]
+    # Components that only the shared scale joins each have an eigenvector and a sign.
+    index = {name: i for i, name in enumerate(part.free)}
+    for names in connected_components(part.pairs):
+        members = np.array([index[name] for name in names if name in index], dtype=int)
+        begin = np.zeros((n, 9))
+        begin[members] = np.random.default_rng(0).standard_normal((len(members), 9))
+        v = _smallest(factor, np.append(begin.ravel(), 0.0)) * unit
+        r += v * _handedness(v[:-1])
+    return [project(unvec(r[:-1]))]
+
+
+def _smallest(factor: BlockFactor, v: Array) -> Array:
+    """The eigenvector of the smallest eigenvalue that ``v`` has a part of."""
+    v = v / np.linalg.norm(v)
+    for _ in range(ITERATIONS):
+        after = factor.solve_vector(v)
+        after /= np.linalg.norm(after)
+        change = float(np.linalg.norm(after - v))
+        v = after
+        if change < SMALL:
+            break
+    return v
+
+
+def _handedness(r: Array) -> float:
+    """+1 or -1, so that the blocks of r are right-handed (design fact 5)."""
+    return 1.0 if float(np.sign(np.linalg.det(unvec(r))).sum()) >= 0.0 else -1.0
+
+
+def graph_unconstrained_start(form: GraphForm) -> list[Array]:
+    """Minimisers of x'Q'x over all matrices, as `start.unconstrained_start` has them."""
+    n = form.rotations
+    shift = np.append(np.tile(np.r_[np.zeros(4), np.full(9, 1e-12 * form.magnitude)], n), 0.0)
+    factor = form.without_h().plus(shift).factor()
+    if factor is None:
+        return []
+
+    def solved(right: Array) -> Array:
+        numbers = np.zeros((n, 13))
+        numbers[:, 4:] = right.reshape(n, 9)
+        return factor.solve_vector(np.append(numbers.ravel(), 0.0))[:-1].reshape(n, 13)[:, 4:].ravel()
+
+    last = np.zeros(form.size)
+    last[-1] = 1.0
+    linear = form.apply(last)[:-1]
+    candidates = []
+    if np.abs(linear).max(initial=0.0) > 0.0:
+        candidates.append(solved(-linear))
+    v: Array = np.ones(form.size - 1)
+    for _ in range(FEW_ITERATIONS):
+        v = solved(v)
+        v /= np.linalg.norm(v)
+    candidates.append(v * _handedness(v))
+    return [project(unvec(r)) for r in candidates]
+
+
+def graph_smallest_eigenpair(form: GraphForm, Lambda: Array) -> tuple[float, Array]:
+    """The smallest eigenvalue of Q' - Lambda without h, and its vector (9 n,): an upper bound, and near it.
+
+    Lambda (n, 9, 9) are the multipliers' blocks.
+    """
+    from scipy.sparse.linalg import LinearOperator, lobpcg  # slow to import, few problems need it
+
+    n = form.rotations
+
+    def apply(v: Array) -> Array:
+        v = v.ravel()
+        product = form.apply(np.append(v, 0.0))[:-1]
+        result: Array = product - np.matmul(Lambda, v.reshape(n, 9, 1)).ravel()
+        return result
+
+    operator = LinearOperator((9 * n, 9 * n), matvec=apply, dtype=np.float64)
+    inverse_diagonal = 1.0 / np.sqrt(
+        np.einsum("nij,nij->n", form.whole.frames[:, 4:, 4:], form.whole.frames[:, 4:, 4:])
+    )
+    scale = np.repeat(inverse_diagonal, 9)
+    nearly = LinearOperator((9 * n, 9 * n), matvec=lambda v: scale * v.ravel(), dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal((9 * n, 2))
+    values, vectors = lobpcg(
+        operator, start, M=nearly, largest=False, maxiter=LOBPCG_ITERATIONS, tol=1e-6 * form.magnitude
+    )
+    vector: Array = np.real(vectors[:, 0])
+    return float(values[0]), vector / np.linalg.norm(vector)
