@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
@@ -18,8 +19,8 @@ SHIFT = 1e-9
 ITERATIONS, SMALL = 40, 1e-3
 #: Inverse iterations with Q' as a whole.
 FEW_ITERATIONS = 8
-#: Iterations for the smallest eigenvalue, which the search for a bound then corrects.
-LOBPCG_ITERATIONS = 60
+#: Steps of Lanczos for the smallest eigenvalue, which the search for a bound then corrects.
+LANCZOS_STEPS = 80
 
 
 def graph_spectral_start(part: Part, rotation_form: FullForm, order: Elimination) -> list[Array]:
@@ -102,27 +103,28 @@ def graph_unconstrained_start(form: GraphForm) -> list[Array]:
 def graph_smallest_eigenpair(form: GraphForm, Lambda: Array) -> tuple[float, Array]:
     """The smallest eigenvalue of Q' - Lambda without h, and its vector (9 n,): an upper bound, and near it.
 
-    Lambda (n, 9, 9) are the multipliers' blocks.
+    Lambda (n, 9, 9) are the multipliers' blocks. By Lanczos' method with full orthogonalisation.
     """
-    from scipy.sparse.linalg import LinearOperator, lobpcg  # slow to import, few problems need it
-
     n = form.rotations
-
-    def apply(v: Array) -> Array:
-        v = v.ravel()
-        product = form.apply(np.append(v, 0.0))[:-1]
-        result: Array = product - np.matmul(Lambda, v.reshape(n, 9, 1)).ravel()
-        return result
-
-    operator = LinearOperator((9 * n, 9 * n), matvec=apply, dtype=np.float64)
-    inverse_diagonal = 1.0 / np.sqrt(
-        np.einsum("nij,nij->n", form.whole.frames[:, 4:, 4:], form.whole.frames[:, 4:, 4:])
+    size = 9 * n
+    steps = min(LANCZOS_STEPS, size)
+    basis = np.zeros((steps, size))
+    diagonal, beside = np.zeros(steps), np.zeros(steps)
+    v = np.random.default_rng(0).standard_normal(size)
+    v /= np.linalg.norm(v)
+    for k in range(steps):
+        basis[k] = v
+        product = form.apply(np.append(v, 0.0))[:-1] - np.matmul(Lambda, v.reshape(n, 9, 1)).ravel()
+        diagonal[k] = float(v @ product)
+        for _ in range(2):  # twice is enough (Parlett 1998, section 6.9)
+            product -= basis[: k + 1].T @ (basis[: k + 1] @ product)
+        beside[k] = float(np.linalg.norm(product))
+        if beside[k] <= 1e-12 * form.magnitude:
+            steps = k + 1
+            break
+        v = product / beside[k]
+    values, vectors = scipy.linalg.eigh_tridiagonal(
+        diagonal[:steps], beside[: steps - 1], select="i", select_range=(0, 0)
     )
-    scale = np.repeat(inverse_diagonal, 9)
-    nearly = LinearOperator((9 * n, 9 * n), matvec=lambda v: scale * v.ravel(), dtype=np.float64)
-    start = np.random.default_rng(0).standard_normal((9 * n, 2))
-    values, vectors = lobpcg(
-        operator, start, M=nearly, largest=False, maxiter=LOBPCG_ITERATIONS, tol=1e-6 * form.magnitude
-    )
-    vector: Array = np.real(vectors[:, 0])
+    vector: Array = basis[:steps].T @ vectors[:, 0]
     return float(values[0]), vector / np.linalg.norm(vector)
