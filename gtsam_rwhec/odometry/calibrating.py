@@ -32,13 +32,14 @@ from gtsam_rwhec.odometry.solved_windows import FEWEST, Answer, Task, solve_wind
 from gtsam_rwhec.odometry.tracks import OdometryTrack
 from gtsam_rwhec.odometry.unknowns import Layout
 from gtsam_rwhec.odometry.up import up_direction
-from gtsam_rwhec.odometry.window_choice import best_edges, edges_near
+from gtsam_rwhec.odometry.window_choice import best_length, edges_near
 from gtsam_rwhec.odometry.window_motions import WindowMotions
 
 #: A time offset that the drive does not tell stays within about so many seconds of the first guess.
 CLOCK_SIGMA_S = 0.05
-#: The windows are made again with new offsets until these change by less than this, s, and so often at most.
-SAME_CLOCK_S = 2e-4
+#: The windows are made again with new offsets until these change by less than this, s, and so often at most. What is
+#: left is in the residuals to first order.
+SAME_CLOCK_S = 2e-3
 CLOCK_ROUNDS = 4
 #: A start for the translation's noise: this part of the median way of a second, in metres a root of a second.
 WAY_SHARE = 0.01
@@ -115,15 +116,13 @@ def calibrate_odometries(
     tell("choosing windows")
     _check_common_time(sampled())
     answer: Answer | None = None
+    seconds = options.window_s
     variances: Array = np.zeros((0, 2))
     for _ in range(CLOCK_ROUNDS):
         samples = sampled()
-        edges = (
-            best_edges(samples, options.max_gap_s)
-            if options.window_s is None
-            else edges_near(samples, options.window_s)
-        )
-        windows = WindowMotions.of(samples, edges, options.max_gap_s)
+        seconds = seconds or best_length(samples, options.max_gap_s)
+        edges = edges_near(samples, seconds)
+        windows = WindowMotions.of(samples, edges, options.max_gap_s, clocks=options.estimate_time_offsets)
         _check_windows(windows, names)
         if answer is None:
             variances = _first_variances(windows, tracks)
@@ -218,7 +217,7 @@ def _first_variances(windows: WindowMotions, tracks: list[OdometryTrack]) -> Arr
 
 
 def _check_turning(samples: list[SampledTrack], options: OdometryOptions, variances: Array) -> None:
-    windows = WindowMotions.of(samples, edges_near(samples, LONG_S), options.max_gap_s)
+    windows = WindowMotions.of(samples, edges_near(samples, LONG_S), options.max_gap_s, clocks=False)
     w = windows.rotation_vectors()
     noise = variances[:, :1] * windows.length
     mean_square = float(((w**2).sum(axis=2) / noise)[windows.used].mean()) / 3.0 if len(windows) else np.inf

@@ -15,7 +15,7 @@ from gtsam_rwhec.odometry.noise_by_residuals import first_rotation_variances
 from gtsam_rwhec.odometry.options import OdometryOptions
 from gtsam_rwhec.odometry.sampling import SampledTrack
 from gtsam_rwhec.odometry.tracks import OdometryTrack
-from gtsam_rwhec.odometry.window_choice import best_edges, edges_near
+from gtsam_rwhec.odometry.window_choice import best_length, edges_near
 from gtsam_rwhec.odometry.window_motions import WindowMotions
 from gtsam_rwhec.solver.rotations import project
 
@@ -72,10 +72,8 @@ def odometry_motions(track_a: OdometryTrack, track_b: OdometryTrack, options: Od
         SampledTrack(gate.track, origin, offset, gate.good)
         for gate, offset in zip(gates, (0.0, clock.offset_s), strict=True)
     ]
-    edges = (
-        best_edges(samples, options.max_gap_s) if options.window_s is None else edges_near(samples, options.window_s)
-    )
-    windows = WindowMotions.of(samples, edges, options.max_gap_s)
+    edges = edges_near(samples, options.window_s or best_length(samples, options.max_gap_s))
+    windows = WindowMotions.of(samples, edges, options.max_gap_s, clocks=False)
     if len(windows) < FEWEST:
         raise UnderdeterminedError(
             f"{track_a.sensor} and {track_b.sensor} share {len(windows)} windows of time; at least {FEWEST} are "

@@ -25,6 +25,8 @@ LONGEST_S = 5.0
 LARGEST_TURN_RAD = 1.2
 #: This part of the information along each axis may be lost to longer windows.
 LOSS = 0.01
+#: An axis has information if what it shows is so many times what noise would.
+CLEARLY = 4.0
 #: Fewer windows than this say little about their own noise.
 FEWEST = 20
 
@@ -45,28 +47,28 @@ def edges_near(tracks: Sequence[SampledTrack], seconds: float) -> Array:
     return edges_of(tracks, max(1, round(seconds / step)))
 
 
-def best_edges(tracks: Sequence[SampledTrack], max_gap_s: float) -> Array:
-    """The edges whose windows have the most information of the turns."""
+def best_length(tracks: Sequence[SampledTrack], max_gap_s: float) -> float:
+    """The length, seconds, of the windows that have the most information of the turns."""
     step = max(float(np.median(np.diff(track.times))) for track in tracks)
-    pilot = WindowMotions.of(tracks, edges_near(tracks, 5.0 * step), max_gap_s)
+    pilot = WindowMotions.of(tracks, edges_near(tracks, 5.0 * step), max_gap_s, clocks=False)
     variances = first_rotation_variances(pilot)
-    found: list[tuple[float, Array]] = []
+    found: list[tuple[float, float]] = []
     for every in LADDER:
         candidate = edges_of(tracks, every)
         if every > 1 and (every * step > LONGEST_S or len(candidate) <= FEWEST):
             break
-        windows = WindowMotions.of(tracks, candidate, max_gap_s)
+        windows = WindowMotions.of(tracks, candidate, max_gap_s, clocks=False)
         if not len(windows):
             continue
         value, turn = _information(windows, variances)
         if every > 1 and turn > LARGEST_TURN_RAD:
             break
-        found.append((value, candidate))
+        found.append((value, every * step))
     if not found:
-        return edges_of(tracks, 1)
+        return step
     # Of lengths that tell as much, the longest: fewer windows, with turns that stand out of the noise.
     enough = max(value for value, _ in found) - LOSS * 3.0 * len(tracks)
-    return [candidate for value, candidate in found if value >= enough][-1]
+    return [seconds for value, seconds in found if value >= enough][-1]
 
 
 def _information(windows: WindowMotions, variances: Array) -> tuple[float, float]:
@@ -79,7 +81,8 @@ def _information(windows: WindowMotions, variances: Array) -> tuple[float, float
         rows = w[k, used] / np.sqrt(noise)[:, None]
         N = 2.0 * float(used.sum())
         S = np.linalg.eigvalsh(float((rows**2).sum()) * np.eye(3) - rows.T @ rows)
-        told = np.maximum(S - N, 0.0)
+        # What is above N by chance, or as the noise is known roughly, tells nothing.
+        told = np.where(S > CLEARLY * N, S - N, 0.0)
         value += float(np.log1p(told**2 / (told + N + 1e-300)).sum())
     return value, float(np.quantile(np.linalg.norm(w[windows.used], axis=1), 0.95))
 

@@ -40,13 +40,16 @@ class WindowMotions:
     by_offset: Array
 
     @staticmethod
-    def of(tracks: Sequence[SampledTrack], edges: Array, max_gap_s: float) -> WindowMotions:
-        """Between neighbouring times ``edges`` (n + 1,); windows that fewer than two sensors have are left out."""
+    def of(tracks: Sequence[SampledTrack], edges: Array, max_gap_s: float, *, clocks: bool = True) -> WindowMotions:
+        """Between neighbouring times ``edges`` (n + 1,); windows that fewer than two sensors have are left out.
+
+        Without ``clocks`` the derivatives by offsets are zero.
+        """
         start, end = edges[:-1], edges[1:]
         used = np.array([track.covers(start, end, max_gap_s) for track in tracks])
         kept = used.sum(axis=0) >= 2
         start, end, used = start[kept], end[kept], used[:, kept]
-        parts = [_of_track(track, start, end) for track in tracks]
+        parts = [_of_track(track, start, end, clocks=clocks) for track in tracks]
         M, length, first, second, by_offset = (np.array(part) for part in zip(*parts, strict=True))
         M[~used] = np.eye(4)
         return WindowMotions(start, end, M, used, length, first, second, by_offset)
@@ -100,10 +103,12 @@ class WindowMotions:
         ).selected(used.sum(axis=0) >= 2)
 
 
-def _of_track(track: SampledTrack, start: Array, end: Array) -> tuple[Array, ...]:
+def _of_track(track: SampledTrack, start: Array, end: Array, *, clocks: bool) -> tuple[Array, ...]:
     T_start, T_end = track.poses(start), track.poses(end)
     M = se3.inverse(T_start) @ T_end
     length, first, second = track.path_sums(start, end, T_end)
+    if not clocks:
+        return M, length, first, second, np.zeros((len(start), 6))
     at_start = np.einsum("nij,nj->ni", se3.adjoint(se3.inverse(M)), track.velocities(start))
     # The sensor's stamp t is the reference's t + offset: a larger offset reads the track earlier.
     return M, length, first, second, at_start - track.velocities(end)
