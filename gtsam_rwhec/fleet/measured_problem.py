@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -68,12 +68,13 @@ def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_sit
     problem = Problem("per_target" if free else "known")
     boards = {target.name: target.corners() for each in rigs.values() for target in each.target_list}
     paths: list[tuple[np.ndarray, Array]] = []
+    common_s = {} if at_site else _common_offsets(of, rig)
     for log in sorted(of.logs, key=lambda one: (one.facts.begin_ns, one.key)):
         file = measurements_file(partial_file(log.key))
         content = read_bytes(below(output, file))
         if checksum(content) != log.facts.measurements_sha256:
             raise FileFormatError(f"{file} is not the file of its partial result; remove both, and run again")
-        kept = read_kept(content, file)
+        kept = _at_offsets(read_kept(content, file), log.facts.cleaning.time_offsets_s, common_s)
         names = {s: sensor_name(log.robot, s) for s in rigs[log.robot].sensors} if at_site else {}
         _add(problem, kept, names, log.facts.weighting, rig, log.facts.url)
         for name, camera in ((name, log.facts.camera(name)) for name in log.facts.cameras):
@@ -99,6 +100,32 @@ def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_sit
         estimated if has_path else (),
         _joined(paths) if has_path else None,
     )
+
+
+def _common_offsets(of: Merged, rig: Rig) -> dict[str, float]:
+    """One time offset for each sensor whose clock is estimated: the mean of what the logs' rotations tell, seconds."""
+    found: dict[str, list[float]] = {}
+    for log in of.logs:
+        for name, offset_s in log.facts.cleaning.time_offsets_s.items():
+            if name in rig.sensors and rig.sensors[name].time_offset == "estimate":
+                found.setdefault(name, []).append(offset_s)
+    return {name: float(np.mean(values)) for name, values in found.items()}
+
+
+def _at_offsets(kept: KeptLog, taken_s: Mapping[str, float], common_s: Mapping[str, float]) -> KeptLog:
+    """The measurements of a log with A at common time offsets in place of those at which it was taken."""
+    if kept.path is None or not common_s:
+        return kept
+    path = Trajectory.of(*kept.path, "the carriers' path of a log")
+    pairs = {}
+    for pair, one in kept.pairs.items():
+        if pair.sensor in common_s:
+            change_ns = round(1e9 * common_s[pair.sensor]) - round(1e9 * taken_s[pair.sensor])
+            stamps = one.stamps_ns + change_ns
+            pairs[pair] = replace(one, stamps_ns=stamps, A=path.at(stamps)[0])
+        else:
+            pairs[pair] = one
+    return replace(kept, pairs=pairs)
 
 
 def _add(problem: Problem, kept: KeptLog, names: Mapping[str, str], weighting: Weighting, rig: Rig, where: str) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.calibration.calibrating import calibrate
 from gtsam_rwhec.calibration.options import CalibrateOptions
+from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.fleet.consistency import check_logs
 from gtsam_rwhec.fleet.log_facts import findings_of_logs, merged_fields
 from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
@@ -120,9 +121,9 @@ def calibrated(
         for name, number in log.poses.items():
             poses[name] = poses.get(name, 0) + number
     findings = (*found.findings, *findings_of_logs(facts), *short_of_measurements(fields, poses))
-    notes = (*found.notes, *dict.fromkeys(words for log in facts for words in log.warnings))
     if measured is None or not measured.estimated:
-        notes += _of_clocks(fields)
+        findings += tuple(_of_clocks(fields))
+    notes = (*found.notes, *dict.fromkeys(words for log in facts for words in log.warnings))
     judgement = found.judgement
     if found.solution is not None:
         judgement = judge(found.solution, found.refined, fields, findings)
@@ -147,10 +148,14 @@ def _with_offsets(fields: LogFields, found: Calibration) -> LogFields:
     return fields.model_copy(update={"time_offsets": tuple(offsets)})
 
 
-def _of_clocks(fields: LogFields) -> tuple[str, ...]:
-    """That clocks were estimated by rotations alone."""
+def _of_clocks(fields: LogFields) -> list[Finding]:
+    """That clocks were estimated by rotations alone, which standard deviations of poses do not hold."""
     sigmas = fields.cleaning.coarse_sigma_s
     if not sigmas:
-        return ()
+        return []
     told = ", ".join(f"{name} to +-{1e3 * sigma_s:.1f} ms" for name, sigma_s in sigmas.items())
-    return (f"time offsets are those that rotations alone tell, log by log ({told})",)
+    words = (
+        f"time offsets are those that rotations alone tell, log by log ({told}), and the poses' standard deviations do "
+        "not hold their errors; --refine estimates them with the poses of a robot that is solved alone"
+    )
+    return [Finding(Ground.COVARIANCE_DOUBTED, words)]

@@ -87,6 +87,25 @@ def test_kept_measurements_have_the_moments(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_clocks_of_several_logs_are_estimated_as_one(tmp_path: Path) -> None:
+    """Rotations tell each log another offset; the poses of all tell one, with its deviation."""
+    made = write_fleet(tmp_path, 1, 3, images=20, tags=2)
+    rig = Path(made.rig)
+    rig.write_text(rig.read_text(encoding="utf-8").replace("tags, ", "tags, time_offset: estimate, "), encoding="utf-8")
+    manifest, output = fleet.read_manifest(made.manifest), str(tmp_path / "out")
+    (row,) = fleet.run(manifest, output).rows
+    assert rw.Ground.COVARIANCE_DOUBTED in row.grounds
+    assert "time offsets are those that rotations alone tell" in row.reason
+    (row,) = fleet.run(manifest, output, fleet.FleetOptions(refine=True)).rows
+    assert rw.Ground.COVARIANCE_DOUBTED not in row.grounds
+    log = rw.results.read_result(tmp_path / "out" / str(row.result)).log
+    assert log is not None
+    (offset,) = log.time_offsets
+    assert offset.sigma_s is not None
+    assert abs(offset.offset_s) < 5.0 * offset.sigma_s < 0.005
+
+
+@pytest.mark.slow
 def test_a_refinement_has_the_measurements_and_corners(tmp_path: Path) -> None:
     made = write_fleet(tmp_path, 1, 2, images=12, tags=2)
     run = fleet.run(fleet.read_manifest(made.manifest), str(tmp_path / "out"), fleet.FleetOptions(refine=True))
