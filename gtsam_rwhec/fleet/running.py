@@ -10,6 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
+from importlib.util import find_spec
 
 from gtsam_rwhec.errors import FileFormatError, ResultVersionError, StoreError, StoreInterruptedError
 from gtsam_rwhec.files.progress import Counted, Progress, Remark, check_progress, silent
@@ -17,6 +18,7 @@ from gtsam_rwhec.fleet.in_process import InProcess
 from gtsam_rwhec.fleet.manifest import Manifest
 from gtsam_rwhec.fleet.map_log import LogTask, map_log
 from gtsam_rwhec.fleet.merging import MergeTask, in_order, merge_task
+from gtsam_rwhec.fleet.parquet import rows_parquet
 from gtsam_rwhec.fleet.planning import FleetOptions, Plan, PlannedLog, many, planned
 from gtsam_rwhec.fleet.receipts import below, kept_receipt
 from gtsam_rwhec.fleet.rows import FailedLog, RobotRow, read_rows, rows_json
@@ -27,6 +29,8 @@ from gtsam_rwhec.fleet.without_secrets import shown
 
 #: All rows of the last run, below the output.
 ROWS_FILE = "fleet.json"
+#: The same for programs that read tables, where pyarrow is installed.
+PARQUET_FILE = "fleet.parquet"
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,8 @@ def _run(manifest: Manifest, output: str, options: FleetOptions, engine: Engine,
     tell("putting the rows together")
     rows = _rows(manifest, plan, output, outcomes)
     write_once(below(output, ROWS_FILE), rows_json(rows))
+    if find_spec("pyarrow") is not None:
+        write_once(below(output, PARQUET_FILE), rows_parquet(rows))
     found = [one for one in outcomes.values() if isinstance(one, Receipt)]
     return FleetRun(
         output=shown(output),

@@ -14,7 +14,9 @@ from fleets import MadeFleet, write_fleet
 import gtsam_rwhec as rw
 from gtsam_rwhec import fleet
 from gtsam_rwhec.fleet.in_process import InProcess
+from gtsam_rwhec.fleet.parquet import read_parquet
 from gtsam_rwhec.fleet.planning import planned
+from gtsam_rwhec.fleet.running import PARQUET_FILE
 from gtsam_rwhec.geometry.pose_covariances import error_of
 
 
@@ -79,6 +81,8 @@ def test_every_robot_has_a_row_with_its_poses(made: MadeFleet, first: tuple[str,
     assert at_site[0].frames[1].T.tolist() == at_site[1].frames[1].T.tolist(), "the site's tags are shared"
     assert all(row.is_fine for row in at_site)
     assert fleet.read_fleet(output)[0].moments_sha256 == alone.moments_sha256
+    table = read_parquet((Path(output) / PARQUET_FILE).read_bytes(), PARQUET_FILE)
+    assert [row.moments_sha256 for row in table] == [row.moments_sha256 for row in run.rows]
 
 
 def test_a_second_run_reads_receipts(made: MadeFleet, first: tuple[str, fleet.FleetRun]) -> None:
