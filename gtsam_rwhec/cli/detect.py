@@ -53,7 +53,10 @@ def detect(
         say(f"{sensor}: {count} images or messages; {_in_words(report, sensor)}")
     for cause in report.likely:
         say(f"Likely: {cause}")
-    say(f"Written to {shown_path(output)}: {used} detections to use, and {rejected} rejected ones with the reasons.")
+    words = f"{used} detections to use, and {rejected} rejected ones with the reasons"
+    if not report.images:
+        words = "no sensor of the rig file sees targets, so there was nothing to detect"
+    say(f"Written to {shown_path(output)}: {words}.")
     _say_pictures(output, draw)
     say(f"Next: gtsam-rwhec clean {shown_path(output)} -o cleaned.mcap")
     return ExitStatus.DONE

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gtsam_rwhec.calibration.verdict import Ground, Judgement, Verdict
-from gtsam_rwhec.errors import FileFormatError
+from gtsam_rwhec.errors import FileFormatError, FrameError
 from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.whole_files import read_whole
 from gtsam_rwhec.geometry.poses import Array, one_transform
@@ -31,8 +31,8 @@ FORMAT_VERSION: Final = 1
 #: A result is at most so many bytes.
 MOST_BYTES = 50_000_000
 CONVENTIONS = (
-    "T_reference_sensor maps coordinates in the sensor's frame to those of the reference. Covariances are of right "
-    "perturbations T Expmap([omega, v]), rad and m, in the sensor's own axes; null is infinite. A scale is measured "
+    "T_parent_child maps coordinates in the child's frame to those of the parent, which is the reference. Covariances are "
+    "of right perturbations T Expmap([omega, v]), rad and m, in the sensor's own axes; null is infinite. A scale is measured "
     "length / true length. A sensor's stamp t is the reference's t + time_offset_s."
 )
 
@@ -53,13 +53,14 @@ class NoiseRecord(_Record):
 
 
 class SensorRecord(_Record):
-    """One sensor; of the reference the pose is the identity."""
+    """The pose of one sensor in the frame of the reference, its scale and its clock."""
 
     sensor: str
-    frame: str
+    parent: str = Field(description="the frame of the reference")
+    child: str = Field(description="the sensor's frame")
     translation_m: Row3
-    quaternion_xyzw: Row4
-    T_reference_sensor: tuple[Row4, Row4, Row4, Row4]
+    quaternion_wxyz: Row4
+    T_parent_child: tuple[Row4, Row4, Row4, Row4]
     standard_deviations_deg: tuple[float | None, float | None, float | None]
     standard_deviations_mm: tuple[float | None, float | None, float | None]
     covariance: tuple[tuple[float | None, ...], ...]
@@ -67,6 +68,12 @@ class SensorRecord(_Record):
     scale_sigma: float | None
     time_offset_s: float
     time_offset_sigma_s: float | None
+
+
+class TrackRecord(_Record):
+    """What one sensor measured, the reference too: its noise, its residuals, and what is not used."""
+
+    sensor: str
     noise: NoiseRecord
     residual_rotation: float = Field(description="root mean square, in standard deviations")
     residual_translation: float
@@ -129,6 +136,7 @@ class OdometryResult(_Record):
     conventions: str
     reference: str
     sensors: tuple[SensorRecord, ...]
+    tracks: tuple[TrackRecord, ...]
     window_s: float
     windows: int
     free_directions: tuple[FreeRecord, ...]
@@ -145,8 +153,13 @@ class OdometryResult(_Record):
 
     def pose(self, sensor: str) -> Array:
         """T_reference_sensor (4, 4), metres."""
-        (found,) = (one.T_reference_sensor for one in self.sensors if one.sensor == sensor)
-        return one_transform(np.array(found), f"the pose of {sensor}")
+        if sensor == self.reference:
+            return np.eye(4)
+        found = [one.T_parent_child for one in self.sensors if one.sensor == sensor]
+        if not found:
+            there = ", ".join((self.reference, *(one.sensor for one in self.sensors)))
+            raise FrameError(f"there is no sensor {sensor!r}; there are {there}")
+        return one_transform(np.array(found[0]), f"the pose of {sensor}")
 
 
 def result_of(
@@ -162,7 +175,8 @@ def result_of(
         not_determined=free_in_words(found),
         conventions=CONVENTIONS,
         reference=found.reference,
-        sensors=tuple(_sensor(found, name, (frames or {}).get(name, name)) for name in found.sensors),
+        sensors=tuple(_sensor(found, name, frames or {}) for name in found.order),
+        tracks=tuple(_track(found, name) for name in found.sensors),
         window_s=found.windows.seconds,
         windows=found.windows.count,
         free_directions=tuple(
@@ -239,20 +253,21 @@ def is_odometry_result(content: bytes) -> bool:
     return FORMAT.encode() in content[:1000]
 
 
-def _sensor(found: OdometryCalibration, name: str, frame: str) -> SensorRecord:
+def _sensor(found: OdometryCalibration, name: str, frames: Mapping[str, str]) -> SensorRecord:
     T, covariance = found.T_reference_sensor[name], found.covariance_of(name)
     sigma = [_finite(float(x)) for x in np.sqrt(np.diagonal(covariance))]
-    noise, scales = found.noise[name], list(found.scales)
+    q = of_rotations(T[None, :3, :3])[0].tolist()  # x, y, z, w
     scale_sigma = None
     if name in found.scales:
-        at = 6 * len(found.order) + scales.index(name)
+        at = 6 * len(found.order) + list(found.scales).index(name)
         scale_sigma = _finite(found.scales[name] * float(np.sqrt(found.covariance[at, at])))
     return SensorRecord(
         sensor=name,
-        frame=frame,
+        parent=frames.get(found.reference, found.reference),
+        child=frames.get(name, name),
         translation_m=tuple(T[:3, 3].tolist()),
-        quaternion_xyzw=tuple(of_rotations(T[None, :3, :3])[0].tolist()),
-        T_reference_sensor=_rows(T),  # type: ignore[arg-type]
+        quaternion_wxyz=(q[3], q[0], q[1], q[2]),
+        T_parent_child=_rows(T),  # type: ignore[arg-type]
         standard_deviations_deg=tuple(None if x is None else float(np.degrees(x)) for x in sigma[:3]),  # type: ignore[arg-type]
         standard_deviations_mm=tuple(None if x is None else 1e3 * x for x in sigma[3:]),  # type: ignore[arg-type]
         covariance=tuple(tuple(_finite(x) for x in row) for row in covariance.tolist()),
@@ -260,6 +275,13 @@ def _sensor(found: OdometryCalibration, name: str, frame: str) -> SensorRecord:
         scale_sigma=scale_sigma,
         time_offset_s=found.time_offsets_s.get(name, 0.0),
         time_offset_sigma_s=_finite(found.time_offset_sigmas_s.get(name, np.inf)),
+    )
+
+
+def _track(found: OdometryCalibration, name: str) -> TrackRecord:
+    noise = found.noise[name]
+    return TrackRecord(
+        sensor=name,
         noise=NoiseRecord(
             rotation_deg_per_sqrt_s=float(np.degrees(noise.rotation_rad_per_sqrt_s)),
             translation_mm_per_sqrt_s=1e3 * noise.translation_m_per_sqrt_s,

@@ -164,7 +164,7 @@ def read_odometries(path: str | Path) -> OdometrySolved:
             raise LogError(f"{path} has no {RESULT_FILE} attached: gtsam-rwhec solve or calibrate did not write it")
         result = parse_odometry_result(content, f"{path}, attachment {RESULT_FILE}")
         metadata = read_metadata(log)
-    if metadata.cleaning is None or {one.sensor for one in result.sensors} != set(metadata.rig.odometries):
+    if metadata.cleaning is None or {one.sensor for one in result.tracks} != set(metadata.rig.odometries):
         raise LogError(
             f"{path} has a {RESULT_FILE} of other sensors than its rig file: they are not of one calibration"
         )
@@ -174,13 +174,12 @@ def read_odometries(path: str | Path) -> OdometrySolved:
 def frames_of_odometries(solved: OdometrySolved) -> RigFrames:
     """The calibrated frames: sensors on the reference."""
     result, rig = solved.result, solved.rig
-    others = [one for one in result.sensors if one.sensor != result.reference]
     warnings = () if result.verdict is Verdict.USE else (str(result.judgement), *result.not_determined)
     return RigFrames(
         sensor_carrier=rig.carriers.sensors,
         target_carrier=rig.carriers.targets,
-        sensors={rig.frame_of(one.sensor): result.pose(one.sensor) for one in others},
+        sensors={rig.frame_of(one.sensor): result.pose(one.sensor) for one in result.sensors},
         targets={},
-        time_offsets_s={rig.frame_of(one.sensor): one.time_offset_s for one in others},
+        time_offsets_s={rig.frame_of(one.sensor): one.time_offset_s for one in result.sensors},
         warnings=warnings,
     )

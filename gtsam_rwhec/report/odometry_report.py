@@ -50,9 +50,7 @@ def print_odometry(result: OdometryResult, *, verbose: bool = False, page: Path 
 def pose_table(result: OdometryResult) -> FrameTable:
     """Poses in the frame of the reference, with their standard deviations."""
     rows = {
-        one.sensor: (*pose_cells(gtsam.Pose3(np.array(one.T_reference_sensor))), *deviations(one))
-        for one in result.sensors
-        if one.sensor != result.reference
+        one.sensor: (*pose_cells(gtsam.Pose3(np.array(one.T_parent_child))), *deviations(one)) for one in result.sensors
     }
     title = f"Sensors in the frame of {result.reference}"
     return FrameTable(title, "sensor", (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows, tight=True)
@@ -72,7 +70,7 @@ def scales_and_clocks(result: OdometryResult) -> list[str]:
         if one.scale is not None:
             sigma = "not determined" if one.scale_sigma is None else f"± {one.scale_sigma:.2g}"
             said.append(f"scale of {one.sensor}: {one.scale:.5g} {sigma} (measured length / true length).")
-        if one.time_offset_sigma_s is not None and one.sensor != result.reference:
+        if one.time_offset_sigma_s is not None:
             said.append(
                 f"clock of {one.sensor}: its stamp t is t {1e3 * one.time_offset_s:+.2f} ms of {result.reference}, ± "
                 f"{1e3 * one.time_offset_sigma_s:.2g} ms."
@@ -105,7 +103,7 @@ def proof_in_words(result: OdometryResult) -> list[str]:
         f"{result.certificate.sentence}.",
         f"{result.windows} windows of {result.window_s:.3g} s, all sensors at once.",
     ]
-    for one in result.sensors:
+    for one in result.tracks:
         noise, how = one.noise, "found" if one.noise.was_found else "stated"
         said.append(
             f"noise of {one.sensor} ({how}): {noise.rotation_deg_per_sqrt_s:.2g}° and "
@@ -119,6 +117,6 @@ def removed_in_words(result: OdometryResult) -> list[str]:
     """What is not used, by sensor and reason."""
     return [
         f"not used of {one.sensor}: {', '.join(f'{why}: {count}' for why, count in one.removed.items())}."
-        for one in result.sensors
+        for one in result.tracks
         if one.removed
     ]

@@ -90,9 +90,12 @@ def test_six_odometries_through_the_command(
     result = read_odometry_result(folder / "out" / "result.json")
     assert result.certificate.status == "certified"
     assert result.not_determined == ()
-    for one in result.sensors[1:]:
+    assert {(one.parent, one.child) for one in result.sensors} == {("lidar_front", name) for name in list(MOUNTS)[1:]}
+    for one in result.sensors:
         truth = driven.T("lidar_front", one.sensor)
         off = se3.logmap(se3.inverse(result.pose(one.sensor)[None]) @ truth[None])[0]
+        w, *xyz = one.quaternion_wxyz
+        assert np.allclose(Rotation.from_quat([*xyz, w]).as_matrix(), result.pose(one.sensor)[:3, :3])
         covariance = np.array(one.covariance, dtype=float)
         assert off @ np.linalg.solve(covariance, off) < 35.0, one.sensor
         assert frame_distance(result.pose(one.sensor), truth).translation_mm < 200.0, one.sensor

@@ -81,15 +81,13 @@ def _noise(result: OdometryResult) -> Iterator[Block]:
         (
             one.sensor,
             "found" if one.noise.was_found else "stated",
-            Number(f"{OF}/sensors/{i}/noise/rotation_deg_per_sqrt_s", one.noise.rotation_deg_per_sqrt_s, spec=".2g"),
-            Number(
-                f"{OF}/sensors/{i}/noise/translation_mm_per_sqrt_s", one.noise.translation_mm_per_sqrt_s, spec=".3g"
-            ),
-            Number(f"{OF}/sensors/{i}/residual_rotation", one.residual_rotation, spec=".2f"),
-            Number(f"{OF}/sensors/{i}/residual_translation", one.residual_translation, spec=".2f"),
-            Number(f"{OF}/sensors/{i}/windows", one.windows, spec=".0f"),
+            Number(f"{OF}/tracks/{i}/noise/rotation_deg_per_sqrt_s", one.noise.rotation_deg_per_sqrt_s, spec=".2g"),
+            Number(f"{OF}/tracks/{i}/noise/translation_mm_per_sqrt_s", one.noise.translation_mm_per_sqrt_s, spec=".3g"),
+            Number(f"{OF}/tracks/{i}/residual_rotation", one.residual_rotation, spec=".2f"),
+            Number(f"{OF}/tracks/{i}/residual_translation", one.residual_translation, spec=".2f"),
+            Number(f"{OF}/tracks/{i}/windows", one.windows, spec=".0f"),
         )
-        for i, one in enumerate(result.sensors)
+        for i, one in enumerate(result.tracks)
     )
     headings = ("sensor", "noise", "° after 1 s", "mm after 1 s", "residuals, turn", "residuals, way", "windows")
     legend = "Residuals are root mean squares in standard deviations: 1 is expected."
