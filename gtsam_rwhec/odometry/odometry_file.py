@@ -32,8 +32,8 @@ FORMAT_VERSION: Final = 1
 MOST_BYTES = 50_000_000
 CONVENTIONS = (
     "T_parent_child maps coordinates in the child's frame to those of the parent, which is the reference. Covariances "
-    "are of right perturbations T Expmap([omega, v]), rad and m, in the sensor's own axes; null is infinite. A scale is "
-    "measured length / true length. A sensor's stamp t is the reference's t + time_offset_s."
+    "are of right perturbations T Expmap([omega, v]), rad and m, in the sensor's own axes; null is infinite. A scale "
+    "is measured length / true length. A sensor's stamp t is the reference's t + time_offset_s."
 )
 
 Row3 = tuple[float, float, float]
