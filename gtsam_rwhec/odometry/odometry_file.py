@@ -26,7 +26,7 @@ from gtsam_rwhec.odometry.calibrated import OdometryCalibration
 from gtsam_rwhec.odometry.found import JointCertificate
 from gtsam_rwhec.odometry.judging import free_in_words, judgement_of
 
-FORMAT: Final = "gtsam_rwhec.odometry_calibration"
+FORMAT: Final = "gtsam-rwhec odometry result"
 FORMAT_VERSION: Final = 1
 #: A result is at most so many bytes.
 MOST_BYTES = 50_000_000
@@ -126,7 +126,7 @@ class CertificateRecord(_Record):
 class OdometryResult(_Record):
     """A result file."""
 
-    format: Literal["gtsam_rwhec.odometry_calibration"] = FORMAT
+    format: Literal["gtsam-rwhec odometry result"] = FORMAT
     format_version: Annotated[int, Field(ge=1, le=FORMAT_VERSION)] = FORMAT_VERSION
     written_by: str
     verdict: Verdict

@@ -44,7 +44,8 @@ class TrackCount(_Count):
     removed: dict[str, Count] = Field(default={}, description="number of removed measurements, by reason")
 
     def __str__(self) -> str:
-        return f"{self.target} in {self.sensor}: {', '.join(f'{count} {why}' for why, count in self.removed.items())}"
+        name = self.pair.label if self.pair.is_motion else f"{self.target} in {self.sensor}"
+        return f"{name}: {', '.join(f'{count} {why}' for why, count in self.removed.items())}"
 
     @property
     def seen(self) -> int:
