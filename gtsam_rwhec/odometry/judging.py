@@ -14,6 +14,8 @@ from gtsam_rwhec.odometry.calibrated import OdometryCalibration
 
 #: What is given is contradicted by the data from so many standard deviations on.
 CONTRADICTED = 4.0
+#: So many of them are named.
+NAMED = 4
 #: A sensor takes part in a free direction from this part of the direction's largest shift or turn on.
 TAKES_PART = 0.05
 #: An axis of the reference is named where the direction is within 8 degrees of it.
@@ -23,6 +25,8 @@ WHAT_TO_DO = (
     "state the missing heights in the rig file (given: {heights_m: {SENSOR: 0.5, ...}}, with that of the reference), "
     "or the ground, directions or distances; or drive other turns and a ramp, and calibrate again"
 )
+#: What to do where what was given is contradicted.
+MEASURE_AGAIN = "measure again what is given, in metres and in the axes of the reference, and correct the rig file"
 PRAISE = "the motions of all sensors agree, their joint cost is certified, and they determine every pose"
 
 
@@ -33,18 +37,23 @@ def judgement_of(found: OdometryCalibration) -> Judgement:
         findings.append(Finding(Ground.NOT_CERTIFIED, f"the joint cost is not proven optimal ({found.certificate})"))
     findings += [Finding(Ground.NOT_UNIQUE, words) for words in free_in_words(found)]
     findings += [Finding(Ground.NOT_UNIQUE, f"another answer fits as well: {other.why}") for other in found.others]
-    findings += [
-        Finding(
-            Ground.POSE_DOUBTED,
-            f"what is given contradicts the motions: {one.what} = {one.value:g} {one.unit} is {one.off_by:.1f} "
-            "standard deviations away",
-        )
-        for one in found.influences
-        if one.off_by > CONTRADICTED
-    ]
+    findings += _contradicted(found)
     findings += [Finding(Ground.COVARIANCE_DOUBTED, words) for words in found.findings]
     judgement = Judgement.of(findings, PRAISE)
-    return replace(judgement, reason=judgement.reason.replace(Ground.NOT_UNIQUE.advice, WHAT_TO_DO))
+    reason = judgement.reason.replace(Ground.NOT_UNIQUE.advice, WHAT_TO_DO)
+    return replace(judgement, reason=reason.replace(Ground.POSE_DOUBTED.advice, MEASURE_AGAIN))
+
+
+def _contradicted(found: OdometryCalibration) -> list[Finding]:
+    """The given numbers that are farthest from the motions, if they contradict them; one that is wrong pulls others."""
+    wrong = sorted((one for one in found.influences if one.off_by > CONTRADICTED), key=lambda one: -one.off_by)
+    if not wrong:
+        return []
+    named = ", ".join(f"{one.what} = {one.value:g} {one.unit} ({one.off_by:.1f})" for one in wrong[:NAMED])
+    words = f"what is given contradicts the motions (by so many standard deviations): {named}"
+    if len(wrong) > NAMED:
+        words += f" and {len(wrong) - NAMED} more"
+    return [Finding(Ground.POSE_DOUBTED, words)]
 
 
 def free_in_words(found: OdometryCalibration) -> tuple[str, ...]:

@@ -143,6 +143,7 @@ class OdometryResult(_Record):
     given: tuple[GivenRecord, ...]
     other_answers: tuple[OtherRecord, ...]
     findings: tuple[str, ...]
+    remarks: tuple[str, ...]
     certificate: CertificateRecord
     sources: tuple[str, ...]
 
@@ -211,6 +212,7 @@ def result_of(
             for one in found.others
         ),
         findings=found.findings,
+        remarks=found.remarks,
         certificate=CertificateRecord(
             status=found.certificate.status.value,
             cost=found.certificate.cost,

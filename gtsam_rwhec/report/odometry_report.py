@@ -43,6 +43,7 @@ def print_odometry(result: OdometryResult, *, verbose: bool = False, page: Path 
     removed = removed_in_words(result)
     if removed:
         print_list(console, removed if verbose else removed[:4])
+    print_list(console, [f"{words[:1].upper()}{words[1:]}." for words in result.remarks])
     if verbose:
         print_list(console, [one.sentence for one in result.free_directions])
 

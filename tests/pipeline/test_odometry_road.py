@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
 from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.odometry.odometry_file import read_odometry_result, result_json
+from gtsam_rwhec.report.page.blocks import Number, Table, every
+from gtsam_rwhec.report.page.odometry_page import odometry_page
 from gtsam_rwhec.simulate import Drive, SimulatedOdometry, drive, frame_distance
 
 #: Of each sensor: about x, y, z in degrees, and where it is on the vehicle in metres.
@@ -65,6 +68,12 @@ def write_tum(folder: Path, driven: Drive) -> None:
         quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
         rows = np.c_[1.7e9 + stamps * 1e-9, poses[:, :3, 3], quaternions]
         np.savetxt(folder / f"{name}.tum", rows, fmt="%.9f", header="t x y z qx qy qz qw")
+
+
+def at(tree: Any, pointer: str) -> Any:
+    for key in pointer.partition("#/")[2].split("/"):
+        tree = tree[int(key)] if isinstance(tree, list) else tree[key]
+    return tree
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -146,6 +155,13 @@ def test_a_plane_leaves_heights_free_until_they_are_given(tmp_path: Path) -> Non
     assert known.result.not_determined == ()
     assert known.judgement.verdict is not rw.Verdict.DO_NOT_USE, str(known.judgement)
     assert {one.what for one in known.result.given} >= {"height of lidar_rear"}
+    page = odometry_page(known.result)
+    tree = json.loads((tmp_path / "known" / "result.json").read_text(encoding="utf-8"))
+    tables = [block for section in page.sections for block in every(section.blocks) if isinstance(block, Table)]
+    numbers = [cell for table in tables for row in table.rows for cell in row if isinstance(cell, Number)]
+    assert len(numbers) == 15
+    for number in numbers:
+        assert number.value == at(tree, number.of), number.of
     for name in names[1:]:
         off = frame_distance(known.result.pose(name), driven.T("lidar_front", name))
         assert off.translation_mm < 100.0
@@ -177,3 +193,18 @@ def test_a_first_rig_file_names_the_odometries_of_a_log(
     assert rig.reference in {"lidar_front", "lidar_rear", "lidar_roof", "wheels"}
     assert {line.key for line in rw.rig.todo_lines(text)} >= {"reference", "odometry"}
     assert sum(note.startswith("moves: ") for note in notes) == 6
+
+
+def test_a_height_that_the_motions_contradict_is_named(tmp_path: Path) -> None:
+    names = ("lidar_front", "lidar_rear")
+    write_tum(tmp_path, drive(sensors(*names), "3d", seconds=20.0, rate_hz=5.0, seed=2))
+    text = "reference: lidar_front\nsensors:\n" + "".join(
+        f"  {name}: {{odometry: {{file: {name}.tum}}}}\n" for name in names
+    )
+    text += "given: {heights_m: {lidar_rear: 2.9}, ground: {up: [0, 0, 1], below_m: 0.6}}\n"
+    solved = rw.pipeline.calibrate_odometry_log(tmp_path, rw.rig.parse_rig(text, "rig.yaml"), tmp_path / "out")
+    assert solved.judgement.verdict is rw.Verdict.DO_NOT_USE
+    assert exit_status(solved.judgement, of_rig=True) is ExitStatus.CONTRADICTED
+    assert "what is given contradicts the motions (by so many standard deviations): " in str(solved.judgement)
+    assert "the ground's normal" in str(solved.judgement)
+    assert "What to do: measure again what is given" in str(solved.judgement)

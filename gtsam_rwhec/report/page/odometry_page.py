@@ -64,8 +64,8 @@ def odometry_page(result: OdometryResult) -> Page:
 
 
 def _findings(result: OdometryResult) -> Iterator[Block]:
-    if result.findings:
-        yield Listing(result.findings)
+    if result.findings or result.remarks:
+        yield Listing((*result.findings, *result.remarks))
 
 
 def _poses(result: OdometryResult) -> Iterator[Block]:
