@@ -9,6 +9,7 @@ from rwhec_factors import se3
 
 from gtsam_rwhec.cleaning.time_offset import estimate_time_offset
 from gtsam_rwhec.errors import StampError
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.options import OdometryOptions
 from gtsam_rwhec.odometry.tracks import OdometryTrack
 from gtsam_rwhec.trajectories.trajectory import Trajectory
@@ -17,6 +18,10 @@ from gtsam_rwhec.trajectories.trajectory import Trajectory
 MOST_S = 180.0
 #: About so many of its poses are enough for a first guess; all are taken where these do not tell.
 ENOUGH = 400
+#: A track is compared in pieces of so many seconds: in one piece, what it drifts would look like a turn.
+PIECE_S = 10.0
+#: A piece has at least so many poses.
+FEWEST_POSES = 5
 
 
 @dataclass(frozen=True)
@@ -39,16 +44,30 @@ def first_offset(reference: OdometryTrack, track: OdometryTrack, options: Odomet
         se3.inverse(np.asarray(reference.T_start_sensor)[near]),
         where=f"the track of {reference.sensor}",
     )
-    few = max(1, int(part.sum()) // ENOUGH)
+    stamps, T = np.asarray(track.stamps_ns)[part], se3.inverse(np.asarray(track.T_start_sensor)[part])
+    few = max(1, len(stamps) // ENOUGH)
     for every in {few: None, 1: None}:
-        seen = np.flatnonzero(part)[::every]
-        track_seen = (np.asarray(track.stamps_ns)[seen], se3.inverse(np.asarray(track.T_start_sensor)[seen]))
         try:
             found = estimate_time_offset(
-                carrier, [track_seen], search_s=options.search_s, max_gap_s=options.max_gap_s, where=track.sensor
+                carrier,
+                _pieces(stamps[::every], T[::every], options.max_gap_s),
+                search_s=options.search_s,
+                max_gap_s=options.max_gap_s,
+                where=track.sensor,
             )
         except StampError as error:
             unknown = str(error)
         else:
             return Clock(found.offset_s)
     return Clock(0.0, unknown)
+
+
+def _pieces(stamps_ns: np.ndarray, T: Array, max_gap_s: float) -> list[tuple[np.ndarray, Array]]:
+    """The track in pieces without gaps: each is a target of its own, so that what it drifts is small."""
+    step = float(np.median(np.diff(stamps_ns)))
+    gap = np.r_[False, np.diff(stamps_ns) > max(1e9 * max_gap_s, 1.5 * step)]
+    piece = np.cumsum(gap | np.r_[False, np.diff((stamps_ns - stamps_ns[0]) // round(1e9 * PIECE_S)) > 0])
+    cuts = np.flatnonzero(np.diff(piece)) + 1
+    return [
+        pair for pair in zip(np.split(stamps_ns, cuts), np.split(T, cuts), strict=True) if len(pair[0]) >= FEWEST_POSES
+    ]

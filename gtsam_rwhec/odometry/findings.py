@@ -14,6 +14,10 @@ from gtsam_rwhec.odometry.tracks import OdometryTrack
 CORRELATED = 0.3
 #: Stated noise is doubted when residuals are so many times as large, or as small.
 DOUBTED = 1.5
+#: A clock that the refinement knows to this, s, needs no first guess.
+CLOCK_KNOWN_S = 0.01
+#: A pose whose standard deviation along or about an axis is larger than this is said to be loose.
+LOOSE_M, LOOSE_RAD = 0.2, float(np.radians(2.0))
 #: More of a track than this left out is said.
 MANY = 0.1
 
@@ -43,8 +47,9 @@ def findings_of(
     task: Task,
     tracks: Sequence[OdometryTrack],
     clocks: Sequence[Clock],
+    sigmas: dict[str, float],
 ) -> tuple[str, ...]:
-    """The sentences; none where all is well."""
+    """The sentences; none where all is well. ``sigmas``: standard deviations of the clocks, s."""
     said: list[str] = []
     sizes = residual_sizes(answer, task.names)
     for k, name in enumerate(task.names):
@@ -67,8 +72,16 @@ def findings_of(
         f"the clock of {track.sensor} was not found from its turning, and its offset was searched near "
         f"zero: {clock.unknown}"
         for track, clock in zip(tracks, clocks, strict=True)
-        if clock.unknown
+        if clock.unknown and sigmas.get(track.sensor, 0.0) > CLOCK_KNOWN_S
     ]
+    C = answer.freedom.covariance()
+    for k, name in enumerate(task.names[1:], 1):
+        sigma = np.sqrt(np.maximum(np.diagonal(C)[task.layout.at[k, :6]], 0.0))
+        if sigma[3:].max() > LOOSE_M or sigma[:3].max() > LOOSE_RAD:
+            said.append(
+                f"{name} is known only to {sigma[3:].max():.2g} m and {np.degrees(sigma[:3].max()):.2g} degrees (one "
+                "standard deviation): drive longer, with more turns about the axes that it lacks, or give what is known"
+            )
     if not answer.fit.converged:
         said.append("the refinement stopped before it converged; the poses may be off by more than they say")
     return tuple(said)

@@ -63,31 +63,33 @@ class Freedom:
         return covariance
 
 
-def freedom(H: Array, N: Array, given: Array, layout: Layout, squares: float, spare: float) -> Freedom:
+def freedom(H: Array, N: Array, possible: Array, given: Array, layout: Layout, squares: float, spare: float) -> Freedom:
     """Test every direction.
 
-    ``squares``: how many squares of noise a direction's information would sum; ``spare``: equations that tell noise.
+    ``possible`` is N if the noise is as large as it may be: a direction that this explains is free. ``squares``: how
+    many squares of noise a direction's information would sum; ``spare``: equations that tell the noise.
     """
     data = np.setdiff1d(np.arange(layout.size), layout.ground)
-    Hd, Nd = H[np.ix_(data, data)], N[np.ix_(data, data)]
+    Hd, Nd, Pd = (each[np.ix_(data, data)] for each in (H, N, possible))
     # Clocks have a weak prior, so that a clock that the drive does not tell is not what a pose is free by.
     clocks = layout.at[layout.open[:, 7], 7]
     of_clocks = np.zeros(layout.size)
     of_clocks[clocks] = np.diagonal(given)[clocks]
     whole = Hd + np.diag(of_clocks[data])
-    unit = 1.0 / np.sqrt(np.maximum(np.diagonal(whole), 1e-300))
+    unit = 1.0 / np.sqrt(np.maximum(np.diagonal(whole) + np.diagonal(Pd), 1e-200))
     scaled = whole * unit[:, None] * unit + RIDGE * np.eye(len(data))
-    share, V = scipy.linalg.eigh(Nd * unit[:, None] * unit, scaled)
-    threshold = (
-        float(fdtri(squares, spare, 1.0 - SIGNIFICANCE))
-        if spare > 0.0
-        else float(chdtri(squares, SIGNIFICANCE) / squares)
+    # With V'HV = I and W = V^-T: H = W W', and a direction's share of noise is a diagonal entry of V'NV.
+    share, V = scipy.linalg.eigh(Pd * unit[:, None] * unit, scaled)
+    threshold = float(
+        fdtri(squares, spare, 1.0 - SIGNIFICANCE) if spare > 0.0 else chdtri(squares, SIGNIFICANCE) / squares
     )
     is_free = share * threshold >= 1.0
-    # With V'HV = I, H = W W' with W = V^-T: H - N = W diag(1 - share) W'.
     W = np.linalg.inv(V).T / unit[:, None]
+    noise = V.T @ (Nd * unit[:, None] * unit) @ V
+    told = np.eye(len(data)) - noise
+    told[is_free], told[:, is_free] = 0.0, 0.0
     informed = np.zeros((layout.size, layout.size))
-    informed[np.ix_(data, data)] = (W * np.where(is_free, 0.0, 1.0 - share)) @ W.T
+    informed[np.ix_(data, data)] = W @ told @ W.T
     informed -= np.diag(of_clocks)  # they come back with what is given
     by_data = np.zeros((layout.size, int(is_free.sum())))
     by_data[data] = V[:, is_free] * unit[:, None]

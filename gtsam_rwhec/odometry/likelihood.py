@@ -76,11 +76,16 @@ class Eliminated:
 
 def weights(windows: WindowMotions, rotation: Array, translation: Array) -> Array:
     """The inverse covariances (m, n, 6, 6) of the windows for variances a second (m,); zero where one is not used."""
+    inverse: Array = np.linalg.inv(covariances(windows, rotation, translation)) * windows.used[:, :, None, None]
+    return inverse
+
+
+def covariances(windows: WindowMotions, rotation: Array, translation: Array) -> Array:
+    """The covariances (m, n, 6, 6) of the windows for variances a second (m,); the identity where one is not used."""
     of_rotation, of_translation = windows.covariance_parts()
     covariance = rotation[:, None, None, None] * of_rotation + translation[:, None, None, None] * of_translation
     covariance[~windows.used] = np.eye(6)
-    inverse: Array = np.linalg.inv(covariance) * windows.used[:, :, None, None]
-    return inverse
+    return covariance
 
 
 def predicted(state: State) -> Array:
@@ -124,15 +129,23 @@ def eliminated(linear: Linear, W: Array, layout: Layout) -> Eliminated:
     return Eliminated(0.5 * (H + H.T), g, G, D, of_motion, 0.5 * float((r * Wr).sum()))
 
 
-def information_of_noise(linear: Linear, W: Array, layout: Layout, state: State, D: Array) -> Array:
-    """N (p, p): what the noise of the windows' estimated motions alone adds to H."""
+def covariance_of_motions(linear: Linear, W: Array, D: Array, V: Array) -> Array:
+    """The covariance (n, 6, 6) of the windows' estimated motions if the sensors' is V (m, n, 6, 6), whatever W says."""
+    WB = W @ linear.B
+    inverse = np.linalg.inv(D)
+    covariance: Array = inverse @ np.einsum("mnia,mnij,mnjb->nab", WB, V, WB, optimize=True) @ inverse
+    return covariance
+
+
+def information_of_noise(linear: Linear, W: Array, layout: Layout, state: State, D: Array, of_motion: Array) -> Array:
+    """N (p, p): what the noise of the windows' estimated motions, with covariance ``of_motion``, alone adds to H."""
     m, n = W.shape[:2]
     M = predicted(state)
     true = M.copy()
     true[..., :3, 3] /= state.scale[:, None, None]
     back = se3.adjoint(se3.inverse(true.reshape(m * n, 4, 4))).reshape(m, n, 6, 6)
-    # The columns of a root of M's covariance D^-1, as each sensor sees them.
-    root = np.linalg.inv(np.swapaxes(np.linalg.cholesky(D), 1, 2))
+    # The columns of a root of M's covariance, as each sensor sees them.
+    root = np.linalg.cholesky(of_motion)
     twists = np.einsum("mij,nja->mnia", se3.adjoint(se3.inverse(state.T)), root)
     R_t = np.einsum("mnji,mnj->mni", true[..., :3, :3], true[..., :3, 3])
     N = np.zeros((layout.size, layout.size))

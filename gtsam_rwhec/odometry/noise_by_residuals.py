@@ -84,6 +84,34 @@ def found_variances(
     return result
 
 
+def uncertain_by(windows: WindowMotions, linear: Linear, variances: Array, stated: np.ndarray, scale: Array) -> Array:
+    """Standard deviations (m, 2) of the logarithms of the variances that were found; zero where they were stated.
+
+    Of several sensors the best one's noise is what the others' leave, and hardly known.
+    """
+    m = windows.sensors
+    unit = np.ones((m, 2))
+    unit[:, 1] = scale**2
+    parts = np.array(windows.covariance_parts())
+    _, information = _score(windows, linear, weights(windows, *variances.T), parts, unit, 1.0)
+    own = (variances / unit).ravel()
+    groups = groups_of(stated)
+    open_ones = np.flatnonzero(~stated)
+    deviation = np.zeros((m, 2))
+    if not len(open_ones):
+        return deviation
+    shared = bool((groups == groups[0]).all())
+    at = np.array([[2 * k, 2 * k + 1] for k in open_ones]).ravel()
+    by_log = own[:, None] * information * own
+    if shared:  # two sensors with one noise
+        both = by_log.reshape(m, 2, m, 2).sum(axis=(0, 2))
+        deviation[:] = np.sqrt(np.diagonal(np.linalg.inv(both + np.eye(2) / PRIOR**2)))
+        return deviation
+    inverse = np.linalg.inv(by_log[np.ix_(at, at)] + np.eye(len(at)) / PRIOR**2)
+    deviation[open_ones] = np.sqrt(np.diagonal(inverse)).reshape(-1, 2)
+    return deviation
+
+
 def _score(
     windows: WindowMotions, linear: Linear, W: Array, parts: Array, unit: Array, taken: float
 ) -> tuple[Array, Array]:

@@ -61,6 +61,7 @@ def calibration_of(
         certificate = replace(certificate, status=Status.CERTIFIED_NOT_UNIQUE)
     back = float(offsets[names.index(reference)])
     clock_at = [int(layout.at[k, OFFSET]) for k in range(len(names))]
+    sigmas = _clock_sigmas(C, clock_at, names, reference) if layout.open[:, OFFSET].any() else {}
     window = answer.windows
     return OdometryCalibration(
         reference=reference,
@@ -68,7 +69,7 @@ def calibration_of(
         T_reference_sensor={reference: np.eye(4), **dict(zip(order, T, strict=True))},
         scales={name: float(state.scale[names.index(name)]) for name in scaled},
         time_offsets_s={name: float(offsets[names.index(name)]) - back for name in order},
-        time_offset_sigmas_s=_clock_sigmas(C, clock_at, names, reference) if layout.open[:, OFFSET].any() else {},
+        time_offset_sigmas_s=sigmas,
         order=order,
         covariance=covariance,
         certificate=certificate,
@@ -86,7 +87,7 @@ def calibration_of(
         residuals=residual_sizes(answer, names),
         influences=_influences(answer, task, change, order),
         others=others,
-        findings=findings_of(answer, task, tracks, clocks),
+        findings=findings_of(answer, task, tracks, clocks, sigmas),
         remarks=remarks_of(task),
     )
 

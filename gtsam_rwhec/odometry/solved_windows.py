@@ -15,8 +15,15 @@ from gtsam_rwhec.odometry.freedom import Freedom, freedom
 from gtsam_rwhec.odometry.given_rows import GivenRows
 from gtsam_rwhec.odometry.joint_form import joint_form
 from gtsam_rwhec.odometry.joint_solution import solved, star_starts
-from gtsam_rwhec.odometry.likelihood import eliminated, information_of_noise, linearised, weights
-from gtsam_rwhec.odometry.noise_by_residuals import found_variances
+from gtsam_rwhec.odometry.likelihood import (
+    covariance_of_motions,
+    covariances,
+    eliminated,
+    information_of_noise,
+    linearised,
+    weights,
+)
+from gtsam_rwhec.odometry.noise_by_residuals import found_variances, uncertain_by
 from gtsam_rwhec.odometry.outlying import outlying
 from gtsam_rwhec.odometry.refining import Fit, motions_fitted, refined, settled
 from gtsam_rwhec.odometry.unknowns import Layout, State
@@ -28,6 +35,8 @@ ROUNDS = 8
 SETTLED = 0.02
 #: Rounds of noise, freedom and refinement after it.
 REFINED = 3
+#: A free direction is tested with noise that is larger by so many of its deviations, and by at most this factor.
+UNSURE, MOST_UNSURE = 3.0, 30.0
 #: At least so many windows must be left, and so large a part of those of a sensor.
 FEWEST, LEAST_SHARE = 6, 0.3
 
@@ -96,7 +105,7 @@ def solve_windows(
     progress("refining the joint likelihood")
     for _ in range(REFINED):
         W = weights(windows, *variances.T)
-        free = freedom_at(windows, W, motions_fitted(windows, W, state, task.layout), task)
+        free = freedom_at(windows, W, variances, motions_fitted(windows, W, state, task.layout), task)
         state = settled(state, free.left, task.layout)
         determined = free.complement()
         fit = refined(windows, W, state, task.layout, task.given, determined)
@@ -112,7 +121,7 @@ def solve_windows(
             break
     W = weights(windows, *variances.T)
     fit = refined(windows, W, state, task.layout, task.given, determined)
-    free = freedom_at(windows, W, fit.state, task)
+    free = freedom_at(windows, W, variances, fit.state, task)
     return Answer(windows, left_out, variances, fit, W, free, certificate, certified)
 
 
@@ -166,15 +175,30 @@ def _certified(
     return state, certificate, variances, left_out, windows
 
 
-def freedom_at(windows: WindowMotions, W: Array, state: State, task: Task) -> Freedom:
+def freedom_at(windows: WindowMotions, W: Array, variances: Array, state: State, task: Task) -> Freedom:
     """What is free at a state."""
     linear = linearised(windows, state)
     normal = eliminated(linear, W, task.layout)
-    N = information_of_noise(linear, W, task.layout, state, normal.D)
+    still = linear.r - np.einsum("mnij,nj->mni", linear.B, normal.motions(np.zeros(task.layout.size)))
+    spare = 6.0 * float((windows.used.sum(axis=0) - 1).sum()) - task.layout.size
+    # The noise as it is known: what was found may be larger, and what was stated may be too small for the residuals.
+    unsure = uncertain_by(windows, linear, variances, task.stated, state.scale)
+    excess = max(1.0, float(np.einsum("mni,mnij,mnj->", still, W, still)) / max(spare, 1.0))
+    largest = variances * np.exp(np.minimum(UNSURE * unsure, np.log(MOST_UNSURE))) * excess
+    known, possible = (
+        information_of_noise(
+            linear,
+            W,
+            task.layout,
+            state,
+            normal.D,
+            covariance_of_motions(linear, W, normal.D, covariances(windows, *v.T)),
+        )
+        for v in (variances, largest)
+    )
     rows = task.given.rows(state, task.layout)
     squares = 2.0 * len(windows)
-    spare = 6.0 * float((windows.used.sum(axis=0) - 1).sum()) - task.layout.size
-    return freedom(normal.H, N, rows.information, task.layout, squares, spare)
+    return freedom(normal.H, known, possible, rows.information, task.layout, squares, spare)
 
 
 def _left_out(

@@ -27,6 +27,8 @@ LARGEST_TURN_RAD = 1.2
 LOSS = 0.01
 #: An axis has information if what it shows is so many times what noise would.
 CLEARLY = 4.0
+#: A vehicle turned about an axis if the square of its turns is so many times that of their noise, as it was found.
+PLAINLY = 10.0
 #: Fewer windows than this say little about their own noise.
 FEWEST = 20
 
@@ -95,7 +97,6 @@ def axes_turned(windows: WindowMotions, motion: Array, variance: float) -> tuple
     w = se3.so3_logmap(motion[:, :3, :3])
     square, axes = np.linalg.eigh(w.T @ w)
     order = np.argsort(-square)
-    # By chance a sum of n squares exceeds its mean by five of its deviations once in a million times.
     n = max(len(windows), 1)
-    limit = variance * float(np.median(windows.length)) * n * (1.0 + 5.0 * np.sqrt(2.0 / n))
+    limit = PLAINLY * variance * float(np.median(windows.length)) * n
     return int((square > limit).sum()), square[order] / n, axes[:, order].T

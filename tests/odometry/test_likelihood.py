@@ -106,7 +106,7 @@ def test_what_noise_alone_adds_to_the_information(hilly: Drive) -> None:
     layout = Layout.of(SCALED, clocks=False, has_ground=False)
     W = weights(windows, *variances.T)
     at_truth = eliminated(linearised(windows, state), W, layout)
-    N = information_of_noise(linearised(windows, state), W, layout, state, at_truth.D)
+    N = information_of_noise(linearised(windows, state), W, layout, state, at_truth.D, np.linalg.inv(at_truth.D))
     generator = np.random.default_rng(1)
     root = np.linalg.inv(np.swapaxes(np.linalg.cholesky(at_truth.D), 1, 2))
     added = np.zeros_like(N)
