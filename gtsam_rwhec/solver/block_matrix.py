@@ -17,8 +17,8 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.arrow import backward_substitution, forward_substitution
 from gtsam_rwhec.solver.elimination import Elimination, Group
 
-#: So many numbers are worked on at once: 16 MB.
-AT_ONCE = 2_000_000
+#: So many numbers are worked on at once: 8 MB.
+AT_ONCE = 1_000_000
 #: The same where frames have the same neighbours: what stays in the processor's cache.
 ALIKE_AT_ONCE = 100_000
 
@@ -126,7 +126,15 @@ class BlockMatrix:
 
     def factor(self) -> BlockFactor | None:
         """The Cholesky factor; None when a pivot is not a positive, finite number."""
-        return _Factorisation(self).run()
+        factorisation = _Factorisation(self)
+        rest = factorisation.run(keep=True)
+        if rest is None:
+            return None
+        return BlockFactor(self.order, factorisation.shape, factorisation.lower, factorisation.rows, rest)
+
+    def has_factor(self) -> bool:
+        """Whether `factor` gives one, which is not kept."""
+        return _Factorisation(self).run(keep=False) is not None
 
 
 @dataclass(frozen=True)
@@ -186,6 +194,8 @@ class _Factorisation:
         self.matrix, self.order = matrix, matrix.order
         n, m, q = matrix.tails.shape
         self.shape = n, m, q
+        self.lower: list[Array] = []
+        self.rows: list[Array] = []
         # One row more than there are: what is summed for no frame goes there.
         self.frames = np.concatenate([matrix.frames, np.zeros((1, m, m))])
         self.tails = np.concatenate([matrix.tails, np.zeros((1, m, q))])
@@ -195,21 +205,24 @@ class _Factorisation:
         last = self.order.number_changed
         self.place = np.append(np.where(self.order.changed < len(self.order.changed), self.order.changed, last), last)
 
-    def run(self) -> BlockFactor | None:
+    def run(self, *, keep: bool) -> Array | None:
+        """The factor of the dense rest; the other parts, where they are kept, are ``lower`` and ``rows``."""
         _, m, q = self.shape
-        frames, rows = [], []
         try:
             for group in self.order.groups:
                 lower = np.linalg.cholesky(self.frames[group.frames])
                 if not np.isfinite(np.einsum("kii->ki", lower)).all():
                     return None
                 k, d = group.neighbours.shape
-                of_group = np.empty((k, m, d * m + q))
+                of_group = np.empty((k if keep else 0, m, d * m + q))
                 for at in _portions(group, m * d + q):
-                    of_group[at] = forward_substitution(lower[at], self._couplings(group, at))
-                    self._take_off(group, at, of_group[at])
-                frames.append(lower)
-                rows.append(of_group)
+                    rows = forward_substitution(lower[at], self._couplings(group, at))
+                    self._take_off(group, at, rows)
+                    if keep:
+                        of_group[at] = rows
+                if keep:
+                    self.lower.append(lower)
+                    self.rows.append(of_group)
             rest = self._dense_rest()
             del self.changes, self.frames
             # LAPACK's own routine, in place; its upper triangle is zero afterwards.
@@ -219,7 +232,8 @@ class _Factorisation:
         # LAPACK may let NaN and infinity pass as pivots; the diagonal then has them.
         if failed or not np.isfinite(np.diagonal(factor)).all():
             return None
-        return BlockFactor(self.order, self.shape, frames, rows, factor)
+        result: Array = factor
+        return result
 
     def _blocks(self, edges: np.ndarray) -> Array:
         """Couplings (k,) as they are now, (k, m, m); one past the last for none."""

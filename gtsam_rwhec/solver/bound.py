@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -47,6 +48,8 @@ ROOMS = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 #: A solution by the factor of a proof is improved at most so many times, until it loses this part of the loss.
 IMPROVEMENTS = 6
 ENOUGH = 1e-6
+#: A loss below this part of the value needs no solution at all.
+NEXT_TO_NOTHING = 1e-10
 #: A factor of the slack between tries.
 MORE_SLACK = 3.0
 #: A loss below this part of the value does not ask for another try.
@@ -100,17 +103,38 @@ def lower_bound(
 
 @dataclass(frozen=True)
 class _Room:
-    """A margin (13 n + 1,) by which Z is proven to be definite, with the proof: the factor of nearly Z - margin."""
+    """A margin (13 n + 1,) by which Z is proven to be definite, and the value that losses are compared with."""
 
     Z: Curvature
     margin: Array
-    factor: BlockFactor
+    value: float
+    proof: BlockFactor | None  #: the factor of nearly Z - margin, where it was kept
+
+    @staticmethod
+    def of(Z: Curvature, margin: Array, value: float) -> _Room | None:
+        """The room, if it is proven."""
+        if Z.has_large_factor:
+            return _Room(Z, margin, value, None) if Z.is_proven_to_exceed(margin) else None
+        proof = Z.proof_that_it_exceeds(margin)
+        return None if proof is None else _Room(Z, margin, value, proof)
+
+    @cached_property
+    def _factor(self) -> BlockFactor | None:
+        return self.proof or self.Z.proof_that_it_exceeds(self.margin)
 
     def solved(self, h: Array, held: np.ndarray) -> Array:
-        """Nearly Z^-1 h: the factor's solution, improved where the margin makes it poor. It is zero where held."""
+        """Nearly Z^-1 h: the factor's solution, improved where the margin makes it poor. It is zero where held.
+
+        Where zero loses next to nothing, and no factor was kept, it is zero.
+        """
         v, rest, size = np.zeros_like(h), h, np.inf
+        if self.proof is None and float((h**2 / self.margin).sum()) <= NEXT_TO_NOTHING * abs(self.value):
+            return v
+        factor = self._factor
+        if factor is None:  # it was there before
+            return v
         for _ in range(IMPROVEMENTS):
-            better = v + self.factor.solve_vector(rest)
+            better = v + factor.solve_vector(rest)
             better[held] = 0.0
             after = h - self.Z.times(better)
             after[held] = 0.0
@@ -274,9 +298,9 @@ class _Lagrangian:
         """A margin by which Z is proven to be definite; None where it is not proven."""
         scale = np.abs(self.form.curvature.diagonal)
         for room in (*(np.maximum(part * scale, 1e-290) for part in ROOMS), 0.25 * Z.allowance(scale)):
-            factor = Z.proof_that_it_exceeds(room)
-            if factor is not None:
-                return _Room(Z, room, factor)
+            proven = _Room.of(Z, room, self.value)
+            if proven is not None:
+                return proven
         return None
 
     def _over_region(self, nulls: NullVectors, room: _Room, enough: float) -> tuple[float, Region | None]:

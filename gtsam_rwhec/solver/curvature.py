@@ -16,12 +16,14 @@ from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
 from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.full_form import FullForm
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
-from gtsam_rwhec.solver.verified import cholesky_allowance, proof_that_it_exceeds
+from gtsam_rwhec.solver.verified import cholesky_allowance, is_proven_to_exceed, proof_that_it_exceeds
 
 #: A variable that is held has this many times its own diagonal entry added.
 HELD = 2.0**50
 #: Above this many variables no dense matrix is decomposed.
 DENSE = 1000
+#: A factor with more numbers beside its dense rest than this, 40 MB, is large.
+LARGE_FACTOR = 5_000_000
 #: So many null vectors are looked for in a large matrix.
 SPARSE_NULLS = 24
 
@@ -112,6 +114,15 @@ class Curvature:
         The factor of the proof is that of a matrix that is a little smaller; None where nothing is proven.
         """
         return proof_that_it_exceeds(self.matrix, margin + self.rounding)
+
+    def is_proven_to_exceed(self, margin: Array) -> bool:
+        """Whether there is such a proof, which is not kept."""
+        return is_proven_to_exceed(self.matrix, margin + self.rounding)
+
+    @property
+    def has_large_factor(self) -> bool:
+        """Whether a factor takes so much memory that it is kept only where it is needed."""
+        return 169 * self.matrix.order.eliminated > LARGE_FACTOR
 
     def factor(self) -> BlockFactor | None:
         """The Cholesky factor of the stored matrix; None where it is not positive definite."""

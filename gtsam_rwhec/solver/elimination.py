@@ -82,6 +82,11 @@ class Elimination:
         return np.bincount(np.r_[self.first[: self.given], self.second[: self.given]], minlength=self.n)
 
     @cached_property
+    def eliminated(self) -> int:
+        """How many blocks of the factor are beside those of the frames and the dense rest."""
+        return sum(group.neighbours.size for group in self.groups)
+
+    @cached_property
     def key_order(self) -> tuple[np.ndarray, np.ndarray]:
         """The couplings' keys, ascending, and which couplings they are."""
         keys = self.first * (self.n + 1) + self.second

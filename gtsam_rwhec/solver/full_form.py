@@ -125,6 +125,27 @@ class Slots:
         S[np.arange(k), 6, self.scale_at[at]] = self.scale[at]
         return S
 
+    def alike(self, at: slice) -> list[tuple[np.ndarray, np.ndarray | None]]:
+        """Sets of pairs of a slice with the same place for everything, and which of the 25 variables each number is.
+
+        -1 stands for none. Pairs with a fixed frame, and motions, are one set without such a table.
+        """
+        first, scale_at = self.first[at], self.scale_at[at]
+        is_plain = (first >= 0).all(axis=1) & (first[:, 0] != first[:, 1]) & (self.scale[at] == 1.0)
+        sets: list[tuple[np.ndarray, np.ndarray | None]] = []
+        if not is_plain.all():
+            sets.append((np.flatnonzero(~is_plain), None))
+        kinds = 28 * first[:, 0] + scale_at
+        for kind in np.unique(kinds[is_plain]):
+            members = np.flatnonzero(is_plain & (kinds == kind))
+            source = np.full(28, -1)
+            for begin, t, r in zip(first[members[0]], (0, 3), (7, 16), strict=True):
+                source[begin : begin + 3] = np.arange(t, t + 3)
+                source[begin + 4 : begin + 13] = np.arange(r, r + 9)
+            source[scale_at[members[0]]] = 6
+            sets.append((members, source))
+        return sets
+
     @property
     def of_pair(self) -> Array:
         """The matrices of all pairs, (E, 25, 28)."""
@@ -150,21 +171,49 @@ def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
             translation = translation[:, SWAPPED[:, None], SWAPPED]
             rotation = rotation.transpose(0, 2, 1)
         of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa[at])
-        S = slots.matrices(at)
-        leaf, center = slots.leaf[at], L + slots.center[at]
-        for form, of_edges in zip(forms, (of_translations + of_rotations, of_rotations), strict=True):
-            m = form.frames.shape[1]
-            Q = S.transpose(0, 2, 1) @ of_edges @ S
-            one, two, tail = slice(13 - m, 13), slice(26 - m, 26), slice(26, 28)
-            for index, has, side in ((leaf, leaf < L, one), (center, center < n, two)):
-                sum_into(form.frames, index[has], Q[has, side, side])
-                sum_into(form.tails, index[has], Q[has, side, tail])
-            if m == 13:
-                couplings[where[at][coupled[at]]] = Q[coupled[at], one, two]
-            form.tail[...] += Q[:, tail, tail].sum(axis=0)
+        for members, source in slots.alike(at):
+            pairs = begin + members
+            leaf, center, has_both = slots.leaf[pairs], L + slots.center[pairs], coupled[pairs]
+            for form, of_edges in zip(forms, (of_translations + of_rotations, of_rotations), strict=True):
+                m = form.frames.shape[1]
+                own = of_edges if len(members) == len(of_edges) else of_edges[members]
+                if source is None:
+                    S = slots.matrices(pairs)
+                    numbers = _Numbers(S.transpose(0, 2, 1) @ own @ S, np.arange(28))
+                else:
+                    numbers = _Numbers(own, source)
+                one, two, tail = np.arange(13 - m, 13), np.arange(26 - m, 26), np.arange(26, 28)
+                for index, has, side in ((leaf, leaf < L, one), (center, center < n, two)):
+                    sum_into(form.frames, index[has], numbers.block(side, side)[has])
+                    sum_into(form.tails, index[has], numbers.block(side, tail)[has])
+                if m == 13:
+                    couplings[where[pairs[has_both]]] = numbers.block(one, two)[has_both]
+                form.tail[...] += numbers.block(tail, tail).sum(axis=0)
     for form in forms:
         _add_priors(form, part)
     return forms[0], forms[1]
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """The forms of k pairs over their 28 numbers.
+
+    They are stored over other variables, of which ``source`` says which each number is, or -1 for none.
+    """
+
+    forms: Array
+    source: np.ndarray
+
+    def block(self, rows: np.ndarray, columns: np.ndarray) -> Array:
+        """(k, rows, columns)."""
+        i, j = self.source[rows], self.source[columns]
+        k, size = len(self.forms), self.forms.shape[1]
+        at = (np.maximum(i, 0)[:, None] * size + np.maximum(j, 0)).ravel()
+        taken = self.forms.reshape(k, size * size).take(at, axis=1)
+        result: Array = taken.reshape(k, len(rows), len(columns))
+        result[:, i < 0] = 0.0
+        result[:, :, j < 0] = 0.0
+        return result
 
 
 def slots_of(part: Part) -> Slots:

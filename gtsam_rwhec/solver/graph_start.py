@@ -13,7 +13,7 @@ from gtsam_rwhec.solver.graph_form import GraphForm
 from gtsam_rwhec.solver.parts import Part, connected_components
 from gtsam_rwhec.solver.rotations import project, unvec
 
-#: With a unit diagonal, this is added to it: exact data make the form singular.
+#: This part of the diagonal is added to it: exact data make the form singular.
 SHIFT = 1e-9
 #: Inverse iterations at most, and the change of a unit vector at which they end: the start need not be exact.
 ITERATIONS, SMALL = 40, 1e-3
@@ -36,13 +36,13 @@ def graph_spectral_start(part: Part, rotation_form: FullForm, order: Elimination
         of_h, tail = np.zeros_like(of_h), np.ones((1, 1))
     P = BlockMatrix(order, frames, rotation_form.couplings, of_h, tail)
     weights = np.maximum(np.einsum("nii->n", frames) / 9.0, 1e-290)
-    unit = np.append(np.repeat(1.0 / np.sqrt(weights), 9), 1.0 / np.sqrt(max(float(tail[0, 0]), 1e-290)))
-    factor = P.scaled(unit).plus(np.full(P.size, SHIFT)).factor()
+    weight = np.append(np.repeat(weights, 9), max(float(tail[0, 0]), 1e-290))
+    factor = P.plus(SHIFT * weight).factor()
     if factor is None:
         return []
-    r = np.zeros(P.size)
+    r: Array = np.zeros(P.size)
     if anchored:
-        r = _smallest(factor, np.ones(P.size)) * unit
+        r = _smallest(factor, weight, np.ones(P.size))
         return [project(unvec(sign * r[:-1])) for sign in (1.0, -1.0)]
     # Components that only the shared scale joins each have an eigenvector and a sign.
     index = {name: i for i, name in enumerate(part.free)}
@@ -50,18 +50,18 @@ def graph_spectral_start(part: Part, rotation_form: FullForm, order: Elimination
         members = np.array([index[name] for name in names if name in index], dtype=int)
         begin = np.zeros((n, 9))
         begin[members] = np.random.default_rng(0).standard_normal((len(members), 9))
-        v = _smallest(factor, np.append(begin.ravel(), 0.0)) * unit
+        v = _smallest(factor, weight, np.append(begin.ravel(), 0.0))
         r += v * _handedness(v[:-1])
     return [project(unvec(r[:-1]))]
 
 
-def _smallest(factor: BlockFactor, v: Array) -> Array:
-    """The eigenvector of the smallest eigenvalue that ``v`` has a part of."""
-    v = v / np.linalg.norm(v)
+def _smallest(factor: BlockFactor, weight: Array, v: Array) -> Array:
+    """The smallest eigenvector, beside the diagonal ``weight``, that ``v`` has a part of."""
+    v = v / np.sqrt(float(weight @ v**2))
     for _ in range(ITERATIONS):
-        after = factor.solve_vector(v)
-        after /= np.linalg.norm(after)
-        change = float(np.linalg.norm(after - v))
+        after = factor.solve_vector(weight * v)
+        after /= np.sqrt(float(weight @ after**2))
+        change = np.sqrt(float(weight @ (after - v) ** 2))
         v = after
         if change < SMALL:
             break

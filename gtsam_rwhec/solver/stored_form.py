@@ -11,7 +11,7 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import gamma
-from gtsam_rwhec.solver.full_form import FullForm
+from gtsam_rwhec.solver.full_form import PAIRS_AT_ONCE, FullForm
 from gtsam_rwhec.solver.point import Action, Evaluation, Point
 
 #: numpy's widest real number: 80 bits on x86, 128 on aarch64 Linux, plain double elsewhere (looser bounds).
@@ -80,10 +80,7 @@ class StoredForm:
 
 def _product(form: FullForm, x: Array, *, size: bool) -> Array:
     """The form, or the sizes of its entries, times x (13 n + 2, D), in the precision of x."""
-    frames, couplings, tails, tail = (
-        (np.abs(blocks) if size else blocks).astype(x.dtype)
-        for blocks in (form.frames, form.couplings, form.tails, form.tail)
-    )
+    frames, tails, tail = (_as(blocks, x, size=size) for blocks in (form.frames, form.tails, form.tail))
     n, L, D = len(frames), form.leaves, x.shape[1]
     of_frames, of_tail = x[:-2].reshape(n, 13, D), x[-2:]
     result, last = np.zeros((n, 13, D), dtype=x.dtype), tail @ of_tail
@@ -91,12 +88,19 @@ def _product(form: FullForm, x: Array, *, size: bool) -> Array:
     if n:
         result += np.einsum("nij,njd->nid", frames, of_frames) + np.einsum("nit,td->nid", tails, of_tail)
         last += np.einsum("nit,nid->td", tails, of_frames)
-    if len(couplings):
-        leaf, center = form.rows, L + form.columns
+    for begin in range(0, len(form.couplings), PAIRS_AT_ONCE):
+        at = slice(begin, begin + PAIRS_AT_ONCE)
+        couplings, leaf, center = _as(form.couplings[at], x, size=size), form.rows[at], L + form.columns[at]
         np.add.at(result, leaf, np.einsum("fij,fjd->fid", couplings, of_frames[center]))
         np.add.at(result, center, np.einsum("fij,fid->fjd", couplings, of_frames[leaf]))
     whole: Array = np.concatenate([result.reshape(13 * n, D), last])
     return whole
+
+
+def _as(blocks: Array, x: Array, *, size: bool) -> Array:
+    """Blocks, or their sizes, in the precision of x."""
+    result: Array = (np.abs(blocks) if size else blocks).astype(x.dtype, copy=False)
+    return result
 
 
 def _rounded(values: Array) -> Array:

@@ -38,7 +38,16 @@ def proof_that_it_exceeds(matrix: BlockMatrix, margin: Array | float = 0.0) -> B
 
     None proves nothing. A negative margin makes a weaker test.
     """
+    return _smaller(matrix, margin).factor()
+
+
+def is_proven_to_exceed(matrix: BlockMatrix, margin: Array | float = 0.0) -> bool:
+    """Whether there is such a proof, which is not kept."""
+    return _smaller(matrix, margin).has_factor()
+
+
+def _smaller(matrix: BlockMatrix, margin: Array | float) -> BlockMatrix:
     diagonal = matrix.diagonal
     # The subtraction rounds by at most u times its result.
     reach = np.abs(diagonal) + np.abs(margin)
-    return matrix.plus(-(margin + cholesky_allowance(matrix, reach) + 4.0 * UNIT * reach)).factor()
+    return matrix.plus(-(margin + cholesky_allowance(matrix, reach) + 4.0 * UNIT * reach))
