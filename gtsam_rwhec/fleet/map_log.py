@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from gtsam_rwhec.calibration.verdict import Finding, Ground
-from gtsam_rwhec.errors import LogError, RigError, RwhecWarning
+from gtsam_rwhec.errors import LogError, RigError, RwhecError, RwhecWarning, StoreInterruptedError
 from gtsam_rwhec.fleet.container import FORMAT_VERSION
 from gtsam_rwhec.fleet.log_facts import LogFacts, Weighting, camera_fields
 from gtsam_rwhec.fleet.log_parts import local_copy_of_topics
@@ -41,6 +41,7 @@ from gtsam_rwhec.pipeline.topics_of_rig import wanted_topics
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.rig import Rig
 from gtsam_rwhec.rig.odometry_section import OdometrySensor
+from gtsam_rwhec.rig.sections import Sensor
 
 
 @dataclass(frozen=True)
@@ -112,31 +113,37 @@ def map_log(task: LogTask, output: str) -> Receipt:
 
 
 def _partial(task: LogTask, folder: Path) -> tuple[Partial, KeptLog]:
+    """The partial result of a log. What is said of files of the worker is said of the log."""
     rig = task.rig.rig(folder)
     _refuse_odometry(rig)
-    said: list[str] = []
+    detected, cleaned = folder / DETECTED_LOG, folder / CLEAN_LOG
+    places = [str(detected), str(cleaned)]
+
+    def in_words(said: object) -> str:
+        words = str(said)
+        for place in places:
+            words = words.replace(place, shown(task.url))
+        return words
+
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", RwhecWarning)
-        path, _ = local_copy_of_topics(task.url, wanted_topics(rig), folder)
-        if stamp_of(task.url) != task.stamp:
-            raise LogError(f"{shown(task.url)} changed while it was read; run again when it is whole")
-        with open_log(path) as log:
-            is_detected = is_from_stage(log)
-        detected = path
-        if not is_detected:
-            detected = folder / DETECTED_LOG
-            has_images = any(sensor.images is not None for sensor in rig.sensors.values())
-            detect_log(path, rig, detected, workers=1 if has_images else None)
-        clean_log(detected, folder / CLEAN_LOG, rig if is_detected else None, images="leave_out")
-        with open_log(folder / CLEAN_LOG) as log:
-            partial, kept = _summed(task, log, rig)
+        try:
+            path, _ = local_copy_of_topics(task.url, wanted_topics(rig), folder)
+            places.append(str(path))
+            if stamp_of(task.url) != task.stamp:
+                raise LogError(f"{shown(task.url)} changed while it was read; run again when it is whole")
+            partial, kept = _summed(task, path, rig, detected, cleaned)
+        except StoreInterruptedError:
+            raise
+        except RwhecError as error:
+            raise type(error)(in_words(error)) from error
+    said: dict[str, None] = {}
     for warning in caught:
         if isinstance(warning.message, RwhecWarning):
-            said.append(str(warning.message).replace(str(folder), shown(task.url).rpartition("/")[0]))
+            said[in_words(warning.message)] = None
         else:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-    facts = partial.facts.model_copy(update={"warnings": list(dict.fromkeys(said))})
-    return replace(partial, facts=facts), kept
+    return replace(partial, facts=partial.facts.model_copy(update={"warnings": list(said)})), kept
 
 
 def _refuse_odometry(rig: Rig) -> None:
@@ -149,7 +156,21 @@ def _refuse_odometry(rig: Rig) -> None:
         )
 
 
-def _summed(task: LogTask, log: Log, rig: Rig) -> tuple[Partial, KeptLog]:
+def _summed(task: LogTask, path: Path, rig: Rig, detected: Path, cleaned: Path) -> tuple[Partial, KeptLog]:
+    """The stages, where they have not been, and their sums."""
+    with open_log(path) as log:
+        is_detected = is_from_stage(log)
+    if is_detected:
+        detected = path
+    else:
+        has_images = any(sensor.images is not None for sensor in rig.sensors.values() if isinstance(sensor, Sensor))
+        detect_log(path, rig, detected, workers=1 if has_images else None)
+    clean_log(detected, cleaned, rig if is_detected else None, images="leave_out")
+    with open_log(cleaned) as log:
+        return _of_cleaned(task, log, rig)
+
+
+def _of_cleaned(task: LogTask, log: Log, rig: Rig) -> tuple[Partial, KeptLog]:
     """Moments, measurements and facts of a cleaned log."""
     metadata, motion = read_metadata(log), read_carrier_motion(log, rig)
     cleaning = metadata.cleaning

@@ -145,3 +145,16 @@ def test_many_logs_are_merged_by_tasks_of_their_own(made: MadeFleet, tmp_path: P
     assert sorted(member.key for merge in plan.merges for member in merge.members) == [
         member.key for merge in plan.merges for member in merge.members
     ]
+
+
+def test_sums_of_chunks_are_the_same_bits(
+    made: MadeFleet, first: tuple[str, fleet.FleetRun], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With chunks of two logs the site's four are merged by two tasks first."""
+    output, run = first
+    monkeypatch.setattr("gtsam_rwhec.fleet.planning.CHUNK", 2)
+    again = fleet.run(fleet.read_manifest(made.manifest), output)
+    assert again.new_tasks == 3, "two sums, and the site's answer from them"
+    assert len(list(Path(output).glob("merged/*.merged"))) == 2
+    assert [row.moments_sha256 for row in again.rows] == [row.moments_sha256 for row in run.rows]
+    assert [(row.logs, row.measurements) for row in again.rows] == [(1, 24), (2, 48), (2, 48)]
