@@ -94,11 +94,12 @@ TABLE: dict[str, dict[str, str]] = {
     },
     "gtsam_rwhec/fleet": {
         "fleet/test_in_process.py": "attempts order",
+        "fleet/test_log_parts.py": "mcap_copy",
         "fleet/test_stores.py": "byte_count store_requests",
         "fleet/test_dask_engine.py": "dask_cluster dask_process extras",
         "fleet/test_watching.py": "night_rows watch_events watch_stream",
         "fleet/test_pair_moments.py": "merging",
-        "fleet/test_running.py": ("log_facts log_parts map_log receipts solve_robot unit_calibration unit_rows"),
+        "fleet/test_running.py": ("log_facts map_log receipts solve_robot unit_calibration unit_rows"),
         "fleet/test_partial.py": "container measured_problem",
         "fleet/test_fleet_report.py": "engines",
         "fleet/test_bad_fleets.py": "planning rig_source",

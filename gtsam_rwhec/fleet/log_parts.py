@@ -1,18 +1,249 @@
-"""A log on this machine's disk: one that is there already, or a copy of one in a store."""
+"""The part of a log that a rig needs, as a log on this machine's disk: only the chunks of its topics travel.
+
+The index at the end of an MCAP file says which channels each chunk has. Two small requests read it; then the chunks of
+the topics are read by ranges, and written behind each other with an index of their own. A chunk travels as it is: what
+else it holds comes with it. Logs without an index, unfinished or damaged ones, are read whole, and a `LogWarning` says
+why.
+"""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, NamedTuple, TypeAlias
 
-from gtsam_rwhec.fleet.stores import local_path, read_bytes, size_of
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Schema, Statistics
+
+from gtsam_rwhec.errors import BudgetError, LogError, LogWarning, StoreError
+from gtsam_rwhec.files.atomic_write import atomic_stream
+from gtsam_rwhec.files.budgets import Spending
+from gtsam_rwhec.fleet.byte_count import count_bytes, counted_bytes
+from gtsam_rwhec.fleet.mcap_copy import McapCopy
+from gtsam_rwhec.fleet.stores import Options, local_path, read_ranges, size_of
+from gtsam_rwhec.fleet.without_secrets import shown
+from gtsam_rwhec.logs.mcap_index import Extra, read_index
+from gtsam_rwhec.logs.mcap_records import FAULTS, RECORD, Descriptions, parsed, records_in
+from gtsam_rwhec.logs.message_kinds import TF_TOPICS, Topic
+
+#: Bytes. A file on disk that is smaller is read where it is, whatever is in it.
+SMALL = 64 << 20
+#: A file on disk is read where it is unless its needed chunks have less than this share of it: the stages go through
+#: a log several times, and open every chunk each time.
+SHARE = 0.5
+#: Bytes between two chunks are read with them, in one request, if they are less than this share of what is before.
+GAP_SHARE = 0.05
+#: Bytes of one request, and of the requests that are under way together.
+REQUEST, TOGETHER = 8 << 20, 32 << 20
+#: This library's own metadata begin with this word; others are not read.
+_OWN = "gtsam_rwhec."
+#: These files are written beside the log by the stages.
+_OF_STAGES = ("detected.mcap", "clean.mcap")
 
 
-def local_copy_of_topics(url: str, topics: tuple[str, ...], folder: Path) -> tuple[Path, int]:
-    """The path of a log that has at least some topics, and how many bytes of the store it took."""
+class LocalCopy(NamedTuple):
+    """A log on this machine's disk: the file itself where it was there, or a copy.
+
+    Attributes
+    ----------
+    path : Path
+    bytes_read : int
+        Bytes that came from the store, or that the file in its place has.
+    """
+
+    path: Path
+    bytes_read: int
+
+
+#: First byte, end, and the places (offset, length) that it holds.
+_Request: TypeAlias = tuple[int, int, list[tuple[int, int]]]
+
+
+@dataclass(frozen=True)
+class Needed:
+    """What is needed of a log, by its index: schemas, channels and statistics as they are, chunks and metadata."""
+
+    descriptions: tuple[bytes, ...]
+    statistics: Statistics
+    chunks: tuple[ChunkIndex, ...]
+    metadata: tuple[Extra, ...]
+
+    @property
+    def chunk_bytes(self) -> int:
+        """Bytes of the chunks, as they are stored."""
+        return sum(chunk.chunk_length for chunk in self.chunks)
+
+
+def local_copy_of_topics(url: str, topics: Collection[str], folder: Path, options: Options | None = None) -> LocalCopy:
+    """A log on disk that has all messages of some topics, and may have others.
+
+    Parameters
+    ----------
+    url
+        An MCAP file.
+    topics
+        By name. With ``/tf`` or ``/tf_static`` all topics of transforms are meant.
+    folder
+        Where a copy is made.
+    options
+        Storage options.
+
+    Raises
+    ------
+    StoreError, StoreInterruptedError
+        The store refuses or breaks off.
+    LogError
+        The copy cannot be written.
+    """
     path = local_path(url)
-    if path is not None:
-        return path, size_of(url)
-    content = read_bytes(url)
-    copy = folder / "log.mcap"
-    copy.write_bytes(content)
-    return copy, len(content)
+    size = size_of(url, options)
+    if path is not None and size < SMALL:
+        count_bytes(size)
+        return LocalCopy(path, size)
+    with counted_bytes() as count:
+        needed = needed_of(url, size, topics, options)
+        is_worth_it = not isinstance(needed, str) and needed.chunk_bytes < SHARE * size
+        if path is not None and not is_worth_it:
+            count_bytes(size)
+            return LocalCopy(path, size)
+        name = shown(url).removesuffix("?...").rpartition("/")[2]
+        copy = folder / (f"log_{name}" if name in _OF_STAGES else name)
+        if not isinstance(needed, str):
+            needed = _copied(url, needed, copy, options)
+        if needed:
+            warnings.warn(f"{shown(url)}: {needed}; all of its {size} bytes are read", LogWarning, stacklevel=2)
+            _copied_whole(url, size, copy, options)
+    return LocalCopy(copy, count.count)
+
+
+def needed_of(url: str, size: int, topics: Collection[str], options: Options | None = None) -> Needed | str:
+    """What a log of `size` bytes has of some topics, by its index; or why the index does not tell."""
+    kept: list[bytes] = []
+
+    def read(offset: int, length: int) -> bytes:
+        data = read_ranges(url, [(offset, min(size, offset + length))], options)[0]
+        kept.append(data)
+        return data
+
+    place = Path(shown(url))
+    descriptions = Descriptions(place)
+    try:
+        index = read_index(read, place, size, descriptions, Spending(place, size))
+    except BudgetError as error:
+        raise BudgetError(str(error).replace(str(place), shown(url))) from None
+    except FAULTS as error:
+        return f"its index is damaged ({error})"
+    if index is None:
+        return "it has no index, or one that does not fit (recording broke off?); mcap recover makes one"
+    wanted = _channels(descriptions, topics)
+    raw, chunks, statistics = [], [], None
+    summary = kept[-1]  # after the footer
+    for opcode, begins, ends in records_in(summary):
+        content = summary[begins:ends]
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            raw.append(RECORD.pack(opcode, len(content)) + content)
+        elif opcode == Opcode.STATISTICS:
+            statistics = parsed(Statistics, content)
+        elif opcode == Opcode.CHUNK_INDEX:
+            chunk = parsed(ChunkIndex, content)
+            # A recorder that writes no index of messages does not say what is in the chunk.
+            if not chunk.message_index_offsets or wanted & set(chunk.message_index_offsets):
+                chunks.append(chunk)
+    assert statistics is not None  # read_index asks for it
+    counts = {key: count for key, count in statistics.channel_message_counts.items() if key in wanted}
+    statistics.channel_message_counts = counts
+    own = (extra for extra in index.extras if extra.opcode == Opcode.METADATA and extra.name.startswith(_OWN))
+    chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
+    return Needed(tuple(raw), statistics, tuple(chunks), tuple(own))
+
+
+def _channels(descriptions: Descriptions, topics: Collection[str]) -> set[int]:
+    """The channels of topics, by number."""
+    with_tf = any(topic.rpartition("/")[2] in TF_TOPICS for topic in topics)
+    found = set()
+    for number, channel in descriptions.channels.items():
+        if channel.topic in topics or (with_tf and _is_tf(channel, descriptions.schemas.get(channel.schema_id))):
+            found.add(number)
+    return found
+
+
+def _is_tf(channel: Channel, schema: Schema | None) -> bool:
+    return Topic(channel.topic, schema.name if schema else "", "", 0, None, None, "").is_tf
+
+
+def _copied(url: str, needed: Needed, copy: Path, options: Options | None) -> str:
+    """Write the needed part; why it could not be, where the index does not tell the truth."""
+    places = [(chunk.chunk_start_offset, chunk.chunk_length) for chunk in needed.chunks]
+    extras = [(extra.offset, extra.length) for extra in needed.metadata]
+    with _written(copy) as stream:
+        out = McapCopy(stream)
+        for chunk, data in zip(needed.chunks, _parts(url, places, options), strict=True):
+            opcode, length = RECORD.unpack_from(data)
+            if opcode != Opcode.CHUNK or RECORD.size + length != chunk.chunk_length:
+                return f"its index says that a chunk is at byte {chunk.chunk_start_offset}, and none is there"
+            out.chunk(chunk, data)
+        for extra, data in zip(needed.metadata, _parts(url, extras, options), strict=True):
+            out.metadata(extra.name, data)
+        out.finish(needed.descriptions, needed.statistics)
+    return ""
+
+
+@contextmanager
+def _written(copy: Path) -> Iterator[BinaryIO]:
+    try:
+        with atomic_stream(copy) as stream:
+            yield stream
+    except StoreError:
+        raise
+    except OSError as error:
+        raise LogError(f"{copy} cannot be written: {error.strerror}.") from error
+
+
+def _copied_whole(url: str, size: int, copy: Path, options: Options | None) -> None:
+    places = [(at, min(REQUEST, size - at)) for at in range(0, size, REQUEST)]
+    with _written(copy) as stream:
+        for data in _parts(url, places, options):
+            stream.write(data)
+
+
+def _parts(url: str, places: list[tuple[int, int]], options: Options | None) -> Iterator[bytes]:
+    """The bytes of places (offset, length), in their order, by few requests."""
+    for group in _together(_joined(places)):
+        for (start, _, members), data in zip(
+            group, read_ranges(url, [each[:2] for each in group], options), strict=True
+        ):
+            for offset, length in members:
+                yield data[offset - start : offset - start + length]
+
+
+def _joined(places: list[tuple[int, int]]) -> list[_Request]:
+    """Requests for places, of which those that lie close together are one."""
+    found: list[_Request] = []
+    for offset, length in places:
+        if found:
+            start, end, members = found[-1]
+            gap = offset - end
+            if 0 <= gap <= GAP_SHARE * (end - start) and offset + length - start <= REQUEST:
+                found[-1] = start, offset + length, [*members, (offset, length)]
+                continue
+        found.append((offset, offset + length, [(offset, length)]))
+    return found
+
+
+def _together(
+    requests: list[_Request],
+) -> Iterator[list[_Request]]:
+    """Requests that travel together, of few bytes, so that memory is bounded."""
+    group: list[_Request] = []
+    size = 0
+    for request in requests:
+        if group and size + request[1] - request[0] > TOGETHER:
+            yield group
+            group, size = [], 0
+        group.append(request)
+        size += request[1] - request[0]
+    if group:
+        yield group

@@ -219,6 +219,8 @@ def _opened(url: str, options: Options | None) -> tuple[Any, str]:
 
     def ask() -> tuple[Any, str]:
         fs, place = core.url_to_fs(url, **given)
+        if scheme == "s3":
+            fs.retries = 1  # `requested` tries again, and says so
         return fs, place
 
     try:
@@ -232,7 +234,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
     "s3": {
         "default_cache_type": "none",
         "use_listings_cache": False,
-        "config_kwargs": {"connect_timeout": 10, "read_timeout": 60, "retries": {"max_attempts": 1}},
+        "config_kwargs": {"connect_timeout": 10, "read_timeout": 60, "retries": {"total_max_attempts": 1}},
     },
     "http": {"use_listings_cache": False},
     "https": {"use_listings_cache": False},

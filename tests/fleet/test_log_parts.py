@@ -1,0 +1,165 @@
+"""Only what a rig needs of a log travels, and the pipeline's readers take the copy as it is."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader
+from mcap.writer import IndexType
+from mixed_log import TOPICS, write_mixed_log
+from s3_server import BUCKET, KEY, SECRET, S3Server, s3_server
+
+from gtsam_rwhec.errors import LogWarning, StoreError, StoreInterruptedError
+from gtsam_rwhec.fleet import log_parts, store_requests, stores
+from gtsam_rwhec.fleet.attempts import attempted
+from gtsam_rwhec.fleet.byte_count import counted_bytes
+from gtsam_rwhec.fleet.log_parts import Needed, local_copy_of_topics, needed_of
+from gtsam_rwhec.fleet.tasks import Failed, Receipt, Task
+from gtsam_rwhec.logs import Log, open_log
+
+URL = f"s3://{BUCKET}/robot_1/run.mcap"
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[S3Server]:
+    with s3_server() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory, server: S3Server) -> Path:
+    path = tmp_path_factory.mktemp("logs") / "run.mcap"
+    write_mixed_log(path, seconds=10, large_bytes=100_000)
+    stores.write_once(URL, path.read_bytes(), server.options)
+    return path
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store_requests, "PAUSE_S", 0.001)
+
+
+def messages_of(path: Path, topics: tuple[str, ...]) -> list[tuple[str, int, bytes]]:
+    """By the other reader, which goes from front to back and looks at no index."""
+    with open(path, "rb") as stream:
+        read = NonSeekingReader(stream).iter_messages(topics, log_time_order=False)
+        return [(channel.topic, message.log_time, message.data) for _, channel, message in read]
+
+
+def blocks_of(log: Log) -> int:
+    """The messages of all blocks, opened and checked as the pipeline's reader does."""
+    return sum(len(log.files[0].open(block).heads) for block in log.files[0].blocks)
+
+
+def test_few_bytes_travel_and_the_copy_has_all(log: Path, server: S3Server, tmp_path: Path) -> None:
+    server.sent = 0
+    with counted_bytes() as count:
+        copy = local_copy_of_topics(URL, TOPICS, tmp_path, server.options)
+    needed = needed_of(str(log), log.stat().st_size, TOPICS)
+    assert isinstance(needed, Needed)
+    assert needed.chunk_bytes < 0.3 * log.stat().st_size
+    assert copy.bytes_read == count.count == server.sent  # counted here as they left the store
+    assert needed.chunk_bytes < server.sent <= 1.05 * needed.chunk_bytes
+    wanted = (*TOPICS, "/static")  # all transforms
+    assert messages_of(copy.path, wanted) == messages_of(log, wanted)
+    with open_log(copy.path) as taken, open_log(log) as all_of_it:
+        assert taken.files[0].is_indexed
+        assert taken.losses == []
+        assert [topic.name for topic in taken.topics()] == [topic.name for topic in all_of_it.topics()]
+        counts = {topic.name: topic.count for topic in taken.topics()}
+        assert counts == {"/tf": 200, "/detections": 200, "/static": 1, "/camera": 0}
+        assert set(taken.metadata()) == {"gtsam_rwhec.rig"}
+        assert blocks_of(taken) >= 401
+        assert 0 < len(taken.files[0].blocks) < len(all_of_it.files[0].blocks)
+
+
+def test_files_on_disk_are_read_where_they_are_if_that_is_cheaper(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert local_copy_of_topics(str(log), TOPICS, tmp_path) == (log, log.stat().st_size)
+    monkeypatch.setattr(log_parts, "SMALL", 0)
+    copy = local_copy_of_topics(log.as_uri(), TOPICS, tmp_path)
+    assert copy.path == tmp_path / "run.mcap"
+    assert copy.bytes_read < 0.3 * log.stat().st_size
+    assert local_copy_of_topics(str(log), ("/camera",), tmp_path).path == log
+
+
+@pytest.mark.parametrize("kind", ["no index", "cut", "index of another file"])
+def test_logs_without_a_good_index_are_read_whole(kind: str, server: S3Server, log: Path, tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    if kind == "no index":
+        write_mixed_log(path, seconds=1, large_bytes=1000, index=IndexType.NONE)
+    elif kind == "cut":
+        path.write_bytes(log.read_bytes()[:400_000])
+    else:
+        write_mixed_log(path, seconds=10, large_bytes=100_000)
+        content = bytearray(path.read_bytes())
+        needed = needed_of(str(path), len(content), TOPICS)
+        assert isinstance(needed, Needed)
+        content[needed.chunks[0].chunk_start_offset] ^= 0x40  # no chunk begins there
+        path.write_bytes(content)
+    url = f"s3://{BUCKET}/{kind}/clean.mcap"
+    stores.write_once(url, path.read_bytes(), server.options)
+    with pytest.warns(LogWarning, match=rf"{url}: .*; all of its {path.stat().st_size} bytes are read"):
+        copy = local_copy_of_topics(url, TOPICS, tmp_path, server.options)
+    assert copy.path == tmp_path / "log_clean.mcap"  # the stages write a clean.mcap beside it
+    assert copy.path.read_bytes() == path.read_bytes()
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_store_that_stops_half_way(log: Path, server: S3Server, tmp_path: Path) -> None:
+    server.cut_after = 50_000  # the index comes, the chunks do not
+    try:
+        with pytest.raises(StoreInterruptedError) as told:
+            local_copy_of_topics(URL, TOPICS, tmp_path, server.options)
+    finally:
+        server.cut_after = None
+    assert f"{URL}: the store broke off or did not answer, 4 times" in str(told.value)
+    assert "bytes came, stopped at byte" in str(told.value)
+    assert list(tmp_path.iterdir()) == []  # nothing that looks like a log
+
+
+@pytest.mark.usefixtures("quick")
+def test_no_message_no_log_and_no_file_has_a_secret(
+    log: Path, server: S3Server, tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    caplog.set_level(logging.INFO)
+    dead = "http://127.0.0.1:9"  # nobody listens
+    said = []
+    for options in (
+        {"key": KEY, "secret": SECRET, "endpoint_url": dead},
+        {**server.options, "client_kwargs": {"verify": f"/no/{SECRET}"}},
+        {"key": KEY, "secret": SECRET, "endpoint_url": f"http://anna:{SECRET}@127.0.0.1:9"},
+    ):
+        task = Task("a", reads, (URL, str(tmp_path), options))
+        outcome = attempted(task, attempts=1)
+        said.append(outcome.reason if isinstance(outcome, Failed) else "")
+    with pytest.raises(StoreError, match="it is not there") as told:
+        stores.read_bytes(f"s3://{BUCKET}/nothing", server.options)
+    captured = capfd.readouterr()
+    files = [path.read_text(encoding="utf-8", errors="replace") for path in tmp_path.rglob("*") if path.is_file()]
+    assert "the store broke off or did not answer" in said[0]
+    for words in (*said, str(told.value), caplog.text, captured.out, captured.err, *files):
+        assert SECRET not in words
+        assert KEY not in words
+
+
+def reads(url: str, folder: str, options: dict[str, object]) -> Receipt:
+    local_copy_of_topics(url, TOPICS, Path(folder), options)
+    return Receipt("a", "", "")
+
+
+def test_parts_are_cut_out_of_common_requests() -> None:
+    content = np.random.default_rng(0).bytes(100_000)
+    places = [(0, 10_000), (10_100, 9_000), (40_000, 50), (40_060, 5_000), (50_000, 50_000)]
+    assert [len(each[2]) for each in log_parts._joined(places)] == [2, 1, 1, 1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        url = "memory://parts/log"
+        stores.write_once(url, content)
+        assert list(log_parts._parts(url, places, None)) == [content[a : a + n] for a, n in places]
