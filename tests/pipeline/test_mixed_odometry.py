@@ -107,6 +107,7 @@ def _moved(content: Mapping[str, Any]) -> dict[str, Any]:
     return {"transforms": [part | {"translation": place | {"x": place["x"] + 5.0}}]}
 
 
+@pytest.mark.slow
 def test_an_odometry_of_another_time_is_named_with_its_line(tmp_path: Path) -> None:
     later = [one.stamped(one.stamp_ns + 10**12) if one.topic == "/vo/odom" else one for one in messages()]
     with pytest.raises(LogError, match=r"rig.yaml, line 12: sensors.vo: topic /vo/odom has 0 windows .*of one clock"):

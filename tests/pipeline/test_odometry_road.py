@@ -84,7 +84,7 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
 def six(tmp_path_factory: pytest.TempPathFactory) -> tuple[Drive, Path, subprocess.CompletedProcess[str]]:
     """A drive with six sensors in three dimensions, calibrated by the command."""
     folder = tmp_path_factory.mktemp("six")
-    driven = drive(sensors(*MOUNTS), "3d", seconds=20.0, rate_hz=5.0, seed=5)
+    driven = drive(sensors(*MOUNTS), "3d", seconds=12.0, rate_hz=5.0, seed=5)
     log = write_log(folder / "raw.mcap", driven)
     (folder / "rig.yaml").write_text(RIG, encoding="utf-8")
     return driven, folder, run("calibrate", log, "--rig", folder / "rig.yaml", "-o", folder / "out")
@@ -127,7 +127,7 @@ def test_what_a_stage_writes_the_next_reads(
     with rw.logs.open_log(tmp_path / "clean.mcap") as log:
         pairs = rw.pipeline.read_pairs(log, solved.rig)
     assert {pair.sensor for pair in pairs} == set(MOUNTS)
-    assert all(one.used.sum() > 90 for one in pairs.values())
+    assert all(one.used.sum() > 50 for one in pairs.values())
     tree = json.loads(result_json(first))
     del tree["reference"]
     (tmp_path / "result.json").write_text(json.dumps(tree))
@@ -137,7 +137,7 @@ def test_what_a_stage_writes_the_next_reads(
 
 def test_a_plane_leaves_heights_free_until_they_are_given(tmp_path: Path) -> None:
     names = ("lidar_front", "lidar_rear", "lidar_roof")
-    driven = drive(sensors(*names), "planar", seconds=30.0, rate_hz=5.0, seed=2)
+    driven = drive(sensors(*names), "planar", seconds=20.0, rate_hz=5.0, seed=2)
     write_tum(tmp_path, driven)
     text = "reference: lidar_front\nsensors:\n" + "".join(
         f"  {name}: {{odometry: {{file: {name}.tum}}}}\n" for name in names
@@ -195,6 +195,7 @@ def test_a_first_rig_file_names_the_odometries_of_a_log(
     assert sum(note.startswith("moves: ") for note in notes) == 6
 
 
+@pytest.mark.slow
 def test_a_height_that_the_motions_contradict_is_named(tmp_path: Path) -> None:
     names = ("lidar_front", "lidar_rear")
     write_tum(tmp_path, drive(sensors(*names), "3d", seconds=20.0, rate_hz=5.0, seed=2))
