@@ -23,6 +23,8 @@ from gtsam_rwhec.solver.block_matrix import BlockFactor, BlockMatrix
 ROUNDING = 4.0 * np.finfo(float).eps
 #: Lanczos steps where nothing is free: the weakest direction of thousands of frames came out to 3 % at worst.
 STEPS = 12
+#: So many directions are searched first where some are free, then four times as many; and their relative precision.
+FIRST, PRECISION = 6, 1e-8
 #: Up to so many parameters all eigenvalues are computed where Lanczos finds very many free directions: 0.2 GB.
 MOST_DENSE = 4000
 #: In larger problems so many free directions are told at most, the weakest ones.
@@ -116,9 +118,9 @@ def _weakest_of_many(matrix: BlockMatrix, used: np.ndarray, enough: float) -> tu
     size, parameters = len(used), int(used.sum())
     operator = LinearOperator((size, size), matvec=factor.solve_vector, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(size) * used
-    count = 12
+    count = FIRST
     while 4 * count < parameters and count <= MOST_FREE:
-        inverse, vectors = eigsh(operator, k=count, which="LA", v0=start)
+        inverse, vectors = eigsh(operator, k=count, which="LA", v0=start, tol=PRECISION)
         values = np.maximum(1.0 / inverse - shift, 0.0)
         if values.max() > enough or (4 * count > MOST_FREE and parameters > MOST_DENSE):
             return values, vectors * used[:, None]
