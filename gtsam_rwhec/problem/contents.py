@@ -8,7 +8,7 @@ from typing import Literal
 from gtsam_rwhec.errors import CountError, FrameError, MeasurementsNotKeptError
 from gtsam_rwhec.problem.accumulation import Accumulator
 from gtsam_rwhec.problem.knowledge import Knowledge, ScaleMode, check_name
-from gtsam_rwhec.problem.measurements import KeptMeasurements, Measurements
+from gtsam_rwhec.problem.measurements import KeptMeasurements, Measurements, Section
 from gtsam_rwhec.problem.moment_stack import MomentStack
 from gtsam_rwhec.problem.moments import Gauge, Moments
 from gtsam_rwhec.problem.pairs import Pair
@@ -101,6 +101,10 @@ class Contents(Knowledge):
     def batches(self, target: str, sensor: str) -> tuple[Measurements, ...]:
         """Raw measurements of a pair as they were added, batch by batch, without a copy; only what was kept."""
         return self._kept[self._pair(target, sensor)].batches
+
+    def stored(self, pair: Pair) -> tuple[Measurements | Section, ...]:
+        """What was kept of a pair, batch by batch, as it is stored."""
+        return self._kept[pair].stored
 
     def _pair(self, target: str, sensor: str) -> Pair:
         check_name(target, "the target's name")

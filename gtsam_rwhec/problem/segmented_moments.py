@@ -86,11 +86,11 @@ class Sorted:
         step = np.arange(int(counts.max()))
         return self.first[group][:, None] + np.minimum(step, counts - 1), step < counts
 
-    def groups(self) -> Iterator[np.ndarray]:
-        """Indices of pairs with about as many measurements, `AT_ONCE` together; a pair with more is alone."""
-        counts = self.counts
+    def groups(self, pairs: np.ndarray) -> Iterator[np.ndarray]:
+        """Some pairs, those with about as many measurements, `AT_ONCE` together; a pair with more is alone."""
+        counts = self.counts[pairs]
         order = np.argsort(-counts, kind="stable")
-        descending = counts[order]
+        descending, order = counts[order], pairs[order]
         begin = 0
         while begin < len(order):
             longest = int(descending[begin])
@@ -115,7 +115,7 @@ class Sorted:
             projected=np.zeros(P, dtype=int),
         )
         motion = self.motion
-        for group in self.groups():
+        for group in self.groups(np.arange(P)):
             if len(group) == 1 and self.counts[group[0]] > BLOCK:
                 self._long(int(group[0]), gauge, result)
             else:

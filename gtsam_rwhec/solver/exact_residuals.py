@@ -9,7 +9,7 @@ is needed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import fsum
 
@@ -18,11 +18,10 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import Doubled, gamma
 from gtsam_rwhec.problem.measurements import Measurements
+from gtsam_rwhec.solver.given import SMALL, Shared
 
 #: So many measurements are evaluated at once: the slices of a block stay in the processor's cache.
 BLOCK = 1024
-#: Batches of fewer measurements are evaluated together.
-SMALL = 256
 #: A stack of small batches has about so many measurements: more at once, as calls take longer than numbers there.
 STACK = 4096
 #: Batches in one stack have at least this part of its longest batch, so that little is padding.
@@ -73,6 +72,13 @@ class Measured:
     a: Array
     c: Array
     is_swapped: bool
+    shared: Sequence[Shared] = ()  #: measurements of many pairs
+
+    @property
+    def count(self) -> int:
+        """The number of measurements."""
+        of_shared = (int(each.many.counts[each.pair >= 0].sum()) for each in self.shared)
+        return sum(len(raw.A) for _, raw in self.batches) + sum(of_shared)
 
 
 @dataclass(frozen=True)
@@ -94,9 +100,31 @@ class Sums:
     one_error: Array
 
 
-def stacks_of(batches: list[tuple[int, Measurements]]) -> Iterator[Stack]:
+def stacks_of(measured: Measured) -> Iterator[Stack]:
     """The measurements in stacks."""
-    small = sorted((b for b in batches if len(b[1].A) <= SMALL), key=lambda b: len(b[1].A), reverse=True)
+    yield from small_stacks(measured)
+    for pair, raw in measured.batches:
+        if len(raw.A) <= SMALL:
+            continue
+        for first in range(0, len(raw.A), BLOCK):
+            part = slice(first, first + BLOCK)
+            weight = 1.0 / raw.sigma[None, part] ** 2
+            yield Stack(
+                np.array([pair]), _rows(raw.A[part])[None], _rows(raw.B[part])[None], weight, raw.kappa[None, part]
+            )
+
+
+def small_stacks(measured: Measured) -> Iterator[Stack]:
+    """The measurements of pairs with few in a batch, in stacks of pairs with about as many."""
+    for shared in measured.shared:
+        many = shared.many
+        for group in many.groups(np.flatnonzero(shared.pair >= 0)):
+            places, valid = many.padded(group)
+            of_A, of_B = (_rows(poses)[places] for poses in (many.A, many.B))
+            of_A[~valid] = of_B[~valid] = 0.0
+            sigmas, kappas = (each if each.ndim == 0 else each[places] for each in (many.sigma, many.kappa))
+            yield Stack(shared.pair[group], of_A, of_B, valid / sigmas**2, valid * kappas)
+    small = sorted((b for b in measured.batches if len(b[1].A) <= SMALL), key=lambda b: len(b[1].A), reverse=True)
     while small:
         longest = len(small[0][1].A)
         count = 1
@@ -113,15 +141,6 @@ def stacks_of(batches: list[tuple[int, Measurements]]) -> Iterator[Stack]:
         weight[filled] = 1.0 / np.concatenate([raw.sigma for _, raw in taken]) ** 2
         kappa[filled] = np.concatenate([raw.kappa for _, raw in taken])
         yield Stack(np.array([pair for pair, _ in taken]), A, B, weight, kappa)
-    for pair, raw in batches:
-        if len(raw.A) <= SMALL:
-            continue
-        for first in range(0, len(raw.A), BLOCK):
-            part = slice(first, first + BLOCK)
-            weight = 1.0 / raw.sigma[None, part] ** 2
-            yield Stack(
-                np.array([pair]), _rows(raw.A[part])[None], _rows(raw.B[part])[None], weight, raw.kappa[None, part]
-            )
 
 
 def _rows(T: Array) -> Array:
@@ -140,7 +159,7 @@ def weighted_sums(measured: Measured, coefficients: Coefficients) -> Sums:
     products_error = np.zeros(shape)
     tables: list[Array] = [np.zeros((pairs, 12, outputs)), np.zeros((pairs, 12, outputs)), np.zeros((pairs, outputs))]
     errors, sizes = ([np.zeros_like(table) for table in tables] for _ in range(2))
-    for stack in stacks_of(measured.batches):
+    for stack in stacks_of(measured):
         front, back = (stack.B, stack.A) if measured.is_swapped else (stack.A, stack.B)
         r, low = _residuals(stack.pairs, front, back, coefficients)
         A, off = _centred(stack, measured)

@@ -14,6 +14,8 @@ precision, so that a distant origin costs no digits.
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,6 +23,7 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import Doubled, difference, gamma, product, reciprocal, turned
+from gtsam_rwhec.solver.block_matrix import sum_into
 from gtsam_rwhec.solver.exact_residuals import Coefficients, Measured, Sums, weighted_sums
 from gtsam_rwhec.solver.full_form import ALPHA, Slots, rounding_of_fixed
 from gtsam_rwhec.solver.given import Given
@@ -29,6 +32,9 @@ from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.plain_residuals import plain_sums
 from gtsam_rwhec.solver.point import Action, Evaluation, Point
 from gtsam_rwhec.solver.variables import Answer, as_point
+
+#: So many pairs are evaluated at once: their coefficients and sums are 15 kB a pair.
+PAIRS_AT_ONCE = 2048
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ class _Ends:
 class _Measured(Evaluation):
     """An evaluation, and the coefficients that it was made with."""
 
-    ends: _Ends | None = None
+    ends: Callable[[slice], _Ends] | None = None
 
 
 @dataclass(frozen=True)
@@ -75,18 +81,21 @@ class MeasuredForm:
 
     def at_poses(self, R: Array, t: Array, answer: Answer) -> Evaluation:
         """The cost of poses as they are returned: R (n, 3, 3), t (n, 3) about the user's origin, and their scales."""
-        frames = {name: (R[i], t[i]) for i, name in enumerate(self.part.free)}
-        frames |= {name: (T[:3, :3], T[:3, 3]) for name, T in self.given.fixed.items()}
-        (R_X, t_X), (R_Y, t_Y) = (
-            [np.array(each) for each in zip(*(frames[name] for name in side), strict=True)]
-            for side in zip(*self.part.pairs, strict=True)
-        )
-        ends = self._of_poses(R_X, t_X, R_Y, t_Y, answer)
+        fixed = np.array([self.given.fixed[name] for name in self.part.fixed]).reshape(-1, 4, 4)
+        of_frames = np.concatenate([R, fixed[:, :3, :3]]), np.concatenate([t, fixed[:, :3, 3]])
+
+        def ends(at: slice) -> _Ends:
+            return self._of_poses(*of_frames, answer, at)
+
         return self._evaluated(as_point(self.part, answer), ends, self._priors.at_poses(R, t))
 
     def at(self, point: Point) -> Evaluation:
         """The cost at values of the variables about the gauge."""
         return self._evaluated(point, self._of_point(point), self._priors.at(point))
+
+    def _blocks(self) -> Iterator[slice]:
+        """The pairs, so many at a time that what is made of them fits."""
+        return (slice(begin, begin + PAIRS_AT_ONCE) for begin in range(0, len(self.part.pairs), PAIRS_AT_ONCE))
 
     def action(self, evaluation: Evaluation, V: Array) -> Action:
         """What the form does to directions."""
@@ -95,12 +104,16 @@ class MeasuredForm:
         ends = evaluation.ends if isinstance(evaluation, _Measured) else None
         if ends is None:
             ends = self._of_point(point)
-        sums = weighted_sums(*self._coefficients(self._joined(self._of_directions(V, 0.0), ends)))
-        QV, QV_error = self._by_variables(sums, range(D))
-        products = 0.5 * sums.products.sum(axis=(0, 3))
-        error = 0.5 * sums.products_error.sum(axis=(0, 3)) + gamma(len(self.part.pairs) + 16) * 0.5 * np.abs(
-            sums.products
-        ).sum(axis=(0, 3))
+        QV, QV_error = np.zeros((2, *V.shape))
+        products, error = np.zeros((2, D + 1, D + 1))
+        for at in self._blocks():
+            sums = weighted_sums(*self._coefficients(self._joined(self._of_directions(V, 0.0, at), ends(at)), at))
+            for whole, of_block in zip((QV, QV_error), self._by_variables(sums, range(D), at), strict=True):
+                whole += of_block
+            products += 0.5 * sums.products.sum(axis=(0, 3))
+            error += 0.5 * sums.products_error.sum(axis=(0, 3))
+            error += gamma(len(self.part.pairs) + 16) * 0.5 * np.abs(sums.products).sum(axis=(0, 3))
+        error *= 1.0 + 1e-9
         of_priors = self._priors.action(point, V)
         return Action(
             QV + of_priors.QV,
@@ -113,30 +126,42 @@ class MeasuredForm:
 
     # -- coefficients -------------------------------------------------------------------------------------------
 
-    def _of_poses(self, R_X: Array, t_X: Array, R_Y: Array, t_Y: Array, answer: Answer) -> _Ends:
-        """The coefficients at poses about the user's origin."""
-        part, (_, c) = self.part, self._centres
-        E = len(part.pairs)
+    def _of_poses(self, R: Array, t: Array, answer: Answer, at: slice) -> _Ends:
+        """The coefficients of some pairs at poses about the user's origin, of free frames and then of fixed ones."""
+        part, c = self.part, self._centres[1][at]
+        target, sensor = part.ends[at].T
+        R_X, t_X, R_Y, t_Y = R[target], t[target], R[sensor], t[sensor]
+        E = len(target)
         if part.kind == "direct":
             alpha = np.full((E, 1), answer.scale if part.scale == "shared" else 1.0)
             one = product(alpha, t_Y)
             return _stacked(R_X, R_Y, product(alpha, t_X), Doubled.of(alpha[:, 0]), Doubled(-one.hi, -one.lo))
         R_1, R_2 = R_X.transpose(0, 2, 1), R_Y.transpose(0, 2, 1)
         arm = turned(R_1, difference(t_X, c))
-        own = dict(zip(part.free, answer.own_scale.tolist(), strict=True))
         if part.scale == "shared":
             scales = np.full(E, answer.scale)
         else:
-            scales = np.array([own.get(target, 1.0) for target, _ in part.pairs])
-            for e, (target, _) in enumerate(part.pairs):
-                if target not in part.scale_owners:
-                    scales[e] = part.fixed_scales.get(target, 1.0)
+            of_frames = np.append(answer.own_scale, np.ones(len(part.fixed)))
+            scales = np.where(self._owns[at], of_frames[target], self._known_scales[at])
         return _stacked(R_1, R_2, Doubled(-arm.hi, -arm.lo), reciprocal(scales), turned(R_2, Doubled.of(t_Y)))
 
-    def _of_directions(self, V: Array, h: float) -> _Ends:
+    @cached_property
+    def _owns(self) -> np.ndarray:
+        """(E,): whether a pair's scale is its own variable."""
+        owners = frozenset(self.part.scale_owners)
+        return np.array([target in owners for target, _ in self.part.pairs], dtype=bool)
+
+    @cached_property
+    def _known_scales(self) -> Array:
+        """(E,): the scale of each pair where it is known."""
+        of_target = self.part.fixed_scales
+        return np.array([of_target.get(target, 1.0) for target, _ in self.part.pairs], dtype=float)
+
+    def _of_directions(self, V: Array, h: float, at: slice) -> _Ends:
         """The coefficients of directions V (13 n + 1, D) about the gauge; with h = 1, of values of the variables."""
-        part, (a, c) = self.part, self._centres
-        leaf, center, S = self.slots.leaf, self.slots.center, self.slots.of_pair
+        part = self.part
+        a, c = (each[at] for each in self._centres)
+        leaf, center, S = self.slots.leaf[at], self.slots.center[at], self.slots.matrices(at)
         L, P = len(part.leaves), len(part.centers)
         D = V.shape[1]
         leaves = np.concatenate([V[: 13 * L].reshape(L, 13, D), np.zeros((1, 13, D))])
@@ -147,14 +172,13 @@ class MeasuredForm:
         R_1, R_2 = (x[:, :, at : at + 9].reshape(-1, D, 3, 3).transpose(0, 1, 3, 2) for at in (7, 16))
         t_1, t_2, s = Doubled.of(x[:, :, 0:3].copy()), Doubled.of(x[:, :, 3:6].copy()), Doubled.of(x[:, :, 6].copy())
         factor = V[-1] if part.kind == "direct" and part.scale == "shared" else np.full(D, h)
-        if part.kind == "inverse":
-            for e, (target, _) in enumerate(part.pairs):
-                if part.scale != "shared" and target not in part.scale_owners:
-                    known = reciprocal(np.array(part.fixed_scales.get(target, 1.0)))
-                    s.hi[e], s.lo[e] = h * known.hi, h * known.lo
+        if part.kind == "inverse" and part.scale != "shared":
+            is_known = ~self._owns[at]
+            known = reciprocal(self._known_scales[at][is_known])
+            s.hi[is_known], s.lo[is_known] = h * known.hi[:, None], h * known.lo[:, None]
         # A fixed frame's translation about the gauge is a difference, which a double would round.
-        for e, pair in enumerate(part.pairs):
-            for name, t, centre in zip(pair, (t_1, t_2), (c[e], a[e]), strict=True):
+        for e in np.flatnonzero((part.ends[at] >= len(part.free)).any(axis=1)):
+            for name, t, centre in zip(part.pairs[at.start + e], (t_1, t_2), (c[e], a[e]), strict=True):
                 if name not in part.fixed:
                     continue
                 T = self.given.fixed[name]
@@ -171,9 +195,9 @@ class MeasuredForm:
         moved = Doubled(R_2, np.zeros_like(R_2)).times(a[:, None, None, :]).summed(axis=3)
         return _Ends(R_1, R_2, t_1, s, moved.minus(t_2))
 
-    def _of_point(self, point: Point) -> _Ends:
+    def _of_point(self, point: Point) -> Callable[[slice], _Ends]:
         """The coefficients at values of the variables."""
-        return self._of_directions(np.append(point.numbers.ravel(), point.alpha)[:, None], 1.0)
+        return lambda at: self._of_directions(np.append(point.numbers.ravel(), point.alpha)[:, None], 1.0, at)
 
     def _joined(self, first: _Ends, second: _Ends) -> _Ends:
         def of(name: str) -> Doubled:
@@ -183,9 +207,10 @@ class MeasuredForm:
         R_1, R_2 = np.concatenate([first.R_1, second.R_1], axis=1), np.concatenate([first.R_2, second.R_2], axis=1)
         return _Ends(R_1, R_2, of("u"), of("s"), of("one"))
 
-    def _coefficients(self, ends: _Ends) -> tuple[Measured, Coefficients]:
-        """What the sums over the measurements are made of."""
+    def _coefficients(self, ends: _Ends, at: slice) -> tuple[Measured, Coefficients]:
+        """What the sums over the measurements of some pairs are made of."""
         E, D = ends.R_1.shape[:2]
+        a, c = (each[at] for each in self._centres)
         front, back = Doubled.zeros(E, 3, 4, D, 12), Doubled.zeros(E, 3, 4, D, 12)
         one = Doubled.zeros(E, D, 12)
         R_1, R_2 = ends.R_1.transpose(0, 2, 1, 3), ends.R_2  # R_1 as [e, k, d, q]; R_2 as [e, d, p, k]
@@ -201,7 +226,6 @@ class MeasuredForm:
             for of_one, value in zip(one, ends.one, strict=True):
                 of_one[:, :, 9 + p] = value[:, :, p]
         if self.part.kind == "inverse":
-            c = self._centres[1]
             for p in range(3):
                 moved = product(-R_2[:, :, p, :].transpose(0, 2, 1)[:, :, None, :], c[:, None, :, None])  # [e, k, m, d]
                 back.hi[:, :, :3, :, 9 + p], back.lo[:, :, :3, :, 9 + p] = moved
@@ -210,18 +234,27 @@ class MeasuredForm:
             Doubled(*(each.reshape(E, 12, 12 * D) for each in back)),
             Doubled(*(each.reshape(E, 12 * D) for each in one)),
         )
-        a, c = self._centres
-        return Measured(self.given.batches, a, c, self.part.kind == "inverse"), coefficients
+        begin, end = at.start, at.start + E
+        first, last = (bisect_left(self.given.batches, e, key=lambda batch: batch[0]) for e in (begin, end))
+        batches = [(e - begin, raw) for e, raw in self.given.batches[first:last]]
+        shared = [own for each in self.given.shared if (own := each.of(begin, end)) is not None]
+        return Measured(batches, a, c, self.part.kind == "inverse", shared), coefficients
 
     # -- results ------------------------------------------------------------------------------------------------
 
-    def _evaluated(self, point: Point, ends: _Ends, priors: Evaluation) -> Evaluation:
-        measured, coefficients = self._coefficients(ends)
-        sums = plain_sums(measured, coefficients) or weighted_sums(measured, coefficients)
-        cost = 0.5 * float(np.sum(sums.products))
-        error = 0.5 * float(sums.products_error.sum()) + gamma(len(self.part.pairs) + 16) * cost
-        gradient, gradient_error = self._by_variables(sums, range(1))
-        gradient, gradient_error = gradient[:, 0] + priors.gradient, gradient_error[:, 0] + priors.gradient_error
+    def _evaluated(self, point: Point, ends: Callable[[slice], _Ends], priors: Evaluation) -> Evaluation:
+        cost, error = 0.0, 0.0
+        size = 13 * len(self.part.free) + 1
+        gradient, gradient_error = np.zeros((2, size))
+        for at in self._blocks():
+            measured, coefficients = self._coefficients(ends(at), at)
+            sums = plain_sums(measured, coefficients) or weighted_sums(measured, coefficients)
+            cost += 0.5 * float(np.sum(sums.products))
+            error += 0.5 * float(sums.products_error.sum())
+            for whole, of_block in zip((gradient, gradient_error), self._by_variables(sums, range(1), at), strict=True):
+                whole += of_block[:, 0]
+        error = error * (1.0 + 1e-9) + gamma(len(self.part.pairs) + 16) * cost
+        gradient, gradient_error = gradient + priors.gradient, gradient_error * (1.0 + 1e-9) + priors.gradient_error
         total = cost + priors.cost
         return _Measured(
             point,
@@ -232,11 +265,12 @@ class MeasuredForm:
             ends=ends,
         )
 
-    def _by_variables(self, sums: Sums, directions: range) -> tuple[Array, Array]:
+    def _by_variables(self, sums: Sums, directions: range, at_pairs: slice) -> tuple[Array, Array]:
         """The sums over features as Q V (13 n + 1, D) by variables, with a bound on its error: the chain rule."""
-        leaf, center, S = self.slots.leaf, self.slots.center, self.slots.of_pair
-        L, P, E = len(self.part.leaves), len(self.part.centers), len(self.part.pairs)
-        size, D = 13 * (L + P) + 1, len(directions)
+        leaf, center = self.slots.leaf[at_pairs], self.slots.center[at_pairs]
+        S = self.slots.matrices(at_pairs)
+        L, n, E = len(self.part.leaves), len(self.part.free), len(self.part.pairs)
+        k, size, D = len(leaf), 13 * n + 1, len(directions)
         result, bound = np.zeros((size, D)), np.zeros((size, D))
         for d in directions:
             at = slice(12 * d, 12 * d + 12)
@@ -246,12 +280,13 @@ class MeasuredForm:
             error += gamma(8) * _by_pair(front, back, one, -1.0)
             shares = 0.5 * np.einsum("ep,epq->eq", value, S)
             slack = 0.5 * np.einsum("ep,epq->eq", error + gamma(E + 40) * np.abs(value), np.abs(S))
-            slack[:, ALPHA] += 0.5 * np.einsum("esk,esk->e", self._of_fixed, np.abs(value[:, :6]).reshape(E, 2, 3))
+            of_fixed = self._of_fixed[at_pairs]
+            slack[:, ALPHA] += 0.5 * np.einsum("esk,esk->e", of_fixed, np.abs(value[:, :6]).reshape(k, 2, 3))
             for of_pairs, out in ((shares, result), (slack, bound)):
-                leaves, centers = np.zeros((L + 1, 13)), np.zeros((P + 1, 13))
-                np.add.at(leaves, leaf, of_pairs[:, :13])
-                np.add.at(centers, center, of_pairs[:, 13:26])
-                out[:, d] = np.r_[leaves[:L].ravel(), centers[:P].ravel(), of_pairs[:, ALPHA].sum()]
+                frames = np.zeros((n, 13))
+                for index, has, side in ((leaf, leaf < L, slice(0, 13)), (L + center, L + center < n, slice(13, 26))):
+                    sum_into(frames, index[has], of_pairs[has, side])
+                out[:, d] = np.append(frames.ravel(), of_pairs[:, ALPHA].sum())
         return result, bound * (1.0 + 1e-9)
 
 

@@ -8,6 +8,7 @@ f changes sum w f r by at most sqrt(sum w f^2) sqrt(sum w e^2).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,8 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import ROTATION_TOLERANCE, Array
 from gtsam_rwhec.geometry.rounding import gamma
 from gtsam_rwhec.problem.measurements import Measurements
-from gtsam_rwhec.solver.exact_residuals import BLOCK, Coefficients, Measured, Sums
+from gtsam_rwhec.solver.exact_residuals import BLOCK, Coefficients, Measured, Stack, Sums, small_stacks
+from gtsam_rwhec.solver.given import SMALL
 
 #: With fewer measurements the exact sums are quick enough.
 MANY = 10_000
@@ -36,7 +38,7 @@ def plain_sums(measured: Measured, coefficients: Coefficients) -> Sums | None:
 
     The result is that of `exact_residuals.weighted_sums`, with larger bounds.
     """
-    if coefficients.one.hi.shape[1] != 12 or sum(len(raw.A) for _, raw in measured.batches) < MANY:
+    if coefficients.one.hi.shape[1] != 12 or measured.count < MANY:
         return None
     pairs = len(measured.a)
     products, products_error = np.zeros((pairs, 12)), np.zeros((pairs, 12))
@@ -44,18 +46,17 @@ def plain_sums(measured: Measured, coefficients: Coefficients) -> Sums | None:
     errors, sizes = ([np.zeros_like(table) for table in tables] for _ in range(2))
     front, back, one = (each.hi for each in (coefficients.front, coefficients.back, coefficients.one))
     counts = np.zeros(pairs, dtype=int)
-    for pair, raw in measured.batches:
-        of_A, of_B = (back[pair], front[pair]) if measured.is_swapped else (front[pair], back[pair])
-        own = _BatchSums.of(raw, of_A, of_B, one[pair], measured.a[pair], measured.c[pair])
-        square, error, by_A, by_B, by_one = own.bounded(of_A, of_B, one[pair], measured.a[pair], measured.c[pair])
-        products[pair] += square
-        products_error[pair] += error
+    for at, own in _sums_of(measured, (back, front) if measured.is_swapped else (front, back), one):
+        of_A, of_B = (back[at], front[at]) if measured.is_swapped else (front[at], back[at])
+        square, error, by_A, by_B, by_one = own.bounded(of_A, of_B, one[at], measured.a[at], measured.c[at])
+        np.add.at(products, at, square)
+        np.add.at(products_error, at, error)
         by_front, by_back = (by_B, by_A) if measured.is_swapped else (by_A, by_B)
-        counts[pair] += 1
+        np.add.at(counts, at, 1)
         for table, bound, size, (value, reach) in zip(tables, errors, sizes, (by_front, by_back, by_one), strict=True):
-            table[pair] += value
-            bound[pair] += reach
-            size[pair] += np.abs(value)
+            np.add.at(table, at, value)
+            np.add.at(bound, at, reach)
+            np.add.at(size, at, np.abs(value))
     batches = gamma(int(counts.max(initial=0)) + 2)
     for bound, size in zip(errors, sizes, strict=True):
         bound += batches * size
@@ -77,22 +78,48 @@ def plain_sums(measured: Measured, coefficients: Coefficients) -> Sums | None:
     )
 
 
+def _sums_of(
+    measured: Measured, of_A_and_B: tuple[Array, Array], one: Array
+) -> Iterator[tuple[np.ndarray, _BatchSums]]:
+    """Pairs (k,) and the sums over a batch of each: of small batches many at once."""
+    of_A, of_B = of_A_and_B
+    for stack in small_stacks(measured):
+        at = stack.pairs
+        yield at, _BatchSums.of_stack(stack, of_A[at], of_B[at], one[at], measured.a[at], measured.c[at])
+    for pair, raw in measured.batches:
+        if len(raw.A) > SMALL:
+            own = _BatchSums.of(raw, of_A[pair], of_B[pair], one[pair], measured.a[pair], measured.c[pair])
+            yield np.array([pair]), own
+
+
+def _wide(of_A: Array, of_B: Array, one: Array, a: Array, c: Array) -> tuple[Array, Array, Array]:
+    """What makes the columns [12 residuals, t_A + R_A c - a, t_A, t_B, 1] of k pairs from A, from B, and constants."""
+    k = len(one)
+    wide_A, wide_B, constant = np.zeros((k, 12, 22)), np.zeros((k, 12, 22)), np.zeros((k, 22))
+    wide_A[:, :, :12], wide_B[:, :, :12], constant[:, :12] = of_A, of_B, one
+    for i in range(3):
+        wide_A[:, 4 * i : 4 * i + 3, 12 + i] = c
+        wide_A[:, 4 * i + 3, 12 + i] = wide_A[:, 4 * i + 3, 15 + i] = wide_B[:, 4 * i + 3, 18 + i] = 1.0
+    constant[:, 12:15], constant[:, 21] = -a, 1.0
+    return wide_A, wide_B, constant
+
+
 @dataclass(frozen=True)
 class _BatchSums:
-    """Sums over one batch: of squares of translations and of residuals, of features times residuals, of weights.
+    """Sums over a batch of each of k pairs: squares of translations and residuals, features times residuals, weights.
 
     Columns of residuals have two kinds of weights, nine times kappa and three times 1 / sigma^2; so every translation
     has two sums of squares.
     """
 
-    count: int
-    square: Array  #: (12,)
-    total: Array  #: (12,), of the weights
-    one: Array  #: (12,)
-    by_A: Array  #: (12, 12)
-    by_B: Array  #: (12, 12)
-    by_t: Array  #: (3, 12)
-    #: (9, 12): squares of the translations of A about the gauge, of A, and of B, by the weights of the residuals.
+    count: int  #: of the longest batch
+    square: Array  #: (k, 12)
+    total: Array  #: (k, 12), of the weights
+    one: Array  #: (k, 12)
+    by_A: Array  #: (k, 12, 12)
+    by_B: Array  #: (k, 12, 12)
+    by_t: Array  #: (k, 3, 12)
+    #: (k, 9, 12): squares of the translations of A about the gauge, of A, and of B, by the weights of the residuals.
     translations: Array
 
     @staticmethod
@@ -101,13 +128,7 @@ class _BatchSums:
         n = len(raw.A)
         A, B = raw.A.reshape(n, 16)[:, :12], raw.B.reshape(n, 16)[:, :12]
         is_uniform = raw.sigma.strides == (0,) and raw.kappa.strides == (0,)
-        # Columns: 12 residuals, t_A + R_A c - a, t_A, t_B, 1.
-        wide_A, wide_B, constant = np.zeros((12, 22)), np.zeros((12, 22)), np.zeros(22)
-        wide_A[:, :12], wide_B[:, :12], constant[:12] = of_A, of_B, one
-        for i in range(3):
-            wide_A[4 * i : 4 * i + 3, 12 + i] = c
-            wide_A[4 * i + 3, [12 + i, 15 + i]] = wide_B[4 * i + 3, 18 + i] = 1.0
-        constant[12:15], constant[21] = -a, 1.0
+        (wide_A,), (wide_B,), (constant,) = _wide(of_A[None], of_B[None], one[None], a[None], c[None])
         by_A, by_B = np.zeros((12, 12)), np.zeros((12, 12))
         of_kappa, of_weight = np.zeros((22, 22)), np.zeros((22, 22))
         size = min(BLOCK, n)
@@ -136,43 +157,67 @@ class _BatchSums:
             of_kappa *= weights[0]
             by_A *= weights
             by_B *= weights
-        by_residual = np.concatenate([of_kappa[:, :9], of_weight[:, 9:12]], axis=1)
-        squares = (
-            np.repeat(np.diagonal(each)[12:, None], count, axis=1) for each, count in ((of_kappa, 9), (of_weight, 3))
+        return _BatchSums._of_products(n, of_kappa[None], of_weight[None], by_A[None], by_B[None])
+
+    @staticmethod
+    def of_stack(stack: Stack, of_A: Array, of_B: Array, one: Array, a: Array, c: Array) -> _BatchSums:
+        """The sums over small batches of k pairs; what pads them has no weight."""
+        wide_A, wide_B, constant = _wide(of_A, of_B, one, a, c)
+        columns = np.matmul(stack.A, wide_A) + np.matmul(stack.B, wide_B) + constant[:, None, :]
+        turned = columns.transpose(0, 2, 1)
+        weighted = columns * stack.kappa[:, :, None], columns * stack.weight[:, :, None]
+        flat = np.concatenate([weighted[0][:, :, :9], weighted[1][:, :, 9:12]], axis=2)
+        return _BatchSums._of_products(
+            columns.shape[1],
+            np.matmul(turned, weighted[0]),
+            np.matmul(turned, weighted[1]),
+            np.matmul(stack.A.transpose(0, 2, 1), flat),
+            np.matmul(stack.B.transpose(0, 2, 1), flat),
         )
-        of_features = np.concatenate(list(squares), axis=1)
+
+    @staticmethod
+    def _of_products(count: int, of_kappa: Array, of_weight: Array, by_A: Array, by_B: Array) -> _BatchSums:
+        """From the weighted products of all columns, (k, 22, 22) for each kind of weight."""
+        by_residual = np.concatenate([of_kappa[:, :, :9], of_weight[:, :, 9:12]], axis=2)
+        squares = (
+            np.repeat(np.einsum("kii->ki", each)[:, 12:, None], columns, axis=2)
+            for each, columns in ((of_kappa, 9), (of_weight, 3))
+        )
+        of_features = np.concatenate(list(squares), axis=2)
         return _BatchSums(
-            n,
-            np.diagonal(by_residual).copy(),
-            of_features[9],
-            by_residual[21],
+            count,
+            np.einsum("kii->ki", by_residual[:, :12]).copy(),
+            of_features[:, 9],
+            by_residual[:, 21],
             by_A,
             by_B,
-            by_residual[12:15],
-            of_features[:9],
+            by_residual[:, 12:15],
+            of_features[:, :9],
         )
 
     def bounded(
         self, of_A: Array, of_B: Array, one: Array, a: Array, c: Array
     ) -> tuple[Array, Array, tuple[Array, Array], tuple[Array, Array], tuple[Array, Array]]:
-        """The squares (12,), by A and by B (12, 12) and by one (12,), each followed by a bound on its error."""
+        """The squares (k, 12), by A and by B (k, 12, 12) and by one (k, 12), each followed by a bound on its error."""
         up = 1.0 + 1e-9
         of_ones: Array = np.sqrt(self.total) * up
-        of_t, of_A_t, of_B_t = np.sqrt(self.translations).reshape(3, 3, 12) * up
-        A_size, B_size = np.empty((12, 12)), np.empty((12, 12))
-        A_size[...] = B_size[...] = np.sqrt(_OF_ROTATION) * up * of_ones
-        A_size[_T], B_size[_T] = of_A_t, of_B_t
+        k = len(of_ones)
+        of_t, of_A_t, of_B_t = (np.sqrt(self.translations).reshape(k, 3, 3, 12) * up).transpose(1, 0, 2, 3)
+        A_size, B_size = np.empty((k, 12, 12)), np.empty((k, 12, 12))
+        A_size[...] = B_size[...] = np.sqrt(_OF_ROTATION) * up * of_ones[:, None, :]
+        A_size[:, _T], B_size[:, _T] = of_A_t, of_B_t
         # The root of the weighted sum of squares of the residuals' own errors.
         terms = np.abs(one) * of_ones
-        terms += np.einsum("fo,fo->o", np.abs(of_A), A_size)
-        terms += np.einsum("fo,fo->o", np.abs(of_B), B_size)
+        terms += np.einsum("kfo,kfo->ko", np.abs(of_A), A_size)
+        terms += np.einsum("kfo,kfo->ko", np.abs(of_B), B_size)
         slack = gamma(OPERATIONS) * up * terms
         unit = gamma(min(BLOCK, self.count) + -(-self.count // BLOCK) + _FEW)
         root = np.sqrt(self.square) * up + slack
         error = unit * root * root + 2.0 * slack * root
         off = unit * root + slack
-        by_A, A_error = self.by_A.copy(), A_size * off
-        of_centring = 8.0 * gamma(1) * (of_A_t + (np.abs(c).sum() + np.abs(a))[:, None] * of_ones)
-        by_A[_T] = self.by_t
-        A_error[_T] = of_t * off + of_centring * root
-        return self.square, error, (by_A, A_error), (self.by_B, B_size * off), (self.one, of_ones * off)
+        by_A, A_error = self.by_A.copy(), A_size * off[:, None, :]
+        reach = np.abs(c).sum(axis=1)[:, None] + np.abs(a)
+        of_centring = 8.0 * gamma(1) * (of_A_t + reach[:, :, None] * of_ones[:, None, :])
+        by_A[:, _T] = self.by_t
+        A_error[:, _T] = of_t * off[:, None, :] + of_centring * root[:, None, :]
+        return self.square, error, (by_A, A_error), (self.by_B, B_size * off[:, None, :]), (self.one, of_ones * off)

@@ -105,6 +105,12 @@ def extent_of(part: Part, point: Point) -> float:
             centred = raw.A[:, :3, 3] + raw.A[:, :3, :3] @ c - a
             largest.append(float(np.linalg.norm(centred, axis=1).max()))
             largest.append(float(np.linalg.norm(raw.B[:, :3, 3], axis=1).max() / scale[e]))
+        for shared in part.given.shared:
+            many, pair = shared.many, np.repeat(shared.pair, shared.many.counts)
+            A, B = many.A[pair >= 0, :3], many.B[pair >= 0, :3, 3]
+            centred = A[:, :, 3] + A[:, :, :3] @ part.gauge.target_carrier - a
+            largest.append(float(np.linalg.norm(centred, axis=1).max()))
+            largest.append(float((np.linalg.norm(B, axis=1) / scale[pair[pair >= 0]]).max()))
     finite = [each for each in largest if np.isfinite(each)]
     return max(float(max(finite, default=0.0)), 1e-9) * (1.0 + 1e-9)
 

@@ -12,6 +12,7 @@ from small_problems import optimum, simulated, whole
 import gtsam_rwhec as rw
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.simulate import Noise, general
+from gtsam_rwhec.solver import measured_form, plain_residuals
 from gtsam_rwhec.solver.given import Given
 from gtsam_rwhec.solver.measured_form import MeasuredForm
 from gtsam_rwhec.solver.part_form import PartForm
@@ -146,3 +147,46 @@ def test_many_measurements_in_blocks_are_the_same_as_in_stacks() -> None:
     assert abs(one.cost - other.cost) <= one.cost_error + other.cost_error
     assert (np.abs(one.gradient - other.gradient) <= one.gradient_error + other.gradient_error).all()
     assert max(one.cost_error, other.cost_error) <= 1e-12 * one.cost
+
+
+@pytest.mark.parametrize("scale", ["known", "shared", "per_target"])
+def test_pairs_that_were_added_many_at_once_are_enclosed_as_single_ones_are(
+    scale: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also with few pairs at a time, in plain doubles and in exact slices."""
+    single = far_from_the_origin(5, scale, 10.0, Noise(0.01, 6500.0), with_knowledge=True)
+    raw = {pair: single.measurements(*pair) for pair in single.pairs}
+    seen = [pair for pair in single.pairs if not pair.is_motion]
+    # The last pair has fewer measurements than the others: it is padded.
+    counts = [len(raw[pair].A) - 2 * (pair == seen[-1]) for pair in seen]
+    index = np.repeat(np.arange(len(seen)), counts)
+    order = np.random.default_rng(2).permutation(len(index))
+    together = {
+        name: np.concatenate([getattr(raw[pair], name)[:count] for pair, count in zip(seen, counts, strict=True)])[
+            order
+        ]
+        for name in ("A", "B", "sigma", "kappa")
+    }
+    many = rw.Problem(scale)
+    many.add_many(seen, index[order], **together)
+    for pair in single.pairs:
+        if pair.is_motion:
+            many.add_motion(pair.sensor, raw[pair].A, raw[pair].B, raw[pair].sigma, raw[pair].kappa)
+    many._learn(single)
+    form = whole(many)
+    answer, one = form.answer_near(optimum(many).R)
+    exact = exact_cost(many, form, answer)
+    found = [one]
+    for pairs, enough in ((2, plain_residuals.MANY), (3, 1), (1, plain_residuals.MANY)):
+        monkeypatch.setattr(measured_form, "PAIRS_AT_ONCE", pairs)
+        monkeypatch.setattr(plain_residuals, "MANY", enough)
+        found.append(form.evaluated(answer))
+    V: Array = np.random.default_rng(0).standard_normal((len(one.gradient), 2))
+    actions = [form.cost.action(each, V) for each in found]
+    for each, action in zip(found, actions, strict=True):
+        assert abs(Fraction(each.cost) - exact) <= Fraction(each.cost_error) + Fraction(1, 10**14) * exact
+        assert each.cost_error <= 1e-9 * each.cost
+        assert (np.abs(each.gradient - one.gradient) <= each.gradient_error + one.gradient_error).all()
+        for name in ("QV", "VQV", "VQx"):
+            error = getattr(action, f"{name}_error") + getattr(actions[0], f"{name}_error")
+            assert (np.abs(getattr(action, name) - getattr(actions[0], name)) <= error).all()

@@ -31,7 +31,8 @@ def inputs(scale: rw.ScaleMode, *, uniform: bool, offset_m: float, sigma_m: floa
     (part,) = parts_of(problem)
     form = PartForm.of(part)
     _, evaluation = form.answer_near(optimum(problem).R)
-    return form.cost._coefficients(evaluation.ends)
+    whole = slice(0, len(part.pairs))
+    return form.cost._coefficients(evaluation.ends(whole), whole)
 
 
 def off_by(first: Sums, second: Sums) -> float:
