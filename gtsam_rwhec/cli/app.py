@@ -25,6 +25,7 @@ from gtsam_rwhec.cli.export import export
 from gtsam_rwhec.cli.failures import failures_in_words
 from gtsam_rwhec.cli.fetch import utias
 from gtsam_rwhec.cli.fleet import run
+from gtsam_rwhec.cli.fleet_watch import watch
 from gtsam_rwhec.cli.init import init
 from gtsam_rwhec.cli.report import report
 from gtsam_rwhec.cli.solve import solve
@@ -68,7 +69,7 @@ app = typer.Typer(
 )
 fetch_app = typer.Typer(help="Download public measurements.", no_args_is_help=True)
 app.add_typer(fetch_app, name="fetch")
-fleet_app = typer.Typer(help="Many robots: calibrate all of them from their logs.", no_args_is_help=True)
+fleet_app = typer.Typer(help="Many robots: calibrate all from their logs, and watch them drift.", no_args_is_help=True)
 app.add_typer(fleet_app, name="fleet")
 
 
@@ -88,6 +89,7 @@ for subcommand in (calibrate, demo, init, convert, detect, clean, solve, export,
     add(subcommand, app)
 add(utias, fetch_app)
 add(run, fleet_app)
+add(watch, fleet_app)
 
 
 def _print_version(wanted: bool) -> None:

@@ -14,7 +14,7 @@ class ExitStatus(IntEnum):
     """The command succeeded; the poses of a calibration may be used, with care or without. With a rig file: each of its
     sensors and targets has a pose that the measurements determine and agree to."""
     CHANGED = 1
-    """``diff``: something changed by more than chance. ``verify``: the old calibration no longer holds.
+    """``diff``, ``fleet watch``: something changed by more than chance. ``verify``: the old one no longer holds.
     ``fleet run``: a log or a robot failed, or the poses of one are not to be used."""
     BAD_INPUT = 2
     """An option, a file or a measurement cannot be used; the message says which."""
@@ -33,9 +33,9 @@ class ExitStatus(IntEnum):
 
 
 HELP = (
-    "Exit status: 0 success, and the poses may be used; 1 diff or verify found a change, or some of a fleet failed; 2 "
-    "bad input; 3 the measurements do not determine every frame; 4 not proven optimal; 5 download failed; 6 the "
-    "measurements contradict the answer (misread, a wrong size, a sensor or a target without an answer); 130 "
+    "Exit status: 0 success, and the poses may be used; 1 diff, verify or fleet watch found a change, or some of a "
+    "fleet failed; 2 bad input; 3 the measurements do not determine every frame; 4 not proven optimal; 5 download failed; 6 "
+    "the measurements contradict the answer (misread, a wrong size, a sensor or a target without an answer); 130 "
     "interrupted."
 )
 

@@ -38,3 +38,12 @@ from .watching import Watched as Watched
 from .watching import watch as watch
 from .watch_events import AlarmEvent as AlarmEvent
 from .watch_stream import stream as stream
+from .history import read_history as read_history
+from .watch_words import alarm_lines as alarm_lines
+from .watch_words import day_ns_of as day_ns_of
+from .watch_words import remarks as remarks
+from .watch_words import verdict as verdict
+
+# What people read.
+from .summary_page import write_summary as write_summary
+from .watch_page import write_watch_page as write_watch_page

@@ -18,6 +18,8 @@ from gtsam_rwhec.geometry.poses import Array
 DETERMINES_SOMETHING = {Ground.NOT_UNIQUE, Ground.NO_ANSWER, Ground.FEW_MEASUREMENTS}
 #: An eigenvalue of a covariance's correlations is at least this: below is rounding.
 ROUNDING = 1e-12
+#: A correlation matrix that is negative by more is not one.
+NEGATIVE = 1e-9
 #: Names of a tangent's numbers.
 AXES = ("rotation about x", "rotation about y", "rotation about z", "x", "y", "z")
 
@@ -77,7 +79,7 @@ class RobotFrames:
             x[at], rows[at] = np.where(known[i], xi[i], 0.0), known[i]
             J[at, 6 * i : 6 * i + 6] = inward[i]
         J[~rows] = 0.0
-        finite = np.where(np.isfinite(row.covariance), row.covariance, 0.0)
+        finite = _without_constant_errors(row)
         C = (J @ finite @ J.T) / self.unit[:, None] / self.unit
         assert row.begin_ns is not None
         return Night(row.begin_ns, x / self.unit, _information(C, rows), np.where(np.outer(rows, rows), C, 0.0), rows)
@@ -147,6 +149,25 @@ def _names(rows: Iterable[RobotRow]) -> dict[tuple[str, str], str]:
             taken = any(name == frame.name and kind != frame.kind for name, kind in names)
             names.setdefault((frame.name, frame.kind), f"{frame.name} ({frame.kind})" if taken else frame.name)
     return names
+
+
+def _without_constant_errors(row: RobotRow) -> Array:
+    """The finite covariances without what all nights share; as they are where they do not hold that much of it."""
+    assert row.covariance is not None
+    finite: Array = np.where(np.isfinite(row.covariance), row.covariance, 0.0)
+    if not row.constant_errors:
+        return finite
+    shift = np.zeros((len(finite), 6))
+    for i, frame in enumerate(row.frames):
+        deviations = np.array(row.constant_errors[frame.kind == "sensor"])
+        shift[6 * i : 6 * i + 6] = se3.adjoint(se3.inverse(frame.T)[None])[0] * deviations
+    known = np.isfinite(np.diagonal(row.covariance)) & (np.diagonal(row.covariance) > 0.0)
+    rest = finite - shift @ shift.T
+    size = np.sqrt(np.maximum(np.diagonal(rest), 0.0))[known]
+    if not (size > 0.0).all():
+        return finite
+    correlations = rest[np.ix_(known, known)] / size[:, None] / size
+    return rest if np.linalg.eigvalsh(correlations).min(initial=0.0) >= -NEGATIVE else finite
 
 
 def _information(C: Array, rows: np.ndarray) -> Array:

@@ -107,6 +107,9 @@ class RobotRow:
         The result file's place below the output, with slashes.
     failure : str or None
         Why there is no calibration; without credentials.
+    constant_errors : two tuples of 6 float, or empty
+        Deviations of a constant error of the target carriers' and the sensor carriers' poses, which `covariance` holds:
+        the same in every calibration with the same carriers (`CalibrationFields`).
     """
 
     unit: str
@@ -136,6 +139,7 @@ class RobotRow:
     receipts: tuple[str, ...] = ()
     result: str | None = None
     failure: str | None = None
+    constant_errors: tuple[tuple[float, ...], ...] = ()
 
     @property
     def is_fine(self) -> bool:
@@ -196,6 +200,7 @@ def _tree(row: RobotRow) -> dict[str, Any]:
         "basis": None if row.basis is None else row.basis.value,
         "frames": [{"name": f.name, "kind": f.kind, "T": f.T[:3].tolist()} for f in row.frames],
         "covariance": None if row.covariance is None else [[_number(v) for v in r] for r in row.covariance.tolist()],
+        "constant_errors": [list(each) for each in row.constant_errors],
         "degrees_of_freedom": _number(row.degrees_of_freedom),
         "scale": dict(scale) if isinstance(scale, Mapping) else None if math.isnan(scale) else scale,
         "condition": None if row.condition is None else _number(row.condition),
@@ -229,6 +234,7 @@ def _row(tree: dict[str, Any]) -> RobotRow:
         basis=None if tree["basis"] is None else Basis(tree["basis"]),
         frames=tuple(RowFrame(f["name"], f["kind"], np.array([*f["T"], [0.0, 0.0, 0.0, 1.0]])) for f in tree["frames"]),
         covariance=None if covariance is None else np.array([[_float(v) for v in r] for r in covariance]),
+        constant_errors=tuple(map(tuple, tree["constant_errors"])),
         degrees_of_freedom=_float(tree["degrees_of_freedom"]),
         scale=math.nan if scale is None else scale,
         condition=None if condition is None else _float(condition),

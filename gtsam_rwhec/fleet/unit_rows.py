@@ -60,6 +60,7 @@ def _row(unit: str, site: str | None, robot: str, of: Merged, found: UnitCalibra
         basis=None if certificate is None else certificate.basis,
         frames=tuple(frames),
         covariance=None if refined is None or not frames else refined.covariance(*sensors, *targets),
+        constant_errors=() if calibration.noise.model is None else calibration.noise.model.constant_deviations,
         degrees_of_freedom=math.inf if refined is None else refined.degrees_of_freedom,
         scale=calibration.scale,
         condition=found.condition,

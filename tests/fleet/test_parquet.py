@@ -24,6 +24,7 @@ def rows() -> list[RobotRow]:
     second = replace(
         second, scale={"board": 1.25, "wall": 0.1 + 0.2}, status=next(iter(Status)), basis=next(iter(Basis)),
         grounds=(Ground.NOT_UNIQUE, Ground.SYSTEMATIC), condition=1.0 / 3.0,
+        constant_errors=((0.1,) * 6, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)),
         removed={"standstill": 5, "fast motion": 7},
         findings=("slow clock",), receipts=("a" * 64,), degrees_of_freedom=112.0, begin_ns=day_ns(1) + 1,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from robot_nights import DAY_NS, DEVIATIONS, day_ns, failed_night, robot_nights, with_free_height
+from robot_nights import DAY_NS, DEVIATIONS, day_ns, failed_night, robot_nights, with_constant_errors, with_free_height
 
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
 from gtsam_rwhec.fleet.rows import RobotRow
@@ -93,6 +93,13 @@ def test_covariances_that_are_too_small_are_found(rows: list[RobotRow]) -> None:
     found = watch(small)
     assert found.spread.variance == pytest.approx(4.0, rel=0.25)
     assert found.alarms == ()
+
+
+def test_what_all_nights_share_does_not_count(rows: list[RobotRow], watched: Watched) -> None:
+    found = watch([with_constant_errors(row, 0.01) for row in rows])
+    for first, second in zip(watched.events, found.events, strict=True):
+        if isinstance(first, NightEvent):
+            assert second.chance == pytest.approx(first.chance, rel=1e-6)
 
 
 def test_the_stream_is_json_with_a_version(watched: Watched) -> None:

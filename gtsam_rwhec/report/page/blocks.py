@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
+from urllib.parse import quote
 
 #: How a paragraph is meant.
 Tone = Literal["plain", "lead", "note", "good", "care", "bad"]
@@ -54,8 +55,21 @@ def significant(number: Number, figures: int) -> Number:
     return replace(number, spec=f".{max(figures - 1 - size, 0)}f")
 
 
+@dataclass(frozen=True)
+class Link:
+    """A link to another file, by its place beside the page, with slashes; never to the network."""
+
+    text: str
+    place: str
+
+    @property
+    def href(self) -> str:
+        """As a page has it."""
+        return "./" + quote(self.place)
+
+
 #: A piece of a sentence, or a cell.
-Piece = str | Number
+Piece = str | Number | Link
 #: A sentence: pieces one after the other.
 Words = Piece | tuple[Piece, ...]
 
@@ -79,12 +93,16 @@ class Listing:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; the first cell of each row is its heading. Cells that are a ``Number`` stand to the right."""
+    """A table; the first cell of each row is its heading. Cells that are a ``Number`` stand to the right.
+
+    One that ``sorts`` has a button at each heading, and moves inside itself where it is long.
+    """
 
     caption: str
     headings: tuple[str, ...]
     rows: tuple[tuple[Words, ...], ...]
     legend: str = ""
+    sorts: bool = False
     kind: str = field(default="table", init=False)
 
 

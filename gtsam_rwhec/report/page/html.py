@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gtsam_rwhec.files.atomic_write import write_atomically
-from gtsam_rwhec.report.page.blocks import Number, Page, Words, every
+from gtsam_rwhec.report.page.blocks import Link, Number, Page, Piece, Words, every
 
 
 def write_page(page: Page, path: str | Path) -> None:
@@ -40,7 +40,7 @@ def page_html(page: Page) -> str:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters.update(base64=_base64, script_json=_script_json, pieces=_pieces, signs=_signs, own_ids=_own_ids)
-    environment.tests.update(number=lambda piece: isinstance(piece, Number))
+    environment.tests.update(number=lambda piece: isinstance(piece, Number), link=lambda piece: isinstance(piece, Link))
     has_drawing = any(block.kind == "drawing" for section in page.sections for block in every(section.blocks))
     script = _own_file("page.js")
     return environment.get_template("page.html.j2").render(
@@ -96,7 +96,7 @@ def _script_json(value: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _pieces(words: Words) -> tuple[str | Number, ...]:
+def _pieces(words: Words) -> tuple[Piece, ...]:
     return words if isinstance(words, tuple) else (words,)
 
 

@@ -42,6 +42,29 @@
     for (const folded of opened) folded.open = false;
   });
 
+  // Tables sort by a column, by the numbers themselves where it has such; a second click turns the order round.
+  for (const table of all("table[data-sorts]")) {
+    const headings = [...table.querySelectorAll("thead th")];
+    const valueOf = (row, column) => {
+      const cell = row.cells[column];
+      const number = cell.querySelector("data");
+      if (!number) return cell.textContent.trim();
+      return number.value === "null" ? Infinity : Number(number.value);
+    };
+    const order = (a, b) => (typeof a === "number" && typeof b === "number" ? a - b : String(a).localeCompare(String(b), undefined, { numeric: true }));
+    headings.forEach((heading, column) => {
+      const button = heading.querySelector(".sort");
+      button.disabled = false;
+      button.addEventListener("click", () => {
+        const sign = heading.getAttribute("aria-sort") === "ascending" ? -1 : 1;
+        for (const other of headings) other.removeAttribute("aria-sort");
+        heading.setAttribute("aria-sort", sign > 0 ? "ascending" : "descending");
+        const body = table.tBodies[0];
+        body.append(...[...body.rows].sort((a, b) => sign * order(valueOf(a, column), valueOf(b, column))));
+      });
+    });
+  }
+
   // Copy. Pages from disk have no clipboard in some browsers: there the text is selected and copied as if by hand.
   const copied = async (place) => {
     try {
