@@ -11,6 +11,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus
 from gtsam_rwhec.cli.failures import said_in_the_report
 from gtsam_rwhec.cli.stage_display import StageDisplay
+from gtsam_rwhec.files.terminal_text import say
 
 Each = Literal["robot", "day", "log"]
 EngineName = Literal["dask", "ray"]
@@ -76,4 +77,5 @@ def run(
         with rw.fleet.StartedLate(lambda: rw.fleet.engine_of(engine, count, memory_bytes, scheduler), stage) as started:
             done = rw.fleet.run(fleet, output, options, started, stage)
     rw.fleet.print_fleet(done)
+    say(f"The page of all robots: {rw.fleet.shown(rw.fleet.put_summary(done.rows, output))}", to_errors=True)
     return ExitStatus.DONE if done.is_fine else ExitStatus.CHANGED

@@ -45,5 +45,6 @@ from .watch_words import remarks as remarks
 from .watch_words import verdict as verdict
 
 # What people read.
+from .summary_page import put_summary as put_summary
 from .summary_page import write_summary as write_summary
 from .watch_page import write_watch_page as write_watch_page

@@ -13,18 +13,22 @@ import numpy as np
 from gtsam_rwhec.calibration.verdict import Verdict
 from gtsam_rwhec.files.paths import checked_path
 from gtsam_rwhec.files.terminal_text import shown
+from gtsam_rwhec.fleet.receipts import below
 from gtsam_rwhec.fleet.rows import RobotRow
+from gtsam_rwhec.fleet.stores import write_once
 from gtsam_rwhec.fleet.summary_charts import cost_chart, uncertainty_chart
 from gtsam_rwhec.fleet.watch_events import day_text
 from gtsam_rwhec.fleet.watch_page import alarm_table, drift_charts
 from gtsam_rwhec.fleet.watch_words import remarks, verdict
-from gtsam_rwhec.fleet.watching import Watched
+from gtsam_rwhec.fleet.watching import Watched, watch
 from gtsam_rwhec.report.page.blocks import Block, Chart, Link, Listing, Number, Page, Paragraph, Section, Table, Words
-from gtsam_rwhec.report.page.html import write_page
+from gtsam_rwhec.report.page.html import page_html, write_page
 
 #: Robots that are named one by one, and reasons that are.
 WORST, REASONS = 10, 12
 MADE_BY = "Written by gtsam-rwhec fleet run."
+#: The page, below a run's output.
+SUMMARY_FILE = "summary.html"
 #: The file of rows that numbers of the page come from.
 ROWS_FILE = "fleet.json"
 
@@ -46,6 +50,23 @@ def write_summary(rows: Sequence[RobotRow], path: str | Path, watched: Watched |
         The file cannot be written.
     """
     write_page(summary_page(rows, watched), checked_path(path))
+
+
+def put_summary(rows: Sequence[RobotRow], output: str) -> str:
+    """Write the summary into a run's output, a folder or a URL, and give its place there.
+
+    Where a robot has several calibrations (``--each day``), the page says what moved between them.
+
+    Raises
+    ------
+    StoreError
+        The output cannot be written.
+    """
+    times = Counter(row.robot for row in rows if row.begin_ns is not None)
+    watched = watch(rows) if max(times.values(), default=0) > 1 else None
+    url = below(output, SUMMARY_FILE)
+    write_once(url, f"{page_html(summary_page(rows, watched))}\n".encode("utf-8", "replace"))
+    return url
 
 
 def summary_page(rows: Sequence[RobotRow], watched: Watched | None = None) -> Page:

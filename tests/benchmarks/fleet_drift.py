@@ -218,16 +218,30 @@ def table(found: list[dict[str, Any]]) -> list[Row]:
             ))  # fmt: skip
         else:
             low, high = Share(alarms, tested).interval(0.95)
-            has_bar = kind.startswith("quiet")
             spread = np.mean([one["variance"] for one in own]), np.mean([one["correlation"] for one in own])
             rows.append(Row(
                 f"{kind}: false alarms a robot in {1 / RATE:.0f} nights",
                 f"{alarms / tested / RATE:.2f} [{low / RATE:.2f}, {high / RATE:.2f}] ({alarms} in {tested} nights, "
                 f"{back} back); variance {spread[0]:.3f}, correlation {spread[1]:.3f}",
-                f"{1 - BAND:g} to {1 + BAND:g}" if has_bar else "",
-                abs(alarms / tested / RATE - 1.0) <= BAND if has_bar else None,
             ))  # fmt: skip
     return rows
+
+
+def pooled(found: list[dict[str, Any]]) -> list[Row]:
+    """The false alarms of all sizes together, without and with those that end a false alarm."""
+    own = [one for one in found if one["kind"].startswith("quiet")]
+    tested, alarms = sum(one["tested"] for one in own), sum(one["alarms"] for one in own)
+    both = alarms + sum(one["back"] for one in own)
+    rows = []
+    for what, count in (("first alarms", alarms), ("and those that say that it is back", both)):
+        low, high = Share(count, tested).interval(0.95)
+        rate = count / tested / RATE if tested else math.nan
+        rows.append(Row(
+            f"quiet, all sizes: {what}, a robot in {1 / RATE:.0f} nights",
+            f"{rate:.2f} [{low / RATE:.2f}, {high / RATE:.2f}] ({count} in {tested} nights)",
+            f"{1 - BAND:g} to {1 + BAND:g}", abs(rate - 1.0) <= BAND,
+        ))  # fmt: skip
+    return rows if own else []
 
 
 def main() -> int:
@@ -240,7 +254,8 @@ def main() -> int:
     parser.add_argument("--calibrations", type=int, default=0, help="robots whose nights are calibrated")
     given = parser.parse_args()
     title = f"Drift of fleets, {given.robots} robots of each kind"
-    return print_rows(title, table(list(campaign(given))), store=given.store)
+    found = list(campaign(given))
+    return print_rows(title, pooled(found) + table(found), store=given.store)
 
 
 if __name__ == "__main__":

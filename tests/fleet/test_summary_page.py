@@ -10,7 +10,7 @@ from robot_nights import failed_night, robot_nights, with_free_height
 
 from gtsam_rwhec.calibration.verdict import Ground, Verdict
 from gtsam_rwhec.fleet.rows import RobotRow
-from gtsam_rwhec.fleet.summary_page import counts_in_words, summary_page, write_summary
+from gtsam_rwhec.fleet.summary_page import counts_in_words, put_summary, summary_page, write_summary
 from gtsam_rwhec.fleet.watch_page import watch_page
 from gtsam_rwhec.fleet.watching import Watched, watch
 from gtsam_rwhec.report.page.blocks import Chart, Link, Number, Table
@@ -75,6 +75,13 @@ def test_it_is_one_file_without_names_that_are_html(rows: list[RobotRow], watche
     assert "<cam>" not in html
     assert "The height of &lt;cam&gt; is free." in html
     assert 'href="./a%20b/%3F.json"' in html
+
+
+def test_a_run_of_many_days_says_what_moved(tmp_path: Path) -> None:
+    put_summary([*robot_nights("arm_0", 16), *robot_nights("arm_1", 16, moved_at=14)], str(tmp_path))
+    html = (tmp_path / "summary.html").read_text(encoding="utf-8")
+    assert "Of 32 calibrations of 2 robots, 32 may be used." in html
+    assert "Moved by more than chance: 1 of 2 robots, 32 nights: arm_1." in html
 
 
 def test_the_page_of_the_watch_has_a_chart_for_each_robot_that_moved(watched: Watched) -> None:
