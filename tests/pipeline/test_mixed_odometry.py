@@ -61,7 +61,7 @@ def messages() -> list[made.Message]:
 def check(calibrated: Solved) -> None:
     refined = calibrated.refined
     assert calibrated.judgement.verdict is not rw.Verdict.DO_NOT_USE, str(calibrated.judgement)
-    assert refined.solution.certificate.status.value == "certified"
+    assert calibrated.solution.certificate.status.value == "certified"
     for name, truth in ({"cam_0": made.Y["cam_0"]} | MOUNTS).items():
         assert refined.contains(name, truth, 0.9999), name
         off = frame_distance(refined.Y[name].matrix(), truth)
