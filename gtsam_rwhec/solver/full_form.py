@@ -171,11 +171,18 @@ def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
             translation = translation[:, SWAPPED[:, None], SWAPPED]
             rotation = rotation.transpose(0, 2, 1)
         of_translations, of_rotations = edge_forms(translation, rotation, part.moments.kappa[at])
+        of_both = of_translations
+        of_both += of_rotations
         for members, source in slots.alike(at):
             pairs = begin + members
             leaf, center, has_both = slots.leaf[pairs], L + slots.center[pairs], coupled[pairs]
-            for form, of_edges in zip(forms, (of_translations + of_rotations, of_rotations), strict=True):
+            for form, of_edges in zip(forms, (of_both, of_rotations), strict=True):
                 m = form.frames.shape[1]
+                if m == 9 and source is not None:  # kappa / 2 |R_A R_X|^2, and the same of R_Y R_B
+                    half = 0.5 * np.tile(part.moments.kappa[pairs], 2)
+                    sums = np.bincount(np.concatenate([leaf, center]), half, minlength=n)
+                    np.einsum("nii->ni", form.frames)[...] += sums[:, None]
+                    continue
                 own = of_edges if len(members) == len(of_edges) else of_edges[members]
                 if source is None:
                     S = slots.matrices(pairs)
