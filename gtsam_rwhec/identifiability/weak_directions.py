@@ -30,6 +30,8 @@ FIRST, PRECISION = 6, 1e-8
 MOST_DENSE = 4000
 #: In larger problems so many free directions are told at most, the weakest ones.
 MOST_FREE = 768
+#: So many couplings are scaled at once.
+AT_ONCE = 4096
 #: What an unused parameter has in the place of its information.
 _FAR = 1e30
 
@@ -63,11 +65,14 @@ def unit_of(noise: Array, used: np.ndarray) -> Array:
 def weakest(info: Information, ends: Array, spare: float, *, few: bool) -> Weak:
     """The directions with the smallest information in units of noise; all free directions are among them.
 
+    The information is changed: it is in units of noise afterwards.
+
     ``ends`` (n + 1,): how many ends of measurements each frame has, and how many measurements the shared scale.
     """
     used = info.used
     unit = unit_of(info.noise, used)
-    matrix = info.matrix.scaled(unit)
+    matrix = info.matrix
+    _scale(matrix, unit)
     if not all(np.isfinite(each).all() for each in (matrix.frames, matrix.couplings, matrix.tails, matrix.tail)):
         raise UnderdeterminedError(
             "what the measurements tell of the poses overflows: the translations of A and of B, or a scale, are "
@@ -92,6 +97,22 @@ def weakest(info: Information, ends: Array, spare: float, *, few: bool) -> Weak:
     thresholds = free_threshold(squares, tilted * squares, spare)
     order = np.argsort(values / thresholds)
     return Weak(values[order], thresholds[order], vectors[:, order] * unit[:, None])
+
+
+def _scale(matrix: BlockMatrix, unit: Array) -> None:
+    """Bring a matrix to diag(unit) A diag(unit) in its place: a copy of large ones takes much memory."""
+    n = len(matrix.frames)
+    of_frames, of_tail = unit[: 7 * n].reshape(n, 7), unit[7 * n :]
+    first, second = matrix.ends
+    for begin in range(0, len(first), AT_ONCE):
+        at = slice(begin, begin + AT_ONCE)
+        matrix.couplings[at] *= of_frames[first[at], :, None]
+        matrix.couplings[at] *= of_frames[second[at], None, :]
+    for blocks in (matrix.frames, matrix.tails):
+        blocks *= of_frames[:, :, None]
+    matrix.frames[...] *= of_frames[:, None, :]
+    matrix.tails[...] *= of_tail
+    matrix.tail[...] *= of_tail[:, None] * of_tail
 
 
 def _all_of(matrix: BlockMatrix, used: np.ndarray) -> tuple[Array, Array]:

@@ -40,7 +40,7 @@ class Batch:
         return Moments.of(self.A, self.B, self.weight, self.kappa, gauge, self.pair.is_motion, self.where)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Row:
     """One pair of moments that were made for many pairs at once."""
 

@@ -84,7 +84,7 @@ class Measurements:
         return KeptMeasurements((copied,), self.covariances is not None)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Section:
     """The measurements of one pair among those of many."""
 
@@ -108,7 +108,7 @@ class Section:
         return Measurements(many.A[at], many.B[at], sigma, kappa, stamps, covariances)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class KeptMeasurements:
     """Raw measurements of a pair that are kept, batch by batch, and whether any batch had covariances."""
 

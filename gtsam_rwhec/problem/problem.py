@@ -162,9 +162,10 @@ class Problem(Contents):
         self.is_relative = self.is_relative or not given.measurements.has_noise
         self._kind |= kinds
         has_covariances = covariances is not None
+        nothing = KeptMeasurements((), has_covariances)  # one for all pairs
         for number, pair in enumerate(many.pairs):
-            section = (Section(many, number),) if self.keep_measurements else ()
-            self._kept[pair] = self._kept.get(pair, KeptMeasurements()) + KeptMeasurements(section, has_covariances)
+            kept = KeptMeasurements((Section(many, number),), has_covariances) if self.keep_measurements else nothing
+            self._kept[pair] = self._kept[pair] + kept if pair in self._kept else kept
 
     def add_corners(
         self,
