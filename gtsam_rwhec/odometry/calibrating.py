@@ -63,7 +63,7 @@ def calibrate_odometries(
 ) -> OdometryCalibration:
     """Find where sensors are on a vehicle, each of which knows only its own motion.
 
-    All sensors are solved at once (design fact 23): the joint cost is certified, then the exact likelihood of all
+    All sensors are solved at once (design fact 24): the joint cost is certified, then the exact likelihood of all
     windows is refined, with the vehicle's motion as unknowns. What the drive leaves free is said.
 
     Parameters

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from rwhec_factors import se3
 
+from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.clocks import Clock
 from gtsam_rwhec.odometry.solved_windows import Answer, Task
 from gtsam_rwhec.odometry.tracks import OdometryTrack
@@ -16,6 +18,8 @@ CORRELATED = 0.3
 DOUBTED = 1.5
 #: A clock that the refinement knows to this, s, needs no first guess.
 CLOCK_KNOWN_S = 0.01
+#: The refined answer is that of the proof if it is within so many standard deviations of it.
+FAR = 10.0
 #: A pose whose standard deviation along or about an axis is larger than this is said to be loose.
 LOOSE_M, LOOSE_RAD = 0.2, float(np.radians(2.0))
 #: More of a track than this left out is said.
@@ -77,6 +81,13 @@ def findings_of(
     C = answer.freedom.covariance()
     for k, name in enumerate(task.names[1:], 1):
         sigma = np.sqrt(np.maximum(np.diagonal(C)[task.layout.at[k, :6]], 0.0))
+        moved = np.abs(se3.logmap(se3.inverse(answer.certified.T[k][None]) @ answer.fit.state.T[k])[0])
+        if _is_apart(moved, sigma, answer, task.layout.at[k, :6]):
+            said.append(
+                f"the exact likelihood moved {name} by {1e3 * np.linalg.norm(moved[3:]):.3g} mm and "
+                f"{np.degrees(np.linalg.norm(moved[:3])):.2g} degrees from the certified answer, more than {FAR:g} of "
+                "its standard deviations: the proof is of another answer"
+            )
         if sigma[3:].max() > LOOSE_M or sigma[:3].max() > LOOSE_RAD:
             said.append(
                 f"{name} is known only to {sigma[3:].max():.2g} m and {np.degrees(sigma[:3].max()):.2g} degrees (one "
@@ -85,6 +96,13 @@ def findings_of(
     if not answer.fit.converged:
         said.append("the refinement stopped before it converged; the poses may be off by more than they say")
     return tuple(said)
+
+
+def _is_apart(moved: Array, sigma: Array, answer: Answer, at: np.ndarray) -> bool:
+    """Whether a pose moved by more than ``FAR`` deviations along axes that no free direction reaches."""
+    loose = answer.freedom.by_data[at]
+    bound = (np.abs(loose) < 0.02).all(axis=1) if loose.size else np.ones(6, dtype=bool)
+    return bool((moved > FAR * np.maximum(sigma, 1e-9))[bound].any())
 
 
 def remarks_of(task: Task) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from gtsam_rwhec.solver.cause import Status
 
 @dataclass(frozen=True)
 class JointCertificate:
-    """The proof for the joint quadratic cost of all sensors (design fact 23).
+    """The proof for the joint quadratic cost of all sensors (design fact 24).
 
     The cost is half the squared residuals of the windows' rotation vectors and translations in all sensors at once,
     with the vehicle's own motion eliminated. The turn of each window inside the lever arms' term, and the length of the
@@ -33,6 +33,9 @@ class JointCertificate:
         The gap up to which the answer counts as optimal.
     region_m : float
         The bound is about all answers whose sensors are at most this far from the reference along each axis.
+    scales_held : bool
+        A mirror image with a negative scale costs less, as a vehicle that turns about one axis may make it by chance
+        (design fact 5). Then cost and bound are of the form with a term that holds each unknown scale near its value.
     """
 
     status: Status
@@ -41,6 +44,7 @@ class JointCertificate:
     min_eigenvalue: float
     tolerance: float
     region_m: float
+    scales_held: bool = False
 
     @property
     def gap(self) -> float:
@@ -53,10 +57,9 @@ class JointCertificate:
         return self.status in (Status.CERTIFIED, Status.CERTIFIED_NOT_UNIQUE)
 
     def __str__(self) -> str:
-        return (
-            f"{self.status}: joint cost {self.cost:.6g}, no answer within {self.region_m:g} m below "
-            f"{self.lower_bound:.6g}"
-        )
+        within = f" within {self.region_m:g} m" if np.isfinite(self.region_m) else ""
+        held = ", with scales held near the answer's (a mirror image fits as well)" if self.scales_held else ""
+        return f"{self.status}: joint cost {self.cost:.6g}, no answer{within} below {self.lower_bound:.6g}{held}"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the drive leaves free, and the covariance of the rest (design facts 8, 14 and 23).
+"""What the drive leaves free, and the covariance of the rest (design facts 8, 14 and 24).
 
 H is the information with the windows' motions eliminated, N the part that the noise of the estimated motions alone
 makes of it. A direction is free when its H is no more than its N would be by chance: the ratio follows an F

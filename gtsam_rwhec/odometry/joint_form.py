@@ -1,4 +1,4 @@
-"""The joint quadratic cost of all sensors' motions, which is certified (design fact 23).
+"""The joint quadratic cost of all sensors' motions, which is certified (design fact 24).
 
 With w_k the rotation vector and s_k the translation of sensor k over a window, and R_0 = I, t_0 = 0:
 

@@ -12,7 +12,7 @@ limited: entries of rotations by themselves, translations by a region.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -90,7 +90,7 @@ def solved(form: JointForm, starts: list[Array], *, axis: Array | None = None) -
             "positive ones: the motion of a sensor of unknown scale is the mirror image of the others'; are its poses "
             "inverted, or its axes left-handed?"
         )
-    return JointSolution(y, with_positive)
+    return JointSolution(y, replace(with_positive, scales_held=True))
 
 
 def _best(form: JointForm, starts: list[Array]) -> tuple[Descent, Array, JointCertificate]:

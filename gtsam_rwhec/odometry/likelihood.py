@@ -1,4 +1,4 @@
-"""The likelihood of all sensors' motions, with the vehicle's own motion eliminated window by window (design fact 23).
+"""The likelihood of all sensors' motions, with the vehicle's own motion eliminated window by window (design fact 24).
 
 Sensor k's motion over a window is M_k = T_k^-1 M T_k, with its translation times its scale; M is the motion of sensor 0
 and a nuisance. To first order in perturbations T_k Expmap(x), M Expmap(d):

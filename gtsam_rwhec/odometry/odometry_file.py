@@ -298,7 +298,10 @@ def _track(found: OdometryCalibration, name: str) -> TrackRecord:
 
 def _proof(found: JointCertificate) -> str:
     where = "no answer" if np.isinf(found.region_m) else f"no answer within {found.region_m:g} m"
-    return f"{found.status}: the joint cost is {found.cost:.6g}, and {where} costs less than {found.lower_bound:.6g}"
+    held = ", with scales held near their values, as a mirror image fits as well" if found.scales_held else ""
+    return (
+        f"{found.status}: the joint cost is {found.cost:.6g}, and {where} costs less than {found.lower_bound:.6g}{held}"
+    )
 
 
 def _rows(T: Array) -> tuple[tuple[float, ...], ...]:

@@ -49,7 +49,8 @@ from kinhec_sequences import STANDARD_SEED
 #: Scripts with tables of their own whose rows have bars; the others compare theirs with the papers'.
 WITH_BARS = (
     "coverage.py", "wrong_assumptions.py", "split_halves.py", "corner_coverage.py", "corner_wrong_intrinsics.py",
-    "corner_undetermined.py", "corner_intrinsics.py", "corner_efficiency.py", "changes.py",
+    "corner_undetermined.py", "corner_intrinsics.py", "corner_efficiency.py", "changes.py", "odometry_bounds.py",
+    "odometry_planar.py",
 )  # fmt: skip
 
 
@@ -88,6 +89,8 @@ class Sizes:
         ("corner_intrinsics.py", 200),
         ("corner_efficiency.py", 2000),
         ("changes.py", 1000),
+        ("odometry_bounds.py", 40),
+        ("odometry_planar.py", 200),
     )
     #: Of the neutral benchmark; none are run without its package.
     neutral_seeds: tuple[int, ...] = (STANDARD_SEED,)
