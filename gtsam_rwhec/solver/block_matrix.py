@@ -161,30 +161,33 @@ class BlockFactor:
 
     def solve_vector(self, v: Array) -> Array:
         """Solve for one vector (n m + q,)."""
+        return self.solve(v[:, None])[:, 0]
+
+    def solve(self, v: Array) -> Array:
+        """Solve for columns (n m + q, c)."""
         n, m, q = self.shape
-        x = np.zeros((n + 1, m))
-        x[:n] = v[: n * m].reshape(n, m)
+        c = v.shape[1]
+        x = np.zeros((n + 1, m, c))
+        x[:n] = v[: n * m].reshape(n, m, c)
         tail = v[n * m :].copy()
         for group, lower, rows in zip(self.order.groups, self.frames, self.rows, strict=True):
-            y = forward_substitution(lower, x[group.frames, :, None])
-            x[group.frames] = y[:, :, 0]
-            passed = np.matmul(y.transpose(0, 2, 1), rows)[:, 0]
+            y = forward_substitution(lower, x[group.frames])
+            x[group.frames] = y
+            passed = np.matmul(rows.transpose(0, 2, 1), y)
             k, d = group.neighbours.shape
-            sum_into(x, group.neighbours.ravel(), passed[:, : d * m].reshape(k * d, m), -1.0)
+            sum_into(x, group.neighbours.ravel(), passed[:, : d * m].reshape(k * d, m, c), -1.0)
             x[n] = 0.0
             tail -= passed[:, d * m :].sum(axis=0)
-        rest = np.concatenate([x[self.order.rest].ravel(), tail])
+        rest = np.concatenate([x[self.order.rest].reshape(-1, c), tail])
         rest = scipy.linalg.cho_solve((self.rest, True), rest, check_finite=False)
-        x[self.order.rest], tail = rest[: len(rest) - q].reshape(-1, m), rest[len(rest) - q :]
+        x[self.order.rest], tail = rest[: len(rest) - q].reshape(-1, m, c), rest[len(rest) - q :]
         for group, lower, rows in zip(
             reversed(self.order.groups), reversed(self.frames), reversed(self.rows), strict=True
         ):
             k, d = group.neighbours.shape
-            known = np.concatenate([x[group.neighbours].reshape(k, d * m), np.broadcast_to(tail, (k, q))], axis=1)
-            z = x[group.frames, :, None] - np.matmul(rows, known[:, :, None])
-            x[group.frames] = backward_substitution(lower, z)[:, :, 0]
-        whole: Array = np.concatenate([x[:n].ravel(), tail])
-        return whole
+            known = np.concatenate([x[group.neighbours].reshape(k, d * m, c), np.broadcast_to(tail, (k, q, c))], axis=1)
+            x[group.frames] = backward_substitution(lower, x[group.frames] - np.matmul(rows, known))
+        return np.concatenate([x[:n].reshape(n * m, c), tail])
 
 
 class _Factorisation:

@@ -12,11 +12,13 @@ class Start(StrEnum):
 
     GIVEN = "given start"
     SPECTRAL = "spectral start"
-    #: A negative eigenvector of Z, the unconstrained minimum of Q', or a random start.
+    #: A negative eigenvector of Z, the unconstrained minimum of Q', or a random start, of all frames or of single ones.
     BETTER = "better start"
     #: The semidefinite relaxation, solved by Clarabel or by the block method of ``interior_point``.
     CLARABEL = "relaxation (Clarabel)"
     INTERIOR_POINT = "relaxation (interior point (blocks))"
+    #: The relaxation of a few of many frames, with the others eliminated (``local_relaxation``).
+    LOCAL_RELAXATION = "relaxation of a few frames"
     #: The relaxation that has alpha >= 0 as a constraint.
     NONNEGATIVE_SCALE = "relaxation with alpha >= 0"
 
@@ -72,6 +74,7 @@ _STARTS = {
     Start.BETTER: "a better start",
     Start.CLARABEL: "the relaxation (Clarabel)",
     Start.INTERIOR_POINT: "the relaxation (interior point)",
+    Start.LOCAL_RELAXATION: "the relaxation of a few frames",
     Start.NONNEGATIVE_SCALE: "the relaxation with alpha >= 0",
 }
 _MULTIPLIERS = {
@@ -156,12 +159,21 @@ class Cause(StrEnum):
         "the answer may be a local minimum, or the multipliers of redundant constraints are needed; method='auto' "
         "finds out",
     )
-    #: The small dual and the relaxation were not tried.
+    #: More frames at once need the multipliers of all constraints than the dense methods take.
     TOO_LARGE = (
         "too_large",
         Status.GAP,
-        "the problem has {frames:.0f} unknown frames, and the semidefinite relaxation is tried up to "
-        "SolveOptions.max_dense_frames = {max_dense_frames:.0f}",
+        "the semidefinite relaxation that it takes has {frames:.0f} unknown frames, and it is tried up to "
+        "SolveOptions.max_dense_frames = {max_dense_frames:.0f}; a larger number takes time and memory with its cube "
+        "and square; look for wrong measurements first",
+    )
+    #: Fact 4 (c), for a few of many frames: the relaxation of all frames may be tight.
+    PART_NOT_TIGHT = (
+        "part_not_tight",
+        Status.GAP,
+        "the relaxation of the {relaxed:.0f} frames where the multipliers of R'R = I do not suffice is not tight: its "
+        "optimum is {relaxation_cost:.8g}, below the best answer's {cost:.8g}; the relaxation of all {frames:.0f} "
+        "unknown frames together is tried up to SolveOptions.max_dense_frames = {max_dense_frames:.0f}",
     )
     #: Fact 4 (c).
     NOT_TIGHT = (

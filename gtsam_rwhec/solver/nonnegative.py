@@ -21,7 +21,8 @@ from gtsam_rwhec.solver.point import Point
 from gtsam_rwhec.solver.reduced_form import ReducedForm
 from gtsam_rwhec.solver.relaxation import round_to_rotations, solve_with_scale
 from gtsam_rwhec.solver.rotations import vec
-from gtsam_rwhec.solver.search import Found, Search
+from gtsam_rwhec.solver.search import Search
+from gtsam_rwhec.solver.searched_part import Found
 from gtsam_rwhec.solver.small_dual import stationary_multipliers
 from gtsam_rwhec.solver.variables import answer_of
 

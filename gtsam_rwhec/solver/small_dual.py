@@ -57,16 +57,27 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
     proves x optimal: z'(Z - t P) z > 0 for all such z but 0. Where rounding errors have given Q' a negative eigenvalue,
     t is minus infinity and the multipliers are the given ones.
     """
+    x = homogeneous(R)
+    Q = form.dense()
+    Z = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
+    Z = 0.5 * (Z + Z.T)
+    Z[-1, -1] -= float(x @ Z @ x)  # the multiplier of h^2 = 1: then Z x = 0 in h's row too
+    return maximise(Z, Q, R, multipliers, max_iterations)
+
+
+def maximise(
+    Z: Array, Q: Array, R: Array, multipliers: Array, max_iterations: int = 60, enough: float = ENOUGH
+) -> tuple[Array, float]:
+    """The same for any Z with Z x = 0, over x = [vec R, 1], which is Z at the given multipliers; P is made of Q.
+
+    It stops when t is above ``enough``.
+    """
     n = len(R)
     null = null_multipliers(R)
     family = np.einsum("nmk,kpq->nmpq", null, CONSTRAINTS)
     x = homogeneous(R)
-    Q = form.dense()
-    Z0 = Q - scatter(np.einsum("nk,kpq->npq", multipliers, CONSTRAINTS))
-    Z0 = 0.5 * (Z0 + Z0.T)
-    Z0[-1, -1] -= float(x @ Z0 @ x)  # the multiplier of h^2 = 1: then Z x = 0 in h's row too
-    scale = float(np.abs(np.diagonal(Z0)).max()) or 1.0
-    Z0 /= scale
+    scale = float(np.abs(np.diagonal(Z)).max()) or 1.0
+    Z0 = Z / scale
     P = Q / scale
     P[np.diag_indices_from(P)] += 1e-9 * np.abs(np.diagonal(P)) + 1e-12
     try:
@@ -95,7 +106,7 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
         if t > best[1]:
             added = np.einsum("nm,nmk->nk", y.reshape(n, 14), null)
             best = (multipliers - scale * added, t)
-        if t > ENOUGH:
+        if t > enough:
             break
         # Newton on -t - weight log det(Z(y) - t P).
         WP = W @ P
@@ -116,8 +127,9 @@ def improve(form: ReducedForm, R: Array, multipliers: Array, max_iterations: int
             break
         decrement = float(np.sqrt(max(-(gradient @ step), 0.0) / weight))
         direction = scatter(np.einsum("nm,nmpq->npq", step[:-1].reshape(n, 14), family)) - step[-1] * P
-        # The damped step is safe and short; a step four times as long mostly stays inside too.
-        length = 1.0 if decrement < 0.25 else 4.0 / (1.0 + decrement)
+        # The damped step is safe and short; a step four times as long mostly stays inside too. None is longer than
+        # Newton's: longer ones go to and fro about the centre without end.
+        length = min(1.0, 4.0 / (1.0 + decrement))
         length = _stay_inside(Z - t * P, direction, length)
         y = y + length * step[:-1]
         t += length * step[-1]

@@ -15,7 +15,8 @@ from gtsam_rwhec.solver.cause import Cause
 from gtsam_rwhec.solver.certificate import Basis, Certificate, Objective
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
-from gtsam_rwhec.solver.search import Found, Search
+from gtsam_rwhec.solver.search import Search
+from gtsam_rwhec.solver.searched_part import Found
 from gtsam_rwhec.solver.variables import Answer, scales_of
 
 TWIN = FreeDirection(FreeKind.TWIN, FreeReason.SYMMETRY)

@@ -14,6 +14,7 @@ FIGURES = {
     "mirror_cost": 1.0,
     "frames": 130.0,
     "max_dense_frames": 120.0,
+    "relaxed": 12.0,
     "relaxation_cost": 1.5,
     "better_cost": 1.0,
     "reduced_cost": 1.9,

@@ -34,7 +34,7 @@ from gtsam_rwhec.solver.nonnegative import (
 from gtsam_rwhec.solver.options import SolveOptions
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.rotations import kkt_multipliers, random_rotations
-from gtsam_rwhec.solver.search import Found
+from gtsam_rwhec.solver.searched_part import Found
 from gtsam_rwhec.solver.variables import answer_of
 
 HELD = SolveOptions(nonnegative_scale=True)

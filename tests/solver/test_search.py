@@ -29,7 +29,8 @@ from gtsam_rwhec.simulate import Motion, Noise
 from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start, Status
 from gtsam_rwhec.solver.certificate import Certificate
 from gtsam_rwhec.solver.relaxation import solve_by_clarabel
-from gtsam_rwhec.solver.search import Found, Search
+from gtsam_rwhec.solver.search import Search
+from gtsam_rwhec.solver.searched_part import Found
 
 
 class TestEasyProblems:

@@ -64,22 +64,20 @@ class TestMethods:
         assert truth.figures["better_cost"] == pytest.approx(solution.cost)
         assert truth.lower_bound <= solution.cost
 
-    def test_many_frames_skip_the_dense_stages_and_say_so(self) -> None:
-        problem = simulated(2, 1, 1, noise=GROSS_NOISE, number_of_measurements=4).problem
+    def test_more_frames_than_the_dense_methods_take_are_said(self) -> None:
+        """Three frames that all need one another, where the dense methods may have two."""
         seen = Counter[str]()
         for seed in range(8):
             problem = simulated(2, 1, seed, noise=GROSS_NOISE, number_of_measurements=4).problem
             certificate = solved(problem, max_dense_frames=2).certificate
-            assert "small dual" not in certificate.seconds
-            assert "semidefinite relaxation" not in certificate.seconds
             if not certificate.is_optimal:
-                assert certificate.cause is Cause.TOO_LARGE
+                assert certificate.cause in (Cause.TOO_LARGE, Cause.PART_NOT_TIGHT)
                 assert "3 unknown frames" in certificate.reason
                 assert "max_dense_frames = 2" in certificate.reason
-            seen[certificate.status] += 1
+            seen[certificate.cause] += 1
             allowed = solved(problem, max_dense_frames=3).certificate
-            assert allowed.lower_bound >= certificate.lower_bound
-        assert seen[Status.GAP] >= 3
+            assert allowed.lower_bound >= certificate.lower_bound - 1e-6 * certificate.cost
+        assert seen[Cause.TOO_LARGE] >= 2
 
     def test_stages_are_told_and_timed(self) -> None:
         told: list[str] = []
