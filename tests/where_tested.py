@@ -263,7 +263,8 @@ TABLE: dict[str, dict[str, str]] = {
         "solver/test_bound.py": "curvature null_vectors part_form polish region stored_form weakest_rotation",
         "solver/test_measured_form.py": "exact_residuals given measured_priors point",
         "solver/test_reduced_form.py": "full_form variables",
-        "solver/test_search.py": "stages",
+        "solver/test_local_dual.py": "local_relaxation own_curvature",
+        "solver/test_search.py": "attempt searched_part stages",
         "solver/test_search_methods.py": "options",
     },
     "gtsam_rwhec/solving": {

@@ -11,7 +11,6 @@ from gtsam_rwhec.solver import small_dual
 from gtsam_rwhec.solver.bound import Bound, lower_bound
 from gtsam_rwhec.solver.cause import Cause, Multipliers, SearchPath, Start
 from gtsam_rwhec.solver.descent import Descent, descend
-from gtsam_rwhec.solver.frame_moves import better_frames
 from gtsam_rwhec.solver.interior_point import Relaxation
 from gtsam_rwhec.solver.local_dual import LocalDual, improve_locally
 from gtsam_rwhec.solver.local_relaxation import relax_locally
@@ -131,15 +130,20 @@ class Attempt:
                 relaxation = relax_locally(evaluation, kkt, local.form, search.options, self.stages.progress)
             if self.descend(relaxation.starts, Start.LOCAL_RELAXATION):
                 continue
+            if self.descend(search.random_starts(search.options.random_starts), Start.BETTER):
+                continue
             self._add_of_relaxation(relaxation.multipliers)
-            if self.cost - relaxation.dual <= search.tolerance(self.cost):
+            if abs(self.cost - relaxation.dual) <= search.tolerance(self.cost):
                 return self.found(Cause.ROUNDING)
             if local.needed > limit:
                 break
+            # A solver that lost its digits may say more than there is: then what is proven counts.
+            proven = self.bound.at_most(self.lowest).lower_bound
+            bound = max(relaxation.dual, proven) if relaxation.dual < self.cost else proven
             return self.found(
                 Cause.PART_NOT_TIGHT,
                 relaxed=len(local.form.frames),
-                relaxation_cost=relaxation.dual,
+                relaxation_cost=bound,
                 frames=self.form.rotations,
                 max_dense_frames=limit,
             )
@@ -162,7 +166,7 @@ class Attempt:
     def look_elsewhere(self) -> bool:
         """Look for a lower critical point: along the negative curvature of Z, from Q' as a whole, at random.
 
-        In a large part the frames start at random one by one: starts at random for all of them lead nowhere.
+        A large part starts at random last, after its local relaxation: these starts take longest and lead nowhere.
         """
         starts = []
         if self.bound.direction is not None:
@@ -173,17 +177,7 @@ class Attempt:
             starts += unconstrained_start(self.form)
             if not self.search.is_large:
                 starts += self.search.random_starts(self.search.options.random_starts)
-        improved = self.descend(starts, Start.BETTER)
-        while self.search.is_large and self._move_frames():
-            improved = True
-        return improved
-
-    def _move_frames(self) -> bool:
-        """Whether other rotations of single frames lowered the cost."""
-        options, evaluation = self.search.options, self.reached[1]
-        with self.stages.of("better starts"):
-            R = better_frames(self.search.whole, evaluation, options.random_starts, np.random.default_rng(options.seed))
-        return not np.array_equal(R, evaluation.point.rotations) and self.descend([R], Start.BETTER)
+        return self.descend(starts, Start.BETTER)
 
     @property
     def is_closed(self) -> bool:

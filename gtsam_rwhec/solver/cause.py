@@ -12,7 +12,7 @@ class Start(StrEnum):
 
     GIVEN = "given start"
     SPECTRAL = "spectral start"
-    #: A negative eigenvector of Z, the unconstrained minimum of Q', or a random start, of all frames or of single ones.
+    #: A negative eigenvector of Z, the unconstrained minimum of Q', or a random start.
     BETTER = "better start"
     #: The semidefinite relaxation, solved by Clarabel or by the block method of ``interior_point``.
     CLARABEL = "relaxation (Clarabel)"
@@ -164,15 +164,15 @@ class Cause(StrEnum):
         "too_large",
         Status.GAP,
         "the semidefinite relaxation that it takes has {frames:.0f} unknown frames, and it is tried up to "
-        "SolveOptions.max_dense_frames = {max_dense_frames:.0f}; a larger number takes time and memory with its cube "
-        "and square; look for wrong measurements first",
+        "SolveOptions.max_dense_frames = {max_dense_frames:.0f}; look for wrong measurements first; a larger number is "
+        "allowed, and takes much time and memory",
     )
     #: Fact 4 (c), for a few of many frames: the relaxation of all frames may be tight.
     PART_NOT_TIGHT = (
         "part_not_tight",
         Status.GAP,
-        "the relaxation of the {relaxed:.0f} frames where the multipliers of R'R = I do not suffice is not tight: its "
-        "optimum is {relaxation_cost:.8g}, below the best answer's {cost:.8g}; the relaxation of all {frames:.0f} "
+        "the multipliers of R'R = I do not suffice for {relaxed:.0f} frames, and the relaxation of these proves no "
+        "more than {relaxation_cost:.8g}, below the best answer's {cost:.8g}; the relaxation of all {frames:.0f} "
         "unknown frames together is tried up to SolveOptions.max_dense_frames = {max_dense_frames:.0f}",
     )
     #: Fact 4 (c).

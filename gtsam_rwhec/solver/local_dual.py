@@ -21,7 +21,7 @@ import numpy as np
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.local_blocks import scatter
-from gtsam_rwhec.solver.own_forms import own_curvature
+from gtsam_rwhec.solver.own_curvature import own_curvature
 from gtsam_rwhec.solver.part_form import PartForm
 from gtsam_rwhec.solver.point import Evaluation
 from gtsam_rwhec.solver.rotations import CONSTRAINTS
@@ -196,7 +196,8 @@ def _frames_of(vectors: Array) -> np.ndarray:
     """The frames whose rotations the directions (13 n + 1, k) reach."""
     n = len(vectors) // 13
     squares = (vectors[:-1].reshape(n, 13, -1)[:, 4:] ** 2).sum(axis=1)
-    result: np.ndarray = np.flatnonzero((squares >= SHARE * squares.sum(axis=0)).any(axis=1))
+    least = np.minimum(SHARE * squares.sum(axis=0), squares.max(axis=0, initial=0.0))  # the first frame in any case
+    result: np.ndarray = np.flatnonzero((squares >= least).any(axis=1))
     return result
 
 

@@ -25,11 +25,14 @@ class SolveOptions:
     max_descent_iterations : int
         Riemannian Newton steps from one start; three to ten are usual.
     random_starts : int
-        Number of random starts that are tried before the relaxation, when the first answer is not proven.
+        Number of random starts that are tried before the relaxation, when the first answer is not proven; in a part
+        with more than ``max_dense_frames`` frames, after the relaxation of a few of them.
     seed : int
         Seed of the random starts. The same problem gives the same answer.
     max_dense_frames : int
-        With more free frames, the search skips the small dual and the semidefinite relaxation, which are dense.
+        So many frames at once have the multipliers of all constraints (small dual, semidefinite relaxation), which are
+        dense. In a part with more free frames these are the frames where the multipliers of R'R = I do not suffice,
+        and those that help them most; all others are eliminated.
     relaxation_tolerance : float
         Relative gap at which the semidefinite solver stops; a descent follows anyway.
     max_relaxation_iterations : int

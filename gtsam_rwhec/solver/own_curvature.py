@@ -1,4 +1,4 @@
-"""The cost of one frame with all others held: a form of its rotation, r'M r + 2 l'r, for all frames at once."""
+"""The curvature of Z along the rotation of one frame with all others held, for all frames at once."""
 
 from __future__ import annotations
 
@@ -6,21 +6,10 @@ import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.part_form import PartForm
-from gtsam_rwhec.solver.point import Evaluation
 from gtsam_rwhec.solver.rotations import CONSTRAINTS_FLAT
 
 #: What is added to the own translation's and scale's diagonal, as a part of it, where they are free.
 FREE = 1e-9
-
-
-def own_forms(whole: PartForm, evaluation: Evaluation) -> tuple[Array, Array]:
-    """M (n, 9, 9) and l (n, 9) of each frame: its own translation and scale are eliminated."""
-    own, inner = _own_blocks(whole)
-    rest = evaluation.gradient[:-1].reshape(-1, 13) - np.einsum("nij,nj->ni", own, evaluation.point.numbers)
-    solved = np.linalg.solve(inner, np.concatenate([own[:, :4, 4:], rest[:, :4, None]], axis=2))
-    M = own[:, 4:, 4:] - np.matmul(own[:, 4:, :4], solved[:, :, :9])
-    linear = rest[:, 4:] - np.matmul(own[:, 4:, :4], solved[:, :, 9:])[:, :, 0]
-    return 0.5 * (M + M.transpose(0, 2, 1)), linear
 
 
 def own_curvature(whole: PartForm, multipliers: Array) -> Array:
