@@ -42,6 +42,11 @@ def remarks(watched: Watched) -> tuple[str, ...]:
             f"A robot that nothing happens to has one false alarm in {1.0 / watched.rate:,.0f} nights: of the {tested} "
             f"nights that were tested, about {tested * watched.rate:.2g}."
         )
+    if watched.of_moments:
+        found.append(
+            f"{watched.of_moments} nights are of moments alone, whose covariances may be too small in some directions "
+            "and too large in others: false alarms may be more frequent than stated. --refine finds the noise."
+        )
     variance, correlation = watched.spread.variance, watched.spread.correlation
     if not AS_STATED[0] <= variance <= AS_STATED[1]:
         found.append(

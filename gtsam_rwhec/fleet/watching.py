@@ -26,6 +26,7 @@ from gtsam_rwhec.fleet.watch_events import (
 )
 from gtsam_rwhec.geometry.blas_threads import one_blas_thread
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.solver.certificate import Basis
 
 #: Nanoseconds of a day.
 DAY_NS = 86_400_000_000_000
@@ -45,12 +46,15 @@ class Watched:
         Robots with at least one night that can be used.
     spread : FoundSpread
         How the nights scatter beside what their covariances say, from all of them.
+    of_moments : int
+        Nights whose answer is of the moments alone, without ``--refine``.
     """
 
     rate: float
     events: tuple[Event, ...]
     robots: dict[str, RobotChart]
     spread: FoundSpread
+    of_moments: int
 
     @property
     def alarms(self) -> tuple[AlarmEvent, ...]:
@@ -138,7 +142,8 @@ def watch(rows: Iterable[RobotRow], rate: float = RATE) -> Watched:
         robot.last = [*robot.last[-1:], night]
     for each in fresh:
         pool.add(*each)
-    return Watched(rate, tuple(events), robots, pool.found())
+    of_moments = sum(row.basis is Basis.MOMENTS for row in usable)
+    return Watched(rate, tuple(events), robots, pool.found(), of_moments)
 
 
 def _one_for_each_time(rows: list[RobotRow]) -> list[RobotRow]:
