@@ -83,6 +83,11 @@ class DaskCluster:
         """The scheduler's number of process."""
         return self._scheduler.pid
 
+    @property
+    def workers_pid(self) -> int:
+        """The number of the process whose children the workers are."""
+        return self._workers.pid
+
     def gone(self) -> str:
         """Which process has ended, and its last words; empty while all run."""
         for process, name in ((self._scheduler, "scheduler"), (self._workers, "process of the workers")):

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from gtsam_rwhec.errors import FileFormatError, RigError, StoreError, UnfinishedRigWarning
+from gtsam_rwhec.files.atomic_write import write_atomically
 from gtsam_rwhec.files.yaml_lines import parse_yaml
 from gtsam_rwhec.fleet.manifest import joined
 from gtsam_rwhec.fleet.stores import read_bytes
@@ -61,7 +62,7 @@ class RigSource:
             if not PurePosixPath(name).is_absolute():
                 place = base / name
                 place.parent.mkdir(parents=True, exist_ok=True)
-                place.write_bytes(content)
+                write_atomically(place, content)
         return _in_words(self.text, shown(self.url), base)
 
     def parsed(self) -> None:
