@@ -55,6 +55,9 @@ class OdometryCalibration:
         How the answer depends on what was given.
     others : tuple of OtherAnswer
         Other answers that fit alike.
+    contradictions : tuple of str
+        Where a given distance moves a pose away from where the motions have it, in sentences: the poses are not to be
+        used.
     findings : tuple of str
         What is doubtful, in sentences: the verdict is to use the poses with care.
     remarks : tuple of str
@@ -78,6 +81,7 @@ class OdometryCalibration:
     residuals: dict[str, tuple[float, float]] = field(hash=False)
     influences: tuple[Influence, ...] = ()
     others: tuple[OtherAnswer, ...] = ()
+    contradictions: tuple[str, ...] = ()
     findings: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
 
@@ -115,11 +119,13 @@ def _verdict(found: OdometryCalibration) -> str:
         return "Do not use these poses: no proof that they are the best was found."
     if found.free_directions:
         return (
-            "Use these poses with care: the drive does not determine all of them. What is free is below; "
+            "Do not use these poses: the drive does not determine all of them. What is free is below; "
             "drive other turns (slopes, ramps), or give heights, the ground, a direction or a distance."
         )
     if found.others:
-        return "Use these poses with care: another answer fits as well. Look which of them is yours."
+        return "Do not use these poses: another answer fits as well. Look which of them is yours."
+    if found.contradictions or any(one.is_contradicted for one in found.influences):
+        return "Do not use these poses: what was given contradicts the motions. Measure it again."
     if found.findings:
         return "Use these poses with care: read the findings first."
     return "Use these poses."
@@ -130,7 +136,7 @@ def _in_words(found: OdometryCalibration) -> str:
     lines = [_verdict(found)]
     lines += [f"- free: {direction}" for direction in found.free_directions]
     lines += [f"- another answer: {other.why} (cost {other.cost_above:+.2g})" for other in found.others]
-    lines += [f"- {finding}" for finding in found.findings]
+    lines += [f"- {finding}" for finding in (*found.contradictions, *found.findings)]
     lines += [f"- {remark}" for remark in found.remarks]
     lines.append(f"{found.certificate}")
     lines += [_sensor(found, name) for name in found.order]

@@ -81,13 +81,8 @@ def findings_of(
     C = answer.freedom.covariance()
     for k, name in enumerate(task.names[1:], 1):
         sigma = np.sqrt(np.maximum(np.diagonal(C)[task.layout.at[k, :6]], 0.0))
-        moved = np.abs(se3.logmap(se3.inverse(answer.certified.T[k][None]) @ answer.fit.state.T[k])[0])
-        if _is_apart(moved, sigma, answer, task.layout.at[k, :6]):
-            said.append(
-                f"the exact likelihood moved {name} by {1e3 * np.linalg.norm(moved[3:]):.3g} mm and "
-                f"{np.degrees(np.linalg.norm(moved[:3])):.2g} degrees from the certified answer, more than {FAR:g} of "
-                "its standard deviations: the proof is of another answer"
-            )
+        if not task.given.given.distances_m and (apart := _apart(answer, task, k, sigma)):
+            said.append(f"the exact likelihood moved {name} by {apart}: the proof is of another answer")
         if sigma[3:].max() > LOOSE_M or sigma[:3].max() > LOOSE_RAD:
             said.append(
                 f"{name} is known only to {sigma[3:].max():.2g} m and {np.degrees(sigma[:3].max()):.2g} degrees (one "
@@ -98,11 +93,30 @@ def findings_of(
     return tuple(said)
 
 
-def _is_apart(moved: Array, sigma: Array, answer: Answer, at: np.ndarray) -> bool:
-    """Whether a pose moved by more than ``FAR`` deviations along axes that no free direction reaches."""
+def contradictions_of(answer: Answer, task: Task) -> tuple[str, ...]:
+    """What distances move of what the motions tell: the certified answer is without them."""
+    if not task.given.given.distances_m:
+        return ()
+    C, said = answer.freedom.covariance(), []
+    for k, name in enumerate(task.names[1:], 1):
+        sigma = np.sqrt(np.maximum(np.diagonal(C)[task.layout.at[k, :6]], 0.0))
+        if apart := _apart(answer, task, k, sigma):
+            said.append(f"the given distances contradict the motions: they moved {name} by {apart}")
+    return tuple(said)
+
+
+def _apart(answer: Answer, task: Task, k: int, sigma: Array) -> str:
+    """How far a pose moved, if by more than ``FAR`` deviations along axes that no free direction reaches, or ""."""
+    at = task.layout.at[k, :6]
+    moved = np.abs(se3.logmap(se3.inverse(answer.certified.T[k][None]) @ answer.fit.state.T[k])[0])
     loose = answer.freedom.by_data[at]
     bound = (np.abs(loose) < 0.02).all(axis=1) if loose.size else np.ones(6, dtype=bool)
-    return bool((moved > FAR * np.maximum(sigma, 1e-9))[bound].any())
+    if not (moved > FAR * np.maximum(sigma, 1e-9))[bound].any():
+        return ""
+    return (
+        f"{1e3 * np.linalg.norm(moved[3:]):.3g} mm and {np.degrees(np.linalg.norm(moved[:3])):.2g} degrees from the "
+        f"certified answer, more than {FAR:g} of its standard deviations"
+    )
 
 
 def remarks_of(task: Task) -> tuple[str, ...]:
@@ -119,6 +133,11 @@ def remarks_of(task: Task) -> tuple[str, ...]:
         said.append(
             "heights count along the axis that the vehicle turned about, with up along "
             f"({', '.join(f'{x:.2f}' for x in n)}) of {task.names[0]}; give the ground if up is another way"
+        )
+    if ground is not None and task.given.normal[2] < -0.5:
+        said.append(
+            f"the given ground has its up along -z of {task.names[0]}: that sensor hangs upside down. If it does not, "
+            "turn the sign of up, since all heights have the wrong sign"
         )
     return tuple(said)
 

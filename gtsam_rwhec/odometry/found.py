@@ -10,6 +10,9 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import Twist
 from gtsam_rwhec.solver.cause import Status
 
+#: What is given is contradicted by the data from so many standard deviations on.
+CONTRADICTED = 4.0
+
 
 @dataclass(frozen=True)
 class JointCertificate:
@@ -101,7 +104,8 @@ class Influence:
     per_sigma : dict of sensor to (6,)
         How far the pose moves if the number is off by one sigma: rad and m.
     off_by : float
-        How far the answer is from the number, in the sigmas of their difference; above 3 the data contradict it.
+        How far the answer is from the number, in the sigmas of their difference; above ``CONTRADICTED`` the data
+        contradict it. Zero where the motions do not measure it.
     """
 
     what: str
@@ -111,6 +115,11 @@ class Influence:
     per_unit: dict[str, Twist] = field(hash=False)
     per_sigma: dict[str, Twist] = field(hash=False)
     off_by: float = 0.0
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the motions contradict the number."""
+        return self.off_by > CONTRADICTED
 
 
 @dataclass(frozen=True)

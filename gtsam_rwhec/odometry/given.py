@@ -14,6 +14,9 @@ Vector = tuple[float, float, float]
 #: What has a known direction: an axis of the sensor, or the line from the reference sensor to it.
 DirectionOf = Literal["x", "y", "z", "lever_arm"]
 
+#: No two sensors of a vehicle are further apart, metres; nor further above the ground.
+MOST_M = 150.0
+
 
 @dataclass(frozen=True)
 class Ground:
@@ -94,7 +97,8 @@ class Given:
         NoiseError
             A standard deviation is not positive and finite.
         OptionError
-            A value is not finite, a distance or height not sensible, or a direction has no length.
+            A value is not finite or larger than a vehicle, a distance or height not sensible, or a direction has no
+            length.
         """
         for where, named in self._named():
             if named not in sensors:
@@ -106,6 +110,11 @@ class Given:
                 raise OptionError(f"{where} is {value!r}; give a finite number")
             if not (np.isfinite(sigma) and sigma > 0.0):
                 raise NoiseError(f"{where} has the standard deviation {sigma!r}; give a positive number")
+            if abs(value) > MOST_M:
+                raise OptionError(
+                    f"{where} is {value:g} m, and no vehicle is larger than {MOST_M:g} m; give metres: {value:g} mm "
+                    f"would be {1e-3 * value:g}"
+                )
         for where, direction in self._vectors():
             length = float(np.linalg.norm(direction)) if len(direction) == 3 else 0.0
             if not (np.isfinite(length) and length > 0.0):

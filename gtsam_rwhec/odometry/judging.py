@@ -12,8 +12,6 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.identifiability.free_directions import FreeDirection, FreeReason
 from gtsam_rwhec.odometry.calibrated import OdometryCalibration
 
-#: What is given is contradicted by the data from so many standard deviations on.
-CONTRADICTED = 4.0
 #: So many of them are named.
 NAMED = 4
 #: A sensor takes part in a free direction from this part of the direction's largest shift or turn on.
@@ -28,6 +26,10 @@ WHAT_TO_DO = (
 #: What to do where what was given is contradicted.
 MEASURE_AGAIN = "measure again what is given, in metres and in the axes of the reference, and correct the rig file"
 PRAISE = "the motions of all sensors agree, their joint cost is certified, and they determine every pose"
+PRAISE_WITH_GIVEN = (
+    "the motions of all sensors agree, their joint cost is certified, and with what was given they determine every "
+    "pose. The motions do not check all that was given: an error in it is an error of the poses"
+)
 
 
 def judgement_of(found: OdometryCalibration) -> Judgement:
@@ -38,15 +40,17 @@ def judgement_of(found: OdometryCalibration) -> Judgement:
     findings += [Finding(Ground.NOT_UNIQUE, words) for words in free_in_words(found)]
     findings += [Finding(Ground.NOT_UNIQUE, f"another answer fits as well: {other.why}") for other in found.others]
     findings += _contradicted(found)
+    findings += [Finding(Ground.POSE_DOUBTED, words) for words in found.contradictions]
     findings += [Finding(Ground.COVARIANCE_DOUBTED, words) for words in found.findings]
-    judgement = Judgement.of(findings, PRAISE)
+    is_unchecked = any(one.off_by == 0.0 for one in found.influences)
+    judgement = Judgement.of(findings, PRAISE_WITH_GIVEN if is_unchecked else PRAISE)
     reason = judgement.reason.replace(Ground.NOT_UNIQUE.advice, WHAT_TO_DO)
     return replace(judgement, reason=reason.replace(Ground.POSE_DOUBTED.advice, MEASURE_AGAIN))
 
 
 def _contradicted(found: OdometryCalibration) -> list[Finding]:
     """The given numbers that are farthest from the motions, if they contradict them; one that is wrong pulls others."""
-    wrong = sorted((one for one in found.influences if one.off_by > CONTRADICTED), key=lambda one: -one.off_by)
+    wrong = sorted((one for one in found.influences if one.is_contradicted), key=lambda one: -one.off_by)
     if not wrong:
         return []
     named = ", ".join(f"{one.what} = {one.value:g} {one.unit} ({one.off_by:.1f})" for one in wrong[:NAMED])

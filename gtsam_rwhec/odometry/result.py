@@ -19,7 +19,7 @@ from gtsam_rwhec.identifiability.free_directions import (
 )
 from gtsam_rwhec.odometry.calibrated import OdometryCalibration
 from gtsam_rwhec.odometry.clocks import Clock
-from gtsam_rwhec.odometry.findings import findings_of, remarks_of, residual_sizes
+from gtsam_rwhec.odometry.findings import contradictions_of, findings_of, remarks_of, residual_sizes
 from gtsam_rwhec.odometry.found import Influence, Windows
 from gtsam_rwhec.odometry.freedom import REACHES, seven_each
 from gtsam_rwhec.odometry.other_answers import other_answers
@@ -87,6 +87,7 @@ def calibration_of(
         residuals=residual_sizes(answer, names),
         influences=_influences(answer, task, change, order),
         others=others,
+        contradictions=contradictions_of(answer, task),
         findings=findings_of(answer, task, tracks, clocks, sigmas),
         remarks=remarks_of(task),
     )

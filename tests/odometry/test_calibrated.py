@@ -37,7 +37,7 @@ def _calibration(status: Status, others: tuple[OtherAnswer, ...] = ()) -> Odomet
     [
         (Status.CERTIFIED, (), "Use these poses."),
         (Status.GAP, (), "Do not use these poses: no proof"),
-        (Status.CERTIFIED, (OtherAnswer("the distance has two signs", {}),), "Use these poses with care: another"),
+        (Status.CERTIFIED, (OtherAnswer("the distance has two signs", {}),), "Do not use these poses: another"),
     ],
 )
 def test_the_verdict_is_the_first_line(status: Status, others: tuple[OtherAnswer, ...], first: str) -> None:

@@ -69,7 +69,7 @@ def test_a_drive_on_a_plane_leaves_every_height_free_and_says_so(planar: Drive) 
         assert abs(up[2]) > 0.99
         assert "turned about one axis only" in str(free)
     assert found.status == "certified_not_unique"
-    assert str(found).startswith("Use these poses with care: the drive does not determine all")
+    assert str(found).startswith("Do not use these poses: the drive does not determine all")
 
 
 def test_heights_hold_it_and_the_answer_says_how_it_depends_on_them(planar: Drive) -> None:
@@ -139,3 +139,15 @@ def test_a_track_of_another_drive_is_refused(hilly: Drive) -> None:
     mixed = [*tracks(hilly)[:3], replace(other[1], sensor="alien")]
     with pytest.raises(OutlierError, match="alien"):
         odometry.calibrate_odometries(mixed, reference="lidar", options=ONE_CLOCK)
+
+
+def test_a_wrong_distance_and_an_unchecked_height_do_not_say_use(planar: Drive) -> None:
+    pair = [track for track in tracks(planar) if track.sensor in ("lidar", "rear")]
+    far = odometry.Given(distances_m={("lidar", "rear"): (40.0, 0.002)})
+    found = odometry.calibrate_odometries(pair, reference="lidar", given=far, options=ONE_CLOCK)
+    judgement = odometry.judgement_of(found)
+    assert judgement.verdict == "do_not_use"
+    assert str(found).startswith("Do not use these poses")
+    high = odometry.Given(heights_m={"lidar": (2.0, 0.01), "rear": (9.0, 0.01)})
+    found = odometry.calibrate_odometries(pair, reference="lidar", given=high, options=ONE_CLOCK)
+    assert "The motions do not check all that was given" in odometry.judgement_of(found).reason
