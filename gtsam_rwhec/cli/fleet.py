@@ -65,7 +65,7 @@ def run(
     something failed, or that poses are not to be used.
     """
     memory_bytes = rw.fleet.bytes_of(memory_per_worker)
-    is_pattern = any(sign in manifest for sign in "*?[")
+    is_pattern = rw.fleet.is_pattern(manifest)
     if is_pattern != (rig is not None):
         needed = "a pattern of logs needs --rig FILE" if is_pattern else "--rig goes with a pattern of logs"
         raise typer.BadParameter(f"{needed}; a manifest names its rig files itself")

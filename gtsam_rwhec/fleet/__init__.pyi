@@ -2,6 +2,7 @@
 from .manifest import LogSource as LogSource
 from .manifest import Manifest as Manifest
 from .manifest import Robot as Robot
+from .manifest import is_pattern as is_pattern
 from .manifest import manifest_of_pattern as manifest_of_pattern
 from .manifest import parse_manifest as parse_manifest
 from .manifest import read_manifest as read_manifest

@@ -34,7 +34,7 @@ def check_rigs(rigs: Mapping[str, Sequence[tuple[str, Rig]]]) -> None:
     first_robot, first_url, first = everyone[0]
     for robot, url, rig in everyone[1:]:
         places = f"{shown(first_url)} and {shown(url)}"
-        for name in first.targets.keys() & rig.targets.keys():
+        for name in sorted(first.targets.keys() & rig.targets.keys()):
             one, other = first.targets[name], rig.targets[name]
             if one != other:
                 found.append(f"target {name} differs between {places} ({_difference(one, other)})")
@@ -50,7 +50,7 @@ def check_rigs(rigs: Mapping[str, Sequence[tuple[str, Rig]]]) -> None:
         ]
         if robot != first_robot:
             continue
-        for name in first.sensors.keys() & rig.sensors.keys():
+        for name in sorted(first.sensors.keys() & rig.sensors.keys()):
             one_camera, other_camera = first.sensors[name].intrinsics, rig.sensors[name].intrinsics
             if one_camera != other_camera:
                 found.append(

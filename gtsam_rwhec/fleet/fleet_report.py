@@ -132,6 +132,8 @@ def _short(words: str | None) -> str:
 
 
 def _done(run: FleetRun) -> str:
+    if not run.new_tasks and any(not row.is_fine and (row.failure or row.failed_logs) for row in run.rows):
+        return f"Nothing new was computed; {run.earlier_tasks} files were there already. {run.seconds:.1f} s."
     if not run.new_tasks:
         return f"Everything was done already ({run.earlier_tasks} files); nothing was computed. {run.seconds:.1f} s."
     earlier = f" {run.earlier_tasks} were there already." if run.earlier_tasks else ""

@@ -58,7 +58,7 @@ class LogSource:
     @property
     def is_pattern(self) -> bool:
         """Whether the URL stands for all logs that match it."""
-        return _PATTERN.search(self.url) is not None
+        return is_pattern(self.url)
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,12 @@ class Manifest:
             if robot.site is not None:
                 found[robot.site] = (*found.get(robot.site, ()), robot)
         return found
+
+
+def is_pattern(url: str) -> bool:
+    """Whether a URL stands for all files that match it. What follows "?" in a URL of http is its query."""
+    place = url.partition("?")[0] if url.lower().startswith(("http://", "https://")) else url
+    return _PATTERN.search(place) is not None
 
 
 def read_manifest(url: str) -> Manifest:

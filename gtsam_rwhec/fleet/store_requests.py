@@ -84,9 +84,10 @@ def requested(
                 raise fault from None  # the library's own error may repeat credentials
             if attempt == most:
                 said = without_secrets(_words(error), url, options)
+                times = f"{most} times" if most > 1 else "once"
                 came = f" {how_far()}." if how_far is not None else ""
                 raise StoreInterruptedError(
-                    f"{what}: the store broke off or did not answer, {most} times, at last: {said}.{came} Try again "
+                    f"{what}: the store broke off or did not answer, {times}, at last: {said}.{came} Try again "
                     "when it answers; nothing that is done is lost."
                 ) from None
             time.sleep(PAUSE_S * 2 ** (attempt - 1) * random.uniform(1.0, 1.5))
@@ -110,6 +111,8 @@ def _fault(error: Exception, what: str, url: str, options: Mapping[str, Any] | N
             f"{what}: refused ({said}). Check the rights and the credentials: they come from the environment, from the "
             "store's own configuration files, or from the storage options."
         )
+    if status is None and "://" in url and _is_of_connection(error):  # fsspec tells it as a file that is not there
+        return None
     if isinstance(error, FileNotFoundError) or status in (404, 410) or any(word in text for word in _ABSENT):
         return StoreError(f"{what}: it is not there ({said}).")
     if isinstance(error, OSError) and error.errno in _OF_DISKS:
@@ -119,6 +122,13 @@ def _fault(error: Exception, what: str, url: str, options: Mapping[str, Any] | N
     if any(word in text for word in _PASSING):
         return None
     return StoreError(f"{what}: {said}.")
+
+
+def _is_of_connection(error: BaseException) -> bool:
+    """Whether nobody answered: the error, or one that it came from, is of the way to the store."""
+    cause = error.__cause__ or error.__context__
+    of_way = "ClientConnect" in type(error).__name__ or isinstance(error, ConnectionError | asyncio.TimeoutError)
+    return of_way or (cause is not None and _is_of_connection(cause))
 
 
 def _words(error: BaseException) -> str:

@@ -57,7 +57,7 @@ def size_of(url: str, options: Options | None = None) -> int:
     """Bytes of a file."""
     path = local_path(url)
     if path is not None:
-        return requested(lambda: os.stat(path), f"the size of {path}", url).st_size
+        return requested(lambda: os.stat(path), str(path), url).st_size
     size = _info(url, options).get("size")
     if size is None:
         raise StoreError(f"{shown(url)}: its server does not say how many bytes it has; copy the file to a disk.")
@@ -68,7 +68,7 @@ def stamp_of(url: str, options: Options | None = None) -> str:
     """What changes when the file does: its ETag or checksum in the store, or else its size and time of change."""
     path = local_path(url)
     if path is not None:
-        status = requested(lambda: os.stat(path), f"the size of {path}", url)
+        status = requested(lambda: os.stat(path), str(path), url)
         return f"{status.st_size}-{status.st_mtime_ns}"
     info = _info(url, options)
     names = ("ETag", "etag", "md5Hash", "generation", "Content-MD5", "LastModified", "updated", "mtime", "created")

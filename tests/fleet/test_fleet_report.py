@@ -52,6 +52,7 @@ def test_the_command_and_its_exit_status(tmp_path: Path) -> None:
     assert failed.exit_code == 1
     assert failed.stdout.startswith("1 calibration: 1 failed. 1 log could not be used.")
     assert "What failed\n  - a: no calibration from " in failed.stdout
+    assert "Nothing new was computed; 0 files were there already." in failed.stdout
     assert (tmp_path / "out" / "fleet.json").is_file()
     for arguments, words in (
         ([f"{tmp_path}/*.mcap"], "needs --rig"),

@@ -81,3 +81,16 @@ def test_every_fault_has_its_line(old: str, new: str, line: int, words: str) -> 
 def test_a_manifest_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(rw.errors.ManifestError, match=r"none\.yaml cannot be read"):
         fleet.read_manifest(str(tmp_path / "none.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("url", "expected"),
+    [
+        ("logs/*.mcap", True),
+        ("s3://logs/night_?.mcap", True),
+        ("https://host/a.mcap?X-Amz-Signature=abc&part[0]=*", False),
+        ("https://host/*.mcap?token=abc", True),
+    ],
+)
+def test_a_signed_url_is_no_pattern(url: str, expected: bool) -> None:
+    assert fleet.is_pattern(url) is expected

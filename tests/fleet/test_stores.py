@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -170,3 +171,11 @@ def test_a_server_without_ranges_is_counted_for_what_it_sends(server: str) -> No
         assert stores.read_ranges(f"{server}/no_ranges", [(10, 20)]) == [CONTENT[10:20]]
     assert count.count == len(CONTENT)
     assert stores.stamp_of(f"{server}/no_ranges") == "4096-abc"
+
+
+def test_a_server_that_nobody_reaches_is_not_a_file_that_is_not_there(server: str) -> None:
+    with socket.socket() as taken:  # bound, and nobody listens
+        taken.bind(("127.0.0.1", 0))
+        with pytest.raises(StoreInterruptedError, match="did not answer, 4 times") as told:
+            stores.stamp_of(f"http://anna:s3cretword@127.0.0.1:{taken.getsockname()[1]}/a.mcap")
+    assert "s3cretword" not in str(told.value)
