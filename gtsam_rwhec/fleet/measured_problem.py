@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,12 +37,15 @@ class MeasuredProblem:
     estimated : tuple of str
         Sensors whose clocks are to be estimated along `path`.
     path : Trajectory or None
+    covariances : dict of (target, sensor) to (N, 6, 6) array
+        Of the pairs whose measurements all have one, whether or not they are weighted by it.
     """
 
     problem: Problem
     carrier_noise: CarrierNoise | None
     estimated: tuple[str, ...] = ()
     path: Trajectory | None = None
+    covariances: dict[Pair, Array] = field(default_factory=dict)
 
 
 def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_site: bool) -> MeasuredProblem:
@@ -68,6 +71,7 @@ def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_sit
     problem = Problem("per_target" if free else "known")
     boards = {target.name: target.corners() for each in rigs.values() for target in each.target_list}
     paths: list[tuple[np.ndarray, Array]] = []
+    covariances: dict[Pair, list[Array | None]] = {}
     common_s = {} if at_site else _common_offsets(of, rig)
     for log in sorted(of.logs, key=lambda one: (one.facts.begin_ns, one.key)):
         file = measurements_file(partial_file(log.key))
@@ -77,6 +81,9 @@ def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_sit
         kept = _at_offsets(read_kept(content, file), log.facts.cleaning.time_offsets_s, common_s)
         names = {s: sensor_name(log.robot, s) for s in rigs[log.robot].sensors} if at_site else {}
         _add(problem, kept, names, log.facts.weighting, rig, log.facts.url)
+        for pair, one in kept.pairs.items():
+            named = Pair(pair.target, names.get(pair.sensor, pair.sensor))
+            covariances.setdefault(named, []).append(one.covariances)
         for name, camera in ((name, log.facts.camera(name)) for name in log.facts.cameras):
             if name in problem.sensors and name not in problem.cameras and _has_corners(problem, name):
                 problem.cameras[name] = camera
@@ -99,7 +106,14 @@ def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_sit
         ),
         estimated if has_path else (),
         _joined(paths) if has_path else None,
+        {pair: np.concatenate(whole) for pair, of_logs in covariances.items() if (whole := _whole(of_logs))},
     )
+
+
+def _whole(covariances: list[Array | None]) -> list[Array]:
+    """The covariances of all logs; none where one log has none."""
+    there = [one for one in covariances if one is not None]
+    return there if len(there) == len(covariances) else []
 
 
 def _common_offsets(of: Merged, rig: Rig) -> dict[str, float]:

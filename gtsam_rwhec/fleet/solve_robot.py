@@ -149,8 +149,8 @@ def _answer(task: UnitTask, output: str, outcomes: tuple[Receipt | Failed, ...],
     results: dict[str, str] = {}
     at_site = task.site is not None
     for unit, one in units.items():
-        measured = measured_problem(one, rigs, output, at_site=at_site) if task.refine else None
-        found = calibrated(one, rigs, measured, at_site=at_site)
+        measured = measured_problem(one, rigs, output, at_site=at_site)
+        found = calibrated(one, rigs, measured, refine=task.refine, at_site=at_site)
         results[unit] = found.result.decode("utf-8", "surrogateescape")
         rows += rows_of(unit, task.site, one, found)
     return Answer(tuple(rows), results)

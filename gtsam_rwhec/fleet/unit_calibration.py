@@ -12,6 +12,7 @@ from gtsam_rwhec.calibration.calibrating import calibrate
 from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.fleet.consistency import check_logs
+from gtsam_rwhec.fleet.detection_covariance import with_covariances_of_detections
 from gtsam_rwhec.fleet.log_facts import findings_of_logs, merged_fields
 from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
 from gtsam_rwhec.fleet.merging import Merged
@@ -58,7 +59,7 @@ def joined_rig(rigs: Sequence[Rig]) -> Rig:
 
 
 def calibrated(
-    of: Merged, rigs: Mapping[str, Rig], measured: MeasuredProblem | None, *, at_site: bool
+    of: Merged, rigs: Mapping[str, Rig], measured: MeasuredProblem, *, refine: bool, at_site: bool
 ) -> UnitCalibration:
     """Calibrate a unit.
 
@@ -68,8 +69,11 @@ def calibrated(
         Its logs and their moments.
     rigs : dict of str to Rig
         By robot.
-    measured : MeasuredProblem or None
-        Its measurements; None: from the moments.
+    measured : MeasuredProblem
+        Its measurements.
+    refine : bool
+        Whether to calibrate from the measurements. Else from the moments; the measurements' covariances are then those
+        of the answer (`detection_covariance`).
     at_site : bool
         Whether several robots are solved together.
 
@@ -90,7 +94,7 @@ def calibrated(
         sizes="known" if rig.sizes == "known" else "check",
         time_offsets=False,
     )
-    if measured is None:
+    if not refine:
         problem = problem_of_moments(
             of.moments.moments(),
             of.moments.gauge,
@@ -109,6 +113,8 @@ def calibrated(
             carrier_path=measured.path if measured.estimated else None,
         )
     found = calibrate(problem, options)
+    if not refine:
+        found = with_covariances_of_detections(found, measured.problem, measured.covariances)
     counts = {pair: (used, there) for pair, (used, there) in found.outliers.counts.items()}
     if not counts:
         counts = {pair: (int(n), int(n)) for pair, n in zip(of.moments.pairs, of.moments.count, strict=True)}
@@ -121,7 +127,7 @@ def calibrated(
         for name, number in log.poses.items():
             poses[name] = poses.get(name, 0) + number
     findings = (*found.findings, *findings_of_logs(facts), *short_of_measurements(fields, poses))
-    if measured is None or not measured.estimated:
+    if not refine or not measured.estimated:
         findings += tuple(_of_clocks(fields))
     notes = (*found.notes, *dict.fromkeys(words for log in facts for words in log.warnings))
     judgement = found.judgement

@@ -44,8 +44,8 @@ def remarks(watched: Watched) -> tuple[str, ...]:
         )
     if watched.of_moments:
         found.append(
-            f"{watched.of_moments} nights are of moments alone, whose covariances may be too small in some directions "
-            "and too large in others: false alarms may be more frequent than stated. --refine finds the noise."
+            f"{watched.of_moments} nights are of moments alone, whose covariances do not hold errors of the carriers' "
+            "poses: where these matter, false alarms are more frequent than stated. --refine finds the noise."
         )
     variance, correlation = watched.spread.variance, watched.spread.correlation
     if not AS_STATED[0] <= variance <= AS_STATED[1]:
