@@ -29,7 +29,7 @@ from gtsam_rwhec.solver.rotations import HATS
 #: seven: rotation, translation, logarithm of its own scale.
 OMEGA_X, V_X, OWN_X, OMEGA_Y, V_Y, SHARED = slice(0, 3), slice(3, 6), 6, slice(7, 10), slice(10, 13), 14
 #: The information of so many pairs is made at once: some megabytes.
-PAIRS_AT_ONCE = 2048
+PAIRS_AT_ONCE = 512
 
 #: Which of them are rotations.
 IS_ROTATION = np.isin(np.arange(15), (0, 1, 2, 7, 8, 9))

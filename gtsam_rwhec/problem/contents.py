@@ -53,7 +53,7 @@ class Contents(Knowledge):
     @property
     def has_measurements(self) -> bool:
         """Whether every raw measurement was kept."""
-        return sum(kept.count for kept in self._kept.values()) == self.number_of_measurements
+        return all(kept.count == self._accumulator.count(pair) for pair, kept in self._kept.items())
 
     def require_pairs(self) -> None:
         """Raise a CountError where the problem has no measurements."""

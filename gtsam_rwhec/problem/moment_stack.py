@@ -101,13 +101,13 @@ class MomentStack:
     @cached_property
     def magnitude(self) -> Array:
         """(E, 25), which bound the rounding."""
-        return self._by_shift(self.packed.magnitude)
+        return self._by_shift(self.packed.magnitude[:])
 
     @cached_property
     def feature_error(self) -> Array:
         """(E, 25), which bound the rounding."""
         error = np.zeros((len(self.packed), 25))
-        error[:, T_A] = self.packed.feature_error
+        error[:, T_A] = self.packed.feature_error[:]
         return self._by_shift(error)
 
     @property

@@ -17,7 +17,7 @@ from gtsam_rwhec.problem.moments import ONE, R_A, R_B, T_A, T_B, Moments
 #: The features without B's rotation.
 FRONT = np.r_[R_A, T_A, T_B, ONE]
 #: So many pairs have their matrices at once: some megabytes.
-PAIRS_AT_ONCE = 1024
+PAIRS_AT_ONCE = 256
 _IS_BACK = np.isin(np.arange(25), np.arange(25)[R_B])
 _ROWS, _COLUMNS = np.triu_indices(25)
 _BACK = _IS_BACK[_ROWS] | _IS_BACK[_COLUMNS]
@@ -29,8 +29,8 @@ _UPPER = np.zeros((16, 16), dtype=int)
 _UPPER[np.triu_indices(16)] = np.arange(136)
 _FULL: np.ndarray = np.maximum(_UPPER, _UPPER.T).ravel()
 #: Fields with one entry, or one short row, for each pair; and those with a long one.
-_SHORT = ("count", "kappa", "magnitude", "feature_error", "operations", "deviation", "projected")
-_LONG = ("front", "rotation")
+_SHORT = ("count", "kappa", "operations", "deviation", "projected")
+_LONG = ("front", "rotation", "magnitude", "feature_error")
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class PackedMoments:
     front: Array | Rows
     back: Array | Rows | None
     rotation: Array | Rows
-    magnitude: Array
-    feature_error: Array
+    magnitude: Array | Rows
+    feature_error: Array | Rows
     operations: np.ndarray
     deviation: Array
     projected: np.ndarray
@@ -102,12 +102,12 @@ class PackedMoments:
         if len(several) == 1:
             return several[0]
         short = {name: np.concatenate([getattr(each, name) for each in several]) for name in _SHORT}
-        front, rotation = (Rows.of([getattr(each, name) for each in several]) for name in _LONG)
-        backs: list[Array | Rows] = [
-            np.full((len(each), len(BACK_ENTRIES[0])), np.nan) if each.back is None else each.back for each in several
-        ]
-        keeps = any(each.back is not None for each in several)
-        return PackedMoments(front=front, back=Rows.of(backs) if keeps else None, rotation=rotation, **short)
+        long = {name: Rows.of([getattr(each, name) for each in several]) for name in _LONG}
+        back: Rows | None = None
+        if any(each.back is not None for each in several):
+            width = len(BACK_ENTRIES[0])
+            back = Rows.of([np.full((len(each), width), np.nan) if each.back is None else each.back for each in several])
+        return PackedMoments(back=back, **long, **short)
 
     @property
     def weight(self) -> Array:
@@ -146,13 +146,13 @@ class PackedMoments:
     def one(self, index: int) -> Moments:
         """The moments of one pair."""
         error = np.zeros(25)
-        error[T_A] = self.feature_error[index]
+        error[T_A] = self.feature_error[index : index + 1][0]
         return Moments(
             int(self.count[index]),
             float(self.kappa[index]),
             self.matrices(slice(index, index + 1))[0],
             self.rotation[index : index + 1].reshape(9, 9),
-            self.magnitude[index],
+            self.magnitude[index : index + 1][0],
             error,
             int(self.operations[index]),
             float(self.deviation[index]),
@@ -166,6 +166,6 @@ class PackedMoments:
         if isinstance(self.back, np.ndarray):
             self.back[index] += np.nan if other.back is None else other.back[:]
         for name in ("magnitude", "feature_error"):
-            getattr(self, name)[index] = np.hypot(getattr(self, name)[index], getattr(other, name))
+            getattr(self, name)[index] = np.hypot(getattr(self, name)[index], getattr(other, name)[:])
         self.operations[index] = np.maximum(self.operations[index], other.operations) + 1
         self.deviation[index] = np.maximum(self.deviation[index], other.deviation)

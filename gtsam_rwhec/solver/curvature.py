@@ -39,7 +39,7 @@ class Curvature:
     @staticmethod
     def of(form: FullForm, order: Elimination, rounding: Array | None = None) -> Curvature:
         """Q of a form; without ``rounding`` (13 n + 1,), of the form exactly as it is stored."""
-        frames = 0.5 * (form.frames + form.frames.transpose(0, 2, 1))
+        frames = form.frames
         coupled = form.tails[:, :, 1].any() or form.tail[0, 1] != 0.0
         if rounding is None:
             rounding = np.zeros(13 * len(frames) + 1)
@@ -49,7 +49,7 @@ class Curvature:
     def _without_absent(self) -> Curvature:
         """A unit diagonal for numbers that the problem does not have."""
         absent = (self.diagonal == 0.0) & (self.rounding == 0.0)
-        return self.plus(absent.astype(float))
+        return self.plus(absent.astype(float)) if absent.any() else self
 
     @property
     def size(self) -> int:

@@ -23,14 +23,14 @@ from gtsam_rwhec.solver.parts import Part
 #: Positions among an edge's 28 numbers: leaf (13), center (13), alpha, h.
 ALPHA, H = 26, 27
 #: The forms of so many pairs are made at once: a few megabytes.
-PAIRS_AT_ONCE = 1024
+PAIRS_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
 class FullForm:
     """Blocks of Q over n frames (leaves, then centers), their couplings, and the tail, [alpha, h].
 
-    frames (n, m, m); tails (n, m, 2); tail (2, 2). The coupling of leaf ``rows[k]`` and center ``columns[k]`` is
+    frames (n, m, m), symmetric; tails (n, m, 2); tail (2, 2). The coupling of leaf ``rows[k]`` and center ``columns[k]`` is
     ``couplings[k]`` (F, m, m); each pair of frames is there once. m is 13, or 9 for rotations alone.
     """
 
@@ -198,6 +198,7 @@ def full_forms(part: Part, slots: Slots) -> tuple[FullForm, FullForm]:
                 form.tail[...] += numbers.block(tail, tail).sum(axis=0)
     for form in forms:
         _add_priors(form, part)
+        _make_symmetric(form.frames)
     return forms[0], forms[1]
 
 
@@ -231,15 +232,13 @@ def slots_of(part: Part) -> Slots:
     motion are one frame.
     """
     L, P = len(part.leaves), len(part.centers)
-    place = {name: i for i, name in enumerate(part.free)}
-    known = {name: i for i, name in enumerate(part.fixed)}
-    index = np.array([[place.get(name, -1) for name in pair] for pair in part.pairs], dtype=int).reshape(-1, 2)
-    fixed = np.array([[known.get(name, -1) for name in pair] for pair in part.pairs], dtype=int).reshape(-1, 2)
+    index = np.where(part.ends < L + P, part.ends, -1)
+    fixed = np.where(part.ends < L + P, -1, part.ends - L - P)
     is_leaf = (index >= 0) & (index < L)
     leaf = np.where(is_leaf, index, -1).max(axis=1, initial=-1)
     center = np.where(index >= L, index - L, -1).max(axis=1, initial=-1)
     first = np.where(index < 0, -1, np.where(is_leaf, 0, 13))
-    poses = np.empty((len(known), 12))
+    poses = np.empty((len(part.fixed), 12))
     for i, T in enumerate(part.fixed.values()):
         variable = as_variable(T, part)
         poses[i] = np.r_[variable[:3, 3], variable[:3, :3].T.ravel()]
@@ -340,6 +339,13 @@ def as_variable(T: Array, part: Part) -> Array:
     inverse[:3, :3] = T[:3, :3].T
     inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
     return inverse
+
+
+def _make_symmetric(blocks: Array) -> None:
+    """Take off what rounding made of symmetric blocks (n, m, m)."""
+    for begin in range(0, len(blocks), PAIRS_AT_ONCE):
+        some = blocks[begin : begin + PAIRS_AT_ONCE]
+        some[...] = 0.5 * (some + some.transpose(0, 2, 1))
 
 
 def _add_priors(form: FullForm, part: Part) -> None:

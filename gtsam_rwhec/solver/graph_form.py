@@ -46,7 +46,7 @@ class GraphForm:
 
         Free translations cost nothing: they stay near the gauge's origin. A free scale has to be 1 (`reduced_form`).
         """
-        frames = 0.5 * (form.frames + form.frames.transpose(0, 2, 1))
+        frames = form.frames
         whole = BlockMatrix(order, frames, form.couplings, form.tails, form.tail)
         tt = BlockMatrix(order, frames[:, :4, :4], form.couplings[:, :4, :4], form.tails[:, :4, :1], form.tail[:1, :1])
         diagonal = tt.diagonal

@@ -29,7 +29,7 @@ def graph_spectral_start(part: Part, rotation_form: FullForm, order: Elimination
     As `start.spectral_start`, with all frames in the eigenvector, each in units of its own diagonal.
     """
     n = len(rotation_form.frames)
-    frames = 0.5 * (rotation_form.frames + rotation_form.frames.transpose(0, 2, 1))
+    frames = rotation_form.frames
     of_h, tail = rotation_form.tails[:, :, 1:], rotation_form.tail[1:, 1:]
     anchored = bool(np.abs(of_h).max(initial=0.0) > 0.0)
     if not anchored:

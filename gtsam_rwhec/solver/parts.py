@@ -58,7 +58,8 @@ class Part:
     def ends(self) -> np.ndarray:
         """(E, 2): each pair's target and sensor, by their places in ``free``; fixed frames, as in ``fixed``, follow."""
         place = {name: i for i, name in enumerate((*self.free, *self.fixed))}
-        return np.array([(place[target], place[sensor]) for target, sensor in self.pairs]).reshape(-1, 2)
+        flat = (place[name] for pair in self.pairs for name in pair)
+        return np.fromiter(flat, int, 2 * len(self.pairs)).reshape(-1, 2)
 
     @cached_property
     def _of_target_carrier(self) -> frozenset[str]:
@@ -115,24 +116,22 @@ def parts_of(problem: Problem) -> list[Part]:
 
 def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
     """The frames of each connected part of the graph, in order of first appearance."""
-    neighbours: dict[str, set[str]] = {}
+    above: dict[str, str] = {}  # towards the first name of the component
+
+    def first_of(name: str) -> str:
+        while (higher := above.setdefault(name, name)) != name:
+            above[name] = above[higher]
+            name = higher
+        return name
+
     for target, sensor in pairs:
-        neighbours.setdefault(target, set()).add(sensor)
-        neighbours.setdefault(sensor, set()).add(target)
-    components, seen = [], set()
-    for start in neighbours:
-        if start in seen:
-            continue
-        component, stack = [], [start]
-        seen.add(start)
-        while stack:
-            name = stack.pop()
-            component.append(name)
-            fresh = neighbours[name] - seen
-            seen |= fresh
-            stack.extend(sorted(fresh))
-        components.append(component)
-    return components
+        of_target, of_sensor = first_of(target), first_of(sensor)
+        if of_target != of_sensor:
+            above[of_sensor] = of_target
+    components: dict[str, list[str]] = {}
+    for name in above:
+        components.setdefault(first_of(name), []).append(name)
+    return list(components.values())
 
 
 def _part(problem: Problem, names: list[str], pairs: tuple[Pair, ...]) -> Part:

@@ -16,7 +16,7 @@ from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.variables import Answer, scales_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Residual:
     """Root mean squares of a pair's residuals, weighted as in the cost.
 
@@ -81,6 +81,5 @@ def residuals_of_pairs(part: Part, poses: PairPoses, J_t: Array, J_R: Array) -> 
     rms = np.sqrt(2.0 * J_t / part.moments.weight) / np.abs(poses.alpha)
     chord = np.sqrt(2.0 * J_R / part.moments.kappa)  # |R_A R_X - R_Y R_B|_F = sqrt(8) sin(angle / 2)
     angle = 2.0 * np.arcsin(np.minimum(1.0, chord / np.sqrt(8.0)))
-    return {
-        pair: Residual(int(part.moments.count[e]), float(rms[e]), float(angle[e])) for e, pair in enumerate(part.pairs)
-    }
+    found = map(Residual, part.moments.count.tolist(), rms.tolist(), angle.tolist())
+    return dict(zip(part.pairs, found, strict=True))

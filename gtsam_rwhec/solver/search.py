@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.attempt import Attempt
 from gtsam_rwhec.solver.cause import Cause, Start
 from gtsam_rwhec.solver.descent import descend
+from gtsam_rwhec.solver.elimination import Elimination
 from gtsam_rwhec.solver.interior_point import Relaxation
 from gtsam_rwhec.solver.mirror import mirrored
 from gtsam_rwhec.solver.options import Method, SolveOptions
@@ -25,6 +26,25 @@ from gtsam_rwhec.solver.variables import Answer, answer_of
 MIRROR_COST = 0.01
 #: Two answers are different when an entry of their rotations differs by this much.
 TWIN_DISTANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What remains of a search that has ended: not its forms, which take more memory than all that follows.
+
+    ``search`` has them, where another answer of the same cost may still be looked for (`Search.has_twin`).
+    """
+
+    part: Part
+    found: Found
+    order: Elimination
+    stages: Stages
+    search: Search | None
+
+    @property
+    def has_twin(self) -> bool:
+        """Whether another answer costs the same."""
+        return self.search is not None and self.search.has_twin(self.found)
 
 
 class Search(SearchedPart):
@@ -89,14 +109,17 @@ class Search(SearchedPart):
             return replace(image, cause=Cause.MIRROR_IMAGE, figures={"mirror_cost": found.cost})
         return replace(image, cause=Cause.ROUNDING, figures={})
 
+    def ended(self, found: Found) -> Searched:
+        """What was found, without the forms where nothing more is searched: in large parts no twin is."""
+        keeps = found.is_closed and not found.bound.definite and not self.is_large
+        return Searched(self.part, found, self.whole.order, self.stages, self if keeps else None)
+
     def has_twin(self, found: Found) -> bool:
         """Whether descents from random starts find another answer of the same cost.
 
         The information matrix shows only the neighbourhood of the answer. If there is a twin far away, Z is not
         positive definite: only then is this function called.
         """
-        if self.is_large:
-            return False
         with self.stages.of("twins"):
             for start in self.random_starts(2 * self.options.random_starts):
                 end = descend(self.form, start, self.options.max_descent_iterations)

@@ -21,7 +21,7 @@ from gtsam_rwhec.solver.options import Method, SolveOptions, check_method
 from gtsam_rwhec.solver.parts import Part, connected_components, parts_of
 from gtsam_rwhec.solver.region import scale_ratio
 from gtsam_rwhec.solver.residuals import Residual
-from gtsam_rwhec.solver.search import Search
+from gtsam_rwhec.solver.search import Search, Searched
 from gtsam_rwhec.solver.variables import (
     Answer,
     as_point,
@@ -101,7 +101,18 @@ def _solved(
     options: SolveOptions,
     progress: Progress | None,
 ) -> PartSolution:
-    """The solution of one part."""
+    """The solution of one part. The search ends, and leaves its forms, before the rest begins."""
+    return PartSolution.of(_searched(part, method, initial, options, progress))
+
+
+def _searched(
+    part: Part,
+    method: Method,
+    initial: tuple[Poses, Poses, Scale] | None,
+    options: SolveOptions,
+    progress: Progress | None,
+) -> Searched:
+    """What the search of one part finds."""
     search = Search.of(part, options, progress)
     if options.nonnegative_scale:
         found = run_with_nonnegative_scale(search)
@@ -110,7 +121,7 @@ def _solved(
         found = search.run(method, rotations_as_variables(part, given.R))
     else:
         found = search.with_positive_scale(search.run(method, None))
-    return PartSolution.of(search, found)
+    return search.ended(found)
 
 
 @one_blas_thread()
@@ -163,7 +174,7 @@ def certify(
         if not np.isfinite(cost):
             raise ScaleError("the cost of the answer overflows; are its translations in metres, and its scale right?")
         tolerance = search.tolerance(cost)
-        best = PartSolution.of(search, found).certificate
+        best = PartSolution.of(search.ended(found)).certificate
         gap = cost - found.bound.lower_bound
         cause, figures = best.cause, best.figures
         if best.cause is not Cause.NO_BOUND and (
@@ -196,7 +207,10 @@ def _merge(problem: Problem, results: list[PartSolution]) -> Solution:
         residuals |= result.residuals
     certificate = Certificate.merged([result.certificate for result in results])
     _warn_of_weights(problem, results)
-    components = tuple(tuple(component) for component in connected_components(problem.pairs))
+    # Only a scale that all share makes one part of what no measurement connects.
+    components = tuple(result.part.names for result in results)
+    if problem.scale == "shared":
+        components = tuple(tuple(component) for component in connected_components(problem.pairs))
     known = Identifiability.merged([result.identifiability for result in results], components)
     if not known.is_unique:
         warnings.warn(

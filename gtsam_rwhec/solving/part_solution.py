@@ -15,8 +15,7 @@ from gtsam_rwhec.solver.cause import Cause
 from gtsam_rwhec.solver.certificate import Basis, Certificate, Objective
 from gtsam_rwhec.solver.parts import Part
 from gtsam_rwhec.solver.residuals import PairPoses, Residual, costs_of_pairs, residuals_of_pairs
-from gtsam_rwhec.solver.search import Search
-from gtsam_rwhec.solver.searched_part import Found
+from gtsam_rwhec.solver.search import Searched
 from gtsam_rwhec.solver.variables import Answer, scales_of
 
 TWIN = FreeDirection(FreeKind.TWIN, FreeReason.SYMMETRY)
@@ -34,22 +33,22 @@ class PartSolution:
     residual_cost: float
 
     @staticmethod
-    def of(search: Search, found: Found) -> PartSolution:
+    def of(searched: Searched) -> PartSolution:
         """Complete what a search found; a ``ScaleError`` for a scale that is not positive."""
-        part = search.part
-        with search.stages.of("identifiability"):
+        part, found = searched.part, searched.found
+        with searched.stages.of("identifiability"):
             answer = found.answer
             _check_scale(part, answer, found.is_closed)
             poses = PairPoses.of(part, answer)
             J_t, J_R = costs_of_pairs(part, poses)
-            known = identify(part, poses, J_t, J_R, search.whole.order)
+            known = identify(part, poses, J_t, J_R, searched.order)
         bound = found.bound
         if not (np.isfinite(bound.lower_bound) and np.isfinite(found.cost)):
             found = replace(found, cause=Cause.NO_BOUND, figures={})
         elif found.is_closed and not known.is_unique:
             number = float(len(known.free_directions))
             found = replace(found, cause=Cause.FREE_DIRECTIONS, figures={"free_directions": number})
-        elif found.is_closed and not bound.definite and search.has_twin(found):
+        elif found.is_closed and not bound.definite and searched.has_twin:
             found = replace(found, cause=Cause.TWIN, figures={})
             known = replace(known, is_unique=False, free_directions=(TWIN,))
         certificate = Certificate(
@@ -65,7 +64,7 @@ class PartSolution:
             min_eigenvalue=-max(found.cost - bound.lower_bound, 0.0) if bound.definite else bound.eigenvalue,
             tolerance=found.tolerance,
             is_relative=part.is_relative,
-            seconds=dict(search.stages.seconds),
+            seconds=dict(searched.stages.seconds),
             figures=found.figures,
         )
         residuals = residuals_of_pairs(part, poses, J_t, J_R)
