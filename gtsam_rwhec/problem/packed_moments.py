@@ -105,8 +105,8 @@ class PackedMoments:
         long = {name: Rows.of([getattr(each, name) for each in several]) for name in _LONG}
         back: Rows | None = None
         if any(each.back is not None for each in several):
-            width = len(BACK_ENTRIES[0])
-            back = Rows.of([np.full((len(each), width), np.nan) if each.back is None else each.back for each in several])
+            n = len(BACK_ENTRIES[0])
+            back = Rows.of([np.full((len(each), n), np.nan) if each.back is None else each.back for each in several])
         return PackedMoments(back=back, **long, **short)
 
     @property

@@ -25,13 +25,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import UNIT, gamma
-from gtsam_rwhec.solver.block_matrix import BlockFactor
+from gtsam_rwhec.solver.bound_loss import Room, loss_along, root_of_loss
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.null_vectors import NullVectors, free_vectors, point_as_null_vector, stationary_along
 from gtsam_rwhec.solver.part_form import PartForm
@@ -43,13 +42,6 @@ from gtsam_rwhec.solver.weakest_rotation import smallest_eigenpair
 
 #: Each entry of R'R - I of an answer in floating point, and of what the other constraints ask, is at most this.
 ROTATION_IN_DOUBLES = 1e-15
-#: Margins of definiteness as parts of the form's diagonal: the largest that is proven costs least.
-ROOMS = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-#: A solution by the factor of a proof is improved at most so many times, until it loses this part of the loss.
-IMPROVEMENTS = 6
-ENOUGH = 1e-6
-#: A loss below this part of the value needs no solution at all.
-NEXT_TO_NOTHING = 1e-10
 #: A factor of the slack between tries.
 MORE_SLACK = 3.0
 #: A loss below this part of the value does not ask for another try.
@@ -99,52 +91,6 @@ def lower_bound(
     lagrangian = _Lagrangian.of(form, evaluation, multipliers, of_scale, contains)
     bound = lagrangian.definite() or lagrangian.semidefinite(enough) or lagrangian.indefinite(enough)
     return bound if np.isfinite(bound.lower_bound) else Bound(value=lagrangian.value, direction=bound.direction)
-
-
-@dataclass(frozen=True)
-class _Room:
-    """A margin (13 n + 1,) by which Z is proven to be definite, and the value that losses are compared with."""
-
-    Z: Curvature
-    margin: Array
-    value: float
-    proof: BlockFactor | None  #: the factor of nearly Z - margin, where it was kept
-
-    @staticmethod
-    def of(Z: Curvature, margin: Array, value: float) -> _Room | None:
-        """The room, if it is proven."""
-        if Z.has_large_factor:
-            return _Room(Z, margin, value, None) if Z.is_proven_to_exceed(margin) else None
-        proof = Z.proof_that_it_exceeds(margin)
-        return None if proof is None else _Room(Z, margin, value, proof)
-
-    @cached_property
-    def _factor(self) -> BlockFactor | None:
-        return self.proof or self.Z.proof_that_it_exceeds(self.margin)
-
-    def solved(self, h: Array, held: np.ndarray) -> Array:
-        """Nearly Z^-1 h: the factor's solution, improved where the margin makes it poor. It is zero where held.
-
-        Where zero loses next to nothing, and no factor was kept, it is zero.
-        """
-        v, rest, size = np.zeros_like(h), h, np.inf
-        if self.proof is None and float((h**2 / self.margin).sum()) <= NEXT_TO_NOTHING * abs(self.value):
-            return v
-        factor = self._factor
-        if factor is None:  # it was there before
-            return v
-        for _ in range(IMPROVEMENTS):
-            better = v + factor.solve_vector(rest)
-            better[held] = 0.0
-            after = h - self.Z.times(better)
-            after[held] = 0.0
-            after_size = float((after**2 / self.margin).sum())
-            if not after_size < size:
-                break
-            v, rest, size = better, after, after_size
-            if size <= ENOUGH * abs(float(h @ v)):
-                break
-        return v
 
 
 @dataclass(frozen=True)
@@ -294,16 +240,11 @@ class _Lagrangian:
 
     # -- parts of a proof ---------------------------------------------------------------------------------------
 
-    def _room(self, Z: Curvature) -> _Room | None:
+    def _room(self, Z: Curvature) -> Room | None:
         """A margin by which Z is proven to be definite; None where it is not proven."""
-        scale = np.abs(self.form.curvature.diagonal)
-        for room in (*(np.maximum(part * scale, 1e-290) for part in ROOMS), 0.25 * Z.allowance(scale)):
-            proven = _Room.of(Z, room, self.value)
-            if proven is not None:
-                return proven
-        return None
+        return Room.largest(Z, np.abs(self.form.curvature.diagonal), self.value)
 
-    def _over_region(self, nulls: NullVectors, room: _Room, enough: float) -> tuple[float, Region | None]:
+    def _over_region(self, nulls: NullVectors, room: Room, enough: float) -> tuple[float, Region | None]:
         """The bound over the largest region that costs little, or over all of space where no region is needed."""
         if self.Z.is_rotation[nulls.held].all():
             return self._lower(nulls, room, None), None
@@ -316,24 +257,24 @@ class _Lagrangian:
                 return lower, region
         return best, smallest
 
-    def _lower(self, nulls: NullVectors, room: _Room, region: Region | None) -> float:
+    def _lower(self, nulls: NullVectors, room: Room, region: Region | None) -> float:
         """The lower bound, rounded down."""
         lower = self._value_less_loss(nulls, room, region)
         lower = max(lower - self._slack_by_multipliers(), self._less_rounding_of_rotations(lower))
         return float(np.nextafter(lower, -np.inf))
 
-    def _value_less_loss(self, nulls: NullVectors, room: _Room, region: Region | None) -> float:
+    def _value_less_loss(self, nulls: NullVectors, room: Room, region: Region | None) -> float:
         """The smallest value of L, less the errors of what it is made of."""
         point = self.evaluation.point
         width = half_widths(self.form.part, point, region or Region(0.0, 0.0))[nulls.held]
-        root = _root_of_loss(room, self.g, self.g_error, nulls.held)
+        root = root_of_loss(room, self.g, self.g_error, nulls.held)
         of_nulls = np.array(
-            [_root_of_loss(room, nulls.ZV[:, k], nulls.ZV_error[:, k], nulls.held) for k in range(len(width))]
+            [root_of_loss(room, nulls.ZV[:, k], nulls.ZV_error[:, k], nulls.held) for k in range(len(width))]
         )
-        loss = root * root + _loss_along(nulls, root, of_nulls, width)
+        loss = root * root + loss_along(nulls, root, of_nulls, width)
         return self.value - self.value_error - loss * (1.0 + 1e-9)
 
-    def _value(self, nulls: NullVectors, room: _Room, region: Region | None) -> float:
+    def _value(self, nulls: NullVectors, room: Room, region: Region | None) -> float:
         """The bound without any allowance for rounding: an estimate of what exact arithmetic gives."""
         exact = replace(self, value_error=0.0, g_error=np.zeros_like(self.g))
         return exact._value_less_loss(nulls.without_errors(), room, region)
@@ -370,44 +311,3 @@ class _Lagrangian:
         change = ROTATION_IN_DOUBLES * float(np.sqrt(np.maximum(diagonal[self.Z.is_rotation], 0.0)).sum())
         root = np.sqrt(lower) * (1.0 - 4.0 * UNIT) - change
         return float(root * root) * (1.0 - 4.0 * UNIT) if root > 0.0 else -np.inf
-
-
-def _loss_along(nulls: NullVectors, root: float, of_nulls: Array, width: Array) -> float:
-    """An upper bound on -min of 2 (V'g)'a + a'(V'ZV)a - (root + sum |a_k| of_nulls_k)^2 + root^2, over |a| <= width.
-
-    In a direction in which V'ZV is surely positive no limit is needed.
-    """
-    k = len(width)
-    if k == 0:
-        return 0.0
-    # (sum |a_k| r_k)^2 <= k sum a_k^2 r_k^2. In units of the limits, so that directions compare.
-    curved = nulls.VZV - np.diag(k * of_nulls**2)
-    curved = 0.5 * (curved + curved.T) * width[:, None] * width
-    slope = (np.abs(nulls.Vg) + nulls.Vg_error + root * of_nulls) * width
-    if not (np.isfinite(curved).all() and np.isfinite(slope).all()):
-        return np.inf
-    values, vectors = np.linalg.eigh(curved)
-    unsure = float((nulls.VZV_error * width[:, None] * width).sum()) + 1e-13 * k * float(np.abs(curved).sum())
-    loss = 0.0
-    for value, vector in zip(values - unsure, vectors.T, strict=True):
-        h = float(np.abs(vector) @ slope)
-        reach = float(np.abs(vector).sum())
-        box = 2.0 * h * reach + max(-float(value), 0.0) * reach**2
-        loss += min(box, h * h / float(value)) if value > 0.0 else box
-    return loss * (1.0 + 1e-9)
-
-
-def _root_of_loss(room: _Room, h: Array, h_error: Array, held: np.ndarray) -> float:
-    """The root of an upper bound on -min 2 h'z + z'Z z, over z whose ``held`` entries are zero."""
-    h, h_error = h.copy(), h_error.copy()
-    h[held], h_error[held] = 0.0, 0.0
-    v = room.solved(h, held)
-    Zv, error = room.Z.times(v), room.Z.rounding_of_product(v)
-    rest = h - Zv
-    rest[held], error[held] = 0.0, 0.0
-    taken = float((h + rest) @ v) + gamma(len(v) + 8) * float((np.abs(h) + np.abs(rest)) @ np.abs(v))
-    taken += float(error @ np.abs(v))
-    rho = np.abs(rest) * (1.0 + 4.0 * UNIT) + error
-    square = max(taken, 0.0) + float((rho**2 / room.margin).sum())
-    root = np.sqrt(square) + np.sqrt(float((h_error**2 / room.margin).sum()))
-    return float(root) * (1.0 + 1e-9)

@@ -30,8 +30,8 @@ PAIRS_AT_ONCE = 256
 class FullForm:
     """Blocks of Q over n frames (leaves, then centers), their couplings, and the tail, [alpha, h].
 
-    frames (n, m, m), symmetric; tails (n, m, 2); tail (2, 2). The coupling of leaf ``rows[k]`` and center ``columns[k]`` is
-    ``couplings[k]`` (F, m, m); each pair of frames is there once. m is 13, or 9 for rotations alone.
+    frames (n, m, m), symmetric; tails (n, m, 2); tail (2, 2). The coupling of leaf ``rows[k]`` and center
+    ``columns[k]`` is ``couplings[k]`` (F, m, m); each pair of frames is there once. m is 13, or 9 for rotations alone.
     """
 
     frames: Array

@@ -16,7 +16,7 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.errors import NotCertifiedWarning, RwhecWarning
 from gtsam_rwhec.simulate import Motion, Noise, general
 from gtsam_rwhec.simulate.transforms import random_poses
-from gtsam_rwhec.solver import Cause, Start, search
+from gtsam_rwhec.solver import Cause, Start, attempt
 from gtsam_rwhec.solver.bound import Bound
 from gtsam_rwhec.solver.parts import parts_of
 
@@ -199,7 +199,7 @@ def test_without_a_bound_a_worse_answer_is_not_called_a_gap(monkeypatch: pytest.
     """A gap needs a bound. No measurements are known that have none, so the search is given the record of none."""
     problem = simulated("known").problem
     best = rw.solve(problem)
-    monkeypatch.setattr(search, "lower_bound", lambda *_, **__: Bound())
+    monkeypatch.setattr(attempt, "lower_bound", lambda *_, **__: Bound())
     for size in (0.0, 0.1):
         certificate = rw.certify(problem, X=perturbed(best.X, size, 3), Y=best.Y)
         assert (certificate.status, certificate.cause) == (rw.Status.FAILED, Cause.NO_BOUND)
