@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -101,13 +102,13 @@ class PackedMoments:
         """All pairs of several, one after the other; long rows stay where they are."""
         if len(several) == 1:
             return several[0]
-        short = {name: np.concatenate([getattr(each, name) for each in several]) for name in _SHORT}
-        long = {name: Rows.of([getattr(each, name) for each in several]) for name in _LONG}
+        fields: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in several]) for name in _SHORT}
+        fields |= {name: Rows.of([getattr(each, name) for each in several]) for name in _LONG}
         back: Rows | None = None
         if any(each.back is not None for each in several):
             n = len(BACK_ENTRIES[0])
             back = Rows.of([np.full((len(each), n), np.nan) if each.back is None else each.back for each in several])
-        return PackedMoments(back=back, **long, **short)
+        return PackedMoments(back=back, **fields)
 
     @property
     def weight(self) -> Array:

@@ -46,7 +46,7 @@ def graph_spectral_start(part: Part, rotation_form: FullForm, order: Elimination
         return [project(unvec(sign * r[:-1])) for sign in (1.0, -1.0)]
     # Components that only the shared scale joins each have an eigenvector and a sign.
     index = {name: i for i, name in enumerate(part.free)}
-    for names in connected_components(part.pairs):
+    for names in connected_components(part.pairs) if part.scale == "shared" else [list(part.free)]:
         members = np.array([index[name] for name in names if name in index], dtype=int)
         begin = np.zeros((n, 9))
         begin[members] = np.random.default_rng(0).standard_normal((len(members), 9))

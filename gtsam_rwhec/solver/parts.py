@@ -116,21 +116,26 @@ def parts_of(problem: Problem) -> list[Part]:
 
 def connected_components(pairs: tuple[Pair, ...]) -> list[list[str]]:
     """The frames of each connected part of the graph, in order of first appearance."""
-    above: dict[str, str] = {}  # towards the first name of the component
-
-    def first_of(name: str) -> str:
-        while (higher := above.setdefault(name, name)) != name:
-            above[name] = above[higher]
-            name = higher
-        return name
-
-    for target, sensor in pairs:
-        of_target, of_sensor = first_of(target), first_of(sensor)
-        if of_target != of_sensor:
-            above[of_sensor] = of_target
-    components: dict[str, list[str]] = {}
-    for name in above:
-        components.setdefault(first_of(name), []).append(name)
+    place: dict[str, int] = {}
+    above: list[int] = []  # nearer to the first frame of the component
+    for pair in pairs:
+        for name in pair:
+            if name not in place:
+                place[name] = len(above)
+                above.append(len(above))
+        # Rem's algorithm (Patwary, Blair, Manne 2010): up both ways at once, joined on the way.
+        low, high = place[pair[0]], place[pair[1]]
+        while above[low] != above[high]:
+            if above[low] < above[high]:
+                low, high = high, low
+            next_up, above[low] = above[low], above[high]
+            if next_up == low:
+                break
+            low = next_up
+    components: dict[int, list[str]] = {}
+    for name, i in place.items():
+        above[i] = above[above[i]]
+        components.setdefault(above[i], []).append(name)
     return list(components.values())
 
 
