@@ -155,7 +155,7 @@ TABLE: dict[str, dict[str, str]] = {
         "odometry/test_calibrated.py": "found",
         "pipeline/test_odometry_road.py": "judging odometry_file",
         "odometry/test_calibrating.py": (
-            "clocks findings freedom given_rows other_answers refining result solved_windows up"
+            "clocks findings freedom given_rows other_answers plausible refining result solved_windows up"
         ),
         "odometry/test_gates.py": "motions sampling window_choice",
         "odometry/test_given.py": "options",

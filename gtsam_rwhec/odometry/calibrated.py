@@ -56,8 +56,7 @@ class OdometryCalibration:
     others : tuple of OtherAnswer
         Other answers that fit alike.
     contradictions : tuple of str
-        Where a given distance moves a pose away from where the motions have it, in sentences: the poses are not to be
-        used.
+        Where tracks look wrong as a whole, or contradict a given distance, in sentences: the poses are not to be used.
     findings : tuple of str
         What is doubtful, in sentences: the verdict is to use the poses with care.
     remarks : tuple of str
@@ -124,7 +123,9 @@ def _verdict(found: OdometryCalibration) -> str:
         )
     if found.others:
         return "Do not use these poses: another answer fits as well. Look which of them is yours."
-    if found.contradictions or any(one.is_contradicted for one in found.influences):
+    if found.contradictions:
+        return "Do not use these poses: tracks, or what was given, contradict one another."
+    if any(one.is_contradicted for one in found.influences):
         return "Do not use these poses: what was given contradicts the motions. Measure it again."
     if found.findings:
         return "Use these poses with care: read the findings first."

@@ -13,7 +13,6 @@ from gtsam_rwhec.errors import (
     OptionError,
     OutlierError,
     ScaleError,
-    StampError,
     UnderdeterminedError,
 )
 from gtsam_rwhec.files.progress import Progress, check_progress, silent
@@ -26,6 +25,7 @@ from gtsam_rwhec.odometry.given import Given
 from gtsam_rwhec.odometry.given_rows import GivenRows
 from gtsam_rwhec.odometry.noise_by_residuals import first_rotation_variances
 from gtsam_rwhec.odometry.options import OdometryOptions
+from gtsam_rwhec.odometry.plausible import check_common_time, check_not_the_same, check_turns
 from gtsam_rwhec.odometry.result import calibration_of
 from gtsam_rwhec.odometry.sampling import SampledTrack
 from gtsam_rwhec.odometry.solved_windows import FEWEST, Answer, Task, solve_windows, too_few
@@ -98,7 +98,10 @@ def calibrate_odometries(
     given.checked([track.sensor for track in tracks], reference)
     names = tuple(track.sensor for track in tracks)
     tell("comparing clocks")
+    check_common_time(tracks, options.search_s if options.estimate_time_offsets else 0.0)
     gates = [gated(track, options) for track in tracks]
+    check_not_the_same(tracks)
+    check_turns([gate.track for gate in gates])
     clocks = [Clock(0.0)] + [
         first_offset(gates[0].track, gate.track, options) if options.estimate_time_offsets else Clock(0.0)
         for gate in gates[1:]
@@ -114,7 +117,6 @@ def calibrate_odometries(
         ]
 
     tell("choosing windows")
-    _check_common_time(sampled())
     answer: Answer | None = None
     seconds = options.window_s
     variances: Array = np.zeros((0, 2))
@@ -178,18 +180,6 @@ def _ordered(tracks: Sequence[OdometryTrack], reference: str, given: Given) -> l
             )
         first = next(track for track in tracks if not track.has_unknown_scale)
     return [first, *(track for track in tracks if track is not first)]
-
-
-def _check_common_time(samples: list[SampledTrack]) -> None:
-    first = samples[0]
-    for other in samples[1:]:
-        if other.times[-1] <= first.times[0] or other.times[0] >= first.times[-1]:
-            raise StampError(
-                f"the tracks of {first.track.sensor} ({first.track.stamps_ns[0] * 1e-9:.3f} to "
-                f"{first.track.stamps_ns[-1] * 1e-9:.3f} s) and {other.track.sensor} "
-                f"({other.track.stamps_ns[0] * 1e-9:.3f} to {other.track.stamps_ns[-1] * 1e-9:.3f} s) have no common "
-                "time; are they of one drive and one clock?"
-            )
 
 
 def _check_windows(windows: WindowMotions, names: tuple[str, ...]) -> None:

@@ -45,12 +45,18 @@ def first_offset(reference: OdometryTrack, track: OdometryTrack, options: Odomet
         where=f"the track of {reference.sensor}",
     )
     stamps, T = np.asarray(track.stamps_ns)[part], se3.inverse(np.asarray(track.T_start_sensor)[part])
+    if not _pieces(stamps, T, options.max_gap_s):
+        return Clock(0.0, f"no piece of its track has {FEWEST_POSES} poses without a gap")
+    unknown = ""
     few = max(1, len(stamps) // ENOUGH)
     for every in {few: None, 1: None}:
+        pieces = _pieces(stamps[::every], T[::every], options.max_gap_s)
+        if not pieces:
+            continue
         try:
             found = estimate_time_offset(
                 carrier,
-                _pieces(stamps[::every], T[::every], options.max_gap_s),
+                pieces,
                 search_s=options.search_s,
                 max_gap_s=options.max_gap_s,
                 where=track.sensor,

@@ -14,6 +14,9 @@ from gtsam_rwhec.odometry.tracks import OdometryTrack
 
 #: Correlation of neighbouring windows' residuals above which errors are not independent from step to step.
 CORRELATED = 0.3
+#: Correlation above which, with residuals of this part of the motions, a track is not of this vehicle, or is read in a
+#: wrong way. A bias or a wrong scale has smaller residuals.
+SAME, SAME_PART = 0.9, 0.2
 #: Stated noise is doubted when residuals are so many times as large, or as small.
 DOUBTED = 1.5
 #: A clock that the refinement knows to this, s, needs no first guess.
@@ -62,8 +65,8 @@ def findings_of(
                 f"the residuals of {name} are {max(sizes[name]):.2g} times what its stated noise makes; state its true "
                 "noise, or leave it out: it is estimated then"
             )
-        share = correlation(answer, k)
-        if share > CORRELATED:
+        share = max(correlations(answer, k))
+        if share > CORRELATED and not _misfit(answer, k):
             factor = np.sqrt((1.0 + share) / (1.0 - share))
             said.append(
                 f"the errors of {name} are alike from window to window (correlation {share:.2f}): they are no random "
@@ -94,10 +97,16 @@ def findings_of(
 
 
 def contradictions_of(answer: Answer, task: Task) -> tuple[str, ...]:
-    """What distances move of what the motions tell: the certified answer is without them."""
+    """Tracks that do not fit at all, and what distances move: the certified answer is without them."""
+    said = [
+        f"the motions of {name} do not fit the other sensors': what differs is the same from window to window, and "
+        f"{100 * part:.0f} % of the motion itself"
+        for k, name in enumerate(task.names)
+        if (part := _misfit(answer, k))
+    ]
     if not task.given.given.distances_m:
-        return ()
-    C, said = answer.freedom.covariance(), []
+        return tuple(said)
+    C = answer.freedom.covariance()
     for k, name in enumerate(task.names[1:], 1):
         sigma = np.sqrt(np.maximum(np.diagonal(C)[task.layout.at[k, :6]], 0.0))
         if apart := _apart(answer, task, k, sigma):
@@ -142,14 +151,28 @@ def remarks_of(task: Task) -> tuple[str, ...]:
     return tuple(said)
 
 
-def correlation(answer: Answer, k: int) -> float:
-    """The correlation of a sensor's residuals with those of the window before, of rotations or translations."""
+def _misfit(answer: Answer, k: int) -> float:
+    """The part of a sensor's motion that its residuals are, where they are large and alike, or zero."""
+    windows, r = answer.windows, answer.fit.linear.r[k]
+    motion = se3.logmap(windows.M[k])
+    used, found = windows.used[k], 0.0
+    for part, share in zip((slice(0, 3), slice(3, 6)), correlations(answer, k), strict=True):
+        of_motion = np.sqrt((r[used, part] ** 2).sum() / max(float((motion[used, part] ** 2).sum()), 1e-300))
+        if share > SAME and of_motion > SAME_PART:
+            found = max(found, float(of_motion))
+    return found
+
+
+def correlations(answer: Answer, k: int) -> tuple[float, float]:
+    """The correlation of a sensor's residuals with those of the window before, of rotations and of translations."""
     windows, r = answer.windows, answer.fit.linear.r[k]
     follows = windows.used[k, 1:] & windows.used[k, :-1] & (np.abs(windows.start[1:] - windows.end[:-1]) < 1e-6)
     if follows.sum() < 20:
-        return 0.0
-    found = 0.0
-    for part in (slice(0, 3), slice(3, 6)):
-        a, b = r[:-1][follows][:, part], r[1:][follows][:, part]
-        found = max(found, float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-300)))
-    return found
+        return 0.0, 0.0
+    before, after = r[:-1][follows], r[1:][follows]
+    product, squares = (before * after), np.stack([before**2, after**2])
+    shares = (
+        float(product[:, part].sum() / max(np.sqrt(squares[:, :, part].sum(axis=(1, 2)).prod()), 1e-300))
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    return next(shares), next(shares)

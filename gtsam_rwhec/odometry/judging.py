@@ -25,6 +25,11 @@ WHAT_TO_DO = (
 )
 #: What to do where what was given is contradicted.
 MEASURE_AGAIN = "measure again what is given, in metres and in the axes of the reference, and correct the rig file"
+#: What to do where a track is wrong as a whole.
+CHECK_TRACKS = (
+    "check the named tracks (poses T_start_sensor, quaternions x y z w, lengths in metres or scale: estimate, one "
+    "vehicle and one drive) and what is given, and calibrate again"
+)
 PRAISE = "the motions of all sensors agree, their joint cost is certified, and they determine every pose"
 PRAISE_WITH_GIVEN = (
     "the motions of all sensors agree, their joint cost is certified, and with what was given they determine every "
@@ -40,11 +45,12 @@ def judgement_of(found: OdometryCalibration) -> Judgement:
     findings += [Finding(Ground.NOT_UNIQUE, words) for words in free_in_words(found)]
     findings += [Finding(Ground.NOT_UNIQUE, f"another answer fits as well: {other.why}") for other in found.others]
     findings += _contradicted(found)
-    findings += [Finding(Ground.POSE_DOUBTED, words) for words in found.contradictions]
+    findings += [Finding(Ground.CONTRADICTED, words) for words in found.contradictions]
     findings += [Finding(Ground.COVARIANCE_DOUBTED, words) for words in found.findings]
     is_unchecked = any(one.off_by == 0.0 for one in found.influences)
     judgement = Judgement.of(findings, PRAISE_WITH_GIVEN if is_unchecked else PRAISE)
     reason = judgement.reason.replace(Ground.NOT_UNIQUE.advice, WHAT_TO_DO)
+    reason = reason.replace(Ground.CONTRADICTED.advice, CHECK_TRACKS)
     return replace(judgement, reason=reason.replace(Ground.POSE_DOUBTED.advice, MEASURE_AGAIN))
 
 

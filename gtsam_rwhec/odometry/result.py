@@ -23,6 +23,7 @@ from gtsam_rwhec.odometry.findings import contradictions_of, findings_of, remark
 from gtsam_rwhec.odometry.found import Influence, Windows
 from gtsam_rwhec.odometry.freedom import REACHES, seven_each
 from gtsam_rwhec.odometry.other_answers import other_answers
+from gtsam_rwhec.odometry.plausible import inverted_in_words
 from gtsam_rwhec.odometry.solved_windows import Answer, Task
 from gtsam_rwhec.odometry.tracks import OdometryNoise, OdometryTrack
 from gtsam_rwhec.odometry.unknowns import OFFSET, SCALE
@@ -87,7 +88,7 @@ def calibration_of(
         residuals=residual_sizes(answer, names),
         influences=_influences(answer, task, change, order),
         others=others,
-        contradictions=contradictions_of(answer, task),
+        contradictions=(*inverted_in_words(tracks), *contradictions_of(answer, task)),
         findings=findings_of(answer, task, tracks, clocks, sigmas),
         remarks=remarks_of(task),
     )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drives_with_sensors import drive, squares, tracks
+from rwhec_factors import se3
 from scipy.stats import chi2
 
 from gtsam_rwhec import odometry
@@ -141,6 +142,26 @@ def test_a_track_of_another_drive_is_refused(hilly: Drive) -> None:
         odometry.calibrate_odometries(mixed, reference="lidar", options=ONE_CLOCK)
 
 
+def test_tracks_that_are_read_in_a_wrong_way_do_not_say_use(hilly: Drive) -> None:
+    good = tracks(hilly)
+    inverted = [replace(track, T_start_sensor=se3.inverse(track.T_start_sensor)) for track in good]
+    found = odometry.calibrate_odometries(inverted, reference="lidar", options=ONE_CLOCK)
+    judgement = odometry.judgement_of(found)
+    assert judgement.verdict == "do_not_use"
+    assert "the poses of rear look inverted" in judgement.reason
+    resting = replace(good[1], T_start_sensor=np.tile(np.eye(4), (len(good[1].stamps_ns), 1, 1)))
+    with pytest.raises(OutlierError, match="rear turns by 0 degrees a second"):
+        odometry.calibrate_odometries([good[0], resting, *good[2:]], reference="lidar", options=ONE_CLOCK)
+    with pytest.raises(OutlierError, match="lidar and rear are the same"):
+        odometry.calibrate_odometries([good[0], replace(good[0], sensor="rear")], reference="lidar")
+    short = replace(good[1], stamps_ns=good[1].stamps_ns[:3], T_start_sensor=good[1].T_start_sensor[:3])
+    with pytest.raises(UnderdeterminedError, match="windows with another sensor"):
+        odometry.calibrate_odometries([good[0], short, *good[2:]], reference="lidar")
+    for stamps in (good[1].stamps_ns * 1000, good[1].stamps_ns + 30_000_000_000_000_000):
+        with pytest.raises(StampError, match="no common time"):
+            odometry.calibrate_odometries([good[0], replace(good[1], stamps_ns=stamps)], reference="lidar")
+
+
 def test_a_wrong_distance_and_an_unchecked_height_do_not_say_use(planar: Drive) -> None:
     pair = [track for track in tracks(planar) if track.sensor in ("lidar", "rear")]
     far = odometry.Given(distances_m={("lidar", "rear"): (40.0, 0.002)})
@@ -151,3 +172,7 @@ def test_a_wrong_distance_and_an_unchecked_height_do_not_say_use(planar: Drive) 
     high = odometry.Given(heights_m={"lidar": (2.0, 0.01), "rear": (9.0, 0.01)})
     found = odometry.calibrate_odometries(pair, reference="lidar", given=high, options=ONE_CLOCK)
     assert "The motions do not check all that was given" in odometry.judgement_of(found).reason
+    below = odometry.Ground((0.0, 0.0, -1.0), 2.0, 0.01, 0.01)
+    turned = odometry.Given(heights_m={"rear": (2.0, 0.01)}, ground=below)
+    found = odometry.calibrate_odometries(pair, reference="lidar", given=turned, options=ONE_CLOCK)
+    assert "hangs upside down" in str(found)
