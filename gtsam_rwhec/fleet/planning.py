@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +15,7 @@ from gtsam_rwhec.fleet.map_log import LogTask
 from gtsam_rwhec.fleet.merging import CHUNK, Member, MergeTask
 from gtsam_rwhec.fleet.rig_source import RigSource, read_rig_source
 from gtsam_rwhec.fleet.solve_robot import Each, UnitTask
-from gtsam_rwhec.fleet.stores import listed, stamp_of
+from gtsam_rwhec.fleet.stores import listed, local_path, stamp_of
 from gtsam_rwhec.fleet.without_secrets import shown, without_secrets
 
 #: So many requests to stores at the same time.
@@ -136,7 +137,8 @@ def _with_task(robot: str, url: str, rig_url: str, failure: str, rigs: Mapping[s
     if failure or isinstance(rig, str):
         return PlannedLog(robot, url, failure=failure or str(rig))
     try:
-        return PlannedLog(robot, url, LogTask(url, stamp_of(url), rig))
+        path = local_path(url)  # whole: the same log whatever folder a run or a worker is started in
+        return PlannedLog(robot, url, LogTask(url if path is None else os.path.abspath(path), stamp_of(url), rig))
     except (RwhecError, OSError) as error:
         return PlannedLog(robot, url, failure=without_secrets(str(error)))
 

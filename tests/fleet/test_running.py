@@ -158,3 +158,14 @@ def test_sums_of_chunks_are_the_same_bits(
     assert len(list(Path(output).glob("merged/*.merged"))) == 2
     assert [row.moments_sha256 for row in again.rows] == [row.moments_sha256 for row in run.rows]
     assert [(row.logs, row.measurements) for row in again.rows] == [(1, 24), (2, 48), (2, 48)]
+
+
+def test_a_log_is_the_same_from_another_working_folder(made: MadeFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path(made.manifest).parent
+    keys = []
+    for here, manifest in ((folder, "fleet.yaml"), (folder / "logs", "../fleet.yaml")):
+        monkeypatch.chdir(here)
+        plan = planned(fleet.read_manifest(manifest), fleet.FleetOptions())
+        keys.append([log.task.key for log in plan.logs if log.task is not None])
+    assert keys[0] == keys[1]
+    assert len(keys[0]) == 6
