@@ -261,7 +261,7 @@ TABLE: dict[str, dict[str, str]] = {
         "solver/test_block_matrix.py": "elimination",
         "solver/test_graph_form.py": "graph_start",
         "solver/test_bound.py": (
-            "bound_loss curvature null_vectors part_form polish region stored_form weakest_rotation"
+            "bound_loss curvature form_rounding null_vectors part_form polish region stored_form weakest_rotation"
         ),
         "solver/test_measured_form.py": "exact_residuals given measured_priors point",
         "solver/test_reduced_form.py": "full_form variables",

@@ -25,7 +25,8 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.geometry.rounding import Doubled, difference, gamma, product, reciprocal, turned
 from gtsam_rwhec.solver.block_matrix import sum_into
 from gtsam_rwhec.solver.exact_residuals import Coefficients, Measured, Sums, weighted_sums
-from gtsam_rwhec.solver.full_form import ALPHA, Slots, rounding_of_fixed
+from gtsam_rwhec.solver.form_rounding import rounding_of_fixed
+from gtsam_rwhec.solver.full_form import ALPHA, Slots
 from gtsam_rwhec.solver.given import Given
 from gtsam_rwhec.solver.measured_priors import MeasuredPriors
 from gtsam_rwhec.solver.parts import Part

@@ -11,7 +11,8 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.solver.curvature import Curvature
 from gtsam_rwhec.solver.descent import SearchForm
 from gtsam_rwhec.solver.elimination import Elimination
-from gtsam_rwhec.solver.full_form import FullForm, Slots, full_forms, rounding_of, slots_of
+from gtsam_rwhec.solver.form_rounding import rounding_of
+from gtsam_rwhec.solver.full_form import FullForm, Slots, full_forms, slots_of
 from gtsam_rwhec.solver.graph_form import GraphForm
 from gtsam_rwhec.solver.graph_start import graph_spectral_start
 from gtsam_rwhec.solver.measured_form import MeasuredForm

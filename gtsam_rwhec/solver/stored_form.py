@@ -80,14 +80,14 @@ class StoredForm:
 
 def _product(form: FullForm, x: Array, *, size: bool) -> Array:
     """The form, or the sizes of its entries, times x (13 n + 2, D), in the precision of x."""
-    frames, tails, tail = (_as(blocks, x, size=size) for blocks in (form.frames, form.tails, form.tail))
-    n, L, D = len(frames), form.leaves, x.shape[1]
+    n, L, D = len(form.frames), form.leaves, x.shape[1]
     of_frames, of_tail = x[:-2].reshape(n, 13, D), x[-2:]
-    result, last = np.zeros((n, 13, D), dtype=x.dtype), tail @ of_tail
-    # A sum over no frame is left out: numpy's einsum gives anything for it in extended precision.
-    if n:
-        result += np.einsum("nij,njd->nid", frames, of_frames) + np.einsum("nit,td->nid", tails, of_tail)
-        last += np.einsum("nit,nid->td", tails, of_frames)
+    result, last = np.zeros((n, 13, D), dtype=x.dtype), _as(form.tail, x, size=size) @ of_tail
+    for begin in range(0, n, PAIRS_AT_ONCE):
+        at = slice(begin, begin + PAIRS_AT_ONCE)
+        frames, tails = _as(form.frames[at], x, size=size), _as(form.tails[at], x, size=size)
+        result[at] = np.einsum("nij,njd->nid", frames, of_frames[at]) + np.einsum("nit,td->nid", tails, of_tail)
+        last += np.einsum("nit,nid->td", tails, of_frames[at])
     for begin in range(0, len(form.couplings), PAIRS_AT_ONCE):
         at = slice(begin, begin + PAIRS_AT_ONCE)
         couplings, leaf, center = _as(form.couplings[at], x, size=size), form.rows[at], L + form.columns[at]

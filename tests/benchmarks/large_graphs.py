@@ -154,6 +154,7 @@ def run(name: str, share: float, keep: bool) -> Measured:
         start = time.process_time()
         problem.add_many(seen.pairs, seen.index, seen.A, seen.B, noise.sigma_m, noise.kappa)
         building += time.process_time() - start
+        del seen  # the problem has what it needs of it
     size = f"{len(problem.targets)} x {len(problem.sensors)} frames, {len(problem.pairs)} pairs"
     building_gb = _gigabytes()
     clock, processor = time.perf_counter(), time.process_time()
