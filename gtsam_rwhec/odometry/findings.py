@@ -11,6 +11,7 @@ from gtsam_rwhec.geometry.poses import Array
 from gtsam_rwhec.odometry.clocks import Clock
 from gtsam_rwhec.odometry.solved_windows import Answer, Task
 from gtsam_rwhec.odometry.tracks import OdometryTrack
+from gtsam_rwhec.odometry.up import upside_down
 
 #: Correlation of neighbouring windows' residuals above which errors are not independent from step to step.
 CORRELATED = 0.3
@@ -104,6 +105,15 @@ def contradictions_of(answer: Answer, task: Task) -> tuple[str, ...]:
         for k, name in enumerate(task.names)
         if (part := _misfit(answer, k))
     ]
+    if task.given.has_ground and task.given.given.ground is None:
+        other_way = upside_down(task.given.normal, answer.fit.state.T)
+        if other_way.sum() >= 0.0 and (other_way > 0.0).any():
+            named = ", ".join(name for name, down in zip(task.names, other_way, strict=True) if down > 0.0)
+            said.append(
+                f"heights count upwards as {task.names[0]} stands, and beside it {named} would hang upside down. If it "
+                f"is {task.names[0]} that hangs, all heights have the wrong sign: give the ground, with its up in the "
+                f"axes of {task.names[0]}"
+            )
     if not task.given.given.distances_m:
         return tuple(said)
     C = answer.freedom.covariance()

@@ -54,3 +54,16 @@ def turning_axis(windows: WindowMotions, variances: Array) -> tuple[Array, float
     of_noise = np.sqrt(noise / len(w) / max(square[2], 1e-300))
     beyond = max(float(square[1]) - 1.3 * noise, 0.0)
     return axes[:, 2], float(np.hypot(of_noise, np.sqrt(beyond / max(square[2], 1e-300) / 10.0)))
+
+
+def upside_down(normal: Array, T: Array) -> np.ndarray:
+    """(m,) for sensors at T (m, 4, 4): 1 where its own axes say that ``normal`` is down, -1 where up, 0 where neither.
+
+    As `up_direction` reads them: z is up; or, where it is level, y is down.
+    """
+    along = np.einsum("mij,i->mj", T[:, :3, :3], normal)
+    limit = np.cos(NEAR_RAD)
+    by_z = np.where(np.abs(along[:, 2]) > limit, -np.sign(along[:, 2]), 0.0)
+    by_y = np.where(np.abs(along[:, 1]) > limit, np.sign(along[:, 1]), 0.0)
+    said: np.ndarray = np.where(by_z != 0.0, by_z, by_y)
+    return said

@@ -20,7 +20,8 @@ from gtsam_rwhec.errors import (
     StampError,
     UnderdeterminedError,
 )
-from gtsam_rwhec.simulate.drives import Drive
+from gtsam_rwhec.simulate.drives import Drive, SimulatedOdometry
+from gtsam_rwhec.simulate.drives import drive as simulated_drive
 
 ONE_CLOCK = odometry.OdometryOptions(estimate_time_offsets=False, window_s=0.5)
 
@@ -176,3 +177,21 @@ def test_a_wrong_distance_and_an_unchecked_height_do_not_say_use(planar: Drive) 
     turned = odometry.Given(heights_m={"rear": (2.0, 0.01)}, ground=below)
     found = odometry.calibrate_odometries(pair, reference="lidar", given=turned, options=ONE_CLOCK)
     assert "hangs upside down" in str(found)
+
+
+def test_heights_are_asked_for_the_ground_where_the_reference_may_hang_upside_down() -> None:
+    made = {name: SimulatedOdometry(np.eye(4), 0.001, 0.01) for name in ("lidar", "rear", "wheels")}
+    hanging = np.diag([1.0, -1.0, -1.0, 1.0])
+    made["lidar"] = replace(made["lidar"], T_vehicle_sensor=hanging)
+    driven = simulated_drive(made, "planar", seconds=30.0, seed=2)
+    heights = dict.fromkeys(made, (1.0, 0.01))
+    found = odometry.calibrate_odometries(
+        tracks(driven), reference="lidar", given=odometry.Given(heights_m=heights), options=ONE_CLOCK
+    )
+    judgement = odometry.judgement_of(found)
+    assert judgement.verdict == "do_not_use"
+    assert "beside it rear, wheels would hang upside down" in judgement.reason
+    ground = odometry.Ground((0.0, 0.0, -1.0), 1.0, 0.01, 0.01)
+    given = odometry.Given(heights_m={"rear": (1.0, 0.01), "wheels": (1.0, 0.01)}, ground=ground)
+    found = odometry.calibrate_odometries(tracks(driven), reference="lidar", given=given, options=ONE_CLOCK)
+    assert odometry.judgement_of(found).verdict == "use"

@@ -93,7 +93,7 @@ def _noise(result: OdometryResult) -> Iterator[Block]:
     legend = "Residuals are root mean squares in standard deviations: 1 is expected."
     yield Table("How errors grow, and how well the motions agree", headings, rows, legend)
     removed = removed_in_words(result)
-    yield Listing(tuple(removed)) if removed else Paragraph("Every pose and window is used.")
+    yield Listing(tuple(removed)) if removed else Paragraph("No pose is left out, and no window as an outlier.")
 
 
 def _proof(result: OdometryResult) -> Iterator[Block]:
