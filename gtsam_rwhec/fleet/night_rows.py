@@ -135,6 +135,12 @@ def why_not(row: RobotRow) -> str:
     if row.covariance is None:
         return "its poses have no covariance, because it was not refined"
     variances = np.diagonal(row.covariance)
+    finite = np.flatnonzero(np.isfinite(variances))
+    is_damaged = np.isnan(variances).any() or (variances < 0.0).any()
+    if is_damaged or not np.isfinite(row.covariance[np.ix_(finite, finite)]).all():
+        return "its covariance has a variance below zero or what is no number; run this night again"
+    if not all(np.isfinite(frame.T).all() for frame in row.frames):
+        return "a pose of it has what is no finite number; run this night again"
     if not ((variances > 0.0) & np.isfinite(variances)).any():
         return "nothing of it is determined"
     if row.begin_ns is None:

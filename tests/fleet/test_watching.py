@@ -129,3 +129,15 @@ def test_without_rows_there_is_nothing_to_say() -> None:
     found = watch([])
     assert (found.events, found.changed) == ((), ())
     assert [json.loads(line)["event"] for line in stream(found)] == ["watch", "end"]
+
+
+@pytest.mark.parametrize("value", [np.nan, -1e-6])
+def test_a_night_with_impossible_numbers_is_left_out_and_hides_no_step(value: float) -> None:
+    nights = robot_nights("arm", 18, moved_at=14)
+    covariance = nights[3].covariance.copy()
+    covariance[0, 0] = value
+    found = watch([*nights[:3], replace(nights[3], covariance=covariance), *nights[4:]])
+    [left_out] = [event for event in found.events if isinstance(event, NoAnswerEvent)]
+    assert left_out.when_ns == day_ns(3)
+    assert "run this night again" in left_out.reason
+    assert found.alarms == watch([*nights[:3], *nights[4:]]).alarms != ()
