@@ -132,7 +132,7 @@ def test_without_rows_there_is_nothing_to_say() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, -1e-6])
-def test_a_night_with_impossible_numbers_is_left_out_and_hides_no_step(value: float) -> None:
+def test_a_night_with_impossible_numbers_is_left_out(value: float) -> None:
     nights = robot_nights("arm", 18, moved_at=14)
     covariance = nights[3].covariance.copy()
     covariance[0, 0] = value
