@@ -20,6 +20,8 @@ from gtsam_rwhec.report.printing import (
     report_console,
 )
 
+#: A free direction moves a coordinate by more than this share of its largest twist; less is the tilt of the axes.
+FREE_SHARE = 0.1
 LEGEND = (
     "x, y, z: metres. roll, pitch, yaw: degrees, with R = Rz(yaw) Ry(pitch) Rx(roll). ±: one standard deviation along "
     "and about the sensor's own axes; free: not determined."
@@ -50,11 +52,24 @@ def print_odometry(result: OdometryResult, *, verbose: bool = False, page: Path 
 
 def pose_table(result: OdometryResult) -> FrameTable:
     """Poses in the frame of the reference, with their standard deviations."""
-    rows = {
-        one.sensor: (*pose_cells(gtsam.Pose3(np.array(one.T_parent_child))), *deviations(one)) for one in result.sensors
-    }
+    rows = {one.sensor: (*_pose(result, one), *deviations(one)) for one in result.sensors}
     title = f"Sensors in the frame of {result.reference}"
     return FrameTable(title, "sensor", (*POSE_HEADINGS, *DEVIATION_HEADINGS), rows, tight=True)
+
+
+def _pose(result: OdometryResult, one: SensorRecord) -> tuple[str, ...]:
+    """The pose, with "free" in the place of a coordinate that a free direction moves, and of angles that one turns."""
+    T = np.array(one.T_parent_child)
+    cells = list(pose_cells(gtsam.Pose3(T)))
+    for direction in result.free_directions:
+        twist = np.array(direction.frames.get(one.sensor, np.zeros(6)))
+        shift = np.abs(T[:3, :3] @ twist[3:])
+        largest = max((float(np.linalg.norm(other)) for other in direction.frames.values()), default=0.0)
+        turned = float(np.linalg.norm(twist[:3])) > FREE_SHARE * largest
+        for i in range(3):
+            cells[i] = "free" if shift[i] > FREE_SHARE * largest else cells[i]
+            cells[3 + i] = "free" if turned else cells[3 + i]
+    return tuple(cells)
 
 
 def deviations(one: SensorRecord) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.odometry.odometry_file import read_odometry_result, result_json
 from gtsam_rwhec.report.page.blocks import Number, Table, every
 from gtsam_rwhec.report.page.odometry_page import odometry_page
+from gtsam_rwhec.report.odometry_report import pose_table
 from gtsam_rwhec.simulate import Drive, SimulatedOdometry, drive, frame_distance
 
 #: Of each sensor: about x, y, z in degrees, and where it is on the vehicle in metres.
@@ -149,6 +150,8 @@ def test_a_plane_leaves_heights_free_until_they_are_given(tmp_path: Path) -> Non
     assert free.result.not_determined == (FREE,)
     assert f"{FREE}. What to do: state the missing heights in the rig file" in str(free.judgement)
     assert not (tmp_path / "free" / "tf.yaml").exists()
+    for cells in pose_table(free.result).rows.values():  # no number in the place of a height that is not known
+        assert [cell == "free" for cell in cells[:6]] == [False, False, True, False, False, False]
     assert {path.name for path in (tmp_path / "free").iterdir()} >= {"result.json", "report.html", "clean.mcap"}
     given = "given: {heights_m: {lidar_front: 0.6, lidar_rear: 0.9, lidar_roof: 1.9}}\n"
     known = rw.pipeline.calibrate_odometry_log(tmp_path, rw.rig.parse_rig(text + given, "rig.yaml"), tmp_path / "known")
