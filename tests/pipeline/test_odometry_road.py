@@ -18,9 +18,9 @@ import gtsam_rwhec as rw
 from gtsam_rwhec.cli.exit_status import ExitStatus, exit_status
 from gtsam_rwhec.errors import FileFormatError, LogError
 from gtsam_rwhec.odometry.odometry_file import read_odometry_result, result_json
+from gtsam_rwhec.report.odometry_report import pose_table
 from gtsam_rwhec.report.page.blocks import Number, Table, every
 from gtsam_rwhec.report.page.odometry_page import odometry_page
-from gtsam_rwhec.report.odometry_report import pose_table
 from gtsam_rwhec.simulate import Drive, SimulatedOdometry, drive, frame_distance
 
 #: Of each sensor: about x, y, z in degrees, and where it is on the vehicle in metres.
