@@ -14,6 +14,7 @@ from rwhec_factors.batch import BatchResiduals
 
 from gtsam_rwhec.calibration.calibrated import Calibration
 from gtsam_rwhec.geometry.poses import Array
+from gtsam_rwhec.problem.measurements import Measurements
 from gtsam_rwhec.problem.pairs import Pair
 from gtsam_rwhec.problem.problem import Problem
 from gtsam_rwhec.refinement.joint_covariance import JointCovariance
@@ -43,12 +44,8 @@ def with_covariances_of_detections(found: Calibration, problem: Problem, covaria
     squares, count = 0.0, 0
     for pair in problem.pairs:
         raw, C = problem.measurements(*pair), covariances[pair]
-        at, J, residual = _rows(refined, pair, raw.A, raw.B)
-        noise = refined.noise[pair]
-        # As moments weigh: alike, or by each measurement's own mean variances.
-        given = np.einsum("nii->ni", raw.covariance_of_B()).reshape(-1, 2, 3).mean(axis=2)
-        relative = np.median(given, axis=0) / given
-        WJ = np.repeat(relative / np.array([noise.rotation_rad**2, noise.translation_m**2]), 3, axis=1)[:, :, None] * J
+        at, J, residual = rows_of_pair(refined, pair, raw.A, raw.B)
+        WJ = weights_of_pair(refined, pair, raw)[:, :, None] * J
         H[np.ix_(at, at)] += np.einsum("nij,nik->jk", J, WJ, optimize=True)
         M[np.ix_(at, at)] += np.einsum("nij,nik->jk", WJ, C @ WJ, optimize=True)
         inverse = np.linalg.inv(C)
@@ -67,7 +64,7 @@ def with_covariances_of_detections(found: Calibration, problem: Problem, covaria
     return replace(found, refined=replace(refined, joint=JointCovariance(joint.slots, finite, joint.free, unit)))
 
 
-def _rows(refined: RefinedPoses, pair: Pair, A: Array, B: Array) -> tuple[np.ndarray, Array, Array]:
+def rows_of_pair(refined: RefinedPoses, pair: Pair, A: Array, B: Array) -> tuple[np.ndarray, Array, Array]:
     """The places (k,) of a pair's unknowns, its residuals' derivatives (N, 6, k) by them, and the residuals (N, 6)."""
     slots = refined.joint.slots
     scale = refined.scale if isinstance(refined.scale, float) else refined.scale.get(pair.target, 1.0)
@@ -81,3 +78,11 @@ def _rows(refined: RefinedPoses, pair: Pair, A: Array, B: Array) -> tuple[np.nda
     there = [(slots[unknown], derivative) for unknown, derivative in derivatives if unknown in slots]
     places = np.concatenate([np.arange(place.start, place.stop) for place, _ in there])
     return places, np.concatenate([derivative for _, derivative in there], axis=2), found.residual
+
+
+def weights_of_pair(refined: RefinedPoses, pair: Pair, raw: Measurements) -> Array:
+    """The weights (N, 6) with which moments count: alike, or by each measurement's own mean variances."""
+    noise = refined.noise[pair]
+    given = np.einsum("nii->ni", raw.covariance_of_B()).reshape(-1, 2, 3).mean(axis=2)
+    relative = np.median(given, axis=0) / given
+    return np.repeat(relative / np.array([noise.rotation_rad**2, noise.translation_m**2]), 3, axis=1)

@@ -39,6 +39,10 @@ class MeasuredProblem:
     path : Trajectory or None
     covariances : dict of (target, sensor) to (N, 6, 6) array
         Of the pairs whose measurements all have one, whether or not they are weighted by it.
+    logs : tuple of str
+        In the order of time.
+    log_of : dict of (target, sensor) to (N,) integers
+        The place of each measurement's log among `logs`.
     """
 
     problem: Problem
@@ -46,6 +50,8 @@ class MeasuredProblem:
     estimated: tuple[str, ...] = ()
     path: Trajectory | None = None
     covariances: dict[Pair, Array] = field(default_factory=dict)
+    logs: tuple[str, ...] = ()
+    log_of: dict[Pair, np.ndarray] = field(default_factory=dict)
 
 
 def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_site: bool) -> MeasuredProblem:
@@ -72,8 +78,10 @@ def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_sit
     boards = {target.name: target.corners() for each in rigs.values() for target in each.target_list}
     paths: list[tuple[np.ndarray, Array]] = []
     covariances: dict[Pair, list[Array | None]] = {}
+    log_of: dict[Pair, list[np.ndarray]] = {}
+    logs = sorted(of.logs, key=lambda one: (one.facts.begin_ns, one.key))
     common_s = {} if at_site else _common_offsets(of, rig)
-    for log in sorted(of.logs, key=lambda one: (one.facts.begin_ns, one.key)):
+    for i, log in enumerate(logs):
         file = measurements_file(partial_file(log.key))
         content = read_bytes(below(output, file))
         if checksum(content) != log.facts.measurements_sha256:
@@ -84,6 +92,7 @@ def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_sit
         for pair, one in kept.pairs.items():
             named = Pair(pair.target, names.get(pair.sensor, pair.sensor))
             covariances.setdefault(named, []).append(one.covariances)
+            log_of.setdefault(named, []).append(np.full(len(one.A), i))
         for name, camera in ((name, log.facts.camera(name)) for name in log.facts.cameras):
             if name in problem.sensors and name not in problem.cameras and _has_corners(problem, name):
                 problem.cameras[name] = camera
@@ -107,6 +116,8 @@ def measured_problem(of: Merged, rigs: Mapping[str, Rig], output: str, *, at_sit
         estimated if has_path else (),
         _joined(paths) if has_path else None,
         {pair: np.concatenate(whole) for pair, of_logs in covariances.items() if (whole := _whole(of_logs))},
+        tuple(log.facts.url for log in logs),
+        {pair: np.concatenate(places) for pair, places in log_of.items()},
     )
 
 

@@ -13,6 +13,7 @@ from gtsam_rwhec.calibration.options import CalibrateOptions
 from gtsam_rwhec.calibration.verdict import Finding, Ground
 from gtsam_rwhec.fleet.consistency import check_logs
 from gtsam_rwhec.fleet.detection_covariance import with_covariances_of_detections
+from gtsam_rwhec.fleet.log_agreement import disagreeing_logs
 from gtsam_rwhec.fleet.log_facts import findings_of_logs, merged_fields
 from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
 from gtsam_rwhec.fleet.merging import Merged
@@ -127,6 +128,8 @@ def calibrated(
         for name, number in log.poses.items():
             poses[name] = poses.get(name, 0) + number
     findings = (*found.findings, *findings_of_logs(facts), *short_of_measurements(fields, poses))
+    if not refine:
+        findings += disagreeing_logs(found, measured)
     if not refine or not measured.estimated:
         findings += tuple(_of_clocks(fields))
     notes = (*found.notes, *dict.fromkeys(words for log in facts for words in log.warnings))

@@ -1,0 +1,44 @@
+"""Logs of which one puts a frame elsewhere are named; logs that agree are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rwhec_factors import se3
+
+import gtsam_rwhec as rw
+from gtsam_rwhec.calibration import Finding, Ground
+from gtsam_rwhec.fleet.log_agreement import disagreeing_logs
+from gtsam_rwhec.fleet.measured_problem import MeasuredProblem
+from gtsam_rwhec.simulate import Noise, general
+
+LOGS = ("monday.mcap", "tuesday.mcap", "wednesday.mcap")
+PER_LOG = 20
+
+
+def findings(moved_m: float, seed: int) -> tuple[Finding, ...]:
+    """What is found where the sensor is elsewhere in the last log."""
+    made = general(2, 1, seed=seed, number_of_measurements=len(LOGS) * PER_LOG, noise=Noise(0.001, 1e4))
+    problem, moments, log_of = rw.Problem(), rw.Problem(keep_measurements=False), {}
+    step = se3.expmap(np.array([[0.0, 0.0, 0.0, moved_m, 0.0, 0.0]]))[0]
+    for pair in made.problem.pairs:
+        raw = made.problem.measurements(*pair)
+        log_of[pair] = np.repeat(np.arange(len(LOGS)), PER_LOG)
+        B = np.where((log_of[pair] == 2)[:, None, None], np.linalg.inv(step) @ raw.B, raw.B)
+        for one in (problem, moments):
+            one.add(*pair, raw.A, B)
+    measured = MeasuredProblem(problem, None, logs=LOGS, log_of=log_of)
+    return disagreeing_logs(rw.calibrate(moments), measured)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_logs_that_agree_are_not_doubted(seed: int) -> None:
+    assert findings(0.0, seed) == ()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_sensor_that_moved_between_logs_is_named_with_the_log(seed: int) -> None:
+    (found,) = findings(0.02, seed)
+    assert found.ground is Ground.COVARIANCE_DOUBTED
+    assert "the logs disagree" in found.words
+    assert "wednesday.mcap puts it" in found.words
