@@ -154,14 +154,14 @@ TABLE: dict[str, dict[str, str]] = {
     "gtsam_rwhec/odometry": {
         "odometry/test_calibrated.py": "found",
         "pipeline/test_odometry_road.py": "judging odometry_file",
-        "odometry/test_calibrating.py": (
-            "clocks findings freedom given_rows other_answers plausible refining result solved_windows up"
+        "odometry/test_calibrating_odometries.py": (
+            "calibrating clocks findings freedom given_rows other_answers plausible refining result solved_windows up"
         ),
         "odometry/test_gates.py": "motions sampling window_choice",
         "odometry/test_given.py": "options",
         "odometry/test_odometry_tracks.py": "tracks",
         "odometry/test_joint_solution.py": "joint_form",
-        "odometry/test_likelihood.py": "noise_by_residuals outlying unknowns window_motions",
+        "odometry/test_odometry_likelihood.py": "likelihood noise_by_residuals outlying unknowns window_motions",
     },
     "gtsam_rwhec/pipeline": {
         "test_gallery.py": "turned_images",

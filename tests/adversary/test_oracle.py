@@ -147,7 +147,8 @@ def test_descent_ends_at_a_minimum_to_the_last_digit() -> None:
         start = descent.answers([poses])
         _, six = descent.descend(start, 6)
         _, many = descent.descend(start, 25)
-        assert six.value.long()[0] - many.value.long()[0] <= 1e-16 * many.value.hi[0]
+        # Of exact data the cost is what poses are rounded by.
+        assert six.value.long()[0] - many.value.long()[0] <= max(1e-16 * many.value.hi[0], 1e-30)
 
 
 def test_a_bound_above_the_least_cost_by_one_part_in_ten_to_the_thirteen_is_found() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from drives_with_sensors import drive
-from test_likelihood import SCALED, truth, windows_of
+from test_odometry_likelihood import SCALED, truth, windows_of
 
 from gtsam_rwhec.odometry.joint_form import JointForm, joint_form
 from gtsam_rwhec.odometry.joint_solution import solved, star_starts
