@@ -124,7 +124,9 @@ def test_wrong_signs_give_a_wrong_answer_with_a_perfect_certificate(signs: Signs
 
 
 @pytest.mark.parametrize(
-    "seeds", [range(9, 12), pytest.param(range(12), marks=pytest.mark.campaign)], ids=["few", "all"]
+    "seeds",
+    [pytest.param(range(9, 12), marks=pytest.mark.slow), pytest.param(range(12), marks=pytest.mark.campaign)],
+    ids=["few", "all"],
 )
 def test_continuous_signs_are_right_until_noise_jumps_over_a_half_turn(seeds: range) -> None:
     """What the RWHEC paper's Tables 4 and 5 show of this method: a sign lost once is lost for the rest of a path."""

@@ -39,6 +39,7 @@ def test_images_are_refused_where_the_log_has_none(stage_log: Path, tmp_path: Pa
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_images_are_copied_where_the_log_has_them(tmp_path: Path) -> None:
     raw = made.write(tmp_path / "raw.mcap", made.recording(4.0))
     with LogWriter(tmp_path / "image.mcap") as out:

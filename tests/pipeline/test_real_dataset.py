@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from utias_log import rig_text, write_utias_log
 
 import gtsam_rwhec as rw
@@ -17,6 +18,7 @@ from gtsam_rwhec.rig import parse_rig
 SIGMA_M, ROTATION_DEG = 0.005, 0.5
 
 
+@pytest.mark.slow
 def test_the_same_cost_and_poses_as_from_csv(utias_folder: Path, tmp_path: Path) -> None:
     problem = rw.read_csv(utias_folder, sigma=SIGMA_M, kappa=1.0 / (2.0 * np.radians(ROTATION_DEG) ** 2))
     expected = rw.solve(problem)
