@@ -24,6 +24,8 @@ import gtsam_rwhec as rw
 
 #: Random starts of the search beside the returned answer and its images.
 STARTS = 20
+#: So many Newton steps end at a minimum to the last digit, from an answer that is optimal to rounding.
+STEPS = 12
 #: Answers that cost more than the bound by more than this share of max(bound, 1) are not refined.
 NEAR = 1e-3
 #: What the moments' rounding may do to a claim about moments, relative to the sums of squares.
@@ -205,7 +207,7 @@ class _Judge:
             if not worth.any():
                 return
         chosen = answers.at(np.flatnonzero(worth)[:3])
-        answers, value = descent.descend(chosen, 6)
+        answers, value = descent.descend(chosen, STEPS)
         self._compare(descent, answers, value)
         best = int(np.argmin(value.value.hi))
         far = descent.far(answers, best)

@@ -70,11 +70,11 @@ def verdicts(
 def test_a_free_direction_is_practically_never_called_determined(
     motion: Any, count: int, scale: str, noise_in_A: Any, turned_at: str
 ) -> None:
-    """At a significance of 1e-3, two among up to 90 verdicts is a chance of 4 in 1000 that the test forgives."""
+    """At a significance of 1e-3, one among up to 90 verdicts is a chance of 9 in 100 that the test forgives."""
     wholes, pairs = verdicts(motion, count, scale, noise_in_A, turned_at)
     assert len(wholes) > RUNS // 4
-    assert sum(wholes) <= 1
-    assert sum(pairs) <= 2
+    assert sum(wholes) == 0
+    assert sum(pairs) <= 1
 
 
 def few(kind: Any, seed: int, count: int, noise_in_A: Noise | None, scale: Any = "known") -> rw.Problem:
@@ -110,7 +110,7 @@ def test_few_equations_to_spare_do_not_make_the_test_brave(kind: Any, count: int
 def test_three_rich_measurements_are_enough() -> None:
     """Turns of up to 60 degrees, with noise of 0.06 and 0.03 degrees: three determine the pair."""
     verdicts = [identify(few("general", seed, 3, Noise(1e-4, 5e5))).is_unique for seed in range(RUNS // 2)]
-    assert sum(verdicts) >= RUNS // 2 - 1
+    assert sum(verdicts) == RUNS // 2
 
 
 @pytest.mark.parametrize("count", [10, 40])
@@ -128,7 +128,7 @@ def test_weights_too_modest_for_the_sensor_do_not_excuse_the_carrier(of_B: Noise
         problem = rw.Problem()
         problem.add("tag", "cam", data.A, data.B, NOISE.sigma_m, NOISE.kappa)
         verdicts.append(identify(problem).is_unique)
-    assert sum(verdicts) <= 1
+    assert sum(verdicts) == 0
 
 
 @pytest.mark.parametrize(
