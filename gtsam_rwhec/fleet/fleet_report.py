@@ -24,7 +24,7 @@ from gtsam_rwhec.solver.certificate import Basis
 #: So many robots and failures are named.
 MOST_NAMED = 10
 #: Characters of a reason in a list.
-LONGEST_REASON = 300
+LONGEST_REASON = 600
 HEADINGS = ("verdict", "logs", "n", "mm", "deg", "condition")
 LEGEND = (
     "n: measurements. mm, deg: the largest standard deviation of a sensor's position along, and of its rotation about, "
@@ -54,11 +54,11 @@ def print_fleet(run: FleetRun) -> None:
     if doubtful:
         print_heading(console, "What speaks against them", tight=True)
         print_list(console, [f"{_name(row)}: {_short(row.reason)}" for row in doubtful])
-    failures = failures_of(run.rows)
-    if failures:
-        print_heading(console, "What failed", tight=True)
-        more = len(failures) - MOST_NAMED
-        print_list(console, [*failures[:MOST_NAMED], *([f"and {more} more, in {ROWS_FILE}"] if more > 0 else [])])
+    for heading, said in (("What failed", failures_of(run.rows)), ("What was remarked", remarks_of(run.rows))):
+        if said:
+            print_heading(console, heading, tight=True)
+            more = len(said) - MOST_NAMED
+            print_list(console, [*said[:MOST_NAMED], *([f"and {more} more, in {ROWS_FILE}"] if more > 0 else [])])
     console.print()
     if any(row.basis is Basis.MOMENTS for row in run.rows):
         print_sentence(console, OF_MOMENTS)
@@ -93,6 +93,11 @@ def failures_of(rows: Sequence[RobotRow]) -> list[str]:
         if row.failure is None
         for log in row.failed_logs
     ]
+
+
+def remarks_of(rows: Sequence[RobotRow]) -> list[str]:
+    """What logs said of themselves where the poses may be used: a log that ends in the middle, for one."""
+    return [f"{_name(row)}: {_short(words)}" for row in rows if row.verdict is Verdict.USE for words in row.findings]
 
 
 def _worst(rows: Sequence[RobotRow]) -> Verdict:

@@ -6,6 +6,7 @@ no engine. Nothing in the output is changed but result files and the table of ro
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +28,8 @@ from gtsam_rwhec.fleet.stores import exists, read_bytes, write_once
 from gtsam_rwhec.fleet.tasks import Engine, Failed, Receipt, Task
 from gtsam_rwhec.fleet.without_secrets import shown
 
+#: Which version wrote the output; written before the first task.
+ABOUT_FILE = "about.json"
 #: All rows of the last run, below the output.
 ROWS_FILE = "fleet.json"
 #: The same for programs that read tables, where pyarrow is installed.
@@ -120,6 +123,8 @@ def _run(manifest: Manifest, output: str, options: FleetOptions, engine: Engine,
     outcomes = _earlier(plan, output)
     tasks = _tasks(plan, output, outcomes)
     if tasks:
+        # Hours of work are not begun for an output that cannot be written.
+        write_once(below(output, ABOUT_FILE), json.dumps({"gtsam-rwhec fleet": version("gtsam-rwhec")}).encode())
         _carry_out(tasks, engine, outcomes, plan, tell)
     tell("putting the rows together")
     rows = _rows(manifest, plan, output, outcomes)

@@ -69,6 +69,10 @@ def _row(unit: str, site: str | None, robot: str, of: Merged, found: UnitCalibra
         measurements=sum(used.get(pair, number[pair]) for pair in pairs),
         result=result_file(unit),
         removed=removed_of(facts),
-        findings=tuple(finding.words for finding in calibration.findings),
+        findings=tuple(
+            dict.fromkeys(
+                [*(finding.words for finding in calibration.findings), *(w for one in facts for w in one.warnings)]
+            )
+        ),
         receipts=tuple(sorted(log.key for log in logs)),
     )

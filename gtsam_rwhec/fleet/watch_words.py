@@ -22,7 +22,7 @@ def verdict(watched: Watched, since_ns: int = 0) -> str:
         return "Nothing was watched: no robot has a night that says where its frames are."
     changed = list(dict.fromkeys(alarm.robot for alarm in watched.alarms if alarm.when_ns >= since_ns))
     nights = sum(len(robot.tests) for robot in watched.robots.values())
-    of = f"{len(watched.robots)} robot{'s' * (len(watched.robots) > 1)}, {nights} nights"
+    of = f"{len(watched.robots)} robot{'s' * (len(watched.robots) != 1)}, {nights} night{'s' * (nights != 1)}"
     since = f" since {day_text(since_ns)}" if since_ns else ""
     if not changed:
         return f"Nothing moved by more than chance{since}: {of}."

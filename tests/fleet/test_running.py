@@ -13,6 +13,8 @@ from fleets import MadeFleet, write_fleet
 
 import gtsam_rwhec as rw
 from gtsam_rwhec import fleet
+from gtsam_rwhec.errors import RwhecError
+from gtsam_rwhec.fleet.fleet_report import remarks_of
 from gtsam_rwhec.fleet.in_process import InProcess
 from gtsam_rwhec.fleet.parquet import read_parquet
 from gtsam_rwhec.fleet.planning import planned
@@ -169,3 +171,23 @@ def test_a_log_is_the_same_from_another_working_folder(made: MadeFleet, monkeypa
         keys.append([log.task.key for log in plan.logs if log.task is not None])
     assert keys[0] == keys[1]
     assert len(keys[0]) == 6
+
+
+def test_a_log_that_ends_in_the_middle_is_remarked(tmp_path: Path) -> None:
+    """Its measurements count as far as they are there; that it was cut is said, in the row and on the terminal."""
+    made = write_fleet(tmp_path / "fleet", robots=1, logs=1)
+    [[log]] = made.logs.values()
+    log.write_bytes(log.read_bytes()[: int(0.9 * log.stat().st_size)])
+    [row] = fleet.run(fleet.read_manifest(made.manifest), str(tmp_path / "out")).rows
+    assert row.verdict is not None
+    said = "\n".join(row.findings)
+    assert "night_00.mcap" in said
+    assert row.verdict is not rw.Verdict.USE or remarks_of([row])
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_any_log_is_read(made: MadeFleet, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    engine = Backwards()
+    with pytest.raises(RwhecError, match=r"about\.json"):
+        fleet.run(fleet.read_manifest(made.manifest), str(tmp_path / "file" / "out"), engine=engine)
+    assert engine.keys == []
